@@ -1,0 +1,34 @@
+# `make run`  sets up .venv and runs the whole job on the default campaign into ./data.
+# `make test` sets up .venv and passes every check.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+CAMPAIGN ?= waterford
+ROOT ?= data
+
+.PHONY: run test lint setup bench clean
+
+run: setup
+	$(BIN)/fleet-slip --root $(ROOT) run --campaign $(CAMPAIGN)
+
+test: setup lint
+	$(BIN)/pytest -n 2
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+bench: setup
+	$(BIN)/python -m benchmarks
+
+setup: $(VENV)/.installed
+
+$(VENV)/.installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade --constraint constraints.txt pip
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable . --group dev
+	touch $@
+
+clean:
+	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache

@@ -1,0 +1,1 @@
+"""Side-slip angle estimation from fleet logs."""

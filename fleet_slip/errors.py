@@ -1,0 +1,43 @@
+"""Every error that a user can meet, each with its exit code. The CLI maps them in one place."""
+
+
+class FleetSlipError(Exception):
+    """Base of all expected errors: the message says what, where, and what to do next."""
+
+    exit_code = 1
+
+
+class ConfigError(FleetSlipError):
+    """A file in `configs/`, or one given by the user, does not say what it must."""
+
+    exit_code = 3
+
+
+class InputError(FleetSlipError):
+    """Data from outside is missing, unreadable or not what its mapping says."""
+
+    exit_code = 4
+
+
+class SelectionError(FleetSlipError):
+    """The data cannot answer: an empty cohort, an absent signal, a rank-deficient model."""
+
+    exit_code = 5
+
+
+class StorageError(FleetSlipError):
+    """The data root cannot be read or written: permissions, a full disk, a damaged file."""
+
+    exit_code = 6
+
+
+class RefusedError(FleetSlipError):
+    """The request is understood and would do harm: a worse model, a changed campaign."""
+
+    exit_code = 7
+
+
+class ConflictError(FleetSlipError):
+    """Another process changed the same thing at the same time, and retrying did not help."""
+
+    exit_code = 8
