@@ -1,0 +1,324 @@
+"""Gram matrices of integer counts: the exact sufficient statistics of every linear model.
+
+A Gram holds the number of rows, the sum of every signal and the sum of every product of two
+signals. All are integers, so Grams add and subtract without rounding: training on all drives
+minus a fold is, bit for bit, training on the other drives.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_slip.errors import SelectionError
+
+IntArray = NDArray[np.int64]
+ObjectArray = NDArray[np.object_]
+
+BLOCK_ROWS = 2**18
+"""Most rows of one matrix product. 16-bit counts would allow 2^21; this keeps the block small."""
+
+_SMALLEST_BLOCK = 2**10
+_LOW_BITS = 32
+
+
+def packed_size(k: int) -> int:
+    """Return k(k+1)/2, the number of entries of a packed lower triangle."""
+    return k * (k + 1) // 2
+
+
+def packed_position(i: int, j: int) -> int:
+    """Return where the product of signals i and j stands: (0,0), (1,0), (1,1), (2,0), ..."""
+    return packed_size(max(i, j)) + min(i, j)
+
+
+@dataclass(frozen=True)
+class Gram:
+    """Row count, sums and sums of products of integer counts, exactly (Python integers).
+
+    Attributes:
+        signals: k names, which are the order of everything else.
+        n: number of rows.
+        sums: k sums of counts.
+        products: k(k+1)/2 sums of products, the lower triangle packed row by row.
+    """
+
+    signals: tuple[str, ...]
+    n: int
+    sums: tuple[int, ...]
+    products: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        """Check the shapes. Raises `ValueError`."""
+        k = len(self.signals)
+        if len(set(self.signals)) != k:
+            raise ValueError(f"a signal stands twice in {self.signals}")
+        if len(self.sums) != k or len(self.products) != packed_size(k):
+            raise ValueError(
+                f"{k} signals need {k} sums and {packed_size(k)} products, "
+                f"not {len(self.sums)} and {len(self.products)}"
+            )
+
+    @classmethod
+    def zero(cls, signals: Sequence[str]) -> "Gram":
+        """Return the Gram of no rows."""
+        k = len(signals)
+        return cls(tuple(signals), 0, (0,) * k, (0,) * packed_size(k))
+
+    @classmethod
+    def from_counts(cls, signals: Sequence[str], counts: NDArray[Any]) -> "Gram":
+        """Return the Gram of rows of integer counts, shape (n, k).
+
+        Counts up to 2^21 go through float64 matrix products of at most `BLOCK_ROWS` rows. Every
+        partial sum there is an integer below 2^53, so that the result is exact in any order of
+        summation. Larger counts (polynomials of decimal data) use Python integers.
+        """
+        if counts.ndim != 2 or counts.shape[1] != len(signals):
+            raise ValueError(f"counts of shape {counts.shape} do not have {len(signals)} columns")
+        if counts.dtype.kind not in "iuO":
+            raise ValueError(f"counts must be integers, not {counts.dtype}")
+        largest = max(1, -int(counts.min()), int(counts.max())) if counts.size else 1
+        rows = min(BLOCK_ROWS, 2**53 // largest**2)
+        if rows < _SMALLEST_BLOCK:
+            return _gram_of_integers(signals, counts.astype(object))
+        total = cls.zero(signals)
+        for start in range(0, len(counts), rows):
+            total += _gram_of_block(signals, counts[start : start + rows])
+        return total
+
+    def __add__(self, other: "Gram") -> "Gram":
+        """Return the Gram of both sets of rows. Raises `SelectionError` if the signals differ."""
+        self._require_same_signals(other)
+        return Gram(
+            self.signals,
+            self.n + other.n,
+            tuple(a + b for a, b in zip(self.sums, other.sums, strict=True)),
+            tuple(a + b for a, b in zip(self.products, other.products, strict=True)),
+        )
+
+    def __sub__(self, other: "Gram") -> "Gram":
+        """Return the Gram of the rows that are not in `other`.
+
+        Raises `SelectionError` if the signals differ, or if a row count or a sum of squares would
+        go negative: then `other` was not a part of this Gram.
+        """
+        self._require_same_signals(other)
+        rest = Gram(
+            self.signals,
+            self.n - other.n,
+            tuple(a - b for a, b in zip(self.sums, other.sums, strict=True)),
+            tuple(a - b for a, b in zip(self.products, other.products, strict=True)),
+        )
+        squares = [rest.products[packed_position(i, i)] for i in range(len(self.signals))]
+        if rest.n < 0 or min(squares, default=0) < 0:
+            raise SelectionError(
+                "cannot subtract a Gram that is not part of the total: a sum of squares would be "
+                "negative. Rebuild the Gram rows from the logs."
+            )
+        return rest
+
+    def restrict(self, signals: Sequence[str]) -> "Gram":
+        """Return the Gram of some of the signals, in the given order.
+
+        Raises `SelectionError` for a signal that the Gram lacks.
+        """
+        at = positions(self.signals, signals)
+        return Gram(
+            tuple(signals),
+            self.n,
+            tuple(self.sums[i] for i in at),
+            tuple(self.products[p] for p in _packed_positions(tuple(at))),
+        )
+
+    def sum(self, signal: str) -> int:
+        """Return the sum of a signal's counts."""
+        return self.sums[positions(self.signals, [signal])[0]]
+
+    def product(self, a: str, b: str) -> int:
+        """Return the sum of the products of two signals' counts."""
+        i, j = positions(self.signals, [a, b])
+        return self.products[packed_position(i, j)]
+
+    def raw(self) -> list[list[int]]:
+        """Return the k x k matrix of product sums about zero, as integers."""
+        k = range(len(self.signals))
+        return [[self.products[packed_position(i, j)] for j in k] for i in k]
+
+    def centred(self) -> list[list[int]]:
+        """Return the integer matrix n S, with S the product sums about the means.
+
+        n S_ab = n sum(a b) - sum(a) sum(b): no rounding, so a constant signal has exactly zero.
+        """
+        k = range(len(self.signals))
+        return [
+            [self.n * self.products[packed_position(i, j)] - self.sums[i] * self.sums[j] for j in k]
+            for i in k
+        ]
+
+    def _require_same_signals(self, other: "Gram") -> None:
+        if self.signals != other.signals:
+            raise SelectionError(
+                f"Grams of different signals cannot be combined: {', '.join(self.signals)} and "
+                f"{', '.join(other.signals)}. Restrict both to the signals that they share."
+            )
+
+
+@dataclass(frozen=True)
+class GramTable:
+    """Many Grams of the same signals, one a drive.
+
+    Attributes:
+        signals: k names.
+        n: rows of each drive, shape (drives,).
+        sums: sums of counts, shape (drives, k).
+        products: packed product sums, shape (drives, k(k+1)/2).
+    """
+
+    signals: tuple[str, ...]
+    n: IntArray
+    sums: IntArray
+    products: IntArray
+
+    def __post_init__(self) -> None:
+        """Check shapes and types. Raises `ValueError`."""
+        drives, k = len(self.n), len(self.signals)
+        if self.sums.shape != (drives, k) or self.products.shape != (drives, packed_size(k)):
+            raise ValueError(
+                f"{drives} drives of {k} signals do not have sums of shape {self.sums.shape} and "
+                f"products of shape {self.products.shape}"
+            )
+        if not self.n.dtype == self.sums.dtype == self.products.dtype == np.int64:
+            raise ValueError("a GramTable holds int64")
+
+    def __len__(self) -> int:
+        """Return the number of drives."""
+        return len(self.n)
+
+    @classmethod
+    def from_grams(cls, grams: Sequence[Gram]) -> "GramTable":
+        """Stack Grams of the same signals. Raises `OverflowError` beyond 64 bits."""
+        first = grams[0]
+        for gram in grams:
+            first._require_same_signals(gram)
+        shape = (len(grams), -1)
+        return cls(
+            first.signals,
+            np.array([gram.n for gram in grams], dtype=np.int64),
+            np.array([gram.sums for gram in grams], dtype=np.int64).reshape(shape),
+            np.array([gram.products for gram in grams], dtype=np.int64).reshape(shape),
+        )
+
+    def row(self, index: int) -> Gram:
+        """Return one drive's Gram."""
+        return self._gram(self.n[index], self.sums[index], self.products[index])
+
+    def take(self, rows: NDArray[Any]) -> "GramTable":
+        """Return the drives at an index array or a boolean mask."""
+        return GramTable(self.signals, self.n[rows], self.sums[rows], self.products[rows])
+
+    def total(self, rows: NDArray[Any] | None = None) -> Gram:
+        """Return the exact sum over all drives, or over those at an index array or a mask."""
+        if rows is not None:
+            return self.take(rows).total()
+        return self.totals(np.zeros(len(self), dtype=np.int64), 1)[0]
+
+    def totals(self, groups: NDArray[Any], count: int) -> list[Gram]:
+        """Return the exact sum over each group of drives; `groups` says each drive's, 0..count-1.
+
+        Exact also where a total needs more than 64 bits: high and low halves are summed apart.
+        """
+        if groups.shape != self.n.shape:
+            raise ValueError(f"{len(self)} drives need as many groups, not {groups.shape}")
+        if len(groups) and not 0 <= groups.min() <= groups.max() < count:
+            raise ValueError(f"groups must lie in 0..{count - 1}")
+        order = np.argsort(groups, kind="stable")
+        sizes = np.bincount(groups, minlength=count)
+        columns = np.column_stack([self.n, self.sums, self.products])
+        if np.any(groups[1:] < groups[:-1]):
+            columns = columns[order]
+        stops = np.cumsum(sizes)
+        return [
+            self._gram_of_columns(exact_sum(columns[stop - size : stop]))
+            for size, stop in zip(sizes, stops, strict=True)
+        ]
+
+    def restrict(self, signals: Sequence[str]) -> "GramTable":
+        """Return the same drives with some of the signals, in the given order.
+
+        Raises `SelectionError` for a signal that the table lacks.
+        """
+        at = positions(self.signals, signals)
+        packed = list(_packed_positions(tuple(at)))
+        return GramTable(tuple(signals), self.n, self.sums[:, at], self.products[:, packed])
+
+    def about(self, origin: Sequence[int]) -> "GramTable":
+        """Return the table of the counts minus an integer origin, exactly.
+
+        sum((a - u)(b - v)) = sum(ab) - u sum(b) - v sum(a) + n u v. Intermediate values may wrap
+        around 64 bits; the result does not, since it is again a sum of products of counts.
+        """
+        u = np.array(origin, dtype=np.int64)
+        i, j = np.tril_indices(len(self.signals))
+        n = self.n[:, None]
+        products = (
+            self.products - u[i] * self.sums[:, j] - u[j] * self.sums[:, i] + n * (u[i] * u[j])
+        )
+        return GramTable(self.signals, self.n, self.sums - n * u, products)
+
+    def _gram_of_columns(self, totals: list[int]) -> Gram:
+        k = len(self.signals)
+        return Gram(self.signals, totals[0], tuple(totals[1 : k + 1]), tuple(totals[k + 1 :]))
+
+    def _gram(self, n: Any, sums: IntArray, products: IntArray) -> Gram:
+        return Gram(self.signals, int(n), tuple(sums.tolist()), tuple(products.tolist()))
+
+
+def exact_sum(values: IntArray) -> list[int]:
+    """Return the sums of the columns of an int64 array, shape (rows < 2^31, columns), exactly."""
+    high = (values >> _LOW_BITS).sum(axis=0).tolist()
+    low = (values & (2**_LOW_BITS - 1)).sum(axis=0).tolist()
+    return [(h << _LOW_BITS) + part for h, part in zip(high, low, strict=True)]
+
+
+def positions(signals: Sequence[str], wanted: Sequence[str]) -> list[int]:
+    """Return the index of each wanted signal. Raises `SelectionError` for an absent one."""
+    missing = [name for name in wanted if name not in signals]
+    if missing:
+        raise SelectionError(
+            f"no Gram of {', '.join(missing)}: the drives have {', '.join(signals)}. "
+            "Leave the signal out, or choose a cohort that has it."
+        )
+    return [signals.index(name) for name in wanted]
+
+
+@cache
+def _packed_positions(at: tuple[int, ...]) -> tuple[int, ...]:
+    return tuple(packed_position(i, at[b]) for a, i in enumerate(at) for b in range(a + 1))
+
+
+def _gram_of_block(signals: Sequence[str], counts: NDArray[Any]) -> Gram:
+    block = counts.astype(np.float64)
+    matrix = block.T @ block
+    return Gram(
+        tuple(signals),
+        len(block),
+        tuple(int(total) for total in block.sum(axis=0)),
+        tuple(int(total) for total in matrix[np.tril_indices(len(signals))]),
+    )
+
+
+def _gram_of_integers(signals: Sequence[str], counts: ObjectArray) -> Gram:
+    columns = [[int(count) for count in column] for column in counts.T]
+    return Gram(
+        tuple(signals),
+        len(counts),
+        tuple(sum(column) for column in columns),
+        tuple(
+            sum(a * b for a, b in zip(columns[i], columns[j], strict=True))
+            for i in range(len(columns))
+            for j in range(i + 1)
+        ),
+    )

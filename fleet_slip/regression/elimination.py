@@ -1,0 +1,98 @@
+"""Fraction-free elimination of integer matrices (Bareiss 1968, Math. Comp. 22:565).
+
+Every intermediate value is a minor of the matrix, so each division is exact and the numbers stay
+as small as exact arithmetic allows. Nothing is rounded, and a zero pivot is a fact.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+
+
+@dataclass(frozen=True)
+class Elimination:
+    """Fraction-free triangular form of a symmetric positive semidefinite integer matrix.
+
+    The last row and column of the matrix belong to the response; the first k to the inputs.
+
+    Attributes:
+        rows: row t after t steps, from its diagonal to the right: k rows.
+        minors: leading principal minors of order 0..k (order 0 is 1).
+        corners: bordered minors of the response after 0..k steps.
+        singular: the first input with a zero pivot, at which elimination stopped; else None.
+    """
+
+    rows: tuple[tuple[int, ...], ...]
+    minors: tuple[int, ...]
+    corners: tuple[int, ...]
+    singular: int | None
+
+    def solve(self, size: int) -> tuple[list[int], int]:
+        """Return x and d with `x / d` the solution for the first `size` inputs (Cramer's rule)."""
+        determinant = self.minors[size]
+        solution = [0] * size
+        for i in reversed(range(size)):
+            row = self.rows[i]
+            right = determinant * row[-1]
+            right -= sum(row[j - i] * solution[j] for j in range(i + 1, size))
+            solution[i] = right // row[0]
+        return solution, determinant
+
+    def residual(self, size: int) -> Fraction:
+        """Return the squared distance of the response from the first `size` inputs.
+
+        It is in the units of the matrix: corner over minor, a ratio of two determinants.
+        """
+        return Fraction(self.corners[size], self.minors[size])
+
+
+def eliminate(matrix: Sequence[Sequence[int]]) -> Elimination:
+    """Eliminate the inputs of a symmetric integer matrix in order, the response last.
+
+    N(t+1)_ab = (N(t)_ab N(t)_tt - N(t)_at N(t)_tb) / p_t, divided without remainder.
+    """
+    size = len(matrix)
+    work = [list(row[i:]) for i, row in enumerate(matrix)]
+    rows: list[tuple[int, ...]] = []
+    previous, minors, corners = 1, [1], [work[-1][0]]
+    for t in range(size - 1):
+        pivot_row = work[t]
+        pivot = pivot_row[0]
+        if pivot == 0:
+            return Elimination(tuple(rows), tuple(minors), tuple(corners), t)
+        for a in range(t + 1, size):
+            factor = pivot_row[a - t]
+            row, other = work[a], pivot_row[a - t :]
+            work[a] = [
+                (x * pivot - factor * y) // previous for x, y in zip(row, other, strict=True)
+            ]
+        rows.append(tuple(pivot_row))
+        minors.append(pivot)
+        corners.append(work[-1][0])
+        previous = pivot
+    return Elimination(tuple(rows), tuple(minors), tuple(corners), None)
+
+
+def inverse_diagonal(matrix: Sequence[Sequence[int]]) -> list[Fraction]:
+    """Return the diagonal of the inverse of a regular symmetric integer matrix, exactly."""
+    inverse = inverse_matrix(matrix)
+    return [inverse[i][i] for i in range(len(matrix))]
+
+
+def inverse_matrix(matrix: Sequence[Sequence[int]]) -> list[list[Fraction]]:
+    """Return the inverse of a regular symmetric integer matrix by fraction-free Gauss-Jordan."""
+    size = len(matrix)
+    work = [[*row, *(int(i == j) for j in range(size))] for i, row in enumerate(matrix)]
+    previous = 1
+    for t in range(size):
+        pivot_row = work[t]
+        pivot = pivot_row[t]
+        for a in range(size):
+            if a != t:
+                factor = work[a][t]
+                work[a] = [
+                    (x * pivot - factor * y) // previous
+                    for x, y in zip(work[a], pivot_row, strict=True)
+                ]
+        previous = pivot
+    return [[Fraction(entry, previous) for entry in row[size:]] for row in work]

@@ -1,0 +1,154 @@
+"""Which fold a drive belongs to.
+
+A drive's fold is a function of the drive alone: the SHA-256 hash of its id modulo the number of
+folds. Adding or removing drives therefore never moves another one, so that models of yesterday
+and today are compared on the same split. No rule that also equalises the folds can do this: it
+would have to know the other drives. The price is that fold sizes vary as they do by chance; with
+fewer than about five drives a fold, one may be empty, which is an error and not a silent change.
+"""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from fleet_slip.errors import SelectionError
+from fleet_slip.gram import Gram, GramTable, IntArray, positions
+
+
+def hash_fold(key: str, count: int) -> int:
+    """Return the fold 0..count-1 of a key, the same on every machine and for ever."""
+    digest = hashlib.sha256(key.encode("utf-8")).digest()
+    return int.from_bytes(digest[:8], "big") % count
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """The fold of each drive of a cohort.
+
+    Attributes:
+        fold: fold 0..len(names)-1 of each drive, shape (drives,).
+        names: what each fold is called.
+    """
+
+    fold: IntArray
+    names: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        """Check that no fold is empty and that there are two. Raises `SelectionError`."""
+        used = set(self.fold.tolist())
+        if len(self.names) < 2:
+            raise SelectionError(
+                "cross-validation needs at least two folds, and the cohort has one: "
+                f"{', '.join(self.names) or 'no drives'}. Widen the cohort, or fold by another key."
+            )
+        empty = [name for number, name in enumerate(self.names) if number not in used]
+        if empty:
+            raise SelectionError(
+                f"no drive falls into fold {', '.join(empty)} of {len(self.names)}: the cohort has "
+                f"{len(self.fold)} drives. Choose fewer folds, or more drives."
+            )
+
+
+def by_hash(keys: Sequence[str], count: int) -> Assignment:
+    """Deal drives into `count` folds by the hash of a key: the drive id, or a vehicle or track.
+
+    Drives with the same key share a fold. Raises `SelectionError` if a fold stays empty.
+    """
+    if count < 2:
+        raise SelectionError(f"cross-validation needs at least two folds, not {count}.")
+    fold = np.array([hash_fold(key, count) for key in keys], dtype=np.int64)
+    return Assignment(fold, tuple(str(number + 1) for number in range(count)))
+
+
+def by_value(values: Sequence[Any]) -> Assignment:
+    """Make one fold of each distinct value: leave one vehicle, track, day or mass out.
+
+    Raises `SelectionError` if a drive has no value, or all have the same.
+    """
+    if any(value is None for value in values):
+        raise SelectionError(
+            "a drive has no value of the column to fold by: fold by another, or leave such drives "
+            "out of the cohort."
+        )
+    distinct = sorted(set(values))
+    number = {value: i for i, value in enumerate(distinct)}
+    fold = np.array([number[value] for value in values], dtype=np.int64)
+    return Assignment(fold, tuple(str(value) for value in distinct))
+
+
+@dataclass(frozen=True)
+class Folds:
+    """One Gram a fold, all of the same signals: what cross-validation needs.
+
+    Attributes:
+        grams: the rows of each fold.
+        names: what the folds are called.
+        drives: number of drives in all folds together.
+    """
+
+    grams: tuple[Gram, ...]
+    names: tuple[str, ...]
+    drives: int
+
+    @cached_property
+    def total(self) -> Gram:
+        """The Gram of all folds."""
+        return sum(self.grams[1:], self.grams[0])
+
+
+@dataclass(frozen=True)
+class CohortFolds:
+    """The folds of a cohort whose drives may have different signals.
+
+    Attributes:
+        names: what the folds are called.
+        tables: for each signal set, one Gram a fold.
+        drives: for each signal set, its number of drives.
+    """
+
+    names: tuple[str, ...]
+    tables: tuple[tuple[Gram, ...], ...]
+    drives: tuple[int, ...]
+
+    @classmethod
+    def of(cls, tables: Sequence[GramTable], assignment: Assignment) -> "CohortFolds":
+        """Add up the drives of each fold. The assignment lists the drives table after table."""
+        sizes = [len(table) for table in tables]
+        if sum(sizes) != len(assignment.fold):
+            raise ValueError("the assignment is not of these drives")
+        parts = np.split(assignment.fold, np.cumsum(sizes)[:-1])
+        grams = tuple(
+            tuple(table.totals(fold, len(assignment.names)))
+            for table, fold in zip(tables, parts, strict=True)
+        )
+        return cls(assignment.names, grams, tuple(sizes))
+
+    def serving(self, inputs: Sequence[str], label: str) -> Folds:
+        """Return the folds of the drives that have the label and all the inputs.
+
+        Raises `SelectionError` if no drive has them all, or a fold has no such row.
+        """
+        signals = (*inputs, label)
+        served = [i for i, grams in enumerate(self.tables) if set(signals) <= set(grams[0].signals)]
+        if not served:
+            known = sorted({name for grams in self.tables for name in grams[0].signals})
+            positions(known, signals)
+            raise SelectionError(
+                f"no drive of the cohort has all of {', '.join(signals)}. Use fewer signals, or "
+                "another cohort."
+            )
+        folds = tuple(
+            sum((self.tables[i][f].restrict(signals) for i in served), Gram.zero(signals))
+            for f in range(len(self.names))
+        )
+        empty = [name for name, gram in zip(self.names, folds, strict=True) if gram.n == 0]
+        if empty:
+            raise SelectionError(
+                f"fold {', '.join(empty)} has no rows with all of {', '.join(signals)}. Choose "
+                "fewer folds, another key to fold by, or fewer signals."
+            )
+        return Folds(folds, self.names, sum(self.drives[i] for i in served))

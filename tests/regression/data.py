@@ -1,0 +1,73 @@
+"""Data and plain float64 formulas that the tests compare with."""
+
+import json
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from fleet_slip.gram import Gram
+
+REFERENCE = Path(__file__).parents[2].parent / "shared" / "reference"
+
+Matrix = NDArray[Any]
+
+
+def reference(path: str) -> Any:
+    """Load a file of outside answers, or skip the test."""
+    file = REFERENCE / path
+    if not file.is_file():
+        pytest.skip(f"outside answers are not here: {path}")
+    return json.loads(file.read_text(encoding="utf-8"))
+
+
+def columns_to_counts(rows: list[list[str]]) -> tuple[Matrix, list[Fraction]]:
+    """Turn decimal strings into integer counts and the scale of each column."""
+    exact = [[Fraction(value) for value in column] for column in zip(*rows, strict=True)]
+    scales = []
+    for column in exact:
+        places = 0
+        while any((value * 10**places).denominator != 1 for value in column):
+            places += 1
+        scales.append(Fraction(1, 10**places))
+    counts = [
+        [int(value / scale) for value in column]
+        for column, scale in zip(exact, scales, strict=True)
+    ]
+    return np.array(counts, dtype=object).T, scales
+
+
+def random_drives(
+    seed: int, drives: int = 12, rows: int = 60, inputs: int = 4, noise: float = 30.0
+) -> list[Matrix]:
+    """Return counts of drives whose last column depends on the others, with drive effects."""
+    rng = np.random.default_rng(seed)
+    mix = rng.normal(size=(inputs, inputs)) + 2 * np.eye(inputs)
+    weights = rng.normal(size=inputs)
+    result = []
+    for _ in range(drives):
+        x = rng.normal(size=(rows, inputs)) @ mix * 300 + rng.normal(size=inputs) * 100
+        y = x @ weights + rng.normal() * noise + rng.normal(size=rows) * noise
+        result.append(np.rint(np.column_stack([x, y])).astype(np.int64))
+    return result
+
+
+def names(inputs: int) -> tuple[str, ...]:
+    """Return x1, x2, ..., y."""
+    return (*(f"x{i + 1}" for i in range(inputs)), "y")
+
+
+def gram_of(counts: Matrix) -> Gram:
+    """Return the Gram of counts, label last."""
+    return Gram.from_counts(names(counts.shape[1] - 1), counts)
+
+
+def dense_fit(counts: Matrix) -> tuple[Matrix, float]:
+    """Return (intercept, coefficients) and the residual sum of squares from rows (float64 QR)."""
+    x = np.column_stack([np.ones(len(counts)), counts[:, :-1]]).astype(float)
+    y = counts[:, -1].astype(float)
+    solution = np.linalg.lstsq(x, y, rcond=None)[0]
+    return solution, float(np.sum((y - x @ solution) ** 2))

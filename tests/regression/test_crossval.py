@@ -1,0 +1,174 @@
+"""Folds, cross-validation from Grams against the rows, and the choice of a winner."""
+
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fleet_slip.errors import SelectionError
+from fleet_slip.gram import Gram, GramTable
+from fleet_slip.regression.crossval import CrossValidation, cross_validate_inputs
+from fleet_slip.regression.folds import CohortFolds, by_hash, by_value, hash_fold
+from fleet_slip.regression.winner import choose
+from .data import dense_fit, gram_of, names, random_drives
+
+SCALES = {**{name: Fraction(1, 100) for name in names(6)}, "y": Fraction(1, 10_000)}
+
+
+def cohort_of(drives: list[np.ndarray], fold: list[int]) -> CohortFolds:
+    table = GramTable.from_grams([gram_of(counts) for counts in drives])
+    return CohortFolds.of([table], by_value(fold))
+
+
+@settings(max_examples=25)
+@given(st.integers(0, 10**6), st.integers(2, 5))
+def test_equals_cross_validation_on_rows(seed: int, count: int) -> None:
+    drives = random_drives(seed, drives=10)
+    fold = [i % count for i in range(10)]
+    result = cross_validate_inputs("m", cohort_of(drives, fold), ["x1", "x3"], "y", SCALES)
+    predicted, label, null = [], [], 0.0
+    for number in range(count):
+        train, test = (
+            np.concatenate([d[:, [0, 2, 4]] for d, f in zip(drives, fold, strict=True) if keep(f)])
+            for keep in (lambda f, n=number: f != n, lambda f, n=number: f == n)
+        )
+        solution, _ = dense_fit(train)
+        estimate = solution[0] + test[:, :-1] @ solution[1:]
+        figures = result.folds[number]
+        assert figures.rows == len(test)
+        assert figures.correlation == pytest.approx(np.corrcoef(estimate, test[:, -1])[0, 1])
+        predicted.append(estimate)
+        label.append(test[:, -1])
+        null += float(np.sum((test[:, -1] - train[:, -1].mean()) ** 2))
+    error = np.concatenate(predicted) - np.concatenate(label)
+    pooled = result.pooled
+    correlation = np.corrcoef(np.concatenate(predicted), np.concatenate(label))[0, 1]
+    assert pooled.correlation == pytest.approx(correlation, rel=1e-9)
+    assert pooled.rmse == pytest.approx(np.sqrt(np.mean(error**2)) * 1e-4, rel=1e-9)
+    assert pooled.error_mean == pytest.approx(error.mean() * 1e-4, rel=1e-6, abs=1e-12)
+    assert pooled.error_std == pytest.approx(error.std(ddof=1) * 1e-4, rel=1e-9)
+    assert pooled.error_std_deg == np.degrees(pooled.error_std)
+    assert pooled.relative_rmse == pytest.approx(np.sqrt(np.sum(error**2) / null), rel=1e-9)
+    spread = np.std([f.correlation for f in result.folds], ddof=1) / np.sqrt(count)
+    assert result.standard_error == pytest.approx(spread)
+
+
+def test_training_without_a_fold_is_training_on_the_other_drives_bit_for_bit() -> None:
+    drives = random_drives(3)
+    grams = [gram_of(counts) for counts in drives]
+    total = sum(grams[1:], grams[0])
+    rest = gram_of(np.concatenate([*reversed(drives[4:]), *drives[:3]]))
+    assert total - grams[3] == rest
+
+
+def test_drives_without_a_signal_serve_the_models_that_do_not_need_it() -> None:
+    drives = random_drives(7, drives=12)
+    full = GramTable.from_grams([gram_of(counts) for counts in drives[:6]])
+    poor = GramTable.from_grams(
+        [Gram.from_counts(("y", "x1", "x2"), counts[:, [4, 0, 1]]) for counts in drives[6:]]
+    )
+    cohort = CohortFolds.of([full, poor], by_value([0, 1, 2] * 4))
+    both = cross_validate_inputs("two", cohort, ["x1", "x2"], "y", SCALES)
+    assert both.drives == 12
+    assert both.pooled.rows == 12 * 60
+    together = cohort_of(drives, [0, 1, 2] * 4)
+    assert both == cross_validate_inputs("two", together, ["x1", "x2"], "y", SCALES)
+    assert cross_validate_inputs("three", cohort, ["x3"], "y", SCALES).drives == 6
+    with pytest.raises(SelectionError, match="no Gram of gyro"):
+        cohort.serving(["gyro"], "y")
+
+
+def test_folds_lacking_a_signal_are_an_error() -> None:
+    drives = random_drives(7, drives=4)
+    full = GramTable.from_grams([gram_of(counts) for counts in drives[:2]])
+    cohort = CohortFolds.of([full, full.restrict(["x1", "y"])], by_value(["a", "a", "b", "b"]))
+    with pytest.raises(SelectionError, match="fold b has no rows with all of x2, y"):
+        cohort.serving(["x2"], "y")
+
+
+def test_the_hash_of_a_drive_decides_its_fold_for_ever() -> None:
+    assert [hash_fold(f"drive-{i}", 5) for i in range(8)] == [4, 4, 1, 4, 3, 1, 1, 1]
+    ids = [f"d{i}" for i in range(200)]
+    few, many = by_hash(ids[:100], 5), by_hash(ids, 5)
+    np.testing.assert_array_equal(few.fold, many.fold[:100])
+    sizes = np.bincount(by_hash([f"d{i}" for i in range(10_000)], 5).fold)
+    assert sizes.min() > 1800
+    assert sizes.max() < 2200
+
+
+def test_drives_of_one_vehicle_share_a_fold() -> None:
+    vehicles = [f"car{i // 3}" for i in range(60)]
+    fold = by_hash(vehicles, 4).fold.reshape(20, 3)
+    assert (fold == fold[:, :1]).all()
+    assert by_value(vehicles).names == tuple(sorted(set(vehicles)))
+
+
+def test_empty_and_single_folds_are_errors() -> None:
+    with pytest.raises(SelectionError, match="no drive falls into fold"):
+        by_hash(["a", "b"], 5)
+    with pytest.raises(SelectionError, match="at least two folds"):
+        by_hash(["a", "b"], 1)
+    with pytest.raises(SelectionError, match="the cohort has one: waterford"):
+        by_value(["waterford", "waterford"])
+    with pytest.raises(SelectionError, match="no value"):
+        by_value(["a", None])
+
+
+def candidate(name: str, size: int, correlation: float, error: float) -> CrossValidation:
+    """Return a real result with two folds' correlations placed to give a standard error."""
+    cohort = cohort_of(random_drives(1, inputs=6), [0, 1] * 6)
+    inputs = names(6)[:size]
+    result = cross_validate_inputs(name, cohort, inputs, "y", SCALES)
+    r = Fraction(correlation)
+    sums = replace(
+        result.sums, n=1, p=Fraction(0), y=Fraction(0), pp=Fraction(1), yy=Fraction(1), py=r
+    )
+    folds = tuple(
+        replace(fold, correlation=correlation + sign * error)
+        for fold, sign in zip(result.folds, (1, -1), strict=True)
+    )
+    return replace(
+        result, sums=sums, folds=folds, pooled=replace(result.pooled, correlation=correlation)
+    )
+
+
+def test_the_smallest_model_within_one_standard_error_wins() -> None:
+    models = [
+        candidate("poor", 1, 0.90, 0.01),
+        candidate("small", 3, 0.985, 0.01),
+        candidate("twin", 3, 0.986, 0.01),
+        candidate("best", 5, 0.990, 0.01),
+    ]
+    winner = choose(models)
+    assert winner.model.name == "twin"
+    assert winner.best.name == "best"
+    assert "fewest signals (3) of the 3 models within one standard error (0.01)" in winner.reason
+
+
+def test_a_clear_best_wins_and_ties_go_to_the_declared_order() -> None:
+    clear = [candidate("first", 1, 0.90, 0.01), candidate("best", 5, 0.990, 0.01)]
+    assert choose(clear).model.name == "best"
+    assert "no other model is within" in choose(clear).reason
+    tied = [candidate("b", 2, 0.9, 0.01), candidate("a", 2, 0.9, 0.01)]
+    assert choose(tied).model.name == "b"
+    with pytest.raises(SelectionError, match="empty"):
+        choose([])
+
+
+def test_a_json_document_has_what_is_promised() -> None:
+    cohort = cohort_of(random_drives(2), [0, 1, 2] * 4)
+    document = cross_validate_inputs("m1", cohort, ["x2"], "y", SCALES).as_dict()
+    assert document["name"] == "m1"
+    assert document["signals"] == ["x2"]
+    assert {"correlation", "rmse_deg", "error_mean_deg", "error_std_deg"} <= document.keys()
+    assert document["coefficients"].keys() == {"x2"}
+    assert len(document["folds"]) == 3
+
+
+def test_a_constant_prediction_has_no_correlation() -> None:
+    drives = random_drives(2, drives=4)
+    result = cross_validate_inputs("null", cohort_of(drives, [0, 0, 1, 1]), [], "y", SCALES)
+    assert all(fold.correlation == 0 for fold in result.folds)

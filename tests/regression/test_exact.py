@@ -1,0 +1,132 @@
+"""Exact least squares against NIST's certified values, dense float64 and exact relations."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fleet_slip.errors import SelectionError
+from fleet_slip.gram import Gram
+from fleet_slip.regression.elimination import eliminate, inverse_matrix
+from fleet_slip.regression.exact import (
+    condition_number,
+    correlation_matrix,
+    dependence,
+    fit,
+)
+from fleet_slip.regression.nested import nested_fits
+from fleet_slip.regression.rounding import sqrt
+from .data import dense_fit, gram_of, names, random_drives
+
+
+@given(st.integers(0, 10**6), st.integers(1, 6))
+def test_agrees_with_dense_least_squares(seed: int, inputs: int) -> None:
+    counts = np.concatenate(random_drives(seed, drives=3, inputs=inputs))
+    fitted = fit(gram_of(counts), names(inputs)[:-1], "y")
+    solution, rss = dense_fit(counts)
+    np.testing.assert_allclose(
+        [fitted.model.offset, *fitted.model.weights.values()], solution, rtol=1e-8, atol=1e-9
+    )
+    assert float(fitted.rss) == pytest.approx(rss, rel=1e-9)
+    y = counts[:, -1].astype(float)
+    assert fitted.r_squared == pytest.approx(1 - rss / np.sum((y - y.mean()) ** 2), rel=1e-9)
+
+
+def test_a_linear_law_is_recovered_exactly() -> None:
+    x = np.array([[1, 7], [2, 5], [9, 4], [4, 4], [0, 3]])
+    y = 3 * x[:, 0] - 2 * x[:, 1] + 11
+    fitted = fit(gram_of(np.column_stack([x, y])), ["x1", "x2"], "y")
+    assert fitted.model.coefficients == (3, -2)
+    assert fitted.model.intercept == 11
+    assert fitted.rss == 0
+
+
+def test_physical_units() -> None:
+    x = np.array([[1], [2], [5]])
+    gram = Gram.from_counts(("ax", "sideslip"), np.column_stack([x, 4 * x + 7]))
+    scales = {"ax": Fraction(1, 1000), "sideslip": Fraction(1, 10_000)}
+    model = fit(gram, ["ax"], "sideslip").model.physical(scales)
+    assert model.coefficients == (Fraction(4, 10),)
+    assert model.intercept == Fraction(7, 10_000)
+    assert model.weights == {"ax": 0.4}
+
+
+def test_the_null_model_is_the_mean() -> None:
+    fitted = fit(gram_of(np.array([[5, 1], [6, 2], [8, 6]])), [], "y")
+    assert fitted.model.intercept == 3
+    assert fitted.rss == fitted.tss == 14
+
+
+@settings(max_examples=25)
+@given(st.integers(0, 10**6))
+def test_all_nested_models_equal_separate_fits(seed: int) -> None:
+    gram = gram_of(np.concatenate(random_drives(seed, drives=2)))
+    order = ["x3", "x1", "x4", "x2"]
+    for size, nested in enumerate(nested_fits(gram, order, "y")):
+        assert nested == fit(gram, order[:size], "y")
+
+
+def test_dependent_signals_are_named_with_the_relation() -> None:
+    rng = np.random.default_rng(1)
+    left = rng.integers(-500, 500, 40)
+    other, label = rng.integers(-500, 500, (2, 40))
+    constant = np.full(40, 6)
+    counts = np.column_stack([left, other, 2 * left - other + 3, constant, label])
+    gram = Gram.from_counts(("steer_fl", "ay", "steer_fr", "ax", "sideslip"), counts)
+    inputs = ["steer_fl", "ay", "steer_fr", "ax"]
+    with pytest.raises(SelectionError) as raised:
+        fit(gram, inputs, "sideslip")
+    assert "steer_fr is a linear combination of steer_fl, ay" in str(raised.value)
+    assert "steer_fr = 2 steer_fl - 1 ay + 3" in str(raised.value)
+    assert "ax is constant (6 counts)" in str(raised.value)
+    assert "steer_fl is" not in str(raised.value)
+    with pytest.raises(SelectionError, match="steer_fr is a linear"):
+        nested_fits(gram, inputs, "sideslip")
+    assert dependence(gram, inputs[:2]) == ""
+
+
+def test_too_few_rows_and_none() -> None:
+    gram = gram_of(np.array([[1, 2, 3], [4, 6, 5]]))
+    with pytest.raises(SelectionError, match="only 2 rows"):
+        fit(gram, ["x1", "x2"], "y")
+    with pytest.raises(SelectionError, match="no rows"):
+        fit(Gram.zero(("x", "y")), ["x"], "y")
+
+
+@given(st.lists(st.integers(-50, 50), min_size=9, max_size=9))
+def test_elimination_gives_determinants_and_inverse(entries: list[int]) -> None:
+    a = np.array(entries).reshape(3, 3)
+    matrix = (a @ a.T + np.eye(3, dtype=int)).tolist()
+    steps = eliminate([*([*row, 0] for row in matrix), [0, 0, 0, 1]])
+    for size in range(1, 4):
+        minor = np.linalg.det(np.array(matrix)[:size, :size])
+        assert steps.minors[size] == pytest.approx(minor, rel=1e-9)
+    inverse = inverse_matrix(matrix)
+    product = [
+        [sum(matrix[i][t] * inverse[t][j] for t in range(3)) for j in range(3)] for i in range(3)
+    ]
+    assert product == [[int(i == j) for j in range(3)] for i in range(3)]
+
+
+@given(st.fractions(min_value=0))
+def test_square_roots_are_correctly_rounded(value: Fraction) -> None:
+    root = sqrt(value)
+    if value == 0:
+        assert root == 0
+        return
+    exact = Fraction(root)
+    below, above = Fraction(np.nextafter(root, 0)), Fraction(np.nextafter(root, np.inf))
+    assert ((below + exact) / 2) ** 2 <= value <= ((exact + above) / 2) ** 2
+
+
+def test_condition_number_is_that_of_the_correlations() -> None:
+    counts = np.concatenate(random_drives(5))
+    gram = gram_of(counts)
+    correlations = np.corrcoef(counts.T.astype(float))
+    np.testing.assert_allclose(correlation_matrix(gram), correlations, atol=1e-12)
+    inputs = names(4)[:-1]
+    expected = np.linalg.cond(correlations[:4, :4])
+    assert condition_number(gram, inputs) == pytest.approx(expected, rel=1e-9)
+    assert condition_number(gram, []) == 1.0
