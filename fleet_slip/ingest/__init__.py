@@ -1,0 +1,14 @@
+"""Brings measured logs in: a CSV or Parquet file and a mapping become counts at 100 Hz."""
+
+from fleet_slip.ingest.mapping import Mapping, load_mapping
+from fleet_slip.ingest.measured import IngestCounts, MeasuredLog, read_measured
+from fleet_slip.ingest.quarantine import QUARANTINE_SCHEMA
+
+__all__ = [
+    "QUARANTINE_SCHEMA",
+    "IngestCounts",
+    "Mapping",
+    "MeasuredLog",
+    "load_mapping",
+    "read_measured",
+]

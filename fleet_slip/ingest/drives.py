@@ -1,0 +1,131 @@
+"""Makes drives of checked rows: their names, their ticks and counts, their Arrow table."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import date
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from fleet_slip.ingest.mapping import FromColumn, Mapping
+from fleet_slip.ingest.resampling import FloatArray, Method, choose_method, resampler
+from fleet_slip.signals import catalogue
+
+SOURCE = "measured"
+_SECONDS_PER_DAY = 86_400
+_FROM_MAPPING = ("vehicle_id", "vehicle_model", "track", "mass_kg", "adhesion", "day")
+
+
+@dataclass(frozen=True)
+class Drive:
+    """One uninterrupted stretch of a file: where its rows are and what is known of it."""
+
+    drive_id: str
+    rows: slice
+    metadata: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Ticked:
+    """The samples of one drive on ticks: counts as float64, NaN where there is none."""
+
+    method: Method
+    start_s: float
+    ticks: NDArray[np.int64]
+    counts: dict[str, FloatArray]
+
+
+def drive_id(prefix: str, group: int, stretch: int = 1) -> str:
+    """Return the name of the n-th stretch (from 1) of the drive with this number (from 0)."""
+    return f"{prefix}-{group + 1}" + (f"-{stretch}" if stretch > 1 else "")
+
+
+def cut(rows: pl.DataFrame, prefix: str, metadata: Sequence[dict[str, Any]]) -> list[Drive]:
+    """Return the drives in rows that are sorted by `group` and `part`, sorted by their names."""
+    parts = rows["part"].to_numpy()
+    starts = np.flatnonzero(np.diff(parts, prepend=parts[0] - 1))
+    ends = [*starts[1:].tolist(), len(parts)]
+    drives, previous, stretch = [], -1, 0
+    for start, end in zip(starts.tolist(), ends, strict=True):
+        group = rows["group"][start]
+        stretch = stretch + 1 if group == previous else 1
+        previous = group
+        name = drive_id(prefix, group, stretch)
+        drives.append(Drive(name, slice(start, end), metadata[group]))
+    return sorted(drives, key=lambda drive: drive.drive_id)
+
+
+def to_ticks(rows: pl.DataFrame, mapping: Mapping, interval_s: float) -> Ticked:
+    """Bring one drive's signals, SI units at times in s, to counts at 100 Hz.
+
+    Ticks at which no signal has a value are left out.
+    """
+    start_s = float(rows["time"][0])
+    time_s = rows["time"].to_numpy() - start_s
+    method = choose_method(time_s, interval_s)
+    ticks, resample = resampler(time_s, method, mapping.time.longest_gap_s)
+    counts = {}
+    for name in mapping.signals:
+        values = rows[name].to_numpy().astype(np.float64)
+        is_label = name == catalogue().label
+        values = _on_the_circle(resample, values) if is_label else resample(values)
+        signal = catalogue()[name]
+        rounded = np.rint(values / float(signal.scale))
+        counts[name] = np.clip(rounded, signal.min_count, signal.max_count)
+    present = ~np.all([np.isnan(values) for values in counts.values()], axis=0)
+    kept = {name: values[present] for name, values in counts.items()}
+    return Ticked(method, start_s, ticks[present], kept)
+
+
+def _on_the_circle(resample: Callable[[FloatArray], FloatArray], angle: FloatArray) -> FloatArray:
+    """Resample an angle without passing through 0 where it wraps from π to -π: the car spins."""
+    present = ~np.isnan(angle)
+    unwrapped = angle.copy()
+    unwrapped[present] = np.unwrap(angle[present])
+    resampled = resample(unwrapped)
+    return np.asarray(resampled - 2 * np.pi * np.rint(resampled / (2 * np.pi)), dtype=np.float64)
+
+
+def log_table(drives: Sequence[Drive], ticked: Sequence[Ticked], mapping: Mapping) -> pa.Table:
+    """Return the rows of `logs` for these drives; strings are dictionary-encoded."""
+    of_drive = np.repeat(np.arange(len(drives)), [drive.ticks.size for drive in ticked])
+    metadata = [_metadata(d, t, mapping) for d, t in zip(drives, ticked, strict=True)]
+    schema = catalogue().log_schema
+    columns = {}
+    for field in schema:
+        if field.name == "tick":
+            ticks = np.concatenate([drive.ticks for drive in ticked])
+            columns[field.name] = pa.array(ticks.astype(np.int32))
+        elif field.name in mapping.signals:
+            counts = np.concatenate([drive.counts[field.name] for drive in ticked])
+            absent = np.isnan(counts)
+            counts[absent] = 0
+            columns[field.name] = pa.array(counts.astype(np.int16), mask=absent)
+        elif field.name in catalogue().signals:
+            columns[field.name] = pa.nulls(of_drive.size, field.type)
+        else:
+            values = pa.array([of.get(field.name) for of in metadata], field.type)
+            encoded = values.dictionary_encode() if pa.types.is_string(field.type) else values
+            columns[field.name] = encoded.take(pa.array(of_drive))
+    return pa.table(columns)
+
+
+def _metadata(drive: Drive, ticked: Ticked, mapping: Mapping) -> dict[str, Any]:
+    """Return what is known of a drive, by column of `logs`."""
+    given = {name: getattr(mapping.drive, name) for name in _FROM_MAPPING}
+    known = {name: value for name, value in given.items() if not isinstance(value, FromColumn)}
+    if given["day"] is None:  # then time is in timestamps
+        known["day"] = date.fromordinal(
+            date(1970, 1, 1).toordinal() + int(ticked.start_s // _SECONDS_PER_DAY)
+        )
+    return {
+        **known,
+        **{name: value for name, value in drive.metadata.items() if name in given},
+        "drive_id": drive.drive_id,
+        "source": SOURCE,
+        "campaign": mapping.name,
+        "saturated": 0,  # what is outside its range is quarantined, not clipped
+    }

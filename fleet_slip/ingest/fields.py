@@ -1,0 +1,207 @@
+"""What a mapping takes from each row, as Polars expressions: values in SI units and their faults.
+
+A batch's columns carry the prefix `RAW`, so that no name in a file can meet one of ours, be taken
+for a pattern, or be anything but a name.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import date, datetime
+from typing import Literal
+
+import polars as pl
+
+from fleet_slip.errors import InputError
+from fleet_slip.ingest.mapping import FromColumn, Mapping
+from fleet_slip.ingest.reading import EXTRA_FIELDS
+from fleet_slip.ingest.units import conversion_factor
+from fleet_slip.signals import catalogue
+
+RAW = "raw "
+REASONS = (
+    "missing",
+    "not_a_number",
+    "not_a_time",
+    "not_finite",
+    "out_of_range",
+    "extra_fields",
+    "no_value",
+)
+"""What can be wrong with a row by itself; a problem is an index into this."""
+LONGEST_TEXT = 200
+"""Characters of metadata that are accepted, and of offending values that are kept."""
+_FIRST_DAY, _END_DAY = date(1970, 1, 1), date(2200, 1, 1)
+
+
+@dataclass(frozen=True)
+class Field:
+    """One thing to take from a row, or a condition on it. `problem` is null where all is well."""
+
+    name: str
+    kind: Literal["key", "time", "signal", "line"]
+    raw: pl.Expr
+    value: pl.Expr
+    problem: pl.Expr
+
+
+def fields_of(mapping: Mapping, schema: pl.Schema) -> list[Field]:
+    """Return the fields of a batch with this schema: drive metadata, time, signals, conditions.
+
+    Raises `InputError` if a column's type cannot be what the mapping says it is.
+    """
+    fields: list[Field] = []
+    if mapping.drive.column is not None:
+        fields.append(_text("drive", mapping.drive.column, schema, mapping))
+    for name, make in _METADATA.items():
+        source = getattr(mapping.drive, name)
+        if isinstance(source, FromColumn):
+            fields.append(make(name, source.column, schema, mapping))
+    if mapping.time.column is not None:
+        fields.append(_time(mapping.time.column, schema, mapping))
+    names = [name for name in catalogue().signals if name in mapping.signals]
+    signals = [_signal(name, schema, mapping) for name in names]
+    nothing = pl.all_horizontal([signal.value.is_null() for signal in signals])
+    fields += [*signals, _condition(nothing, "no_value", pl.lit(None, pl.String))]
+    if RAW + EXTRA_FIELDS in schema:
+        extra = pl.col(RAW + EXTRA_FIELDS)
+        fields.append(_condition(extra.is_not_null(), "extra_fields", extra))
+    return fields
+
+
+def problems(*cases: tuple[pl.Expr, str]) -> pl.Expr:
+    """Return the index of the first reason whose condition holds, else null."""
+    return pl.coalesce(
+        [
+            pl.when(condition).then(pl.lit(REASONS.index(reason), pl.Int16))
+            for condition, reason in cases
+        ]
+    )
+
+
+def _condition(condition: pl.Expr, reason: str, raw: pl.Expr) -> Field:
+    return Field("", "line", raw, raw, problems((condition, reason)))
+
+
+def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> Field:
+    """A signal in SI units. Its range is checked on the count that it will become."""
+    raw, number, unreadable = _number(mapping.signals[name].column, schema, mapping)
+    gain, bias = mapping.linear(name)
+    value = number * gain + bias
+    signal = catalogue()[name]
+    count = value / float(signal.scale)
+    outside = (count <= signal.min_count - 0.5) | (count >= signal.max_count + 0.5)
+    problem = problems(
+        (unreadable, "not_a_number"), (~value.is_finite(), "not_finite"), (outside, "out_of_range")
+    )
+    return Field(name, "signal", raw, value, problem)
+
+
+def _positive(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Field:
+    raw, number, unreadable = _number(column, schema, mapping)
+    problem = problems(
+        (unreadable, "not_a_number"),
+        (~number.is_finite(), "not_finite"),
+        (number <= 0, "out_of_range"),
+    )
+    return Field(name, "key", raw, number, problem)
+
+
+def _text(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Field:
+    raw = pl.col(RAW + column)
+    text = raw.cast(pl.String)
+    if schema[RAW + column] == pl.Float64:
+        whole = raw.cast(pl.Int64, strict=False)
+        text = pl.when(whole == raw).then(whole.cast(pl.String)).otherwise(text)
+    text = _without_missing(text, mapping)
+    problem = problems(
+        (text.is_null(), "missing"), (text.str.len_chars() > LONGEST_TEXT, "out_of_range")
+    )
+    return Field(name, "key", raw, text, problem)
+
+
+def _day(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Field:
+    raw = pl.col(RAW + column)
+    text = raw
+    match schema[RAW + column]:
+        case pl.String:
+            text = _without_missing(raw, mapping)
+            day = text.str.to_date("%Y-%m-%d", strict=False)
+        case pl.Date | pl.Datetime:
+            day = raw.cast(pl.Date)
+        case other:
+            raise _unfit(column, other, "a date such as 2024-05-31")
+    outside = (day < pl.lit(_FIRST_DAY)) | (day >= pl.lit(_END_DAY))
+    problem = problems(
+        (text.is_null(), "missing"), (day.is_null(), "not_a_time"), (outside, "out_of_range")
+    )
+    return Field(name, "key", raw, day, problem)
+
+
+def _time(column: str, schema: pl.Schema, mapping: Mapping) -> Field:
+    """Time in s, since 1970 for timestamps."""
+    raw = pl.col(RAW + column)
+    base = mapping.time
+    kind = schema[RAW + column]
+    if base.unit is not None:
+        raw, number, unreadable = _number(column, schema, mapping)
+        value = number * conversion_factor(base.unit, "s")
+        problem = problems(
+            (unreadable, "not_a_number"),
+            (value.is_null(), "missing"),
+            (~value.is_finite(), "not_finite"),
+        )
+        return Field("time", "time", raw, value, problem)
+    if kind == pl.String and base.format is not None:
+        present = _without_missing(raw, mapping)
+        moment = present.str.to_datetime(base.format, time_unit="us", strict=False)
+    elif isinstance(kind, pl.Datetime):
+        present = moment = raw
+    else:
+        raise _unfit(
+            column, kind, "a time: add 'unit' for numbers, 'format' for timestamps as text"
+        )
+    value = moment.dt.epoch("us") / 1e6
+    first, end = (datetime.combine(day, datetime.min.time()) for day in (_FIRST_DAY, _END_DAY))
+    outside = (value < 0) | (value >= (end - first).total_seconds())
+    problem = problems(
+        (present.is_null(), "missing"), (moment.is_null(), "not_a_time"), (outside, "out_of_range")
+    )
+    return Field("time", "time", raw, value, problem)
+
+
+def _number(column: str, schema: pl.Schema, mapping: Mapping) -> tuple[pl.Expr, pl.Expr, pl.Expr]:
+    """Return a column as it is, as float64 with null for missing, and whether it is unreadable."""
+    raw = pl.col(RAW + column)
+    match schema[RAW + column]:
+        case pl.String:
+            text = _without_missing(raw, mapping)
+            if mapping.csv.decimal_comma:
+                text = text.str.replace(",", ".", literal=True)
+            number = text.cast(pl.Float64, strict=False)
+            return raw, number, text.is_not_null() & number.is_null()
+        case pl.Float64:
+            number = raw
+            if any(text.lower() == "nan" for text in mapping.missing):
+                number = number.fill_nan(None)
+            return raw, number, pl.lit(value=False)
+        case other:
+            raise _unfit(column, other, "numbers")
+
+
+def _without_missing(text: pl.Expr, mapping: Mapping) -> pl.Expr:
+    text = text.str.strip_chars()
+    return pl.when(~text.is_in(["", *mapping.missing])).then(text)
+
+
+def _unfit(column: str, kind: pl.DataType, needed: str) -> InputError:
+    return InputError(f"column {column!r} has the type {kind}; the mapping needs {needed}.")
+
+
+_METADATA: dict[str, Callable[[str, str, pl.Schema, Mapping], Field]] = {
+    "vehicle_id": _text,
+    "vehicle_model": _text,
+    "track": _text,
+    "mass_kg": _positive,
+    "adhesion": _positive,
+    "day": _day,
+}

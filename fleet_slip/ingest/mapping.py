@@ -1,0 +1,165 @@
+"""The mapping of a measured log: which column is which signal, in which unit, with which sign."""
+
+import json
+from datetime import date
+from typing import Annotated
+
+import polars as pl
+from pydantic import Field, StringConstraints, field_validator, model_validator
+
+from fleet_slip.config import Config, load_config
+from fleet_slip.ingest.units import conversion_factor
+from fleet_slip.resources import find_config
+from fleet_slip.signals import Identifier, catalogue
+
+Name = Annotated[str, StringConstraints(min_length=1, max_length=200)]
+PositiveFloat = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class FromColumn(Config):
+    """A drive's metadata that stand in a column of the file; a new value begins a new drive."""
+
+    column: Name
+
+
+class CsvFormat(Config):
+    """How a CSV file is written. It is always UTF-8, with or without a byte order mark."""
+
+    separator: str = ","
+    decimal_comma: bool = False
+
+    @field_validator("separator")
+    @classmethod
+    def _one_character(cls, separator: str) -> str:
+        if len(separator) != 1 or not separator.isascii() or separator in '"\r\n\0':
+            raise ValueError("must be one ASCII character such as ',', ';' or a tab")
+        return separator
+
+    @model_validator(mode="after")
+    def _unambiguous(self) -> "CsvFormat":
+        if self.decimal_comma and self.separator == ",":
+            raise ValueError("with decimal_comma the separator cannot be ',': set it, often ';'")
+        return self
+
+
+class TimeBase(Config):
+    """Where time is from, and which gaps are bridged or end a drive.
+
+    Either `column` with a `unit` (numbers) or a `format` (timestamps as text, strftime codes; naive
+    ones are UTC; a Parquet timestamp column needs neither), or `rate_hz` for equally spaced rows.
+    """
+
+    column: Name | None = None
+    unit: str | None = None
+    format: Name | None = None
+    rate_hz: Annotated[float, Field(ge=1, le=100_000)] | None = None
+    longest_gap_s: Annotated[PositiveFloat, Field(le=10)] = 0.1
+    """Samples of a signal that lie further apart are not interpolated between."""
+    split_gap_s: Annotated[PositiveFloat, Field(le=60)] = 1.0
+    """A step in time larger than this, forward or back, begins a new drive."""
+
+    @field_validator("format")
+    @classmethod
+    def _format_is_known(cls, text: str | None) -> str | None:
+        try:
+            if text is not None:
+                pl.Series(["2000-01-01"]).str.to_datetime(text, strict=False)
+        except (pl.exceptions.PolarsError, pl.exceptions.PanicException):
+            raise ValueError(f"{text!r} is not a strftime format for a timestamp") from None
+        return text
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "TimeBase":
+        if (self.column is None) == (self.rate_hz is None):
+            raise ValueError("needs either 'column' or 'rate_hz'")
+        if self.column is None and (self.unit is not None or self.format is not None):
+            raise ValueError("'unit' and 'format' describe a column, and there is none")
+        if self.unit is not None and self.format is not None:
+            raise ValueError("'unit' is for numbers and 'format' for timestamps: give one of them")
+        if self.longest_gap_s > self.split_gap_s:
+            raise ValueError("longest_gap_s cannot be larger than split_gap_s")
+        if self.unit is not None:
+            try:
+                conversion_factor(self.unit, "s")
+            except ValueError as error:
+                raise ValueError(f"{self.column} {error}") from None
+        return self
+
+
+class DriveMetadata(Config):
+    """What is known of each drive, given here or taken from a column; absent stays null."""
+
+    column: Name | None = None
+    """Every value of this column is a drive of its own."""
+    day: date | FromColumn | None = None
+    """Date of the drive; with timestamps it may be left out and is that of the first row (UTC)."""
+    vehicle_id: Name | FromColumn
+    vehicle_model: Name | FromColumn
+    track: Name | FromColumn | None = None
+    mass_kg: PositiveFloat | FromColumn | None = None
+    adhesion: PositiveFloat | FromColumn | None = None
+
+
+class SignalColumn(Config):
+    """One column of the file: `signal = factor(unit) * (±value + offset)`."""
+
+    column: Name
+    unit: str
+    negate: bool = False
+    """For axes that are not ISO 8855, such as y to the right."""
+    offset: Annotated[float, Field(allow_inf_nan=False)] = 0.0
+    """Added after the sign, in the column's unit."""
+
+
+class Mapping(Config):
+    """How one kind of measured file becomes drives. Identifies itself by `name`."""
+
+    name: Identifier
+    missing: tuple[str, ...] = ()
+    """Texts that mean "no value", besides the empty one; `nan` also clears NaN in binary files."""
+    csv: CsvFormat = CsvFormat()
+    time: TimeBase
+    drive: DriveMetadata
+    signals: dict[str, SignalColumn] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _signals_fit_catalogue(self) -> "Mapping":
+        known = catalogue().signals
+        for name, column in self.signals.items():
+            if name not in known:
+                raise ValueError(f"unknown signal {name!r}. Known signals: {', '.join(known)}")
+            try:
+                conversion_factor(column.unit, known[name].unit)
+            except ValueError as error:
+                reason = str(error).replace("; it ", f"; {name} ").replace("but it ", f"{name} ")
+                raise ValueError(f"signals.{name}: {column.column} {reason}") from None
+        return self
+
+    @model_validator(mode="after")
+    def _day_is_known(self) -> "Mapping":
+        if self.drive.day is None and (self.time.unit is not None or self.time.rate_hz is not None):
+            raise ValueError("drive.day is needed: the time has no date. Give a date or a column")
+        return self
+
+    def columns(self) -> list[str]:
+        """Return the names of all columns of a file that the mapping uses, each once."""
+        metadata = (getattr(self.drive, name) for name in DriveMetadata.model_fields)
+        names = [self.time.column, self.drive.column]
+        names += [source.column for source in metadata if isinstance(source, FromColumn)]
+        names += [signal.column for signal in self.signals.values()]
+        return list(dict.fromkeys(name for name in names if name is not None))
+
+    def linear(self, signal: str) -> tuple[float, float]:
+        """Return (gain, bias) of a signal: `value in SI = gain * value in the file + bias`."""
+        column = self.signals[signal]
+        factor = conversion_factor(column.unit, catalogue()[signal].unit)
+        return (-factor if column.negate else factor), factor * column.offset
+
+    def canonical_json(self) -> str:
+        """The mapping as JSON that does not depend on the order or layout of its TOML file."""
+        return json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
+
+
+def load_mapping(name_or_path: str) -> Mapping:
+    """Load a mapping by name from `configs/mappings`, or by path. Raises `ConfigError`."""
+    return load_config(find_config("mappings", name_or_path), Mapping)

@@ -1,0 +1,157 @@
+"""From a measured file and its mapping to drives in counts, and a quarantine of the rest."""
+
+import os
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import polars as pl
+import pyarrow as pa
+
+from fleet_slip.errors import InputError
+from fleet_slip.ingest.drives import cut, drive_id, log_table, to_ticks
+from fleet_slip.ingest.fields import RAW, Field, fields_of
+from fleet_slip.ingest.mapping import Mapping
+from fleet_slip.ingest.quarantine import QUARANTINE_SCHEMA, DriveKeys, check_rows
+from fleet_slip.ingest.reading import MAX_ROWS, file_digest, read_batches, shown
+from fleet_slip.ingest.resampling import STEP_S
+from fleet_slip.ingest.timebase import cut_into_drives, sample_interval_s
+
+MAX_DRIVES = 10_000
+"""Drives in one file. More means that time or the drive's column is not what the mapping says."""
+MAX_TICKS = 2 * MAX_ROWS
+"""Length of all drives of one file together, in ticks."""
+
+
+@dataclass(frozen=True)
+class IngestCounts:
+    """What became of a file's rows. `rows_read == rows_kept + sum(quarantined.values())`."""
+
+    rows_read: int
+    rows_kept: int
+    quarantined: dict[str, int]
+    """Rejected rows by reason."""
+    drives: int
+    drives_resampled: int
+    ticks: int
+    """Rows of the result; equal to `rows_kept` where nothing was resampled."""
+
+
+@dataclass(frozen=True)
+class MeasuredLog:
+    """A measured file, ready for the warehouse."""
+
+    drives: pa.Table
+    """The catalogue's `log_schema` with strings dictionary-encoded, by drive_id, then tick."""
+    quarantine: pa.Table
+    """`QUARANTINE_SCHEMA`, in the file's order."""
+    counts: IngestCounts
+    digest: str
+    """SHA-256 of the file's bytes and the mapping: what has the same one was ingested before."""
+
+
+def read_measured(file: Path, mapping: Mapping) -> MeasuredLog:
+    """Read a CSV or Parquet file through a mapping.
+
+    The result depends on the file's bytes and the mapping only, not on its path; drives are called
+    `<mapping>-<digest>-<number>`, and `-2`, `-3` … follow where a gap in time cut one.
+
+    Raises `InputError` if the file cannot be read, is not what the mapping says, or has no usable
+    row.
+    """
+    digest = _identity(file, mapping)
+    good, bad, keys, rows_read = _check(file, mapping)
+    rows, misplaced = cut_into_drives(good, mapping.time)
+    bad = pl.concat([bad, misplaced]).sort("row")
+    _check_usable(file, mapping, rows, bad)
+
+    prefix = f"{mapping.name}-{digest[:12]}"
+    interval_s = sample_interval_s(rows)
+    drives = cut(rows, prefix, keys.metadata())
+    ticked = [to_ticks(rows[drive.rows], mapping, interval_s) for drive in drives]
+    table = log_table(drives, ticked, mapping)
+    if not table.num_rows:
+        raise InputError(
+            f"{shown(file)}: its rows are {interval_s:g} s apart and none is on a tick of 100 Hz; "
+            f"longest_gap_s = {mapping.time.longest_gap_s:g} forbids to interpolate. "
+            f"Raise it in the mapping {mapping.name!r} if the signals change slowly enough."
+        )
+    counts = IngestCounts(
+        rows_read=rows_read,
+        rows_kept=rows.height,
+        quarantined=dict(sorted(Counter(bad["reason"]).items())),
+        drives=len(drives),
+        drives_resampled=sum(drive.method != "snap" for drive in ticked),
+        ticks=table.num_rows,
+    )
+    return MeasuredLog(table, _quarantine_table(file, bad, prefix), counts, digest)
+
+
+def _identity(file: Path, mapping: Mapping) -> str:
+    digest = file_digest(file)
+    digest.update(mapping.canonical_json().encode())
+    return digest.hexdigest()
+
+
+def _check(file: Path, mapping: Mapping) -> tuple[pl.DataFrame, pl.DataFrame, DriveKeys, int]:
+    """Read all batches; return the good rows, the bad ones, the drives' keys, and how many rows."""
+    good: list[pl.DataFrame] = []
+    bad: list[pl.DataFrame] = []
+    fields: list[Field] = []
+    keys = DriveKeys(fields)
+    rows_read = 0
+    for batch in read_batches(file, mapping.columns(), mapping.csv):
+        raw = batch.select(pl.all().name.prefix(RAW))
+        if not rows_read:
+            try:
+                fields = fields_of(mapping, raw.schema)
+            except InputError as error:
+                raise InputError(f"{shown(file)}: {error}") from None
+            keys = DriveKeys(fields)
+        row = pl.int_range(rows_read + 1, rows_read + batch.height + 1, dtype=pl.Int64)
+        rows, rejected = check_rows(keys.number(raw.with_columns(row.alias("row"))), fields)
+        if mapping.time.rate_hz is not None:
+            rows = rows.with_columns((pl.col("row") / mapping.time.rate_hz).alias("time"))
+        good.append(rows)
+        bad.append(rejected)
+        rows_read += batch.height
+    if not rows_read:
+        raise InputError(f"{shown(file)}: it has a header and no rows. Export it again.")
+    return pl.concat(good), pl.concat(bad), keys, rows_read
+
+
+def _check_usable(file: Path, mapping: Mapping, rows: pl.DataFrame, bad: pl.DataFrame) -> None:
+    if rows.is_empty():
+        reasons = ", ".join(f"{n:,} {reason}" for reason, n in Counter(bad["reason"]).most_common())
+        first = bad.row(0, named=True)
+        example = f"{first['signal'] or 'the row'} = {first['value']!r} in row {first['row']}"
+        raise InputError(
+            f"{shown(file)}: none of its {bad.height:,} rows is usable ({reasons}; first: "
+            f"{example}). Check columns, units and time in the mapping {mapping.name!r}."
+        )
+    spans = rows.group_by("part").agg((pl.col("time").last() - pl.col("time").first()).alias("s"))
+    if spans.height > MAX_DRIVES:
+        raise InputError(
+            f"{shown(file)}: it falls into {spans.height:,} drives, at most {MAX_DRIVES:,} are "
+            f"read. Check time, split_gap_s and the drive's column in the mapping {mapping.name!r}."
+        )
+    if (ticks := float(spans["s"].sum()) / STEP_S) > MAX_TICKS:
+        raise InputError(
+            f"{shown(file)}: its drives last {ticks:,.0f} ticks of 100 Hz, at most {MAX_TICKS:,} "
+            f"are read. Check the unit of time and split_gap_s in the mapping {mapping.name!r}."
+        )
+
+
+def _quarantine_table(file: Path, bad: pl.DataFrame, prefix: str) -> pa.Table:
+    name = os.fsencode(file.name).decode("utf-8", "replace")
+    groups = bad["group"].unique().drop_nulls()
+    ids = {group: drive_id(prefix, group) for group in groups}
+    frame = bad.select(
+        pl.lit(name).alias("file"),
+        "row",
+        pl.col("group").replace_strict(ids, return_dtype=pl.String).alias("drive_id"),
+        "reason",
+        "signal",
+        "value",
+    )
+    return frame.to_arrow().cast(QUARANTINE_SCHEMA)

@@ -1,0 +1,85 @@
+"""Splits rows into good ones, with values in SI units, and bad ones, each with its reason."""
+
+from typing import Any
+
+import polars as pl
+import pyarrow as pa
+
+from fleet_slip.ingest.fields import LONGEST_TEXT, REASONS, Field
+
+QUARANTINE_SCHEMA = pa.schema(
+    [
+        ("file", pa.string()),
+        ("row", pa.int64()),
+        ("drive_id", pa.string()),
+        ("reason", pa.string()),
+        ("signal", pa.string()),
+        ("value", pa.string()),
+    ]
+)
+"""One row per rejected row of a file. `row` counts its rows of data from 1; `drive_id` is the drive
+that it belongs to, null if that is what is wrong; `signal` is the signal or metadata concerned, or
+`time`; `value` is what stood there, as text."""
+
+_PROBLEM = "problem"
+
+
+class DriveKeys:
+    """Numbers the combinations of drive metadata in a file, from 0, in order of appearance."""
+
+    def __init__(self, fields: list[Field]) -> None:
+        """Collect keys for the fields of kind `key`; without any, the whole file is number 0."""
+        self._fields = [field for field in fields if field.kind == "key"]
+        self._numbers: dict[tuple[Any, ...], int] = {}
+
+    def number(self, batch: pl.DataFrame) -> pl.DataFrame:
+        """Add the column `group`: the number of each row's key, null where the key is faulty."""
+        if not self._fields:
+            return batch.with_columns(pl.lit(0, pl.Int32).alias("group"))
+        names = [field.name for field in self._fields]
+        batch = batch.with_columns(field.value.alias(field.name) for field in self._fields)
+        sound = pl.all_horizontal([field.problem.is_null() for field in self._fields])
+        keys = batch.filter(sound).select(names).unique(maintain_order=True)
+        numbers = [self._numbers.setdefault(key, len(self._numbers)) for key in keys.rows()]
+        keys = keys.with_columns(pl.Series("group", numbers, pl.Int32))
+        joined = batch.join(keys, on=names, how="left", nulls_equal=True, maintain_order="left")
+        return joined.with_columns(pl.when(sound).then("group").alias("group")).drop(names)
+
+    def metadata(self) -> list[dict[str, Any]]:
+        """Return the metadata that each number stands for."""
+        names = [field.name for field in self._fields]
+        return [dict(zip(names, key, strict=True)) for key in self._numbers] if names else [{}]
+
+
+def check_rows(batch: pl.DataFrame, fields: list[Field]) -> tuple[pl.DataFrame, pl.DataFrame]:
+    """Split a batch that has the columns `row` and `group`.
+
+    Returns the good rows, with `row`, `group`, the time and the signals in SI units; and the bad
+    ones, with `row`, `group`, `reason`, `signal` and `value`. The first problem of a row counts.
+    """
+    codes = [field.problem + len(REASONS) * i for i, field in enumerate(fields)]
+    checked = batch.with_columns(pl.coalesce(codes).alias(_PROBLEM))
+    values = [f.value.alias(f.name) for f in fields if f.kind in {"time", "signal"}]
+    good = checked.filter(pl.col(_PROBLEM).is_null()).select("row", "group", *values)
+    bad = checked.filter(pl.col(_PROBLEM).is_not_null())
+    explained = [_explain(rows, fields) for rows in bad.partition_by(_PROBLEM)]
+    return good, pl.concat([no_rows(), *explained])
+
+
+def no_rows() -> pl.DataFrame:
+    """Return an empty frame of bad rows."""
+    names = {"row": pl.Int64, "group": pl.Int32, "reason": pl.String}
+    return pl.DataFrame(schema={**names, "signal": pl.String, "value": pl.String})
+
+
+def _explain(bad: pl.DataFrame, fields: list[Field]) -> pl.DataFrame:
+    """Describe rows that all have the same problem."""
+    index, reason = divmod(bad[_PROBLEM][0], len(REASONS))
+    field = fields[index]
+    return bad.select(
+        "row",
+        "group",
+        pl.lit(REASONS[reason]).alias("reason"),
+        pl.lit(field.name or None, pl.String).alias("signal"),
+        field.raw.cast(pl.String).str.slice(0, LONGEST_TEXT).alias("value"),
+    )
