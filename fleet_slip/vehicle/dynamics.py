@@ -1,0 +1,166 @@
+"""Equations of motion of a car with four wheels.
+
+`derivative` is the only place where they stand; the highway-env class and the lane kernel both call
+it. Symbols, sources and limits: `docs/vehicle.md`.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from fleet_slip.vehicle.compiling import equation
+from fleet_slip.vehicle.parameters import Constants
+from fleet_slip.vehicle.state import Controls, State
+from fleet_slip.vehicle.wheels import (
+    Loads,
+    WheelForces,
+    WheelRate,
+    ackermann_tangents,
+    build_wheel_forces,
+    driven_spin,
+    free_spin,
+    parallel_tangents,
+    static_loads,
+    transferred_loads,
+)
+
+SLOWEST_DRIVE_MPS = 1.0
+"""Speed below which the engine's power no longer limits its force."""
+
+
+class Extensions(NamedTuple):
+    """What the model has beyond highway-env's `BicycleVehicle`; each is fixed at compile time."""
+
+    brush_tyres: bool = True
+    """Brush tyres in the frame of each wheel; else linear ones in slip angle on two axles."""
+    load_transfer: bool = True
+    steering: bool = True
+    """Ackermann geometry and the lag of the steering; else parallel wheels without lag."""
+    drivetrain: bool = True
+    """Wheels spin under drive and brake torque, against drag and rolling resistance; else the
+    demanded acceleration happens and the wheels roll freely."""
+
+
+NO_EXTENSIONS = Extensions(False, False, False, False)
+
+
+class Derivative(NamedTuple):
+    """Rates of the state, and what an accelerometer at the centre of gravity reads."""
+
+    vx: float
+    vy: float
+    yaw_rate: float
+    steering_wheel: float
+    traction: float
+    ax_lag: float
+    ay_lag: float
+    wheel_fl: WheelRate
+    wheel_fr: WheelRate
+    wheel_rl: WheelRate
+    wheel_rr: WheelRate
+    ax: float
+    """Longitudinal specific force v̇x − r vy."""
+    ay: float
+    """Lateral specific force v̇y + r vx."""
+
+
+class Acceleration(NamedTuple):
+    """Specific force at the centre of gravity and the rates of the body's motion."""
+
+    ax: float
+    ay: float
+    vx: float
+    vy: float
+    yaw_rate: float
+
+
+@equation
+def _driven_body(x: State, u: Controls, force: WheelForces, c: Constants) -> Acceleration:
+    """Newton and Euler in the car's frame: m (v̇ + ω × v) = ΣF, I ṙ = ΣM."""
+    air = c.drag_per_mass * abs(x.vx) * x.vx
+    x_front, x_rear = force.fl.x + force.fr.x, force.rl.x + force.rr.x
+    ax = (x_front + x_rear) * c.inverse_mass - air
+    y_front, y_rear = force.fl.y + force.fr.y, force.rl.y + force.rr.y
+    ay = (y_front + y_rear) * c.inverse_mass
+    moment = (
+        c.front * y_front
+        - c.rear * y_rear
+        + c.half_track_front * (force.fr.x - force.fl.x)
+        + c.half_track_rear * (force.rr.x - force.rl.x)
+    )
+    return Acceleration(
+        ax,
+        ay,
+        ax + x.yaw_rate * x.vy,
+        ay - x.yaw_rate * x.vx,
+        moment * c.inverse_yaw_inertia,
+    )
+
+
+@equation
+def _commanded_body(x: State, u: Controls, force: WheelForces, c: Constants) -> Acceleration:
+    """As `_driven_body`, with vx following the demanded acceleration."""
+    free = _driven_body(x, u, force, c)
+    return Acceleration(
+        u.traction - x.yaw_rate * x.vy, free.ay, u.traction, free.vy, free.yaw_rate
+    )
+
+
+def build_derivative(extensions: Extensions) -> Callable[[State, Controls, Constants], Derivative]:
+    """Compile the equations of motion with some of the extensions.
+
+    The compiled function is pure: (state, controls, constants) to rates.
+    """
+    tangents = ackermann_tangents if extensions.steering else parallel_tangents
+    loads = transferred_loads if extensions.load_transfer else static_loads
+    forces = build_wheel_forces(extensions.brush_tyres, extensions.drivetrain)
+    body = _driven_body if extensions.drivetrain else _commanded_body
+    spin = driven_spin if extensions.drivetrain else free_spin
+
+    @equation
+    def spins(
+        x: State, force: WheelForces, load: Loads, motion: Acceleration, c: Constants
+    ) -> tuple[WheelRate, WheelRate, WheelRate, WheelRate]:
+        strongest = c.power_per_mass / max(abs(x.vx), SLOWEST_DRIVE_MPS)
+        drive = c.mass * min(max(x.traction, 0.0), strongest)
+        brake = c.mass * max(-x.traction, 0.0)
+        drive_f, drive_r = c.drive_front * drive, c.drive_rear * drive
+        brake_f, brake_r = c.brake_front * brake, c.brake_rear * brake
+        turn_f = c.half_track_front * motion.yaw_rate
+        turn_r = c.half_track_rear * motion.yaw_rate
+        side_f = motion.vy + c.front * motion.yaw_rate
+        hub_fl = force.fl.cosine * (motion.vx - turn_f) + force.fl.sine * side_f
+        hub_fr = force.fr.cosine * (motion.vx + turn_f) + force.fr.sine * side_f
+        return (
+            spin(force.fl, x.wheel_fl, load.fl, drive_f, brake_f, hub_fl, c),
+            spin(force.fr, x.wheel_fr, load.fr, drive_f, brake_f, hub_fr, c),
+            spin(force.rl, x.wheel_rl, load.rl, drive_r, brake_r, motion.vx - turn_r, c),
+            spin(force.rr, x.wheel_rr, load.rr, drive_r, brake_r, motion.vx + turn_r, c),
+        )
+
+    @equation
+    def derivative(x: State, u: Controls, c: Constants) -> Derivative:
+        load = loads(x, c)
+        force = forces(x, tangents(x, u, c), load, c)
+        motion = body(x, u, force, c)
+        fl, fr, rl, rr = spins(x, force, load, motion, c)
+        return Derivative(
+            motion.vx,
+            motion.vy,
+            motion.yaw_rate,
+            (u.steering_wheel - x.steering_wheel) * c.inverse_steering_lag,
+            (u.traction - x.traction) * c.inverse_drive_lag,
+            (motion.ax - x.ax_lag) * c.inverse_pitch_lag,
+            (motion.ay - x.ay_lag) * c.inverse_roll_lag,
+            fl,
+            fr,
+            rl,
+            rr,
+            motion.ax,
+            motion.ay,
+        )
+
+    return derivative  # type: ignore[no-any-return]
+
+
+derivative = build_derivative(Extensions())
+"""The equations of motion with all extensions."""

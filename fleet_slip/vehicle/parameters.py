@@ -1,0 +1,260 @@
+"""What a car is: the parameters of `configs/vehicles/*.toml`, and the constants of its equations."""
+
+from typing import NamedTuple, Self
+
+from pydantic import Field, FiniteFloat
+
+from fleet_slip.config import Config, load_config
+from fleet_slip.errors import ConfigError
+from fleet_slip.resources import find_config
+from fleet_slip.signals import Identifier
+
+GRAVITY_MPS2 = 9.80665
+AIR_DENSITY_KGPM3 = 1.225
+
+
+class Body(Config):
+    """Masses and geometry. The centre of gravity of the whole car is that of its sprung mass."""
+
+    sprung_mass_kg: FiniteFloat = Field(gt=0)
+    unsprung_mass_front_kg: FiniteFloat = Field(gt=0)
+    unsprung_mass_rear_kg: FiniteFloat = Field(gt=0)
+    sprung_yaw_inertia_kgm2: FiniteFloat = Field(gt=0)
+    front_axle_m: FiniteFloat = Field(gt=0)
+    """From the centre of gravity to the front axle."""
+    rear_axle_m: FiniteFloat = Field(gt=0)
+    """From the centre of gravity to the rear axle."""
+    height_m: FiniteFloat = Field(gt=0)
+    """Of the centre of gravity above the road."""
+    track_front_m: FiniteFloat = Field(gt=0)
+    track_rear_m: FiniteFloat = Field(gt=0)
+
+    @property
+    def mass_kg(self) -> float:
+        """Mass of the whole car."""
+        return self.sprung_mass_kg + self.unsprung_mass_front_kg + self.unsprung_mass_rear_kg
+
+    @property
+    def wheelbase_m(self) -> float:
+        """Distance between the axles."""
+        return self.front_axle_m + self.rear_axle_m
+
+    @property
+    def yaw_inertia_kgm2(self) -> float:
+        """Yaw inertia of the whole car: the sprung mass, and the unsprung ones at the wheels."""
+        front = self.front_axle_m**2 + self.track_front_m**2 / 4
+        rear = self.rear_axle_m**2 + self.track_rear_m**2 / 4
+        return (
+            self.sprung_yaw_inertia_kgm2
+            + self.unsprung_mass_front_kg * front
+            + self.unsprung_mass_rear_kg * rear
+        )
+
+
+class Suspension(Config):
+    """How the car leans on its wheels, and how the axles soften the tyres."""
+
+    front_roll_share: FiniteFloat = Field(ge=0, le=1)
+    """Share of the lateral load transfer that the front axle takes."""
+    roll_lag_s: FiniteFloat = Field(ge=0.01)
+    """Time constant of the lateral load transfer."""
+    pitch_lag_s: FiniteFloat = Field(ge=0.01)
+    """Time constant of the longitudinal load transfer."""
+    front_stiffness_factor: FiniteFloat = Field(gt=0)
+    """Effective cornering stiffness of the axle over that of its tyres."""
+    rear_stiffness_factor: FiniteFloat = Field(gt=0)
+
+
+class Tyre(Config):
+    """The brush tyre of `fleet_slip.vehicle.tyre` and its wheel."""
+
+    rolling_radius_m: FiniteFloat = Field(gt=0)
+    spin_inertia_kgm2: FiniteFloat = Field(gt=0)
+    peak_stiffness_n: FiniteFloat = Field(gt=0)
+    """Cornering stiffness c1 at the load c2, in N per unit of slip."""
+    peak_stiffness_load_n: FiniteFloat = Field(gt=0)
+    """Load c2 at which the cornering stiffness is largest."""
+    longitudinal_stiffness_ratio: FiniteFloat = Field(gt=0)
+    """Longitudinal slip stiffness over cornering stiffness."""
+    friction: FiniteFloat = Field(gt=0)
+    """Static friction coefficient at the nominal load, on a road of adhesion 1."""
+    nominal_load_n: FiniteFloat = Field(gt=0)
+    friction_load_sensitivity: FiniteFloat = Field(ge=0, le=0.2)
+    """Relative fall of friction per relative rise of load."""
+    friction_decay_speed_mps: FiniteFloat = Field(gt=0)
+    """Sliding speed at which half of the friction is left."""
+    rolling_resistance: FiniteFloat = Field(ge=0)
+
+
+class Steering(Config):
+    """From the steering wheel to the rack."""
+
+    ratio: FiniteFloat = Field(gt=0)
+    """Steering wheel angle over the tangent of the mean road wheel angle."""
+    lag_s: FiniteFloat = Field(ge=0.01)
+    limit_rad: FiniteFloat = Field(gt=0)
+    """Largest angle of the steering wheel to each side."""
+
+
+class Drivetrain(Config):
+    """How the demanded tractive force reaches the wheels."""
+
+    front_drive_share: FiniteFloat = Field(ge=0, le=1)
+    front_brake_share: FiniteFloat = Field(ge=0, le=1)
+    lag_s: FiniteFloat = Field(ge=0.01)
+    power_w: FiniteFloat = Field(gt=0)
+
+
+class Aerodynamics(Config):
+    """Resistance of the air."""
+
+    drag_area_m2: FiniteFloat = Field(ge=0)
+    """Drag coefficient times frontal area."""
+
+
+class VehicleParameters(Config):
+    """One car, as in `configs/vehicles/*.toml`."""
+
+    name: Identifier
+    description: str = Field(min_length=1)
+    body: Body
+    suspension: Suspension
+    tyre: Tyre
+    steering: Steering
+    drivetrain: Drivetrain
+    aerodynamics: Aerodynamics
+
+    def with_sprung_mass(self, mass_kg: float) -> Self:
+        """Return the car loaded to another sprung mass.
+
+        The load sits as the sprung mass did, so that the yaw inertia of the sprung mass grows in
+        proportion and the centre of gravity stays. Wheel loads, and with them cornering stiffness
+        and friction, follow from the mass. Raises `ConfigError` if it is not a positive number.
+        """
+        if not 0 < mass_kg < float("inf"):
+            raise ConfigError(f"{self.name}: sprung mass {mass_kg} kg: give a positive number.")
+        inertia = self.body.sprung_yaw_inertia_kgm2 * mass_kg / self.body.sprung_mass_kg
+        changes = {"sprung_mass_kg": mass_kg, "sprung_yaw_inertia_kgm2": inertia}
+        return self.model_copy(update={"body": self.body.model_copy(update=changes)})
+
+    def with_tyres(
+        self, *, stiffness_factor: float = 1.0, rolling_radius_factor: float = 1.0
+    ) -> Self:
+        """Return the car on other tyres: softer or stiffer, smaller or larger.
+
+        Raises `ConfigError` if a factor is not a positive number.
+        """
+        for factor in (stiffness_factor, rolling_radius_factor):
+            if not 0 < factor < float("inf"):
+                raise ConfigError(f"{self.name}: tyre factor {factor}: give a positive number.")
+        changes = {
+            "peak_stiffness_n": self.tyre.peak_stiffness_n * stiffness_factor,
+            "rolling_radius_m": self.tyre.rolling_radius_m * rolling_radius_factor,
+        }
+        return self.model_copy(update={"tyre": self.tyre.model_copy(update=changes)})
+
+
+def load_vehicle(name_or_path: str) -> VehicleParameters:
+    """Read a car by the name of a shipped one or by path. Raises `ConfigError`."""
+    return load_config(find_config("vehicles", name_or_path), VehicleParameters)
+
+
+class Constants(NamedTuple):
+    """What the equations of one car on one road need, in SI units, divisions done beforehand."""
+
+    mass: float
+    inverse_mass: float
+    yaw_inertia: float
+    inverse_yaw_inertia: float
+    front: float
+    rear: float
+    half_track_front: float
+    half_track_rear: float
+    ackermann: float
+    """Half of the front track over the wheelbase."""
+    static_front: float
+    """Load of one front wheel at rest."""
+    static_rear: float
+    pitch_transfer: float
+    """Load that one wheel gains per longitudinal acceleration."""
+    roll_transfer_front: float
+    """Load that one front wheel gains per lateral acceleration."""
+    roll_transfer_rear: float
+    inverse_roll_lag: float
+    inverse_pitch_lag: float
+    stiffness_front: float
+    """Peak cornering stiffness of one effective front tyre."""
+    stiffness_rear: float
+    inverse_stiffness_load: float
+    stiffness_ratio: float
+    friction: float
+    """At no load: tyre, road, and the load sensitivity extrapolated."""
+    friction_per_load: float
+    """Loss of friction per load."""
+    inverse_decay_speed: float
+    rolling_resistance: float
+    radius: float
+    inverse_radius: float
+    inverse_spin_inertia: float
+    steer_per_wheel: float
+    """Tangent of the mean road wheel angle per steering wheel angle."""
+    inverse_steering_lag: float
+    steering_limit: float
+    inverse_drive_lag: float
+    drive_front: float
+    """Force of one front wheel over the drive's force."""
+    drive_rear: float
+    brake_front: float
+    brake_rear: float
+    power_per_mass: float
+    drag_per_mass: float
+
+
+def constants(vehicle: VehicleParameters, adhesion: float) -> Constants:
+    """Return the constants of a car on a road with an adhesion coefficient."""
+    body, suspension, tyre = vehicle.body, vehicle.suspension, vehicle.tyre
+    drive, steering = vehicle.drivetrain, vehicle.steering
+    mass, wheelbase = body.mass_kg, body.wheelbase_m
+    weight = mass * GRAVITY_MPS2
+    overturning = mass * body.height_m
+    friction = adhesion * tyre.friction
+    drag = 0.5 * AIR_DENSITY_KGPM3 * vehicle.aerodynamics.drag_area_m2
+    return Constants(
+        mass=mass,
+        inverse_mass=1 / mass,
+        yaw_inertia=body.yaw_inertia_kgm2,
+        inverse_yaw_inertia=1 / body.yaw_inertia_kgm2,
+        front=body.front_axle_m,
+        rear=body.rear_axle_m,
+        half_track_front=body.track_front_m / 2,
+        half_track_rear=body.track_rear_m / 2,
+        ackermann=body.track_front_m / 2 / wheelbase,
+        static_front=weight * body.rear_axle_m / wheelbase / 2,
+        static_rear=weight * body.front_axle_m / wheelbase / 2,
+        pitch_transfer=overturning / wheelbase / 2,
+        roll_transfer_front=overturning * suspension.front_roll_share / body.track_front_m,
+        roll_transfer_rear=overturning * (1 - suspension.front_roll_share) / body.track_rear_m,
+        inverse_roll_lag=1 / suspension.roll_lag_s,
+        inverse_pitch_lag=1 / suspension.pitch_lag_s,
+        stiffness_front=tyre.peak_stiffness_n * suspension.front_stiffness_factor,
+        stiffness_rear=tyre.peak_stiffness_n * suspension.rear_stiffness_factor,
+        inverse_stiffness_load=1 / tyre.peak_stiffness_load_n,
+        stiffness_ratio=tyre.longitudinal_stiffness_ratio,
+        friction=friction * (1 + tyre.friction_load_sensitivity),
+        friction_per_load=friction * tyre.friction_load_sensitivity / tyre.nominal_load_n,
+        inverse_decay_speed=1 / tyre.friction_decay_speed_mps,
+        rolling_resistance=tyre.rolling_resistance,
+        radius=tyre.rolling_radius_m,
+        inverse_radius=1 / tyre.rolling_radius_m,
+        inverse_spin_inertia=1 / tyre.spin_inertia_kgm2,
+        steer_per_wheel=1 / steering.ratio,
+        inverse_steering_lag=1 / steering.lag_s,
+        steering_limit=steering.limit_rad,
+        inverse_drive_lag=1 / drive.lag_s,
+        drive_front=drive.front_drive_share / 2,
+        drive_rear=(1 - drive.front_drive_share) / 2,
+        brake_front=drive.front_brake_share / 2,
+        brake_rear=(1 - drive.front_brake_share) / 2,
+        power_per_mass=drive.power_w / mass,
+        drag_per_mass=drag / mass,
+    )

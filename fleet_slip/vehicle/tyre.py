@@ -1,0 +1,82 @@
+"""Forces of a tyre: the brush model with combined slip, load and sliding speed.
+
+Sources: H. B. Pacejka, "Tire and Vehicle Dynamics", 3rd ed. (2012), section 3.3 (brush model with
+combined slip), equations 4.E25 (cornering stiffness over load) and 4.E7 (friction that falls with
+sliding speed); J. Svendenius, "Tire Modeling and Friction Estimation" (Lund, 2007), for splitting
+the contact patch into its sticking and its sliding part. `docs/vehicle.md` derives the form used.
+"""
+
+import math
+from typing import NamedTuple
+
+from fleet_slip.vehicle.compiling import equation
+from fleet_slip.vehicle.parameters import Constants
+
+CREEP_SPEED_MPS = 1.0
+"""Rolling speed below which slip is measured against this speed, so that a car comes to rest."""
+
+SMALLEST_SLIDING_MPS = 1e-9
+"""Keeps the direction of sliding finite where nothing slides."""
+
+
+class TyreForce(NamedTuple):
+    """Force of the road on the tyre in the wheel's frame, in N."""
+
+    x: float
+    y: float
+    damping: float
+    """−∂x/∂(longitudinal velocity), nearly: how stiffly the wheel's spin is held, in N s/m."""
+
+
+@equation
+def cornering_stiffness(load: float, peak: float, c: Constants) -> float:
+    """Return c1·sin(2·arctan(Fz/c2)) in N per unit of slip, without the sine."""
+    x = load * c.inverse_stiffness_load
+    return peak * 2.0 * x / (1.0 + x * x)
+
+
+@equation
+def brush_force(
+    along: float, across: float, rolling: float, load: float, peak: float, c: Constants
+) -> TyreForce:
+    """Return the force of a brush tyre.
+
+    `along` and `across` are the velocity of the wheel's centre in the wheel's frame and `rolling`
+    is spin times radius, all in m/s; `load` > 0 is in N and `peak` the largest cornering stiffness.
+
+    The bristles stick at the front of the contact patch, over a part λ of its length, and slide
+    behind. With the slip stiffnesses Cx, Cy and the theoretical slip σ = v_s / |rolling|
+
+        λ = max(0, 1 − |(Cx σx, Cy σy)| / (3 μ0 Fz))
+        F = λ² (Cx σx, Cy σy) + (1 − λ)² (1 + 2 λ) μ(v_s) Fz v_s / |v_s|
+
+    where v_s points against the sliding and μ(v_s) = μ0 / (1 + |v_s| / V).
+    """
+    slide_x = rolling - along
+    slide_y = -across
+    limit = (c.friction - c.friction_per_load * load) * load
+    bristle_y = cornering_stiffness(load, peak, c) / max(abs(rolling), CREEP_SPEED_MPS)
+    bristle_x = c.stiffness_ratio * bristle_y
+    stuck_x = bristle_x * slide_x
+    stuck_y = bristle_y * slide_y
+    stuck = max(0.0, 1.0 - math.sqrt(stuck_x * stuck_x + stuck_y * stuck_y) / (3.0 * limit))
+    stuck2 = stuck * stuck
+    loose = (1.0 - stuck) * (1.0 - stuck) * (1.0 + 2.0 * stuck)
+    speed = max(math.sqrt(slide_x * slide_x + slide_y * slide_y), SMALLEST_SLIDING_MPS)
+    drag = limit * loose / (speed * (1.0 + speed * c.inverse_decay_speed))
+    direction_y = slide_y / speed
+    return TyreForce(
+        stuck2 * stuck_x + drag * slide_x,
+        stuck2 * stuck_y + drag * slide_y,
+        stuck2 * bristle_x + drag * direction_y * direction_y,
+    )
+
+
+@equation
+def linear_force(
+    slip_angle: float, along: float, rolling: float, load: float, peak: float, c: Constants
+) -> TyreForce:
+    """Return the force of a linear tyre: stiffness times slip angle (rad) and slip, no limit."""
+    stiffness = cornering_stiffness(load, peak, c)
+    bristle = c.stiffness_ratio * stiffness / max(abs(rolling), CREEP_SPEED_MPS)
+    return TyreForce(bristle * (rolling - along), stiffness * slip_angle, bristle)

@@ -1,0 +1,215 @@
+"""The four wheels: where they point, what they carry, their forces on the car and their spin."""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+from fleet_slip.vehicle.compiling import equation
+from fleet_slip.vehicle.parameters import Constants
+from fleet_slip.vehicle.state import Controls, State
+from fleet_slip.vehicle.tyre import brush_force, linear_force
+
+SMALLEST_LOAD_N = 1.0
+"""Load of a wheel that has lifted: it gives no force and divides nothing by zero."""
+
+STICTION_RAD_S = 0.1
+"""Wheel speed below which brakes and rolling resistance fade, so that a wheel comes to rest."""
+
+HIGHWAY_ENV_SLOW_MPS = 1.0
+"""Speed below which highway-env replaces tyre forces by damping."""
+
+
+class Loads(NamedTuple):
+    """Vertical load of each wheel in N."""
+
+    fl: float
+    fr: float
+    rl: float
+    rr: float
+
+
+class WheelForce(NamedTuple):
+    """Force of one wheel on the car in the car's frame, in N, and what turns the wheel."""
+
+    x: float
+    y: float
+    along: float
+    """Component along the wheel."""
+    damping: float
+    """How stiffly the tyre holds the wheel's spin, in N s/m."""
+    cosine: float
+    """Of the wheel's steering angle."""
+    sine: float
+
+
+class WheelForces(NamedTuple):
+    """Forces of all wheels."""
+
+    fl: WheelForce
+    fr: WheelForce
+    rl: WheelForce
+    rr: WheelForce
+
+
+class WheelRate(NamedTuple):
+    """How one wheel's speed ω changes."""
+
+    rate: float
+    """dω/dt in rad/s²."""
+    stiffness: float
+    """−∂(dω/dt)/∂ω in 1/s, of tyre and brake, nearly."""
+    drift: float
+    """Change of `rate` with time because the car's speed changes, in rad/s³."""
+
+
+@equation
+def ackermann_tangents(x: State, u: Controls, c: Constants) -> tuple[float, float]:
+    """Return the tangents of the left and right road wheel angles (exact Ackermann geometry).
+
+    The rack moves the mean wheel so that its tangent is the steering wheel's angle over the ratio;
+    both wheels then stand square to one centre on the line of the rear axle.
+    """
+    tangent = c.steer_per_wheel * x.steering_wheel
+    return tangent / (1.0 - c.ackermann * tangent), tangent / (1.0 + c.ackermann * tangent)
+
+
+@equation
+def parallel_tangents(x: State, u: Controls, c: Constants) -> tuple[float, float]:
+    """Return equal tangents, without the lag of the steering."""
+    tangent = c.steer_per_wheel * u.steering_wheel
+    return tangent, tangent
+
+
+@equation
+def transferred_loads(x: State, c: Constants) -> Loads:
+    """Return the wheel loads under the lagged accelerations: a car leans back and outwards."""
+    pitch = c.pitch_transfer * x.ax_lag
+    roll_front = c.roll_transfer_front * x.ay_lag
+    roll_rear = c.roll_transfer_rear * x.ay_lag
+    return Loads(
+        max(c.static_front - pitch - roll_front, SMALLEST_LOAD_N),
+        max(c.static_front - pitch + roll_front, SMALLEST_LOAD_N),
+        max(c.static_rear + pitch - roll_rear, SMALLEST_LOAD_N),
+        max(c.static_rear + pitch + roll_rear, SMALLEST_LOAD_N),
+    )
+
+
+@equation
+def static_loads(x: State, c: Constants) -> Loads:
+    """Return the wheel loads at rest."""
+    return Loads(c.static_front, c.static_front, c.static_rear, c.static_rear)
+
+
+def build_wheel_forces(brush: bool, spinning: bool) -> Callable[..., WheelForces]:
+    """Compile the forces of the wheels: brush or linear tyres, spinning or freely rolling."""
+
+    @equation
+    def brush_wheel(
+        vx: float, vy: float, tangent: float, spin: float, load: float, peak: float, c: Constants
+    ) -> WheelForce:
+        cosine = 1.0 / math.sqrt(1.0 + tangent * tangent)
+        sine = tangent * cosine
+        along = cosine * vx + sine * vy
+        across = cosine * vy - sine * vx
+        rolling = c.radius * spin if spinning else along
+        force = brush_force(along, across, rolling, load, peak, c)
+        return WheelForce(
+            cosine * force.x - sine * force.y,
+            sine * force.x + cosine * force.y,
+            force.x,
+            force.damping,
+            cosine,
+            sine,
+        )
+
+    @equation
+    def brush_forces(
+        x: State, tangents: tuple[float, float], load: Loads, c: Constants
+    ) -> WheelForces:
+        left, right = tangents
+        front, rear = x.vy + c.front * x.yaw_rate, x.vy - c.rear * x.yaw_rate
+        turn_f, turn_r = c.half_track_front * x.yaw_rate, c.half_track_rear * x.yaw_rate
+        peak_f, peak_r = c.stiffness_front, c.stiffness_rear
+        return WheelForces(
+            brush_wheel(x.vx - turn_f, front, left, x.wheel_fl, load.fl, peak_f, c),
+            brush_wheel(x.vx + turn_f, front, right, x.wheel_fr, load.fr, peak_f, c),
+            brush_wheel(x.vx - turn_r, rear, 0.0, x.wheel_rl, load.rl, peak_r, c),
+            brush_wheel(x.vx + turn_r, rear, 0.0, x.wheel_rr, load.rr, peak_r, c),
+        )
+
+    @equation
+    def linear_wheel(
+        vx: float, vy: float, tangent: float, spin: float, load: float, peak: float, c: Constants
+    ) -> WheelForce:
+        slip_angle = math.atan(tangent) - math.atan2(vy, vx)
+        rolling = c.radius * spin if spinning else vx
+        force = linear_force(slip_angle, vx, rolling, load, peak, c)
+        return WheelForce(force.x, force.y, force.x, force.damping, 1.0, 0.0)
+
+    @equation
+    def damped(force: WheelForce, lateral: float) -> WheelForce:
+        return WheelForce(force.x, lateral, force.along, force.damping, 1.0, 0.0)
+
+    @equation
+    def linear_forces(
+        x: State, tangents: tuple[float, float], load: Loads, c: Constants
+    ) -> WheelForces:
+        """As highway-env (Rajamani 2.25-2.28): both wheels of an axle stand at its centre."""
+        left, right = tangents
+        front, rear = x.vy + c.front * x.yaw_rate, x.vy - c.rear * x.yaw_rate
+        fl = linear_wheel(x.vx, front, left, x.wheel_fl, load.fl, c.stiffness_front, c)
+        fr = linear_wheel(x.vx, front, right, x.wheel_fr, load.fr, c.stiffness_front, c)
+        rl = linear_wheel(x.vx, rear, 0.0, x.wheel_rl, load.rl, c.stiffness_rear, c)
+        rr = linear_wheel(x.vx, rear, 0.0, x.wheel_rr, load.rr, c.stiffness_rear, c)
+        if abs(x.vx) < HIGHWAY_ENV_SLOW_MPS:
+            sliding = -c.mass * x.vy
+            turning = c.yaw_inertia / c.front * x.yaw_rate
+            fl, fr = (
+                damped(fl, (sliding - turning) / 2.0),
+                damped(fr, (sliding - turning) / 2.0),
+            )
+            rl, rr = (
+                damped(rl, (sliding + turning) / 2.0),
+                damped(rr, (sliding + turning) / 2.0),
+            )
+        return WheelForces(fl, fr, rl, rr)
+
+    return brush_forces if brush else linear_forces
+
+
+@equation
+def driven_spin(
+    force: WheelForce,
+    spin: float,
+    load: float,
+    drive: float,
+    brake: float,
+    hub: float,
+    c: Constants,
+) -> WheelRate:
+    """Return the rate of a wheel under drive and brake forces at its rim (I dω/dt = sum of torques).
+
+    `hub` is the rate of the hub's speed along the wheel. Brake and rolling resistance oppose the
+    spin; below `STICTION_RAD_S` they fade in proportion to it.
+    """
+    friction = (brake + c.rolling_resistance * load) / max(abs(spin), STICTION_RAD_S)
+    gain = c.radius * c.inverse_spin_inertia
+    return WheelRate(
+        gain * (drive - force.along - friction * spin),
+        gain * (c.radius * force.damping + friction),
+        gain * force.damping * hub,
+    )
+
+
+@equation
+def free_spin(
+    force: WheelForce,
+    spin: float,
+    load: float,
+    drive: float,
+    brake: float,
+    hub: float,
+    c: Constants,
+) -> WheelRate:
+    """Return the rate of a wheel that rolls without slip."""
+    return WheelRate(hub * c.inverse_radius, 0.0, 0.0)
