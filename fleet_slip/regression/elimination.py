@@ -73,14 +73,17 @@ def eliminate(matrix: Sequence[Sequence[int]]) -> Elimination:
     return Elimination(tuple(rows), tuple(minors), tuple(corners), None)
 
 
-def inverse_diagonal(matrix: Sequence[Sequence[int]]) -> list[Fraction]:
-    """Return the diagonal of the inverse of a regular symmetric integer matrix, exactly."""
-    inverse = inverse_matrix(matrix)
-    return [inverse[i][i] for i in range(len(matrix))]
-
-
 def inverse_matrix(matrix: Sequence[Sequence[int]]) -> list[list[Fraction]]:
-    """Return the inverse of a regular symmetric integer matrix by fraction-free Gauss-Jordan."""
+    """Return the inverse of a regular symmetric integer matrix, exactly."""
+    entries, determinant = adjugate(matrix)
+    return [[Fraction(entry, determinant) for entry in row] for row in entries]
+
+
+def adjugate(matrix: Sequence[Sequence[int]]) -> tuple[list[list[int]], int]:
+    """Return the adjugate and the determinant of a positive definite integer matrix.
+
+    The inverse is their ratio. Fraction-free Gauss-Jordan elimination.
+    """
     size = len(matrix)
     work = [[*row, *(int(i == j) for j in range(size))] for i, row in enumerate(matrix)]
     previous = 1
@@ -95,4 +98,4 @@ def inverse_matrix(matrix: Sequence[Sequence[int]]) -> list[list[Fraction]]:
                     for x, y in zip(work[a], pivot_row, strict=True)
                 ]
         previous = pivot
-    return [[Fraction(entry, previous) for entry in row[size:]] for row in work]
+    return [row[size:] for row in work], previous

@@ -1,11 +1,21 @@
 """All k+1 nested models of an order from one elimination (Section II-B of the paper)."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from fleet_slip.errors import SelectionError
 from fleet_slip.gram import Gram
 from fleet_slip.regression.elimination import eliminate
-from fleet_slip.regression.exact import Fit, dependence, fit_leading, moments
+from fleet_slip.regression.evidence import Evidence
+from fleet_slip.regression.exact import (
+    Fit,
+    Scales,
+    condition_number,
+    dependence,
+    fit_leading,
+    moments,
+)
+from fleet_slip.regression.inference import Inference, classical, noise_variance
 
 
 def nested_fits(gram: Gram, order: Sequence[str], label: str) -> list[Fit]:
@@ -19,3 +29,51 @@ def nested_fits(gram: Gram, order: Sequence[str], label: str) -> list[Fit]:
     if triangle.singular is not None:
         raise SelectionError(dependence(part, order))
     return [fit_leading(part, triangle, size) for size in range(len(order) + 1)]
+
+
+@dataclass(frozen=True)
+class NestedModel:
+    """One of the k+1 models of an order.
+
+    Attributes:
+        fit: exact fit in counts, with its residual sum of squares.
+        inference: coefficients in physical units, errors and t, sigma^2 from the full model.
+        contribution: A_j of the last added signal; 0 for the null model.
+        distance: estimate of the distance D of equation (2) to the true model.
+        condition_number: of the inputs' correlation matrix.
+    """
+
+    fit: Fit
+    inference: Inference
+    contribution: float
+    distance: float
+    condition_number: float
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """Its inputs, in the order of entry."""
+        return self.fit.model.signals
+
+
+def nested_models(
+    gram: Gram, order: Sequence[str], label: str, scales: Scales, evidence: Evidence | None = None
+) -> list[NestedModel]:
+    """Return all nested models of an order with their statistics.
+
+    The evidence gives contributions and distances; without one, rows count as independent.
+    Raises `SelectionError` for dependent signals, too few rows, or a label without noise.
+    """
+    fits = nested_fits(gram, order, label)
+    known = evidence or Evidence.naive(fits)
+    variance = noise_variance(fits[-1])
+    distances = known.distances()
+    return [
+        NestedModel(
+            fitted,
+            classical(fitted, scales, variance),
+            known.contributions[size - 1] if size else 0.0,
+            distances[size],
+            condition_number(gram, fitted.model.signals),
+        )
+        for size, fitted in enumerate(fits)
+    ]

@@ -71,3 +71,8 @@ def dense_fit(counts: Matrix) -> tuple[Matrix, float]:
     y = counts[:, -1].astype(float)
     solution = np.linalg.lstsq(x, y, rcond=None)[0]
     return solution, float(np.sum((y - x @ solution) ** 2))
+
+
+def unit_scales(inputs: int) -> dict[str, Fraction]:
+    """Return the scale 1 for x1, x2, ..., y."""
+    return dict.fromkeys(names(inputs), Fraction(1))

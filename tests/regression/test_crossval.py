@@ -13,6 +13,7 @@ from fleet_slip.gram import Gram, GramTable
 from fleet_slip.regression.crossval import CrossValidation, cross_validate_inputs
 from fleet_slip.regression.folds import CohortFolds, by_hash, by_value, hash_fold
 from fleet_slip.regression.winner import choose
+
 from .data import dense_fit, gram_of, names, random_drives
 
 SCALES = {**{name: Fraction(1, 100) for name in names(6)}, "y": Fraction(1, 10_000)}
@@ -31,10 +32,9 @@ def test_equals_cross_validation_on_rows(seed: int, count: int) -> None:
     result = cross_validate_inputs("m", cohort_of(drives, fold), ["x1", "x3"], "y", SCALES)
     predicted, label, null = [], [], 0.0
     for number in range(count):
-        train, test = (
-            np.concatenate([d[:, [0, 2, 4]] for d, f in zip(drives, fold, strict=True) if keep(f)])
-            for keep in (lambda f, n=number: f != n, lambda f, n=number: f == n)
-        )
+        columns = [drive[:, [0, 2, 4]] for drive in drives]
+        train = np.concatenate([c for c, f in zip(columns, fold, strict=True) if f != number])
+        test = np.concatenate([c for c, f in zip(columns, fold, strict=True) if f == number])
         solution, _ = dense_fit(train)
         estimate = solution[0] + test[:, :-1] @ solution[1:]
         figures = result.folds[number]

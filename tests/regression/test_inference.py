@@ -1,0 +1,146 @@
+"""Standard errors, Chow test and variance inflation against dense formulas and SciPy."""
+
+import numpy as np
+import pytest
+import scipy.stats
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.special import betainc
+
+from fleet_slip.errors import SelectionError
+from fleet_slip.gram import GramTable
+from fleet_slip.regression import special
+from fleet_slip.regression.drives import DriveMoments, serving_drives
+from fleet_slip.regression.exact import fit
+from fleet_slip.regression.inference import (
+    chow,
+    classical,
+    cluster,
+    cluster_covariance,
+    variance_inflation,
+)
+
+from .data import dense_fit, gram_of, names, random_drives, unit_scales
+
+
+def moments_of(drives: list[np.ndarray]) -> DriveMoments:
+    return DriveMoments.of(GramTable.from_grams([gram_of(counts) for counts in drives]))
+
+
+def dense_cluster_covariance(drives: list[np.ndarray]) -> np.ndarray:
+    """Cameron and Miller (2015), equations (11) and (12), from the rows."""
+    counts = np.concatenate(drives).astype(float)
+    x = np.column_stack([np.ones(len(counts)), counts[:, :-1]])
+    b, _ = dense_fit(counts)
+    bread = np.linalg.inv(x.T @ x)
+    scores = []
+    for drive in drives:
+        design = np.column_stack([np.ones(len(drive)), drive[:, :-1]])
+        scores.append(design.T @ (drive[:, -1] - design @ b))
+    n, k, p = len(counts), x.shape[1], len(drives)
+    factor = p / (p - 1) * (n - 1) / (n - k)
+    meat = np.array(scores).T @ np.array(scores)
+    return np.asarray(factor * bread @ meat @ bread)
+
+
+@settings(max_examples=25)
+@given(st.integers(0, 10**6), st.integers(1, 5))
+def test_classical_errors_equal_dense(seed: int, inputs: int) -> None:
+    counts = np.concatenate(random_drives(seed, drives=2, inputs=inputs))
+    result = classical(fit(gram_of(counts), names(inputs)[:-1], "y"), unit_scales(inputs))
+    b, rss = dense_fit(counts)
+    x = np.column_stack([np.ones(len(counts)), counts[:, :-1]])
+    degrees = len(counts) - inputs - 1
+    errors = np.sqrt(rss / degrees * np.diag(np.linalg.inv(x.T @ x)))
+    np.testing.assert_allclose([e.standard_error for e in result.estimates], errors, rtol=1e-8)
+    np.testing.assert_allclose([e.t for e in result.estimates], b / errors, rtol=1e-7, atol=1e-9)
+    p = 2 * scipy.stats.t.sf(np.abs([e.t for e in result.estimates]), degrees)
+    np.testing.assert_allclose([e.p for e in result.estimates], p, rtol=1e-8, atol=1e-14)
+    assert result.residual_std == pytest.approx(np.sqrt(rss / degrees))
+
+
+@settings(max_examples=25)
+@given(st.integers(0, 10**6), st.integers(1, 5))
+def test_cluster_errors_equal_dense(seed: int, inputs: int) -> None:
+    drives = random_drives(seed, drives=9, inputs=inputs)
+    fitted = fit(gram_of(np.concatenate(drives)), names(inputs)[:-1], "y")
+    covariance = cluster_covariance(fitted, moments_of(drives))
+    np.testing.assert_allclose(covariance, dense_cluster_covariance(drives), rtol=1e-8, atol=1e-12)
+    result = cluster(fitted, moments_of(drives), unit_scales(inputs))
+    errors = [estimate.standard_error for estimate in result.estimates]
+    np.testing.assert_allclose(errors, np.sqrt(np.diag(covariance)), rtol=1e-12)
+    assert result.degrees_of_freedom == 8
+
+
+def test_cluster_errors_of_a_smaller_model() -> None:
+    drives = random_drives(4, inputs=4)
+    fitted = fit(gram_of(np.concatenate(drives)), ["x4", "x2"], "y")
+    expected = dense_cluster_covariance([drive[:, [3, 1, 4]] for drive in drives])
+    np.testing.assert_allclose(cluster_covariance(fitted, moments_of(drives)), expected, rtol=1e-8)
+
+
+def test_drive_effects_make_the_classical_error_too_small() -> None:
+    drives = random_drives(8, drives=30, noise=300)
+    fitted = fit(gram_of(np.concatenate(drives)), names(4)[:-1], "y")
+    naive = classical(fitted, unit_scales(4)).estimates[0].standard_error
+    robust = cluster(fitted, moments_of(drives), unit_scales(4)).estimates[0].standard_error
+    assert robust > 3 * naive
+
+
+@settings(max_examples=25)
+@given(st.integers(0, 10**6))
+def test_chow_equals_dense(seed: int) -> None:
+    drives = random_drives(seed, drives=3)
+    result = chow([gram_of(counts) for counts in drives], names(4)[:-1], "y")
+    apart = sum(dense_fit(counts)[1] for counts in drives)
+    pooled = dense_fit(np.concatenate(drives))[1]
+    f = (pooled - apart) / 10 / (apart / (180 - 15))
+    assert (result.numerator, result.denominator) == (10, 165)
+    assert result.f == pytest.approx(f, rel=1e-8)
+    assert result.p == pytest.approx(scipy.stats.f.sf(f, 10, 165), rel=1e-8, abs=1e-14)
+
+
+def test_variance_inflation_is_that_of_the_inverse_correlations() -> None:
+    counts = np.concatenate(random_drives(11))
+    expected = np.diag(np.linalg.inv(np.corrcoef(counts[:, :-1].T.astype(float))))
+    inflation = variance_inflation(gram_of(counts), names(4)[:-1])
+    np.testing.assert_allclose([*inflation.values()], expected, rtol=1e-9)
+    twin = np.column_stack([counts[:, 0], counts[:, 0], counts[:, -1]])
+    with pytest.raises(SelectionError, match="x2 is a linear combination of x1"):
+        variance_inflation(gram_of(twin), ["x1", "x2"])
+
+
+def test_questions_without_an_answer_are_errors() -> None:
+    drives = random_drives(1, drives=2)
+    gram = gram_of(drives[0])
+    with pytest.raises(SelectionError, match="two groups"):
+        chow([gram], ["x1"], "y")
+    with pytest.raises(SelectionError, match="two drives"):
+        cluster(fit(gram, ["x1"], "y"), moments_of(drives[:1]), unit_scales(4))
+    few = gram_of(drives[0][:2, [0, -1]])
+    with pytest.raises(SelectionError, match="2 rows cannot tell"):
+        classical(fit(few, ["x1"], "y"), unit_scales(1))
+    with pytest.raises(SelectionError, match="no drive of the cohort has all"):
+        serving_drives([moments_table()], ["x9"])
+
+
+def moments_table() -> GramTable:
+    return GramTable.from_grams([gram_of(random_drives(1)[0])])
+
+
+def test_serving_drives_stacks_tables() -> None:
+    full = moments_table()
+    table, mask = serving_drives([full, full.restrict(["x1", "y"]), full], ["y", "x2"])
+    assert len(table) == 2
+    assert mask.tolist() == [True, False, True]
+
+
+@given(st.floats(0.05, 1e4), st.floats(0.05, 1e4), st.floats(0.0, 1.0))
+def test_incomplete_beta_equals_scipy(a: float, b: float, x: float) -> None:
+    assert special.incomplete_beta(a, b, x) == pytest.approx(betainc(a, b, x), rel=1e-8, abs=1e-12)
+
+
+@given(st.floats(-40, 40))
+def test_normal_distribution_equals_scipy(x: float) -> None:
+    assert special.normal_cdf(x) == pytest.approx(scipy.stats.norm.cdf(x), rel=1e-12)
+    assert special.normal_density(x) == pytest.approx(scipy.stats.norm.pdf(x), rel=1e-12)

@@ -1,0 +1,308 @@
+"""Rankings, criteria and subsets against published diabetes answers, brute force and SciPy."""
+
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import integrate, stats
+from sklearn.linear_model import ElasticNet, lars_path_gram
+
+from fleet_slip.errors import SelectionError
+from fleet_slip.gram import Gram, GramTable
+from fleet_slip.regression import criteria
+from fleet_slip.regression.drives import DriveMoments
+from fleet_slip.regression.evidence import Evidence
+from fleet_slip.regression.exact import correlation_matrix, fit
+from fleet_slip.regression.inference import cluster
+from fleet_slip.regression.lars import lars_path, lasso_model, path_of_moments
+from fleet_slip.regression.leaps import best_by_leaps
+from fleet_slip.regression.nested import nested_fits, nested_models
+from fleet_slip.regression.ranking import RANKINGS, rank, replacement_sets
+from fleet_slip.regression.subsets import all_rss, best_subsets, candidates, signals_of
+
+from .data import dense_fit, gram_of, names, random_drives, reference, unit_scales
+
+ORDERS = {
+    "forward": "forward_order",
+    "backward": "backward_order_kept_first",
+    "t": "tstat_order",
+    "correlation": "corr_order",
+    "pivoted-cholesky": "pivoted_cholesky_order",
+    "lars": "lars_order_sklearn",
+}
+
+
+@pytest.fixture(scope="module")
+def diabetes() -> tuple[Gram, dict[str, Any]]:
+    """Gram of the unscaled diabetes data as integers, and the outside answers."""
+    exact = reference("weka/diabetes_raw_exact.json")
+    answers = reference("subsets/diabetes_reference.json")
+    raw = [[int(value) for value in row] for row in exact["gram_integer_ones_x_y"]]
+    products = tuple(raw[i][j] for i in range(1, 12) for j in range(1, i + 1))
+    return Gram((*answers["names"], "y"), raw[0][0], tuple(raw[0][1:]), products), answers
+
+
+@pytest.mark.parametrize("name", ORDERS)
+def test_diabetes_orders(name: str, diabetes: tuple[Gram, dict[str, Any]]) -> None:
+    gram, answers = diabetes
+    assert rank(name, gram, answers["names"], "y") == tuple(answers[ORDERS[name]])
+
+
+def test_diabetes_best_subsets(diabetes: tuple[Gram, dict[str, Any]]) -> None:
+    gram, answers = diabetes
+    inputs = answers["names"]
+    results = best_subsets(gram, inputs, "y")
+    fits = nested_fits(gram, inputs, "y")
+    evidence = Evidence.naive(fits)
+    rss = np.array([float(result.best.rss) for result in results])
+    size = np.arange(11.0)
+    cp = criteria.subset_values("cp", evidence, rss, size)
+    bic = criteria.subset_values("bic-likelihood", evidence, rss, size)
+    for result, expected in zip(results, answers["best_subsets"], strict=True):
+        assert list(result.best.model.signals) == expected["vars"]
+        assert result.best.r_squared == pytest.approx(expected["r2"], rel=1e-12)
+        assert float(result.best.rss) == pytest.approx(expected["rss"], rel=1e-12)
+        assert cp[expected["size"]] == pytest.approx(expected["cp"], rel=1e-9)
+        shift = bic[0] - answers["best_subsets"][0]["bic_leaps"]
+        assert bic[expected["size"]] - shift == pytest.approx(expected["bic_leaps"], rel=1e-9)
+        if expected["relative_gap_to_second_best"] is not None and 0 < expected["size"] < 10:
+            assert result.gap == pytest.approx(expected["relative_gap_to_second_best"], rel=1e-9)
+    adjusted = criteria.subset_values("adjusted-r2", evidence, rss, size)
+    expected_adjusted = [row["adjr2"] for row in answers["best_subsets"]]
+    assert np.argmin(adjusted) == np.argmax(expected_adjusted)
+
+
+def test_diabetes_lars_and_lasso_paths(diabetes: tuple[Gram, dict[str, Any]]) -> None:
+    gram, answers = diabetes
+    inputs = answers["names"]
+    length = np.sqrt(gram.restrict(["y"]).centred()[0][0] / gram.n)
+    path = lars_path(gram, inputs, "y")
+    np.testing.assert_allclose(
+        path.penalties * length / gram.n, answers["lars_alphas"], rtol=1e-9, atol=1e-12
+    )
+    lasso = lars_path(gram, inputs, "y", lasso=True)
+    np.testing.assert_allclose(
+        lasso.penalties * length / gram.n,
+        answers["lasso_breakpoint_alphas_sklearn"],
+        rtol=1e-9,
+        atol=1e-12,
+    )
+    np.testing.assert_allclose(
+        lasso.coefficients.T * length,
+        answers["lasso_coef_path_sklearn_scaledX"],
+        rtol=1e-8,
+        atol=1e-8,
+    )
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 10**6), st.booleans())
+def test_paths_meet_their_conditions(seed: int, lasso: bool) -> None:
+    gram = gram_of(np.concatenate(random_drives(seed, drives=2, inputs=5)))
+    matrix = correlation_matrix(gram)
+    path = lars_path(gram, names(5)[:-1], "y", lasso=lasso)
+    assert (np.diff(path.penalties) < 0).all()
+    assert sorted(path.order) == list(names(5)[:-1])
+    halfway = (path.penalties[1:] + path.penalties[:-1]) / 2
+    for penalty in [*path.penalties, *halfway]:
+        beta = path.at(penalty)
+        residual = matrix[:5, 5] - matrix[:5, :5] @ beta
+        assert (np.abs(residual) <= penalty + 1e-9).all()
+        used = beta != 0
+        np.testing.assert_allclose(np.abs(residual[used]), penalty, atol=1e-9)
+        if lasso:
+            assert (np.sign(residual[used]) == np.sign(beta[used]))[penalty > 1e-9].all()
+
+
+@settings(max_examples=25)
+@given(st.integers(0, 10**6))
+def test_lasso_equals_scikit_learn(seed: int) -> None:
+    gram = gram_of(np.concatenate(random_drives(seed, drives=2, inputs=5)))
+    matrix = correlation_matrix(gram)
+    path = lars_path(gram, names(5)[:-1], "y", lasso=True)
+    alphas, _, coefficients = lars_path_gram(
+        matrix[:5, 5], matrix[:5, :5], n_samples=1, method="lasso"
+    )
+    for alpha, beta in zip(alphas, coefficients.T, strict=True):
+        np.testing.assert_allclose(path.at(alpha), beta, atol=1e-8)
+
+
+def test_the_lasso_path_of_r() -> None:
+    expected = reference("subsets/lars_R_reference.json")
+    x, y = np.array(expected["X"]), np.array(expected["y"])
+    path = path_of_moments(x.T @ x, x.T @ y, [f"x{i}" for i in range(5)], lasso=True)
+    np.testing.assert_allclose(
+        path.coefficients.T, expected["R_beta_columns_are_steps"], rtol=1e-6, atol=1e-6
+    )
+
+
+def test_elastic_net_equals_scikit_learn() -> None:
+    counts = np.concatenate(random_drives(3, inputs=5)).astype(float)
+    gram = gram_of(counts.astype(np.int64))
+    x = (counts - counts.mean(axis=0)) / np.sqrt(np.sum((counts - counts.mean(axis=0)) ** 2, 0))
+    net = ElasticNet(alpha=0.12 / len(x), l1_ratio=0.1 / 0.12, fit_intercept=False, tol=1e-14)
+    net.set_params(max_iter=100_000).fit(x[:, :5], x[:, 5])
+    path = lars_path(gram, names(5)[:-1], "y", lasso=True, ridge=0.02)
+    np.testing.assert_allclose(path.at(0.1), net.coef_, atol=1e-7)
+    model = lasso_model(gram, names(5)[:-1], "y", 0.1, 0.02)
+    unit = counts.std(axis=0)
+    for name, b in model.weights.items():
+        i = names(5).index(name)
+        assert b == pytest.approx(net.coef_[i] * unit[5] / unit[i], rel=1e-5)
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 10**6), st.integers(1, 6))
+def test_all_subsets_equal_brute_force(seed: int, k: int) -> None:
+    counts = np.concatenate(random_drives(seed, drives=2, inputs=k))
+    gram = gram_of(counts)
+    rss = all_rss(correlation_matrix(gram)) * float(fit(gram, [], "y").tss)
+    for mask in range(2**k):
+        chosen = [i for i in range(k) if mask >> i & 1]
+        assert signals_of(mask, names(k)) == [names(k)[i] for i in chosen]
+        assert rss[mask] == pytest.approx(dense_fit(counts[:, [*chosen, k]])[1], rel=1e-7)
+    for size, result in enumerate(best_subsets(gram, names(k)[:-1], "y")):
+        exact = min(fit(gram, c, "y").rss for c in combinations(names(k)[:-1], size))
+        assert result.best.rss == exact
+        assert result.best.size == size
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("k", [1, 4, 12])
+def test_leaps_and_bounds_finds_what_doubling_finds(k: int) -> None:
+    gram = gram_of(np.concatenate(random_drives(k, inputs=k, noise=2000)))
+    matrix = correlation_matrix(gram)
+    found = best_by_leaps(matrix, 4)
+    assert [set(masks) for masks in found] == [set(masks) for masks in candidates(matrix, 4)]
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 10**6))
+def test_greedy_orders_equal_their_definition(seed: int) -> None:
+    gram = gram_of(np.concatenate(random_drives(seed, drives=2, inputs=5)))
+    inputs = names(5)[:-1]
+
+    def rss(chosen: tuple[str, ...]) -> Any:
+        return fit(gram, chosen, "y").rss
+
+    added: tuple[str, ...] = ()
+    while len(added) < 5:
+        left = [name for name in inputs if name not in added]
+        added = (*added, min(left, key=lambda name: rss((*added, name))))
+    assert rank("forward", gram, inputs, "y") == added
+    kept = inputs
+    removed: tuple[str, ...] = ()
+    while kept:
+        worst = min(kept, key=lambda name: rss(tuple(n for n in kept if n != name)))
+        removed = (worst, *removed)
+        kept = tuple(name for name in kept if name != worst)
+    assert rank("backward", gram, inputs, "y") == removed
+    best = [set(result.best.model.signals) for result in best_subsets(gram, inputs, "y")]
+    for size, chosen in enumerate(replacement_sets(gram, inputs, "y"), start=1):
+        assert rss(tuple(chosen)) <= rss(added[:size])
+        assert rss(tuple(chosen)) >= rss(tuple(best[size]))
+
+
+@pytest.mark.parametrize("name", RANKINGS)
+def test_equals_keep_their_declared_order(name: str) -> None:
+    # Two orthogonal signals with the same effect: every rank is a tie.
+    counts = np.array([[1, 1, 2], [1, -1, 0], [-1, 1, 0], [-1, -1, -2], [0, 0, 1], [0, 0, -1]])
+    gram = gram_of(counts)
+    assert rank(name, gram, ["x1", "x2"], "y") == ("x1", "x2")
+    assert rank(name, gram, ["x2", "x1"], "y") == ("x2", "x1")
+
+
+def test_ranking_mistakes_are_named() -> None:
+    counts = np.concatenate(random_drives(1))
+    twin = gram_of(np.column_stack([counts[:, 0], counts[:, [0, -1]]]))
+    with pytest.raises(SelectionError, match="unknown ranking 'size'"):
+        rank("size", twin, ["x1"], "y")
+    for name in set(RANKINGS) - {"declared"}:
+        with pytest.raises(SelectionError, match="x2 is a linear combination of x1"):
+            rank(name, twin, ["x1", "x2"], "y")
+    with pytest.raises(SelectionError, match="unknown criterion"):
+        criteria.best_size("aicc", Evidence.naive(nested_fits(gram_of(counts), ["x1"], "y")))
+
+
+@pytest.mark.parametrize("k", [1, 4, 9])
+def test_expected_order_statistics(k: int) -> None:
+    chi = stats.chi2(1)
+    for rank_, value in enumerate(criteria.expected_squares(k), start=1):
+        beta = stats.beta(k - rank_ + 1, rank_)
+        expected, _ = integrate.quad(lambda u: chi.ppf(u) * beta.pdf(u), 0, 1, limit=200)  # noqa: B023
+        assert value == pytest.approx(expected, rel=1e-6)
+    assert sum(criteria.expected_squares(k)) == pytest.approx(k, rel=1e-12)
+
+
+def test_criteria_are_prices_on_contributions() -> None:
+    evidence = Evidence((50.0, 9.0, 3.0, 0.5), 1000.0, 1.0, 1.0, 995.0, "rows")
+    assert criteria.best_size("aic", evidence) == 3
+    assert criteria.best_size("cp", evidence) == 3
+    assert criteria.best_size("bic", evidence) == 2
+    assert criteria.best_size("ric", evidence) == 3
+    assert criteria.best_size("bic-likelihood", evidence) == 2
+    assert criteria.best_size("adjusted-r2", evidence) == 3
+    np.testing.assert_allclose(evidence.excess(), [62.5, 12.5, 3.5, 0.5, 0])
+    np.testing.assert_allclose(evidence.distances(), [58.5, 10.5, 3.5, 2.5, 4])
+    cic = criteria.criterion_values("cic", evidence)
+    assert cic[-1] == pytest.approx(2 * 4)
+    assert criteria.criterion_values("cic-log", evidence)[1] > cic[1]
+
+
+def test_likelihood_criteria_equal_their_textbook_form() -> None:
+    gram = gram_of(np.concatenate(random_drives(5)))
+    fits = nested_fits(gram, names(4)[:-1], "y")
+    n, rss = gram.n, np.array([float(f.rss) for f in fits])
+    size = np.arange(5)
+    aic = n * np.log(rss / n) + 2 * (size + 1)
+    bic = n * np.log(rss / n) + np.log(n) * (size + 1)
+    evidence = Evidence.naive(fits)
+    for name, expected in (("aic-likelihood", aic), ("bic-likelihood", bic)):
+        values = criteria.criterion_values(name, evidence)
+        np.testing.assert_allclose(values - values[0], expected - expected[0], rtol=1e-9)
+
+
+def test_contributions_over_drives_are_squared_cluster_t_values() -> None:
+    drives = random_drives(6, drives=20, noise=200)
+    gram = gram_of(np.concatenate(drives))
+    moments = DriveMoments.of(GramTable.from_grams([gram_of(counts) for counts in drives]))
+    fits = nested_fits(gram, names(4)[:-1], "y")
+    evidence = Evidence.clustered(fits, moments)
+    t = cluster(fits[-1], moments, unit_scales(4)).estimates[-1].t
+    assert evidence.contributions[-1] == pytest.approx(t**2, rel=1e-9)
+    assert evidence.kind == "drives"
+    assert 6 <= evidence.rows <= gram.n
+    assert evidence.rows == pytest.approx(gram.n / evidence.design_effect)
+
+
+def test_independent_rows_have_about_as_many_effective_rows() -> None:
+    rng = np.random.default_rng(9)
+    drives = [np.rint(rng.normal(size=(30, 4)) * 500).astype(int) for _ in range(300)]
+    for counts in drives:
+        counts[:, 3] += counts[:, 0]
+    moments = DriveMoments.of(GramTable.from_grams([gram_of(counts) for counts in drives]))
+    fits = nested_fits(gram_of(np.concatenate(drives)), ["x1", "x2", "x3"], "y")
+    assert Evidence.clustered(fits, moments).design_effect == pytest.approx(1, abs=0.2)
+
+
+def test_nested_models_carry_the_full_models_noise() -> None:
+    counts = np.concatenate(random_drives(12))
+    gram = gram_of(counts)
+    models = nested_models(gram, ["x2", "x4", "x1", "x3"], "y", unit_scales(4))
+    assert [model.signals for model in models][2] == ("x2", "x4")
+    sigma2 = dense_fit(counts)[1] / (len(counts) - 5)
+    for model in models:
+        assert model.inference.residual_std == pytest.approx(np.sqrt(sigma2))
+    drop = dense_fit(counts[:, [1, 4]])[1] - dense_fit(counts[:, [1, 3, 4]])[1]
+    assert models[2].contribution == pytest.approx(drop / sigma2, rel=1e-7)
+    assert models[-1].distance == pytest.approx(4)
+
+
+def test_a_label_without_noise_is_an_error() -> None:
+    counts = np.concatenate(random_drives(1))[:, :3]
+    counts[:, 2] = counts[:, 0] + 2 * counts[:, 1]
+    with pytest.raises(SelectionError, match="y is an exact linear combination of x1, x2"):
+        Evidence.naive(nested_fits(gram_of(counts), ["x1", "x2"], "y"))
