@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from fleet_slip.ingest.mapping import FromColumn, Mapping
 from fleet_slip.ingest.resampling import FloatArray, Method, choose_method, resampler
-from fleet_slip.signals import catalogue
+from fleet_slip.signals import Signal, catalogue
 
 SOURCE = "measured"
 _SECONDS_PER_DAY = 86_400
@@ -30,12 +30,12 @@ class Drive:
 
 @dataclass(frozen=True)
 class Ticked:
-    """The samples of one drive on ticks: counts as float64, NaN where there is none."""
+    """The samples of one drive on ticks: an int16 array of counts for each signal."""
 
     method: Method
     start_s: float
-    ticks: NDArray[np.int64]
-    counts: dict[str, FloatArray]
+    ticks: NDArray[np.int32]
+    counts: dict[str, pa.Array]
 
 
 def drive_id(prefix: str, group: int, stretch: int = 1) -> str:
@@ -67,17 +67,23 @@ def to_ticks(rows: pl.DataFrame, mapping: Mapping, interval_s: float) -> Ticked:
     time_s = rows["time"].to_numpy() - start_s
     method = choose_method(time_s, interval_s)
     ticks, resample = resampler(time_s, method, mapping.time.longest_gap_s)
-    counts = {}
+    counts, somewhere = {}, np.zeros(ticks.size, dtype=np.bool_)
     for name in mapping.signals:
         values = rows[name].to_numpy().astype(np.float64)
         is_label = name == catalogue().label
         values = _on_the_circle(resample, values) if is_label else resample(values)
-        signal = catalogue()[name]
-        rounded = np.rint(values / float(signal.scale))
-        counts[name] = np.clip(rounded, signal.min_count, signal.max_count)
-    present = ~np.all([np.isnan(values) for values in counts.values()], axis=0)
-    kept = {name: values[present] for name, values in counts.items()}
-    return Ticked(method, start_s, ticks[present], kept)
+        absent = np.isnan(values)
+        somewhere |= ~absent
+        counts[name] = _counts(catalogue()[name], values, absent)
+    if not somewhere.all():
+        counts = {name: array.filter(pa.array(somewhere)) for name, array in counts.items()}
+    return Ticked(method, start_s, ticks[somewhere].astype(np.int32), counts)
+
+
+def _counts(signal: Signal, values: FloatArray, absent: NDArray[np.bool_]) -> pa.Array:
+    """Round values to counts. The clip catches a resampled value's last bit, no more."""
+    rounded = np.rint(values / float(signal.scale)).clip(signal.min_count, signal.max_count)
+    return pa.array(np.where(absent, 0, rounded).astype(np.int16), mask=absent)
 
 
 def _on_the_circle(resample: Callable[[FloatArray], FloatArray], angle: FloatArray) -> FloatArray:
@@ -91,25 +97,22 @@ def _on_the_circle(resample: Callable[[FloatArray], FloatArray], angle: FloatArr
 
 def log_table(drives: Sequence[Drive], ticked: Sequence[Ticked], mapping: Mapping) -> pa.Table:
     """Return the rows of `logs` for these drives; strings are dictionary-encoded."""
-    of_drive = np.repeat(np.arange(len(drives)), [drive.ticks.size for drive in ticked])
+    sizes = [drive.ticks.size for drive in ticked]
+    of_drive = pa.array(np.repeat(np.arange(len(drives), dtype=np.int32), sizes))
     metadata = [_metadata(d, t, mapping) for d, t in zip(drives, ticked, strict=True)]
     schema = catalogue().log_schema
     columns = {}
     for field in schema:
         if field.name == "tick":
-            ticks = np.concatenate([drive.ticks for drive in ticked])
-            columns[field.name] = pa.array(ticks.astype(np.int32))
+            columns[field.name] = pa.chunked_array([drive.ticks for drive in ticked], field.type)
         elif field.name in mapping.signals:
-            counts = np.concatenate([drive.counts[field.name] for drive in ticked])
-            absent = np.isnan(counts)
-            counts[absent] = 0
-            columns[field.name] = pa.array(counts.astype(np.int16), mask=absent)
+            columns[field.name] = pa.chunked_array([drive.counts[field.name] for drive in ticked])
         elif field.name in catalogue().signals:
-            columns[field.name] = pa.nulls(of_drive.size, field.type)
+            columns[field.name] = pa.nulls(len(of_drive), field.type)
         else:
             values = pa.array([of.get(field.name) for of in metadata], field.type)
             encoded = values.dictionary_encode() if pa.types.is_string(field.type) else values
-            columns[field.name] = encoded.take(pa.array(of_drive))
+            columns[field.name] = encoded.take(of_drive)
     return pa.table(columns)
 
 

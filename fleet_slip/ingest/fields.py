@@ -35,10 +35,14 @@ _FIRST_DAY, _END_DAY = date(1970, 1, 1), date(2200, 1, 1)
 
 @dataclass(frozen=True)
 class Field:
-    """One thing to take from a row, or a condition on it. `problem` is null where all is well."""
+    """One thing to take from a row, or a condition on it.
+
+    `value` is made of raw columns; `problem`, null where all is well, may also use the value under
+    the field's name, so that a text is parsed once.
+    """
 
     name: str
-    kind: Literal["key", "time", "signal", "line"]
+    kind: Literal["key", "time", "signal", "condition"]
     raw: pl.Expr
     value: pl.Expr
     problem: pl.Expr
@@ -60,7 +64,7 @@ def fields_of(mapping: Mapping, schema: pl.Schema) -> list[Field]:
         fields.append(_time(mapping.time.column, schema, mapping))
     names = [name for name in catalogue().signals if name in mapping.signals]
     signals = [_signal(name, schema, mapping) for name in names]
-    nothing = pl.all_horizontal([signal.value.is_null() for signal in signals])
+    nothing = pl.all_horizontal([pl.col(name).is_null() for name in names])
     fields += [*signals, _condition(nothing, "no_value", pl.lit(None, pl.String))]
     if RAW + EXTRA_FIELDS in schema:
         extra = pl.col(RAW + EXTRA_FIELDS)
@@ -79,29 +83,31 @@ def problems(*cases: tuple[pl.Expr, str]) -> pl.Expr:
 
 
 def _condition(condition: pl.Expr, reason: str, raw: pl.Expr) -> Field:
-    return Field("", "line", raw, raw, problems((condition, reason)))
+    return Field("", "condition", raw, raw, problems((condition, reason)))
 
 
 def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> Field:
     """A signal in SI units. Its range is checked on the count that it will become."""
-    raw, number, unreadable = _number(mapping.signals[name].column, schema, mapping)
+    raw, number, present = _number(mapping.signals[name].column, schema, mapping)
     gain, bias = mapping.linear(name)
-    value = number * gain + bias
-    signal = catalogue()[name]
+    signal, value = catalogue()[name], pl.col(name)
     count = value / float(signal.scale)
     outside = (count <= signal.min_count - 0.5) | (count >= signal.max_count + 0.5)
     problem = problems(
-        (unreadable, "not_a_number"), (~value.is_finite(), "not_finite"), (outside, "out_of_range")
+        (value.is_null() & present, "not_a_number"),
+        (~value.is_finite(), "not_finite"),
+        (outside, "out_of_range"),
     )
-    return Field(name, "signal", raw, value, problem)
+    return Field(name, "signal", raw, number * gain + bias, problem)
 
 
 def _positive(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Field:
-    raw, number, unreadable = _number(column, schema, mapping)
+    raw, number, present = _number(column, schema, mapping)
+    value = pl.col(name)
     problem = problems(
-        (unreadable, "not_a_number"),
-        (~number.is_finite(), "not_finite"),
-        (number <= 0, "out_of_range"),
+        (value.is_null() & present, "not_a_number"),
+        (~value.is_finite(), "not_finite"),
+        (value <= 0, "out_of_range"),
     )
     return Field(name, "key", raw, number, problem)
 
@@ -112,15 +118,13 @@ def _text(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Field:
     if schema[RAW + column] == pl.Float64:
         whole = raw.cast(pl.Int64, strict=False)
         text = pl.when(whole == raw).then(whole.cast(pl.String)).otherwise(text)
-    text = _without_missing(text, mapping)
-    problem = problems(
-        (text.is_null(), "missing"), (text.str.len_chars() > LONGEST_TEXT, "out_of_range")
-    )
-    return Field(name, "key", raw, text, problem)
+    too_long = pl.col(name).str.len_chars() > LONGEST_TEXT
+    problem = problems((pl.col(name).is_null(), "missing"), (too_long, "out_of_range"))
+    return Field(name, "key", raw, _without_missing(text, mapping), problem)
 
 
 def _day(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Field:
-    raw = pl.col(RAW + column)
+    raw, value = pl.col(RAW + column), pl.col(name)
     text = raw
     match schema[RAW + column]:
         case pl.String:
@@ -130,62 +134,70 @@ def _day(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Field:
             day = raw.cast(pl.Date)
         case other:
             raise _unfit(column, other, "a date such as 2024-05-31")
-    outside = (day < pl.lit(_FIRST_DAY)) | (day >= pl.lit(_END_DAY))
+    outside = (value < pl.lit(_FIRST_DAY)) | (value >= pl.lit(_END_DAY))
     problem = problems(
-        (text.is_null(), "missing"), (day.is_null(), "not_a_time"), (outside, "out_of_range")
+        (text.is_null(), "missing"), (value.is_null(), "not_a_time"), (outside, "out_of_range")
     )
     return Field(name, "key", raw, day, problem)
 
 
 def _time(column: str, schema: pl.Schema, mapping: Mapping) -> Field:
     """Time in s, since 1970 for timestamps."""
-    raw = pl.col(RAW + column)
-    base = mapping.time
+    if mapping.time.unit is None:
+        return _timestamp(column, schema, mapping)
+    raw, number, present = _number(column, schema, mapping)
+    value = pl.col("time")
+    problem = problems(
+        (value.is_null() & present, "not_a_number"),
+        (value.is_null(), "missing"),
+        (~value.is_finite(), "not_finite"),
+    )
+    time_s = number * conversion_factor(mapping.time.unit, "s")
+    return Field("time", "time", raw, time_s, problem)
+
+
+def _timestamp(column: str, schema: pl.Schema, mapping: Mapping) -> Field:
+    raw, value = pl.col(RAW + column), pl.col("time")
     kind = schema[RAW + column]
-    if base.unit is not None:
-        raw, number, unreadable = _number(column, schema, mapping)
-        value = number * conversion_factor(base.unit, "s")
-        problem = problems(
-            (unreadable, "not_a_number"),
-            (value.is_null(), "missing"),
-            (~value.is_finite(), "not_finite"),
-        )
-        return Field("time", "time", raw, value, problem)
-    if kind == pl.String and base.format is not None:
-        present = _without_missing(raw, mapping)
-        moment = present.str.to_datetime(base.format, time_unit="us", strict=False)
+    if kind == pl.String and mapping.time.format is not None:
+        text = _without_missing(raw, mapping)
+        moment = text.str.to_datetime(mapping.time.format, time_unit="us", strict=False)
     elif isinstance(kind, pl.Datetime):
-        present = moment = raw
+        text = moment = raw
     else:
-        raise _unfit(
-            column, kind, "a time: add 'unit' for numbers, 'format' for timestamps as text"
-        )
-    value = moment.dt.epoch("us") / 1e6
+        needed = "a time: add 'unit' for numbers, 'format' for timestamps as text"
+        raise _unfit(column, kind, needed)
     first, end = (datetime.combine(day, datetime.min.time()) for day in (_FIRST_DAY, _END_DAY))
     outside = (value < 0) | (value >= (end - first).total_seconds())
     problem = problems(
-        (present.is_null(), "missing"), (moment.is_null(), "not_a_time"), (outside, "out_of_range")
+        (text.is_null(), "missing"), (value.is_null(), "not_a_time"), (outside, "out_of_range")
     )
-    return Field("time", "time", raw, value, problem)
+    return Field("time", "time", raw, moment.dt.epoch("us") / 1e6, problem)
 
 
 def _number(column: str, schema: pl.Schema, mapping: Mapping) -> tuple[pl.Expr, pl.Expr, pl.Expr]:
-    """Return a column as it is, as float64 with null for missing, and whether it is unreadable."""
+    """Return a column as it is, as float64 with null for missing, and whether there is a text."""
     raw = pl.col(RAW + column)
     match schema[RAW + column]:
         case pl.String:
             text = _without_missing(raw, mapping)
             if mapping.csv.decimal_comma:
                 text = text.str.replace(",", ".", literal=True)
-            number = text.cast(pl.Float64, strict=False)
-            return raw, number, text.is_not_null() & number.is_null()
+            return raw, text.cast(pl.Float64, strict=False), text.is_not_null()
         case pl.Float64:
-            number = raw
-            if any(text.lower() == "nan" for text in mapping.missing):
-                number = number.fill_nan(None)
+            absent = [float(text) for text in mapping.missing if _is_number(text)]
+            number = pl.when(~raw.is_in(absent)).then(raw) if absent else raw
             return raw, number, pl.lit(value=False)
         case other:
             raise _unfit(column, other, "numbers")
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _without_missing(text: pl.Expr, mapping: Mapping) -> pl.Expr:

@@ -12,7 +12,7 @@ from fleet_slip.errors import InputError
 from fleet_slip.ingest.drives import cut, drive_id, log_table, to_ticks
 from fleet_slip.ingest.fields import RAW, Field, fields_of
 from fleet_slip.ingest.mapping import Mapping
-from fleet_slip.ingest.quarantine import QUARANTINE_SCHEMA, DriveKeys, check_rows
+from fleet_slip.ingest.quarantine import QUARANTINE_SCHEMA, DriveKeys, check_rows, with_values
 from fleet_slip.ingest.reading import MAX_ROWS, file_digest, read_batches, shown
 from fleet_slip.ingest.resampling import STEP_S
 from fleet_slip.ingest.timebase import cut_into_drives, sample_interval_s
@@ -60,8 +60,8 @@ def read_measured(file: Path, mapping: Mapping) -> MeasuredLog:
     row.
     """
     digest = _identity(file, mapping)
-    good, bad, keys, rows_read = _check(file, mapping)
-    rows, misplaced = cut_into_drives(good, mapping.time)
+    rows, bad, keys, rows_read = _check(file, mapping)
+    rows, misplaced = cut_into_drives(rows, mapping.time)
     bad = pl.concat([bad, misplaced]).sort("row")
     _check_usable(file, mapping, rows, bad)
 
@@ -109,7 +109,8 @@ def _check(file: Path, mapping: Mapping) -> tuple[pl.DataFrame, pl.DataFrame, Dr
                 raise InputError(f"{shown(file)}: {error}") from None
             keys = DriveKeys(fields)
         row = pl.int_range(rows_read + 1, rows_read + batch.height + 1, dtype=pl.Int64)
-        rows, rejected = check_rows(keys.number(raw.with_columns(row.alias("row"))), fields)
+        valued = with_values(raw.with_columns(row.alias("row")), fields)
+        rows, rejected = check_rows(keys.number(valued), fields)
         if mapping.time.rate_hz is not None:
             rows = rows.with_columns((pl.col("row") / mapping.time.rate_hz).alias("time"))
         good.append(rows)

@@ -33,17 +33,16 @@ class DriveKeys:
         self._numbers: dict[tuple[Any, ...], int] = {}
 
     def number(self, batch: pl.DataFrame) -> pl.DataFrame:
-        """Add the column `group`: the number of each row's key, null where the key is faulty."""
+        """Add `group` to a batch with values: the row's number, null where its key is faulty."""
         if not self._fields:
             return batch.with_columns(pl.lit(0, pl.Int32).alias("group"))
         names = [field.name for field in self._fields]
-        batch = batch.with_columns(field.value.alias(field.name) for field in self._fields)
         sound = pl.all_horizontal([field.problem.is_null() for field in self._fields])
         keys = batch.filter(sound).select(names).unique(maintain_order=True)
         numbers = [self._numbers.setdefault(key, len(self._numbers)) for key in keys.rows()]
         keys = keys.with_columns(pl.Series("group", numbers, pl.Int32))
         joined = batch.join(keys, on=names, how="left", nulls_equal=True, maintain_order="left")
-        return joined.with_columns(pl.when(sound).then("group").alias("group")).drop(names)
+        return joined.with_columns(pl.when(sound).then("group").alias("group"))
 
     def metadata(self) -> list[dict[str, Any]]:
         """Return the metadata that each number stands for."""
@@ -51,15 +50,20 @@ class DriveKeys:
         return [dict(zip(names, key, strict=True)) for key in self._numbers] if names else [{}]
 
 
+def with_values(batch: pl.DataFrame, fields: list[Field]) -> pl.DataFrame:
+    """Add the fields' values to a raw batch, each under its field's name."""
+    return batch.with_columns(f.value.alias(f.name) for f in fields if f.kind != "condition")
+
+
 def check_rows(batch: pl.DataFrame, fields: list[Field]) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Split a batch that has the columns `row` and `group`.
+    """Split a batch that has the fields' values and the columns `row` and `group`.
 
     Returns the good rows, with `row`, `group`, the time and the signals in SI units; and the bad
     ones, with `row`, `group`, `reason`, `signal` and `value`. The first problem of a row counts.
     """
     codes = [field.problem + len(REASONS) * i for i, field in enumerate(fields)]
     checked = batch.with_columns(pl.coalesce(codes).alias(_PROBLEM))
-    values = [f.value.alias(f.name) for f in fields if f.kind in {"time", "signal"}]
+    values = [field.name for field in fields if field.kind in {"time", "signal"}]
     good = checked.filter(pl.col(_PROBLEM).is_null()).select("row", "group", *values)
     bad = checked.filter(pl.col(_PROBLEM).is_not_null())
     explained = [_explain(rows, fields) for rows in bad.partition_by(_PROBLEM)]

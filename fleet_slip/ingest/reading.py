@@ -120,7 +120,9 @@ def _positions(file: Path, names: Sequence[str], wanted: Iterable[str]) -> dict[
 
 
 def _missing_column(column: str, names: Sequence[str]) -> str:
-    near = difflib.get_close_matches(column, names, n=3, cutoff=0.6)
+    folded = {name.casefold(): name for name in names}
+    matches = difflib.get_close_matches(column.casefold(), folded, n=3, cutoff=0.6)
+    near = [folded[match] for match in matches]
     hint = f" Did the mapping mean {' or '.join(repr(name[:80]) for name in near)}?" if near else ""
     there = ", ".join(repr(name[:80]) for name in names[:_SHOWN_COLUMNS])
     more = f" and {len(names) - _SHOWN_COLUMNS:,} more" if len(names) > _SHOWN_COLUMNS else ""

@@ -18,7 +18,8 @@ def cut_into_drives(rows: pl.DataFrame, base: TimeBase) -> tuple[pl.DataFrame, p
     * `time_duplicate`, `time_backwards`: not later than all earlier rows of its part;
     * `too_short`: its part lasts less than one sample time.
     """
-    rows = rows.sort("group", maintain_order=True)
+    if not rows["group"].is_sorted():
+        rows = rows.sort("group", maintain_order=True)
     far = _is_far(base.split_gap_s)
     alone = far & far.shift(-1, fill_value=True)
     rows, isolated = _quarantine(rows, pl.when(alone).then(pl.lit("isolated")))
