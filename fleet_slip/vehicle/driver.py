@@ -7,6 +7,7 @@ path tracking and stability at the limits of handling"). He knows his car and be
 road: on a slippery one he is wrong.
 """
 
+import math
 from typing import NamedTuple
 
 from fleet_slip.vehicle.compiling import equation
@@ -24,7 +25,7 @@ STEERING_PREVIEW_S = 0.15
 SPEED_PREVIEW_S = 0.1
 """How far ahead the target speed is taken: the drivetrain's lag."""
 
-PURSUIT_TIME_S = 0.8
+PURSUIT_TIME_S = 0.55
 """An offset from the line is steered away towards a point so far ahead."""
 
 SHORTEST_PURSUIT_M = 6.0
@@ -78,13 +79,13 @@ def clip(value: float, limit: float) -> float:
 
 
 @equation
-def slip_growth(ay: float, h: Handling) -> float:
-    """Return how much more a brush tyre slips than a linear one, at a lateral acceleration.
+def slip_growth(ax: float, ay: float, h: Handling) -> float:
+    """Return how much more a brush tyre slips than a linear one, at an acceleration.
 
     With f the share of the friction in use, a brush tyre needs the slip 3 (1 − ∛(1 − f)) / f times
     the linear one's; 3 / (3 − f) has the same slope and no root.
     """
-    use = min(abs(ay) * h.inverse_grip, LARGEST_GRIP_USE)
+    use = min(math.sqrt(ax * ax + ay * ay) * h.inverse_grip, LARGEST_GRIP_USE)
     return 3.0 / (3.0 - use)
 
 
@@ -96,13 +97,13 @@ def wanted_steering(x: State, pose: Pose, path: Path, h: Handling) -> float:
     """
     v2 = x.vx * x.vx
     ay = path.curvature * v2
-    steady_slip = h.rear * path.curvature - h.rear_slip * ay * slip_growth(ay, h)
+    steady_slip = h.rear * path.curvature - h.rear_slip * ay * slip_growth(x.traction, ay, h)
     distance = max(PURSUIT_TIME_S * abs(x.vx), SHORTEST_PURSUIT_M)
     miss = pose.offset + distance * (pose.sine + steady_slip * pose.cosine)
     curvature = path.curvature_ahead - 2.0 * miss / (distance * distance)
     curvature = clip(curvature, LARGEST_CURVATURE_1PM)
     ay = clip(curvature * v2, LARGEST_GRIP_USE / h.inverse_grip)
-    tangent = h.wheelbase * curvature + h.understeer * ay * slip_growth(ay, h)
+    tangent = h.wheelbase * curvature + h.understeer * ay * slip_growth(x.traction, ay, h)
     return h.steering_ratio * tangent
 
 
@@ -110,9 +111,7 @@ def wanted_steering(x: State, pose: Pose, path: Path, h: Handling) -> float:
 def wanted_traction(x: State, path: Path, c: Constants) -> float:
     """Return the tractive force per mass that keeps to the speed profile against resistance."""
     resistance = c.drag_per_mass * x.vx * x.vx + c.rolling_resistance * GRAVITY_MPS2
-    wanted = (
-        path.target_acceleration + SPEED_GAIN_1PS * (path.target_speed - x.vx) + resistance
-    )
+    wanted = path.target_acceleration + SPEED_GAIN_1PS * (path.target_speed - x.vx) + resistance
     wanted = min(max(wanted, -STRONGEST_BRAKE_MPS2), STRONGEST_DRIVE_MPS2)
     return -LOST_BRAKE_MPS2 if path.lost > 0.0 else wanted
 

@@ -100,9 +100,7 @@ def _driven_body(x: State, u: Controls, force: WheelForces, c: Constants) -> Acc
 def _commanded_body(x: State, u: Controls, force: WheelForces, c: Constants) -> Acceleration:
     """As `_driven_body`, with vx following the demanded acceleration."""
     free = _driven_body(x, u, force, c)
-    return Acceleration(
-        u.traction - x.yaw_rate * x.vy, free.ay, u.traction, free.vy, free.yaw_rate
-    )
+    return Acceleration(u.traction - x.yaw_rate * x.vy, free.ay, u.traction, free.vy, free.yaw_rate)
 
 
 def build_derivative(extensions: Extensions) -> Callable[[State, Controls, Constants], Derivative]:

@@ -1,32 +1,44 @@
-"""One step in time: second order for the car, linearly implicit for its wheels."""
+"""One step in time, of second order, with one evaluation of the equations.
+
+The car is stepped explicitly (Adams-Bashforth; the actuators by their Taylor series), its wheels linearly implicitly (SBDF2, Ascher, Ruuth
+and Wetton 1995, "Implicit-explicit methods for time-dependent partial differential equations"): the
+tyre holds a wheel's spin so stiffly that an explicit step would have to be far shorter.
+"""
 
 from typing import NamedTuple
 
 from fleet_slip.vehicle.compiling import equation
 from fleet_slip.vehicle.dynamics import Derivative
+from fleet_slip.vehicle.parameters import Constants
 from fleet_slip.vehicle.state import State
 from fleet_slip.vehicle.wheels import WheelRate
 
 STEP_S = 0.002
 """Time step of the integration."""
 
+FIRST_ORDER = 0.0
+"""Extrapolation of the first step: the step is Euler's."""
+
 SECOND_ORDER = 0.5
-"""Extrapolation of Adams-Bashforth with equal steps; 0 makes the step Euler's, to begin with."""
+"""Extrapolation of all other steps, from this and the previous rate."""
 
 
 class Slopes(NamedTuple):
-    """Rates of the previous step, of the part of the state that is integrated explicitly."""
+    """The previous step: rates at its beginning, and how far the wheels' speeds moved."""
 
     vx: float
     vy: float
     yaw_rate: float
-    steering_wheel: float
-    traction: float
     ax_lag: float
     ay_lag: float
-
-
-AT_REST = Slopes(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    rate_fl: float
+    rate_fr: float
+    rate_rl: float
+    rate_rr: float
+    change_fl: float
+    change_fr: float
+    change_rl: float
+    change_rr: float
 
 
 @equation
@@ -36,33 +48,70 @@ def extrapolate(now: float, before: float, extrapolation: float) -> float:
 
 
 @equation
-def _turned(spin: float, wheel: WheelRate, step: float) -> float:
-    """Linearly implicit step of a wheel's speed, as the tyre's stiffness would demand tiny steps.
+def followed(rate: float, inverse_lag: float, step: float) -> float:
+    """Return how far a first-order lag moves in a step under a constant demand.
 
-    Δω (1 + h K) = h (f + h ∂f/∂t), with K = −∂f/∂ω. The last term carries the car's own change of
-    speed, so that the wheel follows it without lag however stiff the tyre.
+    The demand jumps from sample to sample, so that no slope can be extrapolated from the previous
+    step; but the rate's own rate is known: −rate / lag.
     """
-    return spin + step * (wheel.rate + step * wheel.drift) / (1.0 + step * wheel.stiffness)
+    return step * rate * (1.0 - 0.5 * step * inverse_lag)
+
+
+@equation
+def turned(
+    wheel: WheelRate, rate_before: float, change_before: float, step: float, extrapolation: float
+) -> float:
+    """Return the change of a wheel's speed in a step.
+
+    With K = −∂f/∂ω, or something larger, the part −K ω of the rate f is taken at the end of the
+    step and the rest is extrapolated:
+
+        (3/2 + h K) Δω = Δω_before / 2 + h (2 f − f_before + K Δω_before)
+
+    However stiff the tyre, the wheel follows the car without lag.
+    """
+    twice = 2.0 * extrapolation
+    rate = wheel.rate + twice * (wheel.rate - rate_before + wheel.stiffness * change_before)
+    return (extrapolation * change_before + step * rate) / (
+        1.0 + extrapolation + step * wheel.stiffness
+    )
 
 
 @equation
 def advance(
-    x: State, d: Derivative, before: Slopes, step: float, extrapolation: float
+    x: State, d: Derivative, before: Slopes, c: Constants, step: float, extrapolation: float
 ) -> tuple[State, Slopes]:
-    """Return the state after a step, and the slopes that the next step needs."""
+    """Return the state after a step, and what the next step needs to know of this one."""
+    fl = turned(d.wheel_fl, before.rate_fl, before.change_fl, step, extrapolation)
+    fr = turned(d.wheel_fr, before.rate_fr, before.change_fr, step, extrapolation)
+    rl = turned(d.wheel_rl, before.rate_rl, before.change_rl, step, extrapolation)
+    rr = turned(d.wheel_rr, before.rate_rr, before.change_rr, step, extrapolation)
     after = State(
         x.vx + step * extrapolate(d.vx, before.vx, extrapolation),
         x.vy + step * extrapolate(d.vy, before.vy, extrapolation),
         x.yaw_rate + step * extrapolate(d.yaw_rate, before.yaw_rate, extrapolation),
-        x.steering_wheel
-        + step * extrapolate(d.steering_wheel, before.steering_wheel, extrapolation),
-        x.traction + step * extrapolate(d.traction, before.traction, extrapolation),
+        x.steering_wheel + followed(d.steering_wheel, c.inverse_steering_lag, step),
+        x.traction + followed(d.traction, c.inverse_drive_lag, step),
         x.ax_lag + step * extrapolate(d.ax_lag, before.ax_lag, extrapolation),
         x.ay_lag + step * extrapolate(d.ay_lag, before.ay_lag, extrapolation),
-        _turned(x.wheel_fl, d.wheel_fl, step),
-        _turned(x.wheel_fr, d.wheel_fr, step),
-        _turned(x.wheel_rl, d.wheel_rl, step),
-        _turned(x.wheel_rr, d.wheel_rr, step),
+        x.wheel_fl + fl,
+        x.wheel_fr + fr,
+        x.wheel_rl + rl,
+        x.wheel_rr + rr,
     )
-    slopes = Slopes(d.vx, d.vy, d.yaw_rate, d.steering_wheel, d.traction, d.ax_lag, d.ay_lag)
+    slopes = Slopes(
+        d.vx,
+        d.vy,
+        d.yaw_rate,
+        d.ax_lag,
+        d.ay_lag,
+        d.wheel_fl.rate,
+        d.wheel_fr.rate,
+        d.wheel_rl.rate,
+        d.wheel_rr.rate,
+        fl,
+        fr,
+        rl,
+        rr,
+    )
     return after, slopes

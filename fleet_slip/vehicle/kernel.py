@@ -25,13 +25,12 @@ from fleet_slip.vehicle.driver import (
     decide,
 )
 from fleet_slip.vehicle.dynamics import derivative
-from fleet_slip.vehicle.integration import SECOND_ORDER, STEP_S, Slopes, advance
+from fleet_slip.vehicle.integration import SECOND_ORDER, Slopes, advance
 from fleet_slip.vehicle.parameters import Constants
 from fleet_slip.vehicle.pose import Path, Pose, PoseSlopes, advance_pose, pose_slopes
 from fleet_slip.vehicle.rows import LANES, read, write
 from fleet_slip.vehicle.state import Controls, State
 
-STEPS_PER_SAMPLE = round(SAMPLE_S / STEP_S)
 AFTER_LOSS = 500
 """Samples that a drive goes on after the driver lost the car: 5 s."""
 LOST_OFFSET_M = 10.0
@@ -106,13 +105,17 @@ def _between(table: Any, first: int, plan: Any, station: float) -> tuple[float, 
 
 
 @equation
-def _look_up(curvature: Any, speed: Any, plan: Any, x: State, station: float, lost: bool) -> Path:
+def _look_up(
+    curvature: Any, speed: Any, gain: Any, plan: Any, x: State, station: float, lost: bool
+) -> Path:
     """Return what the driver sees of the road from a station."""
     first = plan.first
     here, slope = _between(curvature, first, plan, station)
     ahead, _ = _between(curvature, first, plan, station + STEERING_PREVIEW_S * x.vx)
-    target, rise = _between(speed, first, plan, station + SPEED_PREVIEW_S * x.vx)
-    return Path(station, here, slope, ahead, target, target * rise, 1.0 if lost else 0.0)
+    soon = station + SPEED_PREVIEW_S * x.vx
+    target, _ = _between(speed, first, plan, soon)
+    rise, _ = _between(gain, first, plan, soon)
+    return Path(station, here, slope, ahead, target, rise, 1.0 if lost else 0.0)
 
 
 @equation
@@ -147,7 +150,7 @@ def _decide(memory: Any) -> None:
 
 
 @equation
-def _integrate(memory: Any, first_step: bool) -> None:
+def _integrate(memory: Any, step_s: float, first_step: bool) -> None:
     """Move all cars on by one step; keep the specific force at the first step of a sample."""
     for lane in range(LANES):
         x = read(memory, STATE, lane, State)
@@ -158,14 +161,14 @@ def _integrate(memory: Any, first_step: bool) -> None:
         order = memory[ORDER * LANES + lane]
         d = derivative(x, u, c)
         slopes_before = read(memory, SLOPES, lane, Slopes)
-        after, slopes = advance(x, d, slopes_before, STEP_S, order)
+        after, slopes = advance(x, d, slopes_before, c, step_s, order)
         pose_before = read(memory, POSE_SLOPES, lane, PoseSlopes)
         travel = pose_slopes(x, pose, path)
         ax = d.ax if first_step else memory[FORCE * LANES + lane]
         ay = d.ay if first_step else memory[(FORCE + 1) * LANES + lane]
         write(memory, STATE, lane, after)
         write(memory, SLOPES, lane, slopes)
-        write(memory, POSE, lane, advance_pose(pose, travel, pose_before, STEP_S, order))
+        write(memory, POSE, lane, advance_pose(pose, travel, pose_before, step_s, order))
         write(memory, POSE_SLOPES, lane, travel)
         write(memory, FORCE, lane, (ax, ay))
         memory[ORDER * LANES + lane] = SECOND_ORDER
@@ -211,12 +214,20 @@ def _compile(sources: str) -> Callable[..., NDArray[np.int64]]:
 
     @numba.njit(cache=True, nogil=True, error_model="numpy")
     def simulate(
-        plans: Any, cars: Any, curvature: Any, speed: Any, queue: Any, truth: Any
+        plans: Any,
+        cars: Any,
+        curvature: Any,
+        speed: Any,
+        gain: Any,
+        queue: Any,
+        steps: int,
+        truth: Any,
     ) -> NDArray[np.int64]:
         """Fill `truth` (drives, channels, samples); return the samples and loss tick of each.
 
-        `plans` are of dtype `PLAN`; `cars` has `Constants` and `Handling` in rows; `queue` is the
-        order in which drives get a lane.
+        `plans` are of dtype `PLAN`, into the tables of the roads' `curvature`, target `speed` and
+        its `gain` in time; `cars` has `Constants` and `Handling` in rows; `queue` is the
+        order in which drives get a lane; `steps` is the number of steps per sample.
         """
         _ = sources
         ended = np.full((len(plans), 2), NOBODY)
@@ -235,7 +246,7 @@ def _compile(sources: str) -> Callable[..., NDArray[np.int64]]:
                     drive[lane], tick[lane], laps[lane] = now, 0, 0
                     start = speed[plans[now].first]
                     _begin(memory, lane, plans[now], cars[now], start)
-                    
+
             if running == 0:
                 return ended
             for lane in range(LANES):
@@ -248,11 +259,11 @@ def _compile(sources: str) -> Callable[..., NDArray[np.int64]]:
                     ended[now, 1] = tick[lane]
                 _record(truth[now], tick[lane], x, pose)
                 lost = ended[now, 1] != NOBODY
-                path = _look_up(curvature, speed, plans[now], x, pose.station, lost)
+                path = _look_up(curvature, speed, gain, plans[now], x, pose.station, lost)
                 write(memory, PATH, lane, path)
             _decide(memory)
-            for step in range(STEPS_PER_SAMPLE):
-                _integrate(memory, step == 0)
+            for step in range(steps):
+                _integrate(memory, SAMPLE_S / steps, step == 0)
             for lane in range(LANES):
                 now = drive[lane]
                 if now == NOBODY:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from fleet_slip.errors import ConfigError
 from fleet_slip.vehicle import kernel
 from fleet_slip.vehicle.driver import SAMPLE_S, handling
+from fleet_slip.vehicle.integration import STEP_S
 from fleet_slip.vehicle.kernel import LOST_SPEED_MPS
 from fleet_slip.vehicle.parameters import VehicleParameters, constants
 
@@ -69,7 +70,12 @@ class Truth:
     """First tick at which the driver had lost the car; None where he never did."""
 
 
-def simulate_drives(drives: Sequence[LaneDrive]) -> list[Truth]:
+STEPS_PER_SAMPLE = round(SAMPLE_S / STEP_S)
+
+
+def simulate_drives(
+    drives: Sequence[LaneDrive], steps_per_sample: int = STEPS_PER_SAMPLE
+) -> list[Truth]:
     """Return what happens in each drive, sampled at 100 Hz from its start.
 
     A drive ends after its laps, at the end of an open road, `kernel.AFTER_LOSS` samples after the
@@ -88,10 +94,7 @@ def simulate_drives(drives: Sequence[LaneDrive]) -> list[Truth]:
     first = dict(zip(roads, [0, *ends[:-1]], strict=True))
     plans = np.array([_plan(drive, first[id(drive.road)]) for drive in drives], dtype=kernel.PLAN)
     cars = np.array(
-        [
-            (*constants(drive.vehicle, drive.adhesion), *handling(drive.vehicle))
-            for drive in drives
-        ]
+        [(*constants(drive.vehicle, drive.adhesion), *handling(drive.vehicle)) for drive in drives]
     )
     longest_first = np.argsort(-plans["samples"], kind="stable")
     truth = np.empty((len(drives), len(kernel.CHANNELS), int(plans["samples"].max())))
@@ -100,7 +103,9 @@ def simulate_drives(drives: Sequence[LaneDrive]) -> list[Truth]:
         cars,
         np.concatenate([road.curvature_1pm for road in roads.values()]),
         np.concatenate([road.speed_mps for road in roads.values()]),
+        np.concatenate([target_acceleration(road) for road in roads.values()]),
         longest_first,
+        steps_per_sample,
         truth,
     )
     return [
@@ -124,6 +129,18 @@ def planned_time_s(road: Road, distance_m: float) -> float:
     speed = np.append(road.speed_mps, road.speed_mps[0]) if road.closed else road.speed_mps
     lap_s = float(np.sum(2 * road.spacing_m / (speed[:-1] + speed[1:])))
     return lap_s * distance_m / road.length_m
+
+
+def target_acceleration(road: Road) -> NDArray[np.float64]:
+    """Return the acceleration d(v²/2)/ds of the target speed at the road's entries, in m/s².
+
+    Central differences; interpolated linearly it is continuous, so that a drive does not hinge on
+    which side of an entry a sample falls.
+    """
+    energy = road.speed_mps**2 / 2
+    if road.closed:
+        return (np.roll(energy, -1) - np.roll(energy, 1)) / (2 * road.spacing_m)
+    return np.gradient(energy, road.spacing_m)
 
 
 def _plan(drive: LaneDrive, first: int) -> tuple[int, int, float, float, bool, float, int]:

@@ -103,6 +103,8 @@ class Drivetrain(Config):
     front_brake_share: FiniteFloat = Field(ge=0, le=1)
     lag_s: FiniteFloat = Field(ge=0.01)
     power_w: FiniteFloat = Field(gt=0)
+    slip_control: FiniteFloat = Field(gt=0)
+    """Slip at which anti-lock and traction control begin to take torque off a wheel."""
 
 
 class Aerodynamics(Config):
@@ -208,6 +210,8 @@ class Constants(NamedTuple):
     brake_rear: float
     power_per_mass: float
     drag_per_mass: float
+    inverse_slip_band: float
+    """One over the range of slip within which slip control takes all torque off."""
 
 
 def constants(vehicle: VehicleParameters, adhesion: float) -> Constants:
@@ -257,4 +261,5 @@ def constants(vehicle: VehicleParameters, adhesion: float) -> Constants:
         brake_rear=(1 - drive.front_brake_share) / 2,
         power_per_mass=drive.power_w / mass,
         drag_per_mass=drag / mass,
+        inverse_slip_band=1 / (2 * drive.slip_control),
     )

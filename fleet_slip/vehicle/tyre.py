@@ -26,6 +26,10 @@ class TyreForce(NamedTuple):
     y: float
     damping: float
     """−∂x/∂(longitudinal velocity), nearly: how stiffly the wheel's spin is held, in N s/m."""
+    slip: float
+    """Longitudinal slip σx, positive when driven."""
+    slip_per_speed: float
+    """∂σx/∂(rolling speed), in s/m."""
 
 
 @equation
@@ -55,7 +59,8 @@ def brush_force(
     slide_x = rolling - along
     slide_y = -across
     limit = (c.friction - c.friction_per_load * load) * load
-    bristle_y = cornering_stiffness(load, peak, c) / max(abs(rolling), CREEP_SPEED_MPS)
+    per_speed = 1.0 / max(abs(rolling), CREEP_SPEED_MPS)
+    bristle_y = cornering_stiffness(load, peak, c) * per_speed
     bristle_x = c.stiffness_ratio * bristle_y
     stuck_x = bristle_x * slide_x
     stuck_y = bristle_y * slide_y
@@ -69,6 +74,8 @@ def brush_force(
         stuck2 * stuck_x + drag * slide_x,
         stuck2 * stuck_y + drag * slide_y,
         stuck2 * bristle_x + drag * direction_y * direction_y,
+        slide_x * per_speed,
+        per_speed,
     )
 
 
@@ -78,5 +85,7 @@ def linear_force(
 ) -> TyreForce:
     """Return the force of a linear tyre: stiffness times slip angle (rad) and slip, no limit."""
     stiffness = cornering_stiffness(load, peak, c)
-    bristle = c.stiffness_ratio * stiffness / max(abs(rolling), CREEP_SPEED_MPS)
-    return TyreForce(bristle * (rolling - along), stiffness * slip_angle, bristle)
+    per_speed = 1.0 / max(abs(rolling), CREEP_SPEED_MPS)
+    bristle = c.stiffness_ratio * stiffness * per_speed
+    slip = (rolling - along) * per_speed
+    return TyreForce(bristle * (rolling - along), stiffness * slip_angle, bristle, slip, per_speed)

@@ -37,6 +37,8 @@ class WheelForce(NamedTuple):
     """Component along the wheel."""
     damping: float
     """How stiffly the tyre holds the wheel's spin, in N s/m."""
+    slip: float
+    slip_per_speed: float
     cosine: float
     """Of the wheel's steering angle."""
     sine: float
@@ -57,9 +59,7 @@ class WheelRate(NamedTuple):
     rate: float
     """dω/dt in rad/s²."""
     stiffness: float
-    """−∂(dω/dt)/∂ω in 1/s, of tyre and brake, nearly."""
-    drift: float
-    """Change of `rate` with time because the car's speed changes, in rad/s³."""
+    """−∂(dω/dt)/∂ω in 1/s, or somewhat more."""
 
 
 @equation
@@ -118,6 +118,8 @@ def build_wheel_forces(brush: bool, spinning: bool) -> Callable[..., WheelForces
             sine * force.x + cosine * force.y,
             force.x,
             force.damping,
+            force.slip,
+            force.slip_per_speed,
             cosine,
             sine,
         )
@@ -144,11 +146,14 @@ def build_wheel_forces(brush: bool, spinning: bool) -> Callable[..., WheelForces
         slip_angle = math.atan(tangent) - math.atan2(vy, vx)
         rolling = c.radius * spin if spinning else vx
         force = linear_force(slip_angle, vx, rolling, load, peak, c)
-        return WheelForce(force.x, force.y, force.x, force.damping, 1.0, 0.0)
+        x, y, damping, slip, per_speed = force
+        return WheelForce(x, y, x, damping, slip, per_speed, 1.0, 0.0)
 
     @equation
     def damped(force: WheelForce, lateral: float) -> WheelForce:
-        return WheelForce(force.x, lateral, force.along, force.damping, 1.0, 0.0)
+        return WheelForce(
+            force.x, lateral, force.x, force.damping, force.slip, force.slip_per_speed, 1.0, 0.0
+        )
 
     @equation
     def linear_forces(
@@ -189,15 +194,19 @@ def driven_spin(
 ) -> WheelRate:
     """Return the rate of a wheel under drive and brake forces at its rim (I dω/dt = sum of torques).
 
-    `hub` is the rate of the hub's speed along the wheel. Brake and rolling resistance oppose the
-    spin; below `STICTION_RAD_S` they fade in proportion to it.
+    Brake and rolling resistance oppose the
+    spin; below `STICTION_RAD_S` they fade in proportion to it. Anti-lock and traction control take
+    the torque off a wheel as its slip grows from `slip_control` to three times that.
     """
-    friction = (brake + c.rolling_resistance * load) / max(abs(spin), STICTION_RAD_S)
+    excess = abs(force.slip) * c.inverse_slip_band
+    left = min(max(1.5 - excess, 0.0), 1.0)
+    fading = c.inverse_slip_band * force.slip_per_speed if 0.0 < left < 1.0 else 0.0
+    friction = (left * brake + c.rolling_resistance * load) / max(abs(spin), STICTION_RAD_S)
     gain = c.radius * c.inverse_spin_inertia
+    held = force.damping + fading * (drive + brake)
     return WheelRate(
-        gain * (drive - force.along - friction * spin),
-        gain * (c.radius * force.damping + friction),
-        gain * force.damping * hub,
+        gain * (left * drive - force.along - friction * spin),
+        gain * (c.radius * held + friction),
     )
 
 
@@ -212,4 +221,4 @@ def free_spin(
     c: Constants,
 ) -> WheelRate:
     """Return the rate of a wheel that rolls without slip."""
-    return WheelRate(hub * c.inverse_radius, 0.0, 0.0)
+    return WheelRate(hub * c.inverse_radius, 0.0)
