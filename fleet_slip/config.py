@@ -1,4 +1,4 @@
-"""Reads a TOML file into a pydantic model and says what is wrong with it by file, key and reason."""
+"""Reads a TOML file into a pydantic model; says what is wrong with it by file, key and reason."""
 
 import tomllib
 from decimal import Decimal
@@ -32,7 +32,7 @@ def load_toml(file: Traversable) -> dict[str, Any]:
 
 
 def load_config(file: Traversable, model: type[ConfigT]) -> ConfigT:
-    """Parse and validate a TOML file. Raises `ConfigError` with file, key and reason of each fault."""
+    """Parse and validate a TOML file. Raises `ConfigError` with file, key, reason of each fault."""
     try:
         return model.model_validate(load_toml(file))
     except ValidationError as error:
@@ -44,4 +44,6 @@ def load_config(file: Traversable, model: type[ConfigT]) -> ConfigT:
 
 
 def _reason(message: str) -> str:
-    return message.removeprefix("Value error, ").replace("Extra inputs are not permitted", "unknown key")
+    return message.removeprefix("Value error, ").replace(
+        "Extra inputs are not permitted", "unknown key"
+    )

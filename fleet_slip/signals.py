@@ -39,7 +39,7 @@ class Signal(Config):
     @classmethod
     def _unit_is_si(cls, unit: str) -> str:
         try:
-            quantity = pint.application_registry.get().Quantity(1, unit)
+            quantity = pint.Quantity(1, unit)
         except (pint.UndefinedUnitError, pint.DefinitionSyntaxError) as error:
             raise ValueError(f"{unit!r} is not a unit: {error}") from None
         if quantity.to_base_units().magnitude != 1:

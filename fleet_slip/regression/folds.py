@@ -56,12 +56,16 @@ class Assignment:
 def by_hash(keys: Sequence[str], count: int) -> Assignment:
     """Deal drives into `count` folds by the hash of a key: the drive id, or a vehicle or track.
 
-    Drives with the same key share a fold. Raises `SelectionError` if a fold stays empty.
+    Drives with the same key share a fold. A fold that no drive falls into, as happens in small
+    cohorts, is left out: a drive's fold must not depend on which other drives there are. Raises
+    `SelectionError` if fewer than two folds are left.
     """
     if count < 2:
         raise SelectionError(f"cross-validation needs at least two folds, not {count}.")
-    fold = np.array([hash_fold(key, count) for key in keys], dtype=np.int64)
-    return Assignment(fold, tuple(str(number + 1) for number in range(count)))
+    numbers = [hash_fold(key, count) for key in keys]
+    used = sorted(set(numbers))
+    fold = np.searchsorted(used, numbers).astype(np.int64)
+    return Assignment(fold, tuple(str(number + 1) for number in used))
 
 
 def by_value(values: Sequence[Any]) -> Assignment:

@@ -106,9 +106,16 @@ def test_drives_of_one_vehicle_share_a_fold() -> None:
     assert by_value(vehicles).names == tuple(sorted(set(vehicles)))
 
 
-def test_empty_and_single_folds_are_errors() -> None:
-    with pytest.raises(SelectionError, match="no drive falls into fold"):
-        by_hash(["a", "b"], 5)
+def test_folds_that_no_drive_falls_into_are_left_out() -> None:
+    ids = [f"drive-{i}" for i in range(4)]
+    few = by_hash(ids, 50)
+    assert few.names == tuple(str(n + 1) for n in sorted({hash_fold(i, 50) for i in ids}))
+    assert [few.names[fold] for fold in few.fold] == [str(hash_fold(i, 50) + 1) for i in ids]
+
+
+def test_single_folds_are_errors() -> None:
+    with pytest.raises(SelectionError, match="the cohort has one"):
+        by_hash(["a", "a"], 5)
     with pytest.raises(SelectionError, match="at least two folds"):
         by_hash(["a", "b"], 1)
     with pytest.raises(SelectionError, match="the cohort has one: waterford"):

@@ -1,0 +1,178 @@
+"""Commands that fill the warehouse: simulate, ingest, gram, check."""
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
+from datetime import date
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from fleet_slip.campaign import Campaign, load_campaign
+from fleet_slip.cli.output import Json, print_json, print_table, progress, say
+from fleet_slip.errors import ConfigError
+from fleet_slip.gram_job import GramReport, gram_statement, update_grams
+from fleet_slip.signals import catalogue
+from fleet_slip.simulation_job import SimulationReport, simulate_campaign
+from fleet_slip.warehouse import Warehouse
+
+CampaignName = Annotated[
+    str, typer.Argument(help="A campaign of configs/campaigns, or the path of a TOML file.")
+]
+Through = Annotated[
+    str | None,
+    typer.Option(help="Last day to simulate, YYYY-MM-DD. Default: all days of the campaign."),
+]
+Days = Annotated[
+    int | None, typer.Option(min=1, help="Simulate the first N days only. Default: all.")
+]
+Threads = Annotated[
+    int | None, typer.Option(min=1, help="Threads. The result is the same. Default: all cores.")
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this module."""
+    app.command()(simulate)
+    app.command()(ingest)
+    app.command()(gram)
+    app.command()(check)
+
+
+def chosen_days(campaign: Campaign, days: int | None, through: str | None) -> tuple[date, ...]:
+    """Return the days of a campaign that the options ask for. Raises `ConfigError`."""
+    try:
+        last = date.fromisoformat(through) if through else date.max
+    except ValueError:
+        raise ConfigError(f"--through {through}: not a date; write it as 2024-05-01.") from None
+    chosen = tuple(day for day in campaign.days()[:days] if day <= last)
+    if not chosen:
+        first, end = campaign.days()[0], campaign.days()[-1]
+        raise ConfigError(f"--through {through}: {campaign.name} lasts from {first} to {end}.")
+    return chosen
+
+
+def run_simulation(
+    warehouse: Warehouse, campaign: Campaign, days: tuple[date, ...], threads: int | None
+) -> SimulationReport:
+    """Simulate with local threads and a progress bar."""
+    with (
+        ThreadPoolExecutor(threads or os.cpu_count()) as executor,
+        progress(f"simulate {campaign.name}", "rows") as advance,
+    ):
+        return simulate_campaign(warehouse, campaign, days, executor, advance)
+
+
+def run_gram(warehouse: Warehouse) -> GramReport:
+    """Run the Gram job with a progress bar."""
+    with progress("gram", "rows") as advance:
+        return update_grams(warehouse, advance)
+
+
+def simulate(
+    context: typer.Context,
+    campaign: CampaignName,
+    days: Days = None,
+    through: Through = None,
+    threads: Threads = None,
+    json: Json = False,
+) -> None:
+    """Simulate what is missing of a campaign and write it to the logs."""
+    plan = load_campaign(campaign)
+    report = run_simulation(context.obj, plan, chosen_days(plan, days, through), threads)
+    if json:
+        print_json(asdict(report))
+    elif report.changed:
+        say(
+            f"{plan.name}: {report.drives} drives, {report.rows:,} rows in {report.batches_written} "
+            f"files, {report.size_bytes / report.rows:.1f} bytes a row"
+        )
+    else:
+        say(f"{plan.name}: nothing to do, all {report.batches_present} files are there")
+
+
+def ingest(
+    context: typer.Context,
+    files: Annotated[list[Path], typer.Argument(help="CSV or Parquet files.", show_default=False)],
+    mapping: Annotated[
+        str, typer.Option(help="A mapping of configs/mappings, or the path of a TOML file.")
+    ],
+    json: Json = False,
+) -> None:
+    """Bring measured logs into the warehouse through a mapping of columns, units and axes.
+
+    Rows that cannot be used go to the quarantine with a reason: fleet-slip sql "FROM quarantine"
+    """
+    from fleet_slip.ingest.mapping import load_mapping  # noqa: PLC0415 - Polars takes a while
+    from fleet_slip.ingest_job import ingest_file  # noqa: PLC0415
+
+    plan = load_mapping(mapping)
+    reports = []
+    for file in files:
+        report = ingest_file(context.obj, file, plan).as_dict()
+        reports.append(report)
+        if not json:
+            say(_ingested(report))
+    if json:
+        print_json(reports)
+
+
+def _ingested(report: dict[str, Any]) -> str:
+    if not report["new"]:
+        return f"{report['file']}: nothing to do, it was ingested before"
+    reasons = ", ".join(f"{n:,} {reason}" for reason, n in report["quarantined"].items())
+    return f"{report['file']}: {report['ticks']:,} rows in {report['drives']} drives" + (
+        f"; {report['rows_quarantined']:,} rows in quarantine ({reasons})" if reasons else ""
+    )
+
+
+def gram(
+    context: typer.Context,
+    sql: Annotated[bool, typer.Option("--sql", help="Print the statement and do nothing.")] = False,
+    json: Json = False,
+) -> None:
+    """Reduce new log files to Gram rows, and drop the rows of files that are gone."""
+    if sql:
+        typer.echo(gram_statement(catalogue()))
+        return
+    report = run_gram(context.obj)
+    if json:
+        print_json(asdict(report))
+    elif report.changed:
+        say(
+            f"gram: {report.files_read} new files, {report.rows_read:,} rows read, "
+            f"{report.files_dropped} files dropped; {report.gram_rows:,} Gram rows"
+        )
+    else:
+        say(f"gram: nothing to do, {report.gram_rows:,} Gram rows are up to date")
+
+
+def check(
+    context: typer.Context,
+    files: Annotated[
+        int, typer.Option(min=1, help="How many log files to check, evenly chosen.")
+    ] = 4,
+    json: Json = False,
+) -> None:
+    """Compute Gram rows three ways and compare them, bit for bit.
+
+    By the SQL statement, by float64 matrix products on blocks in which every partial sum is an
+    exact integer, and (for one drive of each file) by Python integers; and with the stored rows.
+    """
+    from fleet_slip.gram_check import check_grams  # noqa: PLC0415
+
+    with progress("check", "files") as advance:
+        report = check_grams(context.obj, files, advance)
+    if json:
+        print_json(asdict(report))
+    else:
+        print_table(
+            "",
+            ["way", "drives", "equal"],
+            [
+                ["SQL against stored Gram rows", f"{report.drives}", "yes"],
+                ["SQL against float64 blocks", f"{report.drives}", "yes"],
+                ["SQL against Python integers", f"{report.drives_by_integers}", "yes"],
+            ],
+        )

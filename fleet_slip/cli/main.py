@@ -1,0 +1,73 @@
+"""The `fleet-slip` command: its options, its commands and its exit codes."""
+
+import sys
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fleet_slip.cli import data, models, query, run
+from fleet_slip.cli.output import say
+from fleet_slip.connection import ROOT_VARIABLE, data_root
+from fleet_slip.errors import FleetSlipError
+from fleet_slip.warehouse import Warehouse
+
+INTERRUPTED = 130
+
+app = typer.Typer(
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
+    context_settings={"help_option_names": ["-h", "--help"]},
+    epilog=(
+        "Exit codes: 0 done, 1 a bug, 2 wrong usage, 3 a config file, 4 input data, 5 the data "
+        "cannot answer, 6 storage, 7 refused, 8 a conflict with another process, 130 interrupted."
+    ),
+)
+for module in (run, data, models, query):
+    module.register(app)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"fleet-slip {version('fleet-slip')}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    context: typer.Context,
+    root: Annotated[
+        Path | None,
+        typer.Option(
+            help=f"Data root. Default: ${ROOT_VARIABLE}, else ./data.", show_default=False
+        ),
+    ] = None,
+    _version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print it.")
+    ] = False,
+) -> None:
+    """Side-slip angle estimation from fleet logs.
+
+    Logs of many cars become exact Gram matrices; from these every model, cohort and fold follows
+    without reading a row again; the winner becomes a numbered model version.
+
+    Start with: **fleet-slip run --campaign smoke**
+    """
+    context.obj = Warehouse(data_root(root))
+
+
+def main() -> None:
+    """Run the command line; an expected error becomes one line on stderr and its exit code."""
+    try:
+        app()
+    except FleetSlipError as error:
+        say(f"error: {error}")
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        say("interrupted; run the same command again to go on.")
+        sys.exit(INTERRUPTED)
+    except BrokenPipeError:
+        sys.stderr.close()
+        sys.exit(0)

@@ -1,0 +1,99 @@
+"""What commands print: JSON for machines, tables for people, progress on stderr."""
+
+import json
+import os
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+from rich.text import Text
+
+Json = Annotated[bool, typer.Option("--json", help="Print machine-readable JSON on stdout.")]
+
+
+def stdout() -> Console:
+    """Return a console for results. Piped, it keeps to 200 columns and never wraps in mid-word."""
+    return Console(width=None if sys.stdout.isatty() else 200, highlight=False, emoji=False)
+
+
+def stderr() -> Console:
+    """Return a console for progress and remarks."""
+    return Console(stderr=True, highlight=False, emoji=False, soft_wrap=True)
+
+
+def say(text: str) -> None:
+    """Print a remark for people on stderr, as it is."""
+    stderr().print(text, markup=False)
+
+
+def print_json(content: Any) -> None:
+    """Print a JSON document; what JSON does not know (dates, decimals) as text."""
+    sys.stdout.write(json.dumps(content, indent=2, default=str, allow_nan=False) + "\n")
+
+
+def print_table(
+    title: str, header: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1
+) -> None:
+    """Print a table; the first `left` columns are text, the others are numbers."""
+    table = Table(title=title or None, title_justify="left", box=None, pad_edge=False)
+    for i, name in enumerate(header):
+        table.add_column(name, justify="left" if i < left else "right", overflow="fold")
+    for row in rows:
+        table.add_row(*(Text(cell) for cell in row))
+    stdout().print(table)
+
+
+class _Rate(ProgressColumn):
+    """Speed of a task in its unit."""
+
+    def render(self, task: Task) -> Text:
+        speed = task.finished_speed or task.speed
+        unit = task.fields.get("unit", "")
+        return Text(f"{_short(speed)} {unit}/s" if speed else "")
+
+
+def _short(value: float) -> str:
+    for limit, suffix in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if value >= limit:
+            return f"{value / limit:.1f}{suffix}"
+    return f"{value:.0f}"
+
+
+@contextmanager
+def progress(doing: str, unit: str) -> Iterator[Callable[[int, int], None]]:
+    """Show a bar with rate and time left on stderr while a job runs, if a person watches.
+
+    Yields the callback that jobs take: how much more is done, and how much there is in all.
+    """
+    console = stderr()
+    bar = Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f}%"),
+        _Rate(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        console=console,
+        transient=True,
+        disable=not console.is_terminal or bool(os.environ.get("CI")),
+    )
+    with bar:
+        task = bar.add_task(doing, total=None, unit=unit)
+
+        def advance(more: int, total: int) -> None:
+            bar.update(task, advance=more, total=total)
+
+        yield advance

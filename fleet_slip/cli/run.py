@@ -1,0 +1,104 @@
+"""The command that does the whole job: simulate what is missing, gram, select, publish."""
+
+import time
+from dataclasses import asdict
+from typing import Annotated, Any
+
+import typer
+
+from fleet_slip.campaign import load_campaign
+from fleet_slip.cli.data import Days, Threads, Through, chosen_days, run_gram, run_simulation
+from fleet_slip.cli.models import (
+    print_publication,
+    print_selection,
+    published,
+    registry_of,
+    run_selection,
+)
+from fleet_slip.cli.output import Json, print_json, say
+from fleet_slip.errors import RefusedError
+from fleet_slip.publishing import Publication, manifest_of, publish
+from fleet_slip.selection import Selection
+
+DEFAULT_CAMPAIGN = "waterford"
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this module."""
+    app.command()(run)
+
+
+def run(
+    context: typer.Context,
+    campaign: Annotated[
+        str, typer.Option(help="A campaign of configs/campaigns, or the path of a TOML file.")
+    ] = DEFAULT_CAMPAIGN,
+    days: Days = None,
+    through: Through = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name of the model. Default: the campaign's.")
+    ] = None,
+    models: Annotated[
+        str | None, typer.Option(help="A model list of configs/models, or a TOML file.")
+    ] = None,
+    threads: Threads = None,
+    json: Json = False,
+) -> None:
+    """Do the whole job: simulate what is missing, gram, select, publish if it is not worse.
+
+    It can be repeated at any time, and after any interruption: what is done is not done again. A
+    nightly run appends the next day with --through "$(date -I)".
+    """
+    started = time.monotonic()
+    plan = load_campaign(campaign)
+    simulation = run_simulation(context.obj, plan, chosen_days(plan, days, through), threads)
+    gram = run_gram(context.obj)
+    condition = f"campaign = '{plan.name}'"
+    selection, label, sha256 = run_selection(context.obj, condition, models)
+    publication, refusal = _publish(context, selection, name or plan.name, label, sha256)
+    changed = simulation.changed or gram.changed or (publication is not None and publication.new)
+    summary = {
+        "campaign": plan.name,
+        "changed": changed,
+        "simulate": asdict(simulation),
+        "gram": asdict(gram),
+        "select": selection.as_dict(),
+        "publish": published(publication) if publication else {"new": False, "reason": refusal},
+        "seconds": round(time.monotonic() - started, 3),
+    }
+    if json:
+        print_json(summary)
+    else:
+        _print_summary(summary, selection, publication, refusal)
+
+
+def _publish(
+    context: typer.Context, selection: Selection, name: str, label: str, sha256: str
+) -> tuple[Publication | None, str]:
+    manifest = manifest_of(selection, name, label, sha256)
+    try:
+        return publish(registry_of(context.obj), manifest, selection), ""
+    except RefusedError as error:
+        return None, str(error)
+
+
+def _print_summary(
+    summary: dict[str, Any],
+    selection: Selection,
+    publication: Publication | None,
+    refusal: str,
+) -> None:
+    simulated, gram = summary["simulate"], summary["gram"]
+    seconds = summary["seconds"]
+    if not summary["changed"]:
+        kept = publication.version.reference if publication else refusal
+        say(f"{summary['campaign']}: nothing to do, {kept} is up to date ({seconds:.1f} s)")
+        return
+    say(f"simulated {simulated['drives']} drives, {simulated['rows']:,} rows")
+    say(f"gram: {gram['rows_read']:,} rows read, {gram['gram_rows']:,} Gram rows")
+    print_selection(selection)
+    if publication:
+        print_publication(publication)
+    else:
+        say(refusal)
+    say(f"done in {seconds:.1f} s")

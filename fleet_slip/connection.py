@@ -1,0 +1,153 @@
+"""A DuckDB connection on the warehouse: views in SI units over one snapshot of its tables."""
+
+from collections.abc import Mapping
+from os import environ
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import pyarrow as pa
+
+from fleet_slip.database import open_database
+from fleet_slip.registry import Registry
+from fleet_slip.resources import read_sql
+from fleet_slip.signals import SAMPLE_TIME_S, SignalCatalogue
+from fleet_slip.storage import Snapshot
+from fleet_slip.warehouse import Warehouse
+
+VIEWS = ("log_counts", "log", "grams", "drives", "quarantine")
+"""In the order of their dependence; each is a file in `warehouse/`."""
+
+DEFAULT_ROOT = Path("data")
+ROOT_VARIABLE = "FLEET_SLIP_ROOT"
+
+
+def data_root(root: Path | str | None = None) -> Path:
+    """Return the data root: the argument, else $FLEET_SLIP_ROOT, else ./data."""
+    return Path(root or environ.get(ROOT_VARIABLE) or DEFAULT_ROOT)
+
+
+def connect(
+    root: Path | str | None = None, *, threads: int | None = None
+) -> duckdb.DuckDBPyConnection:
+    """Return a DuckDB connection with the views of the warehouse at `root`.
+
+    `log` (SI units), `log_counts`, `drives`, `grams`, `models`, `quarantine` and `dictionary`, which
+    documents every column. The connection sees one snapshot; connect again to see later commits. It
+    can read the warehouse's files only, and its settings are locked.
+    """
+    warehouse = Warehouse(data_root(root))
+    database = open_database(threads=threads)
+    columns = _generated_columns(warehouse.catalogue)
+    stored = {
+        "stored_logs": _source(database, warehouse.logs.snapshot(), "log_files"),
+        "stored_grams": _source(database, warehouse.grams.snapshot(), "gram_files"),
+        "stored_quarantine": _source(database, warehouse.quarantine.snapshot(), "quarantine_files"),
+    }
+    for view in VIEWS:
+        database.execute(read_sql("warehouse", f"{view}.sql").format(**columns, **stored))
+    _add_table(database, "models", Registry(warehouse.root / "models").as_table())
+    _add_table(database, "dictionary", _dictionary(database, warehouse.catalogue))
+    _lock(database, warehouse.root)
+    return database
+
+
+def _source(database: duckdb.DuckDBPyConnection, snapshot: Snapshot, variable: str) -> str:
+    """Return what stands after FROM for a stored table, empty ones included."""
+    database.execute(f"SET VARIABLE {variable} = $paths", {"paths": snapshot.paths})
+    if snapshot.paths:
+        return read_sql("warehouse", f"stored_{snapshot.table.path.name}.sql").replace("{{", "{")
+    empty = f"empty_{snapshot.table.path.name}"
+    _add_table(database, empty, snapshot.table.schema.empty_table())
+    return empty
+
+
+def _add_table(database: duckdb.DuckDBPyConnection, name: str, rows: pa.Table) -> None:
+    database.register("incoming", rows)
+    database.execute(f"CREATE TABLE {name} AS FROM incoming")
+    database.unregister("incoming")
+
+
+def _generated_columns(signals: SignalCatalogue) -> Mapping[str, Any]:
+    separator = ",\n    "
+    return {
+        "drive_columns": separator.join(signals.drive),
+        "signals": separator.join(signals.signals),
+        "si_columns": separator.join(
+            f"{name} * {signal.scale}::DOUBLE AS {signal.column}"
+            for name, signal in signals.signals.items()
+        ),
+        "samples_per_second": int(1 / SAMPLE_TIME_S),
+    }
+
+
+def _dictionary(database: duckdb.DuckDBPyConnection, signals: SignalCatalogue) -> pa.Table:
+    """Comment the views' columns, and return all columns with unit and description as a table."""
+    described = {name: ("", column.description) for name, column in signals.drive.items()}
+    described |= {
+        name: (f"{s.scale} {s.unit}", s.description) for name, s in signals.signals.items()
+    }
+    described |= {s.column: (s.unit, s.description) for s in signals.signals.values()}
+    described |= _OTHER_COLUMNS
+    found = database.execute(
+        "SELECT table_name, column_name, data_type FROM duckdb_columns() "
+        "WHERE NOT internal AND NOT starts_with(table_name, 'empty_') "
+        "ORDER BY table_name, column_index"
+    ).fetchall()
+    rows = []
+    for view, column, data_type in found:
+        unit, description = described.get(column, ("", ""))
+        rows.append(
+            {
+                "view": view,
+                "column": column,
+                "type": data_type,
+                "unit": unit,
+                "description": description,
+            }
+        )
+        if description:
+            text = f"{description} [{unit}]" if unit else description
+            quoted = text.replace("'", "''")
+            database.execute(f"COMMENT ON COLUMN {view}.{column} IS '{quoted}'")
+    return pa.Table.from_pylist(rows)
+
+
+_OTHER_COLUMNS = {
+    "day": ("", "Date of the drive"),
+    "tick": ("0.01 s", "Samples since the drive began; every drive has a row with tick 0"),
+    "time_s": ("s", "Time since the drive began"),
+    "rows": ("", "Rows of the drive, as the Gram job counted them"),
+    "feature_set": ("", "Which columns were multiplied: 'signals' are the catalogue's own"),
+    "file": ("", "File below logs/ that the Gram row was computed from, or the file ingested"),
+    "signals": ("", "Signals of a Gram row or model, separated by commas, in the order of sums"),
+    "n": ("", "Number of rows in the sums"),
+    "sums": ("counts", "Sum of each signal's counts"),
+    "products": (
+        "counts^2",
+        "Sums of products, lower triangle row by row: (0,0), (1,0), (1,1) ...",
+    ),
+    "row": ("", "Row of the ingested file, from 1"),
+    "reason": ("", "Why the row was refused"),
+    "signal": ("", "The signal that was wrong"),
+    "value": ("", "The refused value, as text"),
+    "name": ("", "Name of the model"),
+    "version": ("", "Number of the model version: 1, 2, 3 ..."),
+    "aliases": ("", "Aliases that point at the version now, separated by commas"),
+    "published_at": ("", "When the version was published, UTC"),
+    "correlation": ("", "Pooled cross-validated correlation"),
+    "rmse_deg": ("deg", "Cross-validated root mean square error"),
+    "error_mean_deg": ("deg", "Cross-validated mean of the error, estimate minus truth"),
+    "error_std_deg": ("deg", "Cross-validated standard deviation of the error"),
+    "cohort": ("", "SQL condition on drives that the model was trained on"),
+    "drives": ("", "Number of drives that the model was trained on"),
+    "sha256": ("", "Checksum of the manifest"),
+}
+
+
+def _lock(database: duckdb.DuckDBPyConnection, root: Path) -> None:
+    folders = [str((root / name).resolve()) for name in ("logs", "grams", "quarantine")]
+    folders += [str(root / name) for name in ("logs", "grams", "quarantine")]
+    database.execute(f"SET allowed_directories = {folders!r}")
+    database.execute("SET enable_external_access = false")
+    database.execute("SET lock_configuration = true")

@@ -1,0 +1,111 @@
+"""Numbered, immutable JSON documents in a folder: 1.json, 2.json, ... with a checksum each.
+
+A document is written under a temporary name, flushed, then linked to the next free number, which
+fails if another process took that number first. So numbers are consecutive, no document is ever
+half there, and none is replaced.
+"""
+
+import hashlib
+import json
+import os
+import uuid
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fleet_slip.errors import ConflictError, StorageError
+from fleet_slip.storage import TEMPORARY_PREFIX, flush, storage_errors
+
+ATTEMPTS = 1000
+
+
+def canonical_json(content: Mapping[str, Any]) -> str:
+    """Return the one text of a JSON document that its checksum is taken from."""
+    return json.dumps(
+        content, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
+    )
+
+
+def checksum(content: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of a document's canonical text, in hexadecimal."""
+    return hashlib.sha256(canonical_json(content).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class Document:
+    """One document: its number, its content and the checksum that was verified."""
+
+    number: int
+    content: Mapping[str, Any]
+    sha256: str
+
+
+@dataclass(frozen=True)
+class DocumentFolder:
+    """A folder of numbered documents."""
+
+    path: Path
+
+    def numbers(self) -> list[int]:
+        """Return the numbers of all documents, ascending."""
+        with storage_errors(self.path):
+            if not self.path.is_dir():
+                return []
+            stems = (file.stem for file in self.path.glob("*.json"))
+            return sorted(int(stem) for stem in stems if stem.isascii() and stem.isdigit())
+
+    def read(self, number: int) -> Document:
+        """Return a document. Raises `StorageError` if its checksum does not match."""
+        file = self._file(number)
+        with storage_errors(file):
+            text = file.read_text(encoding="utf-8")
+        try:
+            envelope = json.loads(text)
+            content, stated = envelope["content"], envelope["sha256"]
+            found = checksum(content)
+        except (ValueError, KeyError, TypeError):
+            raise StorageError(f"{file}: not a document of this program. {_RESTORE}") from None
+        if found != stated:
+            raise StorageError(
+                f"{file}: its content does not match its SHA-256; it was changed or damaged. "
+                f"{_RESTORE}"
+            )
+        return Document(number, content, stated)
+
+    def append(self, content: Mapping[str, Any]) -> Document:
+        """Add a document under the next free number, durably."""
+        sha256 = checksum(content)
+        text = json.dumps(
+            {"content": content, "sha256": sha256}, indent=1, ensure_ascii=False, allow_nan=False
+        )
+        temporary = self.path / f"{TEMPORARY_PREFIX}{uuid.uuid4().hex}"
+        with storage_errors(self.path):
+            self.path.mkdir(parents=True, exist_ok=True)
+            try:
+                with temporary.open("x", encoding="utf-8") as file:
+                    file.write(text + "\n")
+                    file.flush()
+                    os.fsync(file.fileno())
+                number = self._link_to_next_number(temporary)
+            finally:
+                temporary.unlink(missing_ok=True)
+            flush(self.path)
+        return Document(number, content, sha256)
+
+    def _link_to_next_number(self, temporary: Path) -> int:
+        number = max(self.numbers(), default=0)
+        for _ in range(ATTEMPTS):
+            number += 1
+            try:
+                self._file(number).hardlink_to(temporary)
+            except FileExistsError:
+                continue
+            return number
+        raise ConflictError(f"{self.path}: too many writers at once. Run the same command again.")
+
+    def _file(self, number: int) -> Path:
+        return self.path / f"{number}.json"
+
+
+_RESTORE = "Restore the file from a backup, or publish again."

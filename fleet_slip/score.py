@@ -1,0 +1,62 @@
+"""Evaluates a published model on the rows of a cohort, in SQL."""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from fleet_slip.connection import connect
+from fleet_slip.database import database_errors, one_query
+from fleet_slip.errors import SelectionError
+from fleet_slip.registry import Manifest
+from fleet_slip.resources import read_sql
+from fleet_slip.warehouse import Warehouse
+
+
+@dataclass(frozen=True)
+class Score:
+    """Figures of the error, estimate minus truth, over all rows of a cohort that have the signals."""
+
+    rows: int
+    correlation: float | None
+    rmse_deg: float
+    error_mean_deg: float
+    error_std_deg: float
+    error_mean_absolute_deg: float
+    error_median_deg: float
+    error_p95_deg: float
+    error_p99_deg: float
+    error_max_deg: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `score --json` prints."""
+        return asdict(self)
+
+
+def score_statement(manifest: Manifest, condition: str) -> str:
+    """Return `jobs/score.sql` for a model: its dot product over the view `log`."""
+    terms = [f"{term.coefficient!r} * {term.column}" for term in manifest.terms]
+    columns = [term.column for term in manifest.terms] + [manifest.label.column]
+    return read_sql("jobs", "score.sql").format(
+        estimate="\n        + ".join([repr(manifest.intercept), *terms]),
+        label=manifest.label.column,
+        complete=" AND ".join(f"{column} IS NOT NULL" for column in columns),
+        condition=condition,
+    )
+
+
+def score(warehouse: Warehouse, manifest: Manifest, condition: str) -> Score:
+    """Score a model. Raises `SelectionError` if the cohort has no row with its signals."""
+    with connect(warehouse.root) as database:
+        statement = one_query(database, score_statement(manifest, condition))
+        with database_errors(f"scoring on the cohort {condition!r}"):
+            result = database.execute(statement)
+            names = [column[0] for column in result.description or ()]
+            row = result.fetchone()
+    if row is None or not row[0]:
+        raise SelectionError(
+            f"no row of the cohort {condition!r} has {', '.join(manifest.signals)} and "
+            f"{manifest.label.signal}. Choose another cohort, or a model with fewer signals."
+        )
+    figures = dict(zip(names, row, strict=True))
+    percentiles = figures.pop("error_percentiles_deg")
+    median, p95, p99 = percentiles
+    return Score(**figures, error_median_deg=median, error_p95_deg=p95, error_p99_deg=p99)

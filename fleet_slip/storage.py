@@ -1,0 +1,287 @@
+"""The tables of a data root: Delta tables of Parquet files that we encode ourselves.
+
+A file is written under a temporary name, flushed to disk and renamed; only then is it committed to
+the table's Delta log. So a reader sees whole files of whole commits, or nothing.
+"""
+
+import contextlib
+import errno
+import json
+import os
+import time
+import uuid
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import date
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+from deltalake import CommitProperties, DeltaTable, Transaction
+from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundError
+from deltalake.transaction import AddAction, RemoveAction
+
+from fleet_slip.errors import ConflictError, StorageError
+
+ROW_GROUP_ROWS = 2**17
+TEMPORARY_PREFIX = ".tmp-"
+
+
+@contextlib.contextmanager
+def storage_errors(path: Path) -> Iterator[None]:
+    """Turn failures of the file system and of Delta into `StorageError` with a next step."""
+    try:
+        yield
+    except OSError as error:
+        raise StorageError(f"{path}: {_reason(error)}") from None
+    except DeltaError as error:
+        raise StorageError(f"{path}: the Delta log cannot be used: {_first_line(error)}") from None
+    except pa.ArrowException as error:
+        raise StorageError(f"{path}: not readable as Parquet: {_first_line(error)}") from None
+
+
+def _reason(error: OSError) -> str:
+    advice = {
+        errno.ENOSPC: "the disk is full. Free some space and run the same command again.",
+        errno.EDQUOT: "the disk quota is used up. Free some space and run the command again.",
+        errno.EACCES: "permission denied. Check the owner of the data root, or choose --root.",
+        errno.EPERM: "not permitted. Check the owner of the data root, or choose --root.",
+        errno.EROFS: "the file system is read-only. Choose a writable data root with --root.",
+        errno.ENOTDIR: "a part of the path is a file, not a folder. Choose another --root.",
+    }
+    return advice.get(error.errno or 0, _first_line(error))
+
+
+def _first_line(error: BaseException) -> str:
+    return str(error).strip().partition("\n")[0]
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """How the columns of a table become Parquet."""
+
+    dictionary: tuple[str, ...] = ()
+    delta_packed: tuple[str, ...] = ()
+    compression: str = "none"
+
+    def options(self) -> dict[str, Any]:
+        """Return the arguments of `pyarrow.parquet.write_table`."""
+        return {
+            "use_dictionary": list(self.dictionary),
+            "column_encoding": dict.fromkeys(self.delta_packed, "DELTA_BINARY_PACKED"),
+            "compression": self.compression,
+        }
+
+
+@dataclass(frozen=True)
+class TableFile:
+    """One active file of a table, as the Delta log has it."""
+
+    path: str
+    rows: int
+    size_bytes: int
+    null_counts: Mapping[str, int]
+    day: date | None = None
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A piece of work that lands exactly once: its name, and a number that its content determines.
+
+    Recorded as a Delta transaction identifier in the commit that lands it. Two processes that land
+    the same unit at once conflict, and one of them is told.
+    """
+
+    name: str
+    version: int
+
+
+@dataclass(frozen=True)
+class Change:
+    """What one commit does to a table."""
+
+    add: Sequence[AddAction] = ()
+    remove: Sequence[TableFile] = ()
+    units: Sequence[Unit] = ()
+    note: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Table:
+    """A Delta table below a data root."""
+
+    path: Path
+    schema: pa.Schema
+    encoding: Encoding
+    partition_by: tuple[str, ...] = ()
+    description: str = ""
+
+    def snapshot(self) -> "Snapshot":
+        """Return the table as it is now; a table that nobody has written yet is empty."""
+        with storage_errors(self.path):
+            try:
+                return Snapshot(self, DeltaTable(str(self.path)))
+            except TableNotFoundError:
+                return Snapshot(self, None)
+
+    def write_file(self, name: str, rows: pa.Table, day: date | None = None) -> AddAction:
+        """Write rows to a file, durably, and return the action that adds it to the table.
+
+        The file is not part of the table before the action is committed. A file of that name left
+        by an interrupted run is replaced.
+        """
+        partition = {"day": day.isoformat()} if day else {}
+        folder = self.path.joinpath(*(f"{key}={value}" for key, value in partition.items()))
+        target = folder / f"{name}.parquet"
+        temporary = folder / f"{TEMPORARY_PREFIX}{uuid.uuid4().hex}.parquet"
+        with storage_errors(target):
+            folder.mkdir(parents=True, exist_ok=True)
+            try:
+                self._write_parquet(rows, temporary)
+                temporary.replace(target)
+            finally:
+                temporary.unlink(missing_ok=True)
+            flush(folder)
+            size = target.stat().st_size
+        return AddAction(
+            path=str(target.relative_to(self.path)),
+            size=size,
+            partition_values=partition,
+            modification_time=_now_ms(),
+            data_change=True,
+            stats=json.dumps(_statistics(rows)),
+        )
+
+    def _write_parquet(self, rows: pa.Table, path: Path) -> None:
+        stored = rows.drop_columns(
+            [name for name in self.partition_by if name in rows.schema.names]
+        )
+        with path.open("wb") as file:
+            pq.write_table(stored, file, row_group_size=ROW_GROUP_ROWS, **self.encoding.options())
+            file.flush()
+            os.fsync(file.fileno())
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """One version of a table. Reading it is not disturbed by later commits."""
+
+    table: Table
+    delta: DeltaTable | None
+
+    @property
+    def version(self) -> int | None:
+        """Version of the Delta table; None before the first commit."""
+        return None if self.delta is None else self.delta.version()
+
+    @cached_property
+    def files(self) -> tuple[TableFile, ...]:
+        """Active files, sorted by path."""
+        if self.delta is None:
+            return ()
+        with storage_errors(self.table.path):
+            actions = pa.table(self.delta.get_add_actions(flatten=True)).to_pylist()
+        return tuple(sorted(map(_table_file, actions), key=lambda file: file.path))
+
+    @property
+    def paths(self) -> list[str]:
+        """Full paths of the active files, sorted."""
+        return [str(self.table.path / file.path) for file in self.files]
+
+    @property
+    def rows(self) -> int:
+        """Number of rows of all active files."""
+        return sum(file.rows for file in self.files)
+
+    @property
+    def size_bytes(self) -> int:
+        """Size of all active files."""
+        return sum(file.size_bytes for file in self.files)
+
+    def landed(self, unit_name: str) -> int | None:
+        """Return the version of a unit of work that has landed, or None."""
+        if self.delta is None:
+            return None
+        return self.delta.transaction_version(unit_name)
+
+    def commit(self, change: Change) -> None:
+        """Apply a change in one atomic commit on top of this snapshot.
+
+        Raises `ConflictError` if another process landed one of the same units meanwhile, and
+        `StorageError` if the log cannot be written.
+        """
+        with storage_errors(self.table.path):
+            delta = self.delta or _create(self.table)
+            try:
+                delta.create_write_transaction(
+                    [*change.add, *map(_remove_action, change.remove)],
+                    mode="append",
+                    schema=self.table.schema,
+                    partition_by=list(self.table.partition_by),
+                    commit_properties=CommitProperties(
+                        custom_metadata={"fleet_slip": json.dumps(dict(change.note))},
+                        app_transactions=[Transaction(u.name, u.version) for u in change.units],
+                    ),
+                )
+            except CommitFailedError as error:
+                raise ConflictError(
+                    f"{self.table.path}: another process changed the table at the same moment "
+                    f"({_first_line(error)}). Run the same command again."
+                ) from None
+
+
+def flush(folder: Path) -> None:
+    """Make renames inside a folder durable."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _create(table: Table) -> DeltaTable:
+    table.path.mkdir(parents=True, exist_ok=True)
+    return DeltaTable.create(
+        str(table.path),
+        schema=table.schema,
+        mode="ignore",
+        partition_by=list(table.partition_by),
+        name=table.path.name,
+        description=table.description,
+    )
+
+
+def _statistics(rows: pa.Table) -> dict[str, Any]:
+    nulls = {name: rows[name].null_count for name in rows.schema.names}
+    return {"numRecords": rows.num_rows, "nullCount": nulls}
+
+
+def _table_file(action: Mapping[str, Any]) -> TableFile:
+    prefix = "null_count."
+    return TableFile(
+        path=action["path"],
+        rows=action["num_records"],
+        size_bytes=action["size_bytes"],
+        null_counts={
+            key.removeprefix(prefix): value
+            for key, value in action.items()
+            if key.startswith(prefix) and value is not None
+        },
+        day=action.get("partition.day"),
+    )
+
+
+def _remove_action(file: TableFile) -> RemoveAction:
+    return RemoveAction(
+        path=file.path,
+        data_change=True,
+        deletion_timestamp=_now_ms(),
+        size=file.size_bytes,
+        partition_values={"day": file.day.isoformat()} if file.day else {},
+    )
+
+
+def _now_ms() -> int:
+    return int(time.time() * 1000)

@@ -1,0 +1,82 @@
+"""The warehouse of one data root: which tables it holds and how they are encoded."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import pyarrow as pa
+
+from fleet_slip.signals import SignalCatalogue, catalogue
+from fleet_slip.storage import Encoding, Table
+
+
+@dataclass(frozen=True)
+class Warehouse:
+    """The tables below a data root. Making one touches nothing on disk."""
+
+    root: Path
+
+    @property
+    def catalogue(self) -> SignalCatalogue:
+        """The signal catalogue of the logs."""
+        return catalogue()
+
+    @cached_property
+    def logs(self) -> Table:
+        """Counts at 100 Hz, partitioned by day; a file holds whole drives."""
+        signals = self.catalogue
+        return Table(
+            path=self.root / "logs",
+            schema=signals.log_schema,
+            encoding=Encoding(
+                dictionary=tuple(signals.drive),
+                delta_packed=("tick", *signals.signals),
+            ),
+            partition_by=("day",),
+            description="Logs of drives at 100 Hz as integer counts: physical = scale * count",
+        )
+
+    @cached_property
+    def grams(self) -> Table:
+        """One Gram row for each drive: n, sums and sums of products of counts."""
+        return Table(
+            path=self.root / "grams",
+            schema=gram_schema(self.catalogue),
+            encoding=Encoding(
+                dictionary=("feature_set", "file", "signals", *self.catalogue.drive),
+                compression="zstd",
+            ),
+            description="Gram rows: exact sums and sums of products of counts, one a drive",
+        )
+
+    @cached_property
+    def quarantine(self) -> Table:
+        """Rows of measured logs that were refused, with the reason."""
+        from fleet_slip.ingest.quarantine import QUARANTINE_SCHEMA  # noqa: PLC0415
+
+        return Table(
+            path=self.root / "quarantine",
+            schema=QUARANTINE_SCHEMA,
+            encoding=Encoding(dictionary=("file", "reason", "signal"), compression="zstd"),
+            description="Rows of measured logs that were refused, with the reason",
+        )
+
+
+def gram_schema(signals: SignalCatalogue) -> pa.Schema:
+    """Return the Arrow schema of the table `grams`.
+
+    `signals` names the signals that the drive has, separated by commas, in the order of `sums`;
+    `products` is the packed lower triangle, row by row: (0,0), (1,0), (1,1), (2,0), ...
+    """
+    return pa.schema(
+        [
+            ("feature_set", pa.string()),
+            ("file", pa.string()),
+            ("day", pa.date32()),
+            *signals.drive_schema,
+            ("signals", pa.string()),
+            ("n", pa.int64()),
+            ("sums", pa.list_(pa.int64())),
+            ("products", pa.list_(pa.int64())),
+        ]
+    )

@@ -1,0 +1,10 @@
+-- The Gram rows of a cohort. The condition may use any column of the view "drives".
+-- Rows without any signal serve no model. Sorted, so that the same cohort reads the same everywhere.
+SELECT
+    drive_id, vehicle_id, vehicle_model, source, campaign, track, mass_kg, adhesion, speed_factor, day,
+    signals, n, sums, products
+FROM grams
+WHERE feature_set = 'signals' AND signals <> '' AND (
+    {condition}
+)
+ORDER BY signals, drive_id

@@ -1,0 +1,12 @@
+-- One Gram row a drive: exact sums and sums of products of the counts (docs/architecture.md).
+CREATE VIEW grams AS
+SELECT
+    feature_set,
+    file,
+    day,
+    {drive_columns},
+    signals,
+    n,
+    sums,
+    products
+FROM {stored_grams}
