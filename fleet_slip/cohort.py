@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from fleet_slip.connection import connect
 from fleet_slip.database import database_errors, one_query
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import RefusedError, SelectionError
 from fleet_slip.gram import GramTable, packed_size
 from fleet_slip.regression.folds import Assignment, CohortFolds, by_hash, by_value
 from fleet_slip.resources import read_sql
@@ -28,7 +28,11 @@ FOLD_KEYS = {
 }
 """What a fold may be made of, and the column that tells."""
 
+SCENARIO = "scenario"
+"""Source of the drives that models are evaluated on, and must never be trained on."""
+
 ALL_DRIVES = "true"
+TRAINING_DRIVES = f"source <> '{SCENARIO}'"
 
 
 @dataclass(frozen=True)
@@ -70,10 +74,11 @@ def assign(values: Sequence[Any], by: str, count: int) -> Assignment:
     return by_value(values)
 
 
-def load_cohort(warehouse: Warehouse, condition: str = ALL_DRIVES) -> Cohort:
+def load_cohort(warehouse: Warehouse, condition: str = TRAINING_DRIVES) -> Cohort:
     """Read the Gram rows of the drives that satisfy a condition.
 
-    Raises `SelectionError` if the condition is not valid SQL or no drive satisfies it.
+    Raises `SelectionError` if the condition is not valid SQL or no drive satisfies it, and
+    `RefusedError` if a drive of an evaluation scenario does.
     """
     logs, grams = warehouse.logs.snapshot(), warehouse.grams.snapshot()
     if not grams.rows:
@@ -85,6 +90,11 @@ def load_cohort(warehouse: Warehouse, condition: str = ALL_DRIVES) -> Cohort:
         rows = _query(database, condition)
         if not rows.num_rows:
             raise SelectionError(_nothing(database, condition))
+    if SCENARIO in rows["source"].unique().to_pylist():
+        raise RefusedError(
+            f"the cohort {condition!r} has drives of evaluation scenarios, which no model may be "
+            f"trained on. Add to the condition: AND {TRAINING_DRIVES}"
+        )
     tables = tuple(
         _gram_table(signals, rows.filter(pc.equal(rows["signals"], signals)))
         for signals in rows["signals"].unique().to_pylist()

@@ -4,7 +4,7 @@ Each batch of drives is one file and one unit of work that lands exactly once: a
 interrupted job goes on with the batches that have not landed.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from dataclasses import dataclass
 from datetime import date
@@ -56,13 +56,23 @@ def simulate_campaign(
     executor: Executor,
     progress: Progress = lambda _rows, _all: None,
 ) -> SimulationReport:
-    """Simulate the batches of the given days that have not landed.
+    """Simulate what has not landed of the given days of a campaign; see `simulate_batches`."""
+    batches = [batch for day in days for batch in campaign.batches(day)]
+    return simulate_batches(warehouse, batches, executor, progress)
 
-    Raises `RefusedError` if a day was simulated from a different version of the campaign, and
+
+def simulate_batches(
+    warehouse: Warehouse,
+    batches: Sequence[Batch],
+    executor: Executor,
+    progress: Progress = lambda _rows, _all: None,
+) -> SimulationReport:
+    """Simulate the batches that have not landed, and land each.
+
+    Raises `RefusedError` if a batch's place was taken by a different version of it, and
     `StorageError` if the warehouse cannot be written.
     """
     snapshot = warehouse.logs.snapshot()
-    batches = [batch for day in days for batch in campaign.batches(day)]
     missing = [batch for batch in batches if not has_landed(snapshot, batch)]
     expected = sum(drive.expected_rows for batch in missing for drive in batch.drives)
     progress(0, expected)

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 import typer
 
 from fleet_slip.cli.output import Json, print_json, print_table, say, stdout
-from fleet_slip.cohort import ALL_DRIVES, load_cohort
+from fleet_slip.cohort import ALL_DRIVES, TRAINING_DRIVES, load_cohort
 from fleet_slip.errors import ConfigError
 from fleet_slip.model_list import (
     CandidateModel,
@@ -109,7 +109,7 @@ def run_selection(
 
 def select(
     context: typer.Context,
-    cohort: Cohort = ALL_DRIVES,
+    cohort: Cohort = TRAINING_DRIVES,
     models: Models = None,
     nested: Nested = None,
     by: FoldBy = None,
@@ -129,7 +129,7 @@ def print_selection(selection: Selection) -> None:
     where = selection.cohort.condition
     print_table(
         f"{selection.cohort.drives.num_rows:,} drives, {selection.cohort.rows:,} rows"
-        + ("" if where == ALL_DRIVES else f" where {where}")
+        + ("" if where == TRAINING_DRIVES else f" where {where}")
         + f"; {selection.folds.count} folds by {selection.folds.by}",
         ["model", "signals", "correlation", "RMSE deg", "mean deg", "std deg", "condition"],
         [
@@ -156,7 +156,7 @@ def print_selection(selection: Selection) -> None:
 def publish(
     context: typer.Context,
     name: Annotated[str, typer.Argument(help="Name of the model, such as sideslip.")],
-    cohort: Cohort = ALL_DRIVES,
+    cohort: Cohort = TRAINING_DRIVES,
     models: Models = None,
     nested: Nested = None,
     by: FoldBy = None,

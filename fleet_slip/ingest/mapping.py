@@ -1,7 +1,7 @@
 """The mapping of a measured log: which column is which signal, in which unit, with which sign."""
 
 import json
-from datetime import date
+from datetime import UTC, date, datetime
 from typing import Annotated
 
 import polars as pl
@@ -61,11 +61,8 @@ class TimeBase(Config):
     @field_validator("format")
     @classmethod
     def _format_is_known(cls, text: str | None) -> str | None:
-        try:
-            if text is not None:
-                pl.Series(["2000-01-01"]).str.to_datetime(text, strict=False)
-        except (pl.exceptions.PolarsError, pl.exceptions.PanicException):
-            raise ValueError(f"{text!r} is not a strftime format for a timestamp") from None
+        if text is not None and not _reads_back(text):
+            raise ValueError(f"{text!r} is not a strftime format with date and time")
         return text
 
     @model_validator(mode="after")
@@ -158,6 +155,17 @@ class Mapping(Config):
     def canonical_json(self) -> str:
         """The mapping as JSON that does not depend on the order or layout of its TOML file."""
         return json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
+
+
+def _reads_back(timestamp_format: str) -> bool:
+    """Whether a moment that is written in this format can be read, to the minute."""
+    moment = datetime(2024, 5, 31, 12, 34, tzinfo=UTC)
+    try:
+        written = pl.Series([moment]).dt.to_string(timestamp_format)
+        read = written.str.to_datetime(timestamp_format, strict=False)[0]
+    except (pl.exceptions.PolarsError, pl.exceptions.PanicException):
+        return False
+    return isinstance(read, datetime) and read.replace(tzinfo=UTC) == moment
 
 
 def load_mapping(name_or_path: str) -> Mapping:

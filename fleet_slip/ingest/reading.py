@@ -14,6 +14,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
+import numpy as np
 import polars as pl
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -176,9 +177,7 @@ def _whole_lines(stream: BinaryIO, file: Path) -> Iterator[bytes]:
     rest = b""
     while block := stream.read(BLOCK_BYTES):
         block = rest + block
-        end = block.rfind(b"\n") + 1
-        if block.count(b'"', 0, end) % 2:
-            end = block.rfind(b"\n", 0, block.rfind(b'"', 0, end)) + 1
+        end = _end_of_lines(block)
         if not end and len(block) > 2 * BLOCK_BYTES:
             raise InputError(
                 f"{shown(file)}: a line is longer than {BLOCK_BYTES:,} bytes. "
@@ -191,6 +190,17 @@ def _whole_lines(stream: BinaryIO, file: Path) -> Iterator[bytes]:
     if rest:
         _decode(rest, file)
         yield rest
+
+
+def _end_of_lines(block: bytes) -> int:
+    """Return where the last whole line ends: behind a line break with no open quote before it."""
+    end = block.rfind(b"\n") + 1
+    if block.count(b'"', 0, end) % 2 == 0:
+        return end
+    characters = np.frombuffer(block[:end], dtype=np.uint8)
+    open_quote = np.logical_xor.accumulate(characters == ord('"'))
+    ends = np.flatnonzero((characters == ord("\n")) & ~open_quote)
+    return int(ends[-1]) + 1 if ends.size else 0
 
 
 def _decode(block: bytes, file: Path) -> str:
