@@ -54,7 +54,7 @@ class DriveSpec:
     @property
     def expected_rows(self) -> int:
         """Rows of the drive if the car holds its target speed."""
-        time_s = self.laps * self.profile.lap_time_s / self.speed_factor
+        time_s = self.profile.time_s(self.laps) / self.speed_factor
         return math.ceil(time_s * SAMPLE_RATE_HZ)
 
     def generator(self) -> np.random.Generator:

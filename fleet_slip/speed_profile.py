@@ -35,13 +35,19 @@ class SpeedProfile:
     station_m: NDArray[np.float64]
     speed_mps: NDArray[np.float64]
 
-    @property
-    def lap_time_s(self) -> float:
-        """Time of one lap or run, in s, at constant acceleration between the stations."""
-        speed = self.speed_mps
+    def time_s(self, laps: float) -> float:
+        """Return the time from the start over so many laps, or over a part of one, in s.
+
+        Between the stations the acceleration is constant.
+        """
+        station, speed = self.station_m, self.speed_mps
         if self.track.closed:
-            speed = np.append(speed, speed[0])
-        return float(np.sum(2 * self.spacing_m / (speed[:-1] + speed[1:])))
+            station, speed = np.append(station, self.track.length_m), np.append(speed, speed[0])
+        steps = 2 * np.diff(station) / (speed[:-1] + speed[1:])
+        passed = np.append(0.0, np.cumsum(steps))
+        whole, part = divmod(laps, 1)
+        rest = np.interp(part * self.track.length_m, station, passed)
+        return float(whole * passed[-1] + rest)
 
 
 def speed_profile(track: Track, limits: SpeedLimits, spacing_m: float) -> SpeedProfile:

@@ -123,7 +123,18 @@ def test_skid_pad_is_driven_at_the_root_of_lateral_acceleration_times_radius() -
     )
     profile = speed_profile(TRACKS["skid_pad"], plan, 1.0)
     assert np.allclose(profile.speed_mps, np.sqrt(4.5 * 50.0))
-    assert profile.lap_time_s == pytest.approx(314.159265 / 15.0)
+    for laps in (0.25, 1, 2.5):
+        assert profile.time_s(laps) == pytest.approx(laps * 314.159265 / 15.0)
+
+
+def test_time_of_a_run_from_slow_to_fast_is_that_of_constant_acceleration() -> None:
+    plan = SpeedLimits(
+        lateral_mps2=6.0, acceleration_mps2=2.0, braking_mps2=3.0, top_speed_mps=100.0
+    )
+    profile = speed_profile(S_BEND, plan, 1.0)
+    first, last = profile.speed_mps[[-201, -1]]
+    part = 1 - 200.0 / S_BEND.length_m
+    assert profile.time_s(1) - profile.time_s(part) == pytest.approx((last - first) / 2.0)
 
 
 def test_braking_into_a_bend_is_a_parabola_in_speed() -> None:
