@@ -1,0 +1,86 @@
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fleet_slip.errors import ConfigError
+from fleet_slip.ingest import load_mapping
+from fleet_slip.resources import config_names
+
+GOOD = """
+name = "car"
+time = { column = "t", unit = "s" }
+drive = { day = 2024-05-31, vehicle_id = "v", vehicle_model = "m" }
+[signals]
+ax = { column = "a", unit = "g", negate = true, offset = 0.5 }
+steer_fl = { column = "steer_fl_deg", unit = "deg" }
+"""
+
+
+def load(folder: Path, text: str) -> Any:
+    file = folder / "m.toml"
+    file.write_text(text, encoding="utf-8")
+    return load_mapping(str(file))
+
+
+def test_shipped_mappings_load() -> None:
+    names = config_names("mappings")
+    assert "race_car_250lm" in names
+    assert [load_mapping(name).name for name in names] == names
+
+
+def test_gain_and_bias_apply_sign_then_offset_then_unit(tmp_path: Path) -> None:
+    gain, bias = load(tmp_path, GOOD).linear("ax")
+    assert (gain, bias) == pytest.approx((-9.80665, 0.5 * 9.80665))
+
+
+def test_columns_are_listed_once(tmp_path: Path) -> None:
+    text = GOOD.replace('"m" }', '{ column = "a" }, column = "run" }')
+    assert load(tmp_path, text).columns() == ["t", "run", "a", "steer_fl_deg"]
+
+
+def test_canonical_json_does_not_depend_on_the_layout(tmp_path: Path) -> None:
+    head, ax, steer = GOOD.rpartition("ax =")[0], *GOOD.splitlines()[-2:]
+    turned = f"# a comment\n{head}{steer}\n{ax.replace('0.5', '0.50')}"
+    assert load(tmp_path, turned).canonical_json() == load(tmp_path, GOOD).canonical_json()
+    other = GOOD.replace("true", "false")
+    assert load(tmp_path, other).canonical_json() != load(tmp_path, GOOD).canonical_json()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('"deg"', '"km/h"', "steer_fl_deg is in 'km/h', steer_fl needs an angle"),
+        ('"deg"', '"smoot"', "'smoot', which is not a known unit; steer_fl needs an angle"),
+        ("steer_fl =", "steer =", "unknown signal 'steer'. Known signals: ax, ay"),
+        ("negate", "negat", "signals.ax.negat: unknown key"),
+        ('unit = "s"', 'unit = "m"', "t is in 'm', but it needs a time"),
+        ('unit = "s"', "rate_hz = 100", "either 'column' or 'rate_hz'"),
+        ('unit = "s"', 'unit = "s", format = "%s"', "give one of them"),
+        ('unit = "s"', 'format = "%Q nonsense"', "not a strftime format"),
+        ('unit = "s"', 'unit = "s", split_gap_s = 0.01', "longest_gap_s cannot be larger"),
+        ('unit = "s"', 'unit = "s", longest_gap_s = nan', "time.longest_gap_s"),
+        ("day = 2024-05-31, ", "", "drive.day is needed"),
+        ("2024-05-31", '"tomorrow"', "drive.day"),
+        ('vehicle_id = "v"', "mass_kg = -1", "drive.vehicle_id: Field required; drive.mass_kg"),
+        ("0.5", "inf", "signals.ax.offset"),
+        ('"car"', '"Car; --"', "name: String should match"),
+        ("time =", "csv = { decimal_comma = true }\ntime =", "the separator cannot be ','"),
+        ("time =", "csv = { separator = '--' }\ntime =", "one ASCII character"),
+        ("[signals]", "[signal]", "signals: Field required"),
+    ],
+)
+def test_mistakes_are_named_by_file_key_and_reason(
+    tmp_path: Path, old: str, new: str, message: str
+) -> None:
+    assert old in GOOD
+    with pytest.raises(ConfigError) as caught:
+        load(tmp_path, GOOD.replace(old, new))
+    assert "m.toml" in str(caught.value)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_unknown_name_lists_the_known_ones() -> None:
+    with pytest.raises(ConfigError, match="race_car_250lm"):
+        load_mapping("no_such_mapping")

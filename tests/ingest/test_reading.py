@@ -1,0 +1,204 @@
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from fleet_slip.errors import InputError
+from fleet_slip.ingest import read_measured, reading
+
+from .samples import a_mapping, csv_text, good_columns, read_text, reasons, ticks
+
+GOOD = csv_text(good_columns())
+
+
+def failure(file: Path) -> str:
+    with pytest.raises(InputError) as caught:
+        read_measured(file, a_mapping())
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+def write(folder: Path, data: bytes, name: str = "log.csv") -> Path:
+    file = folder / name
+    file.write_bytes(data)
+    return file
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda text: b"\xef\xbb\xbf" + text,
+        lambda text: text.replace(b"\n", b"\r\n"),
+        lambda text: text.rstrip(),
+        lambda text: text.replace(b",", b" , "),
+        lambda text: b"\n".join(b'"' + line.replace(b",", b'","') + b'"' for line in text.split()),
+        lambda text: text.replace(b"\n", b",\n"),  # a separator at each line's end
+        lambda text: text.replace(b"\n", b",\xc3\xa9\n"),
+    ],
+    ids=["bom", "crlf", "no final newline", "blanks", "quoted", "trailing separator", "utf-8"],
+)
+def test_dialects_read_alike(tmp_path: Path, change: Callable[[bytes], bytes]) -> None:
+    plain = read_text(tmp_path, GOOD).drives.drop_columns("drive_id")
+    other = read_text(tmp_path, change(GOOD.encode())).drives.drop_columns("drive_id")
+    assert other.equals(plain)
+
+
+def test_semicolons_and_decimal_commas(tmp_path: Path) -> None:
+    mapping = a_mapping(csv={"separator": ";", "decimal_comma": True})
+    text = GOOD.replace(",", ";").replace(".", ",")
+    got = read_text(tmp_path, text, mapping).drives.drop_columns("drive_id")
+    assert got.equals(read_text(tmp_path, GOOD).drives.drop_columns("drive_id"))
+
+
+def test_csv_and_parquet_give_the_same_counts(tmp_path: Path) -> None:
+    columns = {name: np.array(values, dtype=float) for name, values in good_columns().items()}
+    pq.write_table(pa.table(columns), tmp_path / "log.parquet")
+    binary = read_measured(tmp_path / "log.parquet", a_mapping())
+    text = read_text(tmp_path, GOOD)
+    assert binary.drives.drop_columns("drive_id").equals(text.drives.drop_columns("drive_id"))
+    assert binary.digest != text.digest
+
+
+def test_blocks_are_cut_at_lines_and_not_within_quotes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    columns = good_columns(200)
+    columns["note"] = ['"a\nb ""c""\n"' if i % 3 else "é" for i in range(200)]
+    text = csv_text(columns)
+    whole = read_text(tmp_path, text)
+    for size in (32, 61, 100):
+        monkeypatch.setattr(reading, "BLOCK_BYTES", size)
+        pieces = read_text(tmp_path, text)
+        assert pieces.drives.equals(whole.drives)
+        assert pieces.counts == whole.counts
+    assert ticks(whole) == list(range(200))
+
+
+def test_a_line_with_more_fields_than_the_header_is_quarantined(tmp_path: Path) -> None:
+    lines = GOOD.splitlines()
+    lines[4] += ",7,8,9"
+    log = read_text(tmp_path, "\n".join(lines))
+    assert reasons(log) == [(4, "extra_fields", None)]
+    assert log.quarantine["value"].to_pylist() == ["7"]
+
+
+def test_other_columns_may_have_one_name(tmp_path: Path) -> None:
+    assert read_text(tmp_path, GOOD.replace("beta", "beta,x,x")).counts.rows_kept == 20
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"", "it is empty"),
+        (b"\n\n", "its first line is empty"),
+        (b"t,ax,beta\n", "a header and no rows"),
+        (b"t,ax,ax,beta\n0,1,2,3\n", "2 columns are called 'ax' (number 2, 3)"),
+        (b"t,AX,beta_deg\n0,1,2\n", "no column 'ax'. Did the mapping mean 'AX'? Its columns are"),
+        (b"t,ax,beta\n0,1\xe92,3\n", "not UTF-8, near"),
+        ("t,ax,beta\n0,1,2\n".encode("utf-16"), "binary or UTF-16"),
+        (b"\x1f\x8b\x08\x00" + b"\xab" * 50, "UTF-8"),
+        (b"t" * 2_000_000, "the header is longer than"),
+        (b"t,ax,beta" + b",x" * 20_000 + b"\n", "20,003 columns, at most 10,000"),
+        (b't,ax,"beta\n0,1,2\n', "its header is not CSV"),
+        (b't,ax,beta\n0,1,"2\n0.01,3,4\n', "cannot be read"),
+        (b"t,ax,beta\n" + b"x,y,z\n" * 9, "none of its 9 rows is usable (9 not_a_number; first: "),
+    ],
+)
+def test_broken_csv_is_refused_in_one_line(tmp_path: Path, data: bytes, message: str) -> None:
+    assert message in failure(write(tmp_path, data))
+
+
+def test_a_line_without_end_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reading, "BLOCK_BYTES", 1000)
+    data = b't,ax,beta\n0,1,"' + b"2\n" * 5000
+    assert "Is a quote not closed?" in failure(write(tmp_path, data))
+
+
+def test_paths_that_are_no_files_are_refused(tmp_path: Path) -> None:
+    assert "no such file" in failure(tmp_path / "absent.csv")
+    assert "not a regular file" in failure(tmp_path)
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    assert "no such file" in failure(tmp_path / "loop")
+
+
+@pytest.mark.parametrize("name", ["*.csv", "a\nb'.csv", "x'; DROP TABLE logs; --", "é.csv"])
+def test_a_file_name_is_only_a_name(tmp_path: Path, name: str) -> None:
+    log = read_measured(write(tmp_path, GOOD.encode() + b"oops,1,2\n", name), a_mapping())
+    assert log.quarantine["file"].to_pylist() == [name]
+    failure(tmp_path / (name + "absent"))
+
+
+@pytest.mark.parametrize("name", ["^.*$", "*", "raw t", "'; DROP TABLE logs; --", "a.b", "row"])
+def test_a_column_name_is_only_a_name(tmp_path: Path, name: str) -> None:
+    columns: dict[str, Any] = good_columns()
+    columns[name] = columns.pop("ax")
+    mapping = a_mapping(signals={"ax": {"column": name, "unit": "m/s^2"}})
+    log = read_text(tmp_path, csv_text(columns), mapping)
+    assert log.drives["ax"].to_pylist()[:2] == [-1000, -900]
+    table = pa.table({key: np.array(values, dtype=float) for key, values in columns.items()})
+    pq.write_table(table, tmp_path / "log.parquet")
+    binary = read_measured(tmp_path / "log.parquet", mapping)
+    assert binary.drives["ax"].equals(log.drives["ax"])
+
+
+def parquet(folder: Path, **columns: Any) -> Path:
+    table = {"t": np.arange(20) / 100, "ax": np.ones(20), "beta": np.ones(20), **columns}
+    pq.write_table(pa.table(table), folder / "log.parquet")
+    return folder / "log.parquet"
+
+
+def test_parquet_types_that_are_numbers(tmp_path: Path) -> None:
+    whole = pa.array(range(20))
+    for numbers in (
+        whole.cast(pa.int8()),
+        whole.cast(pa.uint64()),
+        whole.cast(pa.float32()),
+        whole.cast(pa.decimal128(21, 2)),
+        whole.cast(pa.string()),
+        whole.cast(pa.large_string()),
+        whole.dictionary_encode(),
+        whole.cast(pa.string()).dictionary_encode(),
+    ):
+        log = read_measured(parquet(tmp_path, ax=numbers), a_mapping())
+        assert log.drives["ax"].to_pylist() == [1000 * i for i in range(20)]
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (pa.array([True] * 20), "has the type bool"),
+        (pa.array([{"b": 1}] * 20), "has the type struct"),
+        (pa.array([[1.0]] * 20), "has the type list"),
+        (pa.array([b"1"] * 20), "has the type binary"),
+        (pa.array([1] * 20, pa.timestamp("ms")), "the mapping needs numbers"),
+        (pa.array(["9" * 5000] * 20), "texts of 5,000 characters"),
+    ],
+)
+def test_parquet_types_that_are_no_numbers(tmp_path: Path, values: pa.Array, message: str) -> None:
+    assert message in failure(parquet(tmp_path, ax=values))
+
+
+def test_an_all_null_column_is_an_absent_signal(tmp_path: Path) -> None:
+    log = read_measured(parquet(tmp_path, ax=pa.nulls(20)), a_mapping())
+    assert log.drives["ax"].null_count == 20
+    assert log.counts.rows_kept == 20
+
+
+def test_broken_parquet_is_refused(tmp_path: Path) -> None:
+    data = parquet(tmp_path).read_bytes()
+    assert "is truncated" in failure(write(tmp_path, data[:-20], "cut.parquet"))
+    assert "is truncated" in failure(write(tmp_path, data[:4]))
+    assert "not a Parquet file" in failure(write(tmp_path, GOOD.encode(), "text.parquet"))
+    assert "footer is too large" in failure(write(tmp_path, b"PAR1" + b"\xff" * 20 + b"PAR1"))
+    assert "cannot be read" in failure(write(tmp_path, b"PAR1\0\0\0\0\x04\0\0\0PAR1"))
+
+
+def test_more_rows_than_fit_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reading, "MAX_ROWS", 19)
+    assert "20 rows, at most 19" in failure(parquet(tmp_path))
+    assert "more than 19 rows" in failure(write(tmp_path, GOOD.encode()))
