@@ -1,1 +1,1 @@
-"""The simulated car: parameters, tyre, equations of motion, driver, highway-env class and batch kernel."""
+"""The simulated car: parameters, equations of motion, driver, highway-env class, batch kernel."""

@@ -11,20 +11,17 @@ from fleet_slip.vehicle.compiling import equation
 from fleet_slip.vehicle.parameters import Constants
 from fleet_slip.vehicle.state import Controls, State
 from fleet_slip.vehicle.wheels import (
-    Loads,
+    Acceleration,
     WheelForces,
     WheelRate,
     ackermann_tangents,
     build_wheel_forces,
-    driven_spin,
-    free_spin,
+    driven_spins,
+    free_spins,
     parallel_tangents,
     static_loads,
     transferred_loads,
 )
-
-SLOWEST_DRIVE_MPS = 1.0
-"""Speed below which the engine's power no longer limits its force."""
 
 
 class Extensions(NamedTuple):
@@ -63,18 +60,8 @@ class Derivative(NamedTuple):
     """Lateral specific force v̇y + r vx."""
 
 
-class Acceleration(NamedTuple):
-    """Specific force at the centre of gravity and the rates of the body's motion."""
-
-    ax: float
-    ay: float
-    vx: float
-    vy: float
-    yaw_rate: float
-
-
 @equation
-def _driven_body(x: State, u: Controls, force: WheelForces, c: Constants) -> Acceleration:
+def _driven_body(x: State, _u: Controls, force: WheelForces, c: Constants) -> Acceleration:
     """Newton and Euler in the car's frame: m (v̇ + ω × v) = ΣF, I ṙ = ΣM."""
     air = c.drag_per_mass * abs(x.vx) * x.vx
     x_front, x_rear = force.fl.x + force.fr.x, force.rl.x + force.rr.x
@@ -112,28 +99,7 @@ def build_derivative(extensions: Extensions) -> Callable[[State, Controls, Const
     loads = transferred_loads if extensions.load_transfer else static_loads
     forces = build_wheel_forces(extensions.brush_tyres, extensions.drivetrain)
     body = _driven_body if extensions.drivetrain else _commanded_body
-    spin = driven_spin if extensions.drivetrain else free_spin
-
-    @equation
-    def spins(
-        x: State, force: WheelForces, load: Loads, motion: Acceleration, c: Constants
-    ) -> tuple[WheelRate, WheelRate, WheelRate, WheelRate]:
-        strongest = c.power_per_mass / max(abs(x.vx), SLOWEST_DRIVE_MPS)
-        drive = c.mass * min(max(x.traction, 0.0), strongest)
-        brake = c.mass * max(-x.traction, 0.0)
-        drive_f, drive_r = c.drive_front * drive, c.drive_rear * drive
-        brake_f, brake_r = c.brake_front * brake, c.brake_rear * brake
-        turn_f = c.half_track_front * motion.yaw_rate
-        turn_r = c.half_track_rear * motion.yaw_rate
-        side_f = motion.vy + c.front * motion.yaw_rate
-        hub_fl = force.fl.cosine * (motion.vx - turn_f) + force.fl.sine * side_f
-        hub_fr = force.fr.cosine * (motion.vx + turn_f) + force.fr.sine * side_f
-        return (
-            spin(force.fl, x.wheel_fl, load.fl, drive_f, brake_f, hub_fl, c),
-            spin(force.fr, x.wheel_fr, load.fr, drive_f, brake_f, hub_fr, c),
-            spin(force.rl, x.wheel_rl, load.rl, drive_r, brake_r, motion.vx - turn_r, c),
-            spin(force.rr, x.wheel_rr, load.rr, drive_r, brake_r, motion.vx + turn_r, c),
-        )
+    spins = driven_spins if extensions.drivetrain else free_spins
 
     @equation
     def derivative(x: State, u: Controls, c: Constants) -> Derivative:
@@ -157,7 +123,7 @@ def build_derivative(extensions: Extensions) -> Callable[[State, Controls, Const
             motion.ay,
         )
 
-    return derivative  # type: ignore[no-any-return]
+    return derivative
 
 
 derivative = build_derivative(Extensions())

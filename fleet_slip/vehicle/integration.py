@@ -1,8 +1,9 @@
 """One step in time, of second order, with one evaluation of the equations.
 
-The car is stepped explicitly (Adams-Bashforth; the actuators by their Taylor series), its wheels linearly implicitly (SBDF2, Ascher, Ruuth
-and Wetton 1995, "Implicit-explicit methods for time-dependent partial differential equations"): the
-tyre holds a wheel's spin so stiffly that an explicit step would have to be far shorter.
+The car is stepped explicitly (Adams-Bashforth; the actuators by their Taylor series), its wheels
+linearly implicitly (SBDF2; Ascher, Ruuth and Wetton 1995, "Implicit-explicit methods for
+time-dependent partial differential equations"): the tyre holds a wheel's spin so stiffly that an
+explicit step would have to be far shorter.
 """
 
 from typing import NamedTuple

@@ -42,9 +42,9 @@ NOBODY = -1
 
 PLAN = np.dtype(
     [
-        ("first", np.int64),  # index of the road's first entry in the tables
-        ("entries", np.int64),
-        ("spacing_m", np.float64),
+        ("first", np.int64),  # index of the road's first entry in the table of all roads
+        ("last", np.int64),
+        ("inverse_spacing", np.float64),
         ("length_m", np.float64),
         ("closed", np.bool_),
         ("distance_m", np.float64),
@@ -52,6 +52,15 @@ PLAN = np.dtype(
     ]
 )
 """What the kernel knows of a drive."""
+
+CURVATURE, SPEED, ACCELERATION = range(3)
+"""Columns of the table of all roads: curvature, target speed, target acceleration."""
+
+DRIVE, TICK, LAP = range(3)
+"""Rows of the book of lanes: which drive a lane carries, its next sample and its lap."""
+
+SAMPLES, LOST = range(2)
+"""Columns of the result: number of samples of a drive, and the tick of its loss or `NOBODY`."""
 
 CHANNELS = (
     "ax_mps2",
@@ -86,53 +95,56 @@ CAR = ORDER + 1
 HANDLING = CAR + len(Constants._fields)
 ROWS = HANDLING + len(Handling._fields)
 
-
-@equation
-def _between(table: Any, first: int, plan: Any, station: float) -> tuple[float, float]:
-    """Return the value of a road's table at a station, and its slope per metre."""
-    place = station / plan.spacing_m
-    if plan.closed:
-        cell = math.floor(place)
-        share = place - cell
-        here = int(cell) % plan.entries
-        there = (here + 1) % plan.entries
-    else:
-        here = min(max(int(math.floor(place)), 0), plan.entries - 2)
-        there = here + 1
-        share = min(max(place - here, 0.0), 1.0)
-    low, high = table[first + here], table[first + there]
-    return low + share * (high - low), (high - low) / plan.spacing_m
+STEER = Constants._fields.index("steer_per_wheel")
+ACKERMANN = Constants._fields.index("ackermann")
 
 
 @equation
-def _look_up(
-    curvature: Any, speed: Any, gain: Any, plan: Any, x: State, station: float, lost: bool
-) -> Path:
+def _place(plan: Any, station: float) -> tuple[int, float]:
+    """Return the entry at or before a station, and how far towards the next the station is.
+
+    A closed road's entries are continued beyond its length by what a driver sees ahead.
+    """
+    place = station * plan.inverse_spacing
+    entry = min(max(math.floor(place), 0), plan.last - plan.first - 1)
+    return plan.first + entry, min(max(place - entry, 0.0), 1.0)
+
+
+@equation
+def _look_up(roads: Any, plan: Any, x: State, station: float, lost: bool) -> Path:
     """Return what the driver sees of the road from a station."""
-    first = plan.first
-    here, slope = _between(curvature, first, plan, station)
-    ahead, _ = _between(curvature, first, plan, station + STEERING_PREVIEW_S * x.vx)
-    soon = station + SPEED_PREVIEW_S * x.vx
-    target, _ = _between(speed, first, plan, soon)
-    rise, _ = _between(gain, first, plan, soon)
-    return Path(station, here, slope, ahead, target, rise, 1.0 if lost else 0.0)
+    here, share = _place(plan, station)
+    curvature = roads[here, CURVATURE]
+    change = roads[here + 1, CURVATURE] - curvature
+    ahead, part = _place(plan, station + STEERING_PREVIEW_S * x.vx)
+    soon, bit = _place(plan, station + SPEED_PREVIEW_S * x.vx)
+    return Path(
+        station,
+        curvature + share * change,
+        change * plan.inverse_spacing,
+        (1.0 - part) * roads[ahead, CURVATURE] + part * roads[ahead + 1, CURVATURE],
+        (1.0 - bit) * roads[soon, SPEED] + bit * roads[soon + 1, SPEED],
+        (1.0 - bit) * roads[soon, ACCELERATION] + bit * roads[soon + 1, ACCELERATION],
+        1.0 if lost else 0.0,
+    )
 
 
 @equation
-def _begin(memory: Any, lane: int, plan: Any, car: Any, start_speed: float) -> None:
-    """Put a drive on a lane: rolling straight along the line at a speed."""
+def _clear(memory: Any, lane: int) -> None:
+    """Let nothing stand on a lane: a car at rest."""
     for row in range(ROWS):
         memory[row * LANES + lane] = 0.0
+
+
+@equation
+def _begin(memory: Any, lane: int, car: Any, speed: float) -> None:
+    """Put a drive on a lane: rolling straight along the line at a speed."""
+    _clear(memory, lane)
     for row in range(len(car)):
         memory[(CAR + row) * LANES + lane] = car[row]
-    c = read(memory, CAR, lane, Constants)
-    spin = start_speed * c.inverse_radius
-    write(
-        memory,
-        STATE,
-        lane,
-        State(start_speed, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, spin, spin, spin, spin),
-    )
+    spin = speed * read(memory, CAR, lane, Constants).inverse_radius
+    start = State(speed, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, spin, spin, spin, spin)
+    write(memory, STATE, lane, start)
     write(memory, POSE, lane, Pose(0.0, 0.0, 1.0, 0.0))
 
 
@@ -185,28 +197,72 @@ def _has_lost(x: State, pose: Pose) -> bool:
 
 
 @equation
-def _record(out: Any, tick: int, x: State, pose: Pose) -> None:
-    """Write the sample that begins a step; the specific force follows from the step itself."""
-    out[2, tick] = x.yaw_rate
-    out[3, tick] = x.steering_wheel
-    out[4, tick] = x.wheel_fl
-    out[5, tick] = x.wheel_fr
-    out[6, tick] = x.wheel_rl
-    out[7, tick] = x.wheel_rr
-    out[11, tick] = x.vx
-    out[12, tick] = x.vy
-    out[13, tick] = pose.station
-    out[14, tick] = pose.offset
+def _record(truth: Any, drive: int, tick: int, x: State, pose: Pose) -> None:
+    """Write the sample that begins here, but for the specific force, which the next step gives."""
+    truth[drive, 2, tick] = x.yaw_rate
+    truth[drive, 3, tick] = x.steering_wheel
+    truth[drive, 4, tick] = x.wheel_fl
+    truth[drive, 5, tick] = x.wheel_fr
+    truth[drive, 6, tick] = x.wheel_rl
+    truth[drive, 7, tick] = x.wheel_rr
+    truth[drive, 11, tick] = x.vx
+    truth[drive, 12, tick] = x.vy
+    truth[drive, 13, tick] = pose.station
+    truth[drive, 14, tick] = pose.offset
 
 
 @equation
-def _finish(out: Any, samples: int, c: Constants) -> None:
+def _look(memory: Any, book: Any, plans: Any, roads: Any, truth: Any, ended: Any) -> None:
+    """Record where all cars are and look up the road before them."""
+    for lane in range(LANES):
+        drive, tick = book[DRIVE, lane], book[TICK, lane]
+        if drive != NOBODY:
+            x = read(memory, STATE, lane, State)
+            pose = read(memory, POSE, lane, Pose)
+            if ended[drive, LOST] == NOBODY and _has_lost(x, pose):
+                ended[drive, LOST] = tick
+            _record(truth, drive, tick, x, pose)
+            lost = ended[drive, LOST] != NOBODY
+            write(memory, PATH, lane, _look_up(roads, plans[drive], x, pose.station, lost))
+
+
+@equation
+def _move_on(memory: Any, book: Any, plans: Any, truth: Any, ended: Any) -> int:
+    """Count the sample and the laps of all cars; return the number of drives that end here."""
+    finished = 0
+    for lane in range(LANES):
+        drive, tick = book[DRIVE, lane], book[TICK, lane]
+        if drive != NOBODY:
+            plan = plans[drive]
+            truth[drive, 0, tick] = memory[FORCE * LANES + lane]
+            truth[drive, 1, tick] = memory[(FORCE + 1) * LANES + lane]
+            station = memory[POSE * LANES + lane]
+            gone = book[LAP, lane] * plan.length_m + station
+            if plan.closed:
+                lap = 1 if station >= plan.length_m else -1 if station < 0.0 else 0
+                book[LAP, lane] += lap
+                memory[POSE * LANES + lane] = station - lap * plan.length_m
+            book[TICK, lane] = tick + 1
+            lost = ended[drive, LOST]
+            given_up = lost != NOBODY and tick >= lost + AFTER_LOSS
+            if given_up or gone >= plan.distance_m or tick + 1 == plan.samples:
+                ended[drive, SAMPLES] = tick + 1
+                book[DRIVE, lane] = NOBODY
+                finished += 1
+    return finished
+
+
+@equation
+def _finish(truth: Any, ended: Any, cars: Any) -> None:
     """Fill in what follows from the recorded: the road wheels' angles and the side-slip angle."""
-    for tick in range(samples):
-        tangent = c.steer_per_wheel * out[3, tick]
-        out[8, tick] = arctan2(tangent, 1.0 - c.ackermann * tangent)
-        out[9, tick] = arctan2(tangent, 1.0 + c.ackermann * tangent)
-        out[10, tick] = arctan2(out[12, tick], out[11, tick])
+    for drive in range(len(truth)):
+        steer = cars[drive, STEER]
+        ackermann = cars[drive, ACKERMANN]
+        for tick in range(ended[drive, SAMPLES]):
+            tangent = steer * truth[drive, 3, tick]
+            truth[drive, 8, tick] = arctan2(tangent, 1.0 - ackermann * tangent)
+            truth[drive, 9, tick] = arctan2(tangent, 1.0 + ackermann * tangent)
+            truth[drive, 10, tick] = arctan2(truth[drive, 12, tick], truth[drive, 11, tick])
 
 
 def _compile(sources: str) -> Callable[..., NDArray[np.int64]]:
@@ -214,82 +270,42 @@ def _compile(sources: str) -> Callable[..., NDArray[np.int64]]:
 
     @numba.njit(cache=True, nogil=True, error_model="numpy")
     def simulate(
-        plans: Any,
-        cars: Any,
-        curvature: Any,
-        speed: Any,
-        gain: Any,
-        queue: Any,
-        steps: int,
-        truth: Any,
+        plans: Any, cars: Any, roads: Any, queue: Any, steps: int, truth: Any
     ) -> NDArray[np.int64]:
-        """Fill `truth` (drives, channels, samples); return the samples and loss tick of each.
+        """Fill `truth` (drives, channels, samples); return samples and loss tick of each drive.
 
-        `plans` are of dtype `PLAN`, into the tables of the roads' `curvature`, target `speed` and
-        its `gain` in time; `cars` has `Constants` and `Handling` in rows; `queue` is the
-        order in which drives get a lane; `steps` is the number of steps per sample.
+        `plans` are of dtype `PLAN` and point into the table `roads`; `cars` has `Constants` and
+        `Handling` in rows; drives get a lane in the order of `queue`; a sample takes `steps` steps.
         """
         _ = sources
         ended = np.full((len(plans), 2), NOBODY)
         memory = np.zeros(ROWS * LANES)
-        drive = np.full(LANES, NOBODY)
-        tick = np.zeros(LANES, np.int64)
-        laps = np.zeros(LANES, np.int64)
+        book = np.full((3, LANES), NOBODY)
         waiting = 0
         running = 0
         while True:
             for lane in range(LANES):
-                if drive[lane] == NOBODY and waiting < len(queue):
-                    now = queue[waiting]
+                if book[DRIVE, lane] == NOBODY and waiting < len(queue):
+                    drive = queue[waiting]
+                    _begin(memory, lane, cars[drive], roads[plans[drive].first, SPEED])
+                    book[DRIVE, lane], book[TICK, lane], book[LAP, lane] = drive, 0, 0
                     waiting += 1
                     running += 1
-                    drive[lane], tick[lane], laps[lane] = now, 0, 0
-                    start = speed[plans[now].first]
-                    _begin(memory, lane, plans[now], cars[now], start)
-
+                elif book[DRIVE, lane] == NOBODY:
+                    _clear(memory, lane)
             if running == 0:
+                _finish(truth, ended, cars)
                 return ended
-            for lane in range(LANES):
-                now = drive[lane]
-                if now == NOBODY:
-                    continue
-                x = read(memory, STATE, lane, State)
-                pose = read(memory, POSE, lane, Pose)
-                if ended[now, 1] == NOBODY and _has_lost(x, pose):
-                    ended[now, 1] = tick[lane]
-                _record(truth[now], tick[lane], x, pose)
-                lost = ended[now, 1] != NOBODY
-                path = _look_up(curvature, speed, gain, plans[now], x, pose.station, lost)
-                write(memory, PATH, lane, path)
-            _decide(memory)
-            for step in range(steps):
-                _integrate(memory, SAMPLE_S / steps, step == 0)
-            for lane in range(LANES):
-                now = drive[lane]
-                if now == NOBODY:
-                    continue
-                plan = plans[now]
-                truth[now, 0, tick[lane]] = memory[FORCE * LANES + lane]
-                truth[now, 1, tick[lane]] = memory[(FORCE + 1) * LANES + lane]
-                tick[lane] += 1
-                station = memory[POSE * LANES + lane]
-                gone = laps[lane] * plan.length_m + station
-                if plan.closed and station >= plan.length_m:
-                    laps[lane] += 1
-                    memory[POSE * LANES + lane] = station - plan.length_m
-                elif plan.closed and station < 0.0:
-                    laps[lane] -= 1
-                    memory[POSE * LANES + lane] = station + plan.length_m
-                over = ended[now, 1] != NOBODY and tick[lane] > ended[now, 1] + AFTER_LOSS
-                if over or gone >= plan.distance_m or tick[lane] == plan.samples:
-                    ended[now, 0] = tick[lane]
-                    _finish(truth[now], tick[lane], read(memory, CAR, lane, Constants))
-                    drive[lane] = NOBODY
-                    running -= 1
-                    for row in range(ROWS):
-                        memory[row * LANES + lane] = 0.0
+            finished = 0
+            while finished == 0:
+                _look(memory, book, plans, roads, truth, ended)
+                _decide(memory)
+                for step in range(steps):
+                    _integrate(memory, SAMPLE_S / steps, step == 0)
+                finished = _move_on(memory, book, plans, truth, ended)
+            running -= finished
 
-    return simulate  # type: ignore[no-any-return]
+    return simulate
 
 
 def _source_digest() -> str:

@@ -87,31 +87,26 @@ def simulate_drives(
     """
     if not drives:
         return []
-    roads = {id(drive.road): drive.road for drive in drives}
     for drive in drives:
         _check(drive)
-    ends = np.cumsum([len(road.curvature_1pm) for road in roads.values()])
-    first = dict(zip(roads, [0, *ends[:-1]], strict=True))
-    plans = np.array([_plan(drive, first[id(drive.road)]) for drive in drives], dtype=kernel.PLAN)
-    cars = np.array(
-        [(*constants(drive.vehicle, drive.adhesion), *handling(drive.vehicle)) for drive in drives]
-    )
+    roads = {id(drive.road): drive.road for drive in drives}
+    tables = [_table(road) for road in roads.values()]
+    ends = np.cumsum([len(table) for table in tables])
+    spans = dict(zip(roads, zip([0, *ends[:-1]], ends - 1, strict=True), strict=True))
+    plans = np.array([_plan(drive, *spans[id(drive.road)]) for drive in drives], dtype=kernel.PLAN)
+    cars = np.array([(*constants(d.vehicle, d.adhesion), *handling(d.vehicle)) for d in drives])
     longest_first = np.argsort(-plans["samples"], kind="stable")
     truth = np.empty((len(drives), len(kernel.CHANNELS), int(plans["samples"].max())))
     ended = kernel.simulate(
-        plans,
-        cars,
-        np.concatenate([road.curvature_1pm for road in roads.values()]),
-        np.concatenate([road.speed_mps for road in roads.values()]),
-        np.concatenate([target_acceleration(road) for road in roads.values()]),
-        longest_first,
-        steps_per_sample,
-        truth,
+        plans, cars, np.concatenate(tables), longest_first, steps_per_sample, truth
     )
     return [
         Truth(
-            **{name: truth[i, row, : ended[i, 0]] for row, name in enumerate(kernel.CHANNELS)},
-            lost_control_tick=int(ended[i, 1]) if ended[i, 1] >= 0 else None,
+            **{
+                name: truth[i, row, : ended[i, kernel.SAMPLES]]
+                for row, name in enumerate(kernel.CHANNELS)
+            },
+            lost_control_tick=int(ended[i, kernel.LOST]) if ended[i, kernel.LOST] >= 0 else None,
         )
         for i in range(len(drives))
     ]
@@ -119,6 +114,9 @@ def simulate_drives(
 
 PATIENCE = 1.5
 """A drive that takes so many times its planned time ends."""
+
+FARTHEST_VIEW_M = 20.0
+"""How far beyond a lap's end a driver may look."""
 
 GRACE_S = 10.0
 """Time that every drive may take beyond that."""
@@ -143,13 +141,24 @@ def target_acceleration(road: Road) -> NDArray[np.float64]:
     return np.gradient(energy, road.spacing_m)
 
 
-def _plan(drive: LaneDrive, first: int) -> tuple[int, int, float, float, bool, float, int]:
+def _table(road: Road) -> NDArray[np.float64]:
+    """Return what the kernel looks up of a road: curvature, target speed and acceleration.
+
+    The table of a closed road goes on beyond its length by what a driver sees ahead.
+    """
+    columns = np.stack([road.curvature_1pm, road.speed_mps, target_acceleration(road)], axis=1)
+    further = math.ceil(FARTHEST_VIEW_M / road.spacing_m) + 1 if road.closed else 0
+    return np.take(columns, range(len(columns) + further), axis=0, mode="wrap")
+
+
+def _plan(
+    drive: LaneDrive, first: int, last: int
+) -> tuple[int, int, float, float, bool, float, int]:
+    """Return a drive's row of `kernel.PLAN`."""
     road = drive.road
-    laps = drive.laps if road.closed else min(drive.laps, 1.0)
-    distance_m = laps * road.length_m
+    distance_m = (drive.laps if road.closed else min(drive.laps, 1.0)) * road.length_m
     samples = math.ceil((PATIENCE * planned_time_s(road, distance_m) + GRACE_S) / SAMPLE_S)
-    entries = len(road.curvature_1pm)
-    return first, entries, road.spacing_m, road.length_m, road.closed, distance_m, samples
+    return first, last, 1 / road.spacing_m, road.length_m, road.closed, distance_m, samples
 
 
 def _check(drive: LaneDrive) -> None:

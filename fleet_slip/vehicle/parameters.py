@@ -1,4 +1,4 @@
-"""What a car is: the parameters of `configs/vehicles/*.toml`, and the constants of its equations."""
+"""A car: the parameters of `configs/vehicles/*.toml`, and the constants of its equations."""
 
 from typing import NamedTuple, Self
 

@@ -4,9 +4,10 @@ With all rows in one array at offsets known at compile time, the compiler needs 
 overlap, and a loop over lanes that reads, computes and writes becomes vector instructions.
 """
 
+from collections.abc import Callable
 from typing import Any
 
-from llvmlite import ir
+from llvmlite import ir  # type: ignore[import-untyped]
 from numba import types
 from numba.extending import intrinsic
 
@@ -25,11 +26,11 @@ def _address(context: Any, builder: Any, array_type: Any, args: Any, index: int)
 
 
 @intrinsic
-def read(typing_context: Any, memory: Any, first_row: Any, lane: Any, kind: Any) -> Any:
-    """Return one lane of successive rows as a named tuple: `read(memory, ROW, lane, State)`."""
+def _read(_typing_context: Any, memory: Any, _first_row: Any, _lane: Any, kind: Any) -> Any:
+    """Type and emit `read`."""
     fields = kind.instance_class
     count = len(fields._fields)
-    result = types.NamedUniTuple(types.float64, count, fields)
+    result = types.NamedUniTuple(types.float64, count, fields)  # type: ignore[no-untyped-call]
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         array_type = signature.args[0]
@@ -43,8 +44,8 @@ def read(typing_context: Any, memory: Any, first_row: Any, lane: Any, kind: Any)
 
 
 @intrinsic
-def write(typing_context: Any, memory: Any, first_row: Any, lane: Any, values: Any) -> Any:
-    """Write a tuple of floats to one lane of successive rows."""
+def _write(_typing_context: Any, memory: Any, _first_row: Any, _lane: Any, values: Any) -> Any:
+    """Type and emit `write`."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         array_type = signature.args[0]
@@ -54,3 +55,10 @@ def write(typing_context: Any, memory: Any, first_row: Any, lane: Any, values: A
         return context.get_dummy_value()
 
     return types.void(memory, types.intp, types.intp, values), codegen
+
+
+read: Callable[..., Any] = _read
+"""Return one lane of successive rows as a named tuple: `read(memory, ROW, lane, State)`."""
+
+write: Callable[..., None] = _write
+"""Write a tuple of floats to one lane of successive rows: `write(memory, ROW, lane, values)`."""

@@ -15,6 +15,9 @@ SMALLEST_LOAD_N = 1.0
 STICTION_RAD_S = 0.1
 """Wheel speed below which brakes and rolling resistance fade, so that a wheel comes to rest."""
 
+SLOWEST_DRIVE_MPS = 1.0
+"""Speed below which the engine's power no longer limits its force."""
+
 HIGHWAY_ENV_SLOW_MPS = 1.0
 """Speed below which highway-env replaces tyre forces by damping."""
 
@@ -62,8 +65,27 @@ class WheelRate(NamedTuple):
     """−∂(dω/dt)/∂ω in 1/s, or somewhat more."""
 
 
+class WheelRates(NamedTuple):
+    """Rates of all wheels."""
+
+    fl: WheelRate
+    fr: WheelRate
+    rl: WheelRate
+    rr: WheelRate
+
+
+class Acceleration(NamedTuple):
+    """Specific force at the centre of gravity, and the rates of the body's motion."""
+
+    ax: float
+    ay: float
+    vx: float
+    vy: float
+    yaw_rate: float
+
+
 @equation
-def ackermann_tangents(x: State, u: Controls, c: Constants) -> tuple[float, float]:
+def ackermann_tangents(x: State, _u: Controls, c: Constants) -> tuple[float, float]:
     """Return the tangents of the left and right road wheel angles (exact Ackermann geometry).
 
     The rack moves the mean wheel so that its tangent is the steering wheel's angle over the ratio;
@@ -74,7 +96,7 @@ def ackermann_tangents(x: State, u: Controls, c: Constants) -> tuple[float, floa
 
 
 @equation
-def parallel_tangents(x: State, u: Controls, c: Constants) -> tuple[float, float]:
+def parallel_tangents(_x: State, u: Controls, c: Constants) -> tuple[float, float]:
     """Return equal tangents, without the lag of the steering."""
     tangent = c.steer_per_wheel * u.steering_wheel
     return tangent, tangent
@@ -95,7 +117,7 @@ def transferred_loads(x: State, c: Constants) -> Loads:
 
 
 @equation
-def static_loads(x: State, c: Constants) -> Loads:
+def static_loads(_x: State, c: Constants) -> Loads:
     """Return the wheel loads at rest."""
     return Loads(c.static_front, c.static_front, c.static_rear, c.static_rear)
 
@@ -183,23 +205,16 @@ def build_wheel_forces(brush: bool, spinning: bool) -> Callable[..., WheelForces
 
 
 @equation
-def driven_spin(
-    force: WheelForce,
-    spin: float,
-    load: float,
-    drive: float,
-    brake: float,
-    hub: float,
-    c: Constants,
+def _spin(
+    force: WheelForce, spin: float, load: float, drive: float, brake: float, c: Constants
 ) -> WheelRate:
-    """Return the rate of a wheel under drive and brake forces at its rim (I dω/dt = sum of torques).
+    """Return the rate of a wheel under drive and brake forces at its rim, I dω/dt = Σ torques.
 
-    Brake and rolling resistance oppose the
-    spin; below `STICTION_RAD_S` they fade in proportion to it. Anti-lock and traction control take
-    the torque off a wheel as its slip grows from `slip_control` to three times that.
+    Brake and rolling resistance oppose the spin; below `STICTION_RAD_S` they fade in proportion to
+    it. Anti-lock and traction control take the torque off a wheel as its slip grows from
+    `slip_control` to three times that.
     """
-    excess = abs(force.slip) * c.inverse_slip_band
-    left = min(max(1.5 - excess, 0.0), 1.0)
+    left = min(max(1.5 - abs(force.slip) * c.inverse_slip_band, 0.0), 1.0)
     fading = c.inverse_slip_band * force.slip_per_speed if 0.0 < left < 1.0 else 0.0
     friction = (left * brake + c.rolling_resistance * load) / max(abs(spin), STICTION_RAD_S)
     gain = c.radius * c.inverse_spin_inertia
@@ -211,14 +226,36 @@ def driven_spin(
 
 
 @equation
-def free_spin(
-    force: WheelForce,
-    spin: float,
-    load: float,
-    drive: float,
-    brake: float,
-    hub: float,
-    c: Constants,
-) -> WheelRate:
-    """Return the rate of a wheel that rolls without slip."""
-    return WheelRate(hub * c.inverse_radius, 0.0)
+def driven_spins(
+    x: State, force: WheelForces, load: Loads, _motion: Acceleration, c: Constants
+) -> WheelRates:
+    """Return the rates of the wheels under the torques of drivetrain and brakes."""
+    strongest = c.power_per_mass / max(abs(x.vx), SLOWEST_DRIVE_MPS)
+    drive = c.mass * min(max(x.traction, 0.0), strongest)
+    brake = c.mass * max(-x.traction, 0.0)
+    drive_f, drive_r = c.drive_front * drive, c.drive_rear * drive
+    brake_f, brake_r = c.brake_front * brake, c.brake_rear * brake
+    return WheelRates(
+        _spin(force.fl, x.wheel_fl, load.fl, drive_f, brake_f, c),
+        _spin(force.fr, x.wheel_fr, load.fr, drive_f, brake_f, c),
+        _spin(force.rl, x.wheel_rl, load.rl, drive_r, brake_r, c),
+        _spin(force.rr, x.wheel_rr, load.rr, drive_r, brake_r, c),
+    )
+
+
+@equation
+def free_spins(
+    _x: State, force: WheelForces, _load: Loads, motion: Acceleration, c: Constants
+) -> WheelRates:
+    """Return the rates of wheels that roll without slip, as their hubs accelerate."""
+    turn_f = c.half_track_front * motion.yaw_rate
+    turn_r = c.half_track_rear * motion.yaw_rate
+    side = motion.vy + c.front * motion.yaw_rate
+    hub_fl = force.fl.cosine * (motion.vx - turn_f) + force.fl.sine * side
+    hub_fr = force.fr.cosine * (motion.vx + turn_f) + force.fr.sine * side
+    return WheelRates(
+        WheelRate(hub_fl * c.inverse_radius, 0.0),
+        WheelRate(hub_fr * c.inverse_radius, 0.0),
+        WheelRate((motion.vx - turn_r) * c.inverse_radius, 0.0),
+        WheelRate((motion.vx + turn_r) * c.inverse_radius, 0.0),
+    )
