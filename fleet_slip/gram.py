@@ -5,7 +5,7 @@ signals. All are integers, so Grams add and subtract without rounding: training 
 minus a fold is, bit for bit, training on the other drives.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -132,6 +132,28 @@ class Gram:
             tuple(self.sums[i] for i in at),
             tuple(self.products[p] for p in _packed_positions(tuple(at))),
         )
+
+    def combine(self, combinations: Mapping[str, Mapping[str, int]]) -> "Gram":
+        """Return the Gram of integer linear combinations of the signals, T'GT.
+
+        Each new signal maps old signals to integer weights: {"difference": {"a": 1, "b": -1}}.
+        Raises `SelectionError` for a signal that the Gram lacks.
+        """
+        weights = [
+            dict(zip(positions(self.signals, [*old]), old.values(), strict=True))
+            for old in combinations.values()
+        ]
+        products = tuple(
+            sum(
+                u * v * self.products[packed_position(a, b)]
+                for a, u in weights[i].items()
+                for b, v in weights[j].items()
+            )
+            for i in range(len(weights))
+            for j in range(i + 1)
+        )
+        sums = tuple(sum(u * self.sums[a] for a, u in new.items()) for new in weights)
+        return Gram(tuple(combinations), self.n, sums, products)
 
     def sum(self, signal: str) -> int:
         """Return the sum of a signal's counts."""

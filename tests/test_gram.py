@@ -73,6 +73,16 @@ def test_restriction_is_the_gram_of_the_columns(
     )
 
 
+@given(counts_of_drive)
+def test_linear_combinations_equal_those_of_the_counts(counts: np.ndarray) -> None:
+    wide = counts.astype(np.int64)
+    expected = np.column_stack([wide[:, 0] - 3 * wide[:, 2], 2 * wide[:, 1]])
+    combined = Gram.from_counts(SIGNALS, counts).combine(
+        {"mix": {"ax": 1, "sideslip": -3}, "twice": {"ay": 2}}
+    )
+    assert combined == Gram.from_counts(("mix", "twice"), expected)
+
+
 def test_centring_is_exact() -> None:
     counts = np.array([[30_000, 1], [30_001, 1], [30_002, 1]])
     gram = Gram.from_counts(("a", "constant"), counts)

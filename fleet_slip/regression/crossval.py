@@ -91,9 +91,15 @@ def cross_validate(
     Raises `SelectionError` if a training fold cannot be fitted.
     """
     tests = [held_out(procedure, folds.total - fold, fold, label) for fold in folds.grams]
+    return assemble(name, folds, tests, procedure(folds.total), scales)
+
+
+def assemble(
+    name: str, folds: Folds, tests: Sequence[ErrorSums], counts: LinearModel, scales: Scales
+) -> CrossValidation:
+    """Put together the held-out sums of each fold and the model of counts fitted to all rows."""
     pooled = sum(tests[1:], tests[0])
-    counts = procedure(folds.total)
-    unit = scales[label]
+    unit = scales[counts.label]
     return CrossValidation(
         name=name,
         signals=counts.signals,
@@ -121,5 +127,5 @@ def cross_validate_inputs(
 
 def held_out(procedure: Procedure, training: Gram, test: Gram, label: str) -> ErrorSums:
     """Fit on one Gram and return the error sums on another."""
-    mean = Fraction(training.sum(label), training.n) if training.n else None
-    return error_sums(procedure(training), test, mean)
+    model = procedure(training)
+    return error_sums(model, test, Fraction(training.sum(label), training.n))

@@ -5,7 +5,8 @@ integers; so nothing is lost to cancellation before they are scaled to unit spre
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,6 +92,10 @@ class DriveMoments:
     def size(self) -> int:
         """Length of u: the constant, the inputs and the label."""
         return len(self.signals) + 1
+
+    def take(self, rows: NDArray[Any]) -> "DriveMoments":
+        """Return the drives at an index array or a mask, with the same centre and spread."""
+        return replace(self, packed=self.packed[rows])
 
     def matrix(self, packed: FloatArray) -> FloatArray:
         """Unpack moments, shape (..., p), to symmetric matrices, shape (..., k+1, k+1)."""

@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 
 from fleet_slip.errors import SelectionError
 from fleet_slip.gram import Gram
+from fleet_slip.regression.criteria import CRITERIA, subset_values
+from fleet_slip.regression.evidence import Evidence
 from fleet_slip.regression.exact import Fit, correlation_matrix, dependence, fit
 from fleet_slip.regression.leaps import best_by_leaps
 from fleet_slip.regression.special import FloatArray
@@ -83,6 +85,16 @@ def best_subsets(gram: Gram, inputs: Sequence[str], label: str, count: int = 2) 
         raise SelectionError(f"{label} is constant: there is nothing to explain.")
     found = candidates(matrix, count + _SPARE)
     return [_exact_best(part, inputs, label, masks, count) for masks in found]
+
+
+def choices(results: Sequence[SizeResult], evidence: Evidence) -> dict[str, int]:
+    """Return the size that each criterion picks among the best models of every size.
+
+    The evidence is that of the full model in any order.
+    """
+    rss = np.array([float(result.best.rss) for result in results])
+    size = np.arange(len(results), dtype=np.float64)
+    return {name: int(np.argmin(subset_values(name, evidence, rss, size))) for name in CRITERIA}
 
 
 def candidates(matrix: FloatArray, count: int) -> list[list[int]]:

@@ -1,0 +1,161 @@
+"""Least squares with an added diagonal: ridge, sensor noise, and errors in variables.
+
+S b + Lambda b = S_xy. A positive Lambda shrinks: it is ridge regression, and with n times the
+variance of noise that will be added to the signals it is the exact minimiser of the expected
+error under that noise (Bishop 1995). A negative one corrects for noise that the signals already
+have (errors in variables, Fuller 1987).
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+
+from fleet_slip.errors import SelectionError
+from fleet_slip.gram import Gram
+from fleet_slip.regression import rounding
+from fleet_slip.regression.crossval import held_out
+from fleet_slip.regression.elimination import eliminate
+from fleet_slip.regression.exact import LinearModel, Scales, correlation_matrix, moments
+from fleet_slip.regression.figures import Figures
+from fleet_slip.regression.folds import Folds
+from fleet_slip.regression.special import FloatArray
+from fleet_slip.regression.standard import from_standardised, through_means
+
+
+def penalised(
+    gram: Gram, inputs: Sequence[str], label: str, penalties: Sequence[Fraction]
+) -> LinearModel:
+    """Solve (S + diag(penalties)) b = S_xy exactly; penalties in counts^2 of each input.
+
+    Raises `SelectionError` if the matrix is not positive definite.
+    """
+    part = gram.restrict([*inputs, label])
+    common = math.lcm(*(penalty.denominator for penalty in penalties))
+    matrix = [[common * entry for entry in row] for row in moments(part)]
+    for i, penalty in enumerate(penalties):
+        matrix[i][i] += int(part.n * common * penalty)
+    triangle = eliminate(matrix)
+    if triangle.singular is not None or min(triangle.minors) <= 0:
+        at = triangle.singular
+        if at is None:
+            at = next(i for i, minor in enumerate(triangle.minors) if minor <= 0) - 1
+        raise SelectionError(
+            f"the moments stop being positive definite at {inputs[at]}: the assumed noise is more "
+            "than the signal holds, or signals are linearly dependent."
+        )
+    numerators, determinant = triangle.solve(len(inputs))
+    slopes = {name: Fraction(x, determinant) for name, x in zip(inputs, numerators, strict=True)}
+    return through_means(part, label, slopes)
+
+
+def noise_matched(
+    gram: Gram, inputs: Sequence[str], label: str, noise: Mapping[str, float], scales: Scales
+) -> LinearModel:
+    """Return the model of counts that is best once noise is added to the signals.
+
+    `noise` is the standard deviation of independent noise to come, in physical units.
+    """
+    return penalised(gram, inputs, label, _variances(gram, inputs, noise, scales))
+
+
+def errors_in_variables(
+    gram: Gram, inputs: Sequence[str], label: str, noise: Mapping[str, float], scales: Scales
+) -> LinearModel:
+    """Return the model of counts for signals without the noise that they were logged with.
+
+    `noise` is the standard deviation of the sensors, in physical units. Raises `SelectionError`
+    if there is less variance in the signals than that.
+    """
+    variances = _variances(gram, inputs, noise, scales)
+    return penalised(gram, inputs, label, [-variance for variance in variances])
+
+
+@dataclass(frozen=True)
+class RidgePath:
+    """Ridge regression of standardised signals over a grid of penalties.
+
+    Attributes:
+        penalties: lambda added to the correlation matrix, rising.
+        coefficients: standardised, shape (penalties, k).
+        rss: residual sum of squares as a share of the total.
+        degrees: effective degrees of freedom without the constant, sum l / (l + lambda).
+        gcv: generalised cross-validation, (RSS / n) / (1 - (degrees + 1) / n)^2, same share.
+    """
+
+    penalties: FloatArray
+    coefficients: FloatArray
+    rss: FloatArray
+    degrees: FloatArray
+    gcv: FloatArray
+
+
+def ridge_path(
+    gram: Gram, inputs: Sequence[str], label: str, penalties: Sequence[float]
+) -> RidgePath:
+    """Return the whole path from one eigendecomposition C = Q diag(l) Q'."""
+    k = len(inputs)
+    matrix = correlation_matrix(gram.restrict([*inputs, label]))
+    eigenvalues, vectors = np.linalg.eigh(matrix[:k, :k])
+    grid = np.array(penalties, dtype=np.float64)
+    target = vectors.T @ matrix[:k, k]
+    shrunk = 1 / (eigenvalues + grid[:, None])
+    coefficients = (shrunk * target) @ vectors.T
+    # RSS = 1 - 2 b'c + b'Cb in the eigenbasis.
+    rss = 1 - np.sum(shrunk * target**2 * (2 - eigenvalues * shrunk), axis=1)
+    degrees = np.sum(eigenvalues * shrunk, axis=1)
+    gcv = rss / gram.n / (1 - (degrees + 1) / gram.n) ** 2
+    return RidgePath(grid, coefficients, rss, degrees, gcv)
+
+
+def ridge_model(gram: Gram, inputs: Sequence[str], label: str, penalty: float) -> LinearModel:
+    """Return the ridge model of counts at one penalty on the correlation matrix."""
+    path = ridge_path(gram, inputs, label, [penalty])
+    return from_standardised(gram, inputs, label, path.coefficients[0])
+
+
+def cross_validated_ridge(
+    folds: Folds, inputs: Sequence[str], label: str, penalties: Sequence[float], scales: Scales
+) -> list[Figures]:
+    """Return the pooled cross-validated figures at each penalty."""
+
+    def figures(penalty: float) -> Figures:
+        sums = [
+            held_out(lambda g: ridge_model(g, inputs, label, penalty), folds.total - f, f, label)
+            for f in folds.grams
+        ]
+        return sum(sums[1:], sums[0]).figures(scales[label])
+
+    return [figures(penalty) for penalty in penalties]
+
+
+def _variances(
+    gram: Gram, inputs: Sequence[str], noise: Mapping[str, float], scales: Scales
+) -> list[Fraction]:
+    unknown = [name for name in noise if name not in inputs]
+    if unknown:
+        raise SelectionError(
+            f"noise is given for {', '.join(unknown)}, which the model does not use. "
+            f"It uses {', '.join(inputs)}."
+        )
+    return [gram.n * (Fraction(noise.get(name, 0)) / scales[name]) ** 2 for name in inputs]
+
+
+def standardised_penalty(gram: Gram, inputs: Sequence[str], penalty: Fraction) -> list[Fraction]:
+    """Return the penalties in counts^2 that equal one on the sample-standardised moments.
+
+    (n - 1) C + penalty I for standard deviations with n - 1 is S + penalty diag(S) / (n - 1).
+    """
+    matrix = gram.restrict(inputs).centred()
+    return [penalty * Fraction(row[i], gram.n * (gram.n - 1)) for i, row in enumerate(matrix)]
+
+
+def standardised_size(gram: Gram, model: LinearModel) -> dict[str, float]:
+    """Return |b_j| s_j / s_y of each signal, s the standard deviations."""
+    matrix = gram.restrict([*model.signals, model.label]).centred()
+    return {
+        name: rounding.sqrt(b * b * matrix[i][i] / matrix[-1][-1])
+        for i, (name, b) in enumerate(zip(model.signals, model.coefficients, strict=True))
+    }

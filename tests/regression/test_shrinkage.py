@@ -1,0 +1,191 @@
+"""Ridge, noise-matched ridge, errors in variables, James-Stein and Pace by properties."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import scipy.optimize
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from sklearn.linear_model import Ridge
+
+from fleet_slip.errors import SelectionError
+from fleet_slip.gram import Gram
+from fleet_slip.regression import pace as pace_module
+from fleet_slip.regression.evidence import Evidence
+from fleet_slip.regression.exact import fit
+from fleet_slip.regression.folds import Folds
+from fleet_slip.regression.mixture import (
+    ChiSquareKernel,
+    NormalKernel,
+    fit_mixture,
+    separable_groups,
+)
+from fleet_slip.regression.nested import nested_fits
+from fleet_slip.regression.nnls import nonnegative_least_squares
+from fleet_slip.regression.orthogonal import OrthogonalResponses
+from fleet_slip.regression.pace import ESTIMATORS, james_stein, pace
+from fleet_slip.regression.ridge import (
+    cross_validated_ridge,
+    errors_in_variables,
+    noise_matched,
+    penalised,
+    ridge_model,
+    ridge_path,
+)
+
+from .data import gram_of, names, random_drives, unit_scales
+
+
+@settings(max_examples=25)
+@given(st.integers(0, 10**6), st.floats(1e-6, 10))
+def test_ridge_equals_scikit_learn(seed: int, penalty: float) -> None:
+    counts = np.concatenate(random_drives(seed, drives=2)).astype(float)
+    centred = counts - counts.mean(axis=0)
+    x = centred / np.sqrt(np.sum(centred**2, axis=0))
+    beta = Ridge(alpha=penalty, fit_intercept=False).fit(x[:, :4], x[:, 4]).coef_
+    gram = gram_of(counts.astype(np.int64))
+    path = ridge_path(gram, names(4)[:-1], "y", [penalty])
+    np.testing.assert_allclose(path.coefficients[0], beta, rtol=1e-6, atol=1e-9)
+    assert path.rss[0] == pytest.approx(np.sum((x[:, 4] - x[:, :4] @ beta) ** 2), rel=1e-6)
+    hat = x[:, :4] @ np.linalg.solve(x[:, :4].T @ x[:, :4] + penalty * np.eye(4), x[:, :4].T)
+    assert path.degrees[0] == pytest.approx(np.trace(hat), rel=1e-6)
+    model = ridge_model(gram, names(4)[:-1], "y", penalty)
+    predicted = counts[:, :4] @ [*model.weights.values()] + model.offset
+    assert np.mean(predicted - counts[:, 4]) == pytest.approx(0, abs=1e-6)
+
+
+def test_the_ridge_path_starts_at_least_squares_and_is_cross_validated() -> None:
+    drives = random_drives(2)
+    gram = gram_of(np.concatenate(drives))
+    inputs = names(4)[:-1]
+    ols = fit(gram, inputs, "y").model
+    np.testing.assert_allclose(
+        [*ridge_model(gram, inputs, "y", 0).weights.values()],
+        [*ols.weights.values()],
+        rtol=1e-9,
+    )
+    folds = Folds(tuple(gram_of(counts) for counts in drives), tuple("abcdefghijkl"), 12)
+    figures = cross_validated_ridge(folds, inputs, "y", [0.0, 0.1, 10.0], unit_scales(4))
+    assert figures[0].rmse < figures[2].rmse
+    assert ridge_path(gram, inputs, "y", [0, 1, 2]).gcv.shape == (3,)
+
+
+def test_noise_matched_ridge_is_best_under_that_noise() -> None:
+    rng = np.random.default_rng(4)
+    counts = np.concatenate(random_drives(4, drives=6)).astype(float)
+    inputs = names(4)[:-1]
+    sigma = {"x1": 200.0, "x3": 80.0}
+    model = noise_matched(gram_of(counts.astype(int)), inputs, "y", sigma, unit_scales(4))
+    copies = np.tile(counts, (60, 1))
+    copies[:, 0] += rng.normal(size=len(copies)) * 200
+    copies[:, 2] += rng.normal(size=len(copies)) * 80
+    refit = fit(gram_of(np.rint(copies).astype(int)), inputs, "y").model
+    np.testing.assert_allclose(
+        [*model.weights.values()], [*refit.weights.values()], rtol=0.05, atol=0.02
+    )
+
+
+def test_errors_in_variables_recovers_the_clean_slope() -> None:
+    rng = np.random.default_rng(5)
+    clean = rng.normal(size=200_000) * 1000
+    noisy = np.column_stack([clean + rng.normal(size=clean.size) * 700, 0.5 * clean])
+    gram = gram_of(np.rint(noisy).astype(np.int64))
+    attenuated = fit(gram, ["x1"], "y").model.weights["x1"]
+    assert attenuated == pytest.approx(0.5 / 1.49, rel=0.02)
+    model = errors_in_variables(gram, ["x1"], "y", {"x1": 700.0}, unit_scales(1))
+    assert model.weights["x1"] == pytest.approx(0.5, rel=0.02)
+    with pytest.raises(SelectionError, match="positive definite at x1"):
+        errors_in_variables(gram, ["x1"], "y", {"x1": 2000.0}, unit_scales(1))
+    with pytest.raises(SelectionError, match="noise is given for gyro"):
+        errors_in_variables(gram, ["x1"], "y", {"gyro": 1.0}, unit_scales(1))
+
+
+def test_no_penalty_is_least_squares_exactly() -> None:
+    gram = gram_of(np.concatenate(random_drives(6)))
+    inputs = names(4)[:-1]
+    assert penalised(gram, inputs, "y", [Fraction(0)] * 4) == fit(gram, inputs, "y").model
+
+
+@settings(max_examples=60)
+@given(st.integers(1, 12), st.integers(1, 8), st.integers(0, 10**6))
+def test_nonnegative_least_squares_equals_scipy(rows: int, columns: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    a, b = rng.normal(size=(rows, columns)), rng.normal(size=rows)
+    x = nonnegative_least_squares(a, b)
+    assert (x >= 0).all()
+    _, residual = scipy.optimize.nnls(a, b)
+    assert np.linalg.norm(a @ x - b) == pytest.approx(residual, abs=1e-9)
+
+
+def test_mixtures_find_the_groups_of_effects() -> None:
+    rng = np.random.default_rng(7)
+    data = np.concatenate([rng.normal(size=40), 8 + rng.normal(size=10)])
+    mixture = fit_mixture(data, NormalKernel())
+    assert mixture.weights.sum() == pytest.approx(1)
+    assert mixture.weights[mixture.points > 4].sum() == pytest.approx(0.2, abs=0.02)
+    assert mixture.points @ mixture.weights == pytest.approx(data.mean(), abs=0.3)
+    squares = fit_mixture(data**2, ChiSquareKernel())
+    assert squares.weights[squares.points > 16].sum() == pytest.approx(0.2, abs=0.02)
+    assert [len(g) for g in separable_groups(np.sort(data), NormalKernel())] == [40, 10]
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10**6))
+def test_the_orthogonal_basis_is_a_rotation(seed: int) -> None:
+    gram = gram_of(np.concatenate(random_drives(seed, drives=2)))
+    order = ("x3", "x1", "x4", "x2")
+    basis = OrthogonalResponses.of(gram, order, "y")
+    fits = nested_fits(gram, order, "y")
+    np.testing.assert_allclose(
+        basis.responses[1:] ** 2, Evidence.naive(fits).contributions, rtol=1e-12
+    )
+    for size in range(5):
+        kept = np.where(np.arange(5) <= size, basis.responses, 0)
+        assert basis.model(kept) == fits[size].model
+
+
+@given(
+    hnp.arrays(
+        np.float64, st.integers(2, 15), elements=st.floats(-50, 50).map(lambda x: round(x, 3))
+    )
+)
+def test_estimators_shrink_and_keep_signs(a: np.ndarray) -> None:
+    for name, estimator in ESTIMATORS.items():
+        shrunk = estimator(a)
+        assert shrunk.shape == a.shape
+        assert np.isfinite(shrunk).all(), name
+        if name in {"pace2", "pace4", "nested", "subset"}:
+            assert ((shrunk == a) | (shrunk == 0)).all()
+        if name in {"james-stein", "posterior-mean", "pace6"}:
+            assert (shrunk * a >= 0).all()
+
+
+def test_shrinkage_lowers_the_loss_when_most_effects_are_small() -> None:
+    rng = np.random.default_rng(8)
+    truth = np.concatenate([np.full(5, 4.0), np.zeros(55)])
+    loss = dict.fromkeys(ESTIMATORS, 0.0)
+    for _ in range(30):
+        a = truth + rng.normal(size=60)
+        for name, estimator in ESTIMATORS.items():
+            loss[name] += float(np.sum((estimator(a) - truth) ** 2)) / 30
+    assert loss["ols"] == pytest.approx(60, rel=0.15)
+    for name in set(ESTIMATORS) - {"ols"}:
+        assert loss[name] < 0.7 * loss["ols"], (name, loss)
+    assert loss["posterior-mean"] < loss["pace6"]
+
+
+def test_pace_needs_no_row_and_names_its_mistakes() -> None:
+    gram = gram_of(np.concatenate(random_drives(9, inputs=6)))
+    inputs = names(6)[:-1]
+    assert pace(gram, inputs, "y", "ols").weights == pytest.approx(
+        fit(gram, inputs, "y").model.weights
+    )
+    with pytest.raises(SelectionError, match="unknown estimator 'pace7'"):
+        pace(gram, inputs, "y", "pace7")
+    exact = Gram.from_counts(("x1", "y"), np.array([[1, 2], [2, 4], [3, 6], [5, 10]]))
+    with pytest.raises(SelectionError, match="no noise"):
+        pace(exact, ["x1"], "y", "eb")
+    assert (james_stein(np.array([0.1, 0.1, 0.1])) == 0).all()
+    assert (pace_module.threshold(4.0)(np.array([1.9, -2.1])) == [0, -2.1]).all()
