@@ -7,9 +7,11 @@ name, never on the number of days, on other drives or on the order in which they
 import hashlib
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import date, timedelta
+from itertools import groupby
+from operator import itemgetter
 from typing import Annotated, Self
 
 import numpy as np
@@ -113,7 +115,7 @@ class Campaign(Config):
         return tuple(self._drive(day, first, i) for i in range(self.drives_per_day))
 
     def batches(self, day: date) -> tuple[Batch, ...]:
-        """Return the files of one day: as many whole drives in each as `rows_per_file` allows."""
+        """Return the files of one day, whole drives in each, about `rows_per_file` or fewer rows."""
         packs = pack(self.drives(day), self.rows_per_file)
         return tuple(Batch(self.name, day, i, drives) for i, drives in enumerate(packs))
 
@@ -145,22 +147,16 @@ class Campaign(Config):
         )
 
 
-def pack(drives: tuple[DriveSpec, ...], rows_per_file: int) -> Iterator[tuple[DriveSpec, ...]]:
-    """Split drives, in their order, into runs of at most so many expected rows.
-
-    A drive that is longer than that stands alone.
-    """
-    run: list[DriveSpec] = []
-    rows = 0
-    for drive in drives:
-        expected = drive.expected_rows
-        if run and rows + expected > rows_per_file:
-            yield tuple(run)
-            run, rows = [], 0
-        run.append(drive)
-        rows += expected
-    if run:
-        yield tuple(run)
+def pack(drives: Sequence[DriveSpec], rows_per_file: int) -> list[tuple[DriveSpec, ...]]:
+    """Split drives, in their order, evenly into as few runs as have about so many rows or fewer."""
+    ends = np.cumsum([drive.expected_rows for drive in drives])
+    middles = (ends + np.append(0, ends[:-1])) / 2
+    files = math.ceil(ends[-1] / rows_per_file)
+    file_of_drive = (middles * files / ends[-1]).astype(int)
+    return [
+        tuple(drive for _, drive in run)
+        for _, run in groupby(zip(file_of_drive, drives, strict=True), key=itemgetter(0))
+    ]
 
 
 def load_campaign(name_or_path: str) -> Campaign:

@@ -11,8 +11,8 @@ from fleet_slip.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ, Measurement, measure
 from fleet_slip.signals import catalogue
 from fleet_slip.vehicle.lanes import LaneDrive, Road, Truth, simulate_drives
 
-LANES = 32
-"""Drives simulated side by side. It bounds the memory for the true signals of a batch."""
+DRIVES_AT_ONCE = 32
+"""Drives of a batch that are simulated together, which bounds the memory for their true signals."""
 
 
 @dataclass(frozen=True)
@@ -68,11 +68,15 @@ def simulate_batch(batch: Batch) -> pa.Table:
     any batches in any order.
     """
     logs: list[DriveLog] = []
-    for first in range(0, len(batch.drives), LANES):
-        specs = batch.drives[first : first + LANES]
-        truths = simulate_drives([lane_drive(spec) for spec in specs])
-        logs += [log_drive(spec, truth) for spec, truth in zip(specs, truths, strict=True)]
+    for first in range(0, len(batch.drives), DRIVES_AT_ONCE):
+        logs += simulate_logs(batch.drives[first : first + DRIVES_AT_ONCE])
     return tabulate(batch, logs)
+
+
+def simulate_logs(specs: Sequence[DriveSpec]) -> list[DriveLog]:
+    """Simulate and measure drives together."""
+    truths = simulate_drives([lane_drive(spec) for spec in specs])
+    return [log_drive(spec, truth) for spec, truth in zip(specs, truths, strict=True)]
 
 
 def log_drive(spec: DriveSpec, truth: Truth) -> DriveLog:

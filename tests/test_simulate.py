@@ -112,13 +112,13 @@ def test_noise_differs_between_drives() -> None:
     assert abs(np.corrcoef(ax[:1000], ax[1000:])[0, 1]) < 0.15
 
 
-@pytest.mark.parametrize("lanes", [1, 3])
+@pytest.mark.parametrize("together", [1, 3])
 def test_bytes_do_not_depend_on_which_drives_run_side_by_side(
-    lanes: int, monkeypatch: pytest.MonkeyPatch
+    together: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    together = simulate_batch(short_batch())
-    monkeypatch.setattr(simulate, "LANES", lanes)
-    assert simulate_batch(short_batch()).equals(together)
+    expected = simulate_batch(short_batch())
+    monkeypatch.setattr(simulate, "DRIVES_AT_ONCE", together)
+    assert simulate_batch(short_batch()).equals(expected)
 
 
 def test_bytes_do_not_depend_on_threads_or_on_the_order_of_batches() -> None:
