@@ -84,13 +84,16 @@ def least_squares(inputs: Sequence[str], label: str) -> Procedure:
 
 
 def cross_validate(
-    name: str, folds: Folds, label: str, procedure: Procedure, scales: Scales
+    name: str, folds: Folds, procedure: Procedure, scales: Scales
 ) -> CrossValidation:
     """Cross-validate a procedure, which sees nothing but the training Gram of each fold.
 
     Raises `SelectionError` if a training fold cannot be fitted.
     """
-    tests = [held_out(procedure, folds.total - fold, fold, label) for fold in folds.grams]
+    tests = []
+    for fold in folds.grams:
+        training = folds.total - fold
+        tests.append(held_out(procedure(training), training, fold))
     return assemble(name, folds, tests, procedure(folds.total), scales)
 
 
@@ -122,10 +125,9 @@ def cross_validate_inputs(
     Raises `SelectionError` if no drive has all the inputs, or if they are linearly dependent.
     """
     folds = cohort.serving(inputs, label)
-    return cross_validate(name, folds, label, least_squares(inputs, label), scales)
+    return cross_validate(name, folds, least_squares(inputs, label), scales)
 
 
-def held_out(procedure: Procedure, training: Gram, test: Gram, label: str) -> ErrorSums:
-    """Fit on one Gram and return the error sums on another."""
-    model = procedure(training)
-    return error_sums(model, test, Fraction(training.sum(label), training.n))
+def held_out(model: LinearModel, training: Gram, test: Gram) -> ErrorSums:
+    """Return the error sums on a test Gram of a model that was fitted on the training Gram."""
+    return error_sums(model, test, Fraction(training.sum(model.label), training.n))

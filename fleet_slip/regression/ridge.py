@@ -16,11 +16,8 @@ import numpy as np
 from fleet_slip.errors import SelectionError
 from fleet_slip.gram import Gram
 from fleet_slip.regression import rounding
-from fleet_slip.regression.crossval import held_out
 from fleet_slip.regression.elimination import eliminate
 from fleet_slip.regression.exact import LinearModel, Scales, correlation_matrix, moments
-from fleet_slip.regression.figures import Figures
-from fleet_slip.regression.folds import Folds
 from fleet_slip.regression.special import FloatArray
 from fleet_slip.regression.standard import from_standardised, through_means
 
@@ -111,24 +108,12 @@ def ridge_path(
 
 
 def ridge_model(gram: Gram, inputs: Sequence[str], label: str, penalty: float) -> LinearModel:
-    """Return the ridge model of counts at one penalty on the correlation matrix."""
+    """Return the ridge model of counts at one penalty on the correlation matrix.
+
+    `cross_validate` with this for a procedure gives the figures at a penalty.
+    """
     path = ridge_path(gram, inputs, label, [penalty])
     return from_standardised(gram, inputs, label, path.coefficients[0])
-
-
-def cross_validated_ridge(
-    folds: Folds, inputs: Sequence[str], label: str, penalties: Sequence[float], scales: Scales
-) -> list[Figures]:
-    """Return the pooled cross-validated figures at each penalty."""
-
-    def figures(penalty: float) -> Figures:
-        sums = [
-            held_out(lambda g: ridge_model(g, inputs, label, penalty), folds.total - f, f, label)
-            for f in folds.grams
-        ]
-        return sum(sums[1:], sums[0]).figures(scales[label])
-
-    return [figures(penalty) for penalty in penalties]
 
 
 def _variances(

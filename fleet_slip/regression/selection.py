@@ -101,7 +101,7 @@ def cross_validate_nested(
 ) -> list[CrossValidation]:
     """Cross-validate the k+1 nested models of a given order; model j is called "first j"."""
     return [
-        cross_validate(f"first {size}", folds, label, least_squares(order[:size], label), scales)
+        cross_validate(f"first {size}", folds, least_squares(order[:size], label), scales)
         for size in range(len(order) + 1)
     ]
 
@@ -123,7 +123,7 @@ def cross_validate_selection(
     for number, test in enumerate(folds.grams):
         rest = _without(training, fold, number)
         model = select_nested(rest, inputs, label, rule).fit.model
-        tests.append(held_out(lambda _, chosen=model: chosen, folds.total - test, test, label))
+        tests.append(held_out(model, rest.folds.total, test))
     chosen = select_nested(training, inputs, label, rule).fit.model
     return assemble(name, folds, tests, chosen, training.scales)
 

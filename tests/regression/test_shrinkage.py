@@ -13,6 +13,7 @@ from sklearn.linear_model import Ridge
 from fleet_slip.errors import SelectionError
 from fleet_slip.gram import Gram
 from fleet_slip.regression import pace as pace_module
+from fleet_slip.regression.crossval import Procedure, cross_validate
 from fleet_slip.regression.evidence import Evidence
 from fleet_slip.regression.exact import fit
 from fleet_slip.regression.folds import Folds
@@ -27,7 +28,6 @@ from fleet_slip.regression.nnls import nonnegative_least_squares
 from fleet_slip.regression.orthogonal import OrthogonalResponses
 from fleet_slip.regression.pace import ESTIMATORS, james_stein, pace
 from fleet_slip.regression.ridge import (
-    cross_validated_ridge,
     errors_in_variables,
     noise_matched,
     penalised,
@@ -66,9 +66,16 @@ def test_the_ridge_path_starts_at_least_squares_and_is_cross_validated() -> None
         [*ols.weights.values()],
         rtol=1e-9,
     )
+
+    def ridge(penalty: float) -> Procedure:
+        return lambda gram: ridge_model(gram, inputs, "y", penalty)
+
     folds = Folds(tuple(gram_of(counts) for counts in drives), tuple("abcdefghijkl"), 12)
-    figures = cross_validated_ridge(folds, inputs, "y", [0.0, 0.1, 10.0], unit_scales(4))
-    assert figures[0].rmse < figures[2].rmse
+    least, most = (
+        cross_validate("ridge", folds, ridge(penalty), unit_scales(4)).pooled.rmse
+        for penalty in (0.0, 10.0)
+    )
+    assert least < most
     assert ridge_path(gram, inputs, "y", [0, 1, 2]).gcv.shape == (3,)
 
 

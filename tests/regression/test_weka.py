@@ -92,7 +92,7 @@ def test_coefficients_zeros_and_pooled_figures(name: str, number: int) -> None:
     run = reference(f"weka/{name}_weka.json")["runs"][number]
     folds, inputs, label, scales = dataset(name)
     result: CrossValidation = cross_validate(
-        run["options"], folds, label, procedure(run, inputs, label), scales
+        run["options"], folds, procedure(run, inputs, label), scales
     )
     ours, theirs = np.array(coefficients(result.model, inputs, run)), np.array(run["coef"])
     assert ((ours == 0) == (theirs == 0)).all()
@@ -117,7 +117,7 @@ def test_exact_answers(name: str) -> None:
     np.testing.assert_allclose(rss, [float(v) for v in exact["nested_rss_in_backward_order"]])
     a = [float(v) for v in exact["A_j_in_backward_order"]]
     np.testing.assert_allclose(Evidence.naive(fits).contributions, a, rtol=1e-13)
-    result = cross_validate("ols", folds, label, lambda g: fit(g, inputs, label).model, scales)
+    result = cross_validate("ols", folds, lambda g: fit(g, inputs, label).model, scales)
     answers = exact["cv10_seed1_weka_folds"]
     assert result.correlation == float(answers["corr"])
     assert result.pooled.rmse == float(answers["rmse"])

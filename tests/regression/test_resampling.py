@@ -1,0 +1,88 @@
+"""Bootstrap and repeated cross-validation against the exact figures and theory."""
+
+import numpy as np
+import pytest
+
+from fleet_slip.errors import SelectionError
+from fleet_slip.gram import GramTable
+from fleet_slip.regression.crossval import cross_validate, least_squares
+from fleet_slip.regression.drives import DriveMoments
+from fleet_slip.regression.exact import fit
+from fleet_slip.regression.folds import CohortFolds, by_value
+from fleet_slip.regression.inference import cluster
+from fleet_slip.regression.resampling import (
+    bootstrap_coefficients,
+    bootstrap_correlations,
+    held_out_products,
+    percentile_interval,
+    repeated_cross_validation,
+    solve,
+    to_counts,
+)
+
+from .data import gram_of, names, random_drives, unit_scales
+
+INPUTS = names(4)[:-1]
+
+
+def table_of(drives: list[np.ndarray]) -> GramTable:
+    return GramTable.from_grams([gram_of(counts) for counts in drives])
+
+
+def test_moments_solve_to_the_exact_coefficients() -> None:
+    drives = random_drives(1)
+    moments = DriveMoments.of(table_of(drives))
+    solution = to_counts(moments, solve(moments.matrix(moments.packed.sum(axis=0))))
+    exact = fit(gram_of(np.concatenate(drives)), INPUTS, "y").model
+    np.testing.assert_allclose(solution, [exact.offset, *exact.weights.values()], rtol=1e-9)
+
+
+def test_held_out_products_pool_to_the_cross_validated_correlation() -> None:
+    drives = random_drives(2, noise=200)
+    table = table_of(drives)
+    assignment = by_value([i % 4 for i in range(12)])
+    folds = CohortFolds.of([table], assignment).serving(INPUTS[:2], "y")
+    result = cross_validate("m", folds, least_squares(INPUTS[:2], "y"), unit_scales(4))
+    models = [fit(folds.total - fold, INPUTS[:2], "y").model for fold in folds.grams]
+    moments = DriveMoments.of(table.restrict([*INPUTS[:2], "y"]))
+    products = held_out_products(moments, assignment.fold, models)
+    n, e, ee, *_ = products.sum(axis=0)
+    assert n == 12 * 60
+    assert e / n * moments.spread[-1] == pytest.approx(result.pooled.error_mean, abs=1e-9)
+    assert np.sqrt(ee / n) * moments.spread[-1] == pytest.approx(result.pooled.rmse, rel=1e-9)
+    draws = bootstrap_correlations(products, 500, seed=1)
+    interval = percentile_interval(draws)
+    assert interval.low < result.correlation < interval.high
+    assert interval.replicates == 500
+    np.testing.assert_array_equal(draws, bootstrap_correlations(products, 500, seed=1))
+
+
+def test_bootstrap_spread_is_the_cluster_robust_error() -> None:
+    drives = random_drives(3, drives=200, noise=200)
+    moments = DriveMoments.of(table_of(drives))
+    draws = bootstrap_coefficients(moments, 2000, seed=3)
+    fitted = fit(gram_of(np.concatenate(drives)), INPUTS, "y")
+    errors = [e.standard_error for e in cluster(fitted, moments, unit_scales(4)).estimates]
+    np.testing.assert_allclose(draws.std(axis=0), errors, rtol=0.15)
+
+
+def test_repeats_agree_with_exact_cross_validation() -> None:
+    drives = random_drives(4, drives=15, noise=200)
+    moments = DriveMoments.of(table_of(drives))
+    repeated = repeated_cross_validation(moments, 15, 2, seed=0)
+    folds = CohortFolds.of([table_of(drives)], by_value(range(15))).serving(INPUTS, "y")
+    exact = cross_validate("loo", folds, least_squares(INPUTS, "y"), unit_scales(4))
+    # With as many folds as drives every deal is the same: leave one drive out.
+    np.testing.assert_allclose(repeated.correlations, exact.correlation, rtol=1e-9)
+    np.testing.assert_allclose(repeated.rmse, exact.pooled.rmse, rtol=1e-9)
+    several = repeated_cross_validation(moments, 5, 20, seed=0)
+    assert several.spread > 0
+    assert several.mean == pytest.approx(exact.correlation, abs=0.01)
+
+
+def test_too_few_drives() -> None:
+    moments = DriveMoments.of(table_of(random_drives(5, drives=3)))
+    with pytest.raises(SelectionError, match="3 drives cannot fill 5 folds"):
+        repeated_cross_validation(moments, 5, 1, seed=0)
+    with pytest.raises(SelectionError, match="at least two drives"):
+        bootstrap_coefficients(moments.take(np.array([0])), 10, seed=0)
