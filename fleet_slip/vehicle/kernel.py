@@ -49,6 +49,7 @@ PLAN = np.dtype(
         ("closed", np.bool_),
         ("distance_m", np.float64),
         ("samples", np.int64),  # most that the drive may take
+        ("output", np.int64),  # where in the output its channels stand, one after the other
     ]
 )
 """What the kernel knows of a drive."""
@@ -79,7 +80,7 @@ CHANNELS = (
     "station_m",
     "lateral_offset_m",
 )
-"""Rows of a drive's output."""
+"""Channels of a drive's output, each with room for the samples of its plan."""
 
 STATE = 0
 SLOPES = STATE + len(State._fields)
@@ -197,18 +198,19 @@ def _has_lost(x: State, pose: Pose) -> bool:
 
 
 @equation
-def _record(truth: Any, drive: int, tick: int, x: State, pose: Pose) -> None:
+def _record(truth: Any, plan: Any, tick: int, x: State, pose: Pose) -> None:
     """Write the sample that begins here, but for the specific force, which the next step gives."""
-    truth[drive, 2, tick] = x.yaw_rate
-    truth[drive, 3, tick] = x.steering_wheel
-    truth[drive, 4, tick] = x.wheel_fl
-    truth[drive, 5, tick] = x.wheel_fr
-    truth[drive, 6, tick] = x.wheel_rl
-    truth[drive, 7, tick] = x.wheel_rr
-    truth[drive, 11, tick] = x.vx
-    truth[drive, 12, tick] = x.vy
-    truth[drive, 13, tick] = pose.station
-    truth[drive, 14, tick] = pose.offset
+    at = plan.output + tick
+    truth[at + 2 * plan.samples] = x.yaw_rate
+    truth[at + 3 * plan.samples] = x.steering_wheel
+    truth[at + 4 * plan.samples] = x.wheel_fl
+    truth[at + 5 * plan.samples] = x.wheel_fr
+    truth[at + 6 * plan.samples] = x.wheel_rl
+    truth[at + 7 * plan.samples] = x.wheel_rr
+    truth[at + 11 * plan.samples] = x.vx
+    truth[at + 12 * plan.samples] = x.vy
+    truth[at + 13 * plan.samples] = pose.station
+    truth[at + 14 * plan.samples] = pose.offset
 
 
 @equation
@@ -221,7 +223,7 @@ def _look(memory: Any, book: Any, plans: Any, roads: Any, truth: Any, ended: Any
             pose = read(memory, POSE, lane, Pose)
             if ended[drive, LOST] == NOBODY and _has_lost(x, pose):
                 ended[drive, LOST] = tick
-            _record(truth, drive, tick, x, pose)
+            _record(truth, plans[drive], tick, x, pose)
             lost = ended[drive, LOST] != NOBODY
             write(memory, PATH, lane, _look_up(roads, plans[drive], x, pose.station, lost))
 
@@ -234,8 +236,8 @@ def _move_on(memory: Any, book: Any, plans: Any, truth: Any, ended: Any) -> int:
         drive, tick = book[DRIVE, lane], book[TICK, lane]
         if drive != NOBODY:
             plan = plans[drive]
-            truth[drive, 0, tick] = memory[FORCE * LANES + lane]
-            truth[drive, 1, tick] = memory[(FORCE + 1) * LANES + lane]
+            truth[plan.output + tick] = memory[FORCE * LANES + lane]
+            truth[plan.output + plan.samples + tick] = memory[(FORCE + 1) * LANES + lane]
             station = memory[POSE * LANES + lane]
             gone = book[LAP, lane] * plan.length_m + station
             if plan.closed:
@@ -253,16 +255,16 @@ def _move_on(memory: Any, book: Any, plans: Any, truth: Any, ended: Any) -> int:
 
 
 @equation
-def _finish(truth: Any, ended: Any, cars: Any) -> None:
+def _finish(truth: Any, plans: Any, ended: Any, cars: Any) -> None:
     """Fill in what follows from the recorded: the road wheels' angles and the side-slip angle."""
-    for drive in range(len(truth)):
-        steer = cars[drive, STEER]
-        ackermann = cars[drive, ACKERMANN]
-        for tick in range(ended[drive, SAMPLES]):
-            tangent = steer * truth[drive, 3, tick]
-            truth[drive, 8, tick] = arctan2(tangent, 1.0 - ackermann * tangent)
-            truth[drive, 9, tick] = arctan2(tangent, 1.0 + ackermann * tangent)
-            truth[drive, 10, tick] = arctan2(truth[drive, 12, tick], truth[drive, 11, tick])
+    for drive in range(len(plans)):
+        steer, ackermann = cars[drive, STEER], cars[drive, ACKERMANN]
+        size = plans[drive].samples
+        for at in range(plans[drive].output, plans[drive].output + ended[drive, SAMPLES]):
+            tangent = steer * truth[at + 3 * size]
+            truth[at + 8 * size] = arctan2(tangent, 1.0 - ackermann * tangent)
+            truth[at + 9 * size] = arctan2(tangent, 1.0 + ackermann * tangent)
+            truth[at + 10 * size] = arctan2(truth[at + 12 * size], truth[at + 11 * size])
 
 
 def _compile(sources: str) -> Callable[..., NDArray[np.int64]]:
@@ -272,7 +274,7 @@ def _compile(sources: str) -> Callable[..., NDArray[np.int64]]:
     def simulate(
         plans: Any, cars: Any, roads: Any, queue: Any, steps: int, truth: Any
     ) -> NDArray[np.int64]:
-        """Fill `truth` (drives, channels, samples); return samples and loss tick of each drive.
+        """Fill `truth`; return the number of samples and the tick of the loss of each drive.
 
         `plans` are of dtype `PLAN` and point into the table `roads`; `cars` has `Constants` and
         `Handling` in rows; drives get a lane in the order of `queue`; a sample takes `steps` steps.
@@ -294,7 +296,7 @@ def _compile(sources: str) -> Callable[..., NDArray[np.int64]]:
                 elif book[DRIVE, lane] == NOBODY:
                     _clear(memory, lane)
             if running == 0:
-                _finish(truth, ended, cars)
+                _finish(truth, plans, ended, cars)
                 return ended
             finished = 0
             while finished == 0:

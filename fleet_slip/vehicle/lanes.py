@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,17 @@ from fleet_slip.vehicle.driver import SAMPLE_S, handling
 from fleet_slip.vehicle.integration import STEP_S
 from fleet_slip.vehicle.kernel import LOST_SPEED_MPS
 from fleet_slip.vehicle.parameters import VehicleParameters, constants
+
+STEPS_PER_SAMPLE = round(SAMPLE_S / STEP_S)
+
+PATIENCE = 1.25
+"""A drive that takes so many times its planned time ends."""
+
+GRACE_S = 5.0
+"""Time that every drive may take beyond that."""
+
+FARTHEST_VIEW_M = 20.0
+"""How far beyond a lap's end a driver may look."""
 
 
 class Road(NamedTuple):
@@ -70,9 +81,6 @@ class Truth:
     """First tick at which the driver had lost the car; None where he never did."""
 
 
-STEPS_PER_SAMPLE = round(SAMPLE_S / STEP_S)
-
-
 def simulate_drives(
     drives: Sequence[LaneDrive], steps_per_sample: int = STEPS_PER_SAMPLE
 ) -> list[Truth]:
@@ -96,30 +104,23 @@ def simulate_drives(
     plans = np.array([_plan(drive, *spans[id(drive.road)]) for drive in drives], dtype=kernel.PLAN)
     cars = np.array([(*constants(d.vehicle, d.adhesion), *handling(d.vehicle)) for d in drives])
     longest_first = np.argsort(-plans["samples"], kind="stable")
-    truth = np.empty((len(drives), len(kernel.CHANNELS), int(plans["samples"].max())))
+    sizes = len(kernel.CHANNELS) * plans["samples"]
+    plans["output"] = np.cumsum(sizes) - sizes
+    memory = np.empty(int(sizes.sum()))
     ended = kernel.simulate(
-        plans, cars, np.concatenate(tables), longest_first, steps_per_sample, truth
+        plans, cars, np.concatenate(tables), longest_first, steps_per_sample, memory
     )
-    return [
-        Truth(
-            **{
-                name: truth[i, row, : ended[i, kernel.SAMPLES]]
-                for row, name in enumerate(kernel.CHANNELS)
-            },
-            lost_control_tick=int(ended[i, kernel.LOST]) if ended[i, kernel.LOST] >= 0 else None,
-        )
-        for i in range(len(drives))
-    ]
+    return [_truth(memory, plan, *end) for plan, end in zip(plans, ended, strict=True)]
 
 
-PATIENCE = 1.5
-"""A drive that takes so many times its planned time ends."""
-
-FARTHEST_VIEW_M = 20.0
-"""How far beyond a lap's end a driver may look."""
-
-GRACE_S = 10.0
-"""Time that every drive may take beyond that."""
+def _truth(memory: NDArray[np.float64], plan: Any, samples: int, lost: int) -> Truth:
+    """Return what the kernel wrote of one drive."""
+    size = len(kernel.CHANNELS) * int(plan["samples"])
+    channels = memory[plan["output"] : plan["output"] + size].reshape(len(kernel.CHANNELS), -1)
+    return Truth(
+        **{name: channels[row, :samples] for row, name in enumerate(kernel.CHANNELS)},
+        lost_control_tick=None if lost == kernel.NOBODY else int(lost),
+    )
 
 
 def planned_time_s(road: Road, distance_m: float) -> float:
@@ -153,12 +154,12 @@ def _table(road: Road) -> NDArray[np.float64]:
 
 def _plan(
     drive: LaneDrive, first: int, last: int
-) -> tuple[int, int, float, float, bool, float, int]:
+) -> tuple[int, int, float, float, bool, float, int, int]:
     """Return a drive's row of `kernel.PLAN`."""
     road = drive.road
     distance_m = (drive.laps if road.closed else min(drive.laps, 1.0)) * road.length_m
     samples = math.ceil((PATIENCE * planned_time_s(road, distance_m) + GRACE_S) / SAMPLE_S)
-    return first, last, 1 / road.spacing_m, road.length_m, road.closed, distance_m, samples
+    return first, last, 1 / road.spacing_m, road.length_m, road.closed, distance_m, samples, 0
 
 
 def _check(drive: LaneDrive) -> None:
