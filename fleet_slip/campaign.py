@@ -18,6 +18,7 @@ import numpy as np
 from pydantic import Field, TypeAdapter, model_validator
 
 from fleet_slip.config import Config, load_config
+from fleet_slip.errors import ConfigError
 from fleet_slip.plan import Fleet, Grid, random_generator
 from fleet_slip.resources import find_config
 from fleet_slip.sensors import SAMPLE_RATE_HZ, Sensors
@@ -110,12 +111,24 @@ class Campaign(Config):
         return tuple(self.first_day + timedelta(days=day) for day in range(self.number_of_days))
 
     def drives(self, day: date) -> tuple[DriveSpec, ...]:
-        """Return the drives of one day, in the order of their names."""
+        """Return the drives of one day, in the order of their names.
+
+        Raises `ConfigError` if the campaign has no such day.
+        """
+        days = self.days()
+        if day not in days:
+            raise ConfigError(
+                f"{day} is not a day of the campaign {self.name!r}, which goes from {days[0]} to"
+                f" {days[-1]}. Choose one of these, or raise number_of_days."
+            )
         first = (day - self.first_day).days * self.drives_per_day
         return tuple(self._drive(day, first, i) for i in range(self.drives_per_day))
 
     def batches(self, day: date) -> tuple[Batch, ...]:
-        """Return the files of one day, whole drives in each, about `rows_per_file` or fewer rows."""
+        """Return the files of one day: whole drives, in each about `rows_per_file` rows or fewer.
+
+        Raises `ConfigError` like `drives`.
+        """
         packs = pack(self.drives(day), self.rows_per_file)
         return tuple(Batch(self.name, day, i, drives) for i, drives in enumerate(packs))
 

@@ -141,7 +141,7 @@ def _noisy_counts(
 
 
 @numba.njit(cache=True, nogil=True)
-def _quantise(  # noqa: PLR0917 compiled functions take positional arguments
+def _quantise(
     physical: NDArray[np.float64],
     noise: NDArray[np.float32],
     bias_and_std: tuple[float, float],

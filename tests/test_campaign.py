@@ -148,8 +148,9 @@ def test_each_day_of_a_grid_covers_the_range_of_speeds() -> None:
 
 
 def test_cars_of_a_grid_are_its_vehicles_and_masses(tmp_path: Path) -> None:
-    campaign = load_text(tmp_path, SMOKE.replace("[1320.0]", "[1000.0, 1320.0, 1740.0]"))
-    drives = [d for n in range(6) for d in campaign.drives(date(2024, 5, 1 + n))]
+    text = SMOKE.replace("[1320.0]", "[1000.0, 1320.0, 1740.0]")
+    campaign = load_text(tmp_path, text.replace("number_of_days = 2", "number_of_days = 6"))
+    drives = [d for day in campaign.days() for d in campaign.drives(day)]
     masses = {(d.vehicle_id, d.vehicle.body.sprung_mass_kg) for d in drives}
     assert masses == {("smoke-0000", 1000.0), ("smoke-0001", 1320.0), ("smoke-0002", 1740.0)}
 
@@ -231,6 +232,12 @@ def test_faults_of_a_fleet_are_named(tmp_path: Path, old: str, new: str, complai
     with pytest.raises(ConfigError) as error:
         load_text(tmp_path, FLEET.replace(old, new, 1))
     assert complaint in str(error.value)
+
+
+@pytest.mark.parametrize("day", [date(2024, 4, 30), date(2024, 5, 3)])
+def test_a_day_outside_the_campaign_is_refused(day: date) -> None:
+    with pytest.raises(ConfigError, match="goes from 2024-05-01 to 2024-05-02"):
+        load_campaign("smoke").batches(day)
 
 
 def test_open_tracks_have_no_laps(tmp_path: Path) -> None:
