@@ -5,14 +5,21 @@ from datetime import UTC, date, datetime
 from typing import Annotated
 
 import polars as pl
-from pydantic import Field, StringConstraints, field_validator, model_validator
+from pydantic import AfterValidator, Field, StringConstraints, field_validator, model_validator
 
 from fleet_slip.config import Config, load_config
 from fleet_slip.ingest.units import conversion_factor
 from fleet_slip.resources import find_config
 from fleet_slip.signals import Identifier, catalogue
 
-Name = Annotated[str, StringConstraints(min_length=1, max_length=200)]
+
+def _printable(text: str) -> str:
+    if not text.isprintable():
+        raise ValueError("has characters that cannot be printed")
+    return text
+
+
+Name = Annotated[str, StringConstraints(min_length=1, max_length=200), AfterValidator(_printable)]
 PositiveFloat = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
@@ -126,10 +133,9 @@ class Mapping(Config):
             if name not in known:
                 raise ValueError(f"unknown signal {name!r}. Known signals: {', '.join(known)}")
             try:
-                conversion_factor(column.unit, known[name].unit)
+                conversion_factor(column.unit, known[name].unit, name)
             except ValueError as error:
-                reason = str(error).replace("; it ", f"; {name} ").replace("but it ", f"{name} ")
-                raise ValueError(f"signals.{name}: {column.column} {reason}") from None
+                raise ValueError(f"signals.{name}: {column.column} {error}") from None
         return self
 
     @model_validator(mode="after")

@@ -13,7 +13,7 @@ from fleet_slip.ingest.drives import cut, drive_id, log_table, to_ticks
 from fleet_slip.ingest.fields import RAW, Field, fields_of
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.quarantine import QUARANTINE_SCHEMA, DriveKeys, check_rows, with_values
-from fleet_slip.ingest.reading import MAX_ROWS, file_digest, read_batches, shown
+from fleet_slip.ingest.reading import MAX_ROWS, file_digest, read_batches, shown, unchanged
 from fleet_slip.ingest.resampling import STEP_S
 from fleet_slip.ingest.timebase import cut_into_drives, sample_interval_s
 
@@ -59,8 +59,9 @@ def read_measured(file: Path, mapping: Mapping) -> MeasuredLog:
     Raises `InputError` if the file cannot be read, is not what the mapping says, or has no usable
     row.
     """
-    digest = _identity(file, mapping)
-    rows, bad, keys, rows_read = _check(file, mapping)
+    with unchanged(file):
+        digest = _identity(file, mapping)
+        rows, bad, keys, rows_read = _check(file, mapping)
     rows, misplaced = cut_into_drives(rows, mapping.time)
     bad = pl.concat([bad, misplaced]).sort("row")
     _check_usable(file, mapping, rows, bad)

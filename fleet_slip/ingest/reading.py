@@ -31,7 +31,7 @@ MAX_ROWS = 20_000_000
 """Rows of one file: 55 hours at 100 Hz. All of them are in memory once, as float64."""
 MAX_COLUMNS = 10_000
 MAX_LINE_BYTES = 2**20
-MAX_FOOTER_BYTES = 2**26
+MAX_FOOTER_BYTES = 2**24
 MAX_TEXT = 1_000
 """Characters of one text in Parquet: a dictionary can repeat a long one for the price of a bit."""
 EXTRA_FIELDS = "\0extra fields"
@@ -47,11 +47,23 @@ def shown(text: object) -> str:
     return plain if plain.isprintable() else repr(plain)
 
 
-def file_digest(file: Path) -> "hashlib._Hash":
-    """Return the SHA-256 of a regular file's bytes, open for more. Raises `InputError`."""
+@contextmanager
+def unchanged(file: Path) -> Iterator[None]:
+    """Raise `InputError` if this is no regular file, or if it is written to while it is read."""
     if not file.is_file():
         what = "is not a regular file" if file.exists() else "no such file"
         raise InputError(f"{shown(file)}: {what}. Give the path of a CSV or Parquet file.")
+    with _file_errors(file):
+        before = file.stat()
+    yield
+    with _file_errors(file):
+        after = file.stat()
+    if (before.st_size, before.st_mtime_ns) != (after.st_size, after.st_mtime_ns):
+        raise InputError(f"{shown(file)}: it changed while it was read. Wait until it is complete.")
+
+
+def file_digest(file: Path) -> "hashlib._Hash":
+    """Return the SHA-256 of a file's bytes, open for more. Raises `InputError`."""
     with _file_errors(file), file.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256")
 
@@ -259,6 +271,7 @@ def _is_text(arrow_type: pa.DataType) -> bool:
 
 def _plain(array: pa.Array, name: str, file: Path) -> pa.Array:
     """Return a column as text, float64, date or timestamp. Raises `InputError` for others."""
+    array.validate(full=True)  # what Parquet calls text need not be UTF-8, and Polars trusts it
     if pa.types.is_dictionary(array.type):
         longest = pc.max(pc.utf8_length(array.dictionary)).as_py() if _is_text(array.type) else 0
         if longest is not None and longest > MAX_TEXT:

@@ -18,8 +18,8 @@ _NEEDS = {
 }
 
 
-def conversion_factor(unit: str, si_unit: str) -> float:
-    """Return f in `value in si_unit = f * value in unit`.
+def conversion_factor(unit: str, si_unit: str, quantity: str = "it") -> float:
+    """Return f in `value in si_unit = f * value in unit`; `quantity` is what messages call it.
 
     In an acceleration `g` is standard gravity, 9.80665 m/s² (elsewhere it would be the gram). The
     radian counts as a dimension, so that neither a ratio passes for an angle nor Hz for rad/s:
@@ -27,17 +27,17 @@ def conversion_factor(unit: str, si_unit: str) -> float:
 
     Raises `ValueError`, with a message that ends in what is needed instead.
     """
-    needs = f"needs {_NEEDS.get(si_unit, f'a unit like {si_unit!r}')}"
+    needs = f"{quantity} needs {_NEEDS.get(si_unit, f'a unit like {si_unit!r}')}"
     # The pattern keeps pint from evaluating arithmetic: '9^9^9^9' would never end.
     if len(unit) > _LONGEST_UNIT or not _UNIT.fullmatch(unit):
-        raise ValueError(f"is in {unit[:_LONGEST_UNIT]!r}, which is not a unit; it {needs}")
+        raise ValueError(f"is in {unit[:_LONGEST_UNIT]!r}, which is not a unit; {needs}")
     registry = pint.application_registry
     name = "standard_gravity" if unit == "g" and si_unit == "m/s^2" else unit
     try:
         root = registry.Quantity(1.0, name).to_root_units()
         wanted = registry.Quantity(1.0, si_unit).to_root_units()
     except (pint.PintError, ValueError, TypeError, AttributeError):
-        raise ValueError(f"is in {unit!r}, which is not a known unit; it {needs}") from None
+        raise ValueError(f"is in {unit!r}, which is not a known unit; {needs}") from None
     if root.units != wanted.units:
-        raise ValueError(f"is in {unit!r}, but it {needs}")
+        raise ValueError(f"is in {unit!r}, {needs}")
     return float(root.magnitude) / float(wanted.magnitude)

@@ -18,7 +18,7 @@ from fleet_slip.signals import catalogue
 from .samples import a_mapping, csv_text, good_columns
 
 CASES = settings(
-    max_examples=250, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 MAPPINGS = (
     a_mapping(),

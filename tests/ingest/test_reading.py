@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import read_measured, reading
+from fleet_slip.ingest import measured, read_measured, reading
 
 from .samples import a_mapping, csv_text, good_columns, read_text, reasons, ticks
 
@@ -126,6 +126,19 @@ def test_paths_that_are_no_files_are_refused(tmp_path: Path) -> None:
     assert "no such file" in failure(tmp_path / "loop")
 
 
+def test_a_file_that_grows_while_it_is_read_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = write(tmp_path, GOOD.encode())
+
+    def grow(*arguments: Any) -> Any:
+        yield from reading.read_batches(*arguments)
+        file.write_bytes(GOOD.encode() + b"0.20,1,1\n")
+
+    monkeypatch.setattr(measured, "read_batches", grow)
+    assert "it changed while it was read" in failure(file)
+
+
 @pytest.mark.parametrize("name", ["*.csv", "a\nb'.csv", "x'; DROP TABLE logs; --", "é.csv"])
 def test_a_file_name_is_only_a_name(tmp_path: Path, name: str) -> None:
     log = read_measured(write(tmp_path, GOOD.encode() + b"oops,1,2\n", name), a_mapping())
@@ -196,6 +209,11 @@ def test_broken_parquet_is_refused(tmp_path: Path) -> None:
     assert "not a Parquet file" in failure(write(tmp_path, GOOD.encode(), "text.parquet"))
     assert "footer is too large" in failure(write(tmp_path, b"PAR1" + b"\xff" * 20 + b"PAR1"))
     assert "cannot be read" in failure(write(tmp_path, b"PAR1\0\0\0\0\x04\0\0\0PAR1"))
+
+
+def test_text_in_parquet_that_is_not_utf8_is_refused(tmp_path: Path) -> None:
+    data = parquet(tmp_path, ax=pa.array(["needle"] * 20)).read_bytes()
+    assert "UTF8" in failure(write(tmp_path, data.replace(b"needle", b"\xffeedle"), "bad.parquet"))
 
 
 def test_more_rows_than_fit_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
