@@ -1,0 +1,256 @@
+"""The car as a highway-env vehicle, for any of its roads and environments.
+
+highway-env draws y downwards and counts headings from x towards y. In its plane the equations hold
+as they stand, with "left" as the direction of growing y: a positive steering angle turns the
+heading up in number and the car to the right of the picture.
+"""
+
+import math
+from collections.abc import Callable
+from functools import cache, lru_cache
+from typing import Any, NamedTuple, Self
+
+import numba
+import numpy as np
+from highway_env.vehicle.dynamics import BicycleVehicle
+from highway_env.vehicle.kinematics import Vehicle
+from numpy.typing import NDArray
+
+from fleet_slip.vehicle.compiling import equation
+from fleet_slip.vehicle.dynamics import NO_EXTENSIONS, Extensions, build_derivative
+from fleet_slip.vehicle.integration import (
+    FIRST_ORDER,
+    SECOND_ORDER,
+    STEP_S,
+    Slopes,
+    advance,
+    extrapolate,
+)
+from fleet_slip.vehicle.parameters import Constants, VehicleParameters, constants, load_vehicle
+from fleet_slip.vehicle.state import Controls, State
+from fleet_slip.vehicle.tyre import cornering_stiffness
+
+NO_SLOPES = Slopes(*(0.0 for _ in Slopes._fields))
+
+
+class Place(NamedTuple):
+    """Where the car stands in highway-env's plane, or how fast that changes."""
+
+    x: float
+    y: float
+    heading: float
+
+
+class Motion(NamedTuple):
+    """All that moves: the car, its place, and what the next step needs of the last one."""
+
+    state: State
+    place: Place
+    slopes: Slopes
+    drift: Place
+
+
+@cache
+def _compiled_derivative(extensions: Extensions) -> Callable[..., Any]:
+    derivative = build_derivative(extensions)
+
+    @numba.njit(error_model="numpy")
+    def evaluate(x: State, u: Controls, c: Constants) -> Any:
+        return derivative(x, u, c)
+
+    return evaluate
+
+
+@cache
+def _compiled_steps(extensions: Extensions) -> Callable[..., Motion]:
+    """Compile successive steps of one car with some of the extensions."""
+    derivative = build_derivative(extensions)
+
+    @equation
+    def drift_of(x: State, place: Place) -> Place:
+        cosine, sine = math.cos(place.heading), math.sin(place.heading)
+        return Place(x.vx * cosine - x.vy * sine, x.vx * sine + x.vy * cosine, x.yaw_rate)
+
+    @numba.njit(error_model="numpy", nogil=True)
+    def steps(
+        motion: Motion, u: Controls, c: Constants, step: float, count: int, order: float
+    ) -> Motion:
+        x, place, slopes, before = motion
+        for _ in range(count):
+            drift = drift_of(x, place)
+            place = Place(
+                place.x + step * extrapolate(drift.x, before.x, order),
+                place.y + step * extrapolate(drift.y, before.y, order),
+                place.heading + step * extrapolate(drift.heading, before.heading, order),
+            )
+            before = drift
+            x, slopes = advance(x, derivative(x, u, c), slopes, c, step, order)
+            order = SECOND_ORDER
+        return Motion(x, place, slopes, before)
+
+    return steps
+
+
+@lru_cache(maxsize=256)
+def _constants(parameters: VehicleParameters, adhesion: float) -> Constants:
+    return constants(parameters, adhesion)
+
+
+class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
+    """A car with four wheels on highway-env's roads.
+
+    It takes highway-env's actions: `steering`, the angle of the road wheels in rad, and
+    `acceleration`, the tractive force per mass in m/s². What becomes of them is up to actuators,
+    engine, brakes, tyres and the road. `speed` is the longitudinal velocity, as in
+    `BicycleVehicle`; `velocity` includes the lateral one.
+
+    highway-env makes vehicles by their class. A class for another car sets `PARAMETERS`,
+    `ADHESION` or `EXTENSIONS`.
+    """
+
+    PARAMETERS: VehicleParameters = load_vehicle("d_class_sedan")
+    ADHESION: float = 1.0
+    EXTENSIONS: Extensions = Extensions()
+    MAX_SPEED: float = 70.0
+    MIN_SPEED: float = -70.0
+
+    position: NDArray[np.float64]
+    heading: float
+    speed: float
+    lateral_speed: float
+    yaw_rate: float
+
+    def __init__(
+        self,
+        road: Any,
+        position: Any,
+        heading: float = 0,
+        speed: float = 0,
+        parameters: VehicleParameters | None = None,
+        adhesion: float | None = None,
+        extensions: Extensions | None = None,
+    ) -> None:
+        """Put the car on a road, or on none, rolling straight ahead.
+
+        `position` is in m, `heading` in rad, `speed` in m/s, as for every vehicle of highway-env.
+        What is not given is the class's.
+        """
+        self.parameters = self.PARAMETERS if parameters is None else parameters
+        self.adhesion = self.ADHESION if adhesion is None else adhesion
+        self.extensions = self.EXTENSIONS if extensions is None else extensions
+        c = self.constants
+        self.MASS = c.mass
+        self.INERTIA_Z = c.yaw_inertia
+        self.LENGTH_A, self.LENGTH_B = c.front, c.rear
+        self.FRICTION_FRONT = cornering_stiffness(c.static_front, c.stiffness_front, c)
+        self.FRICTION_REAR = cornering_stiffness(c.static_rear, c.stiffness_rear, c)
+        super().__init__(road, position, heading, speed)
+        rolling = speed * c.inverse_radius
+        self._hidden = State(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, *(rolling,) * 4)
+        self._slopes = NO_SLOPES
+        self._drift = Place(0.0, 0.0, 0.0)
+        self._step_s = 0.0
+
+    @classmethod
+    def create_from(cls, vehicle: Vehicle) -> Self:
+        """Return a car where another vehicle is, in the same motion if that is of this kind."""
+        if not isinstance(vehicle, FourWheelVehicle):
+            return super().create_from(vehicle)  # type: ignore[no-any-return]
+        copy = cls(
+            vehicle.road,
+            vehicle.position,
+            vehicle.heading,
+            vehicle.speed,
+            vehicle.parameters,
+            vehicle.adhesion,
+            vehicle.extensions,
+        )
+        copy.lateral_speed, copy.yaw_rate = vehicle.lateral_speed, vehicle.yaw_rate
+        copy._hidden = vehicle._hidden
+        if hasattr(vehicle, "color"):
+            copy.color = vehicle.color
+        return copy
+
+    @property
+    def constants(self) -> Constants:
+        """What the equations know of this car on this road."""
+        return _constants(self.parameters, self.adhesion)
+
+    @property
+    def motion(self) -> State:
+        """State of the car in its own frame; velocities as highway-env may have set them."""
+        return self._hidden._replace(
+            vx=float(self.speed), vy=float(self.lateral_speed), yaw_rate=float(self.yaw_rate)
+        )
+
+    @property
+    def wheel_speeds(self) -> NDArray[np.float64]:
+        """Angular velocities fl, fr, rl, rr in rad/s."""
+        return np.array(self._hidden[-4:])
+
+    @property
+    def sideslip(self) -> float:
+        """Side-slip angle in rad."""
+        return math.atan2(self.lateral_speed, self.speed)
+
+    @property
+    def specific_force(self) -> tuple[float, float]:
+        """What an accelerometer at the centre of gravity reads: ax, ay in m/s²."""
+        rates = _compiled_derivative(self.extensions)(self.motion, self.controls, self.constants)
+        return rates.ax, rates.ay
+
+    @property
+    def controls(self) -> Controls:
+        """The present action as demands on steering wheel and drivetrain."""
+        steering = self.parameters.steering
+        angle = steering.ratio * math.tan(float(self.action["steering"]))
+        if self.extensions.steering:
+            angle = min(max(angle, -steering.limit_rad), steering.limit_rad)
+        return Controls(angle, float(self.action["acceleration"]))
+
+    @property
+    def velocity(self) -> NDArray[np.float64]:
+        """Velocity of the centre of gravity in highway-env's plane, with its lateral part."""
+        cosine, sine = math.cos(self.heading), math.sin(self.heading)
+        vx, vy = self.speed, self.lateral_speed
+        return np.array([vx * cosine - vy * sine, vx * sine + vy * cosine])
+
+    def derivative_func(self, time: float, state: NDArray[np.float64], **_: Any) -> Any:
+        """Return the rates of highway-env's state (x, y, heading, vx, vy, yaw rate), (6, 1)."""
+        del time
+        heading, vx, vy, yaw_rate = (float(value) for value in state[2:, 0])
+        x = self._hidden._replace(vx=vx, vy=vy, yaw_rate=yaw_rate)
+        rates = _compiled_derivative(self.extensions)(x, self.controls, self.constants)
+        cosine, sine = math.cos(heading), math.sin(heading)
+        place = (vx * cosine - vy * sine, vx * sine + vy * cosine, yaw_rate)
+        return np.array([*place, rates.vx, rates.vy, rates.yaw_rate])[:, np.newaxis]
+
+    def step(self, dt: float) -> None:
+        """Move on by a time in s, in steps of at most `STEP_S`.
+
+        Without extensions the step is highway-env's own, of fourth order.
+        """
+        if self.extensions == NO_EXTENSIONS:
+            super().step(dt)
+            rolling = self.speed * self.constants.inverse_radius
+            self._hidden = State(*self.motion[:-4], *(rolling,) * 4)
+            return
+        self.clip_actions()
+        count = max(1, math.ceil(dt / STEP_S - 1e-9))
+        step_s = dt / count
+        order = SECOND_ORDER if step_s == self._step_s else FIRST_ORDER
+        place = Place(float(self.position[0]), float(self.position[1]), float(self.heading))
+        moved = _compiled_steps(self.extensions)(
+            Motion(self.motion, place, self._slopes, self._drift),
+            self.controls,
+            self.constants,
+            step_s,
+            count,
+            order,
+        )
+        self._hidden, self._slopes, self._drift = moved.state, moved.slopes, moved.drift
+        self._step_s = step_s
+        self.position = np.array([moved.place.x, moved.place.y])
+        self.heading = moved.place.heading
+        self.speed, self.lateral_speed, self.yaw_rate = moved.state[:3]
+        self.on_state_update()
