@@ -70,8 +70,8 @@ def to_ticks(rows: pl.DataFrame, mapping: Mapping, interval_s: float) -> Ticked:
     counts, somewhere = {}, np.zeros(ticks.size, dtype=np.bool_)
     for name in mapping.signals:
         values = rows[name].to_numpy().astype(np.float64)
-        is_label = name == catalogue().label
-        values = _on_the_circle(resample, values) if is_label else resample(values)
+        between_samples = method != "snap" and name == catalogue().label
+        values = _on_the_circle(resample, values) if between_samples else resample(values)
         absent = np.isnan(values)
         somewhere |= ~absent
         counts[name] = _counts(catalogue()[name], values, absent)

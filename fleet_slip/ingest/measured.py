@@ -19,6 +19,8 @@ from fleet_slip.ingest.timebase import cut_into_drives, sample_interval_s
 
 MAX_DRIVES = 10_000
 """Drives in one file. More means that time or the drive's column is not what the mapping says."""
+MAX_KEYS = 100_000
+"""Combinations of drive metadata in one file, of whatever rows."""
 MAX_TICKS = 2 * MAX_ROWS
 """Length of all drives of one file together, in ticks."""
 
@@ -112,6 +114,11 @@ def _check(file: Path, mapping: Mapping) -> tuple[pl.DataFrame, pl.DataFrame, Dr
         row = pl.int_range(rows_read + 1, rows_read + batch.height + 1, dtype=pl.Int64)
         valued = with_values(raw.with_columns(row.alias("row")), fields)
         rows, rejected = check_rows(keys.number(valued), fields)
+        if len(keys) > MAX_KEYS:
+            raise InputError(
+                f"{shown(file)}: more than {MAX_KEYS:,} combinations of drive metadata. "
+                f"Check the columns under [drive] in the mapping {mapping.name!r}."
+            )
         if mapping.time.rate_hz is not None:
             rows = rows.with_columns((pl.col("row") / mapping.time.rate_hz).alias("time"))
         good.append(rows)

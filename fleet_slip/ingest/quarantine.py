@@ -32,6 +32,10 @@ class DriveKeys:
         self._fields = [field for field in fields if field.kind == "key"]
         self._numbers: dict[tuple[Any, ...], int] = {}
 
+    def __len__(self) -> int:
+        """Return how many there are so far."""
+        return len(self._numbers)
+
     def number(self, batch: pl.DataFrame) -> pl.DataFrame:
         """Add `group` to a batch with values: the row's number, null where its key is faulty."""
         if not self._fields:

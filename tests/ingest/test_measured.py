@@ -250,6 +250,12 @@ def test_other_rates_are_resampled(tmp_path: Path, rate_hz: float) -> None:
     assert physical(log, "sideslip", 1e-4) == pytest.approx(np.radians(5 - time_s), abs=5.1e-5)
 
 
+def test_side_slip_on_ticks_stays_as_measured(tmp_path: Path) -> None:
+    columns = {"t": [0, 0.01, 0.02], "ax": [0] * 3, "beta": [179, -179, 183]}
+    log = read_columns(tmp_path, columns)
+    assert physical(log, "sideslip", 1e-4) == pytest.approx(np.radians([179, -179, 183]), abs=5e-5)
+
+
 def test_side_slip_is_resampled_on_the_circle(tmp_path: Path) -> None:
     t = np.arange(100) / 50
     turning = np.degrees(np.angle(np.exp(1j * (3.0 + 2 * t))))  # spins through 180 degrees
@@ -273,6 +279,9 @@ def test_what_is_absurd_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     columns["run"] = [i // 3 for i in range(300)]
     monkeypatch.setattr(measured, "MAX_DRIVES", 99)
     with pytest.raises(InputError, match="falls into 100 drives, at most 99"):
+        read_columns(tmp_path, columns, a_mapping(drive={"column": "run"}))
+    monkeypatch.setattr(measured, "MAX_KEYS", 99)
+    with pytest.raises(InputError, match="more than 99 combinations"):
         read_columns(tmp_path, columns, a_mapping(drive={"column": "run"}))
     monkeypatch.setattr(measured, "MAX_TICKS", 100)
     with pytest.raises(InputError, match="its drives last 299 ticks"):
