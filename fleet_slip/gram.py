@@ -22,7 +22,7 @@ BLOCK_ROWS = 2**18
 """Most rows of one matrix product. 16-bit counts would allow 2^21; this keeps the block small."""
 
 _SMALLEST_BLOCK = 2**10
-_LOW_BITS = 32
+_MODULUS = 2**64
 
 
 def packed_size(k: int) -> int:
@@ -243,29 +243,20 @@ class GramTable:
 
     def total(self, rows: NDArray[Any] | None = None) -> Gram:
         """Return the exact sum over all drives, or over those at an index array or a mask."""
-        if rows is not None:
-            return self.take(rows).total()
-        return self.totals(np.zeros(len(self), dtype=np.int64), 1)[0]
+        return self._sum() if rows is None else self.take(rows)._sum()
 
     def totals(self, groups: NDArray[Any], count: int) -> list[Gram]:
         """Return the exact sum over each group of drives; `groups` says each drive's, 0..count-1.
 
-        Exact also where a total needs more than 64 bits: high and low halves are summed apart.
+        Exact also where a total needs more than 64 bits.
         """
         if groups.shape != self.n.shape:
             raise ValueError(f"{len(self)} drives need as many groups, not {groups.shape}")
         if len(groups) and not 0 <= groups.min() <= groups.max() < count:
             raise ValueError(f"groups must lie in 0..{count - 1}")
         order = np.argsort(groups, kind="stable")
-        sizes = np.bincount(groups, minlength=count)
-        columns = np.column_stack([self.n, self.sums, self.products])
-        if np.any(groups[1:] < groups[:-1]):
-            columns = columns[order]
-        stops = np.cumsum(sizes)
-        return [
-            self._gram_of_columns(exact_sum(columns[stop - size : stop]))
-            for size, stop in zip(sizes, stops, strict=True)
-        ]
+        stops = np.cumsum(np.bincount(groups, minlength=count))
+        return [self.take(rows)._sum() for rows in np.split(order, stops[:-1])]
 
     def restrict(self, signals: Sequence[str]) -> "GramTable":
         """Return the same drives with some of the signals, in the given order.
@@ -290,19 +281,30 @@ class GramTable:
         )
         return GramTable(self.signals, self.n, self.sums - n * u, products)
 
-    def _gram_of_columns(self, totals: list[int]) -> Gram:
-        k = len(self.signals)
-        return Gram(self.signals, totals[0], tuple(totals[1 : k + 1]), tuple(totals[k + 1 :]))
+    def _sum(self) -> Gram:
+        return Gram(
+            self.signals,
+            exact_sum(self.n[:, None])[0],
+            tuple(exact_sum(self.sums)),
+            tuple(exact_sum(self.products)),
+        )
 
     def _gram(self, n: Any, sums: IntArray, products: IntArray) -> Gram:
         return Gram(self.signals, int(n), tuple(sums.tolist()), tuple(products.tolist()))
 
 
 def exact_sum(values: IntArray) -> list[int]:
-    """Return the sums of the columns of an int64 array, shape (rows < 2^31, columns), exactly."""
-    high = (values >> _LOW_BITS).sum(axis=0).tolist()
-    low = (values & (2**_LOW_BITS - 1)).sum(axis=0).tolist()
-    return [(h << _LOW_BITS) + part for h, part in zip(high, low, strict=True)]
+    """Return the sums of the columns of an int64 array, shape (rows < 2^26, columns), exactly.
+
+    The int64 sum is right modulo 2^64; the float64 sum is right to far less than 2^63, and so
+    says how often it wrapped around.
+    """
+    wrapped = values.sum(axis=0).tolist()
+    near = values.sum(axis=0, dtype=np.float64).tolist()
+    return [
+        remainder + round((total - remainder) / _MODULUS) * _MODULUS
+        for remainder, total in zip(wrapped, near, strict=True)
+    ]
 
 
 def positions(signals: Sequence[str], wanted: Sequence[str]) -> list[int]:

@@ -140,16 +140,17 @@ def repeated_cross_validation(
     if len(drives) < folds:
         raise SelectionError(f"{len(drives)} drives cannot fill {folds} folds.")
     rng = np.random.default_rng(seed)
-    correlations, rmse = [], []
-    for _ in range(repeats):
-        fold = rng.permutation(len(drives)) % folds
-        member = (fold == np.arange(folds)[:, None]).astype(np.float64)
-        tests = drives.matrix(member @ drives.packed)
-        solutions = solve(tests.sum(axis=0) - tests)
-        correlation, error = _pooled(tests, solutions)
-        correlations.append(correlation)
-        rmse.append(error * float(drives.spread[-1]))
-    return RepeatedCrossValidation(np.array(correlations), np.array(rmse))
+    batch = max(1, _BATCH_BYTES // (8 * folds * len(drives)))
+    figures = []
+    for start in range(0, repeats, batch):
+        size = min(batch, repeats - start)
+        fold = np.stack([rng.permutation(len(drives)) % folds for _ in range(size)])
+        member = (fold[:, None, :] == np.arange(folds)[:, None]).astype(np.float64)
+        totals = member.reshape(size * folds, -1) @ drives.packed
+        for tests in drives.matrix(totals).reshape(size, folds, drives.size, drives.size):
+            figures.append(_pooled(tests, solve(tests.sum(axis=0) - tests)))
+    correlations, rmse = np.array(figures).T
+    return RepeatedCrossValidation(correlations, rmse * float(drives.spread[-1]))
 
 
 def _pooled(tests: FloatArray, solutions: FloatArray) -> tuple[float, float]:
@@ -181,14 +182,14 @@ def _resampled_totals(values: FloatArray, replicates: int, seed: int) -> FloatAr
     drives = len(values)
     if drives < 2:
         raise SelectionError("a bootstrap over drives needs at least two drives.")
-    rng = np.random.default_rng(seed)
+    # SFC64 and 64-bit draws are the fastest that bincount takes without a copy.
+    rng = np.random.Generator(np.random.SFC64(seed))
     batch = max(1, _BATCH_BYTES // (8 * drives))
     totals = []
     for start in range(0, replicates, batch):
         size = min(batch, replicates - start)
-        draws = rng.integers(0, drives, (size, drives), dtype=np.int32)
         times = np.empty((size, drives))
-        for row, draw in zip(times, draws, strict=True):
-            row[:] = np.bincount(draw, minlength=drives)
+        for row in times:
+            row[:] = np.bincount(rng.integers(0, drives, drives), minlength=drives)
         totals.append(times @ values)
     return np.concatenate(totals)

@@ -1,4 +1,4 @@
-"""Exact least squares against NIST's certified values, dense float64 and exact relations."""
+"""Exact least squares against dense float64 and exact relations."""
 
 from fractions import Fraction
 
@@ -33,6 +33,34 @@ def test_agrees_with_dense_least_squares(seed: int, inputs: int) -> None:
     assert float(fitted.rss) == pytest.approx(rss, rel=1e-9)
     y = counts[:, -1].astype(float)
     assert fitted.r_squared == pytest.approx(1 - rss / np.sum((y - y.mean()) ** 2), rel=1e-9)
+
+
+@given(
+    st.integers(0, 10**6),
+    st.integers(2, 8),
+    st.integers(20, 400),
+    st.floats(0, 0.99),
+    st.lists(st.integers(0, 3), min_size=9, max_size=9),
+)
+@settings(max_examples=60)
+def test_agrees_at_any_size_collinearity_and_scale(
+    seed: int, inputs: int, rows: int, share: float, powers: list[int]
+) -> None:
+    rng = np.random.default_rng(seed)
+    x = (1 - share) * rng.normal(size=(rows, inputs)) + share * rng.normal(size=(rows, 1))
+    y = x @ rng.normal(size=inputs) + rng.normal(size=rows)
+    scale = 10.0 ** np.array(powers[: inputs + 1])
+    counts = np.rint(np.column_stack([x, y]) * 3000 * scale + 1000 * scale).astype(np.int64)
+    model = fit(gram_of(counts), names(inputs)[:-1], "y").model
+    # The reference: QR of centred and scaled columns.
+    centred = counts - counts.mean(axis=0)
+    spread = centred.std(axis=0)
+    q, r = np.linalg.qr(centred[:, :-1] / spread[:-1])
+    b = np.linalg.solve(r, q.T @ centred[:, -1] / spread[-1]) * spread[-1] / spread[:-1]
+    size = np.abs(b * spread[:-1]).max()
+    np.testing.assert_allclose(
+        [*model.weights.values()] * spread[:-1] / size, b * spread[:-1] / size, atol=1e-9
+    )
 
 
 def test_a_linear_law_is_recovered_exactly() -> None:
