@@ -1,7 +1,8 @@
 """All k+1 nested models of an order from one elimination (Section II-B of the paper)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 from fleet_slip.errors import SelectionError
 from fleet_slip.gram import Gram
@@ -53,6 +54,18 @@ class NestedModel:
     def signals(self) -> tuple[str, ...]:
         """Its inputs, in the order of entry."""
         return self.fit.model.signals
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what a JSON document needs."""
+        return {
+            "size": self.fit.size,
+            "signals": list(self.signals),
+            "r_squared": self.fit.r_squared,
+            "contribution": self.contribution,
+            "distance": self.distance,
+            "condition_number": self.condition_number,
+            "estimates": [asdict(estimate) for estimate in self.inference.estimates],
+        }
 
 
 def nested_models(

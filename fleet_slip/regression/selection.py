@@ -6,6 +6,7 @@ the whole choice again inside every training fold: ranking, evidence, criterion 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -57,6 +58,23 @@ class Selection:
     fit: Fit
     evidence: Evidence
     values: tuple[float, ...]
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """The chosen signals."""
+        return self.order[: self.size]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what a JSON document needs."""
+        return {
+            "order": list(self.order),
+            "signals": list(self.signals),
+            "criterion_values": list(self.values),
+            "contributions": list(self.evidence.contributions),
+            "evidence": self.evidence.kind,
+            "effective_rows": self.evidence.rows,
+            "design_effect": self.evidence.design_effect,
+        }
 
 
 @dataclass(frozen=True)

@@ -299,6 +299,9 @@ def test_nested_models_carry_the_full_models_noise() -> None:
     drop = dense_fit(counts[:, [1, 4]])[1] - dense_fit(counts[:, [1, 3, 4]])[1]
     assert models[2].contribution == pytest.approx(drop / sigma2, rel=1e-7)
     assert models[-1].distance == pytest.approx(4)
+    document = models[1].as_dict()
+    assert document["signals"] == ["x2"]
+    assert [e["name"] for e in document["estimates"]] == ["intercept", "x2"]
 
 
 def test_a_label_without_noise_is_an_error() -> None:

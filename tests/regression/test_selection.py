@@ -52,6 +52,9 @@ def test_the_signals_that_matter_are_found(ranking: str, criterion: str) -> None
     assert set(selection.order[: selection.size]) == {"x2", "x4"}
     assert selection.fit == fit(training.folds.total, selection.order[:2], "y")
     assert len(selection.values) == 6
+    document = selection.as_dict()
+    assert document["signals"] == [*selection.signals]
+    assert document["evidence"] == "drives"
     assert np.argmin(selection.values) >= 2
 
 
