@@ -36,14 +36,14 @@ def load_config(file: Traversable, model: type[ConfigT]) -> ConfigT:
     try:
         return model.model_validate(load_toml(file))
     except ValidationError as error:
-        faults = "; ".join(
-            f"{'.'.join(map(str, fault['loc'])) or 'file'}: {_reason(fault['msg'])}"
-            for fault in error.errors()
-        )
-        raise ConfigError(f"{file}: {faults}") from None
+        raise ConfigError(f"{file}: {faults_of(error)}") from None
 
 
-def _reason(message: str) -> str:
-    return message.removeprefix("Value error, ").replace(
-        "Extra inputs are not permitted", "unknown key"
+def faults_of(error: ValidationError) -> str:
+    """Return what is wrong, key by key, on one line."""
+    faults = (
+        f"{'.'.join(map(str, fault['loc'])) or 'file'}: {fault['msg']}" for fault in error.errors()
     )
+    text = "; ".join(faults).replace("Value error, ", "")
+    text = text.replace("Extra inputs are not permitted", "unknown key")
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)

@@ -32,9 +32,9 @@ def connect(
 ) -> duckdb.DuckDBPyConnection:
     """Return a DuckDB connection with the views of the warehouse at `root`.
 
-    `log` (SI units), `log_counts`, `drives`, `grams`, `models`, `quarantine` and `dictionary`, which
-    documents every column. The connection sees one snapshot; connect again to see later commits. It
-    can read the warehouse's files only, and its settings are locked.
+    `log` (SI units), `log_counts`, `drives`, `grams`, `models`, `quarantine` and `dictionary`,
+    which documents every column. The connection sees one snapshot; connect again to see later
+    commits. It can read the warehouse's files only, and its settings are locked.
     """
     warehouse = Warehouse(data_root(root))
     database = open_database(threads=threads)

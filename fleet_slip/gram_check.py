@@ -151,7 +151,7 @@ def _compare(file: TableFile, other: str, one: DriveGrams, two: DriveGrams) -> N
     for key in sorted(one.keys() | two.keys()):
         if one.get(key) != two.get(key):
             raise StorageError(
-                f"{file.path}: the Gram of drive {key[0]} by SQL and by {other} differ. If the Gram "
-                "job has not run since the logs changed, run: fleet-slip gram. Otherwise the file "
-                "or a library is damaged: keep both and report it."
+                f"{file.path}: the Gram of drive {key[0]} by SQL and by {other} differ. If the "
+                "Gram job has not run since the logs changed, run: fleet-slip gram. Otherwise the "
+                "file or a library is damaged: keep both and report it."
             )

@@ -203,7 +203,9 @@ def _rows_to_keep(grams: Snapshot, files: Sequence[TableFile], stale: frozenset[
     for file in files:
         with storage_errors(grams.table.path / file.path):
             rows = pq.read_table(grams.table.path / file.path).cast(grams.table.schema)
-        parts.append(rows.filter(pc.invert(pc.is_in(rows["file"], pa.array(sorted(stale), pa.string()))))))
+        parts.append(
+            rows.filter(pc.invert(pc.is_in(rows["file"], pa.array(sorted(stale), pa.string()))))
+        )
     return pa.concat_tables(parts)
 
 

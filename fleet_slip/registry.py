@@ -28,7 +28,7 @@ CHAMPION = "champion"
 
 ExactFraction = Annotated[
     Fraction,
-    PlainValidator(lambda text: Fraction(text)),
+    PlainValidator(Fraction),
     PlainSerializer(lambda value: f"{value.numerator}/{value.denominator}"),
 ]
 

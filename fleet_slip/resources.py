@@ -47,5 +47,6 @@ def find_config(kind: str, name_or_path: str) -> Traversable:
         return file
     known = ", ".join(config_names(kind))
     raise ConfigError(
-        f"{kind}: nothing is called {name_or_path!r}. Known: {known}; or give the path of a TOML file."
+        f"{kind}: nothing is called {name_or_path!r}. Known: {known}; or give the path of a TOML "
+        "file."
     )

@@ -13,7 +13,7 @@ from fleet_slip.warehouse import Warehouse
 
 @dataclass(frozen=True)
 class Score:
-    """Figures of the error, estimate minus truth, over all rows of a cohort that have the signals."""
+    """Figures of the error, estimate minus truth, over the rows of a cohort with the signals."""
 
     rows: int
     correlation: float | None

@@ -1,4 +1,4 @@
-"""The signal catalogue `configs/signals.toml` as types: scales, ranges, roles and the Arrow schema."""
+"""The signal catalogue `configs/signals.toml` as types: scales, ranges, roles, Arrow schema."""
 
 from decimal import Decimal
 from fractions import Fraction

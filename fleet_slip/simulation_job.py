@@ -97,9 +97,9 @@ def has_landed(snapshot: Snapshot, batch: Batch) -> bool:
     landed = snapshot.landed(unit.name)
     if landed is not None and landed != unit.version:
         raise RefusedError(
-            f"{batch.day}: the campaign {batch.campaign!r} was changed since this day was simulated, "
-            f"and logs are never replaced. Give the changed campaign another name, or use another "
-            f"--root."
+            f"{batch.day}: the campaign {batch.campaign!r} was changed since this day was "
+            "simulated, and logs are never replaced. Give the changed campaign another name, or "
+            "use another --root."
         )
     return landed is not None
 

@@ -9,6 +9,20 @@ import pyarrow as pa
 from fleet_slip.signals import SignalCatalogue, catalogue
 from fleet_slip.storage import Encoding, Table
 
+QUARANTINE_SCHEMA = pa.schema(
+    [
+        ("file", pa.string()),
+        ("row", pa.int64()),
+        ("drive_id", pa.string()),
+        ("reason", pa.string()),
+        ("signal", pa.string()),
+        ("value", pa.string()),
+    ]
+)
+"""One row per rejected row of a file. `row` counts its rows of data from 1; `drive_id` is the drive
+that it belongs to, null if that is what is wrong; `signal` is the signal or metadata concerned, or
+`time`; `value` is what stood there, as text."""
+
 
 @dataclass(frozen=True)
 class Warehouse:
@@ -52,8 +66,6 @@ class Warehouse:
     @cached_property
     def quarantine(self) -> Table:
         """Rows of measured logs that were refused, with the reason."""
-        from fleet_slip.ingest.quarantine import QUARANTINE_SCHEMA  # noqa: PLC0415
-
         return Table(
             path=self.root / "quarantine",
             schema=QUARANTINE_SCHEMA,

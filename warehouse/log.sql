@@ -3,6 +3,7 @@ CREATE VIEW log AS
 SELECT
     day,
     {drive_columns},
+    tick,
     tick / {samples_per_second}::DOUBLE AS time_s,
     {si_columns}
 FROM log_counts

@@ -5,17 +5,19 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from datetime import date
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fleet_slip.campaign import Campaign, load_campaign
 from fleet_slip.cli.output import Json, print_json, print_table, progress, say
 from fleet_slip.errors import ConfigError
 from fleet_slip.gram_job import GramReport, gram_statement, update_grams
 from fleet_slip.signals import catalogue
-from fleet_slip.simulation_job import SimulationReport, simulate_campaign
 from fleet_slip.warehouse import Warehouse
+
+if TYPE_CHECKING:
+    from fleet_slip.campaign import Campaign
+    from fleet_slip.simulation_job import SimulationReport
 
 CampaignName = Annotated[
     str, typer.Argument(help="A campaign of configs/campaigns, or the path of a TOML file.")
@@ -40,7 +42,7 @@ def register(app: typer.Typer) -> None:
     app.command()(check)
 
 
-def chosen_days(campaign: Campaign, days: int | None, through: str | None) -> tuple[date, ...]:
+def chosen_days(campaign: "Campaign", days: int | None, through: str | None) -> tuple[date, ...]:
     """Return the days of a campaign that the options ask for. Raises `ConfigError`."""
     try:
         last = date.fromisoformat(through) if through else date.max
@@ -54,9 +56,11 @@ def chosen_days(campaign: Campaign, days: int | None, through: str | None) -> tu
 
 
 def run_simulation(
-    warehouse: Warehouse, campaign: Campaign, days: tuple[date, ...], threads: int | None
-) -> SimulationReport:
+    warehouse: Warehouse, campaign: "Campaign", days: tuple[date, ...], threads: int | None
+) -> "SimulationReport":
     """Simulate with local threads and a progress bar."""
+    from fleet_slip.simulation_job import simulate_campaign  # noqa: PLC0415 - the simulator
+
     with (
         ThreadPoolExecutor(threads or os.cpu_count()) as executor,
         progress(f"simulate {campaign.name}", "rows") as advance,
@@ -79,14 +83,16 @@ def simulate(
     json: Json = False,
 ) -> None:
     """Simulate what is missing of a campaign and write it to the logs."""
+    from fleet_slip.campaign import load_campaign  # noqa: PLC0415 - takes a while
+
     plan = load_campaign(campaign)
     report = run_simulation(context.obj, plan, chosen_days(plan, days, through), threads)
     if json:
         print_json(asdict(report))
     elif report.changed:
         say(
-            f"{plan.name}: {report.drives} drives, {report.rows:,} rows in {report.batches_written} "
-            f"files, {report.size_bytes / report.rows:.1f} bytes a row"
+            f"{plan.name}: {report.drives} drives, {report.rows:,} rows in "
+            f"{report.batches_written} files, {report.size_bytes / report.rows:.1f} bytes a row"
         )
     else:
         say(f"{plan.name}: nothing to do, all {report.batches_present} files are there")

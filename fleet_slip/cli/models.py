@@ -12,6 +12,7 @@ from fleet_slip.model_list import (
     FoldKey,
     FoldPlan,
     ModelList,
+    check_model_name,
     load_model_list,
     nested_models,
 )
@@ -167,6 +168,7 @@ def publish(
     json: Json = False,
 ) -> None:
     """Select on a cohort and make the winner the next version of a model, and its champion."""
+    check_model_name(name)
     selection, label, sha256 = run_selection(context.obj, cohort, models, nested, by, folds)
     manifest = manifest_of(selection, name, label, sha256)
     publication = publish_selection(registry_of(context.obj), manifest, selection, force=force)
@@ -304,6 +306,7 @@ def promote(
     alias: Alias = CHAMPION,
 ) -> None:
     """Point an alias, the champion unless told otherwise, at a version."""
+    check_model_name(alias)
     registry = registry_of(context.obj)
     version = registry.resolve(reference)
     registry.promote(version.manifest.name, version.version, alias)

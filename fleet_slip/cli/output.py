@@ -1,10 +1,12 @@
 """What commands print: JSON for machines, tables for people, progress on stderr."""
 
 import json
+import math
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from decimal import Decimal
 from typing import Annotated, Any
 
 import typer
@@ -40,8 +42,23 @@ def say(text: str) -> None:
 
 
 def print_json(content: Any) -> None:
-    """Print a JSON document; what JSON does not know (dates, decimals) as text."""
-    sys.stdout.write(json.dumps(content, indent=2, default=str, allow_nan=False) + "\n")
+    """Print a JSON document; numbers that JSON does not know (NaN, infinity) become null."""
+    text = json.dumps(_for_json(content), indent=2, default=str, allow_nan=False)
+    sys.stdout.write(text + "\n")
+
+
+def _for_json(value: Any) -> Any:
+    match value:
+        case dict():
+            return {key: _for_json(item) for key, item in value.items()}
+        case list() | tuple():
+            return [_for_json(item) for item in value]
+        case float() if not math.isfinite(value):
+            return None
+        case Decimal():
+            return int(value) if value == value.to_integral_value() else float(value)
+        case _:
+            return value
 
 
 def print_table(

@@ -6,7 +6,6 @@ from typing import Annotated, Any
 
 import typer
 
-from fleet_slip.campaign import load_campaign
 from fleet_slip.cli.data import Days, Threads, Through, chosen_days, run_gram, run_simulation
 from fleet_slip.cli.models import (
     print_publication,
@@ -17,6 +16,7 @@ from fleet_slip.cli.models import (
 )
 from fleet_slip.cli.output import Json, print_json, say
 from fleet_slip.errors import RefusedError
+from fleet_slip.model_list import check_model_name
 from fleet_slip.publishing import Publication, manifest_of, publish
 from fleet_slip.selection import Selection
 
@@ -49,13 +49,16 @@ def run(
     It can be repeated at any time, and after any interruption: what is done is not done again. A
     nightly run appends the next day with --through "$(date -I)".
     """
+    from fleet_slip.campaign import load_campaign  # noqa: PLC0415 - the simulator takes a while
+
     started = time.monotonic()
     plan = load_campaign(campaign)
+    model_name = check_model_name(name or plan.name)
     simulation = run_simulation(context.obj, plan, chosen_days(plan, days, through), threads)
     gram = run_gram(context.obj)
     condition = f"campaign = '{plan.name}'"
     selection, label, sha256 = run_selection(context.obj, condition, models)
-    publication, refusal = _publish(context, selection, name or plan.name, label, sha256)
+    publication, refusal = _publish(context, selection, model_name, label, sha256)
     changed = simulation.changed or gram.changed or (publication is not None and publication.new)
     summary = {
         "campaign": plan.name,

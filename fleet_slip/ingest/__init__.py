@@ -2,10 +2,8 @@
 
 from fleet_slip.ingest.mapping import Mapping, load_mapping
 from fleet_slip.ingest.measured import IngestCounts, MeasuredLog, read_measured
-from fleet_slip.ingest.quarantine import QUARANTINE_SCHEMA
 
 __all__ = [
-    "QUARANTINE_SCHEMA",
     "IngestCounts",
     "Mapping",
     "MeasuredLog",

@@ -3,23 +3,8 @@
 from typing import Any
 
 import polars as pl
-import pyarrow as pa
 
 from fleet_slip.ingest.fields import LONGEST_TEXT, REASONS, Field
-
-QUARANTINE_SCHEMA = pa.schema(
-    [
-        ("file", pa.string()),
-        ("row", pa.int64()),
-        ("drive_id", pa.string()),
-        ("reason", pa.string()),
-        ("signal", pa.string()),
-        ("value", pa.string()),
-    ]
-)
-"""One row per rejected row of a file. `row` counts its rows of data from 1; `drive_id` is the drive
-that it belongs to, null if that is what is wrong; `signal` is the signal or metadata concerned, or
-`time`; `value` is what stood there, as text."""
 
 _PROBLEM = "problem"
 

@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import QUARANTINE_SCHEMA, load_mapping, measured, read_measured
+from fleet_slip.ingest import load_mapping, measured, read_measured
 from fleet_slip.signals import catalogue
+from fleet_slip.warehouse import QUARANTINE_SCHEMA
 
 from .samples import (
     a_mapping,

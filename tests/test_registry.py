@@ -1,0 +1,138 @@
+"""Model versions and aliases: numbered, immutable, verified, and safe with many writers."""
+
+import json
+import multiprocessing
+from decimal import Decimal
+from fractions import Fraction
+from pathlib import Path
+
+import pytest
+
+from fleet_slip.documents import DocumentFolder
+from fleet_slip.errors import RefusedError, SelectionError, StorageError
+from fleet_slip.registry import (
+    CHAMPION,
+    CrossValidated,
+    Manifest,
+    ModelLabel,
+    ModelTerm,
+    Registry,
+    SelectedBy,
+    TrainedOn,
+)
+
+
+def manifest(coefficient: Fraction = Fraction(1, 3), name: str = "sideslip") -> Manifest:
+    return Manifest(
+        name=name,
+        label=ModelLabel(
+            signal="sideslip", column="sideslip_rad", unit="rad", scale=Decimal("0.0001")
+        ),
+        intercept=0.0,
+        intercept_exact=Fraction(0),
+        terms=(
+            ModelTerm(
+                signal="ay",
+                column="ay_mps2",
+                unit="m/s^2",
+                scale=Decimal("0.001"),
+                coefficient=float(coefficient),
+                coefficient_exact=coefficient,
+            ),
+        ),
+        cross_validation=CrossValidated(
+            folds_by="drive", folds=5, correlation=0.99, correlation_standard_error=0.001,
+            rmse_deg=0.1, error_mean_deg=0.0, error_std_deg=0.1, condition_number=1.0,
+        ),
+        trained_on=TrainedOn(cohort="true", drives=3, rows=300, logs_version=1, grams_version=1),
+        selected_by=SelectedBy(model_list="table1", model="1", reason="best", config_sha256="0"),
+        package_version="0",
+    )  # fmt: skip
+
+
+def test_versions_are_consecutive_and_the_latest_published_is_champion(tmp_path: Path) -> None:
+    registry = Registry(tmp_path)
+    for number in (1, 2, 3):
+        assert registry.publish(manifest(Fraction(number))).version == number
+    assert registry.versions("sideslip") == [1, 2, 3]
+    assert registry.resolve("sideslip").version == 3
+    assert registry.resolve("sideslip@2").manifest.terms[0].coefficient == 2.0
+    assert registry.resolve(f"sideslip@{CHAMPION}").reference == "sideslip@3"
+
+
+def test_a_manifest_keeps_every_digit(tmp_path: Path) -> None:
+    exact = Fraction(123456789012345678901, 98765432109876543210987)
+    Registry(tmp_path).publish(manifest(exact))
+    loaded = Registry(tmp_path).load("sideslip", 1).manifest
+    assert loaded == manifest(exact)
+    assert loaded.terms[0].coefficient_exact == exact
+    assert loaded.terms[0].coefficient == float(exact)
+
+
+def test_publishing_what_an_interrupted_run_left_uses_it(tmp_path: Path) -> None:
+    registry = Registry(tmp_path)
+    DocumentFolder(tmp_path / "sideslip" / "versions").append(manifest().model_dump(mode="json"))
+    assert registry.champion("sideslip") is None
+    assert registry.publish(manifest()).version == 1
+    assert registry.versions("sideslip") == [1]
+
+
+@pytest.mark.parametrize("change", ["coefficient", "sha256", "truncated"])
+def test_a_changed_version_is_refused(tmp_path: Path, change: str) -> None:
+    Registry(tmp_path).publish(manifest())
+    file = tmp_path / "sideslip" / "versions" / "1.json"
+    envelope = json.loads(file.read_text())
+    if change == "coefficient":
+        envelope["content"]["terms"][0]["coefficient"] = 0.5
+    elif change == "sha256":
+        envelope["sha256"] = "0" * 64
+    file.write_text(json.dumps(envelope)[: 40 if change == "truncated" else None])
+    with pytest.raises(StorageError, match=r"1\.json"):
+        Registry(tmp_path).load("sideslip", 1)
+
+
+def test_aliases_move_and_go_back(tmp_path: Path) -> None:
+    registry = Registry(tmp_path)
+    for number in (1, 2, 3):
+        registry.publish(manifest(Fraction(number)))
+    registry.promote("sideslip", 1, CHAMPION)
+    registry.promote("sideslip", 2, "shadow")
+    assert registry.aliases("sideslip") == {CHAMPION: 1, "shadow": 2}
+    assert [registry.rollback("sideslip", CHAMPION) for _ in range(3)] == [3, 2, 1]
+    with pytest.raises(RefusedError, match="never pointed at another version"):
+        registry.rollback("sideslip", CHAMPION)
+    commands = [move.command for move in registry.history("sideslip")]
+    assert commands == ["publish"] * 3 + ["promote"] * 2 + ["rollback"] * 3
+
+
+def test_unknown_names_versions_and_aliases_say_what_there_is(tmp_path: Path) -> None:
+    registry = Registry(tmp_path)
+    with pytest.raises(SelectionError, match=r"no model is called 'x'.*publish one with"):
+        registry.resolve("x")
+    registry.publish(manifest())
+    with pytest.raises(SelectionError, match=r"It has: 1\."):
+        registry.resolve("sideslip@7")
+    with pytest.raises(SelectionError, match=r"It has: 1, champion\."):
+        registry.resolve("sideslip@best")
+    with pytest.raises(SelectionError, match="no model is called"):
+        registry.resolve("../../etc@1")
+
+
+def _publish_ten(path: Path, writer: int) -> None:
+    for number in range(10):
+        Registry(path).publish(manifest(Fraction(writer * 100 + number, 7)))
+
+
+def test_writers_at_once_never_share_a_number_or_lose_a_version(tmp_path: Path) -> None:
+    context = multiprocessing.get_context("spawn")
+    writers = [context.Process(target=_publish_ten, args=(tmp_path, n)) for n in range(4)]
+    for process in writers:
+        process.start()
+    for process in writers:
+        process.join()
+    registry = Registry(tmp_path)
+    numbers = registry.versions("sideslip")
+    assert numbers == list(range(1, 41))
+    published = {registry.load("sideslip", n).manifest.terms[0].coefficient_exact for n in numbers}
+    assert len(published) == 40
+    assert len(registry.history("sideslip")) == 40
