@@ -1,0 +1,167 @@
+"""Figures and numbers of docs/statistics.md, from the Gram rows of a campaign that has been run.
+
+python -m benchmarks.statistics_figures ROOT [CAMPAIGN]
+"""
+
+import sys
+from pathlib import Path
+
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+
+from fleet_slip.cohort import load_cohort
+from fleet_slip.gram import IntArray
+from fleet_slip.regression.criteria import CRITERIA, criterion_values
+from fleet_slip.regression.disturbance import disturbed
+from fleet_slip.regression.drives import DriveMoments, serving_drives
+from fleet_slip.regression.evidence import Evidence
+from fleet_slip.regression.exact import correlation_matrix, fit
+from fleet_slip.regression.folds import CohortFolds, by_hash
+from fleet_slip.regression.inference import classical, cluster
+from fleet_slip.regression.nested import nested_fits
+from fleet_slip.regression.ranking import RANKINGS, rank
+from fleet_slip.regression.resampling import (
+    bootstrap_correlations,
+    held_out_products,
+    percentile_interval,
+    repeated_cross_validation,
+)
+from fleet_slip.regression.selection import (
+    CROSS_VALIDATION,
+    Rule,
+    Training,
+    cross_validate_nested,
+    cross_validate_selection,
+)
+from fleet_slip.regression.subsets import all_rss, best_subsets, choices, subset_sizes
+from fleet_slip.signals import catalogue
+from fleet_slip.warehouse import Warehouse
+
+IMAGES = Path(__file__).parents[1] / "docs" / "images"
+SIGNALS = catalogue()
+LABEL = SIGNALS.label
+NINE = tuple(name for name in SIGNALS.inputs if name != "steering_wheel")
+SCALES = {name: SIGNALS[name].exact_scale for name in SIGNALS.gram_signals}
+
+
+def load(root: str, campaign: str) -> tuple[Training, IntArray]:
+    cohort = load_cohort(Warehouse(Path(root)), f"campaign = '{campaign}'")
+    table, mask = serving_drives(cohort.tables, [*NINE, LABEL])
+    ids = [
+        name for name, yes in zip(cohort.drives["drive_id"].to_pylist(), mask, strict=True) if yes
+    ]
+    assignment = by_hash(ids, 5)
+    folds = CohortFolds.of([table], assignment).serving(NINE, LABEL)
+    return Training(folds, DriveMoments.of(table), SCALES), assignment.fold
+
+
+def evidence(training: Training) -> None:
+    total = training.folds.total
+    order = rank("backward", total, NINE, LABEL)
+    fits = nested_fits(total, order, LABEL)
+    assert training.drives is not None
+    rows, drives = Evidence.naive(fits), Evidence.clustered(fits, training.drives)
+    print(f"rows {rows.rows:.0f}, effective {drives.rows:.0f}, effect {drives.design_effect:.0f}")
+    for name, a, b in zip(order, rows.contributions, drives.contributions, strict=True):
+        print(f"  {name:<10} A by rows {a:14.1f}   A by drives {b:12.1f}")
+    for name in CRITERIA:
+        sizes = [int(np.argmin(criterion_values(name, known))) for known in (rows, drives)]
+        print(f"  {name:<15} keeps {sizes[0]} by rows, {sizes[1]} by drives")
+    naive, robust = classical(fits[-1], SCALES), cluster(fits[-1], training.drives, SCALES)
+    for one, other in zip(naive.estimates, robust.estimates, strict=True):
+        errors = f"{one.standard_error:.2g} or {other.standard_error:.2g}"
+        print(f"  {one.name:<10} {one.value:12.6f} +- {errors}")
+    figure, axes = plt.subplots(figsize=(6.4, 3.4))
+    at = np.arange(len(order))
+    axes.bar(at - 0.2, rows.contributions, 0.4, label="rows taken for independent")
+    axes.bar(at + 0.2, drives.contributions, 0.4, label="drives taken for independent")
+    axes.axhline(2, color="black", linewidth=0.8, label="price of AIC")
+    axes.axhline(np.log(drives.rows), color="black", linewidth=0.8, linestyle=":", label="of BIC")
+    axes.set_yscale("log")
+    axes.set_ylabel("contribution A")
+    axes.set_xticks(at, order, rotation=30, ha="right")
+    axes.legend(fontsize=8)
+    save(figure, "contributions")
+
+
+def orders(training: Training, fold: IntArray) -> None:
+    total = training.folds.total
+    figure, axes = plt.subplots(figsize=(6.4, 3.4))
+    for name in RANKINGS:
+        order = rank(name, total, NINE, LABEL)
+        models = cross_validate_nested(training.folds, order, LABEL, SCALES)
+        print(f"  {name:<17} {' '.join(order)}")
+        if name in {"declared", "correlation", "backward", "lars"}:
+            rmse = [model.pooled.rmse_deg for model in models]
+            axes.plot(range(len(rmse)), rmse, marker="o", markersize=3, label=name)
+    axes.set_xlabel("number of signals")
+    axes.set_ylabel("cross-validated RMSE, deg")
+    axes.set_yscale("log")
+    axes.legend(fontsize=8, title="order")
+    save(figure, "nested")
+    for criterion in ("bic", CROSS_VALIDATION):
+        rule = Rule("backward", criterion)
+        honest = cross_validate_selection("rule", training, fold, NINE, LABEL, rule)
+        print(f"  backward + {criterion}: {' '.join(honest.signals)}, r = {honest.correlation:.5f}")
+
+
+def subsets(training: Training) -> None:
+    total = training.folds.total
+    results = best_subsets(total, NINE, LABEL)
+    for result in results:
+        gap = f"{result.gap:.2g}" if result.gap is not None else "-"
+        names = " ".join(result.best.model.signals)
+        print(f"  {result.best.size} R2 {result.best.r_squared:.5f} gap {gap:>8} {names}")
+    fits = nested_fits(total, NINE, LABEL)
+    assert training.drives is not None
+    print(" ", choices(results, Evidence.clustered(fits, training.drives)))
+    rss = all_rss(correlation_matrix(total.restrict([*NINE, LABEL])))
+    size = subset_sizes(len(NINE)).astype(np.float64)
+    figure, axes = plt.subplots(figsize=(6.4, 3.4))
+    spread = np.random.default_rng(0).uniform(-0.25, 0.25, len(size))
+    axes.plot(size + spread, rss, ".", markersize=3, color="grey", label="all 512 subsets")
+    best = [float(result.best.rss / results[0].best.rss) for result in results]
+    axes.plot(range(len(best)), best, "o-", markersize=4, label="best of each size")
+    axes.set_yscale("log")
+    axes.set_xlabel("number of signals")
+    axes.set_ylabel("unexplained share, 1 - R²")
+    axes.legend(fontsize=8)
+    save(figure, "subsets")
+
+
+def uncertainty(training: Training, fold: IntArray) -> None:
+    folds = training.folds
+    assert training.drives is not None
+    models = [fit(folds.total - test, NINE, LABEL).model for test in folds.grams]
+    products = held_out_products(training.drives, fold, models)
+    print(" ", percentile_interval(bootstrap_correlations(products, 1000, seed=1)))
+    repeated = repeated_cross_validation(training.drives, 5, 100, seed=1)
+    print(f"  100 repeats: {repeated.mean:.5f} +- {repeated.spread:.5f}")
+    final = cross_validate_nested(folds, NINE, LABEL, SCALES)[-1]
+    for factor in (0, 1, 2):
+        noise = {"ax": 0.1 * factor, "ay": 0.1 * factor, "yaw_rate": 0.01 * factor}
+        after = disturbed(final.sums, final.counts, SCALES, noise=noise).figures(SCALES[LABEL])
+        print(f"  noise {noise}: r {after.correlation:.4f}, rmse {after.rmse_deg:.4f} deg")
+
+
+def save(figure: Figure, name: str) -> None:
+    IMAGES.mkdir(exist_ok=True)
+    figure.tight_layout()
+    figure.savefig(IMAGES / f"statistics_{name}.svg", metadata={"Date": None})
+    plt.close(figure)
+
+
+def main() -> None:
+    mpl.rcParams.update({"svg.hashsalt": "fleet-slip", "axes.grid": True, "grid.alpha": 0.3})
+    training, fold = load(sys.argv[1], sys.argv[2] if len(sys.argv) > 2 else "waterford")
+    print(f"{training.folds.drives} drives, {training.folds.total.n} rows")
+    evidence(training)
+    orders(training, fold)
+    subsets(training)
+    uncertainty(training, fold)
+
+
+if __name__ == "__main__":
+    main()
