@@ -2,14 +2,17 @@
 
 from typing import NamedTuple, Self
 
-from pydantic import Field, FiniteFloat
+from pydantic import Field, FiniteFloat, ValidationError, model_validator
 
-from fleet_slip.config import Config, load_config
+from fleet_slip.config import Config, ConfigT, load_config
 from fleet_slip.errors import ConfigError
 from fleet_slip.resources import find_config
 from fleet_slip.signals import Identifier
 
 GRAVITY_MPS2 = 9.80665
+STIFFEST_TYRE = 30.0
+"""Largest slip stiffness over load that the time step allows; real tyres stay below."""
+
 AIR_DENSITY_KGPM3 = 1.225
 
 
@@ -85,6 +88,17 @@ class Tyre(Config):
     """Sliding speed at which half of the friction is left."""
     rolling_resistance: FiniteFloat = Field(ge=0)
 
+    @model_validator(mode="after")
+    def _not_too_stiff(self) -> Self:
+        stiffness = 2 * self.peak_stiffness_n / self.peak_stiffness_load_n
+        stiffness *= max(1.0, self.longitudinal_stiffness_ratio)
+        if stiffness > STIFFEST_TYRE:
+            raise ValueError(
+                f"slip stiffness is {stiffness:.1f} times the load, at most {STIFFEST_TYRE} can be"
+                f" simulated: lower peak_stiffness_n"
+            )
+        return self
+
 
 class Steering(Config):
     """From the steering wheel to the rack."""
@@ -133,27 +147,29 @@ class VehicleParameters(Config):
         proportion and the centre of gravity stays. Wheel loads, and with them cornering stiffness
         and friction, follow from the mass. Raises `ConfigError` if it is not a positive number.
         """
-        if not 0 < mass_kg < float("inf"):
-            raise ConfigError(f"{self.name}: sprung mass {mass_kg} kg: give a positive number.")
         inertia = self.body.sprung_yaw_inertia_kgm2 * mass_kg / self.body.sprung_mass_kg
         changes = {"sprung_mass_kg": mass_kg, "sprung_yaw_inertia_kgm2": inertia}
-        return self.model_copy(update={"body": self.body.model_copy(update=changes)})
+        return self.model_copy(update={"body": self._changed(self.body, changes)})
 
     def with_tyres(
         self, *, stiffness_factor: float = 1.0, rolling_radius_factor: float = 1.0
     ) -> Self:
         """Return the car on other tyres: softer or stiffer, smaller or larger.
 
-        Raises `ConfigError` if a factor is not a positive number.
+        Raises `ConfigError` if the tyres cannot be simulated.
         """
-        for factor in (stiffness_factor, rolling_radius_factor):
-            if not 0 < factor < float("inf"):
-                raise ConfigError(f"{self.name}: tyre factor {factor}: give a positive number.")
         changes = {
             "peak_stiffness_n": self.tyre.peak_stiffness_n * stiffness_factor,
             "rolling_radius_m": self.tyre.rolling_radius_m * rolling_radius_factor,
         }
-        return self.model_copy(update={"tyre": self.tyre.model_copy(update=changes)})
+        return self.model_copy(update={"tyre": self._changed(self.tyre, changes)})
+
+    def _changed(self, part: ConfigT, changes: dict[str, float]) -> ConfigT:
+        try:
+            return type(part).model_validate(part.model_dump() | changes)
+        except ValidationError as error:
+            reason = "; ".join(fault["msg"] for fault in error.errors())
+            raise ConfigError(f"{self.name} with {changes}: {reason}.") from None
 
 
 def load_vehicle(name_or_path: str) -> VehicleParameters:

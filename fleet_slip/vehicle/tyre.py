@@ -12,8 +12,12 @@ from typing import NamedTuple
 from fleet_slip.vehicle.compiling import equation
 from fleet_slip.vehicle.parameters import Constants
 
-CREEP_SPEED_MPS = 1.0
-"""Rolling speed below which slip is measured against this speed, so that a car comes to rest."""
+CREEP_SPEED_MPS = 2.5
+"""Rolling speed below which slip is measured against this speed.
+
+So a car comes to rest, and the integration is stable: it needs C h / (m v) < 1/4 with C the
+longitudinal slip stiffness of all wheels, which a tyre within `STIFFEST_TYRE` keeps.
+"""
 
 SMALLEST_SLIDING_MPS = 1e-9
 """Keeps the direction of sliding finite where nothing slides."""

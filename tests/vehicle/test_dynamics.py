@@ -1,0 +1,230 @@
+"""The equations of motion against vehicle dynamics as the textbooks have it."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fleet_slip.vehicle.driver import handling
+from fleet_slip.vehicle.parameters import GRAVITY_MPS2, constants, load_vehicle
+from fleet_slip.vehicle.state import Controls, State
+from fleet_slip.vehicle.tyre import cornering_stiffness
+from tests.vehicle.harness import CAR, SEDAN, Run, holding, kinetic_energy, rates, rolling
+
+RATIO = SEDAN.steering.ratio
+KNOWN = handling(SEDAN)
+
+
+def finite(low: float, high: float) -> st.SearchStrategy[float]:
+    return st.floats(low, high, allow_nan=False)
+
+
+STATES = st.builds(
+    State,
+    vx=finite(-60, 60),
+    vy=finite(-60, 60),
+    yaw_rate=finite(-8, 8),
+    steering_wheel=finite(-8.7, 8.7),
+    traction=finite(-10, 6),
+    ax_lag=finite(-12, 12),
+    ay_lag=finite(-12, 12),
+    wheel_fl=finite(-200, 200),
+    wheel_fr=finite(-200, 200),
+    wheel_rl=finite(-200, 200),
+    wheel_rr=finite(-200, 200),
+)
+CONTROLS = st.builds(Controls, steering_wheel=finite(-8.7, 8.7), traction=finite(-10, 6))
+
+
+EASY = CAR._replace(drag_per_mass=0.0, rolling_resistance=0.0)
+"""Needs no drive to hold its speed: a driven tyre corners less stiffly."""
+
+
+def steady_corner(vx: float, steering_wheel: float) -> Run:
+    return Run(rolling(vx), Controls(steering_wheel, 0.0), seconds=8.0, c=EASY)
+
+
+def test_a_left_turn_has_the_signs_of_iso_8855() -> None:
+    turn = steady_corner(20.0, 0.3)
+    assert turn.last.yaw_rate > 0
+    assert turn.forces[-1, 1] > 0
+    assert turn.last.wheel_fr > turn.last.wheel_fl
+
+
+def test_specific_force_is_what_an_accelerometer_reads() -> None:
+    x = rolling(20.0, vy=-1.0, yaw_rate=0.4, steering_wheel=0.5, traction=1.0)
+    d = rates(x, Controls(0.5, 1.0), CAR)
+    assert d.ax == pytest.approx(d.vx - x.yaw_rate * x.vy, abs=1e-12)
+    assert d.ay == pytest.approx(d.vy + x.yaw_rate * x.vx, abs=1e-12)
+
+
+@pytest.mark.parametrize("vx", [12.0, 20.0, 35.0])
+def test_steady_cornering_has_the_analytic_understeer_gradient(vx: float) -> None:
+    """δ = L r / v + K ay with K = (W_f / C_f − W_r / C_r) / g, in the linear range."""
+    turn = steady_corner(vx, RATIO * 0.2 * (KNOWN.wheelbase / vx**2 + KNOWN.understeer))
+    ay = turn.forces[-1, 1]
+    tangent = turn.last.steering_wheel / RATIO
+    gradient = (tangent - KNOWN.wheelbase * turn.last.yaw_rate / turn.last.vx) / ay
+    assert 0.18 < ay < 0.21
+    assert gradient == pytest.approx(KNOWN.understeer, rel=0.025)
+
+
+@pytest.mark.parametrize("vx", [8.0, 15.0, 22.0, 30.0])
+def test_steady_side_slip_is_that_of_the_rear_axle(vx: float) -> None:
+    """β = b r / v − (W_r / C_r) ay / g, which changes sign with speed."""
+    turn = steady_corner(vx, RATIO * 0.2 * (KNOWN.wheelbase / vx**2 + KNOWN.understeer))
+    last = turn.last
+    expected = KNOWN.rear * last.yaw_rate / last.vx - KNOWN.rear_slip * turn.forces[-1, 1]
+    assert last.vy / last.vx == pytest.approx(expected, rel=0.02, abs=2e-5)
+
+
+def test_side_slip_after_a_step_steer_changes_sign_at_the_theoretical_speed() -> None:
+    speed = math.sqrt(KNOWN.rear / KNOWN.rear_slip)
+    slow, fast = steady_corner(0.93 * speed, 0.05), steady_corner(1.07 * speed, 0.05)
+    assert slow.last.vy > 0 > fast.last.vy
+
+
+def test_yaw_rate_gain_is_greatest_at_the_characteristic_speed() -> None:
+    """r / δ = v / (L + K v²), greatest at v = √(L / K)."""
+    characteristic = math.sqrt(KNOWN.wheelbase / KNOWN.understeer)
+    gains = []
+    for vx in (0.6 * characteristic, characteristic, 1.5 * characteristic):
+        last = steady_corner(vx, 0.02).last
+        gain = last.yaw_rate / (last.steering_wheel / RATIO)
+        assert gain == pytest.approx(
+            last.vx / (KNOWN.wheelbase + KNOWN.understeer * last.vx**2), rel=0.02
+        )
+        gains.append(gain)
+    assert gains[1] > gains[0]
+    assert gains[1] > gains[2]
+
+
+def inverse_brush(force: float, load: float, peak: float) -> float:
+    """Return the slip at which F = μ Fz (1 − (1 − C σ / (3 μ Fz))³) is the force."""
+    limit = (CAR.friction - CAR.friction_per_load * load) * load
+    stiffness = CAR.stiffness_ratio * cornering_stiffness(load, peak, CAR)
+    share = 1 - (1 - abs(force) / limit) ** (1 / 3)
+    return math.copysign(3 * limit / stiffness * share, force)
+
+
+def test_straight_braking_has_the_slips_and_forces_of_the_brush_tyre() -> None:
+    run = Run(rolling(40.0), Controls(0.0, -4.0), seconds=2.0)
+    x, ax = run.last, run.forces[-1, 0]
+    shift = CAR.pitch_transfer * x.ax_lag
+    load_front, load_rear = CAR.static_front - shift, CAR.static_rear + shift
+    assert ax == pytest.approx(-4.0 - holding(x.vx), rel=0.03)  # wheels store the rest
+    assert 2 * (load_front + load_rear) == pytest.approx(CAR.mass * GRAVITY_MPS2)
+    for spin, load, share, peak in (
+        (x.wheel_fl, load_front, CAR.brake_front, CAR.stiffness_front),
+        (x.wheel_rr, load_rear, CAR.brake_rear, CAR.stiffness_rear),
+    ):
+        slowing = ax / CAR.radius / CAR.inverse_spin_inertia / CAR.radius  # I dω/dt / R
+        force = CAR.mass * share * -4.0 - CAR.rolling_resistance * load - slowing
+        slip = 1 - x.vx / (CAR.radius * spin)
+        assert slip == pytest.approx(inverse_brush(force, load, peak), rel=0.02)
+
+
+def test_straight_acceleration_slips_the_driven_wheels_only() -> None:
+    run = Run(rolling(15.0), Controls(0.0, 2.5), seconds=2.0)
+    x, ax = run.last, run.forces[-1, 0]
+    inertia = 4 / CAR.inverse_spin_inertia / CAR.radius**2
+    assert ax == pytest.approx((2.5 - holding(x.vx)) / (1 + inertia / CAR.mass), rel=0.02)
+    assert x.wheel_fl == x.wheel_fr
+    assert CAR.radius * x.wheel_fl / x.vx - 1 > 0.02
+    assert abs(CAR.radius * x.wheel_rl / x.vx - 1) < 0.005
+
+
+def test_engine_power_limits_the_force() -> None:
+    run = Run(rolling(50.0), Controls(0.0, 6.0), seconds=0.5)
+    strongest = SEDAN.drivetrain.power_w / SEDAN.body.mass_kg / run.last.vx
+    assert run.forces[-1, 0] < strongest
+
+
+def test_a_car_brakes_to_rest_and_stays() -> None:
+    run = Run(rolling(5.0), Controls(0.0, -6.0), seconds=4.0)
+    assert np.abs(run.states[-1, :3]).max() < 1e-3
+    assert np.abs(run.states[-1, -4:]).max() < 1e-2
+
+
+def mirrored(x: State) -> State:
+    return x._replace(
+        vy=-x.vy,
+        yaw_rate=-x.yaw_rate,
+        steering_wheel=-x.steering_wheel,
+        ay_lag=-x.ay_lag,
+        wheel_fl=x.wheel_fr,
+        wheel_fr=x.wheel_fl,
+        wheel_rl=x.wheel_rr,
+        wheel_rr=x.wheel_rl,
+    )
+
+
+@given(x=STATES, u=CONTROLS)
+def test_the_mirrored_car_moves_as_the_mirror_image(x: State, u: Controls) -> None:
+    d = rates(x, u, CAR)
+    image = rates(mirrored(x), u._replace(steering_wheel=-u.steering_wheel), CAR)
+    assert (image.vx, image.ax, image.ax_lag) == (d.vx, d.ax, d.ax_lag)
+    assert (image.vy, image.yaw_rate, image.ay) == (-d.vy, -d.yaw_rate, -d.ay)
+    assert (image.wheel_fr, image.wheel_rr) == (d.wheel_fl, d.wheel_rl)
+
+
+@given(x=STATES, u=CONTROLS)
+def test_tyres_never_give_energy(x: State, u: Controls) -> None:
+    """With neither drive nor brake, the power of all forces on body and wheels is negative."""
+    d = rates(x._replace(traction=0.0), u, CAR)
+    body = CAR.mass * (x.vx * d.vx + x.vy * d.vy) + CAR.yaw_inertia * x.yaw_rate * d.yaw_rate
+    spins = zip(x[-4:], (d.wheel_fl, d.wheel_fr, d.wheel_rl, d.wheel_rr), strict=True)
+    wheels = sum(spin * wheel.rate for spin, wheel in spins) / CAR.inverse_spin_inertia
+    assert body + wheels <= 1e-6
+
+
+@pytest.mark.parametrize(
+    "start",
+    [
+        rolling(30.0, steering_wheel=1.0),
+        rolling(25.0, vy=6.0, yaw_rate=-1.5),
+        rolling(15.0, yaw_rate=4.0),
+        rolling(1.5, vy=0.5),
+    ],
+)
+def test_energy_never_grows_in_coasting(start: State) -> None:
+    run = Run(start, Controls(start.steering_wheel, 0.0), seconds=6.0)
+    energy = kinetic_energy(run.states)
+    assert (np.diff(energy) <= 1e-7 * energy[0]).all()
+    assert energy[-1] < energy[0]
+
+
+@settings(max_examples=60, deadline=None)
+@given(x=STATES, u=CONTROLS, adhesion=st.sampled_from([0.05, 0.1, 0.4, 1.0, 1.2]))
+def test_nothing_blows_up_in_any_spin(x: State, u: Controls, adhesion: float) -> None:
+    start = kinetic_energy(np.array([x]))[0]
+    run = Run(x, u, seconds=3.0, c=constants(SEDAN, adhesion))
+    assert np.isfinite(run.states).all()
+    assert np.isfinite(run.forces).all()
+    assert kinetic_energy(run.states).max() <= 1.01 * start + SEDAN.drivetrain.power_w * 3.0 + 1
+
+
+@pytest.mark.parametrize("adhesion", [0.1, 1.0])
+@pytest.mark.parametrize("vx", [0.0, 0.3, 1.0, 5.0, 60.0])
+def test_from_standstill_to_60_mps_all_is_finite(vx: float, adhesion: float) -> None:
+    c = constants(SEDAN, adhesion)
+    for traction in (-10.0, 0.0, 6.0):
+        for steering_wheel in (0.0, 8.7):
+            run = Run(rolling(vx), Controls(steering_wheel, traction), seconds=2.0, c=c)
+            assert np.isfinite(run.states).all()
+            assert np.abs(run.forces).max() < 1.6 * GRAVITY_MPS2
+
+
+@given(x=STATES, u=CONTROLS)
+def test_rates_are_pure(x: State, u: Controls) -> None:
+    assert rates(x, u, CAR) == rates(x, u, CAR)
+
+
+@pytest.mark.parametrize("name", ["compact_hatchback", "d_class_sedan", "rear_drive_sedan", "suv"])
+@pytest.mark.parametrize("share", [0.75, 1.0, 1.33])
+def test_every_car_understeers_at_every_mass(name: str, share: float) -> None:
+    car = load_vehicle(name)
+    known = handling(car.with_sprung_mass(share * car.body.sprung_mass_kg))
+    assert 0.2 < math.degrees(known.understeer * GRAVITY_MPS2) < 3.0

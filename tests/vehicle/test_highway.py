@@ -1,0 +1,169 @@
+"""The car among highway-env's vehicles, and without extensions as its own bicycle."""
+
+from typing import Any
+
+import gymnasium
+import highway_env
+import numpy as np
+import pytest
+from highway_env.road.road import Road, RoadNetwork
+from highway_env.vehicle.behavior import IDMVehicle
+from highway_env.vehicle.dynamics import BicycleVehicle
+
+from fleet_slip.vehicle.dynamics import NO_EXTENSIONS
+from fleet_slip.vehicle.highway import FourWheelVehicle
+from fleet_slip.vehicle.parameters import load_vehicle
+from fleet_slip.vehicle.state import Controls
+from tests.vehicle.harness import SEDAN, Run, rolling
+
+gymnasium.register_envs(highway_env)
+
+
+def plain_car(**kwargs: Any) -> FourWheelVehicle:
+    return FourWheelVehicle(
+        None, [3.0, -2.0], heading=0.3, speed=20.0, extensions=NO_EXTENSIONS, **kwargs
+    )
+
+
+def bicycle_like(car: FourWheelVehicle) -> BicycleVehicle:
+    """Return highway-env's own vehicle with the same mass, inertia and tyres."""
+    twin = BicycleVehicle(None, car.position, car.heading, car.speed)
+    for name in ("MASS", "INERTIA_Z", "LENGTH_A", "LENGTH_B", "FRICTION_FRONT", "FRICTION_REAR"):
+        setattr(twin, name, getattr(car, name))
+    return twin
+
+
+def test_without_extensions_the_derivative_is_highway_env_s() -> None:
+    generator = np.random.default_rng(7)
+    car = plain_car()
+    twin = bicycle_like(car)
+    for trial in range(2000):
+        scale = np.array([100.0, 100.0, 3.0, 0.5 if trial % 3 == 0 else 25.0, 5.0, 1.0])
+        state = (generator.normal(size=6) * scale)[:, np.newaxis]
+        action = {
+            "steering": generator.uniform(-1.2, 1.2),
+            "acceleration": generator.normal(scale=4.0),
+        }
+        car.action = twin.action = action
+        ours, theirs = car.derivative_func(0.0, state), twin.derivative_func(0.0, state)
+        np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-12)
+
+
+def test_without_extensions_ten_seconds_are_highway_env_s() -> None:
+    generator = np.random.default_rng(8)
+    car = plain_car()
+    twin = bicycle_like(car)
+    twin.MAX_SPEED, twin.MIN_SPEED = car.MAX_SPEED, car.MIN_SPEED
+    for _ in range(50):
+        action = {
+            "steering": generator.normal(scale=0.05),
+            "acceleration": generator.normal(scale=3.0),
+        }
+        for vehicle in (car, twin):
+            vehicle.act(dict(action))
+            for _ in range(20):
+                vehicle.step(0.01)
+    np.testing.assert_allclose(car.state, twin.state, rtol=0, atol=1e-9)
+    assert abs(car.lateral_speed) > 1e-3
+
+
+def test_the_class_steps_as_the_equations_do() -> None:
+    """Bit for bit: the class adds the place in the plane and nothing else."""
+    car = FourWheelVehicle(None, [0.0, 0.0], speed=22.0)
+    car.act({"steering": np.arctan(0.8 / SEDAN.steering.ratio), "acceleration": 1.0})
+    for _ in range(10):
+        car.step(0.1)
+    demands = car.controls
+    assert demands.steering_wheel == pytest.approx(0.8)
+    run = Run(rolling(22.0), demands, seconds=1.0)
+    assert car.motion == run.last
+
+
+def test_velocity_includes_sliding() -> None:
+    """Displacement over time agrees with `velocity`, which highway-env's own does not."""
+    car = FourWheelVehicle(None, [0.0, 0.0], heading=1.0, speed=20.0)
+    car.act({"steering": 0.05, "acceleration": 0.0})
+    for _ in range(200):
+        car.step(0.01)
+    before, velocity = car.position, car.velocity
+    car.step(0.002)
+    assert abs(np.degrees(car.sideslip)) > 0.5
+    np.testing.assert_allclose((car.position - before) / 0.002, velocity, atol=0.02)
+
+
+def test_positive_steering_turns_towards_growing_y() -> None:
+    car = FourWheelVehicle(None, [0.0, 0.0], speed=15.0)
+    car.act({"steering": 0.05, "acceleration": 0.0})
+    for _ in range(10):
+        car.step(0.1)
+    assert car.position[1] > 0
+    assert car.heading > 0
+    assert car.specific_force[1] > 0
+    assert car.wheel_speeds[1] > car.wheel_speeds[0]
+
+
+def test_it_drives_among_others_on_a_road() -> None:
+    road = Road(
+        RoadNetwork.straight_road_network(3),
+        np_random=np.random.RandomState(1),
+        record_history=True,
+    )
+    car = FourWheelVehicle.make_on_lane(road, ("0", "1", 1), longitudinal=0.0, speed=25.0)
+    other = IDMVehicle.make_on_lane(road, ("0", "1", 0), longitudinal=30.0, speed=20.0)
+    road.vehicles += [car, other]
+    for _ in range(30):
+        road.act()
+        road.step(1 / 15)
+    assert car.position[0] == pytest.approx(50.0, abs=1.0)
+    assert car.lane_index == ("0", "1", 1)
+    assert len(car.history) == 30
+    assert isinstance(car.history[0], FourWheelVehicle)
+    np.testing.assert_array_equal(car.history[0].wheel_speeds, car.wheel_speeds)
+
+
+def test_the_class_of_another_car_is_made_by_highway_env() -> None:
+    class Suv(FourWheelVehicle):
+        PARAMETERS = load_vehicle("suv")
+        ADHESION = 0.5
+
+    road = Road(RoadNetwork.straight_road_network(2), np_random=np.random.RandomState(1))
+    car = Suv.create_random(road, speed=20.0)
+    assert car.parameters.name == "suv"
+    assert car.constants.friction == pytest.approx(0.55)
+    assert Suv.create_from(car).parameters is car.parameters
+
+
+@pytest.mark.parametrize("name", ["highway-v0", "racetrack-v0"])
+def test_it_is_driven_by_a_real_environment(name: str) -> None:
+    config = {"action": {"type": "ContinuousAction"}, "vehicles_count": 3, "other_vehicles": 1}
+    env = gymnasium.make(name, config=config)
+    env.reset(seed=3)
+    inner: Any = env.unwrapped
+    car = FourWheelVehicle.create_from(inner.vehicle)
+    inner.road.vehicles[inner.road.vehicles.index(inner.vehicle)] = car
+    inner.controlled_vehicles = [car]
+    inner.define_spaces()
+    for _ in range(5):
+        observation, reward, *_ = inner.step(np.full(env.action_space.shape or (), 0.05))
+        assert np.isfinite(observation).all()
+        assert np.isfinite(reward)
+    assert car.action["steering"] > 0
+    assert car.yaw_rate > 0
+    env.close()
+
+
+def test_a_coarse_step_of_the_environment_is_as_good_as_a_fine_one() -> None:
+    cars = [FourWheelVehicle(None, [0.0, 0.0], speed=2.0) for _ in range(2)]
+    for car, calls, dt in ((cars[0], 15, 1 / 15), (cars[1], 500, 0.002)):
+        car.act({"steering": 0.02, "acceleration": 0.5})
+        for _ in range(calls):
+            car.step(dt)
+    np.testing.assert_allclose(cars[0].state, cars[1].state, atol=2e-3)
+
+
+def test_hard_braking_keeps_the_demands_of_the_action() -> None:
+    car = FourWheelVehicle(None, [0.0, 0.0], speed=30.0, adhesion=0.3)
+    car.act({"steering": 0.0, "acceleration": -9.0})
+    car.step(1.0)
+    assert car.controls == Controls(0.0, -9.0)
+    assert 0.2 * 9.81 < 30.0 - car.speed < 0.36 * 9.81
