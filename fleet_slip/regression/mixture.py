@@ -144,8 +144,8 @@ Moment = Callable[[FloatArray, FloatArray], FloatArray]
 
 def posterior(mixture: Mixture, x: float, density: Moment) -> FloatArray:
     """Return the probabilities of the mixture's points given a datum."""
-    log_free = mixture.weights * density(np.array(x), mixture.points)
-    return np.asarray(log_free / log_free.sum())
+    likely = mixture.weights * density(np.array(x), mixture.points)
+    return np.asarray(likely / likely.sum())
 
 
 def signed_density(a: FloatArray, m: FloatArray) -> FloatArray:
