@@ -1,0 +1,85 @@
+"""Steps per second of the Kalman filter and its rivals, over drives on threads.
+
+    python -m benchmarks.observers
+
+A step is one row of one drive through the whole estimator: for the Kalman filter the yaw rate
+filter, prediction, the update at every tenth row, and the angle.
+"""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from os import cpu_count
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from fleet_slip.observers import ekf, kalman, luenberger, sliding_mode
+from fleet_slip.observers.signals import STEP_S, DriveSignals
+from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
+
+ROWS = 30_000
+DRIVES = 64
+REPEATS = 5
+
+ESTIMATORS: dict[str, Callable[..., Any]] = {
+    "kalman": partial(kalman.estimate, noise=kalman.FilterNoise()),
+    "ekf": partial(ekf.estimate, noise=ekf.EkfNoise()),
+    "luenberger": partial(luenberger.estimate, poles=luenberger.ObserverPoles()),
+    "sliding_mode": partial(sliding_mode.estimate, gains=sliding_mode.SlidingGains()),
+}
+
+
+def slalom(car: VehicleParameters, seed: int) -> DriveSignals:
+    """Return a drive of noisy signals on a winding road."""
+    noise = np.random.default_rng(seed).standard_normal((9, ROWS))
+    time_s = np.arange(ROWS) * STEP_S
+    yaw_rate = 0.2 * np.sin(0.3 * time_s)
+    spin = 20.0 / car.tyre.rolling_radius_m + 0.02 * noise[:4]
+    turn = yaw_rate * car.body.track_rear_m / 2 / car.tyre.rolling_radius_m
+    steer = yaw_rate * car.body.wheelbase_m / 20.0
+    fix = np.where(np.arange(ROWS) % 10 == 0, 0.0, np.nan)
+    return DriveSignals(
+        ax_mps2=0.1 * noise[4],
+        ay_mps2=20.0 * yaw_rate + 0.1 * noise[5],
+        yaw_rate_rad_s=yaw_rate + 0.01 * noise[6],
+        wheel_fl_rad_s=spin[0] - turn,
+        wheel_fr_rad_s=spin[1] + turn,
+        wheel_rl_rad_s=spin[2] - turn,
+        wheel_rr_rad_s=spin[3] + turn,
+        steer_fl_rad=steer,
+        steer_fr_rad=steer,
+        gps_vx_mps=20.0 + 0.05 * noise[7] + fix,
+        gps_vy_mps=0.05 * noise[8] + fix,
+    )
+
+
+def steps_per_second(
+    estimate: Callable[[DriveSignals], Any], drives: list[DriveSignals], threads: int
+) -> float:
+    """Return the best rate of several runs over all drives."""
+    best = float("inf")
+    with ThreadPoolExecutor(threads) as executor:
+        for _ in range(REPEATS):
+            begin = perf_counter()
+            list(executor.map(estimate, drives))
+            best = min(best, perf_counter() - begin)
+    return sum(map(len, drives)) / best
+
+
+def main() -> None:
+    car = load_vehicle("d_class_sedan")
+    drives = [slalom(car, seed) for seed in range(DRIVES)]
+    cores = cpu_count() or 1
+    print(f"{DRIVES} drives of {ROWS} rows; million steps/s, best of {REPEATS}")
+    for name, estimator in ESTIMATORS.items():
+        estimate = partial(estimator, car=car)
+        estimate(drives[0])  # compiles
+        rates = {threads: steps_per_second(estimate, drives, threads) for threads in (1, cores)}
+        shown = ", ".join(f"{threads} threads {rate / 1e6:.1f}" for threads, rate in rates.items())
+        print(f"{name:13} {shown}")
+
+
+if __name__ == "__main__":
+    main()

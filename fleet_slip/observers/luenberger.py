@@ -1,0 +1,85 @@
+"""A Luenberger observer on the linear single-track model, gains by pole placement at every speed.
+
+    x̂˙ = A x̂ + B δ + L (y − C x̂ − D δ),     x = [vy, r],  y = [r, ay]
+
+Luenberger, "An introduction to observers", IEEE Transactions on Automatic Control 16 (1971); on
+this model Stéphant, Charara and Meizel, "Virtual sensor: application to vehicle sideslip angle and
+transversal forces", IEEE Transactions on Industrial Electronics 51 (2004). Lateral acceleration is
+a second output here: a car near neutral steer hardly shows vy in its yaw rate.
+"""
+
+import numba
+import numpy as np
+from pydantic import Field, FiniteFloat
+
+from fleet_slip.config import Config
+from fleet_slip.observers import yaw_rate
+from fleet_slip.observers.angle import sideslip_angle
+from fleet_slip.observers.signals import STEP_S, DriveSignals, Floats, held
+from fleet_slip.observers.single_track import (
+    SingleTrack,
+    StateSpace,
+    measured_speed_mps,
+    measured_steer_rad,
+    state_space,
+)
+from fleet_slip.observers.yaw_rate import YawRateNoise
+from fleet_slip.vehicle.parameters import VehicleParameters
+
+
+class ObserverPoles(Config):
+    """How fast the errors decay. At 100/s the observer would follow every sample's noise."""
+
+    lateral_velocity_1ps: FiniteFloat = Field(default=5.0, gt=0, le=100)
+    yaw_rate_1ps: FiniteFloat = Field(default=20.0, gt=0, le=100)
+    yaw_rate: YawRateNoise = YawRateNoise()
+
+
+def gains(space: StateSpace, poles: ObserverPoles) -> Floats:
+    """Return L for every row, as rows [l11, l12, l21, l22] of shape (4, n).
+
+    A − L C = diag(−p1, −p2) has one solution, because C = [[0, 1], [a11, a12 + vx]] is regular:
+    L = (A − diag(−p1, −p2)) C⁻¹. The errors then obey ė = diag(−p1, −p2) e at changing speed too.
+    """
+    p1, p2 = poles.lateral_velocity_1ps, poles.yaw_rate_1ps
+    l12 = 1.0 + p1 / space.a11
+    l22 = space.a21 / space.a11
+    return np.stack([space.a12 - l12 * space.c2, l12, space.a22 + p2 - l22 * space.c2, l22])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _observe(
+    system: Floats, gain: Floats, steer: Floats, yaw_rate: Floats, ay: Floats, vx: Floats
+) -> Floats:
+    """Return vy. `system` has the rows a11, a12, a21, a22, b1, b2; Euler's forward step."""
+    vy, r = 0.0, yaw_rate[0]
+    estimates = np.empty(len(ay))
+    for k in range(len(ay)):
+        a11, a12, a21, a22, b1, b2 = system[:, k]
+        force = a11 * vy + a12 * r + b1 * steer[k]
+        error_r = yaw_rate[k] - r
+        error_ay = ay[k] - (force + vx[k] * r)
+        vy_rate = force + gain[0, k] * error_r + gain[1, k] * error_ay
+        moment = a21 * vy + a22 * r + b2 * steer[k]
+        r += STEP_S * (moment + gain[2, k] * error_r + gain[3, k] * error_ay)
+        vy += STEP_S * vy_rate
+        estimates[k] = vy
+    return estimates
+
+
+def estimate(drive: DriveSignals, car: VehicleParameters, poles: ObserverPoles) -> Floats:
+    """Estimate side-slip in rad at every row. Gaps of a sensor are bridged by the value before.
+
+    Raises `SelectionError` if a sensor is absent.
+    """
+    vx_mps = measured_speed_mps(drive, car)
+    space = state_space(SingleTrack.of(car), vx_mps)
+    vy_mps = _observe(
+        np.stack([space.a11, space.a12, space.a21, space.a22, space.b1, space.b2]),
+        gains(space, poles),
+        measured_steer_rad(drive),
+        yaw_rate.estimate(drive, car, poles.yaw_rate).yaw_rate_rad_s,
+        held(drive.ay_mps2, "ay"),
+        vx_mps,
+    )
+    return sideslip_angle(vx_mps, vy_mps)

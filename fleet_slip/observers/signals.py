@@ -1,0 +1,85 @@
+"""What an estimator may read of one drive, in SI units at 100 Hz."""
+
+from dataclasses import dataclass, fields
+
+import duckdb
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_slip.database import database_errors
+from fleet_slip.errors import SelectionError
+from fleet_slip.signals import SAMPLE_TIME_S, catalogue
+
+STEP_S = float(SAMPLE_TIME_S)
+"""Time Δt between two rows."""
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class DriveSignals:
+    """One drive: float64 arrays of one length, NaN where there is no measurement.
+
+    Axes and signs are those of docs/conventions.md. GPS has its own rate and is NaN between fixes.
+    """
+
+    ax_mps2: Floats
+    ay_mps2: Floats
+    yaw_rate_rad_s: Floats
+    wheel_fl_rad_s: Floats
+    wheel_fr_rad_s: Floats
+    wheel_rl_rad_s: Floats
+    wheel_rr_rad_s: Floats
+    steer_fl_rad: Floats
+    steer_fr_rad: Floats
+    gps_vx_mps: Floats
+    gps_vy_mps: Floats
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.ax_mps2)
+
+
+@dataclass(frozen=True)
+class LabelledDrive:
+    """A drive with its true side-slip, for evaluation and tuning; no estimator sees it."""
+
+    drive_id: str
+    signals: DriveSignals
+    sideslip_rad: Floats
+
+
+def read_drive(database: duckdb.DuckDBPyConnection, drive_id: str) -> LabelledDrive:
+    """Read a drive from the view `log` of a warehouse (`fleet_slip.connection.connect`).
+
+    Raises `SelectionError` if there is no such drive.
+    """
+    label = catalogue()[catalogue().label].column
+    columns = [*(field.name for field in fields(DriveSignals)), label]
+    with database_errors(f"reading the drive {drive_id!r}"):
+        found = database.execute(
+            f"SELECT {', '.join(columns)} FROM log WHERE drive_id = $drive_id ORDER BY time_s",
+            {"drive_id": drive_id},
+        ).fetchnumpy()
+    if not len(found[label]):
+        raise SelectionError(f"no drive is called {drive_id!r}. The view drives lists them.")
+    arrays = {name: np.ma.filled(found[name].astype(np.float64), np.nan) for name in columns}
+    sideslip_rad = arrays.pop(label)
+    return LabelledDrive(drive_id, DriveSignals(**arrays), sideslip_rad)
+
+
+def held(values: Floats, name: str) -> Floats:
+    """Return a signal with every gap filled by the value before it, a leading one by the first.
+
+    Raises `SelectionError` if there is no value at all.
+    """
+    valid = np.isfinite(values)
+    if valid.all():
+        return values
+    if not valid.any():
+        raise SelectionError(
+            f"the drive has no {name}, which this estimator needs. Choose drives that have it, or "
+            "another estimator."
+        )
+    latest = np.maximum.accumulate(np.where(valid, np.arange(len(values)), valid.argmax()))
+    return values[latest]
