@@ -8,7 +8,7 @@ from typing import Any
 import duckdb
 import pyarrow as pa
 
-from fleet_slip.database import open_database
+from fleet_slip.database import database_errors, open_database
 from fleet_slip.registry import Registry
 from fleet_slip.resources import read_sql
 from fleet_slip.signals import SAMPLE_TIME_S, SignalCatalogue
@@ -44,8 +44,9 @@ def connect(
         "stored_grams": _source(database, warehouse.grams.snapshot(), "gram_files"),
         "stored_quarantine": _source(database, warehouse.quarantine.snapshot(), "quarantine_files"),
     }
-    for view in VIEWS:
-        database.execute(read_sql("warehouse", f"{view}.sql").format(**columns, **stored))
+    with database_errors(f"opening the warehouse {warehouse.root}"):
+        for view in VIEWS:
+            database.execute(read_sql("warehouse", f"{view}.sql").format(**columns, **stored))
     _add_table(database, "models", Registry(warehouse.root / "models").as_table())
     _add_table(database, "dictionary", _dictionary(database, warehouse.catalogue))
     _lock(database, warehouse.root)

@@ -28,14 +28,16 @@ def database_errors(doing: str) -> Iterator[None]:
     except FleetSlipError:
         raise
     except (duckdb.IOException, duckdb.InvalidInputException, duckdb.OutOfMemoryException) as error:
-        raise StorageError(f"{doing} failed: {_message(error)}") from None
+        raise StorageError(f"{doing} failed: {_message(error)}. {_RESTORE}") from None
     except duckdb.Error as error:
         raise SelectionError(f"{doing} failed: {_message(error)}") from None
 
 
 def _message(error: duckdb.Error) -> str:
-    return " ".join(str(error).split())
+    return " ".join(str(error).split()).rstrip(".")
 
+
+_RESTORE = "If a file is missing or damaged, restore it from a backup."
 
 READING = frozenset({duckdb.StatementType.SELECT, duckdb.StatementType.EXPLAIN})
 
