@@ -1,0 +1,181 @@
+"""The command that evaluates estimators on test drives."""
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Annotated, Any
+
+import typer
+
+from fleet_slip.cli.data import Threads
+from fleet_slip.cli.models import registry_of
+from fleet_slip.cli.output import Json, print_json, print_table, progress, say
+from fleet_slip.cli.run import DEFAULT_CAMPAIGN
+
+OneCar = Annotated[
+    str,
+    typer.Option(
+        help="NAME, NAME@VERSION or NAME@ALIAS of a model. It is evaluated, and the models of "
+        "Table I on the cohort that it was trained on."
+    ),
+]
+Fleet = Annotated[
+    list[str] | None,
+    typer.Option(help="Another model, to be compared with the first. May be repeated."),
+]
+Scenarios = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--scenario",
+        help="A scenario of configs/scenarios, or a TOML file. May be repeated. Default: all.",
+        show_default=False,
+    ),
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command of this module."""
+    app.command()(evaluate)
+
+
+def evaluate(
+    context: typer.Context,
+    one_car: OneCar = DEFAULT_CAMPAIGN,
+    fleet: Fleet = None,
+    scenario: Scenarios = None,
+    threads: Threads = None,
+    json: Json = False,
+) -> None:
+    """Evaluate models on the paper's test drives and on others; simulates those that are missing.
+
+    The results are kept as a JSON document below evaluations/ in the data root.
+    """
+    from fleet_slip.evaluation.evaluate import evaluate as evaluate_models  # noqa: PLC0415
+    from fleet_slip.evaluation.results import keep  # noqa: PLC0415
+    from fleet_slip.evaluation.runs import simulate_scenarios  # noqa: PLC0415
+    from fleet_slip.scenario import load_scenario, shipped_scenarios  # noqa: PLC0415
+
+    scenarios = tuple(map(load_scenario, scenario)) if scenario else shipped_scenarios()
+    versions = [registry_of(context.obj).resolve(name) for name in (one_car, *(fleet or ()))]
+    with (
+        ThreadPoolExecutor(threads or os.cpu_count()) as executor,
+        progress("simulate scenarios", "rows") as advance,
+    ):
+        simulate_scenarios(context.obj, scenarios, executor, advance)
+    content = evaluate_models(context.obj, scenarios, versions[0], versions[1:]).as_dict()
+    kept = keep(context.obj, content)
+    if json:
+        print_json({"number": kept.number, "sha256": kept.sha256, **content})
+    else:
+        print_evaluation(content)
+        say(f"kept as evaluations/{kept.number}.json")
+
+
+def print_evaluation(content: dict[str, Any]) -> None:
+    """Print the tables of an evaluation."""
+    groups: dict[str, list[str]] = {}
+    for name, about in content["estimators"].items():
+        groups.setdefault(about["group"], []).append(name)
+    for group, names in groups.items():
+        _print_group(content, group, names)
+    _print_sections(content)
+    _print_checks(content["checks"])
+    _print_comparisons(content["comparisons"])
+
+
+def _print_group(content: dict[str, Any], group: str, names: Sequence[str]) -> None:
+    print_table(
+        f"\n{group}: standard deviation and mean of the error in deg, and correlation",
+        ["scenario", "side-slip std", *(name.removeprefix(f"{group}/") for name in names)],
+        [
+            [
+                one["name"],
+                f"{one['truth']['sideslip_std_deg']:.2f}",
+                *(_cell(one["results"][name]) for name in names),
+            ]
+            for one in content["scenarios"]
+        ],
+    )
+
+
+def _cell(result: dict[str, Any]) -> str:
+    if result["error_std_deg"] is None:
+        return "no estimate"
+    figures = f"{result['error_std_deg']:.3f} {result['error_mean_deg']:+.3f}"
+    if result["correlation"] is not None:
+        figures += f" {result['correlation']:.3f}"
+    covered = result["coverage"]
+    return figures if covered == 1 else f"{figures} ({covered:.0%})"
+
+
+def _print_sections(content: dict[str, Any]) -> None:
+    for one in content["scenarios"]:
+        for section in one["sections"]:
+            if section["name"] != "unstable":
+                continue
+            where = ", ".join(
+                f"{s['from_s']:.1f}-{s['until_s']:.1f} s" for s in section["stretches"]
+            )
+            print_table(
+                f"\n{one['name']}: unstable at {where}: {section['criterion']}",
+                ["estimator", "std inside", "std outside", "corr. inside", "corr. outside"],
+                [
+                    [
+                        name,
+                        *(
+                            _figure(result[place]["unstable"][figure])
+                            for figure in ("error_std_deg", "correlation")
+                            for place in ("inside", "outside")
+                        ),
+                    ]
+                    for name, result in one["results"].items()
+                ],
+            )
+
+
+def _figure(value: float | None) -> str:
+    return "" if value is None else f"{value:.3f}"
+
+
+def _print_checks(checks: Sequence[dict[str, Any]]) -> None:
+    if not checks:
+        return
+    print_table(
+        "\nwhat the paper's scenarios ask for",
+        ["requirement", "estimator", "found", "limit", ""],
+        [
+            [
+                check["requirement"],
+                check["estimator"],
+                f"{check['found']:.4f}",
+                f"{check['limit']:.4f}",
+                "" if check["reached"] else "missed",
+            ]
+            for check in checks
+        ],
+        left=2,
+    )
+    for check in checks:
+        if not check["reached"]:
+            say(f"missed: {check['requirement']}, {check['estimator']}. {check['explanation']}")
+
+
+def _print_comparisons(comparisons: Sequence[dict[str, Any]]) -> None:
+    if not comparisons:
+        return
+    print_table(
+        "\nthe same signals trained on one car and on a fleet: root mean square error in deg",
+        ["scenario", "one car", "fleet", "one car", "fleet", "better"],
+        [
+            [
+                row["scenario"],
+                row["one_car"],
+                row["fleet"],
+                f"{row['one_car_rmse_deg']:.3f}",
+                f"{row['fleet_rmse_deg']:.3f}",
+                row["better"],
+            ]
+            for row in comparisons
+        ],
+        left=3,
+    )

@@ -1,0 +1,135 @@
+"""Reads the drives of scenarios from the logs: what estimators see, and the truth apart from it."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from fleet_slip.cohort import SCENARIO
+from fleet_slip.connection import connect
+from fleet_slip.database import database_errors
+from fleet_slip.errors import SelectionError
+from fleet_slip.resources import read_sql
+from fleet_slip.scenario import Failure, Scenario
+from fleet_slip.sensors import GPS_SIGNALS
+from fleet_slip.signals import catalogue
+from fleet_slip.warehouse import Warehouse
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+SLOWEST_MPS = 2.0
+"""Speed below which a side-slip angle is not evaluated: at standstill there is none."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """One drive. Arrays have shape (ticks,).
+
+    Attributes:
+        scenario: what it is a test of.
+        time_s: time since the drive began.
+        signals: what an estimator may see, by SI column: the inputs of the catalogue and satellite
+            navigation; NaN where null.
+        vx_mps, vy_mps: true velocity of the centre of gravity.
+        station_m: distance along the track within the lap.
+        lateral_offset_m: distance from the track's centre line, positive to the left.
+        lost_control_s: when the driver lost the car; None where he did not.
+    """
+
+    scenario: Scenario
+    time_s: FloatArray
+    signals: Mapping[str, FloatArray]
+    vx_mps: FloatArray
+    vy_mps: FloatArray
+    station_m: FloatArray
+    lateral_offset_m: FloatArray
+    lost_control_s: float | None
+
+    @cached_property
+    def sideslip_rad(self) -> FloatArray:
+        """True side-slip angle arctan(vy / vx)."""
+        return np.arctan2(self.vy_mps, self.vx_mps)
+
+    @cached_property
+    def speed_mps(self) -> FloatArray:
+        """True speed."""
+        return np.hypot(self.vx_mps, self.vy_mps)
+
+    @cached_property
+    def evaluated(self) -> BoolArray:
+        """Where the car moves forward, so that it has a side-slip angle."""
+        return self.vx_mps > SLOWEST_MPS
+
+
+def visible_signals() -> tuple[str, ...]:
+    """Return the names of the signals that an estimator may see: never a truth."""
+    return (*catalogue().inputs, *GPS_SIGNALS)
+
+
+def load_drives(warehouse: Warehouse, scenarios: Sequence[Scenario]) -> tuple[Drive, ...]:
+    """Read the drives of scenarios and apply their failures.
+
+    Raises `SelectionError` if a drive is not in the logs.
+    """
+    signals = catalogue().signals
+    names = [name for name in signals if name != catalogue().label]
+    statement = read_sql("jobs", "scenario.sql").format(
+        columns=",\n    ".join(signals[name].column for name in names), source=SCENARIO
+    )
+    drives = sorted({scenario.drive_id for scenario in scenarios})
+    with connect(warehouse.root) as database, database_errors("reading the drives of scenarios"):
+        rows = database.sql(statement, params={"drives": drives}).to_arrow_table()
+    return tuple(_drive(scenario, rows) for scenario in scenarios)
+
+
+def _drive(scenario: Scenario, all_rows: pa.Table) -> Drive:
+    rows = all_rows.filter(pc.equal(all_rows["drive_id"], scenario.drive_id))
+    if not rows.num_rows:
+        raise SelectionError(
+            f"the drive {scenario.drive_id} is not in the logs. Run: fleet-slip evaluate"
+        )
+    time_s = _column(rows, "time_s")
+    measured = {name: _column(rows, catalogue()[name].column) for name in visible_signals()}
+    for failure in scenario.failures:
+        measured = apply_failure(measured, time_s, failure)
+    return Drive(
+        scenario=scenario,
+        time_s=time_s,
+        signals={catalogue()[name].column: values for name, values in measured.items()},
+        vx_mps=_column(rows, "vx_mps"),
+        vy_mps=_column(rows, "vy_mps"),
+        station_m=_column(rows, "station_m"),
+        lateral_offset_m=_column(rows, "lateral_offset_m"),
+        lost_control_s=rows["lost_control_s"][0].as_py(),
+    )
+
+
+def _column(rows: pa.Table, name: str) -> FloatArray:
+    values: FloatArray = rows[name].to_numpy().astype(np.float64)
+    return values
+
+
+def apply_failure(
+    signals: Mapping[str, FloatArray], time_s: FloatArray, failure: Failure
+) -> dict[str, FloatArray]:
+    """Return signals, by name, as a car with the failure logs them; the given ones stay.
+
+    Raises `SelectionError` if the drive ends before the failure begins.
+    """
+    until_s = np.inf if failure.until_s is None else failure.until_s
+    failed = (time_s >= failure.from_s) & (time_s < until_s)
+    if not failed.any():
+        raise SelectionError(
+            f"the drive lasts {time_s[-1]:.1f} s, and its failure begins at {failure.from_s} s. "
+            "Choose an earlier from_s."
+        )
+    changed = dict(signals)
+    for name in failure.signals:
+        kept = signals[name][np.argmax(failed)] if failure.kind == "stuck" else np.nan
+        changed[name] = np.where(failed, kept, signals[name])
+    return changed

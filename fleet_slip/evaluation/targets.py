@@ -1,0 +1,179 @@
+"""What the estimators must reach on the paper's scenarios, checked; a miss is explained.
+
+Table II and the sentences of sections III.A to III.D, put into numbers.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from fleet_slip.evaluation.errors import ErrorFigures
+from fleet_slip.evaluation.estimators import LinearEstimate
+from fleet_slip.evaluation.runs import Run
+from fleet_slip.evaluation.stability import rear_compliance
+from fleet_slip.sensors import Sensors
+from fleet_slip.signals import catalogue
+
+TABLE_TWO_STD_DEG = {"1": 0.3018, "2": 0.1754, "3": 0.1556, "4": 0.1549, "5": 0.1505}
+"""The paper's error standard deviations on its nominal drive."""
+
+LARGEST_MEAN_DEG = 0.02
+LARGEST_NOISE_GROWTH_DEG = 0.1
+LARGEST_MASS_CHANGE_DEG = 0.1
+LEAST_CORRELATION_AT_0_7 = 0.95
+LEAST_CORRELATION_AT_0_4 = 0.9
+LARGEST_CORRELATION_LOSS = 0.05
+
+
+@dataclass(frozen=True)
+class Check:
+    """One requirement on one estimator: `found` against `limit`.
+
+    `explanation` is empty where it is reached.
+    """
+
+    requirement: str
+    scenario: str
+    estimator: str
+    found: float
+    limit: float
+    reached: bool
+    explanation: str = ""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what a JSON document needs."""
+        return dict(vars(self))
+
+
+def checks(
+    runs: Sequence[Run], models: Mapping[str, str], estimators: Mapping[str, LinearEstimate]
+) -> tuple[Check, ...]:
+    """Check the models of Table I, given the name of each one's estimator.
+
+    A requirement whose scenarios are not among the runs is left out.
+    """
+    by_name = {run.scenario.name: run for run in runs}
+    found = [
+        check
+        for number, name in models.items()
+        for check in _checks(by_name, number, name, estimators[name])
+    ]
+    order = list(dict.fromkeys(check.requirement for check in found))
+    return tuple(sorted(found, key=lambda check: order.index(check.requirement)))
+
+
+def _checks(
+    runs: Mapping[str, Run], number: str, name: str, model: LinearEstimate
+) -> Iterator[Check]:
+    if "nominal" not in runs:
+        return
+    nominal = runs["nominal"]
+    before = nominal.results[name].whole
+
+    def check(requirement: str, run: Run, found: float, limit: float, why: str) -> Check:
+        # Limits of correlation are lower ones, all others upper ones.
+        reached = found >= limit if "at least" in requirement else found <= limit
+        return Check(
+            requirement, run.scenario.name, name, found, limit, reached, "" if reached else why
+        )
+
+    yield check(
+        "nominal: error std at most Table II's, deg",
+        nominal,
+        _number(before.error_std_deg),
+        TABLE_TWO_STD_DEG[number],
+        _compliance(nominal, nominal),
+    )
+    yield check(
+        f"nominal: size of the mean error at most {LARGEST_MEAN_DEG}, deg",
+        nominal,
+        abs(_number(before.error_mean_deg)),
+        LARGEST_MEAN_DEG,
+        _compliance(nominal, nominal),
+    )
+    if (run := runs.get("noise_doubled")) is not None:
+        grown = _number(run.results[name].whole.error_std_deg) - _number(before.error_std_deg)
+        yield check(
+            f"noise: error std grows by at most {LARGEST_NOISE_GROWTH_DEG}, deg",
+            run,
+            grown,
+            LARGEST_NOISE_GROWTH_DEG,
+            _noise(model, nominal, run),
+        )
+    for mass in ("mass_1000", "mass_1740"):
+        if (run := runs.get(mass)) is not None:
+            std = _number(run.results[name].whole.error_std_deg)
+            yield check(
+                f"{mass}: error std within {LARGEST_MASS_CHANGE_DEG} of nominal, deg",
+                run,
+                abs(std - _number(before.error_std_deg)),
+                LARGEST_MASS_CHANGE_DEG,
+                _compliance(run, nominal),
+            )
+    if (run := runs.get("adhesion_0_7")) is not None:
+        yield check(
+            f"adhesion 0.7: correlation at least {LEAST_CORRELATION_AT_0_7}",
+            run,
+            _number(run.results[name].whole.correlation),
+            LEAST_CORRELATION_AT_0_7,
+            _compliance(run, nominal),
+        )
+    if (run := runs.get("adhesion_0_4")) is not None:
+        yield check(
+            f"adhesion 0.4: correlation at least {LEAST_CORRELATION_AT_0_4} while stable",
+            run,
+            _number(stable(run, name).correlation),
+            LEAST_CORRELATION_AT_0_4,
+            _compliance(run, nominal),
+        )
+    if (run := runs.get("melbourne")) is not None:
+        yield check(
+            f"Melbourne: correlation lower than nominal by at most {LARGEST_CORRELATION_LOSS}",
+            run,
+            _number(before.correlation) - _number(run.results[name].whole.correlation),
+            LARGEST_CORRELATION_LOSS,
+            _compliance(run, nominal),
+        )
+
+
+def stable(run: Run, estimator: str) -> ErrorFigures:
+    """Return the figures outside of the unstable section, or of all where there is none."""
+    result = run.results[estimator]
+    return result.outside.get("unstable", result.whole)
+
+
+def _number(figure: float | None) -> float:
+    """Return a figure; an estimator without estimates reaches nothing."""
+    return math.nan if figure is None else figure
+
+
+def passed_noise_deg(model: LinearEstimate, sensors: Sensors) -> float:
+    """Return the standard deviation that white noise of the signals gives the estimate.
+
+    Noises of different signals are independent: sqrt(sum (coefficient * std)²).
+    """
+    stds = {catalogue()[name].column: std for name, (_, std) in sensors.bias_and_std.items()}
+    squares = [(weight * stds[column]) ** 2 for column, weight in model.coefficients.items()]
+    return math.degrees(math.sqrt(math.fsum(squares)))
+
+
+def _noise(model: LinearEstimate, nominal: Run, noisy: Run) -> str:
+    before = passed_noise_deg(model, nominal.scenario.sensors)
+    after = passed_noise_deg(model, noisy.scenario.sensors)
+    return (
+        "White noise of its signals alone reaches the estimate with a standard deviation of "
+        f"{before:.3f} deg at the initial noise and {after:.3f} deg here, the root of the sum of "
+        "(coefficient * standard deviation) squared. The fewer signals a model has, the larger "
+        "the coefficients that it puts on the noisy ones."
+    )
+
+
+def _compliance(run: Run, nominal: Run) -> str:
+    here = math.degrees(rear_compliance(run.drive))
+    there = math.degrees(rear_compliance(nominal.drive))
+    return (
+        f"The rear axle slips by {here:.3f} deg per m/s² of lateral acceleration here and by "
+        f"{there:.3f} in the nominal drive. Side-slip is b r / vx less that slip, and no signal of "
+        "the model tells how much load, tyres and road have changed it."
+    )

@@ -1,0 +1,113 @@
+"""`fleet-slip evaluate` from end to end, on a small warehouse."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from fleet_slip.cli.main import app
+from fleet_slip.errors import RefusedError
+from fleet_slip.evaluation.drives import load_drives
+from fleet_slip.evaluation.estimators import LinearEstimate
+from fleet_slip.registry import Registry
+from fleet_slip.scenario import load_scenario
+from fleet_slip.score import score
+from fleet_slip.warehouse import Warehouse
+
+SCENARIOS = ("nominal", "adhesion_0_4", "wheel_missing")
+
+pytestmark = pytest.mark.slow
+
+
+def call(root: Path, *words: str) -> Any:
+    result = CliRunner().invoke(app, ["--root", str(root), *words, "--json"])
+    if result.exception is not None:
+        raise result.exception
+    return json.loads(result.stdout)
+
+
+def evaluate(root: Path, *scenarios: str) -> Any:
+    options = [word for name in scenarios for word in ("--scenario", name)]
+    return call(root, "evaluate", "--one-car", "smoke", *options)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("data")
+    call(folder, "run", "--campaign", "smoke")
+    evaluate(folder, *SCENARIOS)
+    return folder
+
+
+def test_evaluating_again_changes_nothing(root: Path) -> None:
+    logs_version = Warehouse(root).logs.snapshot().version
+    again = evaluate(root, *SCENARIOS)
+    assert again["number"] == 1
+    assert Warehouse(root).logs.snapshot().version == logs_version
+
+
+def test_no_model_is_trained_on_scenarios(root: Path) -> None:
+    with pytest.raises(RefusedError, match="scenario"):
+        call(root, "select", "--cohort", "source = 'scenario'")
+    with pytest.raises(RefusedError, match="scenario"):
+        call(root, "publish", "leaking", "--cohort", "true")
+    assert call(root, "select")["drives"] == 8
+    assert not call(root, "run", "--campaign", "smoke")["changed"]
+
+
+def test_a_changed_scenario_is_refused(root: Path, tmp_path: Path) -> None:
+    file = tmp_path / "nominal.toml"
+    file.write_text('name = "mine"\ndescription = "x"\nbase = "nominal"\nlaps = 0.1\n')
+    copy = tmp_path / "data"
+    shutil.copytree(root, copy)
+    evaluate(copy, str(file))
+    file.write_text(file.read_text().replace("0.1", "0.2"))
+    with pytest.raises(RefusedError, match="was changed"):
+        evaluate(copy, str(file))
+
+
+def test_the_published_model_gets_the_same_estimates_as_in_sql(root: Path) -> None:
+    """SQL measures against the noisy label, here the truth counts: 0.03 degrees between them."""
+    manifest = Registry(root / "models").resolve("smoke").manifest
+    in_sql = score(Warehouse(root), manifest, "drive_id = 'scenario-nominal'")
+    one = evaluate(root, *SCENARIOS)["scenarios"][0]
+    here = one["results"]["smoke@1"]
+    assert here["rows"] == in_sql.rows == one["truth"]["rows"]
+    assert here["error_mean_deg"] == pytest.approx(in_sql.error_mean_deg, abs=0.001)
+    label_noise_deg = np.degrees(load_scenario("nominal").sensors.sideslip_std_rad)
+    expected = np.hypot(here["error_std_deg"], label_noise_deg)
+    assert in_sql.error_std_deg == pytest.approx(expected, rel=0.01)
+
+
+def test_stability_is_lost_on_the_slippery_road_alone(root: Path) -> None:
+    content = {one["name"]: one for one in evaluate(root, *SCENARIOS)["scenarios"]}
+    sections = {
+        name: [section["name"] for section in one["sections"]] for name, one in content.items()
+    }
+    assert "unstable" not in sections["nominal"]
+    assert "unstable" in sections["adhesion_0_4"]
+    result = content["adhesion_0_4"]["results"]["smoke@1/4"]
+    inside, outside = result["inside"]["unstable"], result["outside"]["unstable"]
+    assert inside["rows"] + outside["rows"] == result["rows"]
+    assert inside["error_std_deg"] > 3 * outside["error_std_deg"]
+
+
+def test_a_missing_signal_costs_the_models_that_need_it(root: Path) -> None:
+    one = next(
+        one for one in evaluate(root, *SCENARIOS)["scenarios"] if one["name"] == "wheel_missing"
+    )
+    assert one["results"]["smoke@1/1"]["coverage"] == 1
+    expected = 60 / one["truth"]["duration_s"]
+    assert one["results"]["smoke@1/4"]["coverage"] == pytest.approx(expected, abs=0.001)
+
+
+def test_an_estimator_does_not_see_the_truth(root: Path) -> None:
+    (drive,) = load_drives(Warehouse(root), [load_scenario("nominal")])
+    assert not {"vx_mps", "vy_mps", "sideslip_rad", "station_m"} & set(drive.signals)
+    manifest = Registry(root / "models").resolve("smoke").manifest
+    estimate = LinearEstimate.published(manifest)(drive.signals)
+    assert np.corrcoef(estimate, drive.sideslip_rad)[0, 1] > 0.9
