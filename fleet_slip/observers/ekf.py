@@ -45,7 +45,21 @@ class EkfNoise(Config):
     wheel_speed_std_mps: FiniteFloat = Field(default=0.005, gt=0)
     yaw_rate_std_rad_s: FiniteFloat = Field(default=0.01, gt=0)
     ay_std_mps2: FiniteFloat = Field(default=0.1, gt=0)
+    stiffness_factor: FiniteFloat = Field(default=1.0, ge=0.5, le=1.5)
+    """Cornering stiffness over that at rest: load transfer in corners softens an axle."""
     yaw_rate: YawRateNoise = YawRateNoise()
+
+
+TUNABLE = (
+    "lateral_model_std_mps2",
+    "yaw_model_std_rad_s2",
+    "wheel_speed_std_mps",
+    "yaw_rate_std_rad_s",
+    "ay_std_mps2",
+    "stiffness_factor",
+    *yaw_rate.TUNABLE,
+)
+"""The parameters that `tuning.tune` should search."""
 
 
 class Model(NamedTuple):
@@ -272,6 +286,6 @@ def estimate(drive: DriveSignals, car: VehicleParameters, noise: EkfNoise) -> Fl
         vx_mps,
         measured_steer_rad(drive),
         Belief(vx_mps[0], 0.0, turning[0], p0, 0.0, 0.0, p1, 0.0, p2),
-        build_model(SingleTrack.of(car), noise),
+        build_model(SingleTrack.of(car, noise.stiffness_factor), noise),
     )
     return sideslip_angle(means[0], means[1])

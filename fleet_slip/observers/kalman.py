@@ -55,6 +55,17 @@ class FilterNoise(Config):
         )
 
 
+TUNABLE = (
+    "ax_std_mps2",
+    "ay_std_mps2",
+    "gps_vx_std_mps",
+    "gps_vy_std_mps",
+    "bias_std_mps2",
+    *yaw_rate.TUNABLE,
+)
+"""The parameters of Q, R and the first P that `tuning.tune` should search."""
+
+
 class Covariances(NamedTuple):
     """The diagonals of Q and R, and of P at the first fix, as variances per step."""
 

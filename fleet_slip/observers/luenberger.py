@@ -32,7 +32,13 @@ class ObserverPoles(Config):
 
     lateral_velocity_1ps: FiniteFloat = Field(default=5.0, gt=0, le=100)
     yaw_rate_1ps: FiniteFloat = Field(default=20.0, gt=0, le=100)
+    stiffness_factor: FiniteFloat = Field(default=1.0, ge=0.5, le=1.5)
+    """Cornering stiffness over that at rest: load transfer in corners softens an axle."""
     yaw_rate: YawRateNoise = YawRateNoise()
+
+
+TUNABLE = ("lateral_velocity_1ps", "yaw_rate_1ps", "stiffness_factor", *yaw_rate.TUNABLE)
+"""The parameters that `tuning.tune` should search."""
 
 
 def gains(space: StateSpace, poles: ObserverPoles) -> Floats:
@@ -73,7 +79,7 @@ def estimate(drive: DriveSignals, car: VehicleParameters, poles: ObserverPoles) 
     Raises `SelectionError` if a sensor is absent.
     """
     vx_mps = measured_speed_mps(drive, car)
-    space = state_space(SingleTrack.of(car), vx_mps)
+    space = state_space(SingleTrack.of(car, poles.stiffness_factor), vx_mps)
     vy_mps = _observe(
         np.stack([space.a11, space.a12, space.a21, space.a22, space.b1, space.b2]),
         gains(space, poles),

@@ -42,17 +42,21 @@ class SingleTrack:
     grip_rear_n: float
 
     @classmethod
-    def of(cls, car: VehicleParameters) -> Self:
-        """Return the model of a car: both tyres of an axle in one, at the load at rest."""
+    def of(cls, car: VehicleParameters, stiffness_factor: float = 1.0) -> Self:
+        """Return the model of a car on a dry road: both tyres of an axle in one, loaded as at rest.
+
+        `stiffness_factor` multiplies the cornering stiffness of both axles.
+        """
         c = constants(car, adhesion=1.0)
         front, rear = c.static_front, c.static_rear
+        axle = 2 * stiffness_factor
         return cls(
             mass_kg=c.mass,
             yaw_inertia_kgm2=c.yaw_inertia,
             front_m=c.front,
             rear_m=c.rear,
-            stiffness_front_n=2 * cornering_stiffness(front, c.stiffness_front, c),
-            stiffness_rear_n=2 * cornering_stiffness(rear, c.stiffness_rear, c),
+            stiffness_front_n=axle * cornering_stiffness(front, c.stiffness_front, c),
+            stiffness_rear_n=axle * cornering_stiffness(rear, c.stiffness_rear, c),
             grip_front_n=2 * (c.friction - c.friction_per_load * front) * front,
             grip_rear_n=2 * (c.friction - c.friction_per_load * rear) * rear,
         )

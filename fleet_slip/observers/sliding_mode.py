@@ -41,6 +41,8 @@ class SlidingGains(Config):
     lateral_layer_mps: FiniteFloat = Field(default=0.1, gt=0)
     yaw_gain_rad_s2: FiniteFloat = Field(default=1.0, gt=0)
     yaw_layer_rad_s: FiniteFloat = Field(default=0.05, gt=0)
+    stiffness_factor: FiniteFloat = Field(default=1.0, ge=0.5, le=1.5)
+    """Cornering stiffness over that at rest: load transfer in corners softens an axle."""
     yaw_rate: YawRateNoise = YawRateNoise()
 
     @model_validator(mode="after")
@@ -52,6 +54,17 @@ class SlidingGains(Config):
             if gain * STEP_S > layer:
                 raise ValueError(f"a gain of {gain} crosses the layer {layer} in one step")
         return self
+
+
+TUNABLE = (
+    "lateral_gain_mps2",
+    "lateral_layer_mps",
+    "yaw_gain_rad_s2",
+    "yaw_layer_rad_s",
+    "stiffness_factor",
+    *yaw_rate.TUNABLE,
+)
+"""The parameters that `tuning.tune` should search."""
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -89,7 +102,7 @@ def estimate(drive: DriveSignals, car: VehicleParameters, gains: SlidingGains) -
     Raises `SelectionError` if a sensor is absent.
     """
     vx_mps = measured_speed_mps(drive, car)
-    space = state_space(SingleTrack.of(car), vx_mps)
+    space = state_space(SingleTrack.of(car, gains.stiffness_factor), vx_mps)
     steer = measured_steer_rad(drive)
     turning = yaw_rate.estimate(drive, car, gains.yaw_rate).yaw_rate_rad_s
     ay_mps2 = held(drive.ay_mps2, "ay")

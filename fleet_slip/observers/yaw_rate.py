@@ -55,6 +55,14 @@ class YawRateNoise(Config):
         )
 
 
+TUNABLE = (
+    "yaw_rate.gyro_std_rad_s",
+    "yaw_rate.wheel_yaw_rate_std_rad_s",
+    "yaw_rate.yaw_acceleration_std_rad_s2",
+)
+"""What is worth tuning of an estimator's `yaw_rate: YawRateNoise`."""
+
+
 @dataclass(frozen=True)
 class YawRateEstimate:
     """Yaw rate and bias of the gyroscope at every row."""
