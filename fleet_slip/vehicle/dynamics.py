@@ -14,11 +14,11 @@ from fleet_slip.vehicle.wheels import (
     Acceleration,
     WheelForces,
     WheelRate,
-    ackermann_tangents,
+    ackermann,
     build_wheel_forces,
     driven_spins,
     free_spins,
-    parallel_tangents,
+    parallel,
     static_loads,
     transferred_loads,
 )
@@ -95,7 +95,7 @@ def build_derivative(extensions: Extensions) -> Callable[[State, Controls, Const
 
     The compiled function is pure: (state, controls, constants) to rates.
     """
-    tangents = ackermann_tangents if extensions.steering else parallel_tangents
+    directions = ackermann if extensions.steering else parallel
     loads = transferred_loads if extensions.load_transfer else static_loads
     forces = build_wheel_forces(extensions.brush_tyres, extensions.drivetrain)
     body = _driven_body if extensions.drivetrain else _commanded_body
@@ -104,7 +104,7 @@ def build_derivative(extensions: Extensions) -> Callable[[State, Controls, Const
     @equation
     def derivative(x: State, u: Controls, c: Constants) -> Derivative:
         load = loads(x, c)
-        force = forces(x, tangents(x, u, c), load, c)
+        force = forces(x, directions(x, u, c), load, c)
         motion = body(x, u, force, c)
         fl, fr, rl, rr = spins(x, force, load, motion, c)
         return Derivative(

@@ -255,22 +255,37 @@ def _move_on(memory: Any, book: Any, plans: Any, truth: Any, ended: Any) -> int:
 
 
 @equation
+def _angles(wheel: Any, left: Any, right: Any, vx: Any, vy: Any, slip: Any, car: Any) -> None:
+    """Fill in the road wheels' angles and the side-slip angle of a drive."""
+    steer, ackermann = car[STEER], car[ACKERMANN]
+    for tick in range(len(wheel)):
+        tangent = steer * wheel[tick]
+        left[tick] = arctan2(tangent, 1.0 - ackermann * tangent)
+    for tick in range(len(wheel)):
+        tangent = steer * wheel[tick]
+        right[tick] = arctan2(tangent, 1.0 + ackermann * tangent)
+    for tick in range(len(wheel)):
+        slip[tick] = arctan2(vy[tick], vx[tick])
+
+
+@equation
 def _finish(truth: Any, plans: Any, ended: Any, cars: Any) -> None:
-    """Fill in what follows from the recorded: the road wheels' angles and the side-slip angle."""
+    """Fill in what follows from the recorded."""
     for drive in range(len(plans)):
-        steer, ackermann = cars[drive, STEER], cars[drive, ACKERMANN]
-        size = plans[drive].samples
-        for at in range(plans[drive].output, plans[drive].output + ended[drive, SAMPLES]):
-            tangent = steer * truth[at + 3 * size]
-            truth[at + 8 * size] = arctan2(tangent, 1.0 - ackermann * tangent)
-            truth[at + 9 * size] = arctan2(tangent, 1.0 + ackermann * tangent)
-            truth[at + 10 * size] = arctan2(truth[at + 12 * size], truth[at + 11 * size])
+        size, samples = plans[drive].samples, ended[drive, SAMPLES]
+        channels = truth[plans[drive].output :][: len(CHANNELS) * size]
+        wheel, left, right = channels[3 * size :], channels[8 * size :], channels[9 * size :]
+        slip, vx, vy = channels[10 * size :], channels[11 * size :], channels[12 * size :]
+        _angles(wheel[:samples], left, right, vx, vy, slip, cars[drive])
 
 
-def _compile(sources: str) -> Callable[..., NDArray[np.int64]]:
-    """Compile the kernel. The compiled code is kept on disk for as long as its sources stay."""
+def build_kernel(sources: str) -> Callable[..., NDArray[np.int64]]:
+    """Return the kernel, not yet compiled.
 
-    @numba.njit(cache=True, nogil=True, error_model="numpy")
+    Its closure holds a digest of the `sources`, and so does the key under which numba keeps the
+    compiled code on disk: a change of any module compiles it again.
+    """
+
     def simulate(
         plans: Any, cars: Any, roads: Any, queue: Any, steps: int, truth: Any
     ) -> NDArray[np.int64]:
@@ -318,5 +333,5 @@ def _source_digest() -> str:
     return digest.hexdigest()
 
 
-simulate = _compile(_source_digest())
-"""The kernel; see `_compile`."""
+simulate = numba.njit(cache=True, nogil=True, error_model="numpy")(build_kernel(_source_digest()))
+"""The kernel; see `build_kernel`."""

@@ -63,17 +63,26 @@ def brush_force(
     slide_x = rolling - along
     slide_y = -across
     limit = (c.friction - c.friction_per_load * load) * load
-    per_speed = 1.0 / max(abs(rolling), CREEP_SPEED_MPS)
-    bristle_y = cornering_stiffness(load, peak, c) * per_speed
+    # One division serves three quotients: 1 / speed, Cy = 2 c1 x / (1 + x²), and 1 / (3 limit).
+    speed = max(abs(rolling), CREEP_SPEED_MPS)
+    x = load * c.inverse_stiffness_load
+    steep = 1.0 + x * x
+    triple = 3.0 * limit
+    inverse = 1.0 / (speed * steep * triple)
+    per_speed = inverse * steep * triple
+    bristle_y = inverse * triple * peak * 2.0 * x
     bristle_x = c.stiffness_ratio * bristle_y
     stuck_x = bristle_x * slide_x
     stuck_y = bristle_y * slide_y
-    stuck = max(0.0, 1.0 - math.sqrt(stuck_x * stuck_x + stuck_y * stuck_y) / (3.0 * limit))
+    used = math.sqrt(stuck_x * stuck_x + stuck_y * stuck_y) * (inverse * steep * speed)
+    stuck = max(0.0, 1.0 - used)
     stuck2 = stuck * stuck
     loose = (1.0 - stuck) * (1.0 - stuck) * (1.0 + 2.0 * stuck)
-    speed = max(math.sqrt(slide_x * slide_x + slide_y * slide_y), SMALLEST_SLIDING_MPS)
-    drag = limit * loose / (speed * (1.0 + speed * c.inverse_decay_speed))
-    direction_y = slide_y / speed
+    sliding = max(math.sqrt(slide_x * slide_x + slide_y * slide_y), SMALLEST_SLIDING_MPS)
+    decay = 1.0 + sliding * c.inverse_decay_speed
+    decayed = 1.0 / (sliding * decay)
+    drag = limit * loose * decayed
+    direction_y = slide_y * decayed * decay
     return TyreForce(
         stuck2 * stuck_x + drag * slide_x,
         stuck2 * stuck_y + drag * slide_y,

@@ -84,22 +84,42 @@ class Acceleration(NamedTuple):
     yaw_rate: float
 
 
-@equation
-def ackermann_tangents(x: State, _u: Controls, c: Constants) -> tuple[float, float]:
-    """Return the tangents of the left and right road wheel angles (exact Ackermann geometry).
+class Direction(NamedTuple):
+    """Where a wheel points: the unit vector of its steering angle."""
 
-    The rack moves the mean wheel so that its tangent is the steering wheel's angle over the ratio;
-    both wheels then stand square to one centre on the line of the rear axle.
+    cosine: float
+    sine: float
+
+
+AHEAD = Direction(1.0, 0.0)
+"""Where a wheel points that is not steered."""
+
+
+@equation
+def _direction(along: float, across: float) -> Direction:
+    """Return the direction of a vector with `along` > 0."""
+    inverse = 1.0 / math.sqrt(along * along + across * across)
+    return Direction(along * inverse, across * inverse)
+
+
+@equation
+def ackermann(x: State, _u: Controls, c: Constants) -> tuple[Direction, Direction]:
+    """Return where the left and the right front wheel point (exact Ackermann geometry).
+
+    The rack moves the mean wheel so that its tangent t is the steering wheel's angle over the
+    ratio; both wheels then stand square to one centre on the line of the rear axle: their tangents
+    are t / (1 ∓ t w / (2 L)).
     """
     tangent = c.steer_per_wheel * x.steering_wheel
-    return tangent / (1.0 - c.ackermann * tangent), tangent / (1.0 + c.ackermann * tangent)
+    nearer = c.ackermann * tangent
+    return _direction(1.0 - nearer, tangent), _direction(1.0 + nearer, tangent)
 
 
 @equation
-def parallel_tangents(_x: State, u: Controls, c: Constants) -> tuple[float, float]:
-    """Return equal tangents, without the lag of the steering."""
-    tangent = c.steer_per_wheel * u.steering_wheel
-    return tangent, tangent
+def parallel(_x: State, u: Controls, c: Constants) -> tuple[Direction, Direction]:
+    """Return one direction for both front wheels, without the lag of the steering."""
+    direction = _direction(1.0, c.steer_per_wheel * u.steering_wheel)
+    return direction, direction
 
 
 @equation
@@ -127,10 +147,15 @@ def build_wheel_forces(brush: bool, spinning: bool) -> Callable[..., WheelForces
 
     @equation
     def brush_wheel(
-        vx: float, vy: float, tangent: float, spin: float, load: float, peak: float, c: Constants
+        vx: float,
+        vy: float,
+        to: Direction,
+        spin: float,
+        load: float,
+        peak: float,
+        c: Constants,
     ) -> WheelForce:
-        cosine = 1.0 / math.sqrt(1.0 + tangent * tangent)
-        sine = tangent * cosine
+        cosine, sine = to
         along = cosine * vx + sine * vy
         across = cosine * vy - sine * vx
         rolling = c.radius * spin if spinning else along
@@ -148,24 +173,30 @@ def build_wheel_forces(brush: bool, spinning: bool) -> Callable[..., WheelForces
 
     @equation
     def brush_forces(
-        x: State, tangents: tuple[float, float], load: Loads, c: Constants
+        x: State, to: tuple[Direction, Direction], load: Loads, c: Constants
     ) -> WheelForces:
-        left, right = tangents
+        left, right = to
         front, rear = x.vy + c.front * x.yaw_rate, x.vy - c.rear * x.yaw_rate
         turn_f, turn_r = c.half_track_front * x.yaw_rate, c.half_track_rear * x.yaw_rate
         peak_f, peak_r = c.stiffness_front, c.stiffness_rear
         return WheelForces(
             brush_wheel(x.vx - turn_f, front, left, x.wheel_fl, load.fl, peak_f, c),
             brush_wheel(x.vx + turn_f, front, right, x.wheel_fr, load.fr, peak_f, c),
-            brush_wheel(x.vx - turn_r, rear, 0.0, x.wheel_rl, load.rl, peak_r, c),
-            brush_wheel(x.vx + turn_r, rear, 0.0, x.wheel_rr, load.rr, peak_r, c),
+            brush_wheel(x.vx - turn_r, rear, AHEAD, x.wheel_rl, load.rl, peak_r, c),
+            brush_wheel(x.vx + turn_r, rear, AHEAD, x.wheel_rr, load.rr, peak_r, c),
         )
 
     @equation
     def linear_wheel(
-        vx: float, vy: float, tangent: float, spin: float, load: float, peak: float, c: Constants
+        vx: float,
+        vy: float,
+        to: Direction,
+        spin: float,
+        load: float,
+        peak: float,
+        c: Constants,
     ) -> WheelForce:
-        slip_angle = math.atan(tangent) - math.atan2(vy, vx)
+        slip_angle = math.atan2(to.sine, to.cosine) - math.atan2(vy, vx)
         rolling = c.radius * spin if spinning else vx
         force = linear_force(slip_angle, vx, rolling, load, peak, c)
         x, y, damping, slip, per_speed = force
@@ -179,15 +210,15 @@ def build_wheel_forces(brush: bool, spinning: bool) -> Callable[..., WheelForces
 
     @equation
     def linear_forces(
-        x: State, tangents: tuple[float, float], load: Loads, c: Constants
+        x: State, to: tuple[Direction, Direction], load: Loads, c: Constants
     ) -> WheelForces:
         """As highway-env (Rajamani 2.25-2.28): both wheels of an axle stand at its centre."""
-        left, right = tangents
+        left, right = to
         front, rear = x.vy + c.front * x.yaw_rate, x.vy - c.rear * x.yaw_rate
         fl = linear_wheel(x.vx, front, left, x.wheel_fl, load.fl, c.stiffness_front, c)
         fr = linear_wheel(x.vx, front, right, x.wheel_fr, load.fr, c.stiffness_front, c)
-        rl = linear_wheel(x.vx, rear, 0.0, x.wheel_rl, load.rl, c.stiffness_rear, c)
-        rr = linear_wheel(x.vx, rear, 0.0, x.wheel_rr, load.rr, c.stiffness_rear, c)
+        rl = linear_wheel(x.vx, rear, AHEAD, x.wheel_rl, load.rl, c.stiffness_rear, c)
+        rr = linear_wheel(x.vx, rear, AHEAD, x.wheel_rr, load.rr, c.stiffness_rear, c)
         if abs(x.vx) < HIGHWAY_ENV_SLOW_MPS:
             sliding = -c.mass * x.vy
             turning = c.yaw_inertia / c.front * x.yaw_rate

@@ -133,7 +133,7 @@ def test_the_class_of_another_car_is_made_by_highway_env() -> None:
     assert Suv.create_from(car).parameters is car.parameters
 
 
-@pytest.mark.parametrize("name", ["highway-v0", "racetrack-v0"])
+@pytest.mark.parametrize("name", ["highway-v0", "racetrack-v1"])
 def test_it_is_driven_by_a_real_environment(name: str) -> None:
     config = {"action": {"type": "ContinuousAction"}, "vehicles_count": 3, "other_vehicles": 1}
     env = gymnasium.make(name, config=config)

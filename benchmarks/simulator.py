@@ -1,0 +1,110 @@
+"""How fast drives are simulated, beside highway-env's own vehicle, in one run.
+
+    python -m benchmarks.simulator [--seconds 3] [--threads 1 2]
+
+Each is timed in several rounds, in turn, and the best round counts, as it was disturbed least.
+A sample is one car moved on by 0.01 s: by one `BicycleVehicle.step`, or by five steps of 2 ms with
+driver, road and recording.
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
+import numpy as np
+from highway_env.vehicle.dynamics import BicycleVehicle
+
+from fleet_slip.speed_profile import SpeedLimits, speed_profile
+from fleet_slip.track import load_track
+from fleet_slip.vehicle.driver import SAMPLE_S
+from fleet_slip.vehicle.highway import FourWheelVehicle
+from fleet_slip.vehicle.lanes import LaneDrive, Road, simulate_drives
+from fleet_slip.vehicle.parameters import load_vehicle
+
+ROUNDS = 5
+DRIVES = 32
+
+
+def fleet() -> list[LaneDrive]:
+    """Return drives of a lap and a half on Waterford Hills, each at another speed and mass."""
+    track = load_track("waterford_hills")
+    limits = SpeedLimits(
+        lateral_mps2=5.0, acceleration_mps2=2.5, braking_mps2=4.0, top_speed_mps=45.0
+    )
+    profile = speed_profile(track, limits, spacing_m=1.0)
+    curvature, sedan = track.curvature(profile.station_m), load_vehicle("d_class_sedan")
+    return [
+        LaneDrive(
+            sedan.with_sprung_mass(1000.0 + 20.0 * i),
+            Road(
+                profile.spacing_m,
+                curvature,
+                (0.7 + 0.01 * i) * profile.speed_mps,
+                track.length_m,
+                track.closed,
+            ),
+            1.0,
+            1.5,
+        )
+        for i in range(DRIVES)
+    ]
+
+
+def vehicle_rate(kind: type[BicycleVehicle], seconds: float) -> float:
+    """Return steps per second of a highway-env vehicle in a gentle bend."""
+    vehicle = kind(None, [0.0, 0.0], speed=20.0)
+    vehicle.act({"steering": 0.01, "acceleration": 0.0})
+    vehicle.step(SAMPLE_S)
+    steps, start = 0, time.perf_counter()
+    while time.perf_counter() - start < seconds:
+        for _ in range(200):
+            vehicle.step(SAMPLE_S)
+        steps += 200
+    return steps / (time.perf_counter() - start)
+
+
+def lanes_rate(drives: list[LaneDrive], seconds: float, threads: int) -> float:
+    """Return vehicle-samples per second of the lane kernel on some threads."""
+
+    def work(_: int) -> int:
+        samples, start = 0, time.perf_counter()
+        while time.perf_counter() - start < seconds:
+            samples += sum(len(truth.vx_mps) for truth in simulate_drives(drives))
+        return samples
+
+    start = time.perf_counter()
+    with ThreadPoolExecutor(threads) as pool:
+        samples = sum(pool.map(work, range(threads)))
+    return samples / (time.perf_counter() - start)
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=3.0, help="time for each measurement")
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
+    arguments = parser.parse_args()
+    share = arguments.seconds / ROUNDS
+    drives = fleet()
+    simulate_drives(drives[:1])
+    subjects: dict[str, Callable[[], float]] = {
+        "highway-env BicycleVehicle.step": partial(vehicle_rate, BicycleVehicle, share),
+        "FourWheelVehicle.step": partial(vehicle_rate, FourWheelVehicle, share),
+    }
+    for threads in arguments.threads:
+        subjects[f"lanes, threads: {threads}"] = partial(lanes_rate, drives, share, threads)
+    rates: dict[str, list[float]] = {name: [] for name in subjects}
+    for _ in range(ROUNDS):
+        for name, run in subjects.items():
+            rates[name].append(run())
+    base = max(rates["highway-env BicycleVehicle.step"])
+    print(f"{'':34}{'best samples/s':>16}{'median':>14}{'ratio':>8}")
+    for name, values in rates.items():
+        best = max(values)
+        print(f"{name:34}{best:16,.0f}{np.median(values):14,.0f}{best / base:8.1f}")
+
+
+if __name__ == "__main__":
+    main()
