@@ -34,7 +34,8 @@ def database_errors(doing: str) -> Iterator[None]:
 
 
 def _message(error: duckdb.Error) -> str:
-    return " ".join(str(error).split()).rstrip(".")
+    """Return DuckDB's message on one line, without the excerpt of the statement."""
+    return " ".join(str(error).partition("\n\nLINE ")[0].split()).rstrip(".")
 
 
 _RESTORE = "If a file is missing or damaged, restore it from a backup."

@@ -1,0 +1,143 @@
+"""Kills the whole job in mid-write, repeats the command, and compares every bit.
+
+Also a full disk and a read-only one.
+"""
+
+import hashlib
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fleet_slip.registry import Registry
+from fleet_slip.storage import TEMPORARY_PREFIX
+from fleet_slip.warehouse import Warehouse
+from tests.conftest import RunCommand
+
+JOB = ["run", "--campaign", "smoke", "--threads", "1"]
+KILLS = 16
+
+
+def run_until(point: int, root: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "tests.crash", str(point), "--root", str(root), *JOB]
+    return subprocess.run(
+        command, capture_output=True, text=True, check=False, cwd=Path(__file__).parents[1]
+    )
+
+
+def state(root: Path) -> dict[str, Any]:
+    """All that a data root holds, apart from the moments at which it was written."""
+    warehouse = Warehouse(root)
+    files = {
+        path: hashlib.sha256(Path(path).read_bytes()).hexdigest()
+        for table in (warehouse.logs, warehouse.grams)
+        for path in table.snapshot().paths
+    }
+    registry = Registry(root / "models")
+    return {
+        "files": {Path(path).relative_to(root): digest for path, digest in files.items()},
+        "versions": [registry.load("smoke", n).sha256 for n in registry.versions("smoke")],
+        "aliases": registry.aliases("smoke"),
+        "moves": [(move.command, move.version) for move in registry.history("smoke")],
+    }
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], int]:
+    """The state after a run that nothing disturbed, and how many points it passed."""
+    root = tmp_path_factory.mktemp("undisturbed")
+    done = run_until(0, root)
+    assert done.returncode == 0, done.stderr
+    return state(root), int(done.stdout.rsplit(maxsplit=1)[1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", range(KILLS))
+def test_after_a_kill_at_any_point_the_same_command_ends_in_the_same_bits(
+    tmp_path: Path, undisturbed: tuple[dict[str, Any], int], part: int
+) -> None:
+    expected, points = undisturbed
+    assert points > KILLS
+    kill = 1 + round(part * (points - 1) / (KILLS - 1))
+    assert run_until(kill, tmp_path).returncode == -signal.SIGKILL
+    again = run_until(0, tmp_path)
+    assert again.returncode == 0, again.stderr
+    assert state(tmp_path) == expected
+
+
+def test_leftovers_of_a_kill_are_not_part_of_any_table(
+    run_command: RunCommand, tmp_path: Path
+) -> None:
+    run_command("simulate", "smoke")
+    rows = run_command("sql", "SELECT count(*) AS n FROM log", "--json").json
+    day = tmp_path / "data" / "logs" / "day=2024-05-01"
+    (day / f"{TEMPORARY_PREFIX}0.parquet").write_bytes(b"half a file")
+    (day / "smoke-9999-uncommitted.parquet").write_bytes(b"written, not committed")
+    assert run_command("sql", "SELECT count(*) AS n FROM log", "--json").json == rows
+    assert run_command("gram", "--json").json["rows_read"] == rows[0]["n"]
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Any:
+    """Return a function that mounts a small disk; skip where that is not allowed."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+
+    def mount(options: str) -> Path:
+        command = ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(folder)]
+        if subprocess.run(command, capture_output=True, check=False).returncode:
+            pytest.skip("this machine does not allow to mount a file system")
+        return folder / "data"
+
+    yield mount
+    subprocess.run(["umount", str(folder)], capture_output=True, check=False)
+
+
+def test_a_full_disk_is_told_and_the_same_command_goes_on_after_it(
+    run_command: RunCommand, small_disk: Any, tmp_path: Path
+) -> None:
+    root = small_disk("size=300k")
+    full = run_command(*JOB, root=root)
+    assert full.exit_code == 6
+    assert "the disk is full. Free some space" in full.stderr
+    assert not list(root.rglob(f"{TEMPORARY_PREFIX}*"))
+    subprocess.run(["mount", "-o", "remount,size=20m", str(root.parent)], check=True)
+    assert run_command(*JOB, root=root).exit_code == 0
+    assert run_command(*JOB, root=tmp_path / "fresh").exit_code == 0
+    assert state(root) == state(tmp_path / "fresh")
+
+
+def test_a_read_only_root_is_told_and_can_be_queried(
+    run_command: RunCommand, small_disk: Any
+) -> None:
+    root = small_disk("size=20m")
+    assert run_command(*JOB, root=root).exit_code == 0
+    subprocess.run(["mount", "-o", "remount,ro", str(root.parent)], check=True)
+    for command in (["simulate", "waterford", "--days", "1"], ["publish", "other"]):
+        refused = run_command(*command, root=root)
+        assert refused.exit_code == 6
+        assert "read-only. Choose a writable data root" in refused.stderr
+    assert run_command("select", "--json", root=root).exit_code == 0
+    assert run_command(*JOB, "--json", root=root).json["changed"] is False
+
+
+def test_a_damaged_log_file_is_named(run_command: RunCommand, tmp_path: Path) -> None:
+    run_command("simulate", "smoke")
+    file = next((tmp_path / "data" / "logs").rglob("smoke-0000*.parquet"))
+    whole = file.read_bytes()
+    for damaged in (whole[:1000], b"", b"x" * len(whole)):
+        file.write_bytes(damaged)
+        told = run_command("gram")
+        assert told.exit_code == 6
+        assert file.name in told.stderr
+    file.unlink()
+    for command in (["gram"], ["sql", "SELECT max(ax_mps2) FROM log"]):
+        told = run_command(*command)
+        assert told.exit_code == 6
+        assert file.name in told.stderr
+    file.write_bytes(whole)
+    assert json.loads(run_command("gram", "--json").stdout)["files_read"] == 4
