@@ -20,7 +20,7 @@ from fleet_slip.speed_profile import SpeedLimits, speed_profile
 from fleet_slip.track import load_track
 from fleet_slip.vehicle.driver import SAMPLE_S
 from fleet_slip.vehicle.highway import FourWheelVehicle
-from fleet_slip.vehicle.lanes import LaneDrive, Road, simulate_drives
+from fleet_slip.vehicle.lanes import STEPS_PER_SAMPLE, LaneDrive, Road, simulate_drives
 from fleet_slip.vehicle.parameters import load_vehicle
 
 ROUNDS = 5
@@ -65,19 +65,35 @@ def vehicle_rate(kind: type[BicycleVehicle], seconds: float) -> float:
     return steps / (time.perf_counter() - start)
 
 
-def lanes_rate(drives: list[LaneDrive], seconds: float, threads: int) -> float:
+def lanes_rate(
+    drives: list[LaneDrive], seconds: float, threads: int, steps: int = STEPS_PER_SAMPLE
+) -> float:
     """Return vehicle-samples per second of the lane kernel on some threads."""
 
     def work(_: int) -> int:
         samples, start = 0, time.perf_counter()
         while time.perf_counter() - start < seconds:
-            samples += sum(len(truth.vx_mps) for truth in simulate_drives(drives))
+            samples += sum(len(truth.vx_mps) for truth in simulate_drives(drives, steps))
         return samples
 
     start = time.perf_counter()
     with ThreadPoolExecutor(threads) as pool:
         samples = sum(pool.map(work, range(threads)))
     return samples / (time.perf_counter() - start)
+
+
+def print_precision(drives: list[LaneDrive], seconds: float) -> None:
+    """Print the error of the side-slip angle and the rate over the length of the step."""
+    exact = simulate_drives(drives, steps_per_sample=320)
+    print(f"\n{'step, ms':>10}{'largest error of side-slip, deg':>34}{'samples/s':>14}")
+    for steps in (2, 3, 4, 5, 10, 20, 40):
+        error = max(
+            float(np.abs(one.sideslip_rad[:n] - other.sideslip_rad[:n]).max())
+            for one, other in zip(exact, simulate_drives(drives, steps), strict=True)
+            for n in [min(len(one.vx_mps), len(other.vx_mps))]
+        )
+        rate = max(lanes_rate(drives, seconds, 1, steps) for _ in range(ROUNDS))
+        print(f"{1000 * SAMPLE_S / steps:10.2f}{np.degrees(error):34.5f}{rate:14,.0f}")
 
 
 def main() -> None:
@@ -104,6 +120,7 @@ def main() -> None:
     for name, values in rates.items():
         best = max(values)
         print(f"{name:34}{best:16,.0f}{np.median(values):14,.0f}{best / base:8.1f}")
+    print_precision(drives, share)
 
 
 if __name__ == "__main__":
