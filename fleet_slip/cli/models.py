@@ -4,7 +4,7 @@ from typing import Annotated, Any
 
 import typer
 
-from fleet_slip.cli.output import Json, print_json, print_table, say, stdout
+from fleet_slip.cli.output import Json, print_json, print_table, print_text, say
 from fleet_slip.cohort import ALL_DRIVES, TRAINING_DRIVES, load_cohort
 from fleet_slip.errors import ConfigError
 from fleet_slip.model_list import (
@@ -149,9 +149,7 @@ def print_selection(selection: Selection) -> None:
     )
     for name, reason in selection.skipped.items():
         say(f"model {name} was left out: {reason}")
-    stdout().print(
-        f"winner: {selection.winner.model.name}. {selection.winner.reason}", markup=False
-    )
+    print_text(f"winner: {selection.winner.model.name}. {selection.winner.reason}")
 
 
 def publish(

@@ -61,16 +61,26 @@ def _for_json(value: Any) -> Any:
             return value
 
 
+def print_text(text: str) -> None:
+    """Print a line for people on stdout, as it is."""
+    print(text, flush=True)  # noqa: T201 - this is the one place that prints
+
+
 def print_table(
     title: str, header: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1
 ) -> None:
     """Print a table; the first `left` columns are text, the others are numbers."""
-    table = Table(title=title or None, title_justify="left", box=None, pad_edge=False)
+    table = Table(box=None, pad_edge=False, header_style="bold", show_header=any(header))
     for i, name in enumerate(header):
         table.add_column(name, justify="left" if i < left else "right", overflow="fold")
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
-    stdout().print(table)
+    if title:
+        print_text(title)
+    console = stdout()
+    with console.capture() as captured:
+        console.print(table)
+    print_text("\n".join(line.rstrip() for line in captured.get().splitlines()))
 
 
 class _Rate(ProgressColumn):
