@@ -11,12 +11,11 @@ from collections.abc import Callable
 from pathlib import Path as FilePath
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.vehicle.arctangent import arctan2
-from fleet_slip.vehicle.compiling import equation
+from fleet_slip.vehicle.compiling import equation, kernel
 from fleet_slip.vehicle.driver import (
     SAMPLE_S,
     SPEED_PREVIEW_S,
@@ -333,5 +332,5 @@ def _source_digest() -> str:
     return digest.hexdigest()
 
 
-simulate = numba.njit(cache=True, nogil=True, error_model="numpy")(build_kernel(_source_digest()))
+simulate = kernel(build_kernel(_source_digest()))
 """The kernel; see `build_kernel`."""

@@ -46,7 +46,7 @@ def test_small_slips_meet_the_stiffnesses(load: float) -> None:
 
 @pytest.mark.parametrize("slip", [0.01, 0.05, 0.1, 0.15])
 def test_pure_side_slip_is_the_brush_formula(slip: float) -> None:
-    """F = μ Fz (1 − (1 − C σ / (3 μ Fz))³), Pacejka (2012) 3.11; here without friction decay."""
+    """F = μ Fz (1 − (1 − C σ / (3 μ Fz))³), Pacejka (2012) 3.2, without friction decay."""
     c = CAR._replace(inverse_decay_speed=0.0)
     load = 3000.0
     limit = (c.friction - c.friction_per_load * load) * load
