@@ -11,7 +11,9 @@ import typer
 
 from fleet_slip.cli.output import Json, print_json, print_table, progress, say
 from fleet_slip.errors import ConfigError
-from fleet_slip.gram_job import GramReport, gram_statement, update_grams
+from fleet_slip.features import PLAIN, features
+from fleet_slip.gram_job import GramReport, update_grams
+from fleet_slip.gram_statement import gram_statement
 from fleet_slip.signals import catalogue
 from fleet_slip.warehouse import Warehouse
 
@@ -19,12 +21,15 @@ if TYPE_CHECKING:
     from fleet_slip.campaign import Campaign
     from fleet_slip.simulation_job import SimulationReport
 
+ALL_SETS = "all"
+"""Instead of the name of a feature set: every one."""
+
 CampaignName = Annotated[
     str, typer.Argument(help="A campaign of configs/campaigns, or the path of a TOML file.")
 ]
 Through = Annotated[
     str | None,
-    typer.Option(help="Last day to simulate, YYYY-MM-DD. Default: all days of the campaign."),
+    typer.Option(help="Last day to simulate, YYYY-MM-DD or today. Default: all days."),
 ]
 Days = Annotated[
     int | None, typer.Option(min=1, help="Simulate the first N days only. Default: all.")
@@ -45,14 +50,20 @@ def register(app: typer.Typer) -> None:
 def chosen_days(campaign: "Campaign", days: int | None, through: str | None) -> tuple[date, ...]:
     """Return the days of a campaign that the options ask for. Raises `ConfigError`."""
     try:
-        last = date.fromisoformat(through) if through else date.max
+        last = _date(through) if through else date.max
     except ValueError:
-        raise ConfigError(f"--through {through}: not a date; write it as 2024-05-01.") from None
+        raise ConfigError(
+            f"--through {through}: not a date; write it as 2024-05-01, or today."
+        ) from None
     chosen = tuple(day for day in campaign.days()[:days] if day <= last)
     if not chosen:
         first, end = campaign.days()[0], campaign.days()[-1]
         raise ConfigError(f"--through {through}: {campaign.name} lasts from {first} to {end}.")
     return chosen
+
+
+def _date(text: str) -> date:
+    return date.today() if text == "today" else date.fromisoformat(text)
 
 
 def run_simulation(
@@ -68,10 +79,10 @@ def run_simulation(
         return simulate_campaign(warehouse, campaign, days, executor, advance)
 
 
-def run_gram(warehouse: Warehouse) -> GramReport:
-    """Run the Gram job with a progress bar."""
-    with progress("gram", "rows") as advance:
-        return update_grams(warehouse, advance)
+def run_gram(warehouse: Warehouse, feature_set: str = PLAIN) -> GramReport:
+    """Run the Gram job for a feature set with a progress bar."""
+    with progress(f"gram {feature_set}", "rows") as advance:
+        return update_grams(warehouse, advance, feature_set)
 
 
 def simulate(
@@ -135,23 +146,47 @@ def _ingested(report: dict[str, Any]) -> str:
 
 def gram(
     context: typer.Context,
+    feature_set: Annotated[
+        str,
+        typer.Option(
+            "--features",
+            help="A feature set of configs/features.toml; signals is the logged signals "
+            "themselves, all is every set.",
+        ),
+    ] = PLAIN,
     sql: Annotated[bool, typer.Option("--sql", help="Print the statement and do nothing.")] = False,
     json: Json = False,
 ) -> None:
-    """Reduce new log files to Gram rows, and drop the rows of files that are gone."""
+    """Reduce new log files to Gram rows, and drop the rows of files that are gone.
+
+    A feature set that is asked for the first time costs one pass over the logs; from then on only
+    new files are read.
+    """
+    names = (PLAIN, *features().sets) if feature_set == ALL_SETS else (feature_set,)
     if sql:
-        typer.echo(gram_statement(catalogue()))
+        for name in names:
+            typer.echo(gram_statement(catalogue(), name))
         return
-    report = run_gram(context.obj)
+    reports = [run_gram(context.obj, name) for name in names]
     if json:
-        print_json(asdict(report))
-    elif report.changed:
+        documents = [asdict(report) for report in reports]
+        print_json(documents if feature_set == ALL_SETS else documents[0])
+        return
+    for report in reports:
+        _say_gram(report)
+
+
+def _say_gram(report: GramReport) -> None:
+    if report.changed:
         say(
-            f"gram: {report.files_read} new files, {report.rows_read:,} rows read, "
-            f"{report.files_dropped} files dropped; {report.gram_rows:,} Gram rows"
+            f"gram {report.feature_set}: {report.files_read} new files, {report.rows_read:,} rows "
+            f"read, {report.files_dropped} files dropped; {report.gram_rows:,} Gram rows in all"
         )
     else:
-        say(f"gram: nothing to do, {report.gram_rows:,} Gram rows are up to date")
+        say(
+            f"gram {report.feature_set}: nothing to do, {report.gram_rows:,} Gram rows in all are "
+            "up to date"
+        )
 
 
 def check(

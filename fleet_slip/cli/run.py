@@ -47,7 +47,7 @@ def run(
     """Do the whole job: simulate what is missing, gram, select, publish if it is not worse.
 
     It can be repeated at any time, and after any interruption: what is done is not done again. A
-    nightly run appends the next day with --through "$(date -I)".
+    nightly run appends the next day with --through today.
     """
     from fleet_slip.campaign import load_campaign  # noqa: PLC0415 - the simulator takes a while
 
