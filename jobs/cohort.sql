@@ -2,9 +2,9 @@
 -- Rows without any signal serve no model. Sorted, so that the same cohort reads the same everywhere.
 SELECT
     drive_id, vehicle_id, vehicle_model, source, campaign, track, mass_kg, adhesion, speed_factor, day,
-    signals, n, sums, products
+    part, signals, n, clipped, sums, products
 FROM grams
-WHERE feature_set = 'signals' AND signals <> '' AND (
+WHERE feature_set = '{feature_set}' AND signals <> '' AND (
     {condition}
 )
-ORDER BY signals, drive_id
+ORDER BY signals, drive_id, part

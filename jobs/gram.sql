@@ -5,6 +5,9 @@
 -- number with one bit for each signal). Where the Delta log proves that no file has a signal in only some of its
 -- rows, "absent" is the constant 0, which is faster and gives the same rows.
 --
+-- A feature set may also divide the rows of a drive ("part"), and its features may be clipped to int16 ("clipped" says
+-- how often). The set of the catalogue's own signals has neither, and constants cost nothing.
+--
 -- INTEGER products: SMALLINT * SMALLINT would overflow. union_by_name: gives DuckDB the files' statistics, from which
 -- it knows that no sum can overflow; without it the query is three times slower.
 WITH drive AS (
@@ -23,15 +26,17 @@ gram AS (
     SELECT
         drive_id,
         {absent} AS absent,
+        {part} AS part,
         count(*) AS n,
+        {clipped} AS clipped,
         [
             {sums}
         ]::BIGINT[] AS sums,
         [
             {products}
         ]::BIGINT[] AS products
-    FROM read_parquet(getvariable('log_files'), union_by_name => true, hive_partitioning => false)
-    GROUP BY drive_id, absent
+    FROM {counts}
+    GROUP BY {group}
 )
 
 SELECT
@@ -39,10 +44,12 @@ SELECT
     drive.file,
     drive.day,
     {qualified_drive_columns},
+    {part_name} AS part,
     array_to_string(list_where([{names}], [s IS NOT NULL FOR s IN gram.sums]), ',') AS signals,
     gram.n,
+    gram.clipped,
     [s FOR s IN gram.sums IF s IS NOT NULL] AS sums,
     [p FOR p IN gram.products IF p IS NOT NULL] AS products
 FROM gram
 JOIN drive USING (drive_id)
-ORDER BY drive.file, drive_id, gram.absent
+ORDER BY drive.file, drive_id, gram.absent, gram.part
