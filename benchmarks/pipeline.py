@@ -25,7 +25,8 @@ from sklearn.linear_model import LinearRegression
 
 from fleet_slip.campaign import load_campaign
 from fleet_slip.cohort import load_cohort
-from fleet_slip.gram_job import aggregate, gram_statement, update_grams
+from fleet_slip.gram_job import aggregate, update_grams
+from fleet_slip.gram_statement import gram_statement
 from fleet_slip.model_list import load_model_list
 from fleet_slip.selection import select
 from fleet_slip.signals import catalogue

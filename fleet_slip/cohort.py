@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import duckdb
@@ -13,9 +14,14 @@ from numpy.typing import NDArray
 from fleet_slip.connection import connect
 from fleet_slip.database import database_errors, one_query
 from fleet_slip.errors import RefusedError, SelectionError
-from fleet_slip.gram import GramTable, packed_size
+from fleet_slip.features import PLAIN, features
+from fleet_slip.gram import GramTable, IntArray, packed_size
+from fleet_slip.gram_job import find_backlog
+from fleet_slip.regression.drives import serving_drives
 from fleet_slip.regression.folds import Assignment, CohortFolds, by_hash, by_value
 from fleet_slip.resources import read_sql
+from fleet_slip.signals import catalogue
+from fleet_slip.storage import Snapshot
 from fleet_slip.warehouse import Warehouse
 
 FOLD_KEYS = {
@@ -25,8 +31,12 @@ FOLD_KEYS = {
     "day": "day",
     "mass": "mass_kg",
     "adhesion": "adhesion",
+    "row": "part",
 }
 """What a fold may be made of, and the column that tells."""
+
+ROW_FOLDS = "row"
+"""Folds of single rows, as WEKA makes them. They leak: a test row's neighbours train the model."""
 
 SCENARIO = "scenario"
 """Source of the drives that models are evaluated on, and must never be trained on."""
@@ -36,14 +46,31 @@ TRAINING_DRIVES = f"source <> '{SCENARIO}'"
 
 
 @dataclass(frozen=True)
+class Served:
+    """The drives of a cohort that have all of some signals, one Gram row each.
+
+    Attributes:
+        table: their Gram rows, restricted to the signals.
+        drives: metadata of each, in the same order.
+    """
+
+    table: GramTable
+    drives: pa.Table
+
+
+@dataclass(frozen=True)
 class Cohort:
     """Gram rows, grouped by the signals that they have.
+
+    A drive has several Gram rows if it has a signal in some of its rows only, or if the feature set
+    divides its rows.
 
     Attributes:
         condition: SQL condition on the columns of the view `drives`.
         tables: one `GramTable` for each set of signals.
         drives: metadata of each Gram row, in the order of the tables.
         logs_version, grams_version: versions of the Delta tables that were read.
+        feature_set: which Gram rows these are.
     """
 
     condition: str
@@ -51,34 +78,117 @@ class Cohort:
     drives: pa.Table
     logs_version: int
     grams_version: int
+    feature_set: str = PLAIN
 
     @property
     def rows(self) -> int:
         """Number of rows of the logs behind the cohort."""
         return int(sum(table.n.sum() for table in self.tables))
 
+    @cached_property
+    def drive_numbers(self) -> IntArray:
+        """The drive of each Gram row, numbered from 0."""
+        indices = pc.dictionary_encode(self.drives["drive_id"].combine_chunks()).indices
+        return np.asarray(indices.to_numpy(), dtype=np.int64)
+
+    @property
+    def drive_count(self) -> int:
+        """Number of drives."""
+        return int(self.drive_numbers.max()) + 1
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Signals and features that any of the drives has, in the order of the feature set."""
+        found = {name for table in self.tables for name in table.signals}
+        return tuple(name for name in features().set(self.feature_set).inputs if name in found)
+
     def folds(self, by: str, count: int) -> CohortFolds:
-        """Divide the cohort into folds of whole drives.
+        """Divide the cohort into folds, of whole drives unless by `row`.
 
         By `drive`: hashed into `count` folds. By another key of `FOLD_KEYS`: one fold for each
-        value, or hashed into `count` folds if there are more values than that.
+        value, or hashed into `count` folds if there are more values than that. By `row`: the folds
+        that the feature set made of single rows, `count` of them. Raises `SelectionError` if it
+        made none.
         """
+        if by == ROW_FOLDS:
+            self._require_row_folds(count)
         values = self.drives[FOLD_KEYS[by]].to_pylist()
-        return CohortFolds.of(self.tables, assign(values, by, count))
+        return CohortFolds.of(self.tables, assign(values, by, count), self.drive_numbers)
+
+    def serving(self, inputs: Sequence[str]) -> Served:
+        """Return the drives that have the label and all the inputs, one Gram row each.
+
+        Raises `SelectionError` if there is none.
+        """
+        table, mask = serving_drives(self.tables, [*inputs, catalogue().label])
+        rows = np.flatnonzero(mask)
+        numbers = self.drive_numbers[rows]
+        order = np.argsort(numbers, kind="stable")
+        _, first = np.unique(numbers[order], return_index=True)
+        if len(first) == len(rows):
+            return Served(table, self.drives.take(rows))
+        merged = GramTable(
+            table.signals,
+            *(
+                np.add.reduceat(part[order], first)
+                for part in (table.n, table.sums, table.products)
+            ),
+        )
+        return Served(merged, self.drives.take(rows[order[first]]))
+
+    def part(self, wanted: NDArray[np.bool_]) -> "Cohort":
+        """Return the cohort with some of its Gram rows only; the mask lists them all."""
+        stops = np.cumsum([len(table) for table in self.tables])[:-1]
+        masks = np.split(wanted, stops)
+        kept = [table.take(m) for table, m in zip(self.tables, masks, strict=True) if m.any()]
+        return Cohort(
+            self.condition,
+            tuple(kept),
+            self.drives.filter(pa.array(wanted)),
+            self.logs_version,
+            self.grams_version,
+            self.feature_set,
+        )
+
+    def gram_condition(self, inputs: Sequence[str]) -> str:
+        """Return the SQL condition on the view `grams` of the rows that a model is made of."""
+        wanted = ", ".join(f"'{name}'" for name in [*inputs, catalogue().label])
+        return (
+            f"feature_set = '{features().identity(self.feature_set)}' AND ({self.condition}) AND "
+            f"list_has_all(string_split(signals, ','), [{wanted}])"
+        )
+
+    def _require_row_folds(self, count: int) -> None:
+        made = features().set(self.feature_set).row_folds
+        if made is None:
+            known = ", ".join(name for name, one in features().sets.items() if one.row_folds)
+            raise SelectionError(
+                f"the Gram rows of the feature set {self.feature_set} are of whole drives: folds "
+                f"of rows are made when the logs are read. Feature sets that make them: {known}."
+            )
+        if count > made:
+            raise SelectionError(
+                f"the feature set {self.feature_set} made {made} folds of rows; choose no more."
+            )
 
 
 def assign(values: Sequence[Any], by: str, count: int) -> Assignment:
-    """Assign drives to folds by the values of a fold key."""
+    """Assign Gram rows to folds by the values of a fold key."""
+    if by == ROW_FOLDS:
+        return by_value([(int(value) - 1) % count + 1 for value in values])
     if by == "drive" or len(set(values)) > count:
         return by_hash([str(value) for value in values], count)
     return by_value(values)
 
 
-def load_cohort(warehouse: Warehouse, condition: str = TRAINING_DRIVES) -> Cohort:
+def load_cohort(
+    warehouse: Warehouse, condition: str = TRAINING_DRIVES, feature_set: str = PLAIN
+) -> Cohort:
     """Read the Gram rows of the drives that satisfy a condition.
 
-    Raises `SelectionError` if the condition is not valid SQL or no drive satisfies it, and
-    `RefusedError` if a drive of an evaluation scenario does.
+    Raises `SelectionError` if the condition is not valid SQL, no drive satisfies it, or the
+    feature set has not been computed for all logs; `RefusedError` if a drive of an evaluation
+    scenario satisfies it.
     """
     logs, grams = warehouse.logs.snapshot(), warehouse.grams.snapshot()
     if not grams.rows:
@@ -86,8 +196,11 @@ def load_cohort(warehouse: Warehouse, condition: str = TRAINING_DRIVES) -> Cohor
             f"{warehouse.root}: there are no Gram rows yet. Run: fleet-slip simulate CAMPAIGN (or "
             "fleet-slip ingest FILE --mapping M), then fleet-slip gram."
         )
+    identity = features().identity(feature_set)
+    if feature_set != PLAIN:
+        _require_complete(logs, grams, feature_set, identity)
     with connect(warehouse.root) as database:
-        rows = _query(database, condition)
+        rows = _query(database, condition, identity)
         if not rows.num_rows:
             raise SelectionError(_nothing(database, condition))
     if SCENARIO in rows["source"].unique().to_pylist():
@@ -105,11 +218,22 @@ def load_cohort(warehouse: Warehouse, condition: str = TRAINING_DRIVES) -> Cohor
         drives=rows.drop_columns(["sums", "products"]),
         logs_version=logs.version or 0,
         grams_version=grams.version or 0,
+        feature_set=feature_set,
     )
 
 
-def _query(database: duckdb.DuckDBPyConnection, condition: str) -> pa.Table:
-    statement = read_sql("jobs", "cohort.sql").format(condition=condition)
+def _require_complete(logs: Snapshot, grams: Snapshot, feature_set: str, identity: str) -> None:
+    backlog = find_backlog(logs, grams, identity)
+    if backlog.missing or backlog.stale:
+        raise SelectionError(
+            f"the feature set {feature_set}, as it is defined now, has not been computed for "
+            f"{len(backlog.missing)} of {len(logs.files)} log files. Run: fleet-slip gram "
+            f"--features {feature_set}"
+        )
+
+
+def _query(database: duckdb.DuckDBPyConnection, condition: str, identity: str) -> pa.Table:
+    statement = read_sql("jobs", "cohort.sql").format(condition=condition, feature_set=identity)
     with database_errors(f"the cohort {condition!r}"):
         return database.sql(one_query(database, statement)).to_arrow_table()
 

@@ -119,10 +119,15 @@ _OTHER_COLUMNS = {
     "tick": ("0.01 s", "Samples since the drive began; every drive has a row with tick 0"),
     "time_s": ("s", "Time since the drive began"),
     "rows": ("", "Rows of the drive, as the Gram job counted them"),
-    "feature_set": ("", "Which columns were multiplied: 'signals' are the catalogue's own"),
+    "feature_set": (
+        "",
+        "Which columns were multiplied: signals, or a set of features.toml",
+    ),
     "file": ("", "File below logs/ that the Gram row was computed from, or the file ingested"),
     "signals": ("", "Signals of a Gram row or model, separated by commas, in the order of sums"),
+    "part": ("", "Rows of the drive that a Gram row is of, such as a speed band; null: all"),
     "n": ("", "Number of rows in the sums"),
+    "clipped": ("", "Number of values of features that were clipped to the range of int16"),
     "sums": ("counts", "Sum of each signal's counts"),
     "products": (
         "counts^2",

@@ -11,6 +11,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from fleet_slip.errors import SelectionError, StorageError
+from fleet_slip.features import PLAIN
 from fleet_slip.gram import Gram
 from fleet_slip.gram_job import aggregate
 from fleet_slip.storage import TableFile, storage_errors
@@ -78,7 +79,8 @@ def _stored_grams(warehouse: Warehouse) -> dict[str, DriveGrams]:
     by_file: dict[str, DriveGrams] = defaultdict(dict)
     for path in warehouse.grams.snapshot().paths:
         with storage_errors(warehouse.grams.path):
-            rows = pq.read_table(path)
+            every = pq.read_table(path)
+        rows = every.filter(pc.equal(every["feature_set"], PLAIN))
         for file in rows["file"].unique().to_pylist():
             by_file[file] |= grams_of(rows.filter(pc.equal(rows["file"], file)))
     return by_file

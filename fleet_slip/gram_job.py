@@ -1,8 +1,8 @@
 """Makes the table `grams` agree with the active files of `logs`.
 
-Log files without Gram rows are aggregated by `jobs/gram.sql`; Gram rows whose file is no longer
-active are dropped; both in one commit. That one rule covers new days, interrupted runs, repeated
-runs, deletions and compaction.
+Log files without Gram rows of a feature set are aggregated by `jobs/gram.sql`; Gram rows of any set
+whose file is no longer active are dropped; both in one commit. That one rule covers new days,
+interrupted runs, repeated runs, deletions and compaction.
 """
 
 import hashlib
@@ -13,16 +13,14 @@ import duckdb
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
+from deltalake.transaction import AddAction
 
 from fleet_slip.database import database_errors, open_database
 from fleet_slip.errors import ConflictError
-from fleet_slip.resources import read_sql
-from fleet_slip.signals import SignalCatalogue
+from fleet_slip.features import PLAIN, features
+from fleet_slip.gram_statement import gram_statement
 from fleet_slip.storage import Change, Snapshot, TableFile, Unit, storage_errors
 from fleet_slip.warehouse import Warehouse
-
-FEATURE_SET = "signals"
-"""Name of the feature set whose columns are the catalogue's inputs and label themselves."""
 
 FILES_PER_QUERY = 16
 """Planning 77 aggregates costs 20 ms, so that one query takes many files."""
@@ -39,8 +37,9 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class GramReport:
-    """What a run of the job did."""
+    """What a run of the job did for one feature set."""
 
+    feature_set: str
     files_read: int
     rows_read: int
     files_dropped: int
@@ -59,47 +58,57 @@ class Backlog:
     """How `grams` and `logs` differ."""
 
     missing: tuple[TableFile, ...]
-    """Log files without Gram rows."""
+    """Log files without Gram rows of the feature set."""
     stale: frozenset[str]
-    """Paths in `grams` that are no active log file."""
+    """Paths in `grams`, of any set, that are no active log file."""
 
 
-def update_grams(warehouse: Warehouse, progress: Progress = lambda _more, _all: None) -> GramReport:
-    """Bring `grams` up to date. Running it again does nothing.
+def update_grams(
+    warehouse: Warehouse,
+    progress: Progress = lambda _more, _all: None,
+    feature_set: str = PLAIN,
+) -> GramReport:
+    """Bring the Gram rows of a feature set up to date. Running it again does nothing.
 
-    Raises `StorageError`, or `ConflictError` if other processes keep changing the table.
+    Raises `SelectionError` for an unknown set, `StorageError`, or `ConflictError` if other
+    processes keep changing the table.
     """
     for attempt in range(ATTEMPTS):
         try:
-            return _update_once(warehouse, progress)
+            return _update_once(warehouse, progress, feature_set)
         except ConflictError:
             if attempt == ATTEMPTS - 1:
                 raise
     raise AssertionError("unreachable")
 
 
-def _update_once(warehouse: Warehouse, progress: Progress) -> GramReport:
+def _update_once(warehouse: Warehouse, progress: Progress, feature_set: str) -> GramReport:
     logs = warehouse.logs.snapshot()
     grams = warehouse.grams.snapshot()
-    backlog = find_backlog(logs, grams)
+    identity = features().identity(feature_set)
+    backlog = find_backlog(logs, grams, identity)
     version, gram_rows = grams.version, grams.rows
     if backlog.missing or backlog.stale:
-        new_rows = aggregate(warehouse, backlog.missing, progress)
+        new_rows = aggregate(warehouse, backlog.missing, progress, feature_set=feature_set)
         replaced = _files_to_rewrite(grams, backlog.stale)
         kept = _rows_to_keep(grams, replaced, backlog.stale)
         rows = pa.concat_tables([kept, new_rows])
-        name = f"{FEATURE_SET}-{_content_digest(rows)}"
         grams.commit(
             Change(
-                add=[warehouse.grams.write_file(name, rows)] if rows.num_rows else [],
+                add=_write_files(warehouse, rows),
                 remove=replaced,
-                units=[Unit(f"gram/{FEATURE_SET}", logs.version or 0)],
-                note={"job": "gram", "logs_version": logs.version},
+                units=[Unit(f"gram/{identity}", logs.version or 0)],
+                note={
+                    "job": "gram",
+                    "feature_set": identity,
+                    "logs_version": logs.version,
+                },
             )
         )
         after = warehouse.grams.snapshot()
         version, gram_rows = after.version, after.rows
     return GramReport(
+        feature_set=identity,
         files_read=len(backlog.missing),
         rows_read=sum(file.rows for file in backlog.missing),
         files_dropped=len(backlog.stale),
@@ -109,16 +118,23 @@ def _update_once(warehouse: Warehouse, progress: Progress) -> GramReport:
     )
 
 
-def find_backlog(logs: Snapshot, grams: Snapshot) -> Backlog:
-    """Compare the active log files with the files that Gram rows name."""
+def find_backlog(logs: Snapshot, grams: Snapshot, identity: str = PLAIN) -> Backlog:
+    """Compare the active log files with the files that Gram rows name.
+
+    `identity` is that of a feature set, as its Gram rows carry it.
+    """
     done: set[str] = set()
+    named: set[str] = set()
     with storage_errors(grams.table.path):
         for path in grams.paths:
-            done.update(pq.read_table(path, columns=["file"])["file"].unique().to_pylist())
+            rows = pq.read_table(path, columns=["feature_set", "file"])
+            named.update(rows["file"].unique().to_pylist())
+            mine = rows.filter(pc.equal(rows["feature_set"], identity))
+            done.update(mine["file"].unique().to_pylist())
     active = {file.path for file in logs.files}
     return Backlog(
         missing=tuple(file for file in logs.files if file.path not in done),
-        stale=frozenset(done - active),
+        stale=frozenset(named - active),
     )
 
 
@@ -127,6 +143,7 @@ def aggregate(
     files: Sequence[TableFile],
     progress: Progress = lambda _more, _all: None,
     threads: int | None = None,
+    feature_set: str = PLAIN,
 ) -> pa.Table:
     """Return the Gram rows of log files, in the schema of `grams`, sorted by file and drive."""
     parts = [warehouse.grams.schema.empty_table()]
@@ -134,19 +151,24 @@ def aggregate(
     with open_database(threads=threads) as database:
         for first in range(0, len(files), FILES_PER_QUERY):
             batch = files[first : first + FILES_PER_QUERY]
-            parts.append(_query(database, warehouse, batch))
+            parts.append(_query(database, warehouse, batch, feature_set))
             progress(sum(file.rows for file in batch), total)
     return pa.concat_tables(parts)
 
 
 def _query(
-    database: duckdb.DuckDBPyConnection, warehouse: Warehouse, files: Sequence[TableFile]
+    database: duckdb.DuckDBPyConnection,
+    warehouse: Warehouse,
+    files: Sequence[TableFile],
+    feature_set: str,
 ) -> pa.Table:
     paths = {str(warehouse.logs.path / file.path): file.path for file in files}
-    statement = gram_statement(warehouse.catalogue, whole=_signals_are_whole(warehouse, files))
+    whole = feature_set == PLAIN and _signals_are_whole(warehouse, files)
+    statement = gram_statement(warehouse.catalogue, feature_set, whole=whole)
+    identity = features().identity(feature_set)
     with database_errors(f"the Gram query over {len(files)} log files in {warehouse.logs.path}"):
         database.execute("SET VARIABLE log_files = $files", {"files": list(paths)})
-        rows = database.sql(statement, params={"feature_set": FEATURE_SET}).to_arrow_table()
+        rows = database.sql(statement, params={"feature_set": identity}).to_arrow_table()
     relative = pa.array([paths[path] for path in rows["file"].to_pylist()], pa.string())
     return rows.set_column(rows.schema.get_field_index("file"), "file", relative).cast(
         warehouse.grams.schema
@@ -162,24 +184,13 @@ def _signals_are_whole(warehouse: Warehouse, files: Sequence[TableFile]) -> bool
     )
 
 
-def gram_statement(signals: SignalCatalogue, *, whole: bool = False) -> str:
-    """Return `jobs/gram.sql` with the columns of the catalogue filled in.
-
-    `whole` states that no file has a signal in only some of its rows.
-    """
-    names = signals.gram_signals
-    absent = " + ".join(f"({name} IS NULL)::INTEGER * {1 << i}" for i, name in enumerate(names))
-    separator = ",\n            "
-    return read_sql("jobs", "gram.sql").format(
-        drive_columns=", ".join(signals.drive),
-        qualified_drive_columns=", ".join(f"drive.{name}" for name in signals.drive),
-        absent="0" if whole else absent,
-        sums=separator.join(f"sum({name})" for name in names),
-        products=separator.join(
-            f"sum({a}::INTEGER * {b}::INTEGER)" for i, a in enumerate(names) for b in names[: i + 1]
-        ),
-        names=", ".join(f"'{name}'" for name in names),
-    )
+def _write_files(warehouse: Warehouse, rows: pa.Table) -> list[AddAction]:
+    """Write one file for each feature set, so that reading one set reads no other."""
+    actions = []
+    for identity in sorted(rows["feature_set"].unique().to_pylist()):
+        part = rows.filter(pc.equal(rows["feature_set"], identity))
+        actions.append(warehouse.grams.write_file(f"{identity}-{_content_digest(part)}", part))
+    return actions
 
 
 def _files_to_rewrite(grams: Snapshot, stale: frozenset[str]) -> list[TableFile]:

@@ -9,10 +9,11 @@ from pydantic import Field, TypeAdapter, ValidationError, model_validator
 from fleet_slip.config import Config, load_config
 from fleet_slip.documents import canonical_json
 from fleet_slip.errors import ConfigError
+from fleet_slip.features import PLAIN, features
 from fleet_slip.resources import find_config
 from fleet_slip.signals import Identifier, catalogue
 
-FoldKey = Literal["drive", "vehicle", "track", "day", "mass", "adhesion"]
+FoldKey = Literal["drive", "vehicle", "track", "day", "mass", "adhesion", "row"]
 
 
 _MODEL_NAME = TypeAdapter(Identifier)
@@ -30,14 +31,14 @@ def check_model_name(name: str) -> str:
 
 
 class CandidateModel(Config):
-    """A named set of inputs."""
+    """A named set of inputs: signals, or features of a feature set."""
 
     name: str = Field(min_length=1, max_length=60)
     signals: tuple[Identifier, ...] = Field(min_length=1)
 
     @model_validator(mode="after")
     def _signals_are_inputs(self) -> "CandidateModel":
-        inputs = catalogue().inputs
+        inputs = (*catalogue().inputs, *features().features)
         for name in self.signals:
             if name not in inputs:
                 raise ValueError(
@@ -56,9 +57,10 @@ class FoldPlan(Config):
 
 
 class ModelList(Config):
-    """Candidates in their declared order, and the folds to compare them on."""
+    """Candidates in their declared order, the feature set and the folds to compare them on."""
 
     description: str = Field(min_length=1)
+    features: Identifier = PLAIN
     folds: FoldPlan = FoldPlan()
     model: tuple[CandidateModel, ...] = Field(min_length=1)
 
@@ -69,10 +71,26 @@ class ModelList(Config):
             raise ValueError("two models have the same name")
         return self
 
+    @model_validator(mode="after")
+    def _feature_set_has_the_inputs(self) -> "ModelList":
+        known = features()
+        if self.features not in {PLAIN, *known.sets}:
+            raise ValueError(f"features: no feature set is called {self.features!r}")
+        inputs = known.set(self.features).inputs
+        for candidate in self.model:
+            absent = [name for name in candidate.signals if name not in inputs]
+            if absent:
+                raise ValueError(
+                    f"model {candidate.name!r}: {', '.join(absent)} is not in the feature set "
+                    f"{self.features!r}. Its inputs: {', '.join(inputs)}"
+                )
+        return self
+
     @property
     def sha256(self) -> str:
         """Checksum of what the list says, whatever its layout."""
-        return hashlib.sha256(canonical_json(self.model_dump(mode="json")).encode()).hexdigest()
+        content = self.model_dump(mode="json", exclude_defaults=True)
+        return hashlib.sha256(canonical_json(content).encode()).hexdigest()
 
 
 def load_model_list(name_or_path: str) -> ModelList:

@@ -52,12 +52,12 @@ class Warehouse:
 
     @cached_property
     def grams(self) -> Table:
-        """One Gram row for each drive: n, sums and sums of products of counts."""
+        """Gram rows of drives, by feature set: n, sums and sums of products of counts."""
         return Table(
             path=self.root / "grams",
             schema=gram_schema(self.catalogue),
             encoding=Encoding(
-                dictionary=("feature_set", "file", "signals", *self.catalogue.drive),
+                dictionary=("feature_set", "file", "part", "signals", *self.catalogue.drive),
                 compression="zstd",
             ),
             description="Gram rows: exact sums and sums of products of counts, one a drive",
@@ -77,6 +77,8 @@ class Warehouse:
 def gram_schema(signals: SignalCatalogue) -> pa.Schema:
     """Return the Arrow schema of the table `grams`.
 
+    `part` is null where a Gram row is of a whole drive, else which of its rows it is of. `clipped`
+    is how many values of the features were out of the range of int16.
     `signals` names the signals that the drive has, separated by commas, in the order of `sums`;
     `products` is the packed lower triangle, row by row: (0,0), (1,0), (1,1), (2,0), ...
     """
@@ -86,8 +88,10 @@ def gram_schema(signals: SignalCatalogue) -> pa.Schema:
             ("file", pa.string()),
             ("day", pa.date32()),
             *signals.drive_schema,
+            ("part", pa.string()),
             ("signals", pa.string()),
             ("n", pa.int64()),
+            ("clipped", pa.int64()),
             ("sums", pa.list_(pa.int64())),
             ("products", pa.list_(pa.int64())),
         ]

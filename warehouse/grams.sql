@@ -5,8 +5,10 @@ SELECT
     file,
     day,
     {drive_columns},
+    part,
     signals,
     n,
+    clipped,
     sums,
     products
 FROM {stored_grams}

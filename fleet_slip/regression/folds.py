@@ -111,25 +111,35 @@ class CohortFolds:
     Attributes:
         names: what the folds are called.
         tables: for each signal set, one Gram a fold.
-        drives: for each signal set, its number of drives.
+        drives: for each signal set, the number of each Gram row's drive.
     """
 
     names: tuple[str, ...]
     tables: tuple[tuple[Gram, ...], ...]
-    drives: tuple[int, ...]
+    drives: tuple[IntArray, ...]
 
     @classmethod
-    def of(cls, tables: Sequence[GramTable], assignment: Assignment) -> "CohortFolds":
-        """Add up the drives of each fold. The assignment lists the drives table after table."""
+    def of(
+        cls,
+        tables: Sequence[GramTable],
+        assignment: Assignment,
+        drives: IntArray | None = None,
+    ) -> "CohortFolds":
+        """Add up the Gram rows of each fold. The assignment lists the rows table after table.
+
+        `drives` numbers the drive of each row; without it, every row is a drive of its own.
+        """
         sizes = [len(table) for table in tables]
         if sum(sizes) != len(assignment.fold):
             raise ValueError("the assignment is not of these drives")
-        parts = np.split(assignment.fold, np.cumsum(sizes)[:-1])
+        stops = np.cumsum(sizes)[:-1]
+        parts = np.split(assignment.fold, stops)
+        numbers = np.arange(sum(sizes)) if drives is None else drives
         grams = tuple(
             tuple(table.totals(fold, len(assignment.names)))
             for table, fold in zip(tables, parts, strict=True)
         )
-        return cls(assignment.names, grams, tuple(sizes))
+        return cls(assignment.names, grams, tuple(np.split(numbers, stops)))
 
     def serving(self, inputs: Sequence[str], label: str) -> Folds:
         """Return the folds of the drives that have the label and all the inputs.
@@ -155,4 +165,5 @@ class CohortFolds:
                 f"fold {', '.join(empty)} has no rows with all of {', '.join(signals)}. Choose "
                 "fewer folds, another key to fold by, or fewer signals."
             )
-        return Folds(folds, self.names, sum(self.drives[i] for i in served))
+        drives = np.unique(np.concatenate([self.drives[i] for i in served]))
+        return Folds(folds, self.names, len(drives))
