@@ -6,11 +6,12 @@ the table's Delta log. So a reader sees whole files of whole commits, or nothing
 
 import contextlib
 import errno
+import fcntl
 import json
 import os
 import time
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import date
 from functools import cached_property
@@ -230,6 +231,31 @@ class Snapshot:
                     f"{self.table.path}: another process changed the table at the same moment "
                     f"({_first_line(error)}). Run the same command again."
                 ) from None
+
+
+@contextlib.contextmanager
+def exclusive(lock: Path, waiting: Callable[[], None]) -> Iterator[None]:
+    """Hold a lock among processes of this machine; a killed process releases it.
+
+    Calls `waiting` once if another process holds it. Where the file system is read-only there is
+    nothing to protect, and no lock is taken.
+    """
+    with contextlib.ExitStack() as stack:
+        with storage_errors(lock):
+            try:
+                lock.parent.mkdir(parents=True, exist_ok=True)
+                file = stack.enter_context(lock.open("w"))
+            except OSError as error:
+                if error.errno != errno.EROFS:
+                    raise
+                file = None
+            if file is not None:
+                try:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    waiting()
+                    fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
 def flush(folder: Path) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import fleet_slip
+from fleet_slip.warehouse import Warehouse
 from tests.conftest import COMMAND, RunCommand
 
 
@@ -205,6 +206,30 @@ def test_a_changed_campaign_is_refused_and_changes_nothing(
     assert changed.exit_code == 7
     assert "was changed since this day was simulated" in changed.stderr
     assert run_command("sql", "SELECT count(*) AS n FROM log", "--json").json == before
+
+
+def test_two_runs_at_once_do_the_job_once(tmp_path: Path, smoke_root: Path) -> None:
+    command = [COMMAND, "--root", str(tmp_path / "data"), "run", "--campaign", "smoke", "--json"]
+    runs = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(3)]
+    reports = [json.loads(run.communicate()[0]) for run in runs]
+    assert sorted(report["changed"] for report in reports) == [False, False, True]
+    alone = Warehouse(smoke_root).logs.snapshot()
+    together = Warehouse(tmp_path / "data").logs.snapshot()
+    assert [file.path for file in together.files] == [file.path for file in alone.files]
+    assert len(list((tmp_path / "data" / "models" / "smoke" / "versions").iterdir())) == 1
+
+
+def test_simulations_and_gram_jobs_at_once_lose_and_double_nothing(
+    tmp_path: Path, smoke_root: Path
+) -> None:
+    root = str(tmp_path / "data")
+    jobs = [["simulate", "smoke"], ["simulate", "smoke"], ["gram"], ["simulate", "smoke"], ["gram"]]
+    running = [subprocess.Popen([COMMAND, "--root", root, *job]) for job in jobs]
+    assert [process.wait() for process in running] == [0] * len(jobs)
+    subprocess.run([COMMAND, "--root", root, "gram"], check=True)
+    query = "SELECT drive_id, n, sums, products FROM grams ORDER BY ALL"
+    with fleet_slip.connect(root) as mine, fleet_slip.connect(smoke_root) as other:
+        assert mine.execute(query).fetchall() == other.execute(query).fetchall()
 
 
 def test_help_teaches_and_version_is_told(run_command: RunCommand) -> None:

@@ -19,6 +19,7 @@ from fleet_slip.errors import RefusedError
 from fleet_slip.model_list import check_model_name
 from fleet_slip.publishing import Publication, manifest_of, publish
 from fleet_slip.selection import Selection
+from fleet_slip.storage import exclusive
 
 DEFAULT_CAMPAIGN = "waterford"
 
@@ -47,18 +48,21 @@ def run(
     """Do the whole job: simulate what is missing, gram, select, publish if it is not worse.
 
     It can be repeated at any time, and after any interruption: what is done is not done again. A
-    nightly run appends the next day with --through today.
+    second run of the campaign at the same time waits for the first. A nightly run appends the next
+    day with --through today.
     """
     from fleet_slip.campaign import load_campaign  # noqa: PLC0415 - the simulator takes a while
 
     started = time.monotonic()
     plan = load_campaign(campaign)
     model_name = check_model_name(name or plan.name)
-    simulation = run_simulation(context.obj, plan, chosen_days(plan, days, through), threads)
-    gram = run_gram(context.obj)
-    condition = f"campaign = '{plan.name}'"
-    selection, label, sha256 = run_selection(context.obj, condition, models)
-    publication, refusal = _publish(context, selection, model_name, label, sha256)
+    lock = context.obj.root / f".run-{plan.name}.lock"
+    with exclusive(lock, lambda: say(f"{plan.name}: waiting for another run to end")):
+        simulation = run_simulation(context.obj, plan, chosen_days(plan, days, through), threads)
+        gram = run_gram(context.obj)
+        condition = f"campaign = '{plan.name}'"
+        selection, label, sha256 = run_selection(context.obj, condition, models)
+        publication, refusal = _publish(context, selection, model_name, label, sha256)
     changed = simulation.changed or gram.changed or (publication is not None and publication.new)
     summary = {
         "campaign": plan.name,
