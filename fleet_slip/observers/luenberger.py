@@ -54,19 +54,16 @@ def gains(space: StateSpace, poles: ObserverPoles) -> Floats:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _observe(
-    system: Floats, gain: Floats, steer: Floats, yaw_rate: Floats, ay: Floats, vx: Floats
-) -> Floats:
-    """Return vy. `system` has the rows a11, a12, a21, a22, b1, b2; Euler's forward step."""
+def _observe(s: StateSpace, gain: Floats, steer: Floats, yaw_rate: Floats, ay: Floats) -> Floats:
+    """Return vy, by Euler's forward step."""
     vy, r = 0.0, yaw_rate[0]
     estimates = np.empty(len(ay))
     for k in range(len(ay)):
-        a11, a12, a21, a22, b1, b2 = system[:, k]
-        force = a11 * vy + a12 * r + b1 * steer[k]
+        force = s.a11[k] * vy + s.a12[k] * r + s.b1[k] * steer[k]
         error_r = yaw_rate[k] - r
-        error_ay = ay[k] - (force + vx[k] * r)
+        error_ay = ay[k] - (force + s.vx_mps[k] * r)
         vy_rate = force + gain[0, k] * error_r + gain[1, k] * error_ay
-        moment = a21 * vy + a22 * r + b2 * steer[k]
+        moment = s.a21[k] * vy + s.a22[k] * r + s.b2[k] * steer[k]
         r += STEP_S * (moment + gain[2, k] * error_r + gain[3, k] * error_ay)
         vy += STEP_S * vy_rate
         estimates[k] = vy
@@ -81,11 +78,10 @@ def estimate(drive: DriveSignals, car: VehicleParameters, poles: ObserverPoles) 
     vx_mps = measured_speed_mps(drive, car)
     space = state_space(SingleTrack.of(car, poles.stiffness_factor), vx_mps)
     vy_mps = _observe(
-        np.stack([space.a11, space.a12, space.a21, space.a22, space.b1, space.b2]),
+        space,
         gains(space, poles),
         measured_steer_rad(drive),
         yaw_rate.estimate(drive, car, poles.yaw_rate).yaw_rate_rad_s,
         held(drive.ay_mps2, "ay"),
-        vx_mps,
     )
     return sideslip_angle(vx_mps, vy_mps)

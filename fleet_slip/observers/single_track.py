@@ -11,7 +11,7 @@ steering of a wheel that hardly rolls counts by vx / v. So the poles stay finite
 """
 
 from dataclasses import dataclass
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -68,8 +68,7 @@ class SingleTrack:
         return float(np.arctan(yaw_rate_rad_s * (self.rear_m / vx_mps - slip)))
 
 
-@dataclass(frozen=True)
-class StateSpace:
+class StateSpace(NamedTuple):
     """ẋ = A x + B δ for every row of a drive, and the lateral acceleration C x + D δ.
 
     ay = v̇y + r vx gives C = [a11, a12 + vx] and D = b1.
