@@ -43,6 +43,10 @@ def evaluate(
     one_car: OneCar = DEFAULT_CAMPAIGN,
     fleet: Fleet = None,
     scenario: Scenarios = None,
+    rivals: Annotated[
+        bool,
+        typer.Option("--rivals", help="Also train neural networks and trees. Needs scikit-learn."),
+    ] = False,
     threads: Threads = None,
     json: Json = False,
 ) -> None:
@@ -62,7 +66,10 @@ def evaluate(
         progress("simulate scenarios", "rows") as advance,
     ):
         simulate_scenarios(context.obj, scenarios, executor, advance)
-    content = evaluate_models(context.obj, scenarios, versions[0], versions[1:]).as_dict()
+        found = evaluate_models(
+            context.obj, scenarios, versions[0], versions[1:], executor, rivals=rivals
+        )
+    content = found.as_dict()
     kept = keep(context.obj, content)
     if json:
         print_json({"number": kept.number, "sha256": kept.sha256, **content})
@@ -81,6 +88,7 @@ def print_evaluation(content: dict[str, Any]) -> None:
     _print_sections(content)
     _print_checks(content["checks"])
     _print_comparisons(content["comparisons"])
+    _print_rivals(content["rivals"])
 
 
 def _print_group(content: dict[str, Any], group: str, names: Sequence[str]) -> None:
@@ -133,8 +141,8 @@ def _print_sections(content: dict[str, Any]) -> None:
             )
 
 
-def _figure(value: float | None) -> str:
-    return "" if value is None else f"{value:.3f}"
+def _figure(value: float | None, digits: int = 3) -> str:
+    return "" if value is None else f"{value:.{digits}f}"
 
 
 def _print_checks(checks: Sequence[dict[str, Any]]) -> None:
@@ -147,8 +155,8 @@ def _print_checks(checks: Sequence[dict[str, Any]]) -> None:
             [
                 check["requirement"],
                 check["estimator"],
-                f"{check['found']:.4f}",
-                f"{check['limit']:.4f}",
+                _figure(check["found"], 4),
+                _figure(check["limit"], 4),
                 "" if check["reached"] else "missed",
             ]
             for check in checks
@@ -161,21 +169,47 @@ def _print_checks(checks: Sequence[dict[str, Any]]) -> None:
 
 
 def _print_comparisons(comparisons: Sequence[dict[str, Any]]) -> None:
-    if not comparisons:
+    for fleet in dict.fromkeys(row["fleet"].rpartition("/")[0] for row in comparisons):
+        rows = [row for row in comparisons if row["fleet"].startswith(f"{fleet}/")]
+        errors = {(row["scenario"], row["model"]): row for row in rows}
+        models = list(dict.fromkeys(row["model"] for row in rows))
+        one_car = rows[0]["one_car"].rpartition("/")[0]
+        print_table(
+            f"\nroot mean square error in deg, trained as {one_car} and as {fleet}; * the better",
+            ["scenario", *models],
+            [
+                [name, *(_pair(errors.get((name, model))) for model in models)]
+                for name in dict.fromkeys(row["scenario"] for row in rows)
+            ],
+        )
+
+
+def _pair(row: dict[str, Any] | None) -> str:
+    if row is None:
+        return ""
+    first, second = f"{row['one_car_rmse_deg']:.3f}", f"{row['fleet_rmse_deg']:.3f}"
+    better = row["better"] == row["one_car"]
+    return f"{first}* {second} " if better else f"{first}  {second}*"
+
+
+def _print_rivals(rivals: Sequence[dict[str, Any]]) -> None:
+    if not rivals:
         return
     print_table(
-        "\nthe same signals trained on one car and on a fleet: root mean square error in deg",
-        ["scenario", "one car", "fleet", "one car", "fleet", "better"],
+        f"\nlearned rivals, on {rivals[0]['rows']:,} rows of the training drives, cross-validated",
+        ["rival", "learner", "correlation", "std deg", "training s", "bytes", "one us", "each us"],
         [
             [
-                row["scenario"],
-                row["one_car"],
-                row["fleet"],
-                f"{row['one_car_rmse_deg']:.3f}",
-                f"{row['fleet_rmse_deg']:.3f}",
-                row["better"],
+                rival["name"],
+                rival["learner"],
+                f"{rival['cross_validated']['correlation']:.4f}",
+                f"{rival['cross_validated']['error_std_deg']:.4f}",
+                f"{rival['training_s']:.2f}",
+                f"{rival['size_bytes']:,}",
+                f"{rival['one_estimate_us']:.1f}",
+                f"{rival['each_of_many_us']:.3f}",
             ]
-            for row in comparisons
+            for rival in rivals
         ],
-        left=3,
+        left=2,
     )

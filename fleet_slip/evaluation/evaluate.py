@@ -1,25 +1,41 @@
-"""An evaluation from end to end: models, scenarios, figures, checks and comparisons."""
+"""An evaluation from end to end: estimators, scenarios, figures, checks and comparisons."""
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from fleet_slip.evaluation.comparison import Comparison, compare
-from fleet_slip.evaluation.estimators import Estimate, training
+from fleet_slip.evaluation.estimators import Estimate, Training, training
+from fleet_slip.evaluation.filters import filter_bank
 from fleet_slip.evaluation.results import document
 from fleet_slip.evaluation.runs import Run, run_all
-from fleet_slip.evaluation.targets import Check, checks
+from fleet_slip.evaluation.targets import Check, checks, filter_checks
 from fleet_slip.registry import ModelVersion
-from fleet_slip.scenario import Scenario
+from fleet_slip.scenario import Scenario, load_scenario
 from fleet_slip.warehouse import Warehouse
+
+if TYPE_CHECKING:
+    from fleet_slip.rivals.compare import Rival
+
+
+@dataclass(frozen=True)
+class Field:
+    """All estimators that compete, by name, and what a document says of each."""
+
+    one_car: Training
+    fleets: tuple[Training, ...]
+    rivals: "tuple[Rival, ...]"
+    estimators: Mapping[str, Estimate]
+    descriptions: Mapping[str, Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
 class Evaluation:
     """Everything that an evaluation found, with the drives and estimates behind it."""
 
+    field: Field
     runs: tuple[Run, ...]
-    descriptions: Mapping[str, Mapping[str, Any]]
     checks: tuple[Check, ...]
     comparisons: tuple[Comparison, ...]
 
@@ -27,29 +43,70 @@ class Evaluation:
         """Return the evaluation's document."""
         return document(
             self.runs,
-            self.descriptions,
+            self.field.descriptions,
             checks=[check.as_dict() for check in self.checks],
             comparisons=[comparison.as_dict() for comparison in self.comparisons],
+            rivals=[rival.as_dict() for rival in self.field.rivals],
         )
+
+
+def gather(
+    warehouse: Warehouse,
+    one_car: ModelVersion,
+    fleets: Sequence[ModelVersion],
+    executor: Executor,
+    *,
+    rivals: bool,
+) -> Field:
+    """Fit, tune and train all that compete, on cohorts without any drive of a scenario.
+
+    Filters and learned rivals get the training drives of the one-car model.
+    """
+    first = training(warehouse, one_car)
+    others = tuple(training(warehouse, version) for version in fleets)
+    learned = _train_rivals(warehouse, first) if rivals else ()
+    estimators: dict[str, Estimate] = {}
+    descriptions: dict[str, Mapping[str, Any]] = {}
+    for trained in (first, *others):
+        estimators |= trained.estimators()
+        descriptions |= trained.descriptions()
+    bank = filter_bank(warehouse, first.selection.cohort, load_scenario("nominal").car, executor)
+    return Field(
+        one_car=first,
+        fleets=others,
+        rivals=learned,
+        estimators=estimators | bank.estimators | {one.name: one.estimate for one in learned},
+        descriptions=(
+            descriptions | bank.descriptions | {one.name: one.description() for one in learned}
+        ),
+    )
 
 
 def evaluate(
     warehouse: Warehouse,
     scenarios: Sequence[Scenario],
     one_car: ModelVersion,
-    fleets: Sequence[ModelVersion] = (),
+    fleets: Sequence[ModelVersion],
+    executor: Executor,
+    *,
+    rivals: bool = False,
 ) -> Evaluation:
-    """Evaluate a model, and others to compare it with, on scenarios that are in the logs."""
-    first, *others = [training(warehouse, version) for version in (one_car, *fleets)]
-    estimators: dict[str, Estimate] = {}
-    descriptions: dict[str, Mapping[str, Any]] = {}
-    for trained in (first, *others):
-        estimators |= trained.estimators()
-        descriptions |= trained.descriptions()
-    runs = run_all(warehouse, scenarios, estimators)
+    """Evaluate a model and all that competes with it on scenarios that are in the logs."""
+    field = gather(warehouse, one_car, fleets, executor, rivals=rivals)
+    runs = run_all(warehouse, scenarios, field.estimators)
+    first = field.one_car
     return Evaluation(
+        field=field,
         runs=runs,
-        descriptions=descriptions,
-        checks=checks(runs, first.table_one, first.estimators()),
-        comparisons=tuple(row for fleet in others for row in compare(runs, first, fleet)),
+        checks=(
+            *checks(runs, first.table_one, first.estimators()),
+            *filter_checks(runs, first.table_one),
+        ),
+        comparisons=tuple(row for fleet in field.fleets for row in compare(runs, first, fleet)),
     )
+
+
+def _train_rivals(warehouse: Warehouse, trained: Training) -> "tuple[Rival, ...]":
+    from fleet_slip.rivals.compare import train_rivals  # noqa: PLC0415 - an optional extra
+
+    return train_rivals(warehouse, trained.selection.cohort)

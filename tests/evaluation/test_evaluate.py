@@ -10,9 +10,13 @@ import pytest
 from typer.testing import CliRunner
 
 from fleet_slip.cli.main import app
+from fleet_slip.connection import connect
 from fleet_slip.errors import RefusedError
 from fleet_slip.evaluation.drives import load_drives
 from fleet_slip.evaluation.estimators import LinearEstimate
+from fleet_slip.evaluation.filters import FILTERS, bound
+from fleet_slip.observers import kalman
+from fleet_slip.observers.signals import read_drive
 from fleet_slip.registry import Registry
 from fleet_slip.scenario import load_scenario
 from fleet_slip.score import score
@@ -111,3 +115,42 @@ def test_an_estimator_does_not_see_the_truth(root: Path) -> None:
     manifest = Registry(root / "models").resolve("smoke").manifest
     estimate = LinearEstimate.published(manifest)(drive.signals)
     assert np.corrcoef(estimate, drive.sideslip_rad)[0, 1] > 0.9
+
+
+def test_the_filters_are_tuned_once(root: Path) -> None:
+    documents = sorted(path.relative_to(root) for path in (root / "tuned").rglob("*.json"))
+    assert [path.parts[1:] for path in documents] == [
+        (name, "1.json") for name in ("ekf", "kalman", "luenberger", "sliding_mode")
+    ]
+    tuned = json.loads((root / documents[1]).read_text())["content"]
+    assert all(name.startswith("smoke-") for name in tuned["key"]["drives"])
+
+
+def test_a_filter_gives_the_same_estimates_here_as_by_itself(root: Path) -> None:
+    scenario = load_scenario("nominal")
+    (drive,) = load_drives(Warehouse(root), [scenario])
+    with connect(root) as database:
+        alone = read_drive(database, scenario.drive_id)
+    expected = kalman.estimate(alone.signals, scenario.car, kalman.FilterNoise())
+    found = bound(FILTERS[0], FILTERS[0].parameters, scenario.car)(drive.signals)
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_rivals_run_on_the_same_drives(root: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "data"
+    shutil.copytree(root, copy)
+    content = call(copy, "evaluate", "--one-car", "smoke", "--scenario", "nominal", "--rivals")
+    rivals = {rival["name"]: rival for rival in content["rivals"]}
+    assert set(rivals) <= set(content["scenarios"][0]["results"])
+    # The same signals and drives as model 4, and a sample of its rows instead of all of them.
+    exact = content["estimators"]["smoke@1/4"]["cross_validated"]
+    sampled = rivals["regression_8"]["cross_validated"]
+    assert sampled["correlation"] == pytest.approx(exact["correlation"], abs=0.002)
+
+
+def test_every_check_of_the_paper_is_made(root: Path) -> None:
+    content = evaluate(root, *SCENARIOS)
+    made = {check["requirement"].partition(":")[0] for check in content["checks"]}
+    assert made == {"nominal", "adhesion 0.4"}
+    for check in content["checks"]:
+        assert check["reached"] == (not check["explanation"])

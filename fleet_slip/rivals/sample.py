@@ -1,0 +1,75 @@
+"""A sample of a cohort's rows: what a Gram matrix does without, and these rivals cannot."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_slip.cohort import Cohort, assign
+from fleet_slip.connection import connect
+from fleet_slip.database import database_errors
+from fleet_slip.errors import SelectionError
+from fleet_slip.regression.folds import Assignment
+from fleet_slip.resources import read_sql
+from fleet_slip.sensors import SAMPLE_RATE_HZ
+from fleet_slip.signals import catalogue
+from fleet_slip.warehouse import Warehouse
+
+SAMPLE_ROWS = 20_000
+"""Rows of a sample, about. Neighbours at 100 Hz say almost the same, so that little is lost."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Rows evenly spaced in time over all drives.
+
+    Attributes:
+        columns: SI columns of the inputs.
+        inputs: shape (rows, columns).
+        sideslip_rad: shape (rows,).
+        drive_id: the drive of each row.
+    """
+
+    columns: tuple[str, ...]
+    inputs: NDArray[np.float64]
+    sideslip_rad: NDArray[np.float64]
+    drive_id: NDArray[np.str_]
+
+    def of(self, columns: tuple[str, ...]) -> NDArray[np.float64]:
+        """Return some of the inputs, shape (rows, columns)."""
+        return self.inputs[:, [self.columns.index(column) for column in columns]]
+
+    def folds(self, count: int) -> Assignment:
+        """Divide the rows as the regression's cross-validation divides the drives."""
+        return assign(self.drive_id.tolist(), "drive", count)
+
+
+def draw_sample(
+    warehouse: Warehouse, cohort: Cohort, signals: tuple[str, ...], rows: int = SAMPLE_ROWS
+) -> Sample:
+    """Draw about so many rows of a cohort that have the signals and the label.
+
+    Raises `SelectionError` if there is none.
+    """
+    names = (*signals, catalogue().label)
+    columns = [catalogue()[name].column for name in names]
+    statement = read_sql("jobs", "sample.sql").format(
+        columns=",\n    ".join(columns),
+        complete=" AND ".join(f"{column} IS NOT NULL" for column in columns),
+        samples_per_second=SAMPLE_RATE_HZ,
+    )
+    parameters = {
+        "drives": sorted(set(cohort.drives["drive_id"].to_pylist())),
+        "stride": max(1, cohort.rows // rows),
+    }
+    with connect(warehouse.root) as database, database_errors("drawing a sample"):
+        found = database.sql(statement, params=parameters).to_arrow_table()
+    if not found.num_rows:
+        raise SelectionError(f"no row of {cohort.condition!r} has all of {', '.join(names)}.")
+    values = np.stack([found[column].to_numpy() for column in columns], axis=1)
+    return Sample(
+        columns=tuple(columns[:-1]),
+        inputs=values[:, :-1],
+        sideslip_rad=values[:, -1],
+        drive_id=np.array(found["drive_id"].to_pylist()),
+    )
