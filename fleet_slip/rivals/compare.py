@@ -1,7 +1,7 @@
 """Cross-validates the rivals on the regression's folds, and measures what they cost."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +12,7 @@ from fleet_slip.cohort import Cohort
 from fleet_slip.evaluation.errors import ErrorFigures, error_figures
 from fleet_slip.evaluation.estimators import TABLE_ONE, Signals
 from fleet_slip.model_list import load_model_list
-from fleet_slip.rivals.learners import LEARNERS, Fitted, Learner
+from fleet_slip.rivals.learners import LEARNERS, Fitted, Learner, one_thread
 from fleet_slip.rivals.sample import Sample, draw_sample
 from fleet_slip.signals import catalogue
 from fleet_slip.warehouse import Warehouse
@@ -67,7 +67,8 @@ class Rival:
         complete = np.isfinite(inputs).all(axis=1)
         estimates = np.full(len(inputs), np.nan)
         if complete.any():
-            estimates[complete] = self.fitted.predict(inputs[complete])
+            with one_thread():
+                estimates[complete] = self.fitted.predict(inputs[complete])
         return estimates
 
     def description(self) -> dict[str, Any]:
@@ -89,13 +90,12 @@ class Rival:
         }
 
 
-def train_rivals(
-    warehouse: Warehouse, cohort: Cohort, learners: Sequence[Learner] = LEARNERS
-) -> tuple[Rival, ...]:
+def train_rivals(warehouse: Warehouse, cohort: Cohort) -> tuple[Rival, ...]:
     """Fit and cross-validate every learner on both sets of signals."""
     sample = draw_sample(warehouse, cohort, all_signals())
     sets = (TWO_SIGNALS, all_signals())
-    return tuple(train(learner, sample, signals) for learner in learners for signals in sets)
+    with one_thread():
+        return tuple(train(learner, sample, signals) for learner in LEARNERS for signals in sets)
 
 
 def train(learner: Learner, sample: Sample, signals: tuple[str, ...]) -> Rival:

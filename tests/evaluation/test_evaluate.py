@@ -18,6 +18,7 @@ from fleet_slip.evaluation.filters import FILTERS, bound
 from fleet_slip.observers import kalman
 from fleet_slip.observers.signals import read_drive
 from fleet_slip.registry import Registry
+from fleet_slip.rivals.learners import LEARNERS
 from fleet_slip.scenario import load_scenario
 from fleet_slip.score import score
 from fleet_slip.warehouse import Warehouse
@@ -136,7 +137,10 @@ def test_a_filter_gives_the_same_estimates_here_as_by_itself(root: Path) -> None
     np.testing.assert_array_equal(found, expected)
 
 
-def test_rivals_run_on_the_same_drives(root: Path, tmp_path: Path) -> None:
+def test_rivals_run_on_the_same_drives(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fleet_slip.rivals.compare.LEARNERS", LEARNERS[:1])
     copy = tmp_path / "data"
     shutil.copytree(root, copy)
     content = call(copy, "evaluate", "--one-car", "smoke", "--scenario", "nominal", "--rivals")

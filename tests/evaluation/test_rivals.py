@@ -13,6 +13,7 @@ from fleet_slip.rivals.learners import (
     fit_perceptron,
     fit_regression,
     kernel_mean,
+    one_thread,
 )
 from fleet_slip.rivals.sample import Sample
 from fleet_slip.signals import catalogue
@@ -76,9 +77,11 @@ def test_a_perceptron_carries_the_parameters_of_its_layers() -> None:
     assert fitted.size_bytes == 8 * (weights + scaling)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("learner", LEARNERS, ids=lambda learner: learner.name)
 def test_every_learner_learns(learner: Learner) -> None:
-    rival = train(learner, sample(), all_signals())
+    with one_thread():
+        rival = train(learner, sample(), all_signals())
     spread_deg = float(np.degrees(sample().sideslip_rad.std()))
     figures = rival.cross_validated
     assert figures.coverage == 1
