@@ -57,8 +57,11 @@ class Feature(Config):
 
     @model_validator(mode="after")
     def _is_integer_arithmetic(self) -> "Feature":
-        if (self.divided_by is None) != (self.at_least is None):
-            raise ValueError("divided_by and at_least belong together: the divisor and its least")
+        guarded = self.divided_by is not None and not self._divisor_is_number
+        if guarded != (self.at_least is not None):
+            raise ValueError("at_least is for a divisor that varies, which must have it")
+        if self._divisor_is_number and int(self.divided_by or 0) == 0:
+            raise ValueError("divided_by is zero")
         _ = self.sql
         return self
 
@@ -70,10 +73,14 @@ class Feature(Config):
             return counts
         divisor = integer_sql(self.divided_by)
         # `//` truncates, so half a divisor with the sign of the dividend rounds to the nearest.
-        return (
-            f"CASE WHEN {divisor} >= {self.at_least} "
-            f"THEN (2 * ({counts}) + sign({counts}) * ({divisor})) // (2 * ({divisor})) END"
-        )
+        quotient = f"(2 * ({counts}) + sign({counts}) * ({divisor})) // (2 * ({divisor}))"
+        if self._divisor_is_number:
+            return quotient
+        return f"CASE WHEN {divisor} >= {self.at_least} THEN {quotient} END"
+
+    @property
+    def _divisor_is_number(self) -> bool:
+        return self.divided_by is not None and self.divided_by.isdecimal()
 
     @property
     def inputs(self) -> tuple[str, ...]:

@@ -1,9 +1,11 @@
 """From a selection's winner to a published model version, unless the champion is better."""
 
 from dataclasses import dataclass
+from fractions import Fraction
 from importlib.metadata import version as package_version
 
 from fleet_slip.errors import RefusedError, SelectionError
+from fleet_slip.features import features
 from fleet_slip.model_list import CandidateModel
 from fleet_slip.registry import (
     CrossValidated,
@@ -42,19 +44,13 @@ def manifest_of(selection: Selection, name: str, model_list: str, config_sha256:
         intercept=winner.model.offset,
         intercept_exact=winner.model.intercept,
         terms=tuple(
-            ModelTerm(
-                signal=signal,
-                column=signals[signal].column,
-                unit=signals[signal].unit,
-                scale=signals[signal].scale,
-                coefficient=float(exact),
-                coefficient_exact=exact,
-            )
+            _term(signal, exact)
             for signal, exact in zip(winner.signals, winner.model.coefficients, strict=True)
         ),
         cross_validation=_cross_validated(winner, selection),
         trained_on=TrainedOn(
             cohort=selection.cohort.condition,
+            feature_set=features().identity(selection.cohort.feature_set),
             drives=winner.drives,
             rows=winner.pooled.rows,
             logs_version=selection.cohort.logs_version,
@@ -67,6 +63,20 @@ def manifest_of(selection: Selection, name: str, model_list: str, config_sha256:
             config_sha256=config_sha256,
         ),
         package_version=package_version("fleet-slip"),
+    )
+
+
+def _term(name: str, coefficient: Fraction) -> ModelTerm:
+    known = features()
+    one = known.of(name)
+    return ModelTerm(
+        signal=name,
+        column=one.column,
+        unit=one.unit,
+        scale=one.scale,
+        sql=known.features[name].sql if name in known.features else "",
+        coefficient=float(coefficient),
+        coefficient_exact=coefficient,
     )
 
 
@@ -100,15 +110,23 @@ def publish(
 
 
 def _revalidate(champion: ModelVersion, selection: Selection) -> CrossValidation:
-    candidate = CandidateModel(name=champion.reference, signals=champion.manifest.signals)
     folds = selection.cohort.folds(selection.folds.by, selection.folds.count)
     try:
+        _require_same_features(champion)
+        candidate = CandidateModel(name=champion.reference, signals=champion.manifest.signals)
         return validate(candidate, folds)
     except SelectionError as error:
         raise RefusedError(
             f"{champion.manifest.name} was not published: the champion {champion.reference} cannot "
             f"be compared on this cohort ({error}) Use --force to publish all the same."
         ) from None
+
+
+def _require_same_features(champion: ModelVersion) -> None:
+    known = features().features
+    for name, sql in champion.manifest.features.items():
+        if name not in known or known[name].sql != sql:
+            raise SelectionError(f"its feature {name} is not defined as it was then.")
 
 
 def _cross_validated(winner: CrossValidation, selection: Selection) -> CrossValidated:

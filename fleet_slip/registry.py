@@ -34,12 +34,17 @@ ExactFraction = Annotated[
 
 
 class ModelTerm(Config):
-    """One signal of a model: `label = intercept + sum(coefficient * signal)`, in SI units."""
+    """One signal of a model: `label = intercept + sum(coefficient * signal)`, in SI units.
+
+    `sql` is empty for a logged signal. For a feature it computes the count from the counts of
+    signals; the count is clipped to +-32767, and times `scale` it is the physical value.
+    """
 
     signal: Identifier
     column: Identifier
     unit: str
     scale: Decimal
+    sql: str = ""
     coefficient: float
     coefficient_exact: ExactFraction
 
@@ -75,6 +80,7 @@ class TrainedOn(Config):
     """The data that made a model."""
 
     cohort: str
+    feature_set: str = "signals"
     drives: int
     rows: int
     logs_version: int
@@ -108,6 +114,11 @@ class Manifest(Config):
     def signals(self) -> tuple[str, ...]:
         """Names of the model's inputs."""
         return tuple(term.signal for term in self.terms)
+
+    @property
+    def features(self) -> dict[str, str]:
+        """SQL of each input that is a feature."""
+        return {term.signal: term.sql for term in self.terms if term.sql}
 
     def same_estimator(self, other: "Manifest") -> bool:
         """Whether both are the same numbers from the same rows."""

@@ -6,8 +6,10 @@ from typing import Any
 from fleet_slip.connection import connect
 from fleet_slip.database import database_errors, one_query
 from fleet_slip.errors import SelectionError
+from fleet_slip.features import with_features
 from fleet_slip.registry import Manifest
 from fleet_slip.resources import read_sql
+from fleet_slip.signals import catalogue
 from fleet_slip.warehouse import Warehouse
 
 
@@ -32,15 +34,36 @@ class Score:
 
 
 def score_statement(manifest: Manifest, condition: str) -> str:
-    """Return `jobs/score.sql` for a model: its dot product over the view `log`."""
+    """Return `jobs/score.sql` for a model: its dot product over the logs in SI units.
+
+    Features are computed as the manifest defines them, whatever they are called today.
+    """
     terms = [f"{term.coefficient!r} * {term.column}" for term in manifest.terms]
     columns = [term.column for term in manifest.terms] + [manifest.label.column]
     return read_sql("jobs", "score.sql").format(
         estimate="\n        + ".join([repr(manifest.intercept), *terms]),
         label=manifest.label.column,
+        rows=_rows(manifest),
         complete=" AND ".join(f"{column} IS NOT NULL" for column in columns),
         condition=condition,
     )
+
+
+def _rows(manifest: Manifest) -> str:
+    """Return the view `log`, or for a model with features a subquery with their columns too."""
+    if not manifest.features:
+        return "log"
+    columns = [
+        *(f"{name} * {s.scale}::DOUBLE AS {s.column}" for name, s in catalogue().signals.items()),
+        *(f"{t.signal} * {t.scale}::DOUBLE AS {t.column}" for t in manifest.terms if t.sql),
+    ]
+    separator = ",\n            "
+    return f"""(
+        SELECT
+            *,
+            {separator.join(columns)}
+        FROM {with_features("log_counts", manifest.features)}
+    )"""
 
 
 def score(warehouse: Warehouse, manifest: Manifest, condition: str) -> Score:

@@ -4,38 +4,65 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from fleet_slip.cohort import Cohort
+from fleet_slip.cohort import ROW_FOLDS, Cohort
 from fleet_slip.errors import SelectionError
+from fleet_slip.features import features, input_scales
 from fleet_slip.model_list import CandidateModel, FoldPlan
+from fleet_slip.ordered_selection import OrderedChoice
 from fleet_slip.regression.crossval import CrossValidation, cross_validate_inputs
 from fleet_slip.regression.folds import CohortFolds
 from fleet_slip.regression.winner import Winner, choose
 from fleet_slip.signals import catalogue
+from fleet_slip.uncertainty import Uncertainty
 
 
 @dataclass(frozen=True)
 class Selection:
-    """All candidates with their figures, in the order of the list, and the winner."""
+    """All candidates with their figures, in the order of the list, and the winner.
+
+    Attributes:
+        cohort: the Gram rows.
+        folds: how they were divided.
+        models: the candidates that the cohort can serve, cross-validated.
+        winner: the chosen one and why.
+        skipped: candidates that the cohort cannot serve, with the reason.
+        choice: how an order or a subset was chosen; None for a list of models.
+        uncertainty: how sure the winner's figures are, if that was asked for.
+    """
 
     cohort: Cohort
     folds: FoldPlan
     models: tuple[CrossValidation, ...]
     winner: Winner
     skipped: dict[str, str]
-    """Candidates that the cohort cannot serve, with the reason."""
+    choice: OrderedChoice | None = None
+    uncertainty: Uncertainty | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `select --json` prints."""
-        return {
-            "models": [model.as_dict() for model in self.models],
+        document: dict[str, Any] = {
+            "models": [
+                {**model.as_dict(), "gram_rows": self.cohort.gram_condition(model.signals)}
+                for model in self.models
+            ],
             "winner": self.winner.model.name,
             "reason": self.winner.reason,
             "cohort": self.cohort.condition,
-            "drives": self.cohort.drives.num_rows,
+            "feature_set": features().identity(self.cohort.feature_set),
+            "drives": self.cohort.drive_count,
             "rows": self.cohort.rows,
-            "folds": {"by": self.folds.by, "count": self.folds.count},
+            "folds": {
+                "by": self.folds.by,
+                "count": self.folds.count,
+                "leaking": self.folds.by == ROW_FOLDS,
+            },
             "skipped": self.skipped,
         }
+        if self.choice is not None:
+            document["choice"] = self.choice.as_dict()
+        if self.uncertainty is not None:
+            document["uncertainty"] = self.uncertainty.as_dict()
+        return document
 
 
 def select(cohort: Cohort, candidates: Sequence[CandidateModel], folds: FoldPlan) -> Selection:
@@ -60,6 +87,6 @@ def select(cohort: Cohort, candidates: Sequence[CandidateModel], folds: FoldPlan
 
 def validate(candidate: CandidateModel, folds: CohortFolds) -> CrossValidation:
     """Cross-validate one candidate by exact least squares in each fold."""
-    signals = catalogue()
-    scales = {name: signals[name].exact_scale for name in signals.gram_signals}
-    return cross_validate_inputs(candidate.name, folds, candidate.signals, signals.label, scales)
+    return cross_validate_inputs(
+        candidate.name, folds, candidate.signals, catalogue().label, input_scales()
+    )

@@ -3,7 +3,7 @@ WITH scored AS (
     SELECT
         {estimate} AS estimate_rad,
         {label} AS truth_rad
-    FROM log
+    FROM {rows}
     WHERE {complete} AND (
         {condition}
     )

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from fleet_slip.cli import data, evaluate, models, query, run
+from fleet_slip.cli import data, evaluate, models, query, run, selecting
 from fleet_slip.cli.output import say
 from fleet_slip.connection import ROOT_VARIABLE, data_root
 from fleet_slip.errors import FleetSlipError
@@ -25,7 +25,7 @@ app = typer.Typer(
         "cannot answer, 6 storage, 7 refused, 8 a conflict with another process, 130 interrupted."
     ),
 )
-for module in (run, data, models, evaluate, query):
+for module in (run, data, selecting, models, evaluate, query):
     module.register(app)
 
 

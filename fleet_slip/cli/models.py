@@ -1,56 +1,31 @@
-"""Commands that make and serve models: select, publish, models, show, promote, rollback, score."""
+"""Commands that make and serve models: publish, models, show, promote, rollback, score."""
 
 from typing import Annotated, Any
 
 import typer
 
-from fleet_slip.cli.output import Json, print_json, print_table, print_text, say
-from fleet_slip.cohort import ALL_DRIVES, TRAINING_DRIVES, load_cohort
-from fleet_slip.errors import ConfigError
-from fleet_slip.model_list import (
-    CandidateModel,
-    FoldKey,
-    FoldPlan,
-    ModelList,
-    check_model_name,
-    load_model_list,
-    nested_models,
+from fleet_slip.cli.output import Json, print_json, print_table, say
+from fleet_slip.cli.selecting import (
+    AllSubsets,
+    Cohort,
+    Criterion,
+    Features,
+    FoldBy,
+    FoldCount,
+    Models,
+    Naive,
+    Nested,
+    Rank,
+    print_selection,
 )
+from fleet_slip.cohort import ALL_DRIVES, TRAINING_DRIVES
+from fleet_slip.model_list import check_model_name
 from fleet_slip.publishing import Publication, manifest_of
 from fleet_slip.publishing import publish as publish_selection
 from fleet_slip.registry import CHAMPION, ModelVersion, Registry
-from fleet_slip.selection import Selection
-from fleet_slip.selection import select as select_model
-from fleet_slip.signals import catalogue
+from fleet_slip.selection_plan import SelectionPlan, run_plan
 from fleet_slip.warehouse import Warehouse
 
-DEFAULT_MODELS = "table1"
-
-Cohort = Annotated[
-    str,
-    typer.Option(help="SQL condition on the view drives, such as \"track = 'waterford_hills'\"."),
-]
-Models = Annotated[
-    str | None,
-    typer.Option(
-        help=f"A model list of configs/models, or a TOML file. Default: {DEFAULT_MODELS}, unless "
-        "--nested is given.",
-        show_default=False,
-    ),
-]
-Nested = Annotated[
-    str | None,
-    typer.Option(
-        help="Add the nested models of an order of signals, separated by commas; 'catalogue' is "
-        "the order of configs/signals.toml."
-    ),
-]
-FoldBy = Annotated[
-    FoldKey | None, typer.Option(help="What a fold is made of. Default: what the list says.")
-]
-FoldCount = Annotated[
-    int | None, typer.Option("--folds", min=2, help="Number of folds. Default: what the list says.")
-]
 Reference = Annotated[
     str, typer.Argument(help="NAME, NAME@VERSION or NAME@ALIAS. NAME alone is its champion.")
 ]
@@ -59,7 +34,7 @@ Alias = Annotated[str, typer.Option(help="The alias to move.")]
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
-    for command in (select, publish, models, show, promote, rollback, score):
+    for command in (publish, models, show, promote, rollback, score):
         app.command()(command)
 
 
@@ -68,107 +43,44 @@ def registry_of(warehouse: Warehouse) -> Registry:
     return Registry(warehouse.root / "models")
 
 
-def candidates_of(model_list: ModelList | None, nested: str | None) -> tuple[CandidateModel, ...]:
-    """Return the candidates of a list, then those of a nested order."""
-    listed = model_list.model if model_list else ()
-    if nested is None:
-        return listed
-    known = catalogue().inputs
-    order = known if nested == "catalogue" else tuple(name.strip() for name in nested.split(","))
-    unknown = [name for name in order if name not in known]
-    if unknown or len(set(order)) < len(order):
-        raise ConfigError(
-            f"--nested {nested}: {', '.join(unknown) or 'a signal'} "
-            f"{'is not an input' if unknown else 'stands twice'}. Inputs: {', '.join(known)}."
-        )
-    return (*listed, *nested_models(order))
-
-
-def run_selection(
-    warehouse: Warehouse,
-    cohort: str,
-    list_name: str | None = None,
-    nested: str | None = None,
-    by: FoldKey | None = None,
-    folds: int | None = None,
-) -> tuple[Selection, str, str]:
-    """Select on a cohort. Returns the selection, the name of the list, and its checksum."""
-    name = list_name or (None if nested else DEFAULT_MODELS)
-    model_list = load_model_list(name) if name else None
-    plan = model_list.folds if model_list else FoldPlan()
-    plan = FoldPlan(by=by or plan.by, count=folds or plan.count)
-    candidates = candidates_of(model_list, nested)
-    described = ModelList(
-        description=model_list.description if model_list else "Nested models of an order",
-        folds=plan,
-        model=candidates,
-    )
-    selection = select_model(load_cohort(warehouse, cohort), candidates, plan)
-    label = "+".join(filter(None, [name, f"nested:{nested}" if nested else None]))
-    return selection, label, described.sha256
-
-
-def select(
-    context: typer.Context,
-    cohort: Cohort = TRAINING_DRIVES,
-    models: Models = None,
-    nested: Nested = None,
-    by: FoldBy = None,
-    folds: FoldCount = None,
-    json: Json = False,
-) -> None:
-    """Compare models on a cohort by cross-validation and choose one. Reads Gram rows only."""
-    selection, _, _ = run_selection(context.obj, cohort, models, nested, by, folds)
-    if json:
-        print_json(selection.as_dict())
-    else:
-        print_selection(selection)
-
-
-def print_selection(selection: Selection) -> None:
-    """Print the table of a selection, the winner and why."""
-    where = selection.cohort.condition
-    print_table(
-        f"{selection.cohort.drives.num_rows:,} drives, {selection.cohort.rows:,} rows"
-        + ("" if where == TRAINING_DRIVES else f" where {where}")
-        + f"; {selection.folds.count} folds by {selection.folds.by}",
-        ["model", "signals", "correlation", "RMSE deg", "mean deg", "std deg", "condition"],
-        [
-            [
-                model.name,
-                " ".join(model.signals),
-                f"{model.correlation:.4f}",
-                f"{model.pooled.rmse_deg:.4f}",
-                f"{model.pooled.error_mean_deg:+.4f}",
-                f"{model.pooled.error_std_deg:.4f}",
-                f"{model.condition_number:.3g}",
-            ]
-            for model in selection.models
-        ],
-        left=2,
-    )
-    for name, reason in selection.skipped.items():
-        say(f"model {name} was left out: {reason}")
-    print_text(f"winner: {selection.winner.model.name}. {selection.winner.reason}")
-
-
 def publish(
     context: typer.Context,
     name: Annotated[str, typer.Argument(help="Name of the model, such as sideslip.")],
     cohort: Cohort = TRAINING_DRIVES,
     models: Models = None,
     nested: Nested = None,
+    features: Features = None,
     by: FoldBy = None,
     folds: FoldCount = None,
+    rank: Rank = None,
+    criterion: Criterion = None,
+    all_subsets: AllSubsets = False,
+    naive: Naive = False,
     force: Annotated[
         bool, typer.Option("--force", help="Publish even what is worse than the champion.")
     ] = False,
     json: Json = False,
 ) -> None:
-    """Select on a cohort and make the winner the next version of a model, and its champion."""
+    """Select on a cohort and make the winner the next version of a model, and its champion.
+
+    The options are those of select.
+    """
     check_model_name(name)
-    selection, label, sha256 = run_selection(context.obj, cohort, models, nested, by, folds)
-    manifest = manifest_of(selection, name, label, sha256)
+    plan = SelectionPlan(
+        cohort=cohort,
+        models=models,
+        nested=nested,
+        features=features,
+        by=by,
+        folds=folds,
+        rank=rank,
+        criterion=criterion,
+        all_subsets=all_subsets,
+        naive=naive,
+    )
+    planned = run_plan(context.obj, plan)
+    selection = planned.selection
+    manifest = manifest_of(selection, name, planned.label, planned.config_sha256)
     publication = publish_selection(registry_of(context.obj), manifest, selection, force=force)
     if json:
         print_json(published(publication))
@@ -274,6 +186,13 @@ def _print_version(version: ModelVersion) -> None:
         ],
         left=2,
     )
+    if manifest.features:
+        print_table(
+            "\nfeatures: SQL over the counts of log_counts, clipped to +-32767, times the scale",
+            ["feature", "scale", "SQL"],
+            [[t.signal, f"{t.scale} {t.unit}", t.sql] for t in manifest.terms if t.sql],
+            left=3,
+        )
     print_table(
         "",
         ["", ""],

@@ -7,18 +7,14 @@ from typing import Annotated, Any
 import typer
 
 from fleet_slip.cli.data import Days, Threads, Through, chosen_days, run_gram, run_simulation
-from fleet_slip.cli.models import (
-    print_publication,
-    print_selection,
-    published,
-    registry_of,
-    run_selection,
-)
+from fleet_slip.cli.models import print_publication, published, registry_of
 from fleet_slip.cli.output import Json, print_json, say
+from fleet_slip.cli.selecting import print_selection
 from fleet_slip.errors import RefusedError
 from fleet_slip.model_list import check_model_name
 from fleet_slip.publishing import Publication, manifest_of, publish
 from fleet_slip.selection import Selection
+from fleet_slip.selection_plan import PlannedSelection, SelectionPlan, run_plan
 from fleet_slip.storage import exclusive
 
 DEFAULT_CAMPAIGN = "waterford"
@@ -61,8 +57,9 @@ def run(
         simulation = run_simulation(context.obj, plan, chosen_days(plan, days, through), threads)
         gram = run_gram(context.obj)
         condition = f"campaign = '{plan.name}'"
-        selection, label, sha256 = run_selection(context.obj, condition, models)
-        publication, refusal = _publish(context, selection, model_name, label, sha256)
+        planned = run_plan(context.obj, SelectionPlan(cohort=condition, models=models))
+        selection = planned.selection
+        publication, refusal = _publish(context, planned, model_name)
     changed = simulation.changed or gram.changed or (publication is not None and publication.new)
     summary = {
         "campaign": plan.name,
@@ -80,11 +77,11 @@ def run(
 
 
 def _publish(
-    context: typer.Context, selection: Selection, name: str, label: str, sha256: str
+    context: typer.Context, planned: PlannedSelection, name: str
 ) -> tuple[Publication | None, str]:
-    manifest = manifest_of(selection, name, label, sha256)
+    manifest = manifest_of(planned.selection, name, planned.label, planned.config_sha256)
     try:
-        return publish(registry_of(context.obj), manifest, selection), ""
+        return publish(registry_of(context.obj), manifest, planned.selection), ""
     except RefusedError as error:
         return None, str(error)
 

@@ -1,0 +1,263 @@
+"""Selecting: the command select, its options, and how a selection is printed."""
+
+from collections.abc import Iterator, Sequence
+from typing import Annotated
+
+import typer
+
+from fleet_slip.cli.output import Json, print_json, print_table, say, stdout
+from fleet_slip.cohort import ROW_FOLDS, TRAINING_DRIVES
+from fleet_slip.model_list import FoldKey
+from fleet_slip.ordered_selection import OrderedChoice
+from fleet_slip.regression.criteria import CRITERIA
+from fleet_slip.regression.crossval import CrossValidation
+from fleet_slip.regression.ranking import RANKINGS
+from fleet_slip.regression.selection import CROSS_VALIDATION
+from fleet_slip.selection import Selection
+from fleet_slip.selection_plan import DEFAULT_MODELS, SelectionPlan, run_plan
+from fleet_slip.uncertainty import Uncertainty
+
+Cohort = Annotated[
+    str,
+    typer.Option(help="SQL condition on the view drives, such as \"track = 'waterford_hills'\"."),
+]
+Models = Annotated[
+    str | None,
+    typer.Option(
+        help=f"A model list of configs/models, or a TOML file. Default: {DEFAULT_MODELS}, unless "
+        "--nested or an option that searches is given.",
+        show_default=False,
+    ),
+]
+Nested = Annotated[
+    str | None,
+    typer.Option(
+        help="Add the nested models of an order of signals, separated by commas; 'catalogue' is "
+        "all inputs in the order of configs/signals.toml."
+    ),
+]
+Features = Annotated[
+    str | None,
+    typer.Option(
+        help="Feature set of configs/features.toml, computed before with: fleet-slip gram "
+        "--features NAME. Default: what the list says, else the logged signals."
+    ),
+]
+FoldBy = Annotated[
+    FoldKey | None,
+    typer.Option(
+        help="What a fold is made of. Default: what the list says. By row is WEKA's way and leaks."
+    ),
+]
+FoldCount = Annotated[
+    int | None, typer.Option("--folds", min=2, help="Number of folds. Default: what the list says.")
+]
+Rank = Annotated[
+    str | None,
+    typer.Option(
+        help=f"Rank the inputs of --nested first: {', '.join(RANKINGS)}. Default: declared.",
+        show_default=False,
+    ),
+]
+Criterion = Annotated[
+    str | None,
+    typer.Option(
+        help="What decides how many of the ranked inputs are kept: cv (the smallest model within "
+        f"one standard error of the best), {', '.join(CRITERIA)}. Default: cv.",
+        show_default=False,
+    ),
+]
+AllSubsets = Annotated[
+    bool,
+    typer.Option(
+        "--all-subsets", help="Search all subsets of the inputs of --nested instead of an order."
+    ),
+]
+Naive = Annotated[
+    bool,
+    typer.Option(
+        "--naive",
+        help="Take rows for independent evidence, not drives. At 100 Hz they are not: then every "
+        "criterion keeps nearly everything.",
+    ),
+]
+Repeat = Annotated[
+    int | None,
+    typer.Option(min=2, help="Cross-validate the winner again with so many other deals of folds."),
+]
+Bootstrap = Annotated[
+    int | None,
+    typer.Option(
+        min=100,
+        help="Confidence interval of the winner's correlation by drawing the drives so many times.",
+    ),
+]
+
+
+FIGURES = ("drives", "correlation", "RMSE deg", "mean deg", "std deg", "condition")
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command of this module."""
+    app.command()(select)
+
+
+def select(
+    context: typer.Context,
+    cohort: Cohort = TRAINING_DRIVES,
+    models: Models = None,
+    nested: Nested = None,
+    features: Features = None,
+    by: FoldBy = None,
+    folds: FoldCount = None,
+    rank: Rank = None,
+    criterion: Criterion = None,
+    all_subsets: AllSubsets = False,
+    naive: Naive = False,
+    repeat: Repeat = None,
+    bootstrap: Bootstrap = None,
+    json: Json = False,
+) -> None:
+    """Compare models on a cohort by cross-validation and choose one. Reads Gram rows only.
+
+    Compare a list of models: **fleet-slip select --models table1**
+
+    Find an order and a place to stop: **fleet-slip select --rank backward --criterion bic**
+
+    Search all subsets: **fleet-slip select --all-subsets --criterion cv --bootstrap 1000**
+    """
+    plan = SelectionPlan(
+        cohort=cohort,
+        models=models,
+        nested=nested,
+        features=features,
+        by=by,
+        folds=folds,
+        rank=rank,
+        criterion=criterion,
+        all_subsets=all_subsets,
+        naive=naive,
+        repeat=repeat,
+        bootstrap=bootstrap,
+    )
+    selection = run_plan(context.obj, plan).selection
+    if json:
+        print_json(selection.as_dict())
+    else:
+        print_selection(selection)
+
+
+def print_selection(selection: Selection) -> None:
+    """Print the table of a selection, the winner and why, and how sure that is."""
+    where = selection.cohort.condition
+    # The signals of an order or of subsets stand in the table above it.
+    listed = selection.choice is None
+    if selection.choice is not None:
+        _print_choice(selection.choice)
+    print_table(
+        f"{selection.cohort.drive_count:,} drives, {selection.cohort.rows:,} rows"
+        + ("" if where == TRAINING_DRIVES else f" where {where}")
+        + f"; {len(selection.models[0].folds)} folds by {selection.folds.by}",
+        ["model", *(["signals"] if listed else []), *FIGURES],
+        [
+            [model.name, *([" ".join(model.signals)] if listed else []), *_figures(model)]
+            for model in selection.models
+        ],
+        left=1 + listed,
+    )
+    if selection.folds.by == ROW_FOLDS:
+        say(
+            "folds of rows leak: each test row's neighbours at 100 Hz are training rows, so that "
+            "these figures are those of the fit, not of prediction. Compare with --by drive."
+        )
+    for name, reason in selection.skipped.items():
+        say(f"model {name} was left out: {reason}")
+    stdout().print(
+        f"winner: {selection.winner.model.name}. {selection.winner.reason}", markup=False
+    )
+    if selection.choice is not None and selection.choice.honest is not None:
+        _print_honest(selection.choice.honest)
+    if selection.uncertainty is not None:
+        _print_uncertainty(selection.uncertainty)
+
+
+def _figures(model: CrossValidation) -> list[str]:
+    return [
+        f"{model.drives:,}",
+        f"{model.correlation:.4f}",
+        f"{model.pooled.rmse_deg:.4f}",
+        f"{model.pooled.error_mean_deg:+.4f}",
+        f"{model.pooled.error_std_deg:.4f}",
+        f"{model.condition_number:.3g}",
+    ]
+
+
+def _print_choice(choice: OrderedChoice) -> None:
+    worth = (
+        f"taking {choice.evidence.kind} for independent, the cohort is worth "
+        f"{choice.evidence.rows:,.0f} rows"
+    )
+    if choice.nested is not None:
+        nested = choice.nested
+        print_table(
+            f"order by {choice.rule.ranking}; {worth}",
+            ["", "added", "contribution A", _criterion_name(choice)],
+            _order_rows(nested.order, nested.evidence.contributions, nested.values, nested.size),
+            left=2,
+        )
+    if choice.subsets is not None and choice.picks is not None:
+        print_table(
+            f"best subset of every size; {worth}",
+            ["size", "signals", "picked by", "R squared", "gap to second"],
+            [
+                [
+                    str(result.best.size),
+                    " ".join(result.best.model.signals),
+                    " ".join(c for c, size in choice.picks.items() if size == result.best.size),
+                    f"{result.best.r_squared:.6f}",
+                    "" if result.gap is None else f"{result.gap:.2g}",
+                ]
+                for result in choice.subsets
+            ],
+            left=3,
+        )
+
+
+def _criterion_name(choice: OrderedChoice) -> str:
+    if choice.rule.criterion == CROSS_VALIDATION:
+        return "minus correlation"
+    return choice.rule.criterion
+
+
+def _order_rows(
+    order: Sequence[str], contributions: Sequence[float], values: Sequence[float], size: int
+) -> Iterator[list[str]]:
+    for j, value in enumerate(values):
+        added = order[j - 1] if j else "(none)"
+        contribution = f"{contributions[j - 1]:,.1f}" if j else ""
+        mark = " <" if j == size else "  "
+        yield [str(j), added, contribution, f"{value:,.4f}{mark}"]
+
+
+def _print_honest(honest: CrossValidation) -> None:
+    stdout().print(
+        "made again inside every training fold, the whole choice has a correlation of "
+        f"{honest.correlation:.4f} and an RMSE of {honest.pooled.rmse_deg:.4f} deg.",
+        markup=False,
+    )
+
+
+def _print_uncertainty(found: Uncertainty) -> None:
+    if found.interval is not None:
+        stdout().print(
+            f"{found.interval.level:.0%} interval of the winner's correlation, drawing its drives "
+            f"{found.interval.replicates:,} times: {found.interval.low:.4f} to "
+            f"{found.interval.high:.4f}.",
+            markup=False,
+        )
+    if found.repeated_mean is not None and found.repeated_spread is not None:
+        stdout().print(
+            f"{found.repeats} other deals of the drives into folds: correlation "
+            f"{found.repeated_mean:.5f} +- {found.repeated_spread:.5f}.",
+            markup=False,
+        )
