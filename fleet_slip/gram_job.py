@@ -16,10 +16,9 @@ import pyarrow.parquet as pq
 from deltalake.transaction import AddAction
 
 from fleet_slip.database import database_errors, open_database
-from fleet_slip.errors import ConflictError
 from fleet_slip.features import PLAIN, features
 from fleet_slip.gram_statement import gram_statement
-from fleet_slip.storage import Change, Snapshot, TableFile, Unit, storage_errors
+from fleet_slip.storage import Change, Snapshot, TableFile, Unit, retried, storage_errors
 from fleet_slip.warehouse import Warehouse
 
 FILES_PER_QUERY = 16
@@ -28,8 +27,6 @@ FILES_PER_QUERY = 16
 SMALL_FILE_ROWS = 100_000
 SMALL_FILES_MAX = 32
 """So many small Gram files may stand side by side before a commit merges them."""
-
-ATTEMPTS = 5
 
 Progress = Callable[[int, int], None]
 """Called with rows read since the last call, and rows to read in all."""
@@ -73,18 +70,31 @@ def update_grams(
     Raises `SelectionError` for an unknown set, `StorageError`, or `ConflictError` if other
     processes keep changing the table.
     """
-    for attempt in range(ATTEMPTS):
-        try:
-            return _update_once(warehouse, progress, feature_set)
-        except ConflictError:
-            if attempt == ATTEMPTS - 1:
-                raise
-    raise AssertionError("unreachable")
+    return retried(lambda: _update_once(warehouse, progress, feature_set))
+
+
+def reconcile(
+    warehouse: Warehouse, progress: Progress = lambda _more, _all: None
+) -> list[GramReport]:
+    """Bring the Gram rows of every feature set up to date that was ever computed here."""
+    grams = warehouse.grams.snapshot()
+    known = (PLAIN, *features().sets)
+    used = [
+        name for name in known if grams.landed(unit_name(features().identity(name))) is not None
+    ]
+    return [update_grams(warehouse, progress, name) for name in used]
+
+
+def unit_name(identity: str) -> str:
+    """Return the name of the unit of work that lands Gram rows of a feature set."""
+    return f"gram/{identity}"
 
 
 def _update_once(warehouse: Warehouse, progress: Progress, feature_set: str) -> GramReport:
-    logs = warehouse.logs.snapshot()
+    # The logs are looked at last: if they lose a drive from now on, whoever removed it changes the
+    # Gram rows after this snapshot of them, and this job's commit is a conflict.
     grams = warehouse.grams.snapshot()
+    logs = warehouse.logs.snapshot()
     identity = features().identity(feature_set)
     backlog = find_backlog(logs, grams, identity)
     version, gram_rows = grams.version, grams.rows
@@ -97,7 +107,7 @@ def _update_once(warehouse: Warehouse, progress: Progress, feature_set: str) -> 
             Change(
                 add=_write_files(warehouse, rows),
                 remove=replaced,
-                units=[Unit(f"gram/{identity}", logs.version or 0)],
+                units=[Unit(unit_name(identity), logs.version or 0)],
                 note={
                     "job": "gram",
                     "feature_set": identity,

@@ -7,10 +7,9 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from fleet_slip.errors import ConflictError
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.measured import IngestCounts, MeasuredLog, read_measured
-from fleet_slip.storage import Change, Table, Unit
+from fleet_slip.storage import Change, Table, Unit, retried
 from fleet_slip.warehouse import Warehouse
 
 
@@ -47,7 +46,8 @@ def ingest_file(warehouse: Warehouse, file: Path, mapping: Mapping) -> IngestRep
     unit = Unit(f"ingest/{log.digest}", 1)
     new = warehouse.logs.snapshot().landed(unit.name) is None
     if new:
-        note = {"job": "ingest", "file": file.name, "mapping": mapping.name, "digest": log.digest}
+        # Not the file's name: it may name a car, and the Delta log outlives what is forgotten.
+        note = {"job": "ingest", "mapping": mapping.name, "digest": log.digest}
         if log.quarantine.num_rows:
             _land(warehouse.quarantine, {None: log.quarantine}, log, unit, note)
         new = _land(warehouse.logs, _by_day(log.drives), log, unit, note)
@@ -63,15 +63,17 @@ def _land(
     table: Table, parts: dict[Any, pa.Table], log: MeasuredLog, unit: Unit, note: dict[str, str]
 ) -> bool:
     """Commit the parts as files of one commit; False if the unit has landed before."""
-    snapshot = table.snapshot()
-    if snapshot.landed(unit.name) is not None:
+    if table.snapshot().landed(unit.name) is not None:
         return False
     name = f"measured-{log.digest[:24]}"
     actions = [table.write_file(name, rows, day) for day, rows in parts.items()]
-    try:
-        snapshot.commit(Change(add=actions, units=[unit], note=note))
-    except ConflictError:
-        if table.snapshot().landed(unit.name) is None:
-            raise
-        return False
-    return True
+    change = Change(add=actions, units=[unit], note=note)
+
+    def attempt() -> bool:
+        snapshot = table.snapshot()
+        if snapshot.landed(unit.name) is not None:
+            return False
+        snapshot.commit(change)
+        return True
+
+    return retried(attempt)

@@ -13,9 +13,9 @@ from itertools import islice
 from deltalake.transaction import AddAction
 
 from fleet_slip.campaign import Batch, Campaign
-from fleet_slip.errors import ConflictError, RefusedError
+from fleet_slip.errors import RefusedError
 from fleet_slip.simulate import simulate_batch
-from fleet_slip.storage import Change, Snapshot, Unit
+from fleet_slip.storage import Change, Snapshot, Unit, retried
 from fleet_slip.warehouse import Warehouse
 
 IN_FLIGHT = 4
@@ -148,14 +148,12 @@ def _land(warehouse: Warehouse, written: _Written) -> bool:
             "digest": written.batch.digest,
         },
     )
-    while True:
+
+    def attempt() -> bool:
         snapshot = warehouse.logs.snapshot()
         if has_landed(snapshot, written.batch):
             return False
-        try:
-            snapshot.commit(change)
-        except ConflictError:
-            if not has_landed(warehouse.logs.snapshot(), written.batch):
-                raise
-        else:
-            return True
+        snapshot.commit(change)
+        return True
+
+    return retried(attempt)

@@ -2,21 +2,30 @@
 
 A file is written under a temporary name, flushed to disk and renamed; only then is it committed to
 the table's Delta log. So a reader sees whole files of whole commits, or nothing.
+
+A file's name ends in the checksum of its bytes. The name is the one thing about a file that the
+Delta log, its checkpoints, Gram rows and a listing of the folder all keep, so that damage can be
+told years later; the same rows are always the same file; and a file that is made again from its
+source takes its place without a commit.
 """
 
 import contextlib
 import errno
 import fcntl
+import hashlib
 import json
 import os
+import random
+import re
 import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import date
 from functools import cached_property
+from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -28,6 +37,15 @@ from fleet_slip.errors import ConflictError, StorageError
 
 ROW_GROUP_ROWS = 2**17
 TEMPORARY_PREFIX = ".tmp-"
+
+CHECKSUM_DIGITS = 32
+"""Hexadecimal digits of a file's SHA-256 in its name: damage passes unseen once in 2^128 times."""
+
+ATTEMPTS = 12
+FIRST_WAIT_S = 0.02
+LONGEST_WAIT_S = 5.0
+
+Result = TypeVar("Result")
 
 
 @contextlib.contextmanager
@@ -52,11 +70,36 @@ def _reason(error: OSError) -> str:
         errno.EROFS: "the file system is read-only. Choose a writable data root with --root.",
         errno.ENOTDIR: "a part of the path is a file, not a folder. Choose another --root.",
     }
-    return advice.get(error.errno or 0, _first_line(error))
+    # The Delta library tells the number in its text only.
+    stated = re.search(r"\(os error (\d+)\)", str(error))
+    number = error.errno or (int(stated[1]) if stated else 0)
+    return advice.get(number, _on_one_line(error))
+
+
+_COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 
 
 def _first_line(error: BaseException) -> str:
     return str(error).strip().partition("\n")[0]
+
+
+def _on_one_line(error: BaseException) -> str:
+    text = _COLOUR.sub("", str(error)).replace("\N{DOWNWARDS ARROW WITH TIP RIGHTWARDS}", ":")
+    return " ".join(text.split()).replace(" : ", ": ")
+
+
+def retried(attempt: Callable[[], Result]) -> Result:
+    """Call until it raises no `ConflictError`, waiting ever longer between, at random.
+
+    The last conflict is raised. "Full jitter": processes that met once do not meet again.
+    """
+    for number in range(ATTEMPTS - 1):
+        try:
+            return attempt()
+        except ConflictError:
+            longest = min(FIRST_WAIT_S * 2**number, LONGEST_WAIT_S)
+            time.sleep(random.uniform(0, longest))  # noqa: S311 - not a secret
+    return attempt()
 
 
 @dataclass(frozen=True)
@@ -128,41 +171,43 @@ class Table:
                 return Snapshot(self, None)
 
     def write_file(self, name: str, rows: pa.Table, day: date | None = None) -> AddAction:
-        """Write rows to a file, durably, and return the action that adds it to the table.
+        """Write rows to the file NAME-CHECKSUM.parquet, durably.
 
-        The file is not part of the table before the action is committed. A file of that name left
-        by an interrupted run is replaced.
+        Returns the action that adds it to the table; it is not part of the table before that is
+        committed. A file of that name left by an interrupted run is replaced.
         """
         partition = {"day": day.isoformat()} if day else {}
         folder = self.path.joinpath(*(f"{key}={value}" for key, value in partition.items()))
-        target = folder / f"{name}.parquet"
+        content = self._encoded(rows)
+        target = folder / f"{name}-{checksum_of(content)}.parquet"
         temporary = folder / f"{TEMPORARY_PREFIX}{uuid.uuid4().hex}.parquet"
         with storage_errors(target):
             folder.mkdir(parents=True, exist_ok=True)
             try:
-                self._write_parquet(rows, temporary)
+                with temporary.open("wb") as file:
+                    file.write(content)
+                    file.flush()
+                    os.fsync(file.fileno())
                 temporary.replace(target)
             finally:
                 temporary.unlink(missing_ok=True)
             flush(folder)
-            size = target.stat().st_size
         return AddAction(
             path=str(target.relative_to(self.path)),
-            size=size,
+            size=len(content),
             partition_values=partition,
             modification_time=_now_ms(),
             data_change=True,
             stats=json.dumps(_statistics(rows)),
         )
 
-    def _write_parquet(self, rows: pa.Table, path: Path) -> None:
+    def _encoded(self, rows: pa.Table) -> pa.Buffer:
         stored = rows.drop_columns(
             [name for name in self.partition_by if name in rows.schema.names]
         )
-        with path.open("wb") as file:
-            pq.write_table(stored, file, row_group_size=ROW_GROUP_ROWS, **self.encoding.options())
-            file.flush()
-            os.fsync(file.fileno())
+        sink = pa.BufferOutputStream()
+        pq.write_table(stored, sink, row_group_size=ROW_GROUP_ROWS, **self.encoding.options())
+        return sink.getvalue()
 
 
 @dataclass(frozen=True)
@@ -210,14 +255,19 @@ class Snapshot:
     def commit(self, change: Change) -> None:
         """Apply a change in one atomic commit on top of this snapshot.
 
-        Raises `ConflictError` if another process landed one of the same units meanwhile, and
-        `StorageError` if the log cannot be written.
+        A file that is both added and removed stays. Raises `ConflictError` if another process
+        landed one of the same units meanwhile, or removed a file; and `StorageError` if the log
+        cannot be written.
         """
+        both = {action.path for action in change.add} & {file.path for file in change.remove}
         with storage_errors(self.table.path):
             delta = self.delta or _create(self.table)
             try:
                 delta.create_write_transaction(
-                    [*change.add, *map(_remove_action, change.remove)],
+                    [
+                        *(action for action in change.add if action.path not in both),
+                        *(_remove_action(file) for file in change.remove if file.path not in both),
+                    ],
                     mode="append",
                     schema=self.table.schema,
                     partition_by=list(self.table.partition_by),
@@ -227,10 +277,32 @@ class Snapshot:
                     ),
                 )
             except CommitFailedError as error:
+                if not _CONFLICT.search(str(error)):
+                    raise
                 raise ConflictError(
                     f"{self.table.path}: another process changed the table at the same moment "
                     f"({_first_line(error)}). Run the same command again."
                 ) from None
+            _flush_log(self.table.path / "_delta_log", self.version)
+
+
+_CONFLICT = re.compile(
+    r"concurrent|changed since last commit|existing table version|already exists|"
+    r"exceeded maximum commit attempts|^Failed to commit transaction: \d+$",
+    re.IGNORECASE,
+)
+"""What the Delta library says when another commit was faster; anything else is a fault."""
+
+
+def checksum_of(content: pa.Buffer | bytes) -> str:
+    """Return the checksum of a file's bytes as it stands in the file's name."""
+    return hashlib.sha256(content).hexdigest()[:CHECKSUM_DIGITS]
+
+
+def checksum_in(path: str) -> str | None:
+    """Return the checksum in a file's name; None for a file of a version that wrote none."""
+    found = re.search(rf"-([0-9a-f]{{{CHECKSUM_DIGITS}}})\.parquet$", path)
+    return found[1] if found else None
 
 
 @contextlib.contextmanager
@@ -265,6 +337,15 @@ def flush(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def _flush_log(folder: Path, before: int | None) -> None:
+    """Make the commits after a version durable, which the Delta library leaves to the system."""
+    with contextlib.suppress(FileNotFoundError):
+        for version in count(0 if before is None else before + 1):
+            with (folder / f"{version:020}.json").open("rb") as file:
+                os.fsync(file.fileno())
+    flush(folder)
 
 
 def _create(table: Table) -> DeltaTable:

@@ -1,5 +1,6 @@
 """Delta tables below a data root: whole commits or nothing, and units that land once."""
 
+import hashlib
 import threading
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from fleet_slip.errors import ConflictError, StorageError
-from fleet_slip.storage import TEMPORARY_PREFIX, Change, Unit
+from fleet_slip.storage import TEMPORARY_PREFIX, Change, Unit, checksum_in, checksum_of, retried
 from fleet_slip.warehouse import Warehouse
 from tests.conftest import DAY, log_rows, random_counts
 
@@ -29,14 +30,14 @@ def test_a_written_file_is_not_part_of_the_table_before_its_commit(warehouse: Wa
     warehouse.logs.snapshot().commit(Change(add=[action], units=[Unit("u", 7)], note={"job": "t"}))
     snapshot = warehouse.logs.snapshot()
     (file,) = snapshot.files
-    assert (file.rows, file.day, file.path) == (1000, DAY, "day=2024-05-01/one.parquet")
+    assert (file.rows, file.day, file.path) == (1000, DAY, action.path)
     assert file.null_counts["ax"] == 0
     assert (snapshot.landed("u"), snapshot.landed("other")) == (7, None)
 
 
 def test_counts_are_delta_packed_and_strings_are_dictionaries(warehouse: Warehouse) -> None:
-    warehouse.logs.write_file("one", rows("a"), DAY)
-    columns = pq.read_metadata(warehouse.root / "logs/day=2024-05-01/one.parquet").row_group(0)
+    action = warehouse.logs.write_file("one", rows("a"), DAY)
+    columns = pq.read_metadata(warehouse.logs.path / action.path).row_group(0)
     encodings = {
         columns.column(i).path_in_schema: columns.column(i).encodings
         for i in range(columns.num_columns)
@@ -47,12 +48,20 @@ def test_counts_are_delta_packed_and_strings_are_dictionaries(warehouse: Warehou
 
 
 def test_the_same_rows_make_the_same_bytes(warehouse: Warehouse) -> None:
-    path = warehouse.root / "logs/day=2024-05-01/one.parquet"
-    warehouse.logs.write_file("one", rows("a"), DAY)
+    action = warehouse.logs.write_file("one", rows("a"), DAY)
+    path = warehouse.logs.path / action.path
     first = path.read_bytes()
-    warehouse.logs.write_file("one", rows("a"), DAY)
+    assert warehouse.logs.write_file("one", rows("a"), DAY).path == action.path
     assert path.read_bytes() == first
     assert not list(path.parent.glob(f"{TEMPORARY_PREFIX}*"))
+
+
+def test_a_file_is_named_by_its_checksum(warehouse: Warehouse) -> None:
+    action = warehouse.logs.write_file("one", rows("a"), DAY)
+    content = (warehouse.logs.path / action.path).read_bytes()
+    assert action.path == f"day=2024-05-01/one-{hashlib.sha256(content).hexdigest()[:32]}.parquet"
+    assert checksum_in(action.path) == checksum_of(content)
+    assert checksum_in("day=2024-05-01/smoke-0000-0123456789ab.parquet") is None
 
 
 def test_a_unit_lands_once_however_many_try(warehouse: Warehouse) -> None:
@@ -102,6 +111,61 @@ def test_a_root_that_is_a_file_is_told_with_a_next_step(tmp_path: Path) -> None:
         StorageError, match=r"Choose another --root|not a directory|Not a directory"
     ):
         Warehouse(tmp_path / "data").logs.write_file("one", rows("a"), DAY)
+
+
+def test_a_conflict_is_retried_and_the_last_one_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    waits: list[float] = []
+    monkeypatch.setattr("fleet_slip.storage.time.sleep", waits.append)
+    outcomes = [ConflictError("once"), ConflictError("twice"), "done"]
+
+    def attempt() -> object:
+        outcome = outcomes.pop(0) if outcomes else ConflictError("always")
+        if isinstance(outcome, ConflictError):
+            raise outcome
+        return outcome
+
+    assert retried(attempt) == "done"
+    assert len(waits) == 2
+    with pytest.raises(ConflictError, match="always"):
+        retried(attempt)
+    assert max(waits) <= 5
+
+
+def test_a_removal_conflicts_with_a_removal_of_the_same_file(warehouse: Warehouse) -> None:
+    for name in "ab":
+        action = warehouse.logs.write_file(name, rows(name, 10), DAY)
+        warehouse.logs.snapshot().commit(Change(add=[action]))
+    one, two = warehouse.logs.snapshot(), warehouse.logs.snapshot()
+    one.commit(Change(remove=one.files[:1]))
+    with pytest.raises(ConflictError, match="Run the same command again"):
+        two.commit(Change(remove=two.files[:1]))
+    assert len(warehouse.logs.snapshot().files) == 1
+
+
+def test_what_a_commit_adds_and_removes_stays(warehouse: Warehouse) -> None:
+    action = warehouse.logs.write_file("one", rows("a", 10), DAY)
+    warehouse.logs.snapshot().commit(Change(add=[action]))
+    snapshot = warehouse.logs.snapshot()
+    snapshot.commit(Change(add=[action], remove=snapshot.files))
+    assert [file.path for file in warehouse.logs.snapshot().files] == [action.path]
+
+
+@pytest.mark.parametrize(
+    ("number", "told"), [(28, "the disk is full"), (30, "read-only"), (13, "permission denied")]
+)
+def test_a_fault_during_a_commit_is_told_as_what_it_is(
+    warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch, number: int, told: str
+) -> None:
+    action = warehouse.logs.write_file("one", rows("a", 10), DAY)
+    warehouse.logs.snapshot().commit(Change(add=[action]))
+
+    def fail(*_arguments: object, **_options: object) -> None:
+        raise OSError(f"Generic LocalFileSystem error\n Unable to copy (os error {number})")
+
+    snapshot = warehouse.logs.snapshot()
+    monkeypatch.setattr("deltalake.DeltaTable.create_write_transaction", fail)
+    with pytest.raises(StorageError, match=told):
+        snapshot.commit(Change(add=[action]))
 
 
 def test_a_damaged_log_is_told(warehouse: Warehouse) -> None:
