@@ -179,7 +179,10 @@ class Scenario(Config):
 
 
 def _complete(content: Mapping[str, Any], derived: tuple[str, ...]) -> dict[str, Any]:
-    """Fill in what a scenario takes over from its base, and whose drive it is."""
+    """Fill in what a scenario takes over from its base, and whose drive it is.
+
+    `derived` names the scenarios that are made from this one. Raises `ValueError`.
+    """
     name, base = content.get("name"), content.get("base")
     if "drive" in content:
         raise ValueError("drive follows from the base and cannot be given")
@@ -187,20 +190,23 @@ def _complete(content: Mapping[str, Any], derived: tuple[str, ...]) -> dict[str,
         return {**content, "drive": name}
     if base == name or base in derived:
         raise ValueError(f"the base {base!r} leads back to this scenario")
-    try:
-        settings = load_toml(find_config("scenarios", str(base)))
-    except ConfigError as error:
-        raise ValueError(str(error)) from None
-    inherited = _complete(settings, (*derived, str(name)))
-    changes = set(content) - NOT_INHERITED
+    inherited = _complete(_settings(str(base)), (*derived, str(name)))
+    changes = sorted(set(content) - NOT_INHERITED)
     if "failures" in content and changes:
         raise ValueError(
             f"a scenario with failures takes the drive of its base as it is, without "
-            f"{', '.join(sorted(changes))}"
+            f"{', '.join(changes)}"
         )
     drive = inherited["drive"] if "failures" in content else name
     kept = {key: value for key, value in inherited.items() if key not in NOT_INHERITED}
     return {**_merged(kept, content), "drive": drive}
+
+
+def _settings(name: str) -> dict[str, Any]:
+    try:
+        return load_toml(find_config("scenarios", name))
+    except ConfigError as error:
+        raise ValueError(str(error)) from None
 
 
 def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

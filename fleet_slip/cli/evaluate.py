@@ -9,7 +9,8 @@ import typer
 
 from fleet_slip.cli.data import Threads
 from fleet_slip.cli.models import registry_of
-from fleet_slip.cli.output import Json, print_json, print_table, progress, say
+from fleet_slip.cli.output import Json, print_json, print_table, progress, say, stdout
+from fleet_slip.cli.recorded import recorded
 from fleet_slip.cli.run import DEFAULT_CAMPAIGN
 
 OneCar = Annotated[
@@ -38,6 +39,7 @@ def register(app: typer.Typer) -> None:
     app.command()(evaluate)
 
 
+@recorded
 def evaluate(
     context: typer.Context,
     one_car: OneCar = DEFAULT_CAMPAIGN,
@@ -165,7 +167,10 @@ def _print_checks(checks: Sequence[dict[str, Any]]) -> None:
     )
     for check in checks:
         if not check["reached"]:
-            say(f"missed: {check['requirement']}, {check['estimator']}. {check['explanation']}")
+            stdout().print(
+                f"missed: {check['requirement']}, {check['estimator']}. {check['explanation']}",
+                markup=False,
+            )
 
 
 def _print_comparisons(comparisons: Sequence[dict[str, Any]]) -> None:

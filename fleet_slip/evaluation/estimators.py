@@ -89,6 +89,8 @@ class Training:
             "kind": "regression",
             "group": self.version.reference,
             "cohort": self.selection.cohort.condition,
+            "drives": self.selection.cohort.drives.num_rows,
+            "rows": self.selection.cohort.rows,
         }
         fitted = {
             self.table_one[model.name]: {

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Field:
+class Competitors:
     """All estimators that compete, by name, and what a document says of each."""
 
     one_car: Training
@@ -34,19 +34,22 @@ class Field:
 class Evaluation:
     """Everything that an evaluation found, with the drives and estimates behind it."""
 
-    field: Field
+    competitors: Competitors
     runs: tuple[Run, ...]
     checks: tuple[Check, ...]
     comparisons: tuple[Comparison, ...]
 
     def as_dict(self) -> dict[str, Any]:
         """Return the evaluation's document."""
+        cohort = self.competitors.one_car.selection.cohort
         return document(
             self.runs,
-            self.field.descriptions,
+            self.competitors.descriptions,
+            logs_version=cohort.logs_version,
+            grams_version=cohort.grams_version,
             checks=[check.as_dict() for check in self.checks],
             comparisons=[comparison.as_dict() for comparison in self.comparisons],
-            rivals=[rival.as_dict() for rival in self.field.rivals],
+            rivals=[rival.as_dict() for rival in self.competitors.rivals],
         )
 
 
@@ -57,7 +60,7 @@ def gather(
     executor: Executor,
     *,
     rivals: bool,
-) -> Field:
+) -> Competitors:
     """Fit, tune and train all that compete, on cohorts without any drive of a scenario.
 
     Filters and learned rivals get the training drives of the one-car model.
@@ -71,7 +74,7 @@ def gather(
         estimators |= trained.estimators()
         descriptions |= trained.descriptions()
     bank = filter_bank(warehouse, first.selection.cohort, load_scenario("nominal").car, executor)
-    return Field(
+    return Competitors(
         one_car=first,
         fleets=others,
         rivals=learned,
@@ -92,17 +95,19 @@ def evaluate(
     rivals: bool = False,
 ) -> Evaluation:
     """Evaluate a model and all that competes with it on scenarios that are in the logs."""
-    field = gather(warehouse, one_car, fleets, executor, rivals=rivals)
-    runs = run_all(warehouse, scenarios, field.estimators)
-    first = field.one_car
+    competitors = gather(warehouse, one_car, fleets, executor, rivals=rivals)
+    runs = run_all(warehouse, scenarios, competitors.estimators)
+    first = competitors.one_car
     return Evaluation(
-        field=field,
+        competitors=competitors,
         runs=runs,
         checks=(
             *checks(runs, first.table_one, first.estimators()),
             *filter_checks(runs, first.table_one),
         ),
-        comparisons=tuple(row for fleet in field.fleets for row in compare(runs, first, fleet)),
+        comparisons=tuple(
+            row for fleet in competitors.fleets for row in compare(runs, first, fleet)
+        ),
     )
 
 

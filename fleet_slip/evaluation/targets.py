@@ -4,7 +4,7 @@ Table II and the sentences of sections III.A to III.D, put into numbers.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,12 +18,78 @@ from fleet_slip.signals import catalogue
 TABLE_TWO_STD_DEG = {"1": 0.3018, "2": 0.1754, "3": 0.1556, "4": 0.1549, "5": 0.1505}
 """The paper's error standard deviations on its nominal drive."""
 
-LARGEST_MEAN_DEG = 0.02
-LARGEST_NOISE_GROWTH_DEG = 0.1
-LARGEST_MASS_CHANGE_DEG = 0.1
-LEAST_CORRELATION_AT_0_7 = 0.95
-LEAST_CORRELATION_AT_0_4 = 0.9
-LARGEST_CORRELATION_LOSS = 0.05
+
+@dataclass(frozen=True)
+class Requirement:
+    """A limit on a figure of a scenario, which may be compared with that of the nominal drive.
+
+    `found` takes the figures of the nominal drive and those of the scenario outside of unstable
+    sections. The limit is a largest value, or the `least` one.
+    """
+
+    text: str
+    scenario: str
+    found: Callable[[ErrorFigures, ErrorFigures], float]
+    limit: float
+    least: bool = False
+
+
+def _requirements(table_one: str) -> tuple[Requirement, ...]:
+    """Return what is asked of a model of Table I."""
+    return (
+        Requirement(
+            "nominal: error std at most Table II's, deg",
+            "nominal",
+            lambda _, here: _number(here.error_std_deg),
+            TABLE_TWO_STD_DEG[table_one],
+        ),
+        Requirement(
+            "nominal: size of the mean error at most 0.02, deg",
+            "nominal",
+            lambda _, here: abs(_number(here.error_mean_deg)),
+            0.02,
+        ),
+        Requirement(
+            "noise doubled: error std grows by at most 0.1, deg",
+            NOISE,
+            lambda nominal, here: _number(here.error_std_deg) - _number(nominal.error_std_deg),
+            0.1,
+        ),
+        *(
+            Requirement(
+                f"{mass}: error std within 0.1 of nominal, deg",
+                mass,
+                lambda nominal, here: abs(
+                    _number(here.error_std_deg) - _number(nominal.error_std_deg)
+                ),
+                0.1,
+            )
+            for mass in ("mass_1000", "mass_1740")
+        ),
+        Requirement(
+            "adhesion 0.7: correlation at least 0.95",
+            "adhesion_0_7",
+            lambda _, here: _number(here.correlation),
+            0.95,
+            least=True,
+        ),
+        Requirement(
+            "adhesion 0.4: correlation at least 0.9 while stable",
+            "adhesion_0_4",
+            lambda _, here: _number(here.correlation),
+            0.9,
+            least=True,
+        ),
+        Requirement(
+            "Melbourne: correlation lower than nominal by at most 0.05",
+            "melbourne",
+            lambda nominal, here: _number(nominal.correlation) - _number(here.correlation),
+            0.05,
+        ),
+    )
+
+
+NOISE = "noise_doubled"
 
 
 @dataclass(frozen=True)
@@ -54,90 +120,36 @@ def checks(
 ) -> tuple[Check, ...]:
     """Check the models of Table I, given the name of each one's estimator.
 
-    A requirement whose scenarios are not among the runs is left out.
+    A requirement whose scenario is not among the runs is left out, and all without the nominal one.
     """
     by_name = {run.scenario.name: run for run in runs}
+    if "nominal" not in by_name:
+        return ()
     found = [
-        check
+        _check(requirement, by_name["nominal"], by_name[requirement.scenario], name, estimators)
         for number, name in models.items()
-        for check in _checks(by_name, number, name, estimators[name])
+        for requirement in _requirements(number)
+        if requirement.scenario in by_name
     ]
     order = list(dict.fromkeys(check.requirement for check in found))
     return tuple(sorted(found, key=lambda check: order.index(check.requirement)))
 
 
-def _checks(
-    runs: Mapping[str, Run], number: str, name: str, model: LinearEstimate
-) -> Iterator[Check]:
-    if "nominal" not in runs:
-        return
-    nominal = runs["nominal"]
-    before = nominal.results[name].whole
-
-    def check(requirement: str, run: Run, found: float, limit: float, why: str) -> Check:
-        # Limits of correlation are lower ones, all others upper ones.
-        reached = found >= limit if "at least" in requirement else found <= limit
-        return Check(
-            requirement, run.scenario.name, name, found, limit, reached, "" if reached else why
-        )
-
-    yield check(
-        "nominal: error std at most Table II's, deg",
-        nominal,
-        _number(before.error_std_deg),
-        TABLE_TWO_STD_DEG[number],
-        _compliance(nominal, nominal),
-    )
-    yield check(
-        f"nominal: size of the mean error at most {LARGEST_MEAN_DEG}, deg",
-        nominal,
-        abs(_number(before.error_mean_deg)),
-        LARGEST_MEAN_DEG,
-        _compliance(nominal, nominal),
-    )
-    if (run := runs.get("noise_doubled")) is not None:
-        grown = _number(run.results[name].whole.error_std_deg) - _number(before.error_std_deg)
-        yield check(
-            f"noise: error std grows by at most {LARGEST_NOISE_GROWTH_DEG}, deg",
-            run,
-            grown,
-            LARGEST_NOISE_GROWTH_DEG,
-            _noise(model, nominal, run),
-        )
-    for mass in ("mass_1000", "mass_1740"):
-        if (run := runs.get(mass)) is not None:
-            std = _number(run.results[name].whole.error_std_deg)
-            yield check(
-                f"{mass}: error std within {LARGEST_MASS_CHANGE_DEG} of nominal, deg",
-                run,
-                abs(std - _number(before.error_std_deg)),
-                LARGEST_MASS_CHANGE_DEG,
-                _compliance(run, nominal),
-            )
-    if (run := runs.get("adhesion_0_7")) is not None:
-        yield check(
-            f"adhesion 0.7: correlation at least {LEAST_CORRELATION_AT_0_7}",
-            run,
-            _number(run.results[name].whole.correlation),
-            LEAST_CORRELATION_AT_0_7,
-            _compliance(run, nominal),
-        )
-    if (run := runs.get("adhesion_0_4")) is not None:
-        yield check(
-            f"adhesion 0.4: correlation at least {LEAST_CORRELATION_AT_0_4} while stable",
-            run,
-            _number(stable(run, name).correlation),
-            LEAST_CORRELATION_AT_0_4,
-            _compliance(run, nominal),
-        )
-    if (run := runs.get("melbourne")) is not None:
-        yield check(
-            f"Melbourne: correlation lower than nominal by at most {LARGEST_CORRELATION_LOSS}",
-            run,
-            _number(before.correlation) - _number(run.results[name].whole.correlation),
-            LARGEST_CORRELATION_LOSS,
-            _compliance(run, nominal),
-        )
+def _check(
+    requirement: Requirement,
+    nominal: Run,
+    run: Run,
+    name: str,
+    estimators: Mapping[str, LinearEstimate],
+) -> Check:
+    found = requirement.found(nominal.results[name].whole, stable(run, name))
+    limit = requirement.limit
+    reached = found >= limit if requirement.least else found <= limit
+    explanation = ""
+    if not reached:
+        noisy = run.scenario.name == NOISE
+        explanation = _noise(estimators[name], nominal, run) if noisy else _compliance(run, nominal)
+    return Check(requirement.text, run.scenario.name, name, found, limit, reached, explanation)
 
 
 FILTER_SCENARIOS = ("nominal", "gps_clear", "gps_urban", "gps_tunnel")

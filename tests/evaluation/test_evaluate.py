@@ -158,3 +158,12 @@ def test_every_check_of_the_paper_is_made(root: Path) -> None:
     assert made == {"nominal", "adhesion 0.4"}
     for check in content["checks"]:
         assert check["reached"] == (not check["explanation"])
+    (at_0_4,) = [
+        check
+        for check in content["checks"]
+        if check["scenario"] == "adhesion_0_4" and check["estimator"] == "smoke@1/4"
+    ]
+    run = next(one for one in content["scenarios"] if one["name"] == "adhesion_0_4")
+    outside = run["results"]["smoke@1/4"]["outside"]["unstable"]
+    assert at_0_4["found"] == outside["correlation"]
+    assert at_0_4["reached"] == (outside["correlation"] >= 0.9)
