@@ -205,6 +205,19 @@ class FeatureCatalogue(Config):
         digest = hashlib.sha256(canonical_json(content).encode()).hexdigest()
         return f"{name}-{digest[:12]}"
 
+    def name_of(self, identity: str) -> str:
+        """Return the name of the set that Gram rows are of, if it is still defined like that.
+
+        Raises `SelectionError` otherwise.
+        """
+        name = identity.rpartition("-")[0] or identity
+        if name in {PLAIN, *self.sets} and self.identity(name) == identity:
+            return name
+        raise SelectionError(
+            f"the feature set {identity} is not defined as it was then: configs/features.toml has "
+            "changed. Publish the model again."
+        )
+
     def _definition(self, name: str) -> Mapping[str, str]:
         feature = self.features[name]
         return {"sql": feature.sql, "scale": str(feature.scale), "unit": feature.unit}

@@ -1,5 +1,6 @@
 """The `fleet-slip` command: its options, its commands and its exit codes."""
 
+import logging
 import sys
 from importlib.metadata import version
 from pathlib import Path
@@ -7,7 +8,8 @@ from typing import Annotated
 
 import typer
 
-from fleet_slip.cli import data, evaluate, models, query, run, selecting
+from fleet_slip.cli import data, evaluate, models, query, report, run, selecting, statistics
+from fleet_slip.cli.logs import LOG_VARIABLE, LogFormat, configure_logs
 from fleet_slip.cli.output import say
 from fleet_slip.connection import ROOT_VARIABLE, data_root
 from fleet_slip.errors import FleetSlipError
@@ -25,7 +27,7 @@ app = typer.Typer(
         "cannot answer, 6 storage, 7 refused, 8 a conflict with another process, 130 interrupted."
     ),
 )
-for module in (run, data, selecting, models, evaluate, query):
+for module in (run, data, selecting, models, statistics, evaluate, report, query):
     module.register(app)
 
 
@@ -44,6 +46,14 @@ def options(
             help=f"Data root. Default: ${ROOT_VARIABLE}, else ./data.", show_default=False
         ),
     ] = None,
+    log: Annotated[
+        LogFormat,
+        typer.Option(
+            envvar=LOG_VARIABLE,
+            help="Remarks on stderr: text, json (one object a line), or auto: text on a terminal, "
+            "json elsewhere.",
+        ),
+    ] = LogFormat.AUTO,
     _version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print it.")
     ] = False,
@@ -55,18 +65,20 @@ def options(
 
     Start with: **fleet-slip run --campaign smoke**
     """
+    configure_logs(log)
     context.obj = Warehouse(data_root(root))
 
 
 def main() -> None:
     """Run the command line; an expected error becomes one line on stderr and its exit code."""
+    configure_logs(LogFormat.AUTO)
     try:
         app()
     except FleetSlipError as error:
-        say(f"error: {error}")
+        say(f"error: {error}", logging.ERROR)
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
-        say("interrupted; run the same command again to go on.")
+        say("interrupted; run the same command again to go on.", logging.WARNING)
         sys.exit(INTERRUPTED)
     except BrokenPipeError:
         sys.stderr.close()

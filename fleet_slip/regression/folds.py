@@ -165,5 +165,5 @@ class CohortFolds:
                 f"fold {', '.join(empty)} has no rows with all of {', '.join(signals)}. Choose "
                 "fewer folds, another key to fold by, or fewer signals."
             )
-        drives = np.unique(np.concatenate([self.drives[i] for i in served]))
-        return Folds(folds, self.names, len(drives))
+        rows_of_drive = np.bincount(np.concatenate([self.drives[i] for i in served]))
+        return Folds(folds, self.names, int(np.count_nonzero(rows_of_drive)))

@@ -197,6 +197,47 @@ def chow(groups: Sequence[Gram], inputs: Sequence[str], label: str) -> ChowTest:
     return ChowTest(f, numerator, denominator, special.f_upper(f, numerator, denominator))
 
 
+@dataclass(frozen=True)
+class WaldTest:
+    """Test that two models have the same coefficients, drives counting as independent.
+
+    Attributes:
+        f: the statistic, Wald's over its number of coefficients.
+        numerator, denominator: degrees of freedom of the F distribution.
+        p: probability of a larger f if the coefficients are the same.
+    """
+
+    f: float
+    numerator: int
+    denominator: int
+    p: float
+
+
+def wald(one: Fit, one_drives: DriveMoments, other: Fit, other_drives: DriveMoments) -> WaldTest:
+    """Compare the coefficients of the same model fitted to two sets of drives.
+
+    F = d'(V_1 + V_2)^-1 d / (k + 1), d the difference and V the cluster-robust covariances; its
+    denominator is the number of drives minus two (Cameron and Miller 2015). Unlike `chow`, it does
+    not take neighbouring rows for independent. Raises `SelectionError` with fewer drives than
+    coefficients.
+    """
+    size, drives = one.size + 1, len(one_drives) + len(other_drives)
+    if min(len(one_drives), len(other_drives)) <= size:
+        raise SelectionError(
+            f"comparing {size} coefficients by drives needs more than {size} drives in each cohort."
+        )
+    gap = [a - b for a, b in zip(_numbers(one), _numbers(other), strict=True)]
+    covariance = cluster_covariance(one, one_drives) + cluster_covariance(other, other_drives)
+    spread = np.sqrt(np.diag(covariance))
+    d = np.array([float(x) for x in gap]) / spread
+    f = float(d @ np.linalg.solve(covariance / np.outer(spread, spread), d)) / size
+    return WaldTest(f, size, drives - 2, special.f_upper(f, size, drives - 2))
+
+
+def _numbers(fitted: Fit) -> list[Fraction]:
+    return [fitted.model.intercept, *fitted.model.coefficients]
+
+
 def _columns(fitted: Fit, drives: DriveMoments) -> list[int]:
     return [0, *(drives.signals.index(name) + 1 for name in fitted.model.signals)]
 

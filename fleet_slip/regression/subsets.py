@@ -21,7 +21,6 @@ from fleet_slip.gram import Gram
 from fleet_slip.regression.criteria import CRITERIA, subset_values
 from fleet_slip.regression.evidence import Evidence
 from fleet_slip.regression.exact import Fit, correlation_matrix, dependence, fit
-from fleet_slip.regression.leaps import best_by_leaps
 from fleet_slip.regression.special import FloatArray
 
 DOUBLING_LIMIT = 22
@@ -101,6 +100,9 @@ def candidates(matrix: FloatArray, count: int) -> list[list[int]]:
     """Return bit masks of the `count` best subsets of each size, by float64 RSS."""
     k = len(matrix) - 1
     if k > DOUBLING_LIMIT:
+        # Compiled code, whose library takes longer to start than most selections.
+        from fleet_slip.regression.leaps import best_by_leaps  # noqa: PLC0415
+
         return best_by_leaps(matrix, count)
     rss = all_rss(matrix)
     sizes = subset_sizes(k)

@@ -1,0 +1,474 @@
+"""Commands that examine models on Gram rows: features, diagnose, what-if, regimes, shrink."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import typer
+
+from fleet_slip.cli.models import registry_of
+from fleet_slip.cli.output import Json, print_json, print_table, say, stdout
+from fleet_slip.cli.selecting import Cohort, FoldCount, Naive
+from fleet_slip.cohort import TRAINING_DRIVES, load_cohort
+from fleet_slip.diagnostics import Diagnosis, diagnose
+from fleet_slip.errors import ConfigError, SelectionError
+from fleet_slip.features import PLAIN, FeatureSet, features
+from fleet_slip.model_list import FoldKey, FoldPlan
+from fleet_slip.regime_comparison import RegimeComparison, compare_regimes
+from fleet_slip.registry import ModelVersion, Registry
+from fleet_slip.regression.exact import fit
+from fleet_slip.regression.figures import Figures
+from fleet_slip.regression.inference import INTERCEPT, Estimate
+from fleet_slip.selection_plan import WHOLE_SET, inputs_of
+from fleet_slip.shrinkage import compare_shrinkage
+from fleet_slip.signals import catalogue
+from fleet_slip.warehouse import Warehouse
+from fleet_slip.what_if import WhatIf, counts_model, what_if
+
+Model = Annotated[
+    str | None,
+    typer.Argument(
+        help="NAME, NAME@VERSION or NAME@ALIAS of a published model. Default: the only one that "
+        "there is, unless --signals is given.",
+        show_default=False,
+    ),
+]
+Signals = Annotated[
+    str | None,
+    typer.Option(
+        help="Instead of a published model: signals to fit, separated by commas; 'catalogue' is "
+        "all inputs."
+    ),
+]
+FeatureSetOption = Annotated[
+    str | None,
+    typer.Option(
+        "--features", help="Feature set that --signals are of. Default: the logged signals."
+    ),
+]
+By = Annotated[FoldKey, typer.Option(help="What a fold is made of.")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this module."""
+    app.command("features")(list_features)
+    app.command("diagnose")(diagnose_model)
+    app.command("what-if")(what_if_sensors)
+    app.command("regimes")(regimes)
+    app.command("shrink")(shrink)
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What a command examines: the inputs of a published model, or named ones."""
+
+    feature_set: str
+    named: str | None
+    version: ModelVersion | None
+
+    def inputs(self, warehouse: Warehouse, condition: str) -> tuple[str, ...]:
+        """Return the inputs; all that the cohort has, if that was asked for."""
+        if self.version is not None:
+            return self.version.manifest.signals
+        cohort = load_cohort(warehouse, condition, self.feature_set)
+        return inputs_of(cohort, self.named or WHOLE_SET)
+
+
+def subject_of(
+    warehouse: Warehouse, reference: str | None, signals: str | None, feature_set: str | None
+) -> Subject:
+    """Return what is to be examined. Raises `ConfigError` if a model and signals are named."""
+    if signals is not None or feature_set is not None:
+        if reference is not None:
+            raise ConfigError("name a published model or --signals (of --features), not both.")
+        return Subject(feature_set or PLAIN, signals, None)
+    registry = registry_of(warehouse)
+    version = registry.resolve(reference or _only_model(registry))
+    identity = version.manifest.trained_on.feature_set
+    return Subject(features().name_of(identity), None, version)
+
+
+def _only_model(registry: Registry) -> str:
+    names = registry.names()
+    if len(names) == 1:
+        return names[0]
+    known = ", ".join(names) or "none"
+    raise SelectionError(f"name a published model, or --signals. Published: {known}.")
+
+
+def list_features(
+    sets: Annotated[
+        bool, typer.Option("--sets", help="List the feature sets instead of the features.")
+    ] = False,
+    json: Json = False,
+) -> None:
+    """List the features and feature sets of configs/features.toml.
+
+    Features are integer functions of the logged counts, such as yaw rate over speed. Compute the
+    Gram rows of a set with: **fleet-slip gram --features NAME**, then use it with: **fleet-slip
+    select --features NAME**
+    """
+    known = features()
+    if json:
+        print_json(
+            {
+                "features": {
+                    name: {**one.model_dump(mode="json"), "sql": one.sql}
+                    for name, one in known.features.items()
+                },
+                "sets": {
+                    name: {"identity": known.identity(name), **known.set(name).model_dump()}
+                    for name in (PLAIN, *known.sets)
+                },
+            }
+        )
+    elif sets:
+        print_table(
+            "",
+            ["set", "columns", "rows of a drive", "description"],
+            [
+                [name, " ".join(known.set(name).inputs), _parts(known.set(name)), one.description]
+                for name, one in ((n, known.set(n)) for n in (PLAIN, *known.sets))
+            ],
+            left=4,
+        )
+    else:
+        print_table(
+            "",
+            ["feature", "unit", "scale", "from", "description"],
+            [
+                [name, one.unit, str(one.scale), " ".join(one.inputs), one.description]
+                for name, one in known.features.items()
+            ],
+            left=5,
+        )
+
+
+def _parts(one: FeatureSet) -> str:
+    if one.regimes:
+        return f"by {' and '.join(one.regimes)}"
+    if one.row_folds:
+        return f"{one.row_folds} folds of rows"
+    return "with the one before" if one.lagged else "together"
+
+
+def quantities(values: Sequence[str] | None, option: str) -> dict[str, float]:
+    """Return what options like `--noise ay=0.2` say, in SI units. Raises `ConfigError`."""
+    found = {}
+    for value in values or ():
+        name, _, number = value.partition("=")
+        try:
+            found[name.strip()] = float(number)
+        except ValueError:
+            raise ConfigError(
+                f"{option} {value}: write SIGNAL=NUMBER in SI units, such as ay=0.2."
+            ) from None
+    return found
+
+
+def diagnose_model(
+    context: typer.Context,
+    model: Model = None,
+    signals: Signals = None,
+    feature_set: FeatureSetOption = None,
+    cohort: Cohort = TRAINING_DRIVES,
+    against: Annotated[
+        str | None,
+        typer.Option(help="Condition of another cohort: does it have the same coefficients?"),
+    ] = None,
+    serial: Annotated[
+        bool,
+        typer.Option(
+            "--serial",
+            help="Durbin-Watson and AR(1) generalised least squares, from lagged Gram rows: "
+            "fleet-slip gram --features lags",
+        ),
+    ] = False,
+    sensor_noise: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Noise that the logs already have, such as ay=0.1 in SI units: shows the "
+            "coefficients without it (errors in variables). May be repeated."
+        ),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Fit a model's signals to a cohort and examine the fit, from Gram rows.
+
+    Standard errors by drives are the ones to believe: at 100 Hz a row says little that the one
+    before did not say.
+    """
+    subject = subject_of(context.obj, model, signals, feature_set)
+    inputs = subject.inputs(context.obj, cohort)
+    result = diagnose(
+        load_cohort(context.obj, cohort, subject.feature_set),
+        inputs,
+        lagged=load_cohort(context.obj, cohort, _lagged_set()) if serial else None,
+        against=load_cohort(context.obj, against, subject.feature_set) if against else None,
+        sensor_noise=quantities(sensor_noise, "--sensor-noise"),
+    )
+    if json:
+        print_json({"cohort": cohort, **result.as_dict()})
+    else:
+        _print_diagnosis(result)
+
+
+def _lagged_set() -> str:
+    return next(name for name, one in features().sets.items() if one.lagged)
+
+
+def _print_diagnosis(result: Diagnosis) -> None:
+    print_table(
+        f"{result.drives:,} drives, {result.fitted.gram.n:,} rows, worth "
+        f"{result.evidence.rows:,.0f} independent ones; R squared {result.fitted.r_squared:.4f}, "
+        f"condition {result.condition_number:.3g}",
+        _coefficient_header(result),
+        _coefficient_rows(result),
+        left=2,
+    )
+    if result.serial is not None:
+        found = result.serial
+        stdout().print(
+            f"residuals: correlation {found.correlation.rho:.4f} with the row before, "
+            f"Durbin-Watson {found.correlation.durbin_watson:.4f} (2 if independent); AR(1) with rho "
+            f"{found.autoregressive.rho:.4f}.",
+            markup=False,
+        )
+    if result.comparison is not None:
+        _print_comparison(result)
+
+
+def _coefficient_header(result: Diagnosis) -> list[str]:
+    header = ["signal", "unit", "coefficient", "s.e. by drives", "t", "s.e. by rows", "VIF"]
+    if result.serial is not None:
+        header += ["AR(1)", "s.e. AR(1)"]
+    if result.noise_free is not None:
+        header += ["without noise"]
+    return header
+
+
+def _coefficient_rows(result: Diagnosis) -> list[list[str]]:
+    rows = []
+    for i, (robust, naive) in enumerate(
+        zip(result.robust.estimates, result.naive.estimates, strict=True)
+    ):
+        constant = robust.name == INTERCEPT
+        row = [
+            robust.name,
+            catalogue()[catalogue().label].unit if constant else features().of(robust.name).unit,
+            f"{robust.value:.6g}",
+            f"{robust.standard_error:.2g}",
+            f"{robust.t:.1f}",
+            f"{naive.standard_error:.2g}",
+            "" if constant else f"{result.inflation[robust.name]:.3g}",
+        ]
+        if result.serial is not None:
+            estimate = result.serial.inference.estimates[i]
+            slope = [f"{estimate.value:.6g}", f"{estimate.standard_error:.2g}"]
+            row += ["", ""] if constant else slope
+        if result.noise_free is not None:
+            free = result.noise_free
+            row += [f"{free.offset if constant else free.weights[robust.name]:.6g}"]
+        rows.append(row)
+    return rows
+
+
+def _print_comparison(result: Diagnosis) -> None:
+    found = result.comparison
+    if found is None:
+        return
+    print_table(
+        f"\nthe same signals where {found.condition}",
+        ["signal", "coefficient here", "there", "s.e. there", "difference / s.e."],
+        [
+            [
+                here.name,
+                f"{here.value:.6g}",
+                f"{there.value:.6g}",
+                f"{there.standard_error:.2g}",
+                f"{_standardised(here, there):+.1f}",
+            ]
+            for here, there in zip(result.robust.estimates, found.other.estimates, strict=True)
+        ],
+    )
+    for test, kind in ((found.drives, "Wald, by drives"), (found.rows, "Chow, by rows")):
+        stdout().print(
+            f"the same coefficients? {kind}: F({test.numerator}, {test.denominator}) = "
+            f"{test.f:,.2f}, p = {test.p:.2g}.",
+            markup=False,
+        )
+    if found.drives.p > 0.05 >= found.rows.p:
+        say("by drives, the difference is no more than chance: the rows only look like evidence.")
+
+
+def _standardised(here: Estimate, there: Estimate) -> float:
+    spread = float((here.standard_error**2 + there.standard_error**2) ** 0.5)
+    return (there.value - here.value) / spread
+
+
+def what_if_sensors(
+    context: typer.Context,
+    model: Model = None,
+    noise: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="White noise that is added, as SIGNAL=STANDARD_DEVIATION in SI units, such as "
+            "ay=0.2. May be repeated."
+        ),
+    ] = None,
+    bias: Annotated[
+        list[str] | None,
+        typer.Option(help="Bias that is added, such as yaw_rate=0.02. May be repeated."),
+    ] = None,
+    signals: Signals = None,
+    feature_set: FeatureSetOption = None,
+    cohort: Cohort = TRAINING_DRIVES,
+    json: Json = False,
+) -> None:
+    """Predict a model's error with worse sensors, in closed form; nothing is simulated.
+
+    Bias and noise come on top of what the logs have. Shown too: the best model for such sensors.
+
+    **fleet-slip what-if waterford --noise ay=0.2 --bias yaw_rate=0.02**
+    """
+    noises, biases = quantities(noise, "--noise"), quantities(bias, "--bias")
+    if not noises and not biases:
+        raise ConfigError("say what is added: --noise ay=0.2 or --bias yaw_rate=0.02.")
+    subject = subject_of(context.obj, model, signals, feature_set)
+    drives = load_cohort(context.obj, cohort, subject.feature_set)
+    if subject.version is not None:
+        one = counts_model(subject.version.manifest)
+    else:
+        inputs = inputs_of(drives, subject.named or WHOLE_SET)
+        one = fit(drives.serving(inputs).table.total(), inputs, catalogue().label).model
+    result = what_if(drives, one, bias=biases, noise=noises)
+    if json:
+        print_json({"cohort": cohort, "noise": noises, "bias": biases, **result.as_dict()})
+    else:
+        _print_what_if(result)
+
+
+def _print_what_if(result: WhatIf) -> None:
+    print_table(
+        f"{result.drives:,} drives, {result.before.rows:,} rows",
+        ["", "correlation", "RMSE deg", "mean deg", "std deg"],
+        [
+            ["as logged", *_error(result.before)],
+            ["with these sensors", *_error(result.after)],
+            ["best model for these sensors", *_error(result.refitted_after)],
+        ],
+    )
+    print_table(
+        "\nbest model for these sensors",
+        ["signal", "coefficient"],
+        [[INTERCEPT, f"{result.refitted.offset:.6g}"]]
+        + [[name, f"{weight:.6g}"] for name, weight in result.refitted.weights.items()],
+    )
+
+
+def _error(figures: Figures) -> list[str]:
+    return [
+        f"{figures.correlation:.4f}",
+        f"{figures.rmse_deg:.4f}",
+        f"{figures.error_mean_deg:+.4f}",
+        f"{figures.error_std_deg:.4f}",
+    ]
+
+
+def regimes(
+    context: typer.Context,
+    signals: Signals = None,
+    over: Annotated[
+        str | None,
+        typer.Option(
+            help="Regimes to divide by, separated by commas, such as speed. Default: all of the "
+            "set's."
+        ),
+    ] = None,
+    cohort: Cohort = TRAINING_DRIVES,
+    feature_set: Annotated[
+        str, typer.Option("--features", help="Feature set that divides rows by regimes.")
+    ] = "regimes",
+    by: By = "drive",
+    folds: FoldCount = None,
+    json: Json = False,
+) -> None:
+    """Show a model's error by speed and lateral acceleration, and whether to split it there.
+
+    One model for all rows is cross-validated against one for each regime. Needs Gram rows by
+    regime: **fleet-slip gram --features regimes**
+    """
+    drives = load_cohort(context.obj, cohort, feature_set)
+    inputs = inputs_of(drives, signals or WHOLE_SET)
+    plan = FoldPlan(by=by, count=folds or FoldPlan().count)
+    divided_by = [name.strip() for name in over.split(",")] if over else []
+    result = compare_regimes(drives, inputs, plan, divided_by)
+    if json:
+        print_json({"cohort": cohort, **result.as_dict()})
+    else:
+        _print_regimes(result, by)
+
+
+def _print_regimes(result: RegimeComparison, by: str) -> None:
+    print_table(
+        f"{result.drives:,} drives, {result.folds} folds by {by}: {' '.join(result.signals)}",
+        ["regime", "rows", "share", "pooled RMSE deg", "std", "split RMSE deg", "std", ""],
+        [
+            [
+                one.name,
+                f"{one.rows:,}",
+                f"{one.share:.1%}",
+                f"{one.pooled.rmse_deg:.4f}",
+                f"{one.pooled.error_std_deg:.4f}",
+                f"{one.split.rmse_deg:.4f}",
+                f"{one.split.error_std_deg:.4f}",
+                "" if one.own else "too few rows",
+            ]
+            for one in result.regimes
+        ],
+    )
+    one, own = result.pooled, result.split
+    better = "a model for each regime" if result.split_wins else "one model for all"
+    stdout().print(
+        f"one model: correlation {one.correlation:.4f}, RMSE {one.rmse_deg:.4f} deg; one for each "
+        f"regime: {own.correlation:.4f}, {own.rmse_deg:.4f} deg. Gain in correlation over the "
+        f"folds: {result.gain:+.4f} +- {result.gain_standard_error:.4f}. Choose {better}.",
+        markup=False,
+    )
+
+
+def shrink(
+    context: typer.Context,
+    signals: Signals = None,
+    feature_set: FeatureSetOption = None,
+    cohort: Cohort = TRAINING_DRIVES,
+    by: By = "drive",
+    folds: FoldCount = None,
+    naive: Naive = False,
+    json: Json = False,
+) -> None:
+    """Compare least squares with ridge, lasso, James-Stein and Pace regression.
+
+    Penalties are chosen by cross-validation inside each training fold. With many drives for each
+    signal there is little to shrink; with few drives, or many features, it shows here.
+    """
+    drives = load_cohort(context.obj, cohort, feature_set or PLAIN)
+    inputs = inputs_of(drives, signals or WHOLE_SET)
+    plan = FoldPlan(by=by, count=folds or FoldPlan().count)
+    found = compare_shrinkage(drives, inputs, plan, naive=naive)
+    if json:
+        print_json({"cohort": cohort, "methods": [one.as_dict() for one in found]})
+        return
+    print_table(
+        f"{found[0].cross_validation.drives:,} drives, {plan.count} folds by {by}",
+        ["method", "signals kept", "penalty", "correlation", "RMSE deg", "mean deg", "std deg"],
+        [
+            [
+                one.cross_validation.name,
+                f"{len(one.cross_validation.signals)} of {len(inputs)}",
+                "" if one.penalty is None else f"{one.penalty:.2g}",
+                *_error(one.cross_validation.pooled),
+            ]
+            for one in found
+        ],
+    )
