@@ -9,13 +9,15 @@ import duckdb
 import pyarrow as pa
 
 from fleet_slip.database import database_errors, open_database
+from fleet_slip.operations.run_log import FOLDER as RUN_FOLDER
+from fleet_slip.operations.run_log import RECORD_COLUMNS, run_files
 from fleet_slip.registry import Registry
 from fleet_slip.resources import read_sql
 from fleet_slip.signals import SAMPLE_TIME_S, SignalCatalogue
 from fleet_slip.storage import Snapshot
 from fleet_slip.warehouse import Warehouse
 
-VIEWS = ("log_counts", "log", "grams", "drives", "quarantine")
+VIEWS = ("log_counts", "log", "grams", "drives", "quarantine", "runs")
 """In the order of their dependence; each is a file in `warehouse/`."""
 
 DEFAULT_ROOT = Path("data")
@@ -32,9 +34,9 @@ def connect(
 ) -> duckdb.DuckDBPyConnection:
     """Return a DuckDB connection with the views of the warehouse at `root`.
 
-    `log` (SI units), `log_counts`, `drives`, `grams`, `models`, `quarantine` and `dictionary`,
-    which documents every column. The connection sees one snapshot; connect again to see later
-    commits. It can read the warehouse's files only, and its settings are locked.
+    `log` (SI units), `log_counts`, `drives`, `grams`, `models`, `quarantine`, `runs` and
+    `dictionary`, which documents every column. The connection sees one snapshot; connect again to
+    see later commits. It can read the warehouse's files only, and its settings are locked.
     """
     warehouse = Warehouse(data_root(root))
     database = open_database(threads=threads)
@@ -43,6 +45,7 @@ def connect(
         "stored_logs": _source(database, warehouse.logs.snapshot(), "log_files"),
         "stored_grams": _source(database, warehouse.grams.snapshot(), "gram_files"),
         "stored_quarantine": _source(database, warehouse.quarantine.snapshot(), "quarantine_files"),
+        "stored_runs": _run_source(database, warehouse.root),
     }
     with database_errors(f"opening the warehouse {warehouse.root}"):
         for view in VIEWS:
@@ -61,6 +64,17 @@ def _source(database: duckdb.DuckDBPyConnection, snapshot: Snapshot, variable: s
     empty = f"empty_{snapshot.table.path.name}"
     _add_table(database, empty, snapshot.table.schema.empty_table())
     return empty
+
+
+def _run_source(database: duckdb.DuckDBPyConnection, root: Path) -> str:
+    """Return what stands after FROM for the history of runs."""
+    columns = ", ".join(f"{name} {kind}" for name, kind in RECORD_COLUMNS.items())
+    files = run_files(root)
+    database.execute("SET VARIABLE run_files = $paths", {"paths": files})
+    if files:
+        return read_sql("warehouse", "stored_runs.sql").format(run_columns=RECORD_COLUMNS)
+    database.execute(f"CREATE TABLE empty_runs ({columns})")
+    return "empty_runs"
 
 
 def _add_table(database: duckdb.DuckDBPyConnection, name: str, rows: pa.Table) -> None:
@@ -118,7 +132,7 @@ _OTHER_COLUMNS = {
     "day": ("", "Date of the drive"),
     "tick": ("0.01 s", "Samples since the drive began; every drive has a row with tick 0"),
     "time_s": ("s", "Time since the drive began"),
-    "rows": ("", "Rows of the drive, as the Gram job counted them"),
+    "rows": ("", "Of a drive: as the Gram job counted them. Of a run: of its largest step"),
     "feature_set": (
         "",
         "Which columns were multiplied: signals, or a set of features.toml",
@@ -148,12 +162,27 @@ _OTHER_COLUMNS = {
     "cohort": ("", "SQL condition on drives that the model was trained on"),
     "drives": ("", "Number of drives that the model was trained on"),
     "sha256": ("", "Checksum of the manifest"),
+    "run_id": ("", "Name of a run of a command; sorts by the time of its start"),
+    "command": ("", "The command that ran"),
+    "arguments": ("", "Its command line, without what may be secret"),
+    "started_at": ("", "When the run started, by the clock of its host"),
+    "ended_at": ("", "When the run ended; null if it is under way or was killed"),
+    "outcome": ("", "done, failed or interrupted; null if the run is under way or was killed"),
+    "exit_code": ("", "Exit code of the command"),
+    "error": ("", "Why the run failed"),
+    "seconds": ("s", "How long the run took"),
+    "size_bytes": ("", "Size of the data files that the run wrote"),
+    "steps": ("", "Steps of the run: name, seconds, rows, size of the data files written"),
+    "host": ("", "Name of the machine"),
+    "process": ("", "Number of the process"),
+    "package_version": ("", "Version of fleet-slip"),
 }
 
 
 def _lock(database: duckdb.DuckDBPyConnection, root: Path) -> None:
-    folders = [str((root / name).resolve()) for name in ("logs", "grams", "quarantine")]
-    folders += [str(root / name) for name in ("logs", "grams", "quarantine")]
+    names = ("logs", "grams", "quarantine", RUN_FOLDER)
+    folders = [str((root / name).resolve()) for name in names]
+    folders += [str(root / name) for name in names]
     database.execute(f"SET allowed_directories = {folders!r}")
     database.execute("SET enable_external_access = false")
     database.execute("SET lock_configuration = true")

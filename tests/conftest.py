@@ -1,6 +1,7 @@
 """Fixtures that several tests share: a small warehouse, and the command line as a user runs it."""
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -19,6 +20,8 @@ from fleet_slip.warehouse import Warehouse
 
 COMMAND = str(Path(sys.executable).with_name("fleet-slip"))
 DAY = date(2024, 5, 1)
+
+os.environ["FLEET_SLIP_LOG"] = "text"  # a test reads what a person would
 
 
 @dataclass(frozen=True)

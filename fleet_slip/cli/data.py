@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from fleet_slip.cli.output import Json, print_json, print_table, progress, say
+from fleet_slip.cli.recorded import recorded
 from fleet_slip.errors import ConfigError
 from fleet_slip.features import PLAIN, features
 from fleet_slip.gram_job import GramReport, update_grams
 from fleet_slip.gram_statement import gram_statement
+from fleet_slip.operations.run_log import step
 from fleet_slip.signals import catalogue
 from fleet_slip.warehouse import Warehouse
 
@@ -73,18 +75,24 @@ def run_simulation(
     from fleet_slip.simulation_job import simulate_campaign  # noqa: PLC0415 - the simulator
 
     with (
+        step("simulate") as figures,
         ThreadPoolExecutor(threads or os.cpu_count()) as executor,
         progress(f"simulate {campaign.name}", "rows") as advance,
     ):
-        return simulate_campaign(warehouse, campaign, days, executor, advance)
+        report = simulate_campaign(warehouse, campaign, days, executor, advance)
+        figures.rows, figures.size_bytes = report.rows, report.size_bytes
+    return report
 
 
 def run_gram(warehouse: Warehouse, feature_set: str = PLAIN) -> GramReport:
     """Run the Gram job for a feature set with a progress bar."""
-    with progress(f"gram {feature_set}", "rows") as advance:
-        return update_grams(warehouse, advance, feature_set)
+    with step("gram") as figures, progress(f"gram {feature_set}", "rows") as advance:
+        report = update_grams(warehouse, advance, feature_set)
+        figures.rows = report.rows_read
+    return report
 
 
+@recorded
 def simulate(
     context: typer.Context,
     campaign: CampaignName,
@@ -109,6 +117,7 @@ def simulate(
         say(f"{plan.name}: nothing to do, all {report.batches_present} files are there")
 
 
+@recorded
 def ingest(
     context: typer.Context,
     files: Annotated[list[Path], typer.Argument(help="CSV or Parquet files.", show_default=False)],
@@ -127,7 +136,9 @@ def ingest(
     plan = load_mapping(mapping)
     reports = []
     for file in files:
-        report = ingest_file(context.obj, file, plan).as_dict()
+        with step("ingest") as figures:
+            report = ingest_file(context.obj, file, plan).as_dict()
+            figures.rows = report["ticks"] if report["new"] else 0
         reports.append(report)
         if not json:
             say(_ingested(report))
@@ -144,6 +155,7 @@ def _ingested(report: dict[str, Any]) -> str:
     )
 
 
+@recorded
 def gram(
     context: typer.Context,
     feature_set: Annotated[

@@ -5,6 +5,7 @@ from typing import Annotated, Any
 import typer
 
 from fleet_slip.cli.output import Json, print_json, print_table, say
+from fleet_slip.cli.recorded import recorded
 from fleet_slip.cli.selecting import (
     AllSubsets,
     Cohort,
@@ -20,6 +21,7 @@ from fleet_slip.cli.selecting import (
 )
 from fleet_slip.cohort import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.model_list import check_model_name
+from fleet_slip.operations.run_log import step
 from fleet_slip.publishing import Publication, manifest_of
 from fleet_slip.publishing import publish as publish_selection
 from fleet_slip.registry import CHAMPION, ModelVersion, Registry
@@ -43,6 +45,7 @@ def registry_of(warehouse: Warehouse) -> Registry:
     return Registry(warehouse.root / "models")
 
 
+@recorded
 def publish(
     context: typer.Context,
     name: Annotated[str, typer.Argument(help="Name of the model, such as sideslip.")],
@@ -78,7 +81,8 @@ def publish(
         all_subsets=all_subsets,
         naive=naive,
     )
-    planned = run_plan(context.obj, plan)
+    with step("select"):
+        planned = run_plan(context.obj, plan)
     selection = planned.selection
     manifest = manifest_of(selection, name, planned.label, planned.config_sha256)
     publication = publish_selection(registry_of(context.obj), manifest, selection, force=force)
@@ -217,6 +221,7 @@ def _print_version(version: ModelVersion) -> None:
     )
 
 
+@recorded
 def promote(
     context: typer.Context,
     reference: Annotated[str, typer.Argument(help="NAME@VERSION to point the alias at.")],
@@ -230,6 +235,7 @@ def promote(
     say(f"{version.manifest.name}@{alias} is now version {version.version}")
 
 
+@recorded
 def rollback(
     context: typer.Context,
     name: Annotated[str, typer.Argument(help="Name of the model.")],

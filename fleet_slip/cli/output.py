@@ -1,6 +1,7 @@
 """What commands print: JSON for machines, tables for people, progress on stderr."""
 
 import json
+import logging
 import math
 import os
 import sys
@@ -23,6 +24,9 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
+from fleet_slip.cli.logs import for_people, stderr
+from fleet_slip.operations.run_log import LOGGER
+
 Json = Annotated[bool, typer.Option("--json", help="Print machine-readable JSON on stdout.")]
 
 
@@ -31,14 +35,9 @@ def stdout() -> Console:
     return Console(width=None if sys.stdout.isatty() else 200, highlight=False, emoji=False)
 
 
-def stderr() -> Console:
-    """Return a console for progress and remarks."""
-    return Console(stderr=True, highlight=False, emoji=False, soft_wrap=True)
-
-
-def say(text: str) -> None:
-    """Print a remark for people on stderr, as it is."""
-    stderr().print(text, markup=False)
+def say(text: str, level: int = logging.INFO) -> None:
+    """Print a remark on stderr, as it is; in JSON if the log is."""
+    LOGGER.log(level, text)
 
 
 def print_json(content: Any) -> None:
@@ -115,7 +114,7 @@ def progress(doing: str, unit: str) -> Iterator[Callable[[int, int], None]]:
         TimeRemainingColumn(),
         console=console,
         transient=True,
-        disable=not console.is_terminal or bool(os.environ.get("CI")),
+        disable=not (console.is_terminal and for_people()) or bool(os.environ.get("CI")),
     )
     with bar:
         task = bar.add_task(doing, total=None, unit=unit)

@@ -9,9 +9,11 @@ import typer
 from fleet_slip.cli.data import Days, Threads, Through, chosen_days, run_gram, run_simulation
 from fleet_slip.cli.models import print_publication, published, registry_of
 from fleet_slip.cli.output import Json, print_json, say
+from fleet_slip.cli.recorded import recorded
 from fleet_slip.cli.selecting import print_selection
 from fleet_slip.errors import RefusedError
 from fleet_slip.model_list import check_model_name
+from fleet_slip.operations.run_log import step
 from fleet_slip.publishing import Publication, manifest_of, publish
 from fleet_slip.selection import Selection
 from fleet_slip.selection_plan import PlannedSelection, SelectionPlan, run_plan
@@ -25,6 +27,7 @@ def register(app: typer.Typer) -> None:
     app.command()(run)
 
 
+@recorded
 def run(
     context: typer.Context,
     campaign: Annotated[
@@ -57,9 +60,11 @@ def run(
         simulation = run_simulation(context.obj, plan, chosen_days(plan, days, through), threads)
         gram = run_gram(context.obj)
         condition = f"campaign = '{plan.name}'"
-        planned = run_plan(context.obj, SelectionPlan(cohort=condition, models=models))
+        with step("select"):
+            planned = run_plan(context.obj, SelectionPlan(cohort=condition, models=models))
         selection = planned.selection
-        publication, refusal = _publish(context, planned, model_name)
+        with step("publish"):
+            publication, refusal = _publish(context, planned, model_name)
     changed = simulation.changed or gram.changed or (publication is not None and publication.new)
     summary = {
         "campaign": plan.name,
