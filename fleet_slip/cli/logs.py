@@ -1,0 +1,74 @@
+"""Remarks and events on stderr: text for people, or one JSON object a line for machines."""
+
+import json
+import logging
+import sys
+from datetime import UTC, datetime
+from enum import StrEnum
+from typing import Any
+
+from rich.console import Console
+
+from fleet_slip.operations.run_log import LOGGER, current_run_id
+
+LOG_VARIABLE = "FLEET_SLIP_LOG"
+
+
+class LogFormat(StrEnum):
+    """How remarks are written: `auto` is text on a terminal and JSON elsewhere."""
+
+    AUTO = "auto"
+    TEXT = "text"
+    JSON = "json"
+
+
+def stderr() -> Console:
+    """Return a console for progress and remarks."""
+    return Console(stderr=True, highlight=False, emoji=False, soft_wrap=True)
+
+
+class PeopleHandler(logging.Handler):
+    """Prints remarks as they are. Events, which have figures and no sentence, are left out."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print a remark."""
+        if not hasattr(record, "event"):
+            stderr().print(record.getMessage(), markup=False)
+
+
+class JsonHandler(logging.Handler):
+    """Writes every record as one line of JSON."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write a record."""
+        sys.stderr.write(json_line(record) + "\n")
+        sys.stderr.flush()
+
+
+def json_line(record: logging.LogRecord) -> str:
+    """Return a record as JSON: time, level, run_id, event, then what is particular to it."""
+    content: dict[str, Any] = {
+        "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+        "level": record.levelname.lower(),
+        "run_id": current_run_id(),
+    }
+    if hasattr(record, "event"):
+        content |= {"event": record.event, **record.__dict__.get("fields", {})}
+    else:
+        content |= {"event": "message", "message": record.getMessage()}
+    return json.dumps(content, ensure_ascii=False, default=str)
+
+
+def configure_logs(chosen: LogFormat) -> None:
+    """Send the program's log to stderr in a format."""
+    if chosen is LogFormat.AUTO:
+        chosen = LogFormat.TEXT if sys.stderr.isatty() else LogFormat.JSON
+    handler = JsonHandler() if chosen is LogFormat.JSON else PeopleHandler()
+    LOGGER.handlers[:] = [handler]
+    LOGGER.setLevel(logging.INFO)
+    LOGGER.propagate = False
+
+
+def for_people() -> bool:
+    """Whether a person reads stderr: then progress may be drawn there."""
+    return any(isinstance(handler, PeopleHandler) for handler in LOGGER.handlers)

@@ -1,0 +1,1 @@
+"""Keeping a warehouse in service: history of runs, health, data quality, drift."""
