@@ -230,8 +230,8 @@ def _print_diagnosis(result: Diagnosis) -> None:
         found = result.serial
         stdout().print(
             f"residuals: correlation {found.correlation.rho:.4f} with the row before, "
-            f"Durbin-Watson {found.correlation.durbin_watson:.4f} (2 if independent); AR(1) with rho "
-            f"{found.autoregressive.rho:.4f}.",
+            f"Durbin-Watson {found.correlation.durbin_watson:.4f} (2 if independent); AR(1) with "
+            f"rho {found.autoregressive.rho:.4f}.",
             markup=False,
         )
     if result.comparison is not None:
