@@ -45,7 +45,7 @@ def connect(
         "stored_logs": _source(database, warehouse.logs.snapshot(), "log_files"),
         "stored_grams": _source(database, warehouse.grams.snapshot(), "gram_files"),
         "stored_quarantine": _source(database, warehouse.quarantine.snapshot(), "quarantine_files"),
-        "stored_runs": _run_source(database, warehouse.root),
+        "stored_runs": run_source(database, warehouse.root),
     }
     with database_errors(f"opening the warehouse {warehouse.root}"):
         for view in VIEWS:
@@ -66,7 +66,7 @@ def _source(database: duckdb.DuckDBPyConnection, snapshot: Snapshot, variable: s
     return empty
 
 
-def _run_source(database: duckdb.DuckDBPyConnection, root: Path) -> str:
+def run_source(database: duckdb.DuckDBPyConnection, root: Path) -> str:
     """Return what stands after FROM for the history of runs."""
     columns = ", ".join(f"{name} {kind}" for name, kind in RECORD_COLUMNS.items())
     files = run_files(root)

@@ -41,3 +41,15 @@ class ConflictError(FleetSlipError):
     """Another process changed the same thing at the same time, and retrying did not help."""
 
     exit_code = 8
+
+
+class DamageError(FleetSlipError):
+    """`verify` found damage, and did not or could not repair all of it."""
+
+    exit_code = 9
+
+
+class AlarmError(FleetSlipError):
+    """The answer calls for attention: stale data, a failed run, a faulty sensor, drift."""
+
+    exit_code = 10

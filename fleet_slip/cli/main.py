@@ -8,7 +8,18 @@ from typing import Annotated
 
 import typer
 
-from fleet_slip.cli import data, evaluate, models, query, report, run, selecting, statistics
+from fleet_slip.cli import (
+    data,
+    evaluate,
+    maintenance,
+    models,
+    operations,
+    query,
+    report,
+    run,
+    selecting,
+    statistics,
+)
 from fleet_slip.cli.logs import LOG_VARIABLE, LogFormat, configure_logs
 from fleet_slip.cli.output import say
 from fleet_slip.connection import ROOT_VARIABLE, data_root
@@ -24,10 +35,22 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     epilog=(
         "Exit codes: 0 done, 1 a bug, 2 wrong usage, 3 a config file, 4 input data, 5 the data "
-        "cannot answer, 6 storage, 7 refused, 8 a conflict with another process, 130 interrupted."
+        "cannot answer, 6 storage, 7 refused, 8 a conflict with another process, 9 damage found, 10 something "
+        "calls for attention, 130 interrupted."
     ),
 )
-for module in (run, data, selecting, models, statistics, evaluate, report, query):
+for module in (
+    run,
+    data,
+    selecting,
+    models,
+    statistics,
+    evaluate,
+    report,
+    operations,
+    maintenance,
+    query,
+):
     module.register(app)
 
 

@@ -1,0 +1,238 @@
+"""The health of a warehouse on one page: freshness, backlog, last runs, disk, champions."""
+
+import os
+import shutil
+import socket
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, date, datetime
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from fleet_slip.connection import run_source
+from fleet_slip.database import database_errors, open_database
+from fleet_slip.errors import StorageError
+from fleet_slip.gram_job import find_backlog
+from fleet_slip.operations.thresholds import StatusThresholds, thresholds
+from fleet_slip.registry import Registry
+from fleet_slip.resources import read_sql
+from fleet_slip.storage import Snapshot, storage_errors
+from fleet_slip.warehouse import Warehouse
+
+SECONDS_PER_HOUR = 3600
+
+
+@dataclass(frozen=True)
+class TableStatus:
+    """One table of the warehouse."""
+
+    version: int | None
+    committed_at: datetime | None
+    files: int
+    rows: int
+    size_bytes: int
+
+
+@dataclass(frozen=True)
+class ChampionStatus:
+    """The version of a model that is in use.
+
+    `logs_behind` and `grams_behind` are commits to the tables since it was trained.
+    """
+
+    model: str
+    version: int
+    published_at: datetime | None
+    age_hours: float | None
+    logs_behind: int
+    grams_behind: int
+
+
+@dataclass(frozen=True)
+class Status:
+    """What there is to know; `problems` says what calls for attention."""
+
+    root: str
+    checked_at: datetime
+    newest_day: date | None
+    data_age_hours: float | None
+    tables: Mapping[str, TableStatus]
+    backlog_files: int
+    backlog_rows: int
+    disk_free_bytes: int
+    disk_free_fraction: float
+    last_runs: tuple[Mapping[str, Any], ...]
+    champions: tuple[ChampionStatus, ...]
+    problems: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the status for a JSON document."""
+        return asdict(self)
+
+
+def status_of(
+    warehouse: Warehouse, max_age_hours: float | None = None, now: datetime | None = None
+) -> Status:
+    """Examine a warehouse. Reads the Delta logs, the history of runs and the manifests.
+
+    Data older than `max_age_hours`, and log files that old without Gram rows, are a problem; so are
+    a command whose last run failed or was killed, a disk that is nearly full, and a champion that
+    cannot be loaded. Raises `StorageError` if there is no data root.
+    """
+    now = now or datetime.now(UTC)
+    if not warehouse.root.is_dir():
+        raise StorageError(f"{warehouse.root}: there is no data root. Choose another with --root.")
+    parts = (warehouse.logs, warehouse.grams, warehouse.quarantine)
+    snapshots = {table.path.name: table.snapshot() for table in parts}
+    tables = {name: _table(snapshot) for name, snapshot in snapshots.items()}
+    logs, grams = snapshots["logs"], snapshots["grams"]
+    backlog = find_backlog(logs, grams).missing
+    disk = shutil.disk_usage(warehouse.root)
+    champions, damaged = _champions(warehouse, logs, grams, now)
+    last_runs = tuple(_last_runs(warehouse.root))
+    age = _age_hours(tables["logs"].committed_at, now)
+    limits = thresholds().status
+    problems = [
+        *_stale(age, _oldest_hours(logs, {f.path for f in backlog}, now), max_age_hours),
+        *_failed(last_runs),
+        *_full(disk.free / disk.total, limits),
+        *damaged,
+    ]
+    return Status(
+        root=str(warehouse.root),
+        checked_at=now,
+        newest_day=max((file.day for file in logs.files if file.day), default=None),
+        data_age_hours=age,
+        tables=tables,
+        backlog_files=len(backlog),
+        backlog_rows=sum(file.rows for file in backlog),
+        disk_free_bytes=disk.free,
+        disk_free_fraction=disk.free / disk.total,
+        last_runs=last_runs,
+        champions=champions,
+        problems=tuple(problems),
+    )
+
+
+def _table(snapshot: Snapshot) -> TableStatus:
+    return TableStatus(
+        version=snapshot.version,
+        committed_at=_committed_at(snapshot),
+        files=len(snapshot.files),
+        rows=snapshot.rows,
+        size_bytes=snapshot.size_bytes,
+    )
+
+
+def _committed_at(snapshot: Snapshot) -> datetime | None:
+    if snapshot.delta is None:
+        return None
+    with storage_errors(snapshot.table.path):
+        last = snapshot.delta.history(limit=1)
+    return _from_ms(last[0].get("timestamp") if last else None)
+
+
+def _oldest_hours(logs: Snapshot, paths: set[str], now: datetime) -> float | None:
+    """Return how long ago the oldest of some files was written."""
+    if logs.delta is None or not paths:
+        return None
+    with storage_errors(logs.table.path):
+        actions = pa.table(logs.delta.get_add_actions()).to_pylist()
+    moments = [action["modification_time"] for action in actions if action["path"] in paths]
+    return _age_hours(_from_ms(min(moments, default=None)), now)
+
+
+def _age_hours(moment: datetime | None, now: datetime) -> float | None:
+    return None if moment is None else (now - moment).total_seconds() / SECONDS_PER_HOUR
+
+
+def _from_ms(milliseconds: int | None) -> datetime | None:
+    return None if milliseconds is None else datetime.fromtimestamp(milliseconds / 1000, UTC)
+
+
+def _last_runs(root: Path) -> list[dict[str, Any]]:
+    # Not through connect(), which fails with a damaged manifest: that is for the status to tell.
+    with open_database() as database, database_errors(f"reading the history of runs in {root}"):
+        view = read_sql("warehouse", "runs.sql")
+        database.execute(view.format(stored_runs=run_source(database, root)))
+        rows = database.sql(read_sql("jobs", "last_runs.sql")).to_arrow_table().to_pylist()
+    return [row | {"state": _state(row)} for row in rows]
+
+
+def _state(run: Mapping[str, Any]) -> str:
+    """Return done, failed, interrupted, running, or killed: no outcome, and its process is gone.
+
+    Of another machine's process nothing is known: it is said to be running.
+    """
+    if run["outcome"] is not None:
+        return str(run["outcome"])
+    if run["host"] != socket.gethostname():
+        return "running"
+    try:
+        os.kill(run["process"], 0)
+    except ProcessLookupError:
+        return "killed"
+    except (PermissionError, TypeError):
+        return "running"
+    return "running"
+
+
+def _champions(
+    warehouse: Warehouse, logs: Snapshot, grams: Snapshot, now: datetime
+) -> tuple[tuple[ChampionStatus, ...], list[str]]:
+    registry = Registry(warehouse.root / "models")
+    found, damaged = [], []
+    for name in registry.names():
+        try:
+            champion = registry.champion(name)
+            moves = registry.history(name)
+        except StorageError as error:
+            damaged.append(str(error))
+            continue
+        if champion is None:
+            continue
+        trained = champion.manifest.trained_on
+        published = [move.at for move in moves if move.version == champion.version]
+        found.append(
+            ChampionStatus(
+                model=name,
+                version=champion.version,
+                published_at=published[0] if published else None,
+                age_hours=_age_hours(published[0], now) if published else None,
+                logs_behind=(logs.version or 0) - trained.logs_version,
+                grams_behind=(grams.version or 0) - trained.grams_version,
+            )
+        )
+    return tuple(found), damaged
+
+
+def _stale(age: float | None, backlog_age: float | None, limit: float | None) -> list[str]:
+    if limit is None:
+        return []
+    problems = []
+    if age is None:
+        problems.append("no data has ever been committed")
+    elif age > limit:
+        problems.append(f"no data has been committed for {age:.1f} h, more than {limit:g} h")
+    if backlog_age is not None and backlog_age > limit:
+        problems.append(f"a log file has been waiting for its Gram rows for {backlog_age:.1f} h")
+    return problems
+
+
+def _failed(runs: Sequence[Mapping[str, Any]]) -> list[str]:
+    problems = []
+    for run in runs:
+        when = f"{run['command']} of {run['started_at']:%Y-%m-%d %H:%M}"
+        if run["state"] == "failed":
+            problems.append(f"{when} failed with exit code {run['exit_code']}: {run['error']}")
+        elif run["state"] in ("killed", "interrupted"):
+            problems.append(f"{when} was {run['state']}")
+    return problems
+
+
+def _full(free: float, limits: StatusThresholds) -> list[str]:
+    if free >= limits.min_free_fraction:
+        return []
+    return [f"the disk has {free:.1%} left, less than {limits.min_free_fraction:.0%}"]
