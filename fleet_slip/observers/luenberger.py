@@ -54,16 +54,19 @@ def gains(space: StateSpace, poles: ObserverPoles) -> Floats:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _observe(s: StateSpace, gain: Floats, steer: Floats, yaw_rate: Floats, ay: Floats) -> Floats:
-    """Return vy, by Euler's forward step."""
+def _observe(
+    space: tuple[Floats, ...], gain: Floats, steer: Floats, yaw_rate: Floats, ay: Floats
+) -> Floats:
+    """Return vy, by Euler's forward step. The space is a `StateSpace` as a plain tuple."""
+    a11, a12, a21, a22, b1, b2, vx_mps = space
     vy, r = 0.0, yaw_rate[0]
     estimates = np.empty(len(ay))
     for k in range(len(ay)):
-        force = s.a11[k] * vy + s.a12[k] * r + s.b1[k] * steer[k]
+        force = a11[k] * vy + a12[k] * r + b1[k] * steer[k]
         error_r = yaw_rate[k] - r
-        error_ay = ay[k] - (force + s.vx_mps[k] * r)
+        error_ay = ay[k] - (force + vx_mps[k] * r)
         vy_rate = force + gain[0, k] * error_r + gain[1, k] * error_ay
-        moment = s.a21[k] * vy + s.a22[k] * r + s.b2[k] * steer[k]
+        moment = a21[k] * vy + a22[k] * r + b2[k] * steer[k]
         r += STEP_S * (moment + gain[2, k] * error_r + gain[3, k] * error_ay)
         vy += STEP_S * vy_rate
         estimates[k] = vy
@@ -78,7 +81,7 @@ def estimate(drive: DriveSignals, car: VehicleParameters, poles: ObserverPoles) 
     vx_mps = measured_speed_mps(drive, car)
     space = state_space(SingleTrack.of(car, poles.stiffness_factor), vx_mps)
     vy_mps = _observe(
-        space,
+        tuple(space),
         gains(space, poles),
         measured_steer_rad(drive),
         yaw_rate.estimate(drive, car, poles.yaw_rate).yaw_rate_rad_s,

@@ -22,7 +22,6 @@ from fleet_slip.observers.angle import sideslip_angle
 from fleet_slip.observers.signals import STEP_S, DriveSignals, Floats, held
 from fleet_slip.observers.single_track import (
     SingleTrack,
-    StateSpace,
     measured_speed_mps,
     measured_steer_rad,
     state_space,
@@ -76,21 +75,22 @@ def saturate(value: float) -> float:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _observe(
-    s: StateSpace,
+    space: tuple[Floats, ...],
     steer: Floats,
     yaw_rate: Floats,
     measured_vy: Floats,
     gains: tuple[float, float],
     layers: tuple[float, float],
 ) -> Floats:
-    """Return vy, by Euler's forward step."""
+    """Return vy, by Euler's forward step. The space is a `StateSpace` as a plain tuple."""
+    a11, a12, a21, a22, b1, b2, _ = space
     vy, r = 0.0, yaw_rate[0]
     estimates = np.empty(len(steer))
     for k in range(len(steer)):
         slide_vy = gains[0] * saturate((measured_vy[k] - vy) / layers[0])
         slide_r = gains[1] * saturate((yaw_rate[k] - r) / layers[1])
-        vy_rate = s.a11[k] * vy + s.a12[k] * r + s.b1[k] * steer[k] + slide_vy
-        r += STEP_S * (s.a21[k] * vy + s.a22[k] * r + s.b2[k] * steer[k] + slide_r)
+        vy_rate = a11[k] * vy + a12[k] * r + b1[k] * steer[k] + slide_vy
+        r += STEP_S * (a21[k] * vy + a22[k] * r + b2[k] * steer[k] + slide_r)
         vy += STEP_S * vy_rate
         estimates[k] = vy
     return estimates
@@ -107,7 +107,7 @@ def estimate(drive: DriveSignals, car: VehicleParameters, gains: SlidingGains) -
     turning = yaw_rate.estimate(drive, car, gains.yaw_rate).yaw_rate_rad_s
     ay_mps2 = held(drive.ay_mps2, "ay")
     vy_mps = _observe(
-        space,
+        tuple(space),
         steer,
         turning,
         (ay_mps2 - space.b1 * steer - space.c2 * turning) / space.a11,
