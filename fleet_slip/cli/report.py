@@ -1,0 +1,44 @@
+"""The command that writes the report."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fleet_slip.cli.models import registry_of
+from fleet_slip.cli.output import Json, print_json, say
+from fleet_slip.cli.run import DEFAULT_CAMPAIGN
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command of this module."""
+    app.command()(report)
+
+
+def report(
+    context: typer.Context,
+    model: Annotated[
+        str, typer.Option(help="NAME, NAME@VERSION or NAME@ALIAS of a model that was evaluated.")
+    ] = DEFAULT_CAMPAIGN,
+    output: Annotated[
+        Path | None,
+        typer.Option(help="Folder. Default: report/ in the data root.", show_default=False),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Write one page that lays our figures beside the paper's, from the latest evaluation.
+
+    The page needs nothing but itself; the same figures stand beside it as SVG and PNG files.
+    """
+    from fleet_slip.report.write import write_report  # noqa: PLC0415 - matplotlib takes a while
+
+    folder = output or context.obj.root / "report"
+    written = write_report(context.obj, registry_of(context.obj).resolve(model), folder)
+    if json:
+        print_json({name: str(v) if name == "page" else v for name, v in asdict(written).items()})
+    else:
+        say(
+            f"{written.page}: {written.size_bytes / 1e6:.1f} MB, {written.figures} figures, "
+            f"which are in {folder / 'figures'} too"
+        )

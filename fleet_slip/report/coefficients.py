@@ -1,0 +1,86 @@
+"""A model's coefficients with what is known of their uncertainty."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from fleet_slip.cohort import Cohort
+from fleet_slip.regression.drives import DriveMoments
+from fleet_slip.regression.exact import fit
+from fleet_slip.regression.inference import INTERCEPT, classical, cluster, variance_inflation
+from fleet_slip.signals import catalogue
+
+
+@dataclass(frozen=True)
+class Coefficient:
+    """One row of a coefficient table.
+
+    Attributes:
+        name: signal, or "intercept".
+        unit: of the value.
+        value: coefficient.
+        cluster_error: standard error with drives as the independent pieces of evidence.
+        row_error: standard error as if every row were independent.
+        t: value / cluster_error.
+        p: two-sided probability of a larger |t| if the true coefficient were zero.
+        share_deg: degrees of estimate for one standard deviation of the signal; None of a constant.
+        inflation: variance inflation factor; None of the intercept.
+    """
+
+    name: str
+    unit: str
+    value: float
+    cluster_error: float
+    row_error: float
+    t: float
+    p: float
+    share_deg: float | None
+    inflation: float | None
+
+
+@dataclass(frozen=True)
+class Coefficients:
+    """The coefficients of one model, and the data that they are from."""
+
+    model: str
+    rows: Sequence[Coefficient]
+    drives: int
+    log_rows: int
+
+
+def coefficient_table(cohort: Cohort, model: str, inputs: Sequence[str]) -> Coefficients:
+    """Fit the label on the inputs over all drives of a cohort that have them.
+
+    Raises `SelectionError` if no drive has them, or there is one only.
+    """
+    signals = catalogue()
+    label = signals.label
+    served = cohort.serving(inputs)
+    moments = DriveMoments.of(served.table)
+    fitted = fit(served.table.total(), inputs, label)
+    scales = {name: signals[name].exact_scale for name in (*inputs, label)}
+    robust, naive = cluster(fitted, moments, scales), classical(fitted, scales)
+    inflation = variance_inflation(fitted.gram, inputs)
+    spread = dict(zip(moments.signals, moments.spread.tolist(), strict=True))
+    rows = []
+    for estimate, other in zip(robust.estimates, naive.estimates, strict=True):
+        constant = estimate.name == INTERCEPT
+        unit = "rad" if constant else f"rad per {signals[estimate.name].unit}"
+        share = None
+        if not constant:
+            deviation = spread[estimate.name] * float(scales[estimate.name])
+            share = math.degrees(estimate.value * deviation)
+        rows.append(
+            Coefficient(
+                name=estimate.name,
+                unit=unit,
+                value=estimate.value,
+                cluster_error=estimate.standard_error,
+                row_error=other.standard_error,
+                t=estimate.t,
+                p=estimate.p,
+                share_deg=share,
+                inflation=inflation.get(estimate.name),
+            )
+        )
+    return Coefficients(model, tuple(rows), len(moments), served.table.total().n)

@@ -1,0 +1,228 @@
+"""Everything that a report shows, gathered from warehouse, registry and evaluation."""
+
+import hashlib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from fleet_slip.cohort import SCENARIO
+from fleet_slip.connection import connect
+from fleet_slip.documents import canonical_json
+from fleet_slip.errors import SelectionError
+from fleet_slip.evaluation.estimators import TABLE_ONE, Estimate, LinearEstimate, Training, training
+from fleet_slip.evaluation.filters import FILTERS, bound
+from fleet_slip.evaluation.runs import Run, run_all
+from fleet_slip.evaluation.targets import THE_PAPERS_CHOICE
+from fleet_slip.model_list import load_model_list
+from fleet_slip.registry import ModelVersion
+from fleet_slip.report.coefficients import Coefficients, coefficient_table
+from fleet_slip.report.evaluated import Evaluated, latest_of
+from fleet_slip.report.histogram import Histogram, held_out_histogram
+from fleet_slip.report.ordering import Ordering, compare_orders
+from fleet_slip.resources import folder
+from fleet_slip.scenario import Scenario, load_scenario, shipped_scenarios
+from fleet_slip.warehouse import Warehouse
+
+DRAWN_FILTERS = ("kalman", "kalman_tuned")
+DRAWN_SCENARIOS = (
+    "nominal",
+    "noise_doubled",
+    "mass_1000",
+    "mass_1740",
+    "adhesion_0_7",
+    "adhesion_0_4",
+    "melbourne",
+    "gps_tunnel",
+    "style_gentle",
+    "style_brisk",
+    "style_sporty",
+    "style_limit",
+)
+SAME = 1e-6
+"""Relative difference below which two figures of the same estimates are the same."""
+
+
+@dataclass(frozen=True)
+class TableSize:
+    """One table of the warehouse: its version, and what it holds."""
+
+    name: str
+    version: int | None
+    files: int
+    rows: int
+    size_bytes: int
+    drives: int | None
+
+
+@dataclass(frozen=True)
+class ConfigHash:
+    """One configuration and the checksum of what it says."""
+
+    name: str
+    sha256: str
+
+
+@dataclass(frozen=True)
+class ReportData:
+    """All that a report shows.
+
+    Attributes:
+        version: the model version that it is about.
+        evaluated: its latest evaluation.
+        trained: its cohort, and the models of Table I on it.
+        runs: drives of the evaluation's scenarios with the estimates that figures show.
+        coefficients: of the paper's choice, then of the published model if that is another.
+        histogram: held-out estimates of all training rows by the paper's choice.
+        ordering: what the order of the signals is worth.
+        tables: of the warehouse.
+        campaigns: of the drives that the model was trained on.
+        configs: checksums of what determines the results.
+        shipped: names of all shipped scenarios, evaluated or not.
+    """
+
+    version: ModelVersion
+    evaluated: Evaluated
+    trained: Training
+    runs: Mapping[str, Run]
+    coefficients: tuple[Coefficients, ...]
+    histogram: Histogram
+    ordering: Ordering
+    tables: tuple[TableSize, ...]
+    campaigns: tuple[str, ...]
+    configs: tuple[ConfigHash, ...]
+    shipped: tuple[str, ...]
+
+    @property
+    def choice(self) -> str:
+        """Estimator's name of the model that the paper settles on."""
+        return self.evaluated.models[THE_PAPERS_CHOICE]
+
+
+def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
+    """Gather a report about a model version.
+
+    Raises `SelectionError` if the version has not been evaluated, or if its cohort or a drive of a
+    scenario has changed since: all numbers of a report must be of the same data.
+    """
+    evaluated = latest_of(warehouse, version)
+    trained = training(warehouse, version)
+    _same_models(evaluated, trained)
+    shipped = shipped_scenarios()
+    scenarios = [one for one in shipped if one.name in evaluated.scenarios]
+    drawn = [one for one in scenarios if one.name in DRAWN_SCENARIOS]
+    runs = {
+        run.scenario.name: run for run in run_all(warehouse, drawn, drawn_estimators(evaluated))
+    }
+    _same_figures(evaluated, runs)
+    cohort, models = trained.selection.cohort, trained.selection.models
+    choice = next(model for model in models if model.name == THE_PAPERS_CHOICE)
+    return ReportData(
+        version=version,
+        evaluated=evaluated,
+        trained=trained,
+        runs=runs,
+        coefficients=_coefficients(trained),
+        histogram=held_out_histogram(warehouse, trained.selection, choice),
+        ordering=compare_orders(cohort, tuple(dict.fromkeys(models[-1].signals))),
+        tables=_tables(warehouse),
+        campaigns=tuple(sorted(set(cohort.drives["campaign"].to_pylist()))),
+        configs=_configs(scenarios),
+        shipped=tuple(one.name for one in shipped),
+    )
+
+
+def drawn_estimators(evaluated: Evaluated) -> dict[str, Estimate]:
+    """Return the estimators that figures show, rebuilt from what the evaluation says of them."""
+    car = load_scenario("nominal").car
+    kinds = {one.name: one for one in FILTERS}
+    estimators: dict[str, Estimate] = {}
+    for name in evaluated.models.values():
+        about = evaluated.estimators[name]
+        estimators[name] = LinearEstimate(about["intercept"], about["coefficients"])
+    for name in DRAWN_FILTERS:
+        kind = kinds[name.removesuffix("_tuned")]
+        if name in evaluated.estimators:
+            parameters = type(kind.parameters).model_validate(
+                evaluated.estimators[name]["parameters"]
+            )
+            estimators[name] = bound(kind, parameters, car)
+    return estimators
+
+
+def _same_models(evaluated: Evaluated, trained: Training) -> None:
+    now = {name: model.as_dict() for name, model in trained.estimators().items()}
+    for name in evaluated.models.values():
+        kept = evaluated.estimators[name]
+        if now.get(name) != {key: kept[key] for key in ("intercept", "coefficients")}:
+            raise SelectionError(_changed(evaluated, f"the cohort of {evaluated.group}"))
+
+
+def _same_figures(evaluated: Evaluated, runs: Mapping[str, Run]) -> None:
+    for scenario, run in runs.items():
+        for name, result in run.results.items():
+            kept = evaluated.figures(scenario, name)
+            found = result.whole.rmse_deg
+            if kept is None or not _same(kept.rmse_deg, found):
+                raise SelectionError(_changed(evaluated, f"the drive of {scenario}, or {name},"))
+
+
+def _same(first: float | None, second: float | None) -> bool:
+    if first is None or second is None:
+        return first is second
+    return math.isclose(first, second, rel_tol=SAME)
+
+
+def _changed(evaluated: Evaluated, what: str) -> str:
+    return (
+        f"{what} has changed since evaluation {evaluated.document.number}. Run: fleet-slip "
+        f"evaluate --one-car {evaluated.group}"
+    )
+
+
+def _coefficients(trained: Training) -> tuple[Coefficients, ...]:
+    cohort, published = trained.selection.cohort, trained.version
+    choice = next(m for m in trained.selection.models if m.name == THE_PAPERS_CHOICE)
+    tables = [coefficient_table(cohort, f"model {choice.name}", choice.signals)]
+    if set(published.manifest.signals) != set(choice.signals):
+        tables.append(coefficient_table(cohort, published.reference, published.manifest.signals))
+    return tuple(tables)
+
+
+def _tables(warehouse: Warehouse) -> tuple[TableSize, ...]:
+    with connect(warehouse.root) as database:
+        counted = database.execute(
+            "SELECT source = $scenario, count(*) FROM drives GROUP BY ALL", {"scenario": SCENARIO}
+        ).fetchall()
+    drives = sum(number for _, number in counted)
+    sizes = []
+    for table in (warehouse.logs, warehouse.grams, warehouse.quarantine):
+        snapshot = table.snapshot()
+        sizes.append(
+            TableSize(
+                name=table.path.name,
+                version=snapshot.version,
+                files=len(snapshot.files),
+                rows=snapshot.rows,
+                size_bytes=snapshot.size_bytes,
+                drives=drives if table is warehouse.logs else None,
+            )
+        )
+    return tuple(sizes)
+
+
+def _configs(scenarios: list[Scenario]) -> tuple[ConfigHash, ...]:
+    signals = (folder("configs") / "signals.toml").read_bytes()
+    hashes = [
+        ConfigHash("configs/signals.toml", hashlib.sha256(signals).hexdigest()),
+        ConfigHash(f"configs/models/{TABLE_ONE}.toml", load_model_list(TABLE_ONE).sha256),
+    ]
+    return (*hashes, *(_of_scenario(one) for one in scenarios))
+
+
+def _of_scenario(scenario: Scenario) -> ConfigHash:
+    """Return the checksum of all that determines a scenario's drive, and of its failures."""
+    failures = [failure.model_dump(mode="json") for failure in scenario.failures]
+    text = canonical_json({"drive": scenario.batch().digest, "failures": failures})
+    return ConfigHash(
+        f"configs/scenarios/{scenario.name}.toml", hashlib.sha256(text.encode()).hexdigest()
+    )

@@ -1,0 +1,1 @@
+"""One figure a function: from a report's data to a matplotlib figure."""

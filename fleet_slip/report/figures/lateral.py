@@ -1,0 +1,121 @@
+"""Error by lateral acceleration: where the linear relation ends."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from fleet_slip.evaluation.drives import FloatArray
+from fleet_slip.evaluation.runs import Run
+from fleet_slip.report.figures.lines import smoothed
+from fleet_slip.report.figures.series import Line
+from fleet_slip.report.style import Size, colour
+from fleet_slip.sensors import SAMPLE_RATE_HZ
+
+BIN_MPS2 = 0.5
+LEAST_ROWS = 200
+SMOOTHED_S = 0.5
+HEIGHT_IN = 3.3
+
+
+def lateral_acceleration(run: Run) -> FloatArray:
+    """Return |ay| in m/s² at each tick: the sensor's, less its stated bias, smoothed."""
+    ay = run.drive.signals["ay_mps2"] - run.drive.scenario.sensors.ay_bias_mps2
+    return np.abs(smoothed(ay, int(SMOOTHED_S * SAMPLE_RATE_HZ)))
+
+
+def error_by_bin(runs: Sequence[Run], estimator: str) -> tuple[FloatArray, FloatArray]:
+    """Return the middle of each bin in m/s² and the root mean square error in it, in deg."""
+    acceleration = np.concatenate([lateral_acceleration(run) for run in runs])
+    error = np.concatenate(
+        [
+            np.where(
+                run.drive.evaluated,
+                np.degrees(run.estimates[estimator] - run.drive.sideslip_rad),
+                np.nan,
+            )
+            for run in runs
+        ]
+    )
+    given = np.isfinite(error) & np.isfinite(acceleration)
+    place = (acceleration[given] / BIN_MPS2).astype(int)
+    rows = np.bincount(place)
+    squares = np.bincount(place, weights=error[given] ** 2)
+    kept = np.flatnonzero(rows >= LEAST_ROWS)
+    middle = ((kept + 0.5) * BIN_MPS2).astype(np.float64)
+    return middle, np.sqrt(squares[kept] / rows[kept]).astype(np.float64)
+
+
+def error_by_acceleration(
+    runs: Sequence[Run], lines: Sequence[Line], trained_to_mps2: float, size: Size
+) -> Figure:
+    """Draw the error of each estimator over the lateral acceleration, on a logarithmic scale."""
+    figure = Figure(figsize=(size.width_in, HEIGHT_IN))
+    room = 1.35 if size.wide else 0.95
+    axes = figure.add_axes(
+        (
+            0.5 / size.width_in,
+            0.45 / HEIGHT_IN,
+            1 - (0.5 + room) / size.width_in,
+            1 - 0.8 / HEIGHT_IN,
+        )
+    )
+    ends = []
+    for line in lines:
+        middle, error = error_by_bin(runs, line.estimator)
+        axes.plot(middle, error, color=colour(line.colour), linewidth=1.6, marker="o", markersize=3)
+        ends.append((float(error[-1]), float(middle[-1]), line))
+    axes.set_yscale("log")
+    axes.axvspan(0, trained_to_mps2, color=colour("model_4"), alpha=0.07, linewidth=0)
+    axes.text(
+        trained_to_mps2,
+        1.0,
+        "training drives " if size.wide else "training ",
+        transform=axes.get_xaxis_transform(),
+        ha="right",
+        va="top",
+        color=colour("muted"),
+        fontsize=8.5,
+    )
+    axes.set_xlim(0, max(end[1] for end in ends) + BIN_MPS2 / 2)
+    ticks = [0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10]
+    low, high = axes.get_ylim()
+    shown = [tick for tick in ticks if low <= tick <= high]
+    axes.set_yticks(shown, [f"{tick:g}°" for tick in shown])
+    axes.minorticks_off()
+    axes.set_xlabel("size of the lateral acceleration (m/s²)", labelpad=2)
+    axes.set_title("root mean square error", color=colour("muted"))
+    _label_ends(figure, axes.get_ylim(), ends, size)
+    return figure
+
+
+def _label_ends(
+    figure: Figure, limits: tuple[float, float], ends: list[tuple[float, float, Line]], size: Size
+) -> None:
+    """Write each line's name at its right end, far enough apart to be read."""
+    (axes,) = figure.axes
+    low, high = np.log(limits)
+    least = 13.0 / (axes.get_position().height * HEIGHT_IN * 72)
+    ordered = sorted(ends, key=lambda end: end[0])
+    places = apart([(np.log(error) - low) / (high - low) for error, _, _ in ordered], least)
+    for place, (_, _, line) in zip(places, ordered, strict=True):
+        axes.text(
+            1.01,
+            place,
+            line.label,
+            transform=axes.transAxes,
+            color=colour(line.colour),
+            va="center",
+            fontsize=9 if size.wide else 8,
+        )
+
+
+def apart(places: Sequence[float], least: float) -> list[float]:
+    """Move ascending places at most 1 apart by at least so much, up first, then down from 1."""
+    moved = list(places)
+    for i in range(1, len(moved)):
+        moved[i] = max(moved[i], moved[i - 1] + least)
+    moved[-1] = min(moved[-1], 1.0)
+    for i in reversed(range(len(moved) - 1)):
+        moved[i] = min(moved[i], moved[i + 1] - least)
+    return moved

@@ -1,0 +1,157 @@
+"""The report as one static page, without a request to anywhere."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+
+from jinja2 import Environment, FunctionLoader, StrictUndefined
+from markupsafe import Markup
+
+from fleet_slip.report import tables
+from fleet_slip.report.claims import Judged, judged
+from fleet_slip.report.claims.claim import Status
+from fleet_slip.report.data import ReportData
+from fleet_slip.report.drawing import inline_svgs
+from fleet_slip.report.pictures import Picture
+from fleet_slip.report.style import PALETTE
+from fleet_slip.report.tables import Table
+from fleet_slip.report.text import count, degrees, size
+
+TEMPLATES = files("fleet_slip.report") / "templates"
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A picture with its drawings for the page."""
+
+    picture: Picture
+    svgs: Mapping[str, Markup]
+
+
+@dataclass(frozen=True)
+class Tile:
+    """One number of the summary."""
+
+    value: str
+    label: str
+
+
+def render(data: ReportData, shown: Sequence[Picture]) -> str:
+    """Return the page."""
+    environment = Environment(
+        loader=FunctionLoader(lambda name: (TEMPLATES / name).read_text(encoding="utf-8")),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    drawn = [
+        Drawn(one, {kind: Markup(svg) for kind, svg in inline_svgs(one).items()})  # noqa: S704
+        for one in shown
+    ]
+    claims = judged(data)
+    page = environment.get_template("report.html.j2").render(
+        css=Markup((TEMPLATES / "report.css").read_text(encoding="utf-8")),  # noqa: S704
+        palette={name.replace("_", "-"): tone for name, tone in PALETTE.items()},
+        version=data.version,
+        evaluation=data.evaluated.document,
+        paper=[one for one in drawn if one.picture.key.startswith("figure-")],
+        beyond=[one for one in drawn if not one.picture.key.startswith("figure-")],
+        table_one=tables.table_one(data),
+        table_two=tables.table_two(data),
+        targets=list(tables.targets(data)),
+        further=_further(data),
+        coefficients=list(tables.coefficient_tables(data)),
+        storage=tables.storage(data),
+        tiles=_tiles(data, claims),
+        claims=claims,
+        tally=_tally(claims),
+        statuses=list(Status),
+        missing=missing_scenarios(data),
+        provenance=_provenance(data),
+        configs=data.configs,
+        commands=_commands(data),
+    )
+    return page + "\n"
+
+
+def missing_scenarios(data: ReportData) -> list[str]:
+    """Return the names of the shipped scenarios that the evaluation left out."""
+    return [one for one in data.shipped if one not in data.evaluated.scenarios]
+
+
+def _further(data: ReportData) -> list[Table]:
+    learned = tables.rivals(data)
+    return [tables.scenarios(data), *tables.fleets(data), *([learned] if learned else [])]
+
+
+def _tally(claims: Sequence[Judged]) -> dict[Status, int]:
+    counted = Counter(one.verdict.status for one in claims)
+    return {status: counted[status] for status in Status}
+
+
+def _tiles(data: ReportData, claims: Sequence[Judged]) -> list[Tile]:
+    tally = _tally(claims)
+    cohort = data.trained.selection.cohort
+    tiles = [
+        Tile(
+            f"{tally[Status.REPRODUCED]} of "
+            f"{tally[Status.REPRODUCED] + tally[Status.NOT_REPRODUCED]}",
+            f"testable claims reproduced; {tally[Status.NOT_TESTABLE]} cannot be tested here",
+        ),
+        Tile(
+            count(cohort.rows), f"training rows of {data.version.manifest.trained_on.drives} drives"
+        ),
+    ]
+    nominal = data.evaluated.figures("nominal", data.choice)
+    if nominal is not None and nominal.error_std_deg is not None:
+        paper = tables.PAPER_TABLE_TWO["4"][1]
+        tiles.append(
+            Tile(
+                degrees(nominal.error_std_deg),
+                f"error std of model 4 on the nominal drive; the paper: {degrees(paper)}",
+            )
+        )
+    logs = data.tables[0]
+    tiles.append(
+        Tile(size(logs.size_bytes), f"of logs, {logs.size_bytes / logs.rows:.1f} bytes a row")
+    )
+    return tiles
+
+
+def _provenance(data: ReportData) -> list[tuple[str, str]]:
+    manifest = data.version.manifest
+    trained = manifest.trained_on
+    there = [one for one in data.tables if one.version is not None]
+    now = ", ".join(f"{one.name} {one.version}" for one in there)
+    return [
+        ("model version", data.version.reference),
+        ("its SHA-256", data.version.sha256),
+        ("signals", ", ".join(manifest.signals)),
+        ("cohort", trained.cohort),
+        ("trained on", f"{trained.drives} drives, {count(trained.rows)} rows"),
+        (
+            "table versions",
+            f"logs {trained.logs_version}, grams {trained.grams_version} when it was published; "
+            f"{now} now",
+        ),
+        ("model list", f"{manifest.selected_by.model_list}, {manifest.selected_by.config_sha256}"),
+        ("evaluation", f"evaluations/{data.evaluated.document.number}.json"),
+        ("its SHA-256", data.evaluated.document.sha256),
+        ("package", f"fleet-slip {data.evaluated.document.content['package_version']}"),
+    ]
+
+
+def _commands(data: ReportData) -> list[str]:
+    reference = data.version.reference
+    fleets = dict.fromkeys(
+        row["fleet"].rpartition("/")[0] for row in data.evaluated.rows("comparisons")
+    )
+    options = "".join(f" --fleet {name}" for name in fleets)
+    options += " --rivals" if data.evaluated.rows("rivals") else ""
+    return [
+        *(f"fleet-slip run --campaign {name}" for name in data.campaigns),
+        f"fleet-slip evaluate --one-car {reference}{options}",
+        f"fleet-slip report --model {reference}",
+    ]

@@ -1,0 +1,258 @@
+"""Which figures a report has, in the order of the paper, with captions from the same data."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from matplotlib.figure import Figure
+
+from fleet_slip.evaluation.runs import Run
+from fleet_slip.report.data import DRAWN_FILTERS, ReportData
+from fleet_slip.report.figures.density import density
+from fleet_slip.report.figures.lateral import error_by_acceleration
+from fleet_slip.report.figures.series import Block, Line, side_slip
+from fleet_slip.report.figures.speed import KMH_PER_MPS, speed
+from fleet_slip.report.figures.track_map import error_map
+from fleet_slip.report.histogram import Histogram
+from fleet_slip.report.style import Size
+from fleet_slip.report.text import count, degrees, listed, number, percent
+
+STYLES = ("style_gentle", "nominal", "style_brisk", "style_sporty", "style_limit")
+"""Drives of the training car on a dry road, from slow to the limit."""
+
+TRAINED_SHARE = 0.999
+
+FILTER_LABELS = {"kalman": "Kalman filter", "kalman_tuned": "Kalman filter, tuned"}
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One figure of the report.
+
+    Attributes:
+        key: name of its files, and of its place on the page.
+        title: what it shows.
+        caption: what is to be seen, in numbers.
+        alternative: for those who cannot see it.
+        draw: makes it at a size.
+    """
+
+    key: str
+    title: str
+    caption: str
+    alternative: str
+    draw: Callable[[Size], Figure]
+
+
+def pictures(data: ReportData) -> tuple[Picture, ...]:
+    """Return all figures whose drives were evaluated."""
+    return (*_of_the_paper(data), *_beyond_the_paper(data))
+
+
+def model_line(data: ReportData, number_in_table: str) -> Line:
+    """Return how a model of Table I is drawn."""
+    return Line(
+        data.evaluated.models[number_in_table],
+        f"Model {number_in_table}",
+        f"model_{number_in_table}",
+    )
+
+
+def choice_line(data: ReportData) -> Line:
+    """Return how the model that the paper settles on is drawn."""
+    return model_line(data, next(k for k, v in data.evaluated.models.items() if v == data.choice))
+
+
+def _has(data: ReportData, *scenarios: str) -> bool:
+    return all(name in data.runs for name in scenarios)
+
+
+def _of_the_paper(data: ReportData) -> Iterator[Picture]:
+    if _has(data, "nominal"):
+        nominal = data.runs["nominal"]
+        for part, numbers in (("a", ("1", "2")), ("b", ("3", "4", "5"))):
+            lines = tuple(model_line(data, n) for n in numbers if n in data.evaluated.models)
+            yield _series(
+                f"figure-1{part}",
+                f"Figure 1({part}). {listed([line.label for line in lines])}: side-slip angle on "
+                "the test drive",
+                [Block(f"Nominal drive, {listed([line.label for line in lines])}", nominal, lines)],
+            )
+        yield _speed("figure-2", "Figure 2. Speed during the test drive", nominal)
+    applied = (choice_line(data),)
+    if _has(data, "nominal", "noise_doubled"):
+        yield _series(
+            "figure-3",
+            "Figure 3. Effect of increased noise",
+            [
+                Block("Initial noise", data.runs["nominal"], applied),
+                Block("Bias and noise doubled", data.runs["noise_doubled"], applied),
+            ],
+        )
+    if _has(data, "mass_1000", "mass_1740"):
+        yield _series(
+            "figure-4",
+            "Figure 4. Effect of the car's mass",
+            [
+                Block("Sprung mass 1000 kg", data.runs["mass_1000"], applied),
+                Block("Sprung mass 1740 kg", data.runs["mass_1740"], applied),
+            ],
+        )
+    if _has(data, "adhesion_0_7", "adhesion_0_4"):
+        yield _series(
+            "figure-5",
+            "Figure 5. Effect of the adhesion coefficient",
+            [
+                Block("Adhesion 0.7", data.runs["adhesion_0_7"], applied, shaded="unstable"),
+                Block("Adhesion 0.4", data.runs["adhesion_0_4"], applied, shaded="unstable"),
+            ],
+        )
+    if _has(data, "melbourne"):
+        melbourne = data.runs["melbourne"]
+        yield _speed("figure-6", "Figure 6. Speed on the Melbourne circuit", melbourne)
+        yield _series(
+            "figure-7",
+            "Figure 7. Side-slip angle on the Melbourne circuit",
+            [Block("Melbourne Grand Prix Circuit", melbourne, applied)],
+        )
+    yield from _against_the_filter(data, applied)
+
+
+def _against_the_filter(data: ReportData, applied: tuple[Line, ...]) -> Iterator[Picture]:
+    known = [name for name in DRAWN_FILTERS if name in data.evaluated.estimators]
+    if known and _has(data, "nominal"):
+        filters = tuple(Line(name, FILTER_LABELS[name], name) for name in known)
+        drives = [("Nominal drive", "nominal"), ("A tunnel of 20 s", "gps_tunnel")]
+        yield _series(
+            "figure-8",
+            "Figure 8. The Kalman filter and the regression",
+            [
+                Block(
+                    title,
+                    data.runs[name],
+                    (filters[0], *applied),
+                    strips=filters[1:],
+                    shaded="gps_outage",
+                )
+                for title, name in drives
+                if name in data.runs
+            ],
+        )
+
+
+def _series(key: str, title: str, blocks: Sequence[Block]) -> Picture:
+    found = [sentence for block in blocks for sentence in _found(block, len(blocks) > 1)]
+    return Picture(
+        key=key,
+        title=title,
+        caption=" ".join(found),
+        alternative=(
+            f"{title}. Lines over time of the true angle and of the estimates, and beneath them "
+            f"the differences. {' '.join(found)}"
+        ),
+        draw=lambda size: side_slip(blocks, size),
+    )
+
+
+def _found(block: Block, named: bool) -> Iterator[str]:
+    errors = []
+    for line in block.all_strips:
+        figures = block.run.results[line.estimator].whole
+        errors.append(
+            f"{line.label} {degrees(figures.error_std_deg)} "
+            f"({degrees(figures.error_mean_deg, sign=True)})"
+        )
+    place = f"{block.title}: standard" if named else "Standard"
+    yield f"{place} deviation (mean) of the error: {', '.join(errors)}."
+    if block.shaded == "unstable":
+        yield from _stability(block)
+
+
+def _stability(block: Block) -> Iterator[str]:
+    result = block.run.results[block.lines[0].estimator]
+    if "unstable" not in result.inside:
+        yield "The car is stable throughout."
+        return
+    inside, outside = result.inside["unstable"], result.outside["unstable"]
+    yield (
+        f"Where the car is unstable (shaded) it is {degrees(inside.error_std_deg)}, elsewhere "
+        f"{degrees(outside.error_std_deg)} with a correlation of {number(outside.correlation)}."
+    )
+
+
+def _speed(key: str, title: str, run: Run) -> Picture:
+    kmh = run.drive.speed_mps * KMH_PER_MPS
+    caption = (
+        f"From {kmh.min():.0f} to {kmh.max():.0f} km/h in {run.drive.time_s[-1]:.0f} s, over "
+        f"{run.drive.scenario.track.length_m / 1000:.2f} km."
+    )
+    return Picture(
+        key, title, caption, f"{title}: a line of speed over time. {caption}",
+        lambda size: speed(run.drive, size),
+    )  # fmt: skip
+
+
+def _beyond_the_paper(data: ReportData) -> Iterator[Picture]:
+    maps = [("Nominal drive", "nominal"), ("Adhesion 0.4", "adhesion_0_4")]
+    shown = [(title, data.runs[name]) for title, name in maps if name in data.runs]
+    if shown:
+        yield _map(data, shown)
+    yield _density(data, data.histogram)
+    yield from _lateral(data, data.runs)
+
+
+def _map(data: ReportData, shown: Sequence[tuple[str, Run]]) -> Picture:
+    label = choice_line(data).label
+    title = f"Where on the track {label} is off"
+    caption = (
+        "Blue: the estimate is too far to the right; orange: too far to the left. The error "
+        "follows the bends: what is left is systematic, not noise."
+    )
+    return Picture(
+        "error-map",
+        title,
+        caption,
+        f"{title}: maps of the track for {listed([name for name, _ in shown])}, coloured by the "
+        "error.",
+        lambda size: error_map(shown, data.choice, size),
+    )
+
+
+def _density(data: ReportData, histogram: Histogram) -> Picture:
+    label = choice_line(data).label
+    model = next(m for m in data.trained.selection.models if f"Model {m.name}" == label)
+    title = "Predicted against true"
+    caption = (
+        f"All {count(int(histogram.rows.sum()))} rows of the training drives, each predicted by "
+        f"the {label} that was fitted without its fold of drives: correlation "
+        f"{number(model.correlation, 4)}, error {degrees(model.pooled.error_std_deg)}."
+    )
+    return Picture(
+        "density", title, caption, f"{title}: a density along the diagonal. {caption}",
+        lambda size: density(histogram, size),
+    )  # fmt: skip
+
+
+def _lateral(data: ReportData, runs: Mapping[str, Run]) -> Iterator[Picture]:
+    driven = [runs[name] for name in STYLES if name in runs]
+    if "style_limit" not in runs:
+        return
+    wanted = [n for n in ("1", "2", "4") if n in data.evaluated.models]
+    lines = [model_line(data, n) for n in wanted]
+    if "kalman_tuned" in data.evaluated.estimators:
+        lines.append(Line("kalman_tuned", "Kalman, tuned", "kalman_tuned"))
+    trained_to = data.histogram.trained_to_mps2(TRAINED_SHARE)
+    title = "Error by lateral acceleration"
+    caption = (
+        f"Five dry test drives of the training car, from a gentle driver to a racing one. "
+        f"{percent(TRAINED_SHARE, 1)} of the training rows lie below {trained_to:.1f} m/s² "
+        "(shaded). Beyond, tyres are no longer linear, and no linear model can follow; the Kalman "
+        "filter, which integrates accelerations, does."
+    )
+    yield Picture(
+        "lateral-acceleration",
+        title,
+        caption,
+        f"{title}: the root mean square error of each estimator in bins of lateral acceleration. "
+        f"{caption}",
+        lambda size: error_by_acceleration(driven, lines, trained_to, size),
+    )
