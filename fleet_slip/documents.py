@@ -59,12 +59,12 @@ class DocumentFolder:
         """Return a document. Raises `StorageError` if its checksum does not match."""
         file = self._file(number)
         with storage_errors(file):
-            text = file.read_text(encoding="utf-8")
+            text = file.read_bytes()
         try:
             envelope = json.loads(text)
             content, stated = envelope["content"], envelope["sha256"]
             found = checksum(content)
-        except (ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError, RecursionError):
             raise StorageError(f"{file}: not a document of this program. {_RESTORE}") from None
         if found != stated:
             raise StorageError(
@@ -73,18 +73,30 @@ class DocumentFolder:
             )
         return Document(number, content, stated)
 
+    def faults(self) -> dict[Path, str]:
+        """Return what is wrong with the files of the folder, by file, down to the last byte."""
+        found = {}
+        numbers = self.numbers()
+        for number in sorted({*numbers, *range(1, max(numbers, default=0) + 1)}):
+            file = self._file(number)
+            try:
+                document = self.read(number)
+                if file.read_bytes() != _rendered(document.content, document.sha256).encode():
+                    found[file] = "its layout was changed"
+            except StorageError as error:
+                found[file] = str(error).removeprefix(f"{file}: ")
+        return found
+
     def append(self, content: Mapping[str, Any]) -> Document:
         """Add a document under the next free number, durably."""
         sha256 = checksum(content)
-        text = json.dumps(
-            {"content": content, "sha256": sha256}, indent=1, ensure_ascii=False, allow_nan=False
-        )
+        text = _rendered(content, sha256)
         temporary = self.path / f"{TEMPORARY_PREFIX}{uuid.uuid4().hex}"
         with storage_errors(self.path):
             self.path.mkdir(parents=True, exist_ok=True)
             try:
                 with temporary.open("x", encoding="utf-8") as file:
-                    file.write(text + "\n")
+                    file.write(text)
                     file.flush()
                     os.fsync(file.fileno())
                 number = self._link_to_next_number(temporary)
@@ -106,6 +118,11 @@ class DocumentFolder:
 
     def _file(self, number: int) -> Path:
         return self.path / f"{number}.json"
+
+
+def _rendered(content: Mapping[str, Any], sha256: str) -> str:
+    document = {"content": content, "sha256": sha256}
+    return json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 _RESTORE = "Restore the file from a backup, or publish again."

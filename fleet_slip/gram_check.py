@@ -1,7 +1,7 @@
 """Checks the Gram rows against two other ways to compute them, bit for bit."""
 
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,13 +46,13 @@ def check_grams(
         raise SelectionError(f"{warehouse.root}: no logs yet. Run: fleet-slip simulate CAMPAIGN")
     step = max(1, len(logs.files) // count)
     chosen = logs.files[::step][:count]
-    stored = _stored_grams(warehouse)
+    stored = stored_grams(warehouse)
     drives = by_integers = rows = 0
     for file in chosen:
         from_sql = grams_of(aggregate(warehouse, [file]))
         _compare(file, "the stored Gram rows", from_sql, stored.get(file.path, {}))
-        counts = _read_counts(warehouse, file)
-        _compare(file, "float64 blocks", from_sql, _grams_by_blocks(warehouse, counts))
+        counts = read_counts(warehouse, file)
+        _compare(file, "float64 blocks", from_sql, grams_by_blocks(warehouse, counts))
         by_integers += _check_by_integers(warehouse, file, counts)
         drives += len(from_sql)
         rows += file.rows
@@ -75,9 +75,10 @@ def grams_of(rows: pa.Table) -> DriveGrams:
     return found
 
 
-def _stored_grams(warehouse: Warehouse) -> dict[str, DriveGrams]:
+def stored_grams(warehouse: Warehouse, paths: Sequence[str] | None = None) -> dict[str, DriveGrams]:
+    """Return the stored Gram rows of the logged signals, by log file; of some files, or all."""
     by_file: dict[str, DriveGrams] = defaultdict(dict)
-    for path in warehouse.grams.snapshot().paths:
+    for path in warehouse.grams.snapshot().paths if paths is None else paths:
         with storage_errors(warehouse.grams.path):
             every = pq.read_table(path)
         rows = every.filter(pc.equal(every["feature_set"], PLAIN))
@@ -86,7 +87,8 @@ def _stored_grams(warehouse: Warehouse) -> dict[str, DriveGrams]:
     return by_file
 
 
-def _read_counts(warehouse: Warehouse, file: TableFile) -> pa.Table:
+def read_counts(warehouse: Warehouse, file: TableFile) -> pa.Table:
+    """Return the columns of a log file that its Gram rows are made of."""
     path = warehouse.logs.path / file.path
     with storage_errors(path):
         return pq.read_table(
@@ -99,7 +101,8 @@ def _drives(rows: pa.Table) -> list[tuple[str, pa.Table]]:
     return [(drive, rows.filter(pc.equal(rows["drive_id"], drive))) for drive in ids]
 
 
-def _grams_by_blocks(warehouse: Warehouse, counts: pa.Table) -> DriveGrams:
+def grams_by_blocks(warehouse: Warehouse, counts: pa.Table) -> DriveGrams:
+    """Compute Gram rows by matrix products in float64, exact because blocks are small."""
     found: DriveGrams = {}
     for drive, rows in _drives(counts):
         for signals, matrix in _complete_parts(warehouse, rows):

@@ -133,8 +133,13 @@ def _in_flight(
 
 def _write(warehouse: Warehouse, batch: Batch) -> _Written:
     rows = simulate_batch(batch)
-    name = f"{batch.campaign}-{batch.index:04d}-{batch.digest[:12]}"
-    return _Written(batch, warehouse.logs.write_file(name, rows, batch.day), rows.num_rows)
+    action = warehouse.logs.write_file(file_name(batch), rows, batch.day)
+    return _Written(batch, action, rows.num_rows)
+
+
+def file_name(batch: Batch) -> str:
+    """Return the name of a batch's file, before the checksum of its bytes."""
+    return f"{batch.campaign}-{batch.index:04d}-{batch.digest[:12]}"
 
 
 def _land(warehouse: Warehouse, written: _Written) -> bool:

@@ -144,12 +144,16 @@ class Unit:
 
 @dataclass(frozen=True)
 class Change:
-    """What one commit does to a table."""
+    """What one commit does to a table.
+
+    `data_change` is false where rows only move between files.
+    """
 
     add: Sequence[AddAction] = ()
     remove: Sequence[TableFile] = ()
     units: Sequence[Unit] = ()
     note: Mapping[str, Any] = field(default_factory=dict)
+    data_change: bool = True
 
 
 @dataclass(frozen=True)
@@ -162,11 +166,14 @@ class Table:
     partition_by: tuple[str, ...] = ()
     description: str = ""
 
-    def snapshot(self) -> "Snapshot":
-        """Return the table as it is now; a table that nobody has written yet is empty."""
+    def snapshot(self, version: int | None = None) -> "Snapshot":
+        """Return the table as it is now; a table that nobody has written yet is empty.
+
+        An earlier version can be asked for; `StorageError` is raised if it is no longer known.
+        """
         with storage_errors(self.path):
             try:
-                return Snapshot(self, DeltaTable(str(self.path)))
+                return Snapshot(self, DeltaTable(str(self.path), version=version))
             except TableNotFoundError:
                 return Snapshot(self, None)
 
@@ -176,13 +183,12 @@ class Table:
         Returns the action that adds it to the table; it is not part of the table before that is
         committed. A file of that name left by an interrupted run is replaced.
         """
-        partition = {"day": day.isoformat()} if day else {}
-        folder = self.path.joinpath(*(f"{key}={value}" for key, value in partition.items()))
         content = self._encoded(rows)
-        target = folder / f"{name}-{checksum_of(content)}.parquet"
-        temporary = folder / f"{TEMPORARY_PREFIX}{uuid.uuid4().hex}.parquet"
+        path = _file_path(name, content, day)
+        target = self.path / path
+        temporary = target.with_name(f"{TEMPORARY_PREFIX}{uuid.uuid4().hex}.parquet")
         with storage_errors(target):
-            folder.mkdir(parents=True, exist_ok=True)
+            target.parent.mkdir(parents=True, exist_ok=True)
             try:
                 with temporary.open("wb") as file:
                     file.write(content)
@@ -191,15 +197,19 @@ class Table:
                 temporary.replace(target)
             finally:
                 temporary.unlink(missing_ok=True)
-            flush(folder)
+            flush(target.parent)
         return AddAction(
-            path=str(target.relative_to(self.path)),
+            path=path,
             size=len(content),
-            partition_values=partition,
+            partition_values={"day": day.isoformat()} if day else {},
             modification_time=_now_ms(),
             data_change=True,
             stats=json.dumps(_statistics(rows)),
         )
+
+    def path_of(self, name: str, rows: pa.Table, day: date | None = None) -> str:
+        """Return the path below the table that `write_file` gives to rows."""
+        return _file_path(name, self._encoded(rows), day)
 
     def _encoded(self, rows: pa.Table) -> pa.Buffer:
         stored = rows.drop_columns(
@@ -266,7 +276,11 @@ class Snapshot:
                 delta.create_write_transaction(
                     [
                         *(action for action in change.add if action.path not in both),
-                        *(_remove_action(file) for file in change.remove if file.path not in both),
+                        *(
+                            _remove_action(file, data_change=change.data_change)
+                            for file in change.remove
+                            if file.path not in both
+                        ),
                     ],
                     mode="append",
                     schema=self.table.schema,
@@ -339,6 +353,11 @@ def flush(folder: Path) -> None:
         os.close(descriptor)
 
 
+def _file_path(name: str, content: pa.Buffer, day: date | None) -> str:
+    folder = f"day={day.isoformat()}/" if day else ""
+    return f"{folder}{name}-{checksum_of(content)}.parquet"
+
+
 def _flush_log(folder: Path, before: int | None) -> None:
     """Make the commits after a version durable, which the Delta library leaves to the system."""
     with contextlib.suppress(FileNotFoundError):
@@ -380,10 +399,10 @@ def _table_file(action: Mapping[str, Any]) -> TableFile:
     )
 
 
-def _remove_action(file: TableFile) -> RemoveAction:
+def _remove_action(file: TableFile, *, data_change: bool) -> RemoveAction:
     return RemoveAction(
         path=file.path,
-        data_change=True,
+        data_change=data_change,
         deletion_timestamp=_now_ms(),
         size=file.size_bytes,
         partition_values={"day": file.day.isoformat()} if file.day else {},

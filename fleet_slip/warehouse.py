@@ -73,6 +73,11 @@ class Warehouse:
             description="Rows of measured logs that were refused, with the reason",
         )
 
+    @property
+    def tables(self) -> tuple[Table, ...]:
+        """All tables."""
+        return (self.logs, self.grams, self.quarantine)
+
 
 def gram_schema(signals: SignalCatalogue) -> pa.Schema:
     """Return the Arrow schema of the table `grams`.

@@ -1,0 +1,218 @@
+"""Commands that look after the warehouse: verify, compact, vacuum, forget, retain."""
+
+from dataclasses import asdict
+from datetime import date
+from typing import Annotated, Any
+
+import typer
+
+from fleet_slip.audit import Subject
+from fleet_slip.cli.output import Json, print_json, print_table, progress, say
+from fleet_slip.compaction import TARGET_ROWS
+from fleet_slip.compaction import compact as compact_logs
+from fleet_slip.errors import DamageError
+from fleet_slip.forget import ForgetReport
+from fleet_slip.forget import forget as forget_drives
+from fleet_slip.retention import load_retention
+from fleet_slip.retention import retain as apply_retention
+from fleet_slip.vacuum import RETENTION_HOURS, VacuumReport
+from fleet_slip.vacuum import vacuum as remove_expired
+from fleet_slip.verify import Finding, Verification
+from fleet_slip.verify import verify as verify_root
+from fleet_slip.warehouse import Warehouse
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this module."""
+    for command in (verify, compact, vacuum, forget, retain):
+        app.command()(command)
+
+
+def verify(
+    context: typer.Context,
+    full: Annotated[
+        bool, typer.Option("--full", help="Compute the Gram rows of all log files again.")
+    ] = False,
+    repair: Annotated[
+        bool,
+        typer.Option(
+            "--repair", help="Rebuild Gram rows from the logs, and simulated logs from campaigns."
+        ),
+    ] = False,
+    campaign: Annotated[
+        list[str] | None,
+        typer.Option(help="A campaign's TOML file for --repair, besides those that ship."),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Verify every byte against its checksum, and everything against everything else.
+
+    Exits with 9 if there is damage that was not repaired.
+    """
+    report = _verify(context.obj, full=full)
+    rebuilt: list[str] = []
+    if repair and report.damage:
+        from fleet_slip.repair import repair as rebuild  # noqa: PLC0415 - the simulator
+
+        rebuilt = rebuild(context.obj, report, campaign or ())
+        report = _verify(context.obj, full=full)
+    if json:
+        print_json(_verified(report, rebuilt))
+    else:
+        _print_verification(report, rebuilt)
+    if report.damage:
+        advice = (
+            "What is left cannot be rebuilt here: restore these files from a backup."
+            if repair
+            else "Rebuild what can be rebuilt with: fleet-slip verify --repair"
+        )
+        raise DamageError(f"{context.obj.root}: {len(report.damage)} damaged. {advice}")
+
+
+def _verify(warehouse: Warehouse, *, full: bool) -> Verification:
+    with progress("verify", "bytes") as advance:
+        return verify_root(warehouse, full=full, progress=advance)
+
+
+def _verified(report: Verification, rebuilt: list[str]) -> dict[str, Any]:
+    counts = asdict(report)
+    del counts["findings"]
+    return {
+        **counts,
+        "damage": [asdict(finding) for finding in report.damage],
+        "remarks": [asdict(finding) for finding in report.findings if not finding.damage],
+        "rebuilt": rebuilt,
+    }
+
+
+def _print_verification(report: Verification, rebuilt: list[str]) -> None:
+    for path in rebuilt:
+        say(f"rebuilt {path}")
+    remarks = [finding for finding in report.findings if not finding.damage]
+    for title, findings in (("damage", report.damage), ("remarks", remarks)):
+        if findings:
+            print_table(title, ["where", "problem"], map(_row, findings), left=2)
+    say(
+        f"{report.files} files with {report.size_bytes:,} bytes and {report.documents} documents "
+        f"were read, the Gram rows of {report.log_files_recomputed} log files computed again: "
+        + (f"{len(report.damage)} damaged" if report.damage else "all is as it must be")
+    )
+
+
+def _row(finding: Finding) -> list[str]:
+    return [finding.path, finding.problem]
+
+
+def compact(
+    context: typer.Context,
+    target_rows: Annotated[
+        int, typer.Option(min=1, help="Rows of a file after it, or fewer.")
+    ] = TARGET_ROWS,
+    json: Json = False,
+) -> None:
+    """Turn the small log files of each day into large ones. Readers and jobs are not disturbed."""
+    with progress("compact", "days") as advance:
+        report = compact_logs(context.obj, target_rows, advance)
+    if json:
+        print_json(asdict(report))
+    elif report.changed:
+        say(
+            f"{report.files_before} files became {report.files_after}; {report.rows_rewritten:,} "
+            f"rows were written again, {report.size_bytes_before:,} bytes became "
+            f"{report.size_bytes_after:,}"
+        )
+    else:
+        say(f"nothing to do, all {report.files_after} files are large or alone in their day")
+
+
+def vacuum(
+    context: typer.Context,
+    retention_hours: Annotated[
+        int,
+        typer.Option(
+            min=1, max=RETENTION_HOURS, help="Keep what a version of the last hours refers to."
+        ),
+    ] = RETENTION_HOURS,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="List the files and remove nothing.")
+    ] = False,
+    json: Json = False,
+) -> None:
+    """Remove replaced files and leftovers of killed jobs when they are old enough."""
+    report = remove_expired(context.obj, retention_hours, dry_run=dry_run)
+    if json:
+        print_json(asdict(report))
+        return
+    if dry_run and report.files:
+        print_table("", ["would be removed"], ([file] for file in report.files))
+    say(_vacuumed(report))
+
+
+def _vacuumed(report: VacuumReport) -> str:
+    done = "would be removed" if report.dry_run else "removed"
+    return f"{len(report.files)} files with {report.size_bytes:,} bytes {done}"
+
+
+def forget(
+    context: typer.Context,
+    vehicle: Annotated[str | None, typer.Option(help="The vehicle_id to forget.")] = None,
+    drive: Annotated[str | None, typer.Option(help="The drive_id to forget.")] = None,
+    now: Annotated[
+        bool,
+        typer.Option("--now", help="Delete the old files at once, not when vacuum is due."),
+    ] = False,
+    json: Json = False,
+) -> None:
+    """Forget a vehicle or a drive: in logs, Gram rows and quarantine; mark the models it trained.
+
+    Simulating or ingesting the same again does not bring it back. `fleet-slip run` retrains.
+    """
+    if (vehicle is None) == (drive is None):
+        raise typer.BadParameter("give one of --vehicle and --drive.")
+    subject = Subject("drive", drive) if drive else Subject("vehicle", vehicle or "")
+    with progress("forget", "files") as advance:
+        report = forget_drives(context.obj, subject, now=now, progress=advance)
+    if json:
+        print_json(asdict(report))
+    else:
+        _say_forgotten(report)
+
+
+def _say_forgotten(report: ForgetReport) -> None:
+    if not report.changed:
+        say("nothing to do, it was forgotten before")
+        return
+    say(
+        f"{report.drives} drives forgotten, {report.rows:,} rows: {report.files_rewritten} files "
+        f"written again without them, {report.files_removed} removed"
+    )
+    if report.old_files_deleted:
+        say(f"{report.old_files_deleted} old files with them deleted")
+    if report.old_files_left:
+        say(
+            f"{report.old_files_left} old files still have them until fleet-slip vacuum is due; "
+            "repeat with --now to delete them at once"
+        )
+    if report.models:
+        say(f"trained on them: {', '.join(report.models)}. Train again with: fleet-slip run")
+
+
+def retain(
+    context: typer.Context,
+    config: Annotated[
+        str | None,
+        typer.Option(help="A retention TOML file. Default: configs/retention.toml as it ships."),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Forget drives that are older than the retention says, then vacuum. For a schedule."""
+    with progress("retain", "files") as advance:
+        report = apply_retention(context.obj, load_retention(config), date.today(), advance)
+    if json:
+        print_json(asdict(report))
+        return
+    if report.forgotten.changed:
+        _say_forgotten(report.forgotten)
+    else:
+        say(f"no drive is older than {report.before}")
+    say(_vacuumed(report.vacuumed))

@@ -1,0 +1,211 @@
+"""Forgets drives: one car's, a single one, or all before a day.
+
+Their rows leave `quarantine`, `logs` and `grams`, in this order, so that an interrupted job finds
+by what is left what it still has to do. The log files concerned are written again without them,
+in one commit; the Gram rows follow by reconciliation. `fleet_slip/audit.py` is the record of it.
+"""
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from pathlib import Path
+
+import duckdb
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from fleet_slip.audit import Audit, Subject
+from fleet_slip.connection import connect
+from fleet_slip.database import database_errors, one_query, open_database
+from fleet_slip.errors import FleetSlipError, SelectionError
+from fleet_slip.gram_job import reconcile
+from fleet_slip.old_files import quarantined_of, remove_old_files
+from fleet_slip.registry import Registry
+from fleet_slip.resources import read_sql
+from fleet_slip.rewriting import read_drives
+from fleet_slip.storage import Change, Snapshot, retried, storage_errors
+from fleet_slip.warehouse import Warehouse
+
+Progress = Callable[[int, int], None]
+"""Called with files rewritten since the last call, and files to rewrite in all."""
+
+
+@dataclass(frozen=True)
+class ForgetReport:
+    """What was done."""
+
+    drives: int
+    rows: int
+    files_rewritten: int
+    files_removed: int
+    """Log files all of whose drives were forgotten."""
+    models: tuple[str, ...]
+    """Model versions, NAME@VERSION, that were trained on the drives."""
+    old_files_deleted: int
+    old_files_left: int
+    """Files with the drives that no version refers to, kept for readers of the last week."""
+
+    @property
+    def changed(self) -> bool:
+        """Whether there was anything to do."""
+        return bool(self.drives or self.old_files_deleted)
+
+
+def forget(
+    warehouse: Warehouse,
+    subject: Subject,
+    *,
+    now: bool = False,
+    progress: Progress = lambda _more, _all: None,
+) -> ForgetReport:
+    """Forget drives; with `now`, delete the replaced files at once instead of by `vacuum`.
+
+    It can be repeated after any interruption. Raises `SelectionError` if there never was such a
+    drive, `StorageError`, or `ConflictError`.
+    """
+    audit = Audit(warehouse.root)
+    drives = _drives_of(warehouse, subject)
+    state = audit.state(subject)
+    if not drives and state is None and subject.kind != "before":
+        raise SelectionError(
+            f"no drive has {subject.column} {subject.value!r}. See: "
+            'fleet-slip sql "SELECT drive_id, vehicle_id, day FROM drives"'
+        )
+    models = audit.models_of(subject)
+    if drives and state != "begun":
+        models = models_trained_on(warehouse, drives)
+        audit.begin(subject, len(drives), models)
+    _forget_quarantined(warehouse, drives)
+    rows, rewritten, removed = _rewrite_logs(warehouse, subject, progress)
+    reconcile(warehouse)
+    deleted, left = remove_old_files(warehouse, subject, delete=now)
+    if drives or state == "begun":
+        audit.end(subject)
+    return ForgetReport(
+        drives=len(drives),
+        rows=rows,
+        files_rewritten=rewritten,
+        files_removed=removed,
+        models=tuple(models),
+        old_files_deleted=deleted,
+        old_files_left=left,
+    )
+
+
+def _drives_of(warehouse: Warehouse, subject: Subject) -> frozenset[str]:
+    """Return the drives in the logs, and in the Gram rows where an interrupted job left them."""
+    found: set[str] = set().union(*drives_by_file(warehouse.logs.snapshot(), subject).values())
+    for path in warehouse.grams.snapshot().paths:
+        with storage_errors(warehouse.grams.path):
+            rows = pq.read_table(path, columns=["drive_id", "vehicle_id", "day"])
+        found.update(rows.filter(subject.mask(rows))["drive_id"].to_pylist())
+    return frozenset(found)
+
+
+def drives_by_file(logs: Snapshot, subject: Subject) -> dict[str, frozenset[str]]:
+    """Return the drives concerned of each log file that has some, by the file's path."""
+    if not logs.files:
+        return {}
+    paths = {str(logs.table.path / file.path): file.path for file in logs.files}
+    statement = read_sql("jobs", "find_drives.sql").format(condition=subject.condition)
+    found: dict[str, set[str]] = {}
+    with (
+        open_database() as database,
+        database_errors(f"looking for drives in {logs.table.path}"),
+    ):
+        database.execute("SET VARIABLE log_files = $files", {"files": list(paths)})
+        rows = database.execute(statement, {"value": subject.value}).fetchall()
+    for drive, path in rows:
+        found.setdefault(paths[path], set()).add(drive)
+    return {path: frozenset(drives) for path, drives in found.items()}
+
+
+def _rewrite_logs(
+    warehouse: Warehouse, subject: Subject, progress: Progress
+) -> tuple[int, int, int]:
+    """Commit the logs without the drives; return rows forgotten, files rewritten, removed."""
+
+    def attempt() -> tuple[int, int, int]:
+        logs = warehouse.logs.snapshot()
+        drives = drives_by_file(logs, subject)
+        concerned = [file for file in logs.files if file.path in drives]
+        if not concerned:
+            return 0, 0, 0
+        actions = []
+        rows = sum(file.rows for file in concerned)
+        for file in concerned:
+            kept = read_drives(warehouse.logs, [file], without=drives[file.path])
+            if kept.num_rows:
+                actions.append(warehouse.logs.write_file("kept", kept, file.day))
+                rows -= kept.num_rows
+            progress(1, len(concerned))
+        logs.commit(Change(add=actions, remove=concerned, note={"job": "forget"}))
+        return rows, len(actions), len(concerned) - len(actions)
+
+    return retried(attempt)
+
+
+def _forget_quarantined(warehouse: Warehouse, drives: Collection[str]) -> None:
+    def attempt() -> None:
+        snapshot = warehouse.quarantine.snapshot()
+        add, remove = [], []
+        for file, path in zip(snapshot.files, snapshot.paths, strict=True):
+            with storage_errors(warehouse.quarantine.path):
+                rows = pq.read_table(path)
+            kept = rows.filter(pc.invert(quarantined_of(rows, drives)))
+            if kept.num_rows < rows.num_rows:
+                remove.append(file)
+                if kept.num_rows:
+                    add.append(warehouse.quarantine.write_file("kept", kept))
+        if remove:
+            snapshot.commit(Change(add=add, remove=remove, note={"job": "forget"}))
+
+    if drives:
+        retried(attempt)
+
+
+def models_trained_on(warehouse: Warehouse, drives: Collection[str]) -> list[str]:
+    """Return the model versions whose cohort has one of the drives, among those that it could see.
+
+    Where that can no longer be told, because the Gram rows of that time are gone or the manifest
+    is damaged, the version counts as trained on them.
+    """
+    registry = Registry(warehouse.root / "models")
+    marked = []
+    with connect(warehouse.root) as database:
+        for name in registry.names():
+            for number in registry.versions(name):
+                try:
+                    trained = registry.load(name, number).manifest.trained_on
+                    drives_of_cohort = _in_cohort(database, trained.cohort, drives)
+                    concerned = _were_there(warehouse, trained.grams_version, drives_of_cohort)
+                except FleetSlipError:
+                    concerned = True
+                if concerned:
+                    marked.append(f"{name}@{number}")
+    return marked
+
+
+def _in_cohort(
+    database: duckdb.DuckDBPyConnection, cohort: str, drives: Collection[str]
+) -> set[str]:
+    statement = (
+        "SELECT DISTINCT drive_id FROM grams "
+        f"WHERE list_contains($drives, drive_id) AND ({cohort}\n)"
+    )
+    with database_errors(f"the cohort {cohort!r}"):
+        one_query(database, statement)
+        rows = database.execute(statement, {"drives": sorted(drives)}).fetchall()
+    return {row[0] for row in rows}
+
+
+def _were_there(warehouse: Warehouse, version: int, drives: Collection[str]) -> bool:
+    """Whether a version of the Gram rows has one of the drives. Raises `StorageError`."""
+    if not drives:
+        return False
+    for path in warehouse.grams.snapshot(version).paths:
+        with storage_errors(Path(path)):
+            ids = pq.read_table(path, columns=["drive_id"])["drive_id"].cast(pa.string())
+        if not set(drives).isdisjoint(ids.unique().to_pylist()):
+            return True
+    return False

@@ -1,0 +1,88 @@
+"""Files on disk that no version of a table refers to any more, and the drives that they hold."""
+
+from collections.abc import Collection, Iterator
+from datetime import date
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from fleet_slip.audit import Subject
+from fleet_slip.errors import FleetSlipError
+from fleet_slip.storage import Snapshot, storage_errors
+from fleet_slip.vacuum import Unreferenced, discard, replaced, unreferenced
+from fleet_slip.warehouse import Warehouse
+
+BEING_WRITTEN_HOURS = 1.0
+"""A file that no commit ever knew and that is younger may belong to a job that is running."""
+
+
+def remove_old_files(warehouse: Warehouse, subject: Subject, *, delete: bool) -> tuple[int, int]:
+    """Delete the files with the drives that no version refers to, or count them.
+
+    The logs come last: their old files are what tells the drives of a car in the quarantine.
+    """
+    logs = list(_with_subject(warehouse.logs.snapshot(), subject))
+    drives = {drive for _, names in logs for drive in names}
+    old = [file for file, _ in _of_quarantine(warehouse.quarantine.snapshot(), drives)]
+    old += [file for file, _ in _with_subject(warehouse.grams.snapshot(), subject)]
+    old += [file for file, _ in logs]
+    deleted = sum(discard(file) for file in old) if delete else 0
+    return deleted, len(old) - deleted
+
+
+def _readable(snapshot: Snapshot) -> Iterator[tuple[Unreferenced, pa.Table]]:
+    """Yield replaced files and leftovers that are not being written, with what tells the drives."""
+    known = replaced(snapshot)
+    wanted = {"drive_id", "vehicle_id", "day"}
+    for file in unreferenced(snapshot.table):
+        if str(file.path) not in known and file.age_hours < BEING_WRITTEN_HOURS:
+            continue
+        try:
+            with storage_errors(file.path):
+                schema = pq.read_schema(file.path)
+                columns = [name for name in schema.names if name in wanted]
+                rows = pq.read_table(file.path, columns=columns, partitioning=None)
+        except FleetSlipError:
+            continue  # half a file, or just deleted
+        yield file, _with_day(file, rows)
+
+
+def _with_day(file: Unreferenced, rows: pa.Table) -> pa.Table:
+    """Return the rows of a partitioned file with the day that its folder tells."""
+    key, _, day = file.path.parent.name.partition("=")
+    if key != "day":
+        return rows
+    return rows.append_column("day", pa.repeat(date.fromisoformat(day), rows.num_rows))
+
+
+def _with_subject(
+    snapshot: Snapshot, subject: Subject
+) -> Iterator[tuple[Unreferenced, frozenset[str]]]:
+    for file, rows in _readable(snapshot):
+        names = rows.filter(subject.mask(rows))["drive_id"].unique().to_pylist()
+        if names:
+            yield file, frozenset(names)
+
+
+def _of_quarantine(
+    snapshot: Snapshot, drives: Collection[str]
+) -> Iterator[tuple[Unreferenced, frozenset[str]]]:
+    for file, rows in _readable(snapshot):
+        concerned = quarantined_of(rows, drives)
+        if pc.any(concerned).as_py():
+            yield file, frozenset(rows.filter(concerned)["drive_id"].to_pylist())
+
+
+def quarantined_of(rows: pa.Table, drives: Collection[str]) -> pa.Array:
+    """Return which rows of the quarantine are of some drives.
+
+    A row that was refused before its drive was cut at a gap in time names the drive as a whole.
+    """
+    ids = rows["drive_id"].cast(pa.string())
+    concerned = {
+        name
+        for name in ids.unique().to_pylist()
+        if name and any(drive == name or drive.startswith(f"{name}-") for drive in drives)
+    }
+    return pc.is_in(ids, pa.array(sorted(concerned), pa.string()))

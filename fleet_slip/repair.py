@@ -1,0 +1,136 @@
+"""Rebuilds what can be rebuilt: Gram rows from the logs, simulated logs from their campaign.
+
+Nothing is deleted that was not rebuilt. A log file is simulated again under the name that the
+Delta log knows; since the name has the file's checksum, it is the same file or it is refused.
+"""
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from datetime import date
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from fleet_slip.campaign import Batch, Campaign, DriveSpec, load_campaign
+from fleet_slip.errors import FleetSlipError
+from fleet_slip.gram_job import reconcile, update_grams
+from fleet_slip.resources import config_names
+from fleet_slip.simulate import simulate_batch
+from fleet_slip.simulation_job import file_name
+from fleet_slip.storage import Change, TableFile, checksum_in, retried, storage_errors
+from fleet_slip.verify import Verification, problem_of
+from fleet_slip.warehouse import Warehouse
+
+
+def repair(
+    warehouse: Warehouse, verification: Verification, campaigns: Sequence[str] = ()
+) -> list[str]:
+    """Rebuild what a verification found damaged; return what was rebuilt, below the root.
+
+    `campaigns` names campaign files besides those that ship. Verify again to see what is left.
+    """
+    damaged = {finding.path for finding in verification.damage if finding.kind == "file"}
+    wrong = {f.path.removeprefix("logs/") for f in verification.damage if f.kind == "gram"}
+    rebuilt = _simulate_again(warehouse, damaged, campaigns)
+    rebuilt += _aggregate_again(warehouse, damaged, wrong)
+    return rebuilt
+
+
+def _simulate_again(
+    warehouse: Warehouse, damaged: Collection[str], campaigns: Sequence[str]
+) -> list[str]:
+    files = [file for file in warehouse.logs.snapshot().files if f"logs/{file.path}" in damaged]
+    if not files:
+        return []
+    known = _campaigns(campaigns)
+    drives = _drives_of(warehouse, {file.path for file in files})
+    rebuilt = []
+    for file in files:
+        for batch in _candidates(file, drives.get(file.path, frozenset()), known):
+            name = file.path.rpartition("/")[2].removesuffix(f"-{checksum_in(file.path)}.parquet")
+            rows = simulate_batch(batch)
+            if warehouse.logs.path_of(name, rows, file.day) == file.path:
+                warehouse.logs.write_file(name, rows, file.day)
+                rebuilt.append(f"logs/{file.path}")
+                break
+    return rebuilt
+
+
+def _campaigns(named: Sequence[str]) -> list[Campaign]:
+    return [load_campaign(name) for name in (*named, *config_names("campaigns"))]
+
+
+def _drives_of(warehouse: Warehouse, paths: Collection[str]) -> dict[str, frozenset[str]]:
+    """Return the drives that log files have, which their Gram rows tell."""
+    found: dict[str, set[str]] = {}
+    for rows in _readable_grams(warehouse).values():
+        concerned = rows.filter(pc.is_in(rows["file"], pa.array(sorted(paths), pa.string())))
+        for row in concerned.select(["file", "drive_id"]).to_pylist():
+            found.setdefault(row["file"], set()).add(row["drive_id"])
+    return {path: frozenset(drives) for path, drives in found.items()}
+
+
+def _candidates(
+    file: TableFile, drives: Collection[str], campaigns: Iterable[Campaign]
+) -> Iterable[Batch]:
+    """Yield what the file may have been simulated from: its drives, or a batch of its name."""
+    if file.day is None:
+        return
+    for campaign in campaigns:
+        if file.day not in campaign.days():
+            continue
+        specs: Mapping[str, DriveSpec] = {spec.drive_id: spec for spec in campaign.drives(file.day)}
+        if drives and specs.keys() >= set(drives):
+            yield _batch(campaign, file.day, [specs[drive] for drive in sorted(drives)])
+        for batch in campaign.batches(file.day):
+            if f"/{file_name(batch)}-" in file.path:
+                yield batch
+
+
+def _batch(campaign: Campaign, day: date, drives: Sequence[DriveSpec]) -> Batch:
+    return Batch(campaign.name, day, 0, tuple(drives))
+
+
+def _aggregate_again(
+    warehouse: Warehouse, damaged: Collection[str], wrong: Collection[str]
+) -> list[str]:
+    """Drop the Gram files that are damaged or have wrong rows, and compute what is missing."""
+    removed: list[str] = []
+
+    def attempt() -> None:
+        removed.clear()
+        snapshot = warehouse.grams.snapshot()
+        readable = _readable_grams(warehouse)
+        bad = [
+            file
+            for file in snapshot.files
+            if f"grams/{file.path}" in damaged
+            or (file.path in readable and _names_any(readable[file.path], wrong))
+        ]
+        if bad:
+            snapshot.commit(Change(remove=bad, note={"job": "repair"}))
+            removed.extend(f"grams/{file.path}" for file in bad)
+
+    retried(attempt)
+    if removed:
+        reconcile(warehouse)
+        update_grams(warehouse)
+    return removed
+
+
+def _names_any(rows: pa.Table, files: Collection[str]) -> bool:
+    return not set(files).isdisjoint(rows["file"].unique().to_pylist())
+
+
+def _readable_grams(warehouse: Warehouse) -> dict[str, pa.Table]:
+    """Return which drives and log files the Gram files name, of those that are whole."""
+    found = {}
+    for file in warehouse.grams.snapshot().files:
+        if problem_of(warehouse.grams, file) is None:
+            path = warehouse.grams.path / file.path
+            try:
+                with storage_errors(path):
+                    found[file.path] = pq.read_table(path, columns=["file", "drive_id"])
+            except FleetSlipError:
+                continue
+    return found

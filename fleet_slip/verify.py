@@ -1,0 +1,270 @@
+"""Compares everything below a data root with everything else that tells what it must be.
+
+Every byte of every data file with the checksum in its name; files, sizes and counts with the Delta
+log; drives with the rule that they are whole; Gram rows with the logs by a path of their own;
+documents with their checksums; model versions with the tables that they were made of.
+"""
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from itertools import chain
+from pathlib import Path
+from typing import Literal
+
+import pyarrow.parquet as pq
+
+from fleet_slip.database import database_errors, open_database
+from fleet_slip.documents import DocumentFolder
+from fleet_slip.errors import FleetSlipError
+from fleet_slip.gram_check import DriveGrams, grams_by_blocks, read_counts, stored_grams
+from fleet_slip.registry import Registry
+from fleet_slip.resources import read_sql
+from fleet_slip.storage import Snapshot, Table, TableFile, checksum_in, checksum_of, storage_errors
+from fleet_slip.vacuum import replaced, temporary_files, unreferenced
+from fleet_slip.warehouse import Warehouse
+
+SAMPLE = 4
+"""Log files whose Gram rows are computed again, evenly chosen, unless all are asked for."""
+
+Progress = Callable[[int, int], None]
+"""Called with bytes read since the last call, and bytes to read in all."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that is not as it must be, or that is worth knowing.
+
+    Attributes:
+        kind: where it is. "damage" of a `file`, a `drive`, a `gram` row, a `document`, a `model`,
+            or the `log` of a table; or only a remark: "unreferenced" or "backlog".
+        path: the file below the root, or the drive or model version.
+        problem: what is wrong.
+    """
+
+    kind: Literal["file", "drive", "gram", "document", "model", "log", "unreferenced", "backlog"]
+    path: str
+    problem: str
+
+    @property
+    def damage(self) -> bool:
+        """Whether something is lost, or would be computed wrongly."""
+        return self.kind not in {"unreferenced", "backlog"}
+
+
+@dataclass
+class Verification:
+    """What was looked at, and what was found."""
+
+    files: int = 0
+    size_bytes: int = 0
+    rows: int = 0
+    log_files_recomputed: int = 0
+    documents: int = 0
+    findings: list[Finding] = field(default_factory=list)
+
+    @property
+    def damage(self) -> list[Finding]:
+        """The findings that are damage."""
+        return [finding for finding in self.findings if finding.damage]
+
+
+def verify(
+    warehouse: Warehouse,
+    *,
+    full: bool = False,
+    progress: Progress = lambda _more, _all: None,
+) -> Verification:
+    """Verify a data root; `full` computes the Gram rows of all log files again."""
+    report = Verification()
+    snapshots = _snapshots(warehouse, report)
+    good = {table: _verify_files(s, report, progress) for table, s in snapshots.items()}
+    logs, grams = (good.get(table, []) for table in ("logs", "grams"))
+    if logs:
+        _verify_drives(warehouse, logs, report)
+    if grams:
+        _verify_grams(warehouse, logs, grams, full, report)
+    _verify_documents(warehouse.root, report)
+    _verify_models(warehouse, snapshots, report)
+    _list_unreferenced(warehouse, snapshots, report)
+    return report
+
+
+def _snapshots(warehouse: Warehouse, report: Verification) -> dict[str, Snapshot]:
+    found = {}
+    for table in warehouse.tables:
+        try:
+            snapshot = table.snapshot()
+            _ = snapshot.files
+        except FleetSlipError as error:
+            report.findings.append(Finding("log", table.path.name, str(error)))
+        else:
+            found[table.path.name] = snapshot
+    return found
+
+
+def _verify_files(snapshot: Snapshot, report: Verification, progress: Progress) -> list[TableFile]:
+    """Return the files of a table that are what they must be."""
+    table = snapshot.table
+    good = []
+    with ThreadPoolExecutor(os.cpu_count()) as executor:
+        problems = executor.map(lambda file: problem_of(table, file), snapshot.files)
+        for file, problem in zip(snapshot.files, problems, strict=True):
+            if problem:
+                report.findings.append(Finding("file", f"{table.path.name}/{file.path}", problem))
+            else:
+                good.append(file)
+            progress(file.size_bytes, snapshot.size_bytes)
+    report.files += len(snapshot.files)
+    report.size_bytes += snapshot.size_bytes
+    report.rows += snapshot.rows if table.path.name == "logs" else 0
+    return good
+
+
+def problem_of(table: Table, file: TableFile) -> str | None:
+    """Return what is wrong with a data file, or None."""
+    path = table.path / file.path
+    try:
+        with storage_errors(path):
+            content = path.read_bytes()
+            if len(content) != file.size_bytes:
+                return f"has {len(content):,} bytes instead of {file.size_bytes:,}"
+            expected = checksum_in(file.path)
+            if expected and checksum_of(content) != expected:
+                return "its bytes do not match the checksum in its name"
+            metadata = pq.read_metadata(path)
+    except FleetSlipError as error:
+        return str(error).removeprefix(f"{path}: ")
+    return _contradiction(file, metadata)
+
+
+def _contradiction(file: TableFile, metadata: pq.FileMetaData) -> str | None:
+    """Return in what a file's footer and the Delta log differ, or None."""
+    if metadata.num_rows != file.rows:
+        return f"has {metadata.num_rows:,} rows, the Delta log says {file.rows:,}"
+    if (nulls := _null_counts(metadata)).items() - file.null_counts.items():
+        wrong = [name for name, count in nulls.items() if file.null_counts.get(name) != count]
+        return f"the Delta log states other numbers of nulls of {', '.join(wrong)}"
+    if file.day and not file.path.startswith(f"day={file.day}/"):
+        return f"the Delta log says that it is of {file.day}"
+    return None
+
+
+def _null_counts(metadata: pq.FileMetaData) -> dict[str, int]:
+    """Return the number of nulls of each plain column, from the file's own statistics."""
+    counts: dict[str, int] = {}
+    for group in range(metadata.num_row_groups):
+        for number in range(metadata.num_columns):
+            column = metadata.row_group(group).column(number)
+            statistics = column.statistics
+            if "." not in column.path_in_schema and statistics and statistics.has_null_count:
+                name = column.path_in_schema
+                counts[name] = counts.get(name, 0) + statistics.null_count
+    return counts
+
+
+def _verify_drives(warehouse: Warehouse, files: Sequence[TableFile], report: Verification) -> None:
+    paths = [str(warehouse.logs.path / file.path) for file in files]
+    with open_database() as database, database_errors("verifying the drives"):
+        database.execute("SET VARIABLE log_files = $files", {"files": paths})
+        rows = database.execute(read_sql("jobs", "verify_drives.sql")).fetchall()
+    for drive, in_files, beginnings, n, file in rows:
+        problem = f"{n:,} rows in {in_files} files with {beginnings} rows of tick 0; one is {file}"
+        report.findings.append(Finding("drive", drive, problem))
+
+
+def _verify_grams(
+    warehouse: Warehouse,
+    logs: Sequence[TableFile],
+    grams: Sequence[TableFile],
+    full: bool,
+    report: Verification,
+) -> None:
+    paths = [str(warehouse.grams.path / file.path) for file in grams]
+    with open_database() as database, database_errors("verifying the Gram rows"):
+        database.execute("SET VARIABLE gram_files = $files", {"files": paths})
+        twice = database.execute(read_sql("jobs", "verify_grams.sql")).fetchall()
+    for identity, file, drive, n in twice:
+        problem = f"the Gram row {identity} of drive {drive} stands {n} times"
+        report.findings.append(Finding("gram", f"logs/{file}", problem))
+    stored = stored_grams(warehouse, paths)
+    covered = [file for file in logs if file.path in stored]
+    step = 1 if full else max(1, len(covered) // SAMPLE)
+    for file in covered[::step]:
+        computed = grams_by_blocks(warehouse, read_counts(warehouse, file))
+        for drive in _different(stored[file.path], computed):
+            problem = f"the stored Gram row of drive {drive} is not that of its rows"
+            report.findings.append(Finding("gram", f"logs/{file.path}", problem))
+        report.log_files_recomputed += 1
+    missing = len(logs) - len(covered)
+    stale = stored.keys() - {file.path for file in warehouse.logs.snapshot().files}
+    if missing or stale:
+        problem = f"{missing} log files have no Gram rows, {len(stale)} with Gram rows are gone"
+        report.findings.append(Finding("backlog", "grams", f"{problem}; run: fleet-slip gram"))
+
+
+def _different(one: DriveGrams, two: DriveGrams) -> list[str]:
+    return sorted({key[0] for key in one.keys() | two.keys() if one.get(key) != two.get(key)})
+
+
+def _verify_documents(root: Path, report: Verification) -> None:
+    for folder in _document_folders(root):
+        report.documents += len(folder.numbers())
+        for file, problem in folder.faults().items():
+            report.findings.append(Finding("document", str(file.relative_to(root)), problem))
+
+
+def _document_folders(root: Path) -> list[DocumentFolder]:
+    files = chain.from_iterable(
+        entry.rglob("*.json") for entry in sorted(root.glob("*")) if not _is_table(entry)
+    )
+    return [DocumentFolder(path) for path in sorted({file.parent for file in files})]
+
+
+def _is_table(folder: Path) -> bool:
+    return (folder / "_delta_log").is_dir()
+
+
+def _verify_models(
+    warehouse: Warehouse, snapshots: dict[str, Snapshot], report: Verification
+) -> None:
+    registry = Registry(warehouse.root / "models")
+    for name in registry.names():
+        numbers = registry.versions(name)
+        for number in numbers:
+            try:
+                trained = registry.load(name, number).manifest.trained_on
+            except FleetSlipError:
+                continue  # told as a document
+            made_of = {"logs": trained.logs_version, "grams": trained.grams_version}
+            for table, version in made_of.items():
+                latest = snapshots[table].version if table in snapshots else None
+                if latest is None or version > latest:
+                    problem = f"was made of version {version} of {table}, which does not exist"
+                    report.findings.append(Finding("model", f"{name}@{number}", problem))
+        try:
+            aliases = registry.aliases(name)
+        except (FleetSlipError, ValueError):
+            continue
+        for alias, version in aliases.items():
+            if version not in numbers:
+                problem = f"points at version {version}, which does not exist"
+                report.findings.append(Finding("model", f"{name}@{alias}", problem))
+
+
+def _list_unreferenced(
+    warehouse: Warehouse, snapshots: dict[str, Snapshot], report: Verification
+) -> None:
+    for snapshot in snapshots.values():
+        known = replaced(snapshot)
+        for file in unreferenced(snapshot.table):
+            what = "replaced" if str(file.path) in known else "never committed"
+            _remark(warehouse, file.path, f"{what}; fleet-slip vacuum removes it in time", report)
+    for file in temporary_files(warehouse):
+        _remark(warehouse, file.path, "left by a killed job, or being written", report)
+
+
+def _remark(warehouse: Warehouse, path: Path, problem: str, report: Verification) -> None:
+    where = str(path.relative_to(warehouse.root))
+    report.findings.append(Finding("unreferenced", where, problem))
