@@ -79,7 +79,7 @@ def test_every_feature_is_its_physical_definition_rounded_and_clipped() -> None:
     with duckdb.connect() as database:
         database.register("log_counts", pa.table(logged))
         query = f"SELECT * FROM {with_features('log_counts', definitions)}"
-        found = database.execute(query).to_arrow_table()
+        found: pa.Table = database.sql(query).to_arrow_table()
     exact = {name: catalogue()[name].exact_scale for name in INPUTS}
     clipped = 0
     for i, row in enumerate(found.to_pylist()):
