@@ -218,9 +218,14 @@ class Registry:
         return ModelVersion(document.number, manifest, document.sha256)
 
     def promote(self, name: str, version: int, alias: str) -> None:
-        """Point an alias at a version. Raises `SelectionError` for an unknown version."""
+        """Point an alias at a version. Raises `SelectionError` for an unknown version.
+
+        Where it points there already nothing is added, so that a repeated command can be undone by
+        one `rollback`.
+        """
         self.load(name, version)
-        self._move(name, alias, version, "promote")
+        if self.aliases(name).get(alias) != version:
+            self._move(name, alias, version, "promote")
 
     def rollback(self, name: str, alias: str) -> int:
         """Point an alias back at the version it had before; return that version.

@@ -8,6 +8,7 @@ import typer
 
 from fleet_slip.audit import Subject
 from fleet_slip.cli.output import Json, print_json, print_table, progress, say
+from fleet_slip.cli.recorded import recorded
 from fleet_slip.compaction import TARGET_ROWS
 from fleet_slip.compaction import compact as compact_logs
 from fleet_slip.errors import DamageError
@@ -103,6 +104,7 @@ def _row(finding: Finding) -> list[str]:
     return [finding.path, finding.problem]
 
 
+@recorded
 def compact(
     context: typer.Context,
     target_rows: Annotated[
@@ -125,6 +127,7 @@ def compact(
         say(f"nothing to do, all {report.files_after} files are large or alone in their day")
 
 
+@recorded
 def vacuum(
     context: typer.Context,
     retention_hours: Annotated[
@@ -153,6 +156,7 @@ def _vacuumed(report: VacuumReport) -> str:
     return f"{len(report.files)} files with {report.size_bytes:,} bytes {done}"
 
 
+@recorded
 def forget(
     context: typer.Context,
     vehicle: Annotated[str | None, typer.Option(help="The vehicle_id to forget.")] = None,
@@ -197,6 +201,7 @@ def _say_forgotten(report: ForgetReport) -> None:
         say(f"trained on them: {', '.join(report.models)}. Train again with: fleet-slip run")
 
 
+@recorded
 def retain(
     context: typer.Context,
     config: Annotated[

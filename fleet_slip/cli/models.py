@@ -4,6 +4,7 @@ from typing import Annotated, Any
 
 import typer
 
+from fleet_slip.audit import Audit
 from fleet_slip.cli.output import Json, print_json, print_table, say
 from fleet_slip.cli.recorded import recorded
 from fleet_slip.cli.selecting import (
@@ -120,7 +121,12 @@ def models(
 ) -> None:
     """List the published model versions."""
     registry = registry_of(context.obj)
-    rows = [row for row in registry.as_table().to_pylist() if name in (None, row["name"])]
+    marked = Audit(context.obj.root).marked_models()
+    rows = [
+        {**row, "trained_on_forgotten": f"{row['name']}@{row['version']}" in marked}
+        for row in registry.as_table().to_pylist()
+        if name in (None, row["name"])
+    ]
     if name and not rows:
         registry.resolve(name)
     if json:
@@ -147,6 +153,9 @@ def models(
         ],
         left=4,
     )
+    for row in rows:
+        if row["trained_on_forgotten"]:
+            say(f"{row['name']}@{row['version']} was trained on drives that were forgotten since")
     if name:
         print_table(
             "\nhistory of aliases",

@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
+from fleet_slip.audit import Audit
 from fleet_slip.cli.data import Days, Threads, Through, chosen_days, run_gram, run_simulation
 from fleet_slip.cli.models import print_publication, published, registry_of
 from fleet_slip.cli.output import Json, print_json, say
@@ -85,8 +86,12 @@ def _publish(
     context: typer.Context, planned: PlannedSelection, name: str
 ) -> tuple[Publication | None, str]:
     manifest = manifest_of(planned.selection, name, planned.label, planned.config_sha256)
+    registry = registry_of(context.obj)
+    champion = registry.champion(name)
+    # What was trained on forgotten drives is replaced, even if the new model is worse.
+    tainted = champion and champion.reference in Audit(context.obj.root).marked_models()
     try:
-        return publish(registry_of(context.obj), manifest, planned.selection), ""
+        return publish(registry, manifest, planned.selection, force=bool(tainted)), ""
     except RefusedError as error:
         return None, str(error)
 
