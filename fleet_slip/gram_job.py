@@ -24,6 +24,9 @@ from fleet_slip.warehouse import Warehouse
 FILES_PER_QUERY = 16
 """Planning 77 aggregates costs 20 ms, so that one query takes many files."""
 
+LAGGED_FILES_PER_QUERY = 2
+"""Rows are sorted to find the one before, which takes memory for all rows of a query."""
+
 SMALL_FILE_ROWS = 100_000
 SMALL_FILES_MAX = 32
 """So many small Gram files may stand side by side before a commit merges them."""
@@ -158,9 +161,11 @@ def aggregate(
     """Return the Gram rows of log files, in the schema of `grams`, sorted by file and drive."""
     parts = [warehouse.grams.schema.empty_table()]
     total = sum(file.rows for file in files)
+    lagged = features().set(feature_set).lagged
+    step = LAGGED_FILES_PER_QUERY if lagged else FILES_PER_QUERY
     with open_database(threads=threads) as database:
-        for first in range(0, len(files), FILES_PER_QUERY):
-            batch = files[first : first + FILES_PER_QUERY]
+        for first in range(0, len(files), step):
+            batch = files[first : first + step]
             parts.append(_query(database, warehouse, batch, feature_set))
             progress(sum(file.rows for file in batch), total)
     return pa.concat_tables(parts)
