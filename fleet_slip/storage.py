@@ -238,7 +238,9 @@ class Snapshot:
         if self.delta is None:
             return ()
         with storage_errors(self.table.path):
-            actions = pa.table(self.delta.get_add_actions(flatten=True)).to_pylist()
+            # pa.table() would import pandas, which takes half a second.
+            stream = self.delta.get_add_actions(flatten=True)
+            actions = pa.RecordBatchReader.from_stream(stream).read_all().to_pylist()
         return tuple(sorted(map(_table_file, actions), key=lambda file: file.path))
 
     @property
