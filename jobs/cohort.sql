@@ -1,7 +1,7 @@
 -- The Gram rows of a cohort. The condition may use any column of the view "drives".
 -- Rows without any signal serve no model. Sorted, so that the same cohort reads the same everywhere.
 SELECT
-    drive_id, vehicle_id, vehicle_model, source, campaign, track, mass_kg, adhesion, speed_factor, day,
+    drive_id, vehicle_id, vehicle_model, source, campaign, track, mass_kg, adhesion, speed_factor, saturated, day,
     part, signals, n, clipped, sums, products
 FROM grams
 WHERE feature_set = '{feature_set}' AND signals <> '' AND (

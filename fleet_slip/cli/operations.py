@@ -1,17 +1,20 @@
-"""Commands that keep a warehouse in service: status."""
+"""Commands that keep a warehouse in service: status, quality."""
 
 from typing import Annotated, Any
 
 import typer
 
 from fleet_slip.cli.output import Json, print_json, print_table
+from fleet_slip.cohort import TRAINING_DRIVES, load_cohort
 from fleet_slip.errors import AlarmError
+from fleet_slip.operations.quality import QualityReport, examine
 from fleet_slip.operations.status import Status, status_of
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
     app.command()(status)
+    app.command()(quality)
 
 
 def status(
@@ -101,6 +104,47 @@ def _print_runs(found: Status) -> None:
             for run in found.last_runs
         ],
         left=3,
+    )
+
+
+def quality(
+    context: typer.Context,
+    cohort: Annotated[
+        str,
+        typer.Option(help="SQL condition on the view drives: which drives to examine together."),
+    ] = TRAINING_DRIVES,
+    json: Json = False,
+) -> None:
+    """Find stuck, saturated, biased, noisy, scaled, reversed and swapped sensors, drive by drive.
+
+    Reads Gram rows only. Exit code 10 if a drive's sensors are not in order.
+    """
+    found = examine(load_cohort(context.obj, cohort))
+    if json:
+        print_json(found.as_dict())
+    else:
+        _print_quality(found)
+    if found.findings:
+        raise AlarmError(
+            f"the sensors of {len(found.findings)} of {found.drives} drives are not in order"
+        )
+
+
+def _print_quality(found: QualityReport) -> None:
+    print_table(
+        f"{found.drives:,} drives examined, {found.compared:,} of them beside their peers",
+        ["drive", "car", "fault", "signals", "what shows it"],
+        [
+            [
+                finding.drive_id,
+                finding.vehicle_id,
+                finding.fault.kind,
+                " ".join(finding.fault.signals),
+                finding.fault.figure,
+            ]
+            for finding in found.findings
+        ],
+        left=5,
     )
 
 

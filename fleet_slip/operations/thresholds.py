@@ -18,10 +18,34 @@ class StatusThresholds(Config):
     min_free_fraction: float = Field(ge=0, lt=1)
 
 
+class QualityThresholds(Config):
+    """When `quality` finds a drive's sensors not in order.
+
+    Attributes:
+        min_rows: shorter drives are not examined.
+        min_drives: fewest drives in order of a vehicle model to compare others with.
+        min_correlation: a sign of turning contradicts the others at less than minus this.
+        limit: how many spreads from the cohort's median a figure may be.
+        offset_floor_counts, gain_floor, noise_floor: least spread of the figures between drives;
+            noise_floor is of the logarithm of the noise.
+        max_saturated_per_row: most values at the end of their range, per row.
+    """
+
+    min_rows: int = Field(gt=0)
+    min_drives: int = Field(ge=8)
+    min_correlation: float = Field(gt=0, lt=1)
+    limit: float = Field(gt=0)
+    offset_floor_counts: float = Field(gt=0)
+    gain_floor: float = Field(gt=0)
+    noise_floor: float = Field(gt=0)
+    max_saturated_per_row: float = Field(gt=0)
+
+
 class Thresholds(Config):
     """All thresholds."""
 
     status: StatusThresholds
+    quality: QualityThresholds
 
 
 @cache
