@@ -78,12 +78,11 @@ def inline(svg: str, prefix: str, alternative: str) -> str:
     width, height = re.search(r'viewBox="0 0 ([\d.]+) ([\d.]+)"', body).groups()  # type: ignore[union-attr]
     largest = f"max-width: {float(width) * PIXELS_PER_POINT:.0f}px"
     head = (
-        f'<svg role="img" aria-labelledby="{prefix}-title" viewBox="0 0 {width} {height}" '
+        f'<svg role="img" aria-label="{_escaped(alternative)}" viewBox="0 0 {width} {height}" '
         f'xmlns:xlink="http://www.w3.org/1999/xlink" style="{largest}">'
-        f'<title id="{prefix}-title">{_escaped(alternative)}</title>'
     )
     return head + body[body.index(">") + 1 :]
 
 
 def _escaped(text: str) -> str:
-    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    return text.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")

@@ -4,10 +4,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from fleet_slip.evaluation.errors import ErrorFigures
 from fleet_slip.evaluation.targets import FILTER_SCENARIOS
 from fleet_slip.report.coefficients import Coefficient, Coefficients
 from fleet_slip.report.data import ReportData
 from fleet_slip.report.text import count, degrees, number, percent, scientific, size
+from fleet_slip.signals import catalogue
 
 Mark = Literal["", "good", "miss"]
 
@@ -23,14 +25,8 @@ PAPER_TABLE_TWO = {
 }
 """Mean and standard deviation of the error in deg, Table II."""
 
-SYMBOLS = {
-    "ax": "aₓ",
-    "ay": "a_y",
-    "yaw_rate": "ψ̇",
-    "steering_wheel": "δ_s",
-    "steer_fl": "δ_l",
-    "steer_fr": "δ_r",
-}
+SHOWN_MODELS = ("1", "2", "4", "5")
+"""Model 3 hardly differs from model 2 anywhere."""
 
 
 @dataclass(frozen=True)
@@ -231,7 +227,7 @@ def scenarios(data: ReportData) -> Table:
     """Return how the models and the filters do on every scenario."""
     evaluated = data.evaluated
     shown = {
-        **{f"model {k}": v for k, v in evaluated.models.items()},
+        **{f"model {k}": v for k, v in evaluated.models.items() if k in SHOWN_MODELS},
         **{
             name.removesuffix("_tuned").replace("_", " "): name
             for name in evaluated.of_kind("filter")
@@ -240,37 +236,40 @@ def scenarios(data: ReportData) -> Table:
     }
     rows: list[list[str | Cell]] = []
     for name, scenario in evaluated.scenarios.items():
-        stds = [_std(data, name, estimator) for estimator in shown.values()]
-        least = min((std for std, _ in stds if std is not None), default=None)
+        found = [evaluated.figures(name, estimator) for estimator in shown.values()]
+        least = min(
+            (one.error_std_deg for one in found if one and one.error_std_deg and one.coverage == 1),
+            default=None,
+        )
         place = scenario["paper"]
         rows.append(
             [
                 scenario["description"] + (f" ({place})" if place else ""),
                 number(scenario["truth"]["sideslip_std_deg"], 2),
-                *(Cell(text, "good" if std == least else "") for std, text in stds),
+                *(_std(one, least) for one in found),
             ]
         )
     return table(
         "scenarios",
         "Every test drive: standard deviation of the error in degrees",
-        ["test drive", "of the angle", *shown],
+        ["test drive", "angle itself", *shown],
         rows,
         note=(
             "Green: the smallest of the row. A percentage: the share of the drive with an "
-            "estimate, where a signal is missing. Filters and observers are the tuned ones; they "
-            "know mass, geometry and tyres of the training car, the regression nothing but its "
-            "drives."
+            "estimate, where a signal is missing; such are not compared. Filters and observers are "
+            "the tuned ones; they know mass, geometry and tyres of the training car, the "
+            "regression nothing but its drives."
         ),
     )
 
 
-def _std(data: ReportData, scenario: str, estimator: str) -> tuple[float | None, str]:
-    figures = data.evaluated.figures(scenario, estimator)
-    if figures is None or figures.error_std_deg is None:
-        return None, number(None)
-    text = number(figures.error_std_deg)
-    covered = figures.coverage
-    return figures.error_std_deg, text if covered == 1 else f"{text} ({percent(covered)})"
+def _std(found: ErrorFigures | None, least: float | None = None) -> Cell:
+    if found is None or found.error_std_deg is None:
+        return Cell(number(None))
+    text = number(found.error_std_deg)
+    if found.coverage < 1:
+        return Cell(f"{text} ({percent(found.coverage)})")
+    return Cell(text, "good" if found.error_std_deg == least else "")
 
 
 def rivals(data: ReportData) -> Table | None:
@@ -297,7 +296,7 @@ def rivals(data: ReportData) -> Table | None:
                 str(len(one["signals"])),
                 number(one["cross_validated"]["correlation"], 4),
                 degrees(one["cross_validated"]["error_std_deg"]),
-                degrees(_std(data, "nominal", one["name"])[0]),
+                _std(data.evaluated.figures("nominal", one["name"])),
                 number(one["training_s"], 2),
                 count(one["size_bytes"]),
                 number(one["one_estimate_us"], 1),
@@ -343,7 +342,7 @@ def storage(data: ReportData) -> Table:
     """Return what the warehouse holds."""
     return table(
         "storage",
-        "The warehouse",
+        "Rows and bytes",
         ["table", "version", "files", "drives", "rows", "size", "bytes a row"],
         [
             [
@@ -358,8 +357,7 @@ def storage(data: ReportData) -> Table:
             for one in data.tables
         ],
         note=(
-            f"A row of the logs is one sample of {len(data.version.manifest.signals)} of its "
-            "signals and more, at 100 Hz. Models are made from the Gram rows, one a drive; the "
-            "logs are not read again."
+            f"A row of the logs is one sample at 100 Hz of {len(catalogue().signals)} signals, and "
+            "what is known of the drive. Models are made from the Gram rows alone, one a drive."
         ),
     )

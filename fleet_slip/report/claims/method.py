@@ -30,11 +30,11 @@ def many_vehicles(data: ReportData) -> Verdict:
     if not rows:
         raise NotEvaluatedError("fleet-trained model on cars of other classes")
     better = sum(row["better"] == row["fleet"] for row in rows)
-    gain = sum(row["one_car_rmse_deg"] - row["fleet_rmse_deg"] for row in rows) / len(rows)
+    change = sum(row["fleet_rmse_deg"] - row["one_car_rmse_deg"] for row in rows) / len(rows)
     return verdict(
         better > len(rows) / 2,
-        f"better in {better} of {len(rows)} cases; the error is smaller by "
-        f"{degrees(gain, sign=True)} on average",
+        f"better in {better} of {len(rows)} cases; on average its root mean square error differs "
+        f"by {degrees(change, sign=True)}",
         "Loads, tyres and sensor biases of many cars average out in a fleet's coefficients. A car "
         "that is much like the trained one is served worse by them, a very different one better.",
     )
@@ -48,12 +48,11 @@ def many_vehicles(data: ReportData) -> Verdict:
 def little_computation(data: ReportData) -> Verdict:
     """Count the terms of the dot product."""
     signals = len(data.evaluated.estimators[data.choice]["signals"])
-    rows = next(table.rows for table in data.tables if table.name == "grams")
+    drives = data.version.manifest.trained_on.drives
     return verdict(
         signals <= LITTLE,
         f"{signals} multiplications and {signals} additions, {8 * (signals + 1)} bytes of numbers",
-        f"An estimate is one dot product. All training is done off line, from {count(rows)} Gram "
-        "rows.",
+        f"An estimate is one dot product. All training is done off line, from {drives} Gram rows.",
     )
 
 

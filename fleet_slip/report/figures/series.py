@@ -21,6 +21,9 @@ HEAD_IN = 0.42
 FOOT_IN = 0.42
 LEFT_IN = 0.42
 RIGHT_IN = 0.08
+REACHES_DEG = (0.2, 0.4, 0.6, 1.0, 2.0, 4.0, 6.0, 10.0, 20.0, 40.0, 90.0, 180.0, 360.0)
+COMPARABLE = 3
+"""Largest ratio of scales at which the smaller one is given up."""
 
 
 @dataclass(frozen=True)
@@ -66,13 +69,13 @@ def side_slip(blocks: Sequence[Block], size: Size) -> Figure:
     height = sum(block.height_in for block in blocks)
     figure = Figure(figsize=(size.width_in, height))
     top = height
-    for block in blocks:
-        _draw(figure, block, top, size)
+    for block, reach in zip(blocks, _reaches(blocks), strict=True):
+        _draw(figure, block, top, reach, size)
         top -= block.height_in
     return figure
 
 
-def _draw(figure: Figure, block: Block, top_in: float, size: Size) -> None:
+def _draw(figure: Figure, block: Block, top_in: float, reach: float, size: Size) -> None:
     angle, *strips = _panels(figure, block, top_in)
     time_s = block.run.drive.time_s
     truth_deg = np.degrees(block.run.drive.sideslip_rad)
@@ -85,7 +88,6 @@ def _draw(figure: Figure, block: Block, top_in: float, size: Size) -> None:
     angle.plot(truth.x, truth.mean, color=colour("truth"), linewidth=1.1)
     _legend(figure, angle, block, top_in)
     angle.set_ylabel("side-slip angle (deg)" if size.wide else "deg", labelpad=2)
-    reach = _reach([_estimate_deg(block, line) - truth_deg for line in block.all_strips])
     for axes, line in zip(strips, block.all_strips, strict=True):
         _plot(axes, time_s, _estimate_deg(block, line) - truth_deg, line, size)
         axes.set_ylim(-reach, reach)
@@ -123,12 +125,19 @@ def _plot(axes: Axes, x: FloatArray, y: FloatArray, line: Line, size: Size) -> N
     axes.plot(series.x, series.mean, color=tone, linewidth=1.0)
 
 
-def _reach(differences: Sequence[FloatArray]) -> float:
-    """Return the half-height of the strips: a round number that holds all differences."""
-    largest = max(float(np.nanmax(np.abs(values))) for values in differences)
-    return next(
-        reach for reach in (0.2, 0.4, 0.6, 1, 2, 4, 6, 10, 20, 40, 90, 180) if largest < reach
-    )
+def _reaches(blocks: Sequence[Block]) -> list[float]:
+    """Return the half-height of each block's strips: the same for all where that can be read."""
+    reaches = [_reach(block) for block in blocks]
+    comparable = max(reaches) <= COMPARABLE * min(reaches)
+    return [max(reaches)] * len(reaches) if comparable else reaches
+
+
+def _reach(block: Block) -> float:
+    """Return a round number that is larger than all differences of a block, in deg."""
+    truth = np.degrees(block.run.drive.sideslip_rad)
+    sizes = [np.abs(_estimate_deg(block, line) - truth) for line in block.all_strips]
+    largest = max(float(np.nanmax(values)) for values in sizes)
+    return next(reach for reach in REACHES_DEG if largest < reach)
 
 
 def _shade(axes: Axes, block: Block) -> None:
@@ -160,7 +169,7 @@ def _legend(figure: Figure, axes: Axes, block: Block, top_in: float) -> None:
             color=colour(tone),
             va="top",
         )
-        left += 0.078 * (len(name) + 4)
+        left += 0.07 * (len(name) + 3.5)
     axes.margins(y=0.06)
 
 
