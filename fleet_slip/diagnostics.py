@@ -4,7 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from fleet_slip.cohort import Cohort
+from fleet_slip.cohort import Cohort, Served
+from fleet_slip.errors import SelectionError
 from fleet_slip.features import input_scales
 from fleet_slip.regression.drives import DriveMoments, serving_drives
 from fleet_slip.regression.evidence import Evidence
@@ -157,7 +158,7 @@ def diagnose(
         condition_number=condition_number(total, inputs),
         evidence=Evidence.clustered(fits, moments),
         serial=_serial(fitted, lagged) if lagged else None,
-        comparison=_compare(fitted, moments, against) if against else None,
+        comparison=_compare(served, fitted, moments, against) if against else None,
         noise_free=free,
     )
 
@@ -174,11 +175,17 @@ def _serial(fitted: Fit, lagged: Cohort) -> SerialDiagnosis:
     )
 
 
-def _compare(fitted: Fit, moments: DriveMoments, against: Cohort) -> Comparison:
+def _compare(here: Served, fitted: Fit, moments: DriveMoments, against: Cohort) -> Comparison:
     inputs, label = fitted.model.signals, fitted.model.label
-    served = against.serving(inputs)
-    other_moments = DriveMoments.of(served.table)
-    other = fit(served.table.total(), inputs, label)
+    there = against.serving(inputs)
+    shared = {*here.drives["drive_id"].to_pylist()} & {*there.drives["drive_id"].to_pylist()}
+    if shared:
+        raise SelectionError(
+            f"the two cohorts share {len(shared)} drives, such as {min(shared)}: a comparison "
+            f"needs different drives. Add to --cohort: AND NOT ({against.condition})"
+        )
+    other_moments = DriveMoments.of(there.table)
+    other = fit(there.table.total(), inputs, label)
     return Comparison(
         against.condition,
         cluster(other, other_moments, input_scales()),

@@ -266,6 +266,7 @@ def test_shrinkage_is_compared_with_least_squares(
         (["regimes", "--over", "mood"], 5, "it has speed, ay"),
         (["regimes", "--features", "motion"], 5, "Sets with regimes: regimes"),
         (["diagnose", "--signals", "ay,ay"], 3, "stands twice"),
+        (["diagnose", "smoke", "--against", "speed_factor > 0.85"], 5, "AND NOT (speed_factor"),
     ],
 )
 def test_a_mistake_is_one_line_and_its_exit_code(
