@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fleet_slip.cohort import FOLD_KEYS, Cohort, assign
+from fleet_slip.cohort import FOLD_KEYS, ROW_FOLDS, Cohort, assign
 from fleet_slip.errors import SelectionError
 from fleet_slip.features import features, input_scales
 from fleet_slip.gram import Gram, IntArray
@@ -128,6 +128,8 @@ def compare_regimes(
 
     Raises `SelectionError` for a feature set without regimes, absent signals, or empty folds.
     """
+    if plan.by == ROW_FOLDS:
+        raise SelectionError("rows are divided by regime already: fold by drive, or by vehicle.")
     names = regime_names(cohort, over)
     order = band_order(cohort, names)
     regime = np.array([order.index(name) for name in names], dtype=np.int64)

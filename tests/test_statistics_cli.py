@@ -264,6 +264,8 @@ def test_shrinkage_is_compared_with_least_squares(
         (["what-if", "nothing", "--noise", "ay=1"], 5, "no model is called"),
         (["what-if", "smoke", "--signals", "ay", "--noise", "ay=1"], 3, "not both"),
         (["regimes", "--over", "mood"], 5, "it has speed, ay"),
+        (["regimes", "--by", "row"], 5, "fold by drive"),
+        (["shrink", "--by", "row"], 5, "Fold by drive"),
         (["regimes", "--features", "motion"], 5, "Sets with regimes: regimes"),
         (["diagnose", "--signals", "ay,ay"], 3, "stands twice"),
         (["diagnose", "smoke", "--against", "speed_factor > 0.85"], 5, "AND NOT (speed_factor"),

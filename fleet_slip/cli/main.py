@@ -10,6 +10,7 @@ import typer
 
 from fleet_slip.cli import (
     data,
+    diagnosing,
     evaluate,
     maintenance,
     models,
@@ -44,6 +45,7 @@ for module in (
     data,
     selecting,
     models,
+    diagnosing,
     statistics,
     evaluate,
     report,

@@ -1,99 +1,34 @@
-"""Commands that examine models on Gram rows: features, diagnose, what-if, regimes, shrink."""
+"""Commands that examine models on Gram rows: features, what-if, regimes, shrink."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Annotated
 
 import typer
 
-from fleet_slip.cli.models import registry_of
-from fleet_slip.cli.output import Json, print_json, print_table, say, stdout
+from fleet_slip.cli.output import Json, print_json, print_table, stdout
 from fleet_slip.cli.selecting import Cohort, FoldCount, Naive
+from fleet_slip.cli.subject import FeatureSetOption, Model, Signals, quantities, subject_of
 from fleet_slip.cohort import TRAINING_DRIVES, load_cohort
-from fleet_slip.diagnostics import Diagnosis, diagnose
-from fleet_slip.errors import ConfigError, SelectionError
+from fleet_slip.errors import ConfigError
 from fleet_slip.features import PLAIN, FeatureSet, features
 from fleet_slip.model_list import FoldKey, FoldPlan
 from fleet_slip.regime_comparison import RegimeComparison, compare_regimes
-from fleet_slip.registry import ModelVersion, Registry
 from fleet_slip.regression.exact import fit
 from fleet_slip.regression.figures import Figures
-from fleet_slip.regression.inference import INTERCEPT, Estimate
+from fleet_slip.regression.inference import INTERCEPT
 from fleet_slip.selection_plan import WHOLE_SET, inputs_of
 from fleet_slip.shrinkage import compare_shrinkage
 from fleet_slip.signals import catalogue
-from fleet_slip.warehouse import Warehouse
 from fleet_slip.what_if import WhatIf, counts_model, what_if
 
-Model = Annotated[
-    str | None,
-    typer.Argument(
-        help="NAME, NAME@VERSION or NAME@ALIAS of a published model. Default: the only one that "
-        "there is, unless --signals is given.",
-        show_default=False,
-    ),
-]
-Signals = Annotated[
-    str | None,
-    typer.Option(
-        help="Instead of a published model: signals to fit, separated by commas; 'catalogue' is "
-        "all inputs."
-    ),
-]
-FeatureSetOption = Annotated[
-    str | None,
-    typer.Option(
-        "--features", help="Feature set that --signals are of. Default: the logged signals."
-    ),
-]
 By = Annotated[FoldKey, typer.Option(help="What a fold is made of.")]
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
     app.command("features")(list_features)
-    app.command("diagnose")(diagnose_model)
     app.command("what-if")(what_if_sensors)
     app.command("regimes")(regimes)
     app.command("shrink")(shrink)
-
-
-@dataclass(frozen=True)
-class Subject:
-    """What a command examines: the inputs of a published model, or named ones."""
-
-    feature_set: str
-    named: str | None
-    version: ModelVersion | None
-
-    def inputs(self, warehouse: Warehouse, condition: str) -> tuple[str, ...]:
-        """Return the inputs; all that the cohort has, if that was asked for."""
-        if self.version is not None:
-            return self.version.manifest.signals
-        cohort = load_cohort(warehouse, condition, self.feature_set)
-        return inputs_of(cohort, self.named or WHOLE_SET)
-
-
-def subject_of(
-    warehouse: Warehouse, reference: str | None, signals: str | None, feature_set: str | None
-) -> Subject:
-    """Return what is to be examined. Raises `ConfigError` if a model and signals are named."""
-    if signals is not None or feature_set is not None:
-        if reference is not None:
-            raise ConfigError("name a published model or --signals (of --features), not both.")
-        return Subject(feature_set or PLAIN, signals, None)
-    registry = registry_of(warehouse)
-    version = registry.resolve(reference or _only_model(registry))
-    identity = version.manifest.trained_on.feature_set
-    return Subject(features().name_of(identity), None, version)
-
-
-def _only_model(registry: Registry) -> str:
-    names = registry.names()
-    if len(names) == 1:
-        return names[0]
-    known = ", ".join(names) or "none"
-    raise SelectionError(f"name a published model, or --signals. Published: {known}.")
 
 
 def list_features(
@@ -150,160 +85,6 @@ def _parts(one: FeatureSet) -> str:
     if one.row_folds:
         return f"{one.row_folds} folds of rows"
     return "with the one before" if one.lagged else "together"
-
-
-def quantities(values: Sequence[str] | None, option: str) -> dict[str, float]:
-    """Return what options like `--noise ay=0.2` say, in SI units. Raises `ConfigError`."""
-    found = {}
-    for value in values or ():
-        name, _, number = value.partition("=")
-        try:
-            found[name.strip()] = float(number)
-        except ValueError:
-            raise ConfigError(
-                f"{option} {value}: write SIGNAL=NUMBER in SI units, such as ay=0.2."
-            ) from None
-    return found
-
-
-def diagnose_model(
-    context: typer.Context,
-    model: Model = None,
-    signals: Signals = None,
-    feature_set: FeatureSetOption = None,
-    cohort: Cohort = TRAINING_DRIVES,
-    against: Annotated[
-        str | None,
-        typer.Option(help="Condition of another cohort: does it have the same coefficients?"),
-    ] = None,
-    serial: Annotated[
-        bool,
-        typer.Option(
-            "--serial",
-            help="Durbin-Watson and AR(1) generalised least squares, from lagged Gram rows: "
-            "fleet-slip gram --features lags",
-        ),
-    ] = False,
-    sensor_noise: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Noise that the logs already have, such as ay=0.1 in SI units: shows the "
-            "coefficients without it (errors in variables). May be repeated."
-        ),
-    ] = None,
-    json: Json = False,
-) -> None:
-    """Fit a model's signals to a cohort and examine the fit, from Gram rows.
-
-    Standard errors by drives are the ones to believe: at 100 Hz a row says little that the one
-    before did not say.
-    """
-    subject = subject_of(context.obj, model, signals, feature_set)
-    inputs = subject.inputs(context.obj, cohort)
-    result = diagnose(
-        load_cohort(context.obj, cohort, subject.feature_set),
-        inputs,
-        lagged=load_cohort(context.obj, cohort, _lagged_set()) if serial else None,
-        against=load_cohort(context.obj, against, subject.feature_set) if against else None,
-        sensor_noise=quantities(sensor_noise, "--sensor-noise"),
-    )
-    if json:
-        print_json({"cohort": cohort, **result.as_dict()})
-    else:
-        _print_diagnosis(result)
-
-
-def _lagged_set() -> str:
-    return next(name for name, one in features().sets.items() if one.lagged)
-
-
-def _print_diagnosis(result: Diagnosis) -> None:
-    print_table(
-        f"{result.drives:,} drives, {result.fitted.gram.n:,} rows, worth "
-        f"{result.evidence.rows:,.0f} independent ones; R squared {result.fitted.r_squared:.4f}, "
-        f"condition {result.condition_number:.3g}",
-        _coefficient_header(result),
-        _coefficient_rows(result),
-        left=2,
-    )
-    if result.serial is not None:
-        found = result.serial
-        stdout().print(
-            f"residuals: correlation {found.correlation.rho:.4f} with the row before, "
-            f"Durbin-Watson {found.correlation.durbin_watson:.4f} (2 if independent); AR(1) with "
-            f"rho {found.autoregressive.rho:.4f}.",
-            markup=False,
-        )
-    if result.comparison is not None:
-        _print_comparison(result)
-
-
-def _coefficient_header(result: Diagnosis) -> list[str]:
-    header = ["signal", "unit", "coefficient", "s.e. by drives", "t", "s.e. by rows", "VIF"]
-    if result.serial is not None:
-        header += ["AR(1)", "s.e. AR(1)"]
-    if result.noise_free is not None:
-        header += ["without noise"]
-    return header
-
-
-def _coefficient_rows(result: Diagnosis) -> list[list[str]]:
-    rows = []
-    for i, (robust, naive) in enumerate(
-        zip(result.robust.estimates, result.naive.estimates, strict=True)
-    ):
-        constant = robust.name == INTERCEPT
-        row = [
-            robust.name,
-            catalogue()[catalogue().label].unit if constant else features().of(robust.name).unit,
-            f"{robust.value:.6g}",
-            f"{robust.standard_error:.2g}",
-            f"{robust.t:.1f}",
-            f"{naive.standard_error:.2g}",
-            "" if constant else f"{result.inflation[robust.name]:.3g}",
-        ]
-        if result.serial is not None:
-            estimate = result.serial.inference.estimates[i]
-            slope = [f"{estimate.value:.6g}", f"{estimate.standard_error:.2g}"]
-            row += ["", ""] if constant else slope
-        if result.noise_free is not None:
-            free = result.noise_free
-            row += [f"{free.offset if constant else free.weights[robust.name]:.6g}"]
-        rows.append(row)
-    return rows
-
-
-def _print_comparison(result: Diagnosis) -> None:
-    found = result.comparison
-    if found is None:
-        return
-    print_table(
-        f"\nthe same signals where {found.condition}",
-        ["signal", "coefficient here", "there", "s.e. there", "difference / s.e."],
-        [
-            [
-                here.name,
-                f"{here.value:.6g}",
-                f"{there.value:.6g}",
-                f"{there.standard_error:.2g}",
-                f"{_standardised(here, there):+.1f}",
-            ]
-            for here, there in zip(result.robust.estimates, found.other.estimates, strict=True)
-        ],
-    )
-    for test, kind in ((found.drives, "Wald, by drives"), (found.rows, "Chow, by rows")):
-        stdout().print(
-            f"the same coefficients? {kind}: F({test.numerator}, {test.denominator}) = "
-            f"{test.f:,.2f}, p = {test.p:.2g}.",
-            markup=False,
-        )
-    if found.drives.p > 0.05 >= found.rows.p:
-        say("by drives, the difference is no more than chance: the rows only look like evidence.")
-
-
-def _standardised(here: Estimate, there: Estimate) -> float:
-    spread = float((here.standard_error**2 + there.standard_error**2) ** 0.5)
-    return (there.value - here.value) / spread
 
 
 def what_if_sensors(
