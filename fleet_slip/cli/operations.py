@@ -1,12 +1,18 @@
-"""Commands that keep a warehouse in service: status, quality."""
+"""Commands that keep a warehouse in service: status, quality, monitor."""
 
+from datetime import date
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from fleet_slip.cli.models import Reference, registry_of
 from fleet_slip.cli.output import Json, print_json, print_table
+from fleet_slip.cli.run import DEFAULT_CAMPAIGN
 from fleet_slip.cohort import TRAINING_DRIVES, load_cohort
-from fleet_slip.errors import AlarmError
+from fleet_slip.errors import AlarmError, ConfigError
+from fleet_slip.operations.monitor import Chart
+from fleet_slip.operations.monitor import monitor as chart_errors
 from fleet_slip.operations.quality import QualityReport, examine
 from fleet_slip.operations.status import Status, status_of
 
@@ -15,6 +21,7 @@ def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
     app.command()(status)
     app.command()(quality)
+    app.command()(monitor)
 
 
 def status(
@@ -145,6 +152,73 @@ def _print_quality(found: QualityReport) -> None:
             for finding in found.findings
         ],
         left=5,
+    )
+
+
+def monitor(
+    context: typer.Context,
+    reference: Reference = DEFAULT_CAMPAIGN,
+    cohort: Annotated[
+        str | None,
+        typer.Option(
+            help="SQL condition on the view drives. Default: the condition of its training."
+        ),
+    ] = None,
+    since: Annotated[
+        str | None,
+        typer.Option(
+            help="First new day, YYYY-MM-DD. Default: the one after the days it was trained on."
+        ),
+    ] = None,
+    plot: Annotated[
+        Path | None, typer.Option(help="Draw the chart to an SVG, PDF or PNG file.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Chart a model's error on each day since it was trained, with control limits.
+
+    Reads Gram rows only. Exit code 10 if a new day is beyond the limits.
+    """
+    version = registry_of(context.obj).resolve(reference)
+    chart = chart_errors(context.obj, version, cohort, _first_new_day(since))
+    if plot:
+        from fleet_slip.operations.chart import draw  # noqa: PLC0415 - an optional dependency
+
+        draw(chart, plot)
+    if json:
+        print_json(chart.as_dict())
+    else:
+        _print_chart(chart)
+    if chart.alarms:
+        days = ", ".join(f"{day.day} ({' and '.join(day.alarms)})" for day in chart.alarms)
+        raise AlarmError(f"the error of {chart.model} is beyond its limits on {days}")
+
+
+def _first_new_day(text: str | None) -> date | None:
+    try:
+        return None if text is None else date.fromisoformat(text)
+    except ValueError:
+        raise ConfigError(f"--since {text}: not a date; write it as 2024-05-01.") from None
+
+
+def _print_chart(chart: Chart) -> None:
+    mean, std = chart.mean_limits, chart.std_limits
+    print_table(
+        f"{chart.model}, drives where {chart.cohort}; limits from the training days: "
+        f"mean {mean.lower:+.4f} to {mean.upper:+.4f}, std up to {std.upper:.4f} deg",
+        ["day", "", "drives", "rows", "mean deg", "std deg"],
+        [
+            [
+                str(day.day),
+                "training" if day.training else "new, alarm" if day.alarms else "new",
+                f"{day.drives:,}",
+                f"{day.rows:,}",
+                f"{day.error_mean_deg:+.4f}" + ("*" if "mean" in day.alarms else ""),
+                f"{day.error_std_deg:.4f}" + ("*" if "std" in day.alarms else ""),
+            ]
+            for day in chart.days
+        ],
+        left=2,
     )
 
 

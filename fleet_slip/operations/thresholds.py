@@ -41,11 +41,24 @@ class QualityThresholds(Config):
     max_saturated_per_row: float = Field(gt=0)
 
 
+class MonitorThresholds(Config):
+    """When `monitor` calls a day an alarm.
+
+    Attributes:
+        min_training_days: fewest days to learn from what is usual.
+        false_alarms_per_day: probability that a usual day is beyond a figure's limits.
+    """
+
+    min_training_days: int = Field(ge=3)
+    false_alarms_per_day: float = Field(gt=0, lt=0.5)
+
+
 class Thresholds(Config):
     """All thresholds."""
 
     status: StatusThresholds
     quality: QualityThresholds
+    monitor: MonitorThresholds
 
 
 @cache

@@ -31,6 +31,22 @@ def student_t_two_sided(t: float, degrees: float) -> float:
     return incomplete_beta(degrees / 2, 0.5, degrees / (degrees + t * t))
 
 
+def student_t_quantile(p: float, degrees: float) -> float:
+    """Return the t that Student's t distribution exceeds with probability 1 - p, for p > 1/2.
+
+    Bisection of the distribution function down to neighbouring numbers.
+    """
+    low, high = 0.0, 1.0
+    while student_t_two_sided(high, degrees) > 2 * (1 - p):
+        high *= 2
+    while low < (middle := (low + high) / 2) < high:
+        if student_t_two_sided(middle, degrees) > 2 * (1 - p):
+            low = middle
+        else:
+            high = middle
+    return high
+
+
 def f_upper(f: float, numerator: float, denominator: float) -> float:
     """Return P(F >= f) for the F distribution with the given degrees of freedom."""
     if f <= 0:

@@ -1,0 +1,111 @@
+"""What `fleet-slip monitor` says of days like those before, and of days on which something changed.
+
+    python -m benchmarks.drift [DAYS]
+
+Simulates DAYS days (12) of the campaign `fleet` with 24 drives each, publishes a model, and then
+lands six more days three times over: as before, on worn tyres, and on wet roads. Draws each chart
+to drift_0.svg, drift_1.svg, drift_2.svg in the working directory.
+"""
+
+import shutil
+import sys
+import tempfile
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+from fleet_slip.campaign import Campaign, load_campaign
+from fleet_slip.gram_job import update_grams
+from fleet_slip.operations.chart import draw
+from fleet_slip.operations.monitor import Chart, monitor
+from fleet_slip.publishing import manifest_of, publish
+from fleet_slip.registry import Registry
+from fleet_slip.selection_plan import SelectionPlan, run_plan
+from fleet_slip.simulation_job import simulate_campaign
+from fleet_slip.warehouse import Warehouse
+
+NEW_DAYS = 6
+COHORT = "source = 'simulated'"
+
+
+def base(days: int) -> Campaign:
+    update = {"drives_per_day": 24, "number_of_days": days}
+    return load_campaign("fleet").model_copy(update=update)
+
+
+def later(name: str, days: int, update: Mapping[str, Any]) -> Campaign:
+    """Return a campaign of the days after, changed in some way."""
+    first = base(days)
+    content = first.model_dump()
+    content |= {
+        "name": f"fleet_{name}",
+        "seed": first.seed + 1,
+        "first_day": first.first_day + timedelta(days=days),
+        "number_of_days": NEW_DAYS,
+    }
+    content["plan"] |= update.get("plan", {})
+    content["sensors"] |= update.get("sensors", {})
+    return first.model_copy(
+        update={
+            **{key: content[key] for key in ("name", "seed", "first_day", "number_of_days")},
+            "plan": type(first.plan).model_validate(content["plan"]),
+            "sensors": type(first.sensors).model_validate(content["sensors"]),
+        }
+    )
+
+
+CHANGES: Mapping[str, Mapping[str, Any]] = {
+    "as before": {},
+    "worn tyres (stiffness 0.60-0.80 instead of 0.85-1.15)": {
+        "plan": {"tyre_stiffness": {"min": 0.60, "max": 0.80}}
+    },
+    "wet roads (adhesion 0.4-0.6 instead of 0.6-1.0)": {
+        "plan": {"adhesion": {"min": 0.4, "max": 0.6}}
+    },
+}
+
+
+def land(warehouse: Warehouse, campaign: Campaign) -> None:
+    with ThreadPoolExecutor(2) as executor:
+        simulate_campaign(warehouse, campaign, campaign.days(), executor)
+    update_grams(warehouse)
+
+
+def train(warehouse: Warehouse) -> None:
+    planned = run_plan(warehouse, SelectionPlan(cohort=COHORT))
+    manifest = manifest_of(planned.selection, "sideslip", planned.label, planned.config_sha256)
+    publish(Registry(warehouse.root / "models"), manifest, planned.selection)
+
+
+def tell(name: str, chart: Chart) -> None:
+    mean, std = chart.mean_limits, chart.std_limits
+    print(
+        f"\n{name}: mean within {mean.lower:+.4f} and {mean.upper:+.4f}, std up to {std.upper:.4f}"
+    )
+    for day in chart.days:
+        told = "training" if day.training else "ALARM " + " ".join(day.alarms) * bool(day.alarms)
+        told = told if day.training or day.alarms else ""
+        print(f"{day.day}  {day.error_mean_deg:+.4f}  {day.error_std_deg:.4f}  {told}")
+
+
+def main() -> None:
+    days = int(sys.argv[1]) if len(sys.argv) > 1 else 12
+    with tempfile.TemporaryDirectory() as folder:
+        trained = Path(folder) / "trained"
+        land(Warehouse(trained), base(days))
+        train(Warehouse(trained))
+        for number, (name, update) in enumerate(CHANGES.items()):
+            root = Path(folder) / str(number)
+            shutil.copytree(trained, root)
+            warehouse = Warehouse(root)
+            land(warehouse, later(f"later_{number}", days, update))
+            version = Registry(root / "models").resolve("sideslip")
+            chart = monitor(warehouse, version, COHORT)
+            tell(name, chart)
+            draw(chart, Path(f"drift_{number}.svg"))
+
+
+if __name__ == "__main__":
+    main()
