@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 
 from fleet_slip.campaign import Batch, Campaign, DriveSpec, load_campaign
 from fleet_slip.errors import FleetSlipError
-from fleet_slip.gram_job import reconcile, update_grams
+from fleet_slip.gram_job import reconcile
 from fleet_slip.resources import config_names
 from fleet_slip.simulate import simulate_batch
 from fleet_slip.simulation_job import file_name
@@ -112,9 +112,7 @@ def _aggregate_again(
             removed.extend(f"grams/{file.path}" for file in bad)
 
     retried(attempt)
-    if removed:
-        reconcile(warehouse)
-        update_grams(warehouse)
+    reconcile(warehouse)  # also what an interrupted repair has dropped
     return removed
 
 

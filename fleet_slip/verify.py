@@ -6,7 +6,7 @@ documents with their checksums; model versions with the tables that they were ma
 """
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from itertools import chain
@@ -84,7 +84,8 @@ def verify(
     if logs:
         _verify_drives(warehouse, logs, report)
     if grams:
-        _verify_grams(warehouse, logs, grams, full, report)
+        active = {file.path for file in snapshots["logs"].files} if "logs" in snapshots else set()
+        _verify_grams(warehouse, logs, grams, active, full, report)
     _verify_documents(warehouse.root, report)
     _verify_models(warehouse, snapshots, report)
     _list_unreferenced(warehouse, snapshots, report)
@@ -178,6 +179,7 @@ def _verify_grams(
     warehouse: Warehouse,
     logs: Sequence[TableFile],
     grams: Sequence[TableFile],
+    active: Collection[str],
     full: bool,
     report: Verification,
 ) -> None:
@@ -198,7 +200,7 @@ def _verify_grams(
             report.findings.append(Finding("gram", f"logs/{file.path}", problem))
         report.log_files_recomputed += 1
     missing = len(logs) - len(covered)
-    stale = stored.keys() - {file.path for file in warehouse.logs.snapshot().files}
+    stale = stored.keys() - set(active)
     if missing or stale:
         problem = f"{missing} log files have no Gram rows, {len(stale)} with Gram rows are gone"
         report.findings.append(Finding("backlog", "grams", f"{problem}; run: fleet-slip gram"))

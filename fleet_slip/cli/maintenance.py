@@ -52,7 +52,7 @@ def verify(
     """
     report = _verify(context.obj, full=full)
     rebuilt: list[str] = []
-    if repair and report.damage:
+    if repair:
         from fleet_slip.repair import repair as rebuild  # noqa: PLC0415 - the simulator
 
         rebuilt = rebuild(context.obj, report, campaign or ())

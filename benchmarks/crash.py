@@ -1,0 +1,295 @@
+"""Kills commands (SIGKILL) in mid-work, repeats them, and compares every bit with a quiet run.
+
+    python -m benchmarks.crash [--kills 300] [--seed 0] [--commands simulate gram ...]
+
+A command dies either at a named point, before or after a call that makes something durable, or at
+a random moment. Then nothing may be damaged; and after the same command has been given again the
+rows, Gram rows, quarantine, model versions, aliases and records of forgetting must be those of a
+root on which it was never killed.
+
+A process that has imported everything forks for every command, which takes a tenth of the time.
+"""
+
+import argparse
+import hashlib
+import importlib
+import json
+import os
+import random
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+from deltalake import DeltaTable
+
+from benchmarks.crash_commands import COMMANDS, Command, prepare_inputs
+from fleet_slip import (  # whatever a command imports late is here before the fork
+    ingest_job,  # noqa: F401
+    repair,  # noqa: F401
+    simulation_job,  # noqa: F401
+)
+from fleet_slip.audit import Audit
+from fleet_slip.campaign import load_campaign
+from fleet_slip.cli.main import main as fleet_slip_main
+from fleet_slip.ingest.mapping import load_mapping
+from fleet_slip.registry import Registry
+from fleet_slip.simulate import simulate_logs
+from fleet_slip.storage import Table
+from fleet_slip.verify import verify
+from fleet_slip.warehouse import Warehouse
+
+POINTS: tuple[tuple[Any, str], ...] = (
+    (pq, "write_table"),
+    (os, "fsync"),
+    (Path, "replace"),
+    (Path, "rename"),
+    (Path, "unlink"),
+    (Path, "hardlink_to"),
+    (Path, "mkdir"),
+    (DeltaTable, "create"),
+    (DeltaTable, "create_write_transaction"),
+)
+"""Calls that make something durable, or are about to. Each is a point twice: before and after."""
+
+
+class Countdown:
+    """Counts the points that were passed, and kills the process at one of them."""
+
+    def __init__(self, fatal: int) -> None:
+        self.fatal = fatal
+        self.passed = 0
+
+    def point(self) -> None:
+        self.passed += 1
+        if self.passed == self.fatal:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    def around(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        def wrapped(*arguments: Any, **options: Any) -> Any:
+            self.point()
+            result = function(*arguments, **options)
+            self.point()
+            return result
+
+        return wrapped
+
+
+@dataclass(frozen=True)
+class Ended:
+    """A forked process that is over."""
+
+    killed: bool
+    result: Any
+    seconds: float
+
+
+def forked(work: Callable[[], Any], kill_after_s: float | None = None) -> Ended:
+    """Do work in a forked process and return its result, or kill it after a time."""
+    with tempfile.TemporaryDirectory() as folder:
+        answer, noise = Path(folder) / "answer", Path(folder) / "noise"
+        started = time.monotonic()
+        process = os.fork()
+        if not process:
+            _child(work, answer, noise)
+        if kill_after_s is not None:
+            time.sleep(kill_after_s)
+            os.kill(process, signal.SIGKILL)
+        status = os.waitpid(process, 0)[1]
+        seconds = time.monotonic() - started
+        if os.WIFSIGNALED(status):
+            return Ended(True, None, seconds)
+        if os.WEXITSTATUS(status):
+            raise AssertionError(noise.read_text())
+        return Ended(False, json.loads(answer.read_text()), seconds)
+
+
+def _child(work: Callable[[], Any], answer: Path, noise: Path) -> None:
+    code = 1
+    try:
+        with noise.open("w") as file:
+            os.dup2(file.fileno(), 1)
+            os.dup2(file.fileno(), 2)
+            answer.write_text(json.dumps(work()))
+            code = 0
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        sys.stderr.flush()
+        os._exit(code)
+
+
+def give(root: Path, arguments: tuple[str, ...], fatal: int = 0) -> int:
+    """Run one command in this process; return how many points it passed."""
+    countdown = Countdown(fatal)
+    for owner, name in POINTS:
+        setattr(owner, name, countdown.around(getattr(owner, name)))
+    sys.argv = ["fleet-slip", "--root", str(root), *arguments]
+    try:
+        fleet_slip_main()
+    except SystemExit as ended:
+        assert not ended.code, f"{arguments} ended with {ended.code}"
+    return countdown.passed
+
+
+def state(root: Path) -> dict[str, Any]:
+    """All that a root holds, apart from file names and the moments at which it was written."""
+    warehouse = Warehouse(root)
+    registry = Registry(root / "models")
+    names = registry.names()
+    return {
+        "tables": {table.path.name: _digest(table) for table in warehouse.tables},
+        "versions": {
+            n: [registry.load(n, number).sha256 for number in registry.versions(n)] for n in names
+        },
+        "aliases": {name: registry.aliases(name) for name in names},
+        "moves": {n: [(move.command, move.version) for move in registry.history(n)] for n in names},
+        "forgotten": [
+            [entry["event"], entry.get("drives"), entry.get("models")]
+            for entry in Audit(root).entries()
+        ],
+        "damage": [str(finding) for finding in verify(warehouse, full=True).damage],
+    }
+
+
+def _digest(table: Table) -> list[Any]:
+    """Return version, number of rows, and a hash of the rows whatever files they are in."""
+    snapshot = table.snapshot()
+    parts = [pq.read_table(path, partitioning=None) for path in snapshot.paths]
+    rows = [row for part in parts for row in _plain(part).to_pylist()]
+    texts = sorted(json.dumps(row, sort_keys=True, default=str) for row in rows)
+    return [len(texts), hashlib.sha256("\n".join(texts).encode()).hexdigest()]
+
+
+def _plain(rows: pa.Table) -> pa.Table:
+    unneeded = [
+        name for name in rows.column_names if name == "file" and "sums" in rows.schema.names
+    ]
+    return rows.drop_columns(unneeded)
+
+
+def damage(root: Path) -> list[str]:
+    return [str(finding) for finding in verify(Warehouse(root)).damage]
+
+
+class Harness:
+    """A root prepared for one command, and what the command makes of it undisturbed."""
+
+    def __init__(self, command: Command, folder: Path, inputs: dict[str, str]) -> None:
+        self.command = command
+        self.arguments = tuple(part.format(**inputs) for part in command.arguments)
+        self.folder = folder
+        self.before = folder / "before"
+        self.before.mkdir(parents=True)
+        for arguments in command.before:
+            filled = tuple(part.format(**inputs) for part in arguments)
+            forked(partial(give, self.before, filled))
+        if arrange := command.arrange:
+            forked(partial(arrange, self.before))
+        quiet = self.copy()
+        ended = forked(lambda: give(quiet, self.arguments))
+        self.points: int = ended.result
+        self.seconds = ended.seconds
+        self.expected = forked(lambda: state(quiet)).result
+        assert not self.expected["damage"], self.expected["damage"]
+
+    def copy(self) -> Path:
+        root = self.folder / "root"
+        shutil.rmtree(root, ignore_errors=True)
+        shutil.copytree(self.before, root)
+        return root
+
+    def kill(self, rng: random.Random, number: int) -> str | None:
+        """Kill once, repeat and compare. Return at what kind of point, or None if it was too late.
+
+        Even numbers are named points, in turn over the whole command; odd ones random moments.
+        """
+        root = self.copy()
+        if number % 2 == 0 and self.points:
+            point = 1 + (number // 2 * 7919 + rng.randrange(self.points)) % self.points
+            ended = forked(lambda: give(root, self.arguments, point))
+            where = "at a named point"
+        else:
+            ended = forked(
+                lambda: give(root, self.arguments), kill_after_s=rng.uniform(0, self.seconds)
+            )
+            where = "at a random moment"
+        if not ended.killed:
+            return None
+
+        def repeat() -> list[Any]:
+            found = [] if self.command.damaged else damage(root)
+            give(root, self.arguments)
+            return [found, state(root)]
+
+        found, after = forked(repeat).result
+        assert not found, f"{self.command.name}: after a kill {where}: {found}"
+        assert after == self.expected, (
+            f"{self.command.name}: after a kill {where}\n{after}\ninstead of\n{self.expected}"
+        )
+        return where
+
+
+def _load_code(inputs: Mapping[str, str]) -> None:
+    """Simulate a drive and read a mapping in this process, so that its forks need not load code."""
+    plan = load_campaign(inputs["campaign"])
+    simulate_logs(plan.drives(plan.days()[0])[:1])
+    load_mapping(inputs["mapping"])
+    importlib.import_module("pandas")  # as pyarrow does at its first use
+
+
+def run(kills: int, seed: int, names: list[str]) -> Counter[tuple[str, str]]:
+    """Kill so many times in all, the commands in turn. Raises `AssertionError` if it shows."""
+    rng = random.Random(seed)  # noqa: S311
+    done: Counter[tuple[str, str]] = Counter()
+    with tempfile.TemporaryDirectory() as folder:
+        inputs = prepare_inputs(Path(folder))
+        _load_code(inputs)
+        chosen = [command for command in COMMANDS if command.name in names]
+        for place, command in enumerate(chosen):
+            share = kills // len(chosen) + (place < kills % len(chosen))
+            harness = Harness(command, Path(folder) / command.name, inputs)
+            number = 0
+            while sum(n for (name, _), n in done.items() if name == command.name) < share:
+                where = harness.kill(rng, number)
+                number += 1
+                if where:
+                    done[command.name, where] += 1
+            shutil.rmtree(harness.folder)
+            print(
+                f"{command.name:24s} {share:4d} kills survived, {harness.points} points", flush=True
+            )
+    return done
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--kills", type=int, default=300)
+    parser.add_argument("--seed", type=int, default=0)
+    names = [command.name for command in COMMANDS]
+    parser.add_argument("--commands", nargs="+", choices=names, default=names)
+    options = parser.parse_args()
+    started = time.monotonic()
+    done = run(options.kills, options.seed, options.commands)
+    by_kind: Counter[str] = Counter()
+    for (_, where), count in done.items():
+        by_kind[where] += count
+    kinds = ", ".join(f"{count} {where}" for where, count in sorted(by_kind.items()))
+    print(
+        f"{done.total()} kills survived ({kinds}), nothing lost or doubled, "
+        f"{time.monotonic() - started:.0f} s"
+    )
+
+
+if __name__ == "__main__":
+    main()

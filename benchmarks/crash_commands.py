@@ -1,0 +1,122 @@
+"""The commands that `benchmarks/crash.py` kills, what must be there before, and small inputs."""
+
+import csv
+import math
+import os
+import random
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from fleet_slip import storage
+from fleet_slip.resources import find_config
+from fleet_slip.warehouse import Warehouse
+
+SIMULATE = ("simulate", "{campaign}", "--threads", "1")
+INGEST = ("ingest", "{measured}", "--mapping", "{mapping}")
+PUBLISH = ("publish", "sideslip")
+WORSE = ("publish", "sideslip", "--nested", "ax", "--force")
+
+MAPPING = """
+name = "logger"
+[time]
+column = "t"
+unit = "s"
+split_gap_s = 1.0
+longest_gap_s = 0.1
+[drive]
+day = 2024-05-01
+vehicle_id = { column = "car" }
+vehicle_model = "van"
+[signals]
+ax = { column = "ax", unit = "m/s^2" }
+ay = { column = "ay", unit = "m/s^2" }
+yaw_rate = { column = "r", unit = "rad/s" }
+sideslip = { column = "beta", unit = "rad" }
+"""
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command to kill.
+
+    `arrange` changes the root after the commands before; `damaged` says that it leaves damage.
+    """
+
+    name: str
+    before: tuple[tuple[str, ...], ...]
+    arguments: tuple[str, ...]
+    arrange: Callable[[Path], None] | None = None
+    damaged: bool = False
+
+
+def prepare_inputs(folder: Path) -> dict[str, str]:
+    """Write a campaign of eight very short drives, and a measured log with rows to refuse."""
+    text = find_config("campaigns", "smoke").read_text(encoding="utf-8")
+    text = text.replace("laps = 0.5", "laps = 0.04").replace("15_000", "1_500")
+    campaign, mapping, measured = (folder / name for name in ("smoke.toml", "m.toml", "log.csv"))
+    campaign.write_text(text, encoding="utf-8")
+    mapping.write_text(MAPPING, encoding="utf-8")
+    rng = random.Random(1)  # noqa: S311
+    with measured.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["t", "car", "ax", "ay", "r", "beta"])
+        for car in ("car-1", "car-2"):
+            for tick in range(400):
+                ay = 3 * math.sin(tick / 50) + rng.gauss(0, 0.1)
+                row = [rng.gauss(0, 1), "broken" if tick % 97 == 5 else ay, ay / 20, -ay / 200]
+                writer.writerow([tick / 100, car, *row])
+    return {"campaign": str(campaign), "mapping": str(mapping), "measured": str(measured)}
+
+
+def let_time_pass(root: Path) -> None:
+    """Make all files old, and leave what killed jobs leave."""
+    day = next((root / "logs").glob("day=*"))
+    (day / f"{storage.TEMPORARY_PREFIX}0.parquet").write_bytes(b"half a file")
+    (day / "smoke-9999-uncommitted.parquet").write_bytes(b"written, never committed")
+    for file in root.rglob("*"):
+        if file.is_file() and "_delta_log" not in file.parts:
+            os.utime(file, (0, 0))
+    for log in root.glob("*/_delta_log/*.json"):
+        log.write_text(_removed_long_ago(log.read_text(encoding="utf-8")), encoding="utf-8")
+
+
+def _removed_long_ago(log: str) -> str:
+    key = '"deletionTimestamp":'
+    head, *tails = log.split(key)
+    return head + "".join(key + "1" + tail.lstrip("0123456789") for tail in tails)
+
+
+def damage_files(root: Path) -> None:
+    """Flip a bit in a simulated log file and in a Gram file."""
+    warehouse = Warehouse(root)
+    for table in (warehouse.logs, warehouse.grams):
+        file = Path(table.snapshot().paths[-1])
+        content = bytearray(file.read_bytes())
+        content[len(content) // 2] ^= 1
+        file.write_bytes(content)
+
+
+LOGS = (SIMULATE, INGEST)
+MODEL = (*LOGS, ("gram",), PUBLISH)
+COMMANDS = (
+    Command("simulate", (), SIMULATE),
+    Command("ingest", (SIMULATE,), INGEST),
+    Command("gram", LOGS, ("gram",)),
+    Command("gram of features", (*LOGS, ("gram",)), ("gram", "--features", "all")),
+    Command("select", (*LOGS, ("gram",)), ("select", "--json")),
+    Command("publish", (*LOGS, ("gram",)), PUBLISH),
+    Command("promote", (*MODEL, WORSE), ("promote", "sideslip@1")),
+    Command("forget a vehicle", MODEL, ("forget", "--vehicle", "car-1", "--now")),
+    Command("forget a drive", MODEL, ("forget", "--drive", "smoke-2024-05-01-0001")),
+    Command("compact", MODEL, ("compact",)),
+    Command("vacuum", (*MODEL, ("compact",)), ("vacuum",), let_time_pass),
+    Command(
+        "repair",
+        MODEL,
+        ("verify", "--full", "--repair", "--campaign", "{campaign}"),
+        damage_files,
+        damaged=True,
+    ),
+    Command("run", (), ("run", "--campaign", "{campaign}", "--threads", "1")),
+)
