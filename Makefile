@@ -1,15 +1,20 @@
 # `make run`  sets up .venv and runs the whole job on the default campaign into ./data.
 # `make test` sets up .venv and passes every check.
+# `make report` does what `make run` does, then writes ./data/report/report.html.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 CAMPAIGN ?= waterford
 ROOT ?= data
 
-.PHONY: run test lint setup bench clean
+.PHONY: run report test lint setup bench clean
 
 run: setup
 	$(BIN)/fleet-slip --root $(ROOT) run --campaign $(CAMPAIGN)
+
+report: run
+	$(BIN)/fleet-slip --root $(ROOT) evaluate --one-car $(CAMPAIGN)
+	$(BIN)/fleet-slip --root $(ROOT) report --model $(CAMPAIGN)
 
 test: setup lint
 	$(BIN)/pytest -n 2

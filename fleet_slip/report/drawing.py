@@ -8,7 +8,7 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from fleet_slip.report.pictures import Picture
-from fleet_slip.report.style import DESK, PALETTE, PHONE, STYLE, Size
+from fleet_slip.report.style import DESK, FONT, PALETTE, PHONE, STYLE, Size
 
 PNG_DPI = 150
 PIXELS_PER_POINT = 4 / 3
@@ -16,7 +16,8 @@ PIXELS_PER_POINT = 4 / 3
 
 def svg_file(picture: Picture) -> str:
     """Return the picture as an SVG file of its own, on a light ground."""
-    return _lean(_svg(picture, DESK))
+    svg = _lean(_svg(picture, DESK))
+    return svg.replace(f"'{FONT}'", f"'{FONT}', Verdana, sans-serif")
 
 
 def png_file(picture: Picture) -> bytes:

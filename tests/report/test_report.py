@@ -1,0 +1,226 @@
+"""A report from end to end: its numbers are those of the evaluation, and it stands by itself."""
+
+import re
+import shutil
+from collections import Counter
+from copy import deepcopy
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fleet_slip.connection import connect
+from fleet_slip.documents import Document
+from fleet_slip.errors import SelectionError
+from fleet_slip.evaluation.results import keep
+from fleet_slip.report import tables
+from fleet_slip.report.blocks import blocks_won, difference
+from fleet_slip.report.claims import CLAIMS, judged
+from fleet_slip.report.claims.claim import Status
+from fleet_slip.report.claims.demonstration import noise_is_slight
+from fleet_slip.report.data import ReportData
+from fleet_slip.report.drawing import png_file, svg_file
+from fleet_slip.report.histogram import ANGLE_DEG, held_out_coefficients
+from fleet_slip.report.page import render
+from fleet_slip.report.pictures import pictures
+from fleet_slip.report.text import number
+from fleet_slip.warehouse import Warehouse
+from tests.conftest import RunCommand
+from tests.report.conftest import Reported, call
+
+pytestmark = pytest.mark.slow
+
+
+class Page(HTMLParser):
+    """The names, links and sources of a page, and how often each element stands in it."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.ids: list[str] = []
+        self.links: list[str] = []
+        self.sources: list[str] = []
+        self.elements: Counter[str] = Counter()
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements[tag] += 1
+        for name, value in attrs:
+            if name == "id":
+                self.ids.append(value or "")
+            elif name in ("href", "xlink:href"):
+                (self.links if tag == "a" else self.sources).append(value or "")
+            elif name in ("src", "srcset", "data", "poster"):
+                self.sources.append(value or "")
+
+
+@pytest.fixture(scope="module")
+def page(reported: Reported) -> Page:
+    return Page(reported.page.read_text(encoding="utf-8"))
+
+
+def test_the_page_is_small_and_asks_for_nothing(reported: Reported, page: Page) -> None:
+    assert reported.page.stat().st_size < 3_000_000
+    assert all(source.startswith(("#", "data:")) for source in page.sources)
+    text = reported.page.read_text(encoding="utf-8")
+    assert not re.findall(r"@import|url\((?!#)", text)
+    assert page.elements["script"] == 0
+
+
+def test_every_link_leads_somewhere(reported: Reported, page: Page) -> None:
+    assert not [name for name, times in Counter(page.ids).items() if times > 1]
+    for link in page.links:
+        if link.startswith("#"):
+            assert link[1:] in page.ids
+        else:
+            assert (reported.page.parent / link).is_file()
+
+
+def test_each_figure_is_on_the_page_and_in_two_files(reported: Reported, page: Page) -> None:
+    svgs = sorted(file.stem for file in reported.figures.glob("*.svg"))
+    assert svgs == sorted(file.stem for file in reported.figures.glob("*.png"))
+    assert set(svgs) >= {"figure-1a", "figure-1b", "figure-2", "figure-3", "figure-5", "figure-8"}
+    assert set(svgs) <= set(page.ids)
+    assert page.elements["figure"] == len(svgs)
+    assert page.elements["svg"] == 2 * len(svgs)
+
+
+def test_a_scenario_that_was_left_out_is_said(reported: Reported, page: Page) -> None:
+    assert "figure-7" not in page.ids
+    assert "melbourne" in reported.page.read_text(encoding="utf-8")
+
+
+def test_the_same_data_give_the_same_bytes(reported: Reported, data: ReportData) -> None:
+    """Gathered and drawn once more, in another process where tests run in several."""
+    shown = pictures(data)
+    assert render(data, shown) == reported.page.read_text(encoding="utf-8")
+    density = next(picture for picture in shown if picture.key == "density")
+    assert png_file(density) == (reported.figures / "density.png").read_bytes()
+    assert svg_file(density) == (reported.figures / "density.svg").read_text(encoding="utf-8")
+
+
+def test_table_two_has_the_evaluations_numbers(data: ReportData) -> None:
+    rows = tables.table_two(data).rows
+    assert [row[0].text for row in rows] == ["1", "2", "3", "4", "5"]
+    for row in rows:
+        estimator = data.evaluated.models[row[0].text]
+        found = data.evaluated.scenarios["nominal"]["results"][estimator]
+        assert row[2].text == number(found["error_mean_deg"], 4, sign=True)
+        assert row[4].text == number(found["error_std_deg"], 4)
+        assert (row[4].mark == "good") == (
+            found["error_std_deg"] <= tables.PAPER_TABLE_TWO[row[0].text][1]
+        )
+
+
+def test_held_out_estimates_are_those_of_cross_validation(
+    reported: Reported, data: ReportData
+) -> None:
+    """Pooled from exact sums there, from the rows in SQL here."""
+    selection = data.trained.selection
+    model = next(model for model in selection.models if model.name == "4")
+    signals = Warehouse(reported.root).catalogue
+    terms = " + ".join(f"h.{name} * l.{signals[name].column}" for name in model.signals)
+    with connect(reported.root) as database:
+        database.register("h", held_out_coefficients(selection, model))
+        found = database.execute(
+            f"SELECT count(*), stddev_samp(degrees(h.intercept + {terms} - sideslip_rad)), "
+            f"corr(h.intercept + {terms}, sideslip_rad) FROM log AS l JOIN h USING (drive_id)"
+        ).fetchall()
+    ((rows, std, correlation),) = found
+    assert rows == model.pooled.rows == data.histogram.rows.sum()
+    assert std == pytest.approx(model.pooled.error_std_deg, rel=1e-9)
+    assert correlation == pytest.approx(model.correlation, rel=1e-9)
+
+
+def test_the_histogram_has_the_error_of_cross_validation(data: ReportData) -> None:
+    histogram = data.histogram
+    model = next(model for model in data.trained.selection.models if model.name == "4")
+    error = (histogram.estimate - histogram.truth) * ANGLE_DEG
+    mean = np.average(error, weights=histogram.rows)
+    std = float(np.sqrt(np.average((error - mean) ** 2, weights=histogram.rows)))
+    assert std == pytest.approx(model.pooled.error_std_deg, abs=ANGLE_DEG / 2)
+    assert histogram.cells(histogram.reach_deg(1)).sum() == histogram.rows.sum()
+
+
+def test_the_published_coefficients_are_in_the_table(data: ReportData) -> None:
+    manifest = data.version.manifest
+    published = data.coefficients[-1]
+    values = {row.name: row.value for row in published.rows}
+    assert published.model == data.version.reference
+    assert values.pop("intercept") == pytest.approx(manifest.intercept, rel=1e-12)
+    assert values == pytest.approx(
+        {term.signal: term.coefficient for term in manifest.terms}, rel=1e-12
+    )
+    assert all(row.cluster_error > 0 for row in published.rows)
+
+
+def test_the_errors_of_blocks_add_up(data: ReportData) -> None:
+    run = data.runs["nominal"]
+    won = blocks_won(run, list(data.evaluated.models.values()))
+    assert sum(won.values()) == len(run.drive.time_s) // 500
+    better = difference(run, data.evaluated.models["4"], data.evaluated.models["1"])
+    assert better.t > 0
+    assert better.p < 0.01
+    worse = difference(run, data.evaluated.models["1"], data.evaluated.models["4"])
+    assert worse.t == pytest.approx(-better.t)
+
+
+def changed(data: ReportData, content: Any) -> ReportData:
+    document = Document(data.evaluated.document.number, content, "")
+    return replace(data, evaluated=replace(data.evaluated, document=document))
+
+
+def test_every_claim_is_judged(data: ReportData) -> None:
+    verdicts = judged(data)
+    assert len(verdicts) == len(CLAIMS)
+    assert len({one.claim.statement for one in verdicts}) == len(CLAIMS)
+    for one in verdicts:
+        assert one.verdict.why
+        assert bool(one.verdict.figure) == (one.verdict.status is not Status.NOT_TESTABLE)
+
+
+def test_a_verdict_follows_from_the_figures(data: ReportData) -> None:
+    assert noise_is_slight.judge(data).status is Status.REPRODUCED
+    content = deepcopy(dict(data.evaluated.document.content))
+    (noisy,) = (one for one in content["scenarios"] if one["name"] == "noise_doubled")
+    noisy["results"][data.choice]["error_std_deg"] = 0.9
+    verdict = noise_is_slight.judge(changed(data, content))
+    assert verdict.status is Status.NOT_REPRODUCED
+    assert "0.900°" in verdict.figure
+
+
+def test_a_claim_without_its_drives_is_not_judged(data: ReportData) -> None:
+    content = deepcopy(dict(data.evaluated.document.content))
+    content["scenarios"] = [one for one in content["scenarios"] if one["name"] == "nominal"]
+    verdict = noise_is_slight.judge(changed(data, content))
+    assert verdict.status is Status.NOT_TESTABLE
+    assert "noise_doubled" in verdict.why
+    assert "fleet-slip evaluate" in verdict.why
+
+
+def test_an_evaluation_of_other_data_is_refused(reported: Reported, data: ReportData) -> None:
+    for path, told in (
+        (("estimators", data.choice, "intercept"), "cohort"),
+        (("scenarios", 0, "results", data.choice, "rmse_deg"), "drive of"),
+    ):
+        copy = reported.root.with_name(f"copy-{told.partition(' ')[0]}")
+        shutil.copytree(reported.root, copy, dirs_exist_ok=True)
+        content = deepcopy(dict(data.evaluated.document.content))
+        place: Any = content
+        for key in path[:-1]:
+            place = place[key]
+        place[path[-1]] += 0.001
+        keep(Warehouse(copy), content)
+        with pytest.raises(SelectionError, match=f"{told}.* has changed since evaluation 2"):
+            call(copy, "report", "--model", "smoke")
+
+
+def test_a_model_that_was_not_evaluated_is_told(
+    reported: Reported, run_command: RunCommand, tmp_path: Path
+) -> None:
+    shutil.copytree(reported.root / "models", tmp_path / "data" / "models")
+    done = run_command("report", "--model", "smoke")
+    assert done.exit_code == 5
+    assert "fleet-slip evaluate --one-car smoke@1" in done.stderr
