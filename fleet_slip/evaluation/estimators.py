@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.cohort import load_cohort
+from fleet_slip.errors import SelectionError
 from fleet_slip.evaluation.drives import FloatArray
 from fleet_slip.model_list import load_model_list
 from fleet_slip.registry import Manifest, ModelVersion
@@ -43,7 +44,16 @@ class LinearEstimate:
 
     @classmethod
     def published(cls, manifest: Manifest) -> "LinearEstimate":
-        """Return the estimator that a manifest publishes."""
+        """Return the estimator that a manifest publishes.
+
+        Raises `SelectionError` for a model with features, which are SQL and not signals.
+        """
+        features = [term.signal for term in manifest.terms if term.sql]
+        if features:
+            raise SelectionError(
+                f"{manifest.name} uses the features {', '.join(features)}, and test drives are "
+                "evaluated on signals alone. Use: fleet-slip score"
+            )
         return cls(manifest.intercept, {term.column: term.coefficient for term in manifest.terms})
 
     def __call__(self, signals: Signals) -> FloatArray:
