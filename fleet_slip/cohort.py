@@ -12,11 +12,12 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from fleet_slip.connection import connect
-from fleet_slip.database import database_errors, one_query
+from fleet_slip.database import database_errors
 from fleet_slip.errors import RefusedError, SelectionError
 from fleet_slip.features import PLAIN, features
 from fleet_slip.gram import GramTable, IntArray, packed_size
 from fleet_slip.gram_job import find_backlog
+from fleet_slip.reading_query import one_query
 from fleet_slip.regression.drives import serving_drives
 from fleet_slip.regression.folds import Assignment, CohortFolds, by_hash, by_value
 from fleet_slip.resources import read_sql

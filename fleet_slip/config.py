@@ -19,15 +19,27 @@ class Config(BaseModel):
 ConfigT = TypeVar("ConfigT", bound=Config)
 
 
+LONGEST_FILE_BYTES = 2**22
+FAULTS_SHOWN = 10
+LONGEST_FAULT = 300
+"""Characters of one fault that are shown; what was given may stand in it."""
+
+
 def load_toml(file: Traversable) -> dict[str, Any]:
     """Parse a TOML file, decimal numbers as exact `Decimal`. Raises `ConfigError`."""
     try:
-        return tomllib.loads(file.read_text(encoding="utf-8"), parse_float=Decimal)
+        with file.open("rb") as stream:
+            content = stream.read(LONGEST_FILE_BYTES + 1)
+        if len(content) > LONGEST_FILE_BYTES:
+            raise ConfigError(f"{file}: larger than {LONGEST_FILE_BYTES:,} bytes. Is it TOML?")
+        return tomllib.loads(content.decode("utf-8"), parse_float=Decimal)
     except FileNotFoundError:
         raise ConfigError(f"{file}: no such file.") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{file}: cannot be read: {error}") from None
-    except tomllib.TOMLDecodeError as error:
+    except RecursionError:
+        raise ConfigError(f"{file}: nested too deeply.") from None
+    except (ValueError, ArithmeticError) as error:  # of TOML, of a date, of a number's size
         raise ConfigError(f"{file}: not valid TOML: {error}") from None
 
 
@@ -40,10 +52,17 @@ def load_config(file: Traversable, model: type[ConfigT]) -> ConfigT:
 
 
 def faults_of(error: ValidationError) -> str:
-    """Return what is wrong, key by key, on one line."""
-    faults = (
-        f"{'.'.join(map(str, fault['loc'])) or 'file'}: {fault['msg']}" for fault in error.errors()
-    )
-    text = "; ".join(faults).replace("Value error, ", "")
+    """Return what is wrong, key by key, on one line; of many faults the first."""
+    faults = [
+        f"{'.'.join(map(str, fault['loc'])) or 'file'}: {fault['msg']}"
+        for fault in error.errors(include_input=False, include_url=False)
+    ]
+    text = "; ".join(_shortened(fault) for fault in faults[:FAULTS_SHOWN])
+    more = len(faults) - FAULTS_SHOWN
+    return text + (f"; and {more:,} more" if more > 0 else "")
+
+
+def _shortened(fault: str) -> str:
+    text = fault.replace("Value error, ", "")
     text = text.replace("Extra inputs are not permitted", "unknown key")
-    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
+    return text if len(text) <= LONGEST_FAULT else text[:LONGEST_FAULT] + "…"

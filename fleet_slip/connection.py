@@ -9,12 +9,12 @@ import duckdb
 import pyarrow as pa
 
 from fleet_slip.database import database_errors, open_database
-from fleet_slip.operations.run_log import FOLDER as RUN_FOLDER
+from fleet_slip.gram_statement import with_absent
 from fleet_slip.operations.run_log import RECORD_COLUMNS, run_files
 from fleet_slip.registry import Registry
 from fleet_slip.resources import read_sql
-from fleet_slip.signals import SAMPLE_TIME_S, SignalCatalogue
-from fleet_slip.storage import Snapshot
+from fleet_slip.signals import SAMPLE_TIME_S, SignalCatalogue, catalogue
+from fleet_slip.storage import Snapshot, absent_columns
 from fleet_slip.warehouse import Warehouse
 
 VIEWS = ("log_counts", "log", "grams", "drives", "quarantine", "runs")
@@ -30,21 +30,27 @@ def data_root(root: Path | str | None = None) -> Path:
 
 
 def connect(
-    root: Path | str | None = None, *, threads: int | None = None
+    root: Path | str | None = None, *, threads: int | None = None, locked: bool = True
 ) -> duckdb.DuckDBPyConnection:
     """Return a DuckDB connection with the views of the warehouse at `root`.
 
     `log` (SI units), `log_counts`, `drives`, `grams`, `models`, `quarantine`, `runs` and
     `dictionary`, which documents every column. The connection sees one snapshot; connect again to
-    see later commits. It can read the warehouse's files only, and its settings are locked.
+    see later commits.
+
+    Locked, it can open the files of the snapshot and no others, and its settings cannot be
+    changed. DuckDB knows no right to read without the right to write: run SQL of others through
+    `fleet_slip.reading_query.one_query` first, as the command line does.
     """
     warehouse = Warehouse(data_root(root))
-    database = open_database(threads=threads)
+    database = open_database(threads=threads, spill=warehouse.root)
     columns = _generated_columns(warehouse.catalogue)
+    logs, grams = warehouse.logs.snapshot(), warehouse.grams.snapshot()
+    quarantine = warehouse.quarantine.snapshot()
     stored = {
-        "stored_logs": _source(database, warehouse.logs.snapshot(), "log_files"),
-        "stored_grams": _source(database, warehouse.grams.snapshot(), "gram_files"),
-        "stored_quarantine": _source(database, warehouse.quarantine.snapshot(), "quarantine_files"),
+        "stored_logs": _source(database, logs, "log_files"),
+        "stored_grams": _source(database, grams, "gram_files"),
+        "stored_quarantine": _source(database, quarantine, "quarantine_files"),
         "stored_runs": run_source(database, warehouse.root),
     }
     with database_errors(f"opening the warehouse {warehouse.root}"):
@@ -52,7 +58,9 @@ def connect(
             database.execute(read_sql("warehouse", f"{view}.sql").format(**columns, **stored))
     _add_table(database, "models", Registry(warehouse.root / "models").as_table())
     _add_table(database, "dictionary", _dictionary(database, warehouse.catalogue))
-    _lock(database, warehouse.root)
+    if locked:
+        paths = [*logs.paths, *grams.paths, *quarantine.paths, *run_files(warehouse.root)]
+        _lock(database, paths)
     return database
 
 
@@ -60,7 +68,10 @@ def _source(database: duckdb.DuckDBPyConnection, snapshot: Snapshot, variable: s
     """Return what stands after FROM for a stored table, empty ones included."""
     database.execute(f"SET VARIABLE {variable} = $paths", {"paths": snapshot.paths})
     if snapshot.paths:
-        return read_sql("warehouse", f"stored_{snapshot.table.path.name}.sql").replace("{{", "{")
+        rows = read_sql("warehouse", f"stored_{snapshot.table.path.name}.sql").replace("{{", "{")
+        if snapshot.table.path.name != "logs":
+            return rows
+        return with_absent(rows, absent_columns(snapshot.files, catalogue().signals))
     empty = f"empty_{snapshot.table.path.name}"
     _add_table(database, empty, snapshot.table.schema.empty_table())
     return empty
@@ -179,10 +190,8 @@ _OTHER_COLUMNS = {
 }
 
 
-def _lock(database: duckdb.DuckDBPyConnection, root: Path) -> None:
-    names = ("logs", "grams", "quarantine", RUN_FOLDER)
-    folders = [str((root / name).resolve()) for name in names]
-    folders += [str(root / name) for name in names]
-    database.execute(f"SET allowed_directories = {folders!r}")
+def _lock(database: duckdb.DuckDBPyConnection, paths: list[str]) -> None:
+    database.execute("SET python_enable_replacements = false")
+    database.execute("SET allowed_paths = $paths", {"paths": paths})
     database.execute("SET enable_external_access = false")
     database.execute("SET lock_configuration = true")

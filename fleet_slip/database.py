@@ -1,23 +1,48 @@
-"""DuckDB connections: how they are opened, and how their errors are told."""
+"""DuckDB connections: how they are opened, what they may use, and how their errors are told."""
 
 import contextlib
-import re
+import os
+import uuid
 from collections.abc import Iterator
+from pathlib import Path
 
 import duckdb
 
 from fleet_slip.errors import FleetSlipError, SelectionError, StorageError
 
+SPILL_LIMIT = "20GB"
+"""Largest size of what one connection may write to disk for a query beyond its memory."""
 
-def open_database(*, threads: int | None = None) -> duckdb.DuckDBPyConnection:
-    """Open an in-memory database. Data stays in Parquet, so that no lock can block a reader."""
+CGROUP_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
+
+
+def open_database(
+    *, threads: int | None = None, spill: Path | None = None
+) -> duckdb.DuckDBPyConnection:
+    """Open an in-memory database. Data stays in Parquet, so that no lock can block a reader.
+
+    It takes at most half of the memory that the process may have. What a large query cannot hold
+    in memory goes below the folder `spill`; without one, such a query fails.
+    """
     config: dict[str, str | bool | int | float | list[str]] = {
         "autoinstall_known_extensions": False,
         "autoload_known_extensions": False,
+        "memory_limit": f"{memory_bytes() // 2 // 2**20}MiB",
+        "temp_directory": str(spill / f".spill-{uuid.uuid4().hex}") if spill else "",
+        "max_temp_directory_size": SPILL_LIMIT,
     }
     if threads is not None:
         config["threads"] = threads
     return duckdb.connect(":memory:", config=config)
+
+
+def memory_bytes() -> int:
+    """Return the memory that this process may have: the machine's, or less in a container."""
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    for file in CGROUP_LIMITS:
+        with contextlib.suppress(OSError, ValueError):
+            memory = min(memory, int(Path(file).read_text(encoding="ascii")))
+    return memory
 
 
 @contextlib.contextmanager
@@ -28,40 +53,14 @@ def database_errors(doing: str) -> Iterator[None]:
     except FleetSlipError:
         raise
     except (duckdb.IOException, duckdb.InvalidInputException, duckdb.OutOfMemoryException) as error:
-        raise StorageError(f"{doing} failed: {_message(error)}. {_RESTORE}") from None
+        raise StorageError(f"{doing} failed: {first_line(error)}. {_RESTORE}") from None
     except duckdb.Error as error:
-        raise SelectionError(f"{doing} failed: {_message(error)}") from None
+        raise SelectionError(f"{doing} failed: {first_line(error)}") from None
 
 
-def _message(error: duckdb.Error) -> str:
+def first_line(error: duckdb.Error) -> str:
     """Return DuckDB's message on one line, without the excerpt of the statement."""
     return " ".join(str(error).partition("\n\nLINE ")[0].split()).rstrip(".")
 
 
 _RESTORE = "If a file is missing or damaged, restore it from a backup."
-
-READING = frozenset({duckdb.StatementType.SELECT, duckdb.StatementType.EXPLAIN})
-
-
-def one_query(database: duckdb.DuckDBPyConnection, text: str) -> str:
-    """Return the text if it is one statement that only reads.
-
-    Raises `SelectionError` otherwise: a query must not write files or change settings.
-    """
-    try:
-        statements = database.extract_statements(text)
-    except duckdb.Error as error:
-        raise SelectionError(f"not valid SQL: {_message(error)}") from None
-    if len(statements) != 1:
-        raise SelectionError(f"one SQL statement is expected, not {len(statements)}.")
-    statement = statements[0]
-    explained = statement.type == duckdb.StatementType.EXPLAIN
-    inner = (
-        re.sub(r"(?is)^\s*explain(\s+analyze)?\s*(\([^)]*\))?\s*", "", text) if explained else text
-    )
-    if statement.type not in READING or (explained and one_query(database, inner) != inner):
-        raise SelectionError(
-            "only queries are allowed here (SELECT, WITH, DESCRIBE, SUMMARIZE, EXPLAIN): the "
-            "warehouse is written by the jobs alone."
-        )
-    return text

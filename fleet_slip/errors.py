@@ -1,10 +1,25 @@
 """Every error that a user can meet, each with its exit code. The CLI maps them in one place."""
 
 
+def printable(text: str) -> str:
+    """Return text on one line, as it can be shown on a terminal or in a log.
+
+    A name from outside may hold line breaks, which forge lines, or escape sequences, which
+    terminals obey: whatever is not printable is written as an escape, such as `\\x1b`.
+    """
+    return "".join(
+        c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text
+    )
+
+
 class FleetSlipError(Exception):
     """Base of all expected errors: the message says what, where, and what to do next."""
 
     exit_code = 1
+
+    def __init__(self, message: str) -> None:
+        """Take a message; names in it may be hostile."""
+        super().__init__(printable(message))
 
 
 class ConfigError(FleetSlipError):

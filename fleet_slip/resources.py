@@ -39,14 +39,22 @@ def find_config(kind: str, name_or_path: str) -> Traversable:
     """
     if name_or_path.endswith(".toml") or "/" in name_or_path:
         path = Path(name_or_path)
-        if path.is_file():
+        if _is_file(path):
             return path
         raise ConfigError(f"{path}: no such file. Give the path of a {kind} TOML file.")
     file = folder("configs") / kind / f"{name_or_path}.toml"
-    if file.is_file():
+    if _is_file(file):
         return file
     known = ", ".join(config_names(kind))
     raise ConfigError(
         f"{kind}: nothing is called {name_or_path!r}. Known: {known}; or give the path of a TOML "
         "file."
     )
+
+
+def _is_file(path: Traversable) -> bool:
+    """Whether there is such a file; a name that the system cannot have names none."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False

@@ -9,6 +9,7 @@ from typing import Any
 
 from rich.console import Console
 
+from fleet_slip.errors import printable
 from fleet_slip.operations.run_log import LOGGER, current_run_id
 
 LOG_VARIABLE = "FLEET_SLIP_LOG"
@@ -33,7 +34,7 @@ class PeopleHandler(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """Print a remark."""
         if not hasattr(record, "event"):
-            stderr().print(record.getMessage(), markup=False)
+            stderr().print(printable(record.getMessage()), markup=False)
 
 
 class JsonHandler(logging.Handler):
@@ -56,7 +57,7 @@ def json_line(record: logging.LogRecord) -> str:
         content |= {"event": record.event, **record.__dict__.get("fields", {})}
     else:
         content |= {"event": "message", "message": record.getMessage()}
-    return json.dumps(content, ensure_ascii=False, default=str)
+    return json.dumps(content, default=str)
 
 
 def configure_logs(chosen: LogFormat) -> None:

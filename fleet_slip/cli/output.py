@@ -25,6 +25,7 @@ from rich.table import Table
 from rich.text import Text
 
 from fleet_slip.cli.logs import for_people, stderr
+from fleet_slip.errors import printable
 from fleet_slip.operations.run_log import LOGGER
 
 Json = Annotated[bool, typer.Option("--json", help="Print machine-readable JSON on stdout.")]
@@ -73,7 +74,7 @@ def print_table(
     for i, name in enumerate(header):
         table.add_column(name, justify="left" if i < left else "right", overflow="fold")
     for row in rows:
-        table.add_row(*(Text(cell) for cell in row))
+        table.add_row(*(Text(printable(cell)) for cell in row))
     if title:
         print_text(title)
     console = stdout()

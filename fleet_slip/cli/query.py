@@ -1,17 +1,21 @@
 """Commands that read the warehouse in SQL: sql, shell."""
 
+import contextlib
 import shutil
 import sys
+from collections.abc import Iterator
 from typing import Annotated
 
 import duckdb
+import pyarrow as pa
 import typer
 from pyarrow.csv import write_csv
 
 from fleet_slip.cli.output import Json, print_json, say
 from fleet_slip.connection import connect
-from fleet_slip.database import database_errors, one_query
-from fleet_slip.errors import FleetSlipError
+from fleet_slip.database import database_errors
+from fleet_slip.errors import FleetSlipError, SelectionError
+from fleet_slip.reading_query import one_query
 
 ROWS_SHOWN = 40
 
@@ -29,30 +33,56 @@ def sql(
     ],
     json: Json = False,
     csv: Annotated[bool, typer.Option("--csv", help="Print CSV on stdout.")] = False,
+    unsafe: Annotated[
+        bool,
+        typer.Option(
+            "--unsafe",
+            help="Allow any statement, and any file that you may read or write. Only for SQL that "
+            "you trust: it can overwrite the warehouse.",
+        ),
+    ] = False,
 ) -> None:
     """Query the warehouse: log (SI), log_counts, drives, grams, models, quarantine, dictionary.
 
-    Every column is described in the view dictionary.
+    Every column is described in the view dictionary. A query can read the warehouse, and nothing
+    else.
     """
-    text = sys.stdin.read() if query == "-" else query
-    with connect(context.obj.root) as database:
-        _answer(database, text, json=json, csv=csv)
+    text = _read_stdin() if query == "-" else query
+    with connect(context.obj.root, locked=not unsafe) as database:
+        _answer(database, text if unsafe else one_query(database, text), json=json, csv=csv)
+
+
+def _read_stdin() -> str:
+    try:
+        return sys.stdin.read()
+    except UnicodeDecodeError:
+        raise SelectionError("the query on stdin is not UTF-8 text.") from None
 
 
 def _answer(
     database: duckdb.DuckDBPyConnection, text: str, *, json: bool = False, csv: bool = False
 ) -> None:
-    one_query(database, text)
-    with database_errors("the query"):
-        if json or csv:
-            rows = database.sql(text).to_arrow_table()
-            if csv:
-                write_csv(rows, sys.stdout.buffer)
-            else:
-                print_json(rows.to_pylist())
+    with database_errors("the query"), _representation_errors():
+        relation = database.sql(text)
+        if relation is None:  # an unsafe statement without a result
+            return
+        if json:
+            print_json(relation.to_arrow_table().to_pylist())
+        elif csv:
+            write_csv(relation.to_arrow_table(), sys.stdout.buffer)
         else:
-            relation = database.sql(text)
             relation.show(max_rows=ROWS_SHOWN, max_width=_width())
+
+
+@contextlib.contextmanager
+def _representation_errors() -> Iterator[None]:
+    """Explain values that Python, JSON or CSV has no form for, such as lists in CSV."""
+    try:
+        yield
+    except (pa.ArrowException, ValueError, OverflowError) as error:
+        raise SelectionError(
+            f"the result cannot be printed: {error}. Cast the column, such as: CAST(sums AS TEXT)"
+        ) from None
 
 
 def _width() -> int:
@@ -68,7 +98,7 @@ def shell(context: typer.Context) -> None:
         while (text := _read_statement()) is not None:
             try:
                 if text.strip():
-                    _answer(database, text)
+                    _answer(database, one_query(database, text))
             except FleetSlipError as error:
                 say(f"error: {error}")
             except KeyboardInterrupt:

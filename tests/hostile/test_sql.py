@@ -1,0 +1,253 @@
+"""SQL of strangers reads the warehouse and does nothing else."""
+
+import hashlib
+import json
+from pathlib import Path
+
+import duckdb
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fleet_slip.cohort import load_cohort
+from fleet_slip.connection import connect
+from fleet_slip.errors import FleetSlipError, SelectionError
+from fleet_slip.gram_job import update_grams
+from fleet_slip.reading_query import one_query
+from fleet_slip.warehouse import Warehouse
+from tests.conftest import RunCommand, land, log_rows, random_counts
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A warehouse of one file with two drives."""
+    warehouse = Warehouse(tmp_path_factory.mktemp("sql") / "data")
+    rng = np.random.default_rng(1)
+    land(warehouse, "one", *(log_rows(f"d{i}", random_counts(rng, 50)) for i in range(2)))
+    update_grams(warehouse, lambda _more, _total: None)
+    return warehouse.root
+
+
+def contents(folder: Path) -> dict[str, str]:
+    """Every file below a folder with its checksum."""
+    return {
+        str(file.relative_to(folder)): hashlib.sha256(file.read_bytes()).hexdigest()
+        for file in sorted(folder.rglob("*"))
+        if file.is_file()
+    }
+
+
+def serialised(query: str) -> str:
+    """The query as DuckDB's JSON, to be run from a string."""
+    row = duckdb.execute("SELECT json_serialize_sql($q::VARCHAR)", {"q": query}).fetchone()
+    assert row is not None
+    return str(row[0]).replace("'", "''")
+
+
+COPY_IN_CTE = "WITH x AS (COPY (SELECT 1) TO '{file}' (USE_TMP_FILE false)) FROM x"
+
+WRITES = [
+    "COPY (SELECT 1) TO '{file}'",
+    "EXPLAIN ANALYZE COPY (SELECT 1) TO '{file}'",
+    "/* hidden */ EXPLAIN ANALYZE COPY (SELECT 1) TO '{file}'",
+    "EXPLAIN /* hidden */ (ANALYZE) COPY (SELECT 1) TO '{file}'",
+    "EXPLAIN (ANALYZE, FORMAT json) COPY (SELECT 1) TO '{file}'",
+    COPY_IN_CTE,
+    "EXPLAIN ANALYZE " + COPY_IN_CTE,
+    "EXPLAIN (ANALYZE) (" + COPY_IN_CTE + ")",
+    "WITH x AS (DELETE FROM dictionary RETURNING *) FROM x",
+    "WITH x AS (INSERT INTO dictionary SELECT * FROM dictionary RETURNING *) FROM x",
+    "EXPORT DATABASE '{file}'",
+    "PREPARE p AS COPY (SELECT 1) TO '{file}'",
+    "EXECUTE p",
+    "SELECT 1; COPY (SELECT 1) TO '{file}'",
+    "SELECT 1 --;\n; COPY (SELECT 1) TO '{file}'",
+    "SET VARIABLE log_files = ['/etc/passwd']",
+    "ATTACH '{file}'",
+    "CREATE TABLE t AS SELECT 1",
+    "CALL enable_logging(storage := 'file', storage_path := '{file}')",
+    "FROM enable_logging(storage := 'file', storage_path := '{file}')",
+    "FROM enable_profiling(format := 'json', save_location := '{file}')",
+    "FROM query('COPY (SELECT 1) TO ''{file}''')",
+    "FROM system.main.\"QUERY\"('SELECT 1')",
+    "PRAGMA enable_profiling",
+    "INSTALL httpfs",
+    "LOAD json",
+    "USE system",
+    "CHECKPOINT",
+]
+
+
+@pytest.mark.parametrize("attack", WRITES)
+def test_what_writes_is_refused_and_has_not_run(root: Path, attack: str) -> None:
+    before = contents(root)
+    target = root / next(name for name in before if name.endswith(".parquet"))
+    with connect(root) as database, pytest.raises(SelectionError):
+        one_query(database, attack.format(file=target))
+    assert contents(root) == before
+
+
+def test_a_statement_in_a_string_is_refused(root: Path) -> None:
+    before = contents(root)
+    target = root / next(name for name in before if name.endswith(".parquet"))
+    text = serialised(COPY_IN_CTE.format(file=target))
+    with connect(root) as database:
+        for attack in (
+            f"FROM json_execute_serialized_sql('{text}')",
+            f"SELECT (SELECT 1 FROM json_execute_serialized_sql('{text}'))",
+            f"EXPLAIN SELECT * FROM \"json_execute_serialized_sql\"('{text}')",
+        ):
+            with pytest.raises(SelectionError, match="json_execute_serialized_sql"):
+                one_query(database, attack)
+    assert contents(root) == before
+
+
+@pytest.mark.parametrize(
+    "condition",
+    [
+        "true) OR (true",
+        "1; DROP VIEW grams",
+        "true /*",
+        "true --",
+        "true) FROM grams; COPY (SELECT 1) TO 'stolen.csv'; SELECT (true",
+        "EXISTS (WITH x AS (COPY (SELECT 1) TO 'stolen.csv') FROM x)",
+        "EXISTS (FROM query('SELECT 1'))",
+        "EXISTS (FROM read_text('/etc/passwd'))",
+        "EXISTS (FROM read_parquet('/etc/passwd'))",
+        "{condition}",
+        "drive_id = '\0'",
+        "drive_id = $feature_set",
+        "error('x')",
+        "1/0",
+        "\ud800",
+        "(" * 3000 + "true" + ")" * 3000,
+        "true" + " AND true" * 20_000,
+    ],
+)
+def test_a_cohort_condition_cannot_break_out(
+    root: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, condition: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    before = contents(root)
+    try:
+        cohort = load_cohort(Warehouse(root), condition)
+    except FleetSlipError as error:
+        assert str(error).isprintable()
+    else:
+        assert cohort.drive_count <= 2
+    assert not list(tmp_path.iterdir())
+    assert contents(root) == before
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        "FROM drives",
+        "EXPLAIN SELECT 1",
+        "EXPLAIN (SELECT 1)",
+        "-- é\nEXPLAIN ANALYZE FROM drives",
+        "EXPLAIN (ANALYZE, FORMAT json) SELECT 1",
+        "SUMMARIZE drives",
+        "DESCRIBE log",
+        "SHOW TABLES",
+        "WITH a AS (SELECT 1 AS n) SELECT (SELECT max(n) FROM a) FROM range(3)",
+        "WITH RECURSIVE r AS (SELECT 1 AS n UNION ALL SELECT n + 1 FROM r WHERE n < 5) FROM r",
+        "PIVOT drives ON source IN ('simulated') USING count(*)",
+        "SELECT view, count(*) FROM dictionary GROUP BY ALL UNION ALL SELECT 'all', 1",
+        "SELECT copy, insert FROM (SELECT 1 AS copy, 2 AS insert)",
+        "SELECT 'COPY x TO y; DROP TABLE z'",
+        "FROM duckdb_columns() WHERE NOT internal",
+        "SELECT unnest(sums) FROM grams;",
+    ],
+)
+def test_what_reads_is_answered(root: Path, query: str) -> None:
+    with connect(root) as database:
+        assert database.sql(one_query(database, query)).fetchall() is not None
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.lists(
+        st.sampled_from(
+            [
+                *"();,*'\"$-",
+                *(
+                    "/*",
+                    "*/",
+                    "--\n",
+                    "EXPLAIN",
+                    "ANALYZE",
+                    "WITH",
+                    "x",
+                    "AS",
+                    "COPY",
+                    "TO",
+                    "FROM",
+                ),
+                *("FROM", "SELECT", "1", "INSERT", "INTO", "'f'", "query", "MATERIALIZED"),
+            ]
+        ),
+        max_size=14,
+    )
+    | st.text(max_size=20)
+)
+def test_any_text_is_a_reading_query_or_refused(words: list[str] | str) -> None:
+    text = words if isinstance(words, str) else " ".join(words)
+    with duckdb.connect() as database:
+        try:
+            one_query(database, text)
+        except SelectionError as error:
+            assert str(error).isprintable()
+        else:
+            (statement,) = database.extract_statements(text)
+            assert statement.type in {duckdb.StatementType.SELECT, duckdb.StatementType.EXPLAIN}
+
+
+def test_a_connection_opens_no_other_file_and_writes_none_anew(root: Path, tmp_path: Path) -> None:
+    before = contents(root)
+    data = root / next(name for name in before if name.endswith(".parquet"))
+    secret = tmp_path / "secret.csv"
+    secret.write_text("a\n1\n")
+    with connect(root) as database:
+        for attack in (
+            f"FROM read_csv('{secret}')",
+            f"FROM '{secret}'",
+            f"FROM glob('{tmp_path}/*')",
+            f"COPY (SELECT 1) TO '{tmp_path}/new.csv'",
+            f"COPY (SELECT 1) TO '{data}'",
+            f"COPY (SELECT 1) TO '{data.parent}/new.parquet'",
+            f"COPY (SELECT 1 AS a) TO '{root}/logs' (PARTITION_BY a, OVERWRITE)",
+            f"EXPORT DATABASE '{root}/logs'",
+            f"ATTACH '{root}/logs/new.db'",
+            "SET enable_external_access = true",
+            "RESET lock_configuration",
+            "SET allowed_paths = ['/etc/passwd']",
+            f"FROM '{root}/logs/../models'",
+        ):
+            with pytest.raises(duckdb.Error):
+                database.execute(attack)
+    assert contents(root) == before
+    assert [file.name for file in tmp_path.iterdir()] == ["secret.csv"]
+
+
+def test_unsafe_lifts_the_lock(run_command: RunCommand, root: Path, tmp_path: Path) -> None:
+    copy = "COPY (SELECT 1 AS one) TO 'mine.csv'"
+    assert run_command("sql", copy, root=root).exit_code == 5
+    assert not (tmp_path / "mine.csv").exists()
+    assert run_command("sql", copy, "--unsafe", root=root).exit_code == 0
+    read = run_command("sql", "FROM 'mine.csv'", "--unsafe", "--json", root=root)
+    assert json.loads(read.stdout) == [{"one": 1}]
+
+
+def test_hostile_characters_reach_neither_terminal_nor_log(
+    run_command: RunCommand, tmp_path: Path
+) -> None:
+    done = run_command("sql", "SELECT \x1b[31m", root=tmp_path / "evil\x1b[2J\nroot")
+    assert done.exit_code == 5
+    shown = run_command("sql", "SELECT chr(27) || '[2J' AS x")
+    named = run_command("ingest", "a\x1b[2J\nb.csv", "--mapping", "race_car_250lm")
+    assert named.exit_code == 4
+    for text in (done.stderr, shown.stdout, named.stderr):
+        assert "\x1b" not in text
+    assert named.stderr.count("\n") == 1
