@@ -3,6 +3,7 @@
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -88,17 +89,31 @@ def stored_grams(warehouse: Warehouse, paths: Sequence[str] | None = None) -> di
 
 
 def read_counts(warehouse: Warehouse, file: TableFile) -> pa.Table:
-    """Return the columns of a log file that its Gram rows are made of."""
+    """Return the columns of a log file that its Gram rows are made of, null where it has none."""
     path = warehouse.logs.path / file.path
+    names = ["drive_id", *warehouse.catalogue.gram_signals]
     with storage_errors(path):
-        return pq.read_table(
-            path, columns=["drive_id", *warehouse.catalogue.gram_signals], partitioning=None
+        present = pq.read_schema(path).names
+        rows = pq.read_table(
+            path, columns=[name for name in names if name in present], partitioning=None
         )
+    for name in names:
+        if name not in present:
+            rows = rows.append_column(name, pa.nulls(len(rows), pa.int16()))
+    return rows.select(names)
 
 
 def _drives(rows: pa.Table) -> list[tuple[str, pa.Table]]:
-    ids = rows["drive_id"].unique().to_pylist()
-    return [(drive, rows.filter(pc.equal(rows["drive_id"], drive))) for drive in ids]
+    ids = pc.dictionary_encode(rows["drive_id"].cast(pa.string()).combine_chunks())
+    drive_of_row = ids.indices.to_numpy()
+    order = np.argsort(drive_of_row, kind="stable")
+    if (order[1:] < order[:-1]).any():
+        rows, drive_of_row = rows.take(order), drive_of_row[order]
+    starts = np.flatnonzero(np.diff(drive_of_row, prepend=-1))
+    return [
+        (ids.dictionary[int(drive_of_row[start])].as_py(), rows.slice(start, end - start))
+        for start, end in pairwise([*starts.tolist(), rows.num_rows])
+    ]
 
 
 def grams_by_blocks(warehouse: Warehouse, counts: pa.Table) -> DriveGrams:
@@ -123,10 +138,11 @@ def _complete_parts(
         [column.fill_null(0).to_numpy(zero_copy_only=False).astype(np.int64) for column in columns]
     )
     parts = []
-    for pattern in np.unique(present, axis=0):
-        rows_of_pattern = (present == pattern).all(axis=1)
+    number_of_row = present @ (1 << np.arange(len(names)))
+    for number in np.unique(number_of_row).tolist():
+        pattern = [bool(number >> i & 1) for i in range(len(names))]
         signals = tuple(name for name, there in zip(names, pattern, strict=True) if there)
-        parts.append((signals, values[rows_of_pattern][:, pattern]))
+        parts.append((signals, values[number_of_row == number][:, pattern]))
     return parts
 
 

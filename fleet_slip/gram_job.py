@@ -18,7 +18,15 @@ from deltalake.transaction import AddAction
 from fleet_slip.database import database_errors, open_database
 from fleet_slip.features import PLAIN, features
 from fleet_slip.gram_statement import gram_statement
-from fleet_slip.storage import Change, Snapshot, TableFile, Unit, retried, storage_errors
+from fleet_slip.storage import (
+    Change,
+    Snapshot,
+    TableFile,
+    Unit,
+    absent_columns,
+    retried,
+    storage_errors,
+)
 from fleet_slip.warehouse import Warehouse
 
 FILES_PER_QUERY = 16
@@ -179,7 +187,8 @@ def _query(
 ) -> pa.Table:
     paths = {str(warehouse.logs.path / file.path): file.path for file in files}
     whole = feature_set == PLAIN and _signals_are_whole(warehouse, files)
-    statement = gram_statement(warehouse.catalogue, feature_set, whole=whole)
+    absent = absent_columns(files, warehouse.catalogue.signals)
+    statement = gram_statement(warehouse.catalogue, feature_set, whole=whole, absent=absent)
     identity = features().identity(feature_set)
     with database_errors(f"the Gram query over {len(files)} log files in {warehouse.logs.path}"):
         database.execute("SET VARIABLE log_files = $files", {"files": list(paths)})
@@ -193,7 +202,7 @@ def _query(
 def _signals_are_whole(warehouse: Warehouse, files: Sequence[TableFile]) -> bool:
     """Whether each signal is in all rows of a file or in none, by the Delta log's statistics."""
     return all(
-        file.null_counts.get(signal) in (0, file.rows)
+        file.null_counts.get(signal, file.rows) in (0, file.rows)
         for file in files
         for signal in warehouse.catalogue.gram_signals
     )

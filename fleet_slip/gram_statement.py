@@ -26,12 +26,25 @@ class Parts:
     names: tuple[str, ...]
 
 
+def with_absent(rows: str, absent: Sequence[str]) -> str:
+    """Return a table expression with signals that none of its files has, as nulls."""
+    if not absent:
+        return rows
+    nulls = ", ".join(f"NULL::SMALLINT AS {name}" for name in absent)
+    return f"(SELECT *, {nulls} FROM {rows})"
+
+
 def gram_statement(
-    signals: SignalCatalogue, feature_set: str = PLAIN, *, whole: bool = False
+    signals: SignalCatalogue,
+    feature_set: str = PLAIN,
+    *,
+    whole: bool = False,
+    absent: Sequence[str] = (),
 ) -> str:
     """Return the statement that computes the Gram rows of a feature set.
 
-    `whole` states that no file has a column of the set in only some of its rows. Raises
+    `whole` states that no file has a column of the set in only some of its rows; `absent` are the
+    signals that no file has, since they came to the catalogue later. Raises
     `SelectionError` for an unknown set.
     """
     known = features()
@@ -43,7 +56,8 @@ def gram_statement(
         for name in dict.fromkeys([*one.features, *(regime.of for regime in regimes)])
         if name in known.features
     }
-    rows = _lagged(names) if one.lagged else with_features(LOGS, definitions)
+    logs = with_absent(LOGS, absent)
+    rows = _lagged(names, logs) if one.lagged else with_features(logs, definitions)
     parts = _row_folds(one.row_folds) if one.row_folds else _regime_parts(regimes, known)
     return read_sql("jobs", "gram.sql").format(
         drive_columns=", ".join(signals.drive),
@@ -105,13 +119,13 @@ def _row_folds(count: int) -> Parts:
     return Parts(f"({value}) % {count}", tuple(str(fold + 1) for fold in range(count)))
 
 
-def _lagged(names: Sequence[str]) -> str:
+def _lagged(names: Sequence[str], logs: str) -> str:
     """Return the rows that have a predecessor in their drive, with both rows' counts."""
     now = [name for name in names if not name.endswith(LAG)]
     lags = _SEPARATOR.join(f"lag({name}) OVER before AS {name}{LAG}" for name in now)
     return (
         f"(\n        SELECT\n            drive_id,\n            {', '.join(now)},\n"
-        f"            {lags}\n        FROM {LOGS}\n"
+        f"            {lags}\n        FROM {logs}\n"
         "        WINDOW before AS (PARTITION BY drive_id ORDER BY tick)\n"
         "        QUALIFY lag(tick) OVER before = tick - 1\n    )"
     )

@@ -90,9 +90,10 @@ def measure(
 ) -> Measurement:
     """Measure one drive.
 
-    `truth` holds a float64 array of one length for the SI column of every signal but GPS. The
-    draws come in a fixed order: white noise signal by signal in catalogue order, then the GPS
-    outages, then the GPS noise. Signals without an entry in `Sensors.bias_and_std` are exact.
+    `truth` holds a float64 array of one length for the SI column of every signal but GPS; a
+    signal without one is not measured, as by a car that lacks the sensor. The draws come in a fixed
+    order: white noise signal by signal in catalogue order, then the GPS outages, then the GPS
+    noise. Signals without an entry in `Sensors.bias_and_std` are exact.
     """
     ticks = len(next(iter(truth.values())))
     noise = np.zeros(ticks, dtype=np.float32)
@@ -100,7 +101,7 @@ def measure(
     counts = {}
     saturated = 0
     for name, signal in catalogue().signals.items():
-        if name in GPS_SIGNALS:
+        if name in GPS_SIGNALS or signal.column not in truth:
             continue
         if name in errors:
             generator.standard_normal(out=noise, dtype=np.float32)
@@ -110,6 +111,8 @@ def measure(
         saturated += clipped
     gps_fix = _gps_fixes(ticks, sensors.gps, generator)
     for name, column in GPS_SIGNALS.items():
+        if name not in catalogue().signals:
+            continue
         fixed = truth[column][gps_fix]
         drawn = generator.standard_normal(len(fixed), dtype=np.float32)
         counts[name] = np.zeros(ticks, dtype=np.int16)
@@ -117,7 +120,9 @@ def measure(
             fixed, drawn, (0.0, sensors.gps.velocity_std_mps), catalogue()[name]
         )
         saturated += clipped
-    return Measurement({name: counts[name] for name in catalogue().signals}, gps_fix, saturated)
+    return Measurement(
+        {name: counts[name] for name in catalogue().signals if name in counts}, gps_fix, saturated
+    )
 
 
 def quantise(physical: NDArray[np.float64], signal: Signal) -> tuple[NDArray[np.int16], int]:

@@ -4,6 +4,8 @@ from decimal import Decimal
 from fractions import Fraction
 from functools import cache, cached_property
 from importlib.resources.abc import Traversable
+from os import environ
+from pathlib import Path
 from typing import Annotated, Literal
 
 import pyarrow as pa
@@ -11,7 +13,11 @@ from pydantic import Field, StringConstraints, model_validator
 
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import SelectionError
+from fleet_slip.evolution import SCALE
 from fleet_slip.resources import folder
+
+CATALOGUE_VARIABLE = "FLEET_SLIP_SIGNALS"
+"""Names a signal catalogue to use instead of the shipped one: another fleet, other signals."""
 
 COUNT_MAX = 2**15 - 1
 """Largest count. The range is symmetric, so that mirroring a drive never overflows."""
@@ -136,6 +142,18 @@ class SignalCatalogue(Config):
             ]
         )
 
+    @cached_property
+    def stored_schema(self) -> pa.Schema:
+        """The log schema with the scale of each signal in its field's metadata."""
+        return pa.schema(
+            [
+                field.with_metadata({SCALE: str(self.signals[field.name].scale)})
+                if field.name in self.signals
+                else field
+                for field in self.log_schema
+            ]
+        )
+
 
 def load_catalogue(file: Traversable) -> SignalCatalogue:
     """Read a catalogue from a TOML file. Raises `ConfigError`."""
@@ -144,5 +162,6 @@ def load_catalogue(file: Traversable) -> SignalCatalogue:
 
 @cache
 def catalogue() -> SignalCatalogue:
-    """Return the catalogue that ships with this installation."""
-    return load_catalogue(folder("configs") / "signals.toml")
+    """Return the catalogue of `$FLEET_SLIP_SIGNALS`, else the one that ships with the package."""
+    chosen = environ.get(CATALOGUE_VARIABLE)
+    return load_catalogue(Path(chosen) if chosen else folder("configs") / "signals.toml")

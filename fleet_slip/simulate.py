@@ -84,7 +84,7 @@ def log_drive(spec: DriveSpec, truth: Truth) -> DriveLog:
     columns = {
         signal.column: getattr(truth, signal.column)
         for name, signal in catalogue().signals.items()
-        if name not in GPS_SIGNALS
+        if name not in GPS_SIGNALS and hasattr(truth, signal.column)
     }
     lost = truth.lost_control_tick
     return DriveLog(
@@ -107,6 +107,9 @@ def tabulate(batch: Batch, logs: Sequence[DriveLog]) -> pa.Table:
     columns["tick"] = pa.array(np.concatenate([np.arange(n, dtype=np.int32) for n in rows]))
     no_fix = ~np.concatenate([log.measurement.gps_fix for log in logs])
     for name in catalogue().signals:
+        if name not in logs[0].measurement.counts:
+            columns[name] = pa.nulls(len(drive_of_row), pa.int16())
+            continue
         counts = np.concatenate([log.measurement.counts[name] for log in logs])
         columns[name] = pa.array(counts, mask=no_fix if name in GPS_SIGNALS else None)
     return pa.table({name: columns[name] for name in catalogue().log_schema.names})

@@ -19,7 +19,7 @@ import random
 import re
 import time
 import uuid
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import date
 from functools import cached_property
@@ -34,6 +34,7 @@ from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundErr
 from deltalake.transaction import AddAction, RemoveAction
 
 from fleet_slip.errors import ConflictError, StorageError
+from fleet_slip.evolution import require_readable, require_writable
 
 ROW_GROUP_ROWS = 2**17
 TEMPORARY_PREFIX = ".tmp-"
@@ -130,6 +131,12 @@ class TableFile:
     day: date | None = None
 
 
+def absent_columns(files: Iterable[TableFile], names: Iterable[str]) -> tuple[str, ...]:
+    """Return the columns that none of the files has: they came to the table later."""
+    present = {name for file in files for name in file.null_counts}
+    return tuple(name for name in names if name not in present)
+
+
 @dataclass(frozen=True)
 class Unit:
     """A piece of work that lands exactly once: its name, and a number that its content determines.
@@ -173,9 +180,12 @@ class Table:
         """
         with storage_errors(self.path):
             try:
-                return Snapshot(self, DeltaTable(str(self.path), version=version))
+                delta = DeltaTable(str(self.path), version=version)
             except TableNotFoundError:
                 return Snapshot(self, None)
+        if version is None:
+            require_readable(self.path, self.schema, delta)
+        return Snapshot(self, delta)
 
     def write_file(self, name: str, rows: pa.Table, day: date | None = None) -> AddAction:
         """Write rows to the file NAME-CHECKSUM.parquet, durably.
@@ -274,6 +284,7 @@ class Snapshot:
         both = {action.path for action in change.add} & {file.path for file in change.remove}
         with storage_errors(self.table.path):
             delta = self.delta or _create(self.table)
+            require_writable(self.table.path, self.table.schema, delta)
             try:
                 delta.create_write_transaction(
                     [

@@ -41,7 +41,7 @@ class Warehouse:
         signals = self.catalogue
         return Table(
             path=self.root / "logs",
-            schema=signals.log_schema,
+            schema=signals.stored_schema,
             encoding=Encoding(
                 dictionary=tuple(signals.drive),
                 delta_packed=("tick", *signals.signals),

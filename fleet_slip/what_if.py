@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from fractions import Fraction
 from typing import Any
 
 from fleet_slip.cohort import Cohort
@@ -45,11 +44,16 @@ class WhatIf:
 
 def counts_model(manifest: Manifest) -> LinearModel:
     """Return a published model as one of counts, exactly."""
-    unit = Fraction(manifest.label.scale)
+    # Of the counts as they are now: a signal's scale may have changed since it was published.
+    scales = input_scales()
+    unit = scales[manifest.label.signal]
     return LinearModel(
         manifest.signals,
         manifest.label.signal,
-        tuple(term.coefficient_exact * term.scale_exact / unit for term in manifest.terms),
+        tuple(
+            term.coefficient_exact * (term.scale_exact if term.sql else scales[term.signal]) / unit
+            for term in manifest.terms
+        ),
         manifest.intercept_exact / unit,
     )
 

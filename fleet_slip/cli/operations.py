@@ -1,5 +1,6 @@
-"""Commands that keep a warehouse in service: status, quality, monitor."""
+"""Commands that keep a warehouse in service: status, quality, monitor, migrate."""
 
+from dataclasses import asdict
 from datetime import date
 from pathlib import Path
 from typing import Annotated, Any
@@ -7,13 +8,16 @@ from typing import Annotated, Any
 import typer
 
 from fleet_slip.cli.models import Reference, registry_of
-from fleet_slip.cli.output import Json, print_json, print_table
+from fleet_slip.cli.output import Json, print_json, print_table, progress, say
+from fleet_slip.cli.recorded import recorded
 from fleet_slip.cli.run import DEFAULT_CAMPAIGN
 from fleet_slip.cohort import TRAINING_DRIVES, load_cohort
 from fleet_slip.errors import AlarmError, ConfigError
+from fleet_slip.migration import migrate as migrate_logs
 from fleet_slip.operations.monitor import Chart
 from fleet_slip.operations.monitor import monitor as chart_errors
 from fleet_slip.operations.quality import QualityReport, examine
+from fleet_slip.operations.run_log import step
 from fleet_slip.operations.status import Status, status_of
 
 
@@ -22,6 +26,7 @@ def register(app: typer.Typer) -> None:
     app.command()(status)
     app.command()(quality)
     app.command()(monitor)
+    app.command()(migrate)
 
 
 def status(
@@ -220,6 +225,31 @@ def _print_chart(chart: Chart) -> None:
         ],
         left=2,
     )
+
+
+@recorded
+def migrate(context: typer.Context, json: Json = False) -> None:
+    """Bring the logs to the signal catalogue: add columns, convert counts to other scales.
+
+    See docs/operations.md before widening a scale. It can be repeated after any interruption.
+    """
+    with step("migrate") as figures, progress("migrate", "rows") as advance:
+        report = migrate_logs(context.obj, advance)
+        figures.rows = report.rows_rewritten
+    if json:
+        print_json(asdict(report))
+        return
+    if not report.changed:
+        say("migrate: nothing to do, the logs agree with the signal catalogue")
+    if report.added:
+        say(f"added: {', '.join(report.added)}; null in the files that are there")
+    for name, (old, new) in report.rescaled.items():
+        say(f"{name}: counts of {old} are now counts of {new}")
+    if report.files_rewritten:
+        say(
+            f"{report.files_rewritten} files, {report.rows_rewritten:,} rows rewritten. Run: "
+            "fleet-slip gram"
+        )
 
 
 def _number(value: Any, form: str) -> str:

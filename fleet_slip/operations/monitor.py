@@ -17,7 +17,6 @@ from statistics import fmean, stdev
 from typing import Any
 
 import numpy as np
-from deltalake import DeltaTable
 
 from fleet_slip.cohort import load_cohort
 from fleet_slip.errors import SelectionError, StorageError
@@ -28,7 +27,6 @@ from fleet_slip.registry import ModelVersion
 from fleet_slip.regression.exact import LinearModel, fit
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.special import student_t_quantile
-from fleet_slip.storage import Snapshot, storage_errors
 from fleet_slip.warehouse import Warehouse
 from fleet_slip.what_if import counts_model
 
@@ -173,8 +171,7 @@ def _last_training_day(warehouse: Warehouse, version: ModelVersion) -> date | No
     logs = warehouse.logs
     number = version.manifest.trained_on.logs_version
     try:
-        with storage_errors(logs.path):
-            then = Snapshot(logs, DeltaTable(str(logs.path), version=number))
+        then = logs.snapshot(number)
     except StorageError:
         raise StorageError(
             f"{logs.path}: version {number}, which {version.reference} was trained on, is no "
