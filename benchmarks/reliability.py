@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from fleet_slip.audit import Subject
@@ -40,6 +41,8 @@ ROWS = 20
 FILES_OF_A_COMMIT = 2
 READERS = 2
 HOST_CLOCKS_APART_S = 86_400.0
+CAMPAIGNS = {"waterford": None, "fleet": 2}
+"""The warehouse that bits are flipped in: campaigns, and how many of their days."""
 
 
 @dataclass(frozen=True)
@@ -178,7 +181,7 @@ def _flip(path: Path, bit: int) -> None:
 
 
 def costs(warehouse: Warehouse) -> None:
-    """Time verify and forget on the `waterford` campaign."""
+    """Time verify, forget and compact."""
     size = warehouse.logs.snapshot().size_bytes + warehouse.grams.snapshot().size_bytes
     for full in (False, True):
         started = time.perf_counter()
@@ -192,15 +195,18 @@ def costs(warehouse: Warehouse) -> None:
             "at most",
             flush=True,
         )
-    rows = pq.read_table(warehouse.grams.snapshot().paths[0], columns=["vehicle_id"])
-    for vehicle in sorted(set(rows["vehicle_id"].to_pylist()))[:2]:
+    rows = pq.read_table(
+        warehouse.grams.snapshot().paths[0], columns=["drive_id", "vehicle_id", "campaign"]
+    )
+    row = rows.filter(pc.equal(rows["campaign"], "fleet")).to_pylist()[0]
+    for subject in (Subject("drive", row["drive_id"]), Subject("vehicle", row["vehicle_id"])):
         started = time.perf_counter()
-        done = forget(warehouse, Subject("vehicle", vehicle), now=True)
+        done = forget(warehouse, subject, now=True)
         seconds = time.perf_counter() - started
         print(
-            f"forget --vehicle {vehicle} --now: {seconds:.2f} s for {done.drives} drives in "
-            f"{done.files_rewritten} files, {done.rows:,} rows; {done.old_files_deleted} old files "
-            "deleted",
+            f"forget --{subject.kind} {subject.value} --now: {seconds:.2f} s, {done.drives} drives "
+            f"with {done.rows:,} rows in {done.files_rewritten} files; {done.old_files_deleted} "
+            "old files deleted",
             flush=True,
         )
     assert not verify(warehouse, full=True).damage
@@ -222,9 +228,10 @@ def main() -> None:
     concurrency(options.writers, options.commits)
     with tempfile.TemporaryDirectory() as folder:
         warehouse = Warehouse(Path(folder))
-        campaign = load_campaign("waterford")
-        with ThreadPoolExecutor(os.cpu_count()) as executor:
-            simulate_campaign(warehouse, campaign, campaign.days(), executor)
+        for name, days in CAMPAIGNS.items():
+            campaign = load_campaign(name)
+            with ThreadPoolExecutor(os.cpu_count()) as executor:
+                simulate_campaign(warehouse, campaign, campaign.days()[:days], executor)
         update_grams(warehouse)
         bits(warehouse, options.bits)
         costs(warehouse)

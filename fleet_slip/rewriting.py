@@ -18,8 +18,12 @@ from fleet_slip.storage import Table, TableFile, storage_errors
 def read_drives(
     table: Table, files: Sequence[TableFile], without: Collection[str] = ()
 ) -> pa.Table:
-    """Return the rows of log files, but for some drives, in the order and types of a new file."""
-    rows = pa.concat_tables([_read(table, file, without) for file in files]).combine_chunks()
+    """Return the rows of log files, but for some drives, in the order and types of a new file.
+
+    Columns that the catalogue no longer has are kept, after the others.
+    """
+    parts = [_read(table, file, without) for file in files]
+    rows = pa.concat_tables(parts, promote_options="default").combine_chunks()
     rows = rows.take(_order(rows))
     return pa.table({name: _compact(rows[name].combine_chunks()) for name in rows.column_names})
 
@@ -40,7 +44,8 @@ def _read(table: Table, file: TableFile, without: Collection[str]) -> pa.Table:
             columns[field.name] = pc.dictionary_encode(column).unify_dictionaries()
         else:
             columns[field.name] = column.cast(field.type)
-    rows = pa.table(columns)
+    retired = [name for name in stored.schema.names if name not in table.schema.names]
+    rows = pa.table(columns | {name: stored[name] for name in retired})
     ids = rows["drive_id"].combine_chunks()
     unwanted = pc.is_in(ids.dictionary, pa.array(sorted(without), ids.dictionary.type))
     return rows.filter(pc.invert(unwanted.take(ids.indices)))

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import duckdb
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -80,6 +81,18 @@ def test_the_same_drives_make_the_same_file_however_they_were_divided(
     assert [f.path for f in warehouse.logs.snapshot().files] == [
         f.path for f in other.logs.snapshot().files
     ]
+
+
+def test_columns_that_the_catalogue_no_longer_has_are_kept(warehouse: Warehouse) -> None:
+    rng = np.random.default_rng(2)
+    old = log_rows("a", random_counts(rng, 40)).append_column("retired", pa.array(range(40)))
+    action = warehouse.logs.write_file("old", old, DAY)
+    warehouse.logs.snapshot().commit(Change(add=[action]))
+    land(warehouse, "new", log_rows("b", random_counts(rng, 40)))
+    compact(warehouse)
+    (path,) = warehouse.logs.snapshot().paths
+    retired = pq.read_table(path, columns=["retired"])["retired"].to_pylist()
+    assert retired == [*range(40), *[None] * 40]
 
 
 def test_large_files_are_left_alone_and_small_ones_fill_up_to_the_target(six: Warehouse) -> None:
