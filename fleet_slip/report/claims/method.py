@@ -139,7 +139,7 @@ def no_loss(data: ReportData) -> Verdict:
 
 @claim(
     "II.B",
-    "All 2^k subset models are unfeasible to compute as k grows",
+    "All 2ᵏ subset models are unfeasible to compute as k grows",
     "the subsets of the paper's own signals cannot all be compared",
 )
 def subsets_unfeasible(data: ReportData) -> Verdict:
