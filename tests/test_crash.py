@@ -2,6 +2,8 @@
 
 import hashlib
 import json
+import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -118,3 +120,35 @@ def test_a_damaged_log_file_is_named(run_command: RunCommand, tmp_path: Path) ->
         assert file.name in told.stderr
     file.write_bytes(whole)
     assert json.loads(run_command("gram", "--json").stdout)["files_read"] == 4
+
+
+@pytest.fixture
+def failing_disk(tmp_path: Path) -> dict[str, str]:
+    """The environment in which reads of files with `FAILING_PATH` in their path fail with EIO."""
+    library = tmp_path / "eio.so"
+    source = Path(__file__).with_name("eio.c")
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("this machine has no C compiler to make a disk fail with")
+    subprocess.run([compiler, "-shared", "-fPIC", "-o", library, source, "-ldl"], check=True)
+    return {**os.environ, "LD_PRELOAD": str(library)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("failing", ["smoke-0000", "signals-", "00000000000000000001.json"])
+def test_a_read_error_is_told_and_loses_nothing(
+    run_command: RunCommand, tmp_path: Path, failing_disk: dict[str, str], failing: str
+) -> None:
+    run_command(*JOB)
+    rows = "SELECT count(*) AS n, bit_xor(hash(l)) AS h FROM log_counts l"
+    before = run_command("sql", rows, "--json").json
+    environment = {**failing_disk, "FAILING_PATH": failing}
+    compacted = run_command("compact", env=environment)
+    assert compacted.exit_code == 6
+    assert "nput/output error" in compacted.stderr or failing in compacted.stderr
+    verified = run_command("verify", "--json", env=environment)
+    assert verified.exit_code == 9
+    assert verified.json["damage"]
+    assert run_command("compact").exit_code == 0
+    assert run_command("sql", rows, "--json").json == before
+    assert run_command("verify", "--full").exit_code == 0
