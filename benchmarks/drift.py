@@ -81,12 +81,9 @@ def train(warehouse: Warehouse) -> None:
 
 def tell(name: str, chart: Chart) -> None:
     mean, std = chart.mean_limits, chart.std_limits
-    print(
-        f"\n{name}: mean within {mean.lower:+.4f} and {mean.upper:+.4f}, std up to {std.upper:.4f}"
-    )
+    print(f"\n{name}: mean {mean.lower:+.4f} to {mean.upper:+.4f}, std up to {std.upper:.4f} deg")
     for day in chart.days:
-        told = "training" if day.training else "ALARM " + " ".join(day.alarms) * bool(day.alarms)
-        told = told if day.training or day.alarms else ""
+        told = "training" if day.training else " ".join(f"ALARM {figure}" for figure in day.alarms)
         print(f"{day.day}  {day.error_mean_deg:+.4f}  {day.error_std_deg:.4f}  {told}")
 
 

@@ -38,7 +38,8 @@ def draw(chart: Chart, file: Path) -> None:
     below.tick_params(axis="x", rotation=30)
     with storage_errors(file):
         try:
-            figure.savefig(file)
+            # Without a date, the same chart is the same file.
+            figure.savefig(file, metadata={"Date": None} if file.suffix == ".svg" else None)
         except ValueError as error:
             raise ConfigError(f"--plot {file}: {error}") from None
 
