@@ -152,9 +152,7 @@ def test_connecting_costs_no_more_with_a_hundred_thousand_runs(tmp_path: Path) -
 def test_commands_are_recorded_and_questions_are_not(run_command: RunCommand) -> None:
     run_command("run", "--campaign", "smoke", "--days", "1")
     run_command("gram", "--features", "unknown")
-    run_command("models")
     run_command("sql", "FROM drives")
-    run_command("run", "--help")
     run_command("run", "--no-such-option")
     query = "SELECT command, exit_code, rows, outcome, [s.name FOR s IN steps] AS steps FROM runs"
     done, failed = run_command("sql", f"{query} ORDER BY started_at", "--json").json

@@ -80,8 +80,7 @@ def test_the_command_tells_a_monitor(run_command: RunCommand, tmp_path: Path) ->
     assert run_command("status", "--json").json["champions"][0]["logs_behind"] > 0
     manifest = tmp_path / "data" / "models" / "smoke" / "versions" / "1.json"
     manifest.write_text(manifest.read_text().replace('"name": "smoke"', '"name": "smoky"'))
-    bad = run_command("status", "--json")
+    bad = run_command("status")
     assert bad.exit_code == 10
-    assert "does not match its SHA-256" in bad.json["problems"][0]
     assert "does not match its SHA-256" in bad.stderr
-    assert "last runs" in run_command("status").stdout
+    assert "last runs" in bad.stdout
