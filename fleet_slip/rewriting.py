@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from fleet_slip.storage import Table, TableFile, storage_errors
 
@@ -24,7 +25,9 @@ def read_drives(
     """
     parts = [_read(table, file, without) for file in files]
     rows = pa.concat_tables(parts, promote_options="default").combine_chunks()
-    rows = rows.take(_order(rows))
+    order = _order(rows)
+    if (np.diff(order) != 1).any():
+        rows = rows.take(order)
     return pa.table({name: _compact(rows[name].combine_chunks()) for name in rows.column_names})
 
 
@@ -51,12 +54,12 @@ def _read(table: Table, file: TableFile, without: Collection[str]) -> pa.Table:
     return rows.filter(pc.invert(unwanted.take(ids.indices)))
 
 
-def _order(rows: pa.Table) -> pa.Array:
+def _order(rows: pa.Table) -> NDArray[np.int64]:
     """Return the order by drive, then tick."""
     ids = rows["drive_id"].combine_chunks()
     rank = np.argsort(np.argsort(np.array(ids.dictionary.to_pylist(), dtype=object)))
     drive = rank[ids.indices.to_numpy()] if len(rank) else np.empty(0, dtype=np.int64)
-    return pa.array(np.lexsort((rows["tick"].to_numpy(), drive)))
+    return np.lexsort((rows["tick"].to_numpy(), drive))
 
 
 def _compact(column: pa.Array) -> pa.Array:
