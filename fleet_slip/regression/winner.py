@@ -44,12 +44,12 @@ def _reason(winner: CrossValidation, best: CrossValidation, near: int) -> str:
     if winner is best:
         rivals = "no other model is" if near == 1 else "no model with fewer signals is"
         return (
-            f"Model {best.name} has the best cross-validated correlation, {best.correlation:.4f}, and "
-            f"{rivals} within one standard error ({error:.2g}) of it."
+            f"Model {best.name} has the best cross-validated correlation, {best.correlation:.4f}, "
+            f"and {rivals} within one standard error ({error:.2g}) of it."
         )
     return (
-        f"Model {winner.name} has the fewest signals ({len(winner.signals)}) of the {near} models within "
-        f"one standard error ({error:.2g}) of the best cross-validated correlation, "
+        f"Model {winner.name} has the fewest signals ({len(winner.signals)}) of the {near} models "
+        f"within one standard error ({error:.2g}) of the best cross-validated correlation, "
         f"{best.correlation:.4f} (model {best.name}, {len(best.signals)} signals); its own is "
         f"{winner.correlation:.4f}."
     )
