@@ -190,14 +190,10 @@ def models_trained_on(warehouse: Warehouse, drives: Collection[str]) -> list[str
 def _in_cohort(
     database: duckdb.DuckDBPyConnection, cohort: str, drives: Collection[str]
 ) -> set[str]:
-    statement = (
-        "SELECT DISTINCT drive_id FROM grams "
-        f"WHERE list_contains($drives, drive_id) AND ({cohort}\n)"
-    )
+    statement = f"SELECT DISTINCT drive_id FROM grams WHERE ({cohort}\n)"
     with database_errors(f"the cohort {cohort!r}"):
-        one_query(database, statement)
-        rows = database.execute(statement, {"drives": sorted(drives)}).fetchall()
-    return {row[0] for row in rows}
+        rows = database.execute(one_query(database, statement)).fetchall()
+    return {row[0] for row in rows}.intersection(drives)
 
 
 def _were_there(warehouse: Warehouse, version: int, drives: Collection[str]) -> bool:
