@@ -1,0 +1,73 @@
+"""Agreement with statsmodels: OLS, cluster-robust errors and AR(1) generalised least squares."""
+
+import numpy as np
+import statsmodels.api as sm
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fleet_slip.gram import GramTable
+from fleet_slip.regression.drives import DriveMoments
+from fleet_slip.regression.exact import fit
+from fleet_slip.regression.inference import classical, cluster
+from fleet_slip.regression.serial import autoregressive_fit
+
+from .data import gram_of, names, unit_scales
+from .test_serial import autoregressive_drives, lag_gram
+
+AGREEMENT = 1e-9
+
+
+def drives_of(
+    seed: int, inputs: int, drives: int, collinearity: float, scale: float
+) -> list[np.ndarray]:
+    """Random counts with a common part in all inputs, and an offset of each drive's label."""
+    rng = np.random.default_rng(seed)
+    result = []
+    for _ in range(drives):
+        rows = int(rng.integers(20, 120))
+        x = rng.normal(size=(rows, inputs)) + collinearity * rng.normal(size=(rows, 1))
+        y = x @ np.arange(1, inputs + 1) + rng.normal() + rng.normal(size=rows)
+        result.append(np.rint(scale * np.column_stack([x, y])).astype(np.int64))
+    return result
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    seed=st.integers(0, 10**6),
+    inputs=st.integers(1, 8),
+    drives=st.integers(3, 12),
+    collinearity=st.floats(0, 10),
+    scale=st.floats(30, 900),
+)
+def test_coefficients_and_both_kinds_of_errors_agree(
+    seed: int, inputs: int, drives: int, collinearity: float, scale: float
+) -> None:
+    parts = drives_of(seed, inputs, drives, collinearity, scale)
+    counts = np.concatenate(parts)
+    fitted = fit(gram_of(counts), names(inputs)[:-1], "y")
+    model = sm.OLS(counts[:, -1].astype(float), sm.add_constant(counts[:, :-1].astype(float)))
+    groups = np.repeat(np.arange(drives), [len(part) for part in parts])
+    moments = DriveMoments.of(GramTable.from_grams([gram_of(part) for part in parts]))
+    ours = [
+        classical(fitted, unit_scales(inputs)),
+        cluster(fitted, moments, unit_scales(inputs)),
+    ]
+    theirs = [model.fit(), model.fit(cov_type="cluster", cov_kwds={"groups": groups})]
+    for mine, other in zip(ours, theirs, strict=True):
+        largest = np.abs(other.params).max()
+        values = [estimate.value for estimate in mine.estimates]
+        np.testing.assert_allclose(values, other.params, rtol=AGREEMENT, atol=AGREEMENT * largest)
+        errors = [estimate.standard_error for estimate in mine.estimates]
+        np.testing.assert_allclose(errors, other.bse, rtol=AGREEMENT)
+    assert abs(ours[0].residual_std / np.sqrt(theirs[0].scale) - 1) < AGREEMENT
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 10**6), rho=st.floats(-0.8, 0.9))
+def test_the_autoregressive_fit_agrees_at_its_correlation(seed: int, rho: float) -> None:
+    drive = autoregressive_drives(seed, rho, drives=1)[0]
+    result = autoregressive_fit(lag_gram([drive]), ["x1", "x2"], "y")
+    design = sm.add_constant(drive[:, :-1].astype(float))
+    other = sm.GLSAR(drive[:, -1].astype(float), design, rho=[result.rho]).fit()
+    values = [result.model.offset, *result.model.weights.values()]
+    np.testing.assert_allclose(values, other.params, rtol=AGREEMENT)
