@@ -24,7 +24,7 @@ def draw(chart: Chart, file: Path) -> None:
         from matplotlib.figure import Figure  # noqa: PLC0415
     except ImportError:
         raise ConfigError(
-            "--plot needs matplotlib. Install it with: pip install 'fleet-slip[report]'"
+            "--plot needs matplotlib. Install it with: pip install matplotlib"
         ) from None
     figure = Figure(figsize=(9, 5.5), layout="constrained")
     FigureCanvasAgg(figure)
