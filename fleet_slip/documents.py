@@ -8,6 +8,7 @@ half there, and none is replaced.
 import hashlib
 import json
 import os
+import re
 import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,6 +19,11 @@ from fleet_slip.errors import ConflictError, StorageError
 from fleet_slip.storage import TEMPORARY_PREFIX, flush, storage_errors
 
 ATTEMPTS = 1000
+
+MAX_DIGITS = 9
+"""Digits of a document's number."""
+
+_NUMBER = re.compile(rf"[1-9][0-9]{{0,{MAX_DIGITS - 1}}}")
 
 
 def canonical_json(content: Mapping[str, Any]) -> str:
@@ -53,11 +59,11 @@ class DocumentFolder:
             if not self.path.is_dir():
                 return []
             stems = (file.stem for file in self.path.glob("*.json"))
-            return sorted(int(stem) for stem in stems if stem.isascii() and stem.isdigit())
+            return sorted(int(stem) for stem in stems if _NUMBER.fullmatch(stem))
 
     def read(self, number: int) -> Document:
         """Return a document. Raises `StorageError` if its checksum does not match."""
-        file = self._file(number)
+        file = self.file(number)
         with storage_errors(file):
             text = file.read_bytes()
         try:
@@ -78,7 +84,7 @@ class DocumentFolder:
         found = {}
         numbers = self.numbers()
         for number in sorted({*numbers, *range(1, max(numbers, default=0) + 1)}):
-            file = self._file(number)
+            file = self.file(number)
             try:
                 document = self.read(number)
                 if file.read_bytes() != _rendered(document.content, document.sha256).encode():
@@ -110,13 +116,14 @@ class DocumentFolder:
         for _ in range(ATTEMPTS):
             number += 1
             try:
-                self._file(number).hardlink_to(temporary)
+                self.file(number).hardlink_to(temporary)
             except FileExistsError:
                 continue
             return number
         raise ConflictError(f"{self.path}: too many writers at once. Run the same command again.")
 
-    def _file(self, number: int) -> Path:
+    def file(self, number: int) -> Path:
+        """Return where a document of this number is."""
         return self.path / f"{number}.json"
 
 

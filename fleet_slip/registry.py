@@ -6,8 +6,9 @@
 A manifest is a function of data, configuration and program alone; the time stands in the history.
 """
 
+import contextlib
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from decimal import Decimal
@@ -16,21 +17,66 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import pyarrow as pa
-from pydantic import Field, PlainSerializer, PlainValidator, ValidationError
+from pydantic import (
+    AfterValidator,
+    Field,
+    FiniteFloat,
+    PlainSerializer,
+    PlainValidator,
+    ValidationError,
+)
 
-from fleet_slip.config import Config
-from fleet_slip.documents import DocumentFolder
+from fleet_slip.config import Config, faults_of
+from fleet_slip.documents import MAX_DIGITS, DocumentFolder
 from fleet_slip.errors import RefusedError, SelectionError, StorageError
-from fleet_slip.signals import Identifier
+from fleet_slip.signals import IDENTIFIER_PATTERN, Identifier, catalogue
+from fleet_slip.signing import require_signature, sign
+from fleet_slip.storage import storage_errors
+
+_IDENTIFIER = re.compile(IDENTIFIER_PATTERN)
 
 CHAMPION = "champion"
 """The alias of the version in use."""
 
+_FRACTION = re.compile(r"-?[0-9]{1,4000}/[0-9]{1,4000}")
+
+
+def _exact_fraction(value: Any) -> Fraction:
+    """Return a fraction, also from its text "3/4". Raises `ValueError` for anything else."""
+    if isinstance(value, Fraction):
+        return value
+    if not isinstance(value, str) or not _FRACTION.fullmatch(value):
+        raise ValueError("is not a fraction such as 3/4")
+    numerator, denominator = map(int, value.split("/"))
+    if not denominator:
+        raise ValueError("is divided by zero")
+    return Fraction(numerator, denominator)
+
+
 ExactFraction = Annotated[
     Fraction,
-    PlainValidator(Fraction),
+    PlainValidator(_exact_fraction),
     PlainSerializer(lambda value: f"{value.numerator}/{value.denominator}"),
 ]
+
+Scale = Annotated[Decimal, Field(ge=Decimal("1e-12"), le=Decimal("1e12"), allow_inf_nan=False)]
+
+Count = Annotated[int, Field(ge=0, lt=2**63)]
+
+_SQL_WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_SQL_CHARACTERS = re.compile(r"[A-Za-z0-9_+*/()<>=: -]{0,5000}")
+_SQL_WORDS = frozenset({"CASE", "WHEN", "THEN", "ELSE", "END", "BIGINT", "abs", "sign"})
+
+
+def _integer_arithmetic(sql: str) -> str:
+    """Return the SQL of a feature. Raises `ValueError` if it is more than integer arithmetic.
+
+    A manifest may come from anywhere, and this is the one text of it that becomes SQL.
+    """
+    words = set(_SQL_WORD.findall(sql)) - _SQL_WORDS - set(catalogue().signals)
+    if words or not _SQL_CHARACTERS.fullmatch(sql) or "--" in sql or "/*" in sql:
+        raise ValueError("is not integer arithmetic on the counts of signals")
+    return sql
 
 
 class ModelTerm(Config):
@@ -43,9 +89,9 @@ class ModelTerm(Config):
     signal: Identifier
     column: Identifier
     unit: str
-    scale: Decimal
-    sql: str = ""
-    coefficient: float
+    scale: Scale
+    sql: Annotated[str, AfterValidator(_integer_arithmetic)] = ""
+    coefficient: FiniteFloat
     coefficient_exact: ExactFraction
 
     @property
@@ -60,20 +106,20 @@ class ModelLabel(Config):
     signal: Identifier
     column: Identifier
     unit: str
-    scale: Decimal
+    scale: Scale
 
 
 class CrossValidated(Config):
     """Pooled cross-validated figures of a model, and how the folds were made."""
 
     folds_by: str
-    folds: int
-    correlation: float
-    correlation_standard_error: float
-    rmse_deg: float
-    error_mean_deg: float
-    error_std_deg: float
-    condition_number: float
+    folds: Count
+    correlation: FiniteFloat
+    correlation_standard_error: FiniteFloat
+    rmse_deg: FiniteFloat
+    error_mean_deg: FiniteFloat
+    error_std_deg: FiniteFloat
+    condition_number: FiniteFloat
 
 
 class TrainedOn(Config):
@@ -81,10 +127,10 @@ class TrainedOn(Config):
 
     cohort: str
     feature_set: str = "signals"
-    drives: int
-    rows: int
-    logs_version: int
-    grams_version: int
+    drives: Count
+    rows: Count
+    logs_version: Count
+    grams_version: Count
 
 
 class SelectedBy(Config):
@@ -102,7 +148,7 @@ class Manifest(Config):
     format: Literal[1] = 1
     name: Identifier
     label: ModelLabel
-    intercept: float
+    intercept: FiniteFloat
     intercept_exact: ExactFraction
     terms: tuple[ModelTerm, ...] = Field(min_length=1)
     cross_validation: CrossValidated
@@ -134,7 +180,7 @@ class AliasMove(Config):
     """One entry of the history: an alias points at a version from this moment on."""
 
     alias: Identifier
-    version: int
+    version: Annotated[int, Field(ge=1, lt=10**MAX_DIGITS)]
     command: Literal["publish", "promote", "rollback"]
     at: datetime
 
@@ -155,33 +201,56 @@ class ModelVersion:
 
 @dataclass(frozen=True)
 class Registry:
-    """All models below a folder."""
+    """All models below a folder. New versions are signed with a private key, if there is one."""
 
     path: Path
+    signing_key: Path | None = None
 
     def names(self) -> list[str]:
         """Return the names of all models, sorted."""
         if not self.path.is_dir():
             return []
-        return sorted(entry.name for entry in self.path.iterdir() if (entry / "versions").is_dir())
+        with storage_errors(self.path):
+            return sorted(
+                entry.name
+                for entry in self.path.iterdir()
+                if _IDENTIFIER.fullmatch(entry.name) and (entry / "versions").is_dir()
+            )
 
     def versions(self, name: str) -> list[int]:
         """Return the version numbers of a model, ascending."""
         return self._versions(name).numbers()
 
     def load(self, name: str, version: int) -> ModelVersion:
-        """Return one version. Raises `StorageError` if it was changed after it was published."""
-        numbers = self.versions(name)
+        """Return one version.
+
+        Raises `StorageError` if it was changed after it was published, and `RefusedError` if it
+        lacks the signature that is asked for (`fleet_slip.signing`).
+        """
+        loaded = self._read(name, version)
+        require_signature(self._versions(name).file(version), name, loaded.sha256)
+        return loaded
+
+    def sign(self, name: str, version: int) -> None:
+        """Sign a version, if there is a key to sign with."""
+        if self.signing_key is not None:
+            loaded = self._read(name, version)
+            document = self._versions(name).file(version)
+            sign(document, name, loaded.sha256, self.signing_key)
+
+    def _read(self, name: str, version: int) -> ModelVersion:
+        numbers = self.versions(name) if name in self.names() else []
         if version not in numbers:
             raise SelectionError(_unknown(name, str(version), self.names(), numbers))
         document = self._versions(name).read(version)
-        try:
-            return ModelVersion(version, Manifest.model_validate(document.content), document.sha256)
-        except ValidationError as error:
+        with _foreign_document(f"{name}@{version}: its manifest"):
+            manifest = Manifest.model_validate(document.content)
+        if manifest.name != name:
             raise StorageError(
-                f"{name}@{version}: its manifest is not one that this program understands: "
-                f"{error.errors()[0]['msg']}. Update fleet-slip, or publish again."
-            ) from None
+                f"{name}@{version}: its manifest is of the model {manifest.name}. Restore the file "
+                "from a backup, or publish again."
+            )
+        return ModelVersion(version, manifest, document.sha256)
 
     def resolve(self, reference: str) -> ModelVersion:
         """Return the version that `NAME`, `NAME@VERSION` or `NAME@ALIAS` names.
@@ -189,11 +258,11 @@ class Registry:
         `NAME` alone is its champion. Raises `SelectionError` for an unknown one.
         """
         name, _, which = reference.partition("@")
-        if not re.fullmatch(r"[a-z][a-z0-9_]*", name) or name not in self.names():
+        if name not in self.names():
             known = ", ".join(self.names()) or "none yet; publish one with: fleet-slip publish"
             raise SelectionError(f"no model is called {name!r}. Models: {known}.")
         which = which or CHAMPION
-        if which.isascii() and which.isdigit():
+        if which.isascii() and which.isdigit() and len(which) <= MAX_DIGITS:
             return self.load(name, int(which))
         aliases = self.aliases(name)
         if which not in aliases:
@@ -214,6 +283,7 @@ class Registry:
         content = manifest.model_dump(mode="json")
         number = self._same_as_latest(manifest)
         document = folder.read(number) if number else folder.append(content)
+        self.sign(manifest.name, document.number)
         self._move(manifest.name, CHAMPION, document.number, "publish")
         return ModelVersion(document.number, manifest, document.sha256)
 
@@ -247,7 +317,9 @@ class Registry:
     def history(self, name: str) -> list[AliasMove]:
         """Return all moves of a model's aliases, oldest first."""
         folder = self._history(name)
-        return [AliasMove.model_validate(folder.read(n).content) for n in folder.numbers()]
+        documents = [folder.read(number) for number in folder.numbers()]
+        with _foreign_document(f"{folder.path}: a move of an alias"):
+            return [AliasMove.model_validate(document.content) for document in documents]
 
     def aliases(self, name: str) -> dict[str, int]:
         """Return each alias of a model and the version that it points at."""
@@ -263,7 +335,7 @@ class Registry:
         aliases = self.aliases(name)
         rows: list[Mapping[str, Any]] = []
         for number in self.versions(name):
-            version = self.load(name, number)
+            version = self._read(name, number)
             manifest = version.manifest
             published = [move.at for move in history if move.version == number]
             rows.append(
@@ -287,7 +359,7 @@ class Registry:
 
     def _same_as_latest(self, manifest: Manifest) -> int | None:
         latest = max(self.versions(manifest.name), default=None)
-        if latest is not None and self.load(manifest.name, latest).manifest == manifest:
+        if latest is not None and self._read(manifest.name, latest).manifest == manifest:
             return latest
         return None
 
@@ -298,6 +370,11 @@ class Registry:
         version: int,
         command: Literal["publish", "promote", "rollback"],
     ) -> None:
+        if not _IDENTIFIER.fullmatch(alias):
+            raise SelectionError(
+                f"{alias!r} cannot be an alias: use small letters, digits and _, beginning with a "
+                "letter, at most 41."
+            )
         move = AliasMove(alias=alias, version=version, command=command, at=datetime.now(UTC))
         self._history(name).append(move.model_dump(mode="json"))
 
@@ -325,6 +402,18 @@ _TABLE_SCHEMA = pa.schema(
         ("sha256", pa.string()),
     ]
 )
+
+
+@contextlib.contextmanager
+def _foreign_document(what: str) -> Iterator[None]:
+    """Explain a document that is whole and yet not one of ours."""
+    try:
+        yield
+    except ValidationError as error:
+        raise StorageError(
+            f"{what} is not one that this program understands: {faults_of(error)}. Update "
+            "fleet-slip, or publish again."
+        ) from None
 
 
 def _unknown(

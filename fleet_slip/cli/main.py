@@ -19,6 +19,7 @@ from fleet_slip.cli import (
     report,
     run,
     selecting,
+    signing,
     statistics,
 )
 from fleet_slip.cli.logs import LOG_VARIABLE, LogFormat, configure_logs
@@ -51,6 +52,7 @@ for module in (
     report,
     operations,
     maintenance,
+    signing,
     query,
 ):
     module.register(app)

@@ -1,5 +1,6 @@
 """Commands that make and serve models: publish, models, show, promote, rollback, score."""
 
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -20,6 +21,7 @@ from fleet_slip.cli.selecting import (
     Rank,
     print_selection,
 )
+from fleet_slip.cli.signing import SignKey, signing_key
 from fleet_slip.cohort import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.model_list import check_model_name
 from fleet_slip.operations.run_log import step
@@ -41,9 +43,9 @@ def register(app: typer.Typer) -> None:
         app.command()(command)
 
 
-def registry_of(warehouse: Warehouse) -> Registry:
-    """Return the registry of a data root."""
-    return Registry(warehouse.root / "models")
+def registry_of(warehouse: Warehouse, sign_key: Path | None = None) -> Registry:
+    """Return the registry of a data root; it signs new versions if a key is configured."""
+    return Registry(warehouse.root / "models", signing_key(sign_key))
 
 
 @recorded
@@ -63,6 +65,7 @@ def publish(
     force: Annotated[
         bool, typer.Option("--force", help="Publish even what is worse than the champion.")
     ] = False,
+    sign_key: SignKey = None,
     json: Json = False,
 ) -> None:
     """Select on a cohort and make the winner the next version of a model, and its champion.
@@ -86,7 +89,8 @@ def publish(
         planned = run_plan(context.obj, plan)
     selection = planned.selection
     manifest = manifest_of(selection, name, planned.label, planned.config_sha256)
-    publication = publish_selection(registry_of(context.obj), manifest, selection, force=force)
+    registry = registry_of(context.obj, sign_key)
+    publication = publish_selection(registry, manifest, selection, force=force)
     if json:
         print_json(published(publication))
     else:

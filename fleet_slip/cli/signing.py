@@ -1,0 +1,58 @@
+"""Commands that make keys and sign model versions: keygen, sign."""
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fleet_slip.cli.output import say
+from fleet_slip.errors import ConfigError
+from fleet_slip.registry import Registry
+from fleet_slip.signing import SIGNING_VARIABLE, VERIFY_VARIABLE, make_keys
+
+SignKey = Annotated[
+    Path | None,
+    typer.Option(
+        "--sign-key",
+        help=f"Private key to sign the version with. Default: ${SIGNING_VARIABLE}.",
+        show_default=False,
+    ),
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this module."""
+    app.command()(keygen)
+    app.command()(sign)
+
+
+def signing_key(given: Path | None) -> Path | None:
+    """Return the private key that versions are signed with: the option, else the environment's."""
+    return given or (Path(named) if (named := os.environ.get(SIGNING_VARIABLE)) else None)
+
+
+def keygen(
+    file: Annotated[Path, typer.Argument(help="Where to write the private key; FILE.pub is made.")],
+) -> None:
+    """Make a key to sign model versions with. Keep it where versions are made, and nowhere else."""
+    public = make_keys(file)
+    say(f"{file}: the private key. Sign with: export {SIGNING_VARIABLE}={file}")
+    say(f"{public}: the public key. Demand signatures with: export {VERIFY_VARIABLE}={public}")
+
+
+def sign(
+    context: typer.Context,
+    reference: Annotated[str, typer.Argument(help="NAME@VERSION")],
+    sign_key: SignKey = None,
+) -> None:
+    """Sign a version that was published without a signature."""
+    key = signing_key(sign_key)
+    if key is None:
+        raise ConfigError(f"no key to sign with. Give --sign-key FILE, or set ${SIGNING_VARIABLE}.")
+    registry = Registry(context.obj.root / "models", key)
+    name, _, version = reference.partition("@")
+    if not (version.isascii() and version.isdigit() and len(version) < 10):
+        raise ConfigError(f"{reference!r}: name one version, such as sideslip@3.")
+    registry.sign(name, int(version))
+    say(f"{name}@{int(version)} is signed")

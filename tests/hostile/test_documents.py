@@ -1,0 +1,133 @@
+"""Manifests and histories that were made by someone else."""
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fleet_slip.documents import DocumentFolder, checksum
+from fleet_slip.errors import FleetSlipError, StorageError
+from fleet_slip.registry import Registry
+from tests.test_registry import manifest
+
+NAME = manifest().name
+
+
+@pytest.fixture
+def registry(tmp_path: Path) -> Registry:
+    """A registry with one version."""
+    registry = Registry(tmp_path / "models")
+    registry.publish(manifest())
+    return registry
+
+
+def forge(registry: Registry, kind: str, **changes: Any) -> None:
+    """Change keys of a document, `term` in its first term, and make its checksum right."""
+    file = registry.path / NAME / kind / "1.json"
+    document = json.loads(file.read_text())
+    term = changes.pop("term", {})
+    document["content"] |= changes
+    if term:
+        document["content"]["terms"][0] |= term
+    document["sha256"] = checksum(document["content"])
+    file.write_text(json.dumps(document))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"intercept_exact": "1/0"},
+        {"intercept_exact": "1e999999999"},
+        {"intercept_exact": "9" * 5000 + "/1"},
+        {"intercept_exact": None},
+        {"intercept_exact": 0.1},
+        {"intercept": "inf"},
+        {"intercept": "nan"},
+        {"term": {"scale": "NaN"}},
+        {"term": {"scale": "1e999999"}},
+        {"term": {"scale": 0}},
+        {"term": {"column": "ay_mps2; DROP VIEW log"}},
+        {"term": {"signal": "ay\n"}},
+        {"term": {"sql": "(SELECT 1)"}},
+        {"term": {"sql": "error('x')"}},
+        {"term": {"sql": "1 -- "}},
+        {"term": {"sql": "ay /* */"}},
+        {"term": {"sql": "ay; COPY x TO 'y'"}},
+        {"term": {"sql": "'a'"}},
+        {"terms": []},
+        {"name": "another"},
+        {"unknown": 1},
+        {"trained_on": {"cohort": "true", "drives": 2**70, "rows": 1}},
+        {"trained_on": {"cohort": "true", "drives": -1, "rows": 1}},
+    ],
+)
+def test_a_forged_manifest_is_refused(registry: Registry, changes: dict[str, Any]) -> None:
+    forge(registry, "versions", **changes)
+    started = time.monotonic()
+    with pytest.raises(StorageError, match="manifest"):
+        registry.load(NAME, 1)
+    with pytest.raises(StorageError):
+        registry.as_table()
+    assert time.monotonic() - started < 5
+
+
+@pytest.mark.parametrize("sql", ["", "ay::BIGINT * yaw_rate::BIGINT", "abs(ay::BIGINT)"])
+def test_integer_arithmetic_is_what_a_feature_may_be(registry: Registry, sql: str) -> None:
+    forge(registry, "versions", term={"sql": sql})
+    assert registry.load(NAME, 1).manifest.terms[0].sql == sql
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"alias": "a b"}, {"version": "x"}, {"version": 10**30}, {"at": 0.5e300}, {"command": "rm"}],
+)
+def test_a_forged_history_is_refused(registry: Registry, changes: dict[str, Any]) -> None:
+    forge(registry, "history", **changes)
+    with pytest.raises(StorageError, match="move of an alias"):
+        registry.aliases(NAME)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[" * 100_000,
+        '{"content": ' + "[" * 5000 + "]" * 5000 + ', "sha256": ""}',
+        '{"content": ' + "9" * 5000 + ', "sha256": ""}',
+        '{"content": NaN, "sha256": ""}',
+        '{"content": "\\ud800", "sha256": ""}',
+        "[]",
+        "null",
+        "\xff",
+        "",
+    ],
+)
+def test_a_document_that_is_none_is_refused(registry: Registry, text: str) -> None:
+    (registry.path / NAME / "versions" / "1.json").write_text(text, encoding="latin-1")
+    with pytest.raises(StorageError, match="not a document"):
+        registry.load(NAME, 1)
+
+
+def test_only_numbers_are_documents(registry: Registry) -> None:
+    folder = DocumentFolder(registry.path / NAME / "versions")
+    for stem in ("01", "0", "-1", "1e3", "٣", "9" * 200, "x"):
+        (folder.path / f"{stem}.json").write_text("{}")
+    assert folder.numbers() == [1]
+
+
+@pytest.mark.parametrize("name", ["..", "Evil", "a b", "x\n", "x'; DROP TABLE y", "\x1b[2J"])
+def test_folders_that_are_no_models_are_passed_over(registry: Registry, name: str) -> None:
+    (registry.path / name / "versions").mkdir(parents=True)
+    assert registry.names() == [NAME]
+    with pytest.raises(FleetSlipError):
+        registry.resolve(name)
+    with pytest.raises(FleetSlipError):
+        registry.load(name, 1)
+
+
+@pytest.mark.parametrize("alias", ["", "a b", "x\n", "../x", "1", "x" * 100])
+def test_an_alias_is_a_plain_name(registry: Registry, alias: str) -> None:
+    with pytest.raises(FleetSlipError):
+        registry.promote(NAME, 1, alias)
+    assert registry.aliases(NAME) == {"champion": 1}
