@@ -19,7 +19,7 @@ class Config(BaseModel):
 ConfigT = TypeVar("ConfigT", bound=Config)
 
 
-LONGEST_FILE_BYTES = 2**22
+LONGEST_FILE_BYTES = 2**20
 FAULTS_SHOWN = 10
 LONGEST_FAULT = 300
 """Characters of one fault that are shown; what was given may stand in it."""

@@ -9,6 +9,7 @@ import duckdb
 import pyarrow as pa
 
 from fleet_slip.database import database_errors, open_database
+from fleet_slip.errors import StorageError
 from fleet_slip.gram_statement import with_absent
 from fleet_slip.operations.run_log import RECORD_COLUMNS, run_files
 from fleet_slip.registry import Registry
@@ -22,11 +23,22 @@ VIEWS = ("log_counts", "log", "grams", "drives", "quarantine", "runs")
 
 DEFAULT_ROOT = Path("data")
 ROOT_VARIABLE = "FLEET_SLIP_ROOT"
+UNFIT_CHARACTERS = "\\*?["
+"""The backslash becomes a slash in Delta; the others are patterns to DuckDB."""
 
 
 def data_root(root: Path | str | None = None) -> Path:
-    """Return the data root: the argument, else $FLEET_SLIP_ROOT, else ./data."""
-    return Path(root or environ.get(ROOT_VARIABLE) or DEFAULT_ROOT)
+    """Return the data root: the argument, else $FLEET_SLIP_ROOT, else ./data.
+
+    Raises `StorageError` for a path with characters that Delta or DuckDB take for something else.
+    """
+    path = Path(root or environ.get(ROOT_VARIABLE) or DEFAULT_ROOT)
+    unfit = [c for c in str(path) if not c.isprintable() or c in UNFIT_CHARACTERS]
+    if unfit:
+        raise StorageError(
+            f"{path}: a data root cannot have {unfit[0]!r} in its path. Choose another with --root."
+        )
+    return path
 
 
 def connect(

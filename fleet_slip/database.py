@@ -45,6 +45,14 @@ def memory_bytes() -> int:
     return memory
 
 
+_OF_FILES = (
+    duckdb.IOException,
+    duckdb.InvalidInputException,
+    duckdb.OutOfMemoryException,
+    duckdb.InternalException,
+)
+
+
 @contextlib.contextmanager
 def database_errors(doing: str) -> Iterator[None]:
     """Turn DuckDB's errors into ours, saying what was being done."""
@@ -52,10 +60,14 @@ def database_errors(doing: str) -> Iterator[None]:
         yield
     except FleetSlipError:
         raise
-    except (duckdb.IOException, duckdb.InvalidInputException, duckdb.OutOfMemoryException) as error:
+    except _OF_FILES as error:
         raise StorageError(f"{doing} failed: {first_line(error)}. {_RESTORE}") from None
     except duckdb.Error as error:
+        if type(error) is duckdb.Error:  # what its Parquet reader raises at damaged metadata
+            raise StorageError(f"{doing} failed: {first_line(error)}. {_RESTORE}") from None
         raise SelectionError(f"{doing} failed: {first_line(error)}") from None
+    except UnicodeDecodeError:  # the message quotes bytes of a damaged file
+        raise StorageError(f"{doing} failed: a file is damaged. {_RESTORE}") from None
 
 
 def first_line(error: duckdb.Error) -> str:

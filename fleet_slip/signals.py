@@ -25,7 +25,9 @@ COUNT_MAX = 2**15 - 1
 SAMPLE_TIME_S = Fraction(1, 100)
 """Time between two rows of a drive, in s: the paper's 0.01 s."""
 
-Identifier = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]{0,40}$")]
+IDENTIFIER_PATTERN = r"^[a-z][a-z0-9_]{0,40}$"
+
+Identifier = Annotated[str, StringConstraints(pattern=IDENTIFIER_PATTERN)]
 """A name that is safe to stand in SQL unquoted."""
 
 

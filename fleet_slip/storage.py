@@ -39,6 +39,9 @@ from fleet_slip.evolution import require_readable, require_writable
 ROW_GROUP_ROWS = 2**17
 TEMPORARY_PREFIX = ".tmp-"
 
+_DATA_FILE = re.compile(r"[\w.=-][\w.=/-]*\.parquet", re.ASCII)
+"""Path of a data file below its table: relative, and without characters that could be a pattern."""
+
 CHECKSUM_DIGITS = 32
 """Hexadecimal digits of a file's SHA-256 in its name: damage passes unseen once in 2^128 times."""
 
@@ -251,7 +254,24 @@ class Snapshot:
             # pa.table() would import pandas, which takes half a second.
             stream = self.delta.get_add_actions(flatten=True)
             actions = pa.RecordBatchReader.from_stream(stream).read_all().to_pylist()
-        return tuple(sorted(map(_table_file, actions), key=lambda file: file.path))
+        files = sorted(map(_table_file, actions), key=lambda file: file.path)
+        for file in files:
+            self._require_sound(file)
+        return tuple(files)
+
+    def _require_sound(self, file: TableFile) -> None:
+        """Raise `StorageError` if the log names a file as this program never does."""
+        parts = file.path.split("/")
+        if not _DATA_FILE.fullmatch(file.path) or ".." in parts or "." in parts:
+            raise StorageError(
+                f"{self.table.path}: the Delta log names the file {file.path[:200]!r}, which is "
+                "not one of this table. Restore the log from a backup."
+            )
+        if file.rows is None or file.rows < 0 or file.size_bytes is None or file.size_bytes < 0:
+            raise StorageError(
+                f"{self.table.path}: the Delta log does not say how large {file.path} is. Another "
+                "program wrote it, or it was damaged: restore the log from a backup."
+            )
 
     @property
     def paths(self) -> list[str]:

@@ -21,6 +21,9 @@ CLOSURE_TOLERANCE_RAD = 1e-3
 CONTINUITY_TOLERANCE_1PM = 1e-6
 """Largest jump of curvature between two segments, in 1/m: a car cannot follow a jump."""
 
+LONGEST_M = 1e6
+"""Longest track, in m. Its points are tabulated, which takes memory."""
+
 INTEGRATION_STEP_M = 5.0
 QUADRATURE_POINTS = 6
 
@@ -28,7 +31,7 @@ QUADRATURE_POINTS = 6
 class Segment(Config):
     """A straight, an arc or a clothoid: curvature is linear in arc length between two values."""
 
-    length_m: FiniteFloat = Field(gt=0)
+    length_m: FiniteFloat = Field(gt=0, le=LONGEST_M)
     curvature_1pm: tuple[FiniteFloat, FiniteFloat]
 
 
@@ -51,7 +54,13 @@ class Track(Config):
     name: Identifier
     description: str = Field(min_length=1)
     closed: bool
-    segments: tuple[Segment, ...] = Field(min_length=1)
+    segments: tuple[Segment, ...] = Field(min_length=1, max_length=10_000)
+
+    @model_validator(mode="after")
+    def _is_not_too_long(self) -> Self:
+        if self.length_m > LONGEST_M:
+            raise ValueError(f"is {self.length_m:g} m long, at most {LONGEST_M:g} m are possible")
+        return self
 
     @model_validator(mode="after")
     def _curvature_is_continuous(self) -> Self:

@@ -10,6 +10,7 @@ import difflib
 import hashlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from datetime import date
 from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
@@ -38,6 +39,9 @@ EXTRA_FIELDS = "\0extra fields"
 """Column of a CSV batch: what a line has after the header's last column, null if nothing."""
 
 _PARQUET_MAGIC = b"PAR1"
+_PER_DAY = {unit: 86_400 * 10**power for unit, power in {"s": 0, "ms": 3, "us": 6, "ns": 9}.items()}
+_FIRST_DAY = date.min.toordinal() - date(1970, 1, 1).toordinal()
+_END_DAY = date.max.toordinal() + 1 - date(1970, 1, 1).toordinal()
 _SHOWN_COLUMNS = 30
 
 
@@ -281,8 +285,10 @@ def _plain(array: pa.Array, name: str, file: Path) -> pa.Array:
             )
         array = array.dictionary_decode()
     kind = array.type
-    if _is_text(kind) or pa.types.is_date(kind) or pa.types.is_timestamp(kind):
+    if _is_text(kind):
         return array
+    if pa.types.is_date(kind) or pa.types.is_timestamp(kind):
+        return _in_calendar(array)
     if pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_decimal(kind):
         return pc.cast(array, pa.float64(), safe=False)
     if pa.types.is_null(kind):
@@ -291,3 +297,19 @@ def _plain(array: pa.Array, name: str, file: Path) -> pa.Array:
         f"{shown(file)}: column {name!r} has the type {shown(kind)[:80]}, which is neither a "
         "number, text nor a time. Convert it or map another one."
     )
+
+
+def _in_calendar(array: pa.Array) -> pa.Array:
+    """Return dates or timestamps with null for those outside the years 1 to 9999.
+
+    They are no times of a drive, and Polars panics when it should show one.
+    """
+    kind = array.type
+    if pa.types.is_date32(kind):
+        counts, per_day = pc.cast(pc.cast(array, pa.int32()), pa.int64()), 1
+    else:
+        unit = "ms" if pa.types.is_date64(kind) else kind.unit
+        counts, per_day = pc.cast(array, pa.int64()), _PER_DAY[unit]
+    first, end = (max(-(2**63), min(2**63 - 1, days * per_day)) for days in (_FIRST_DAY, _END_DAY))
+    inside = pc.and_(pc.greater_equal(counts, first), pc.less(counts, end))
+    return pc.if_else(inside, array, pa.scalar(None, kind))

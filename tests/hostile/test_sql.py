@@ -244,7 +244,7 @@ def test_hostile_characters_reach_neither_terminal_nor_log(
     run_command: RunCommand, tmp_path: Path
 ) -> None:
     done = run_command("sql", "SELECT \x1b[31m", root=tmp_path / "evil\x1b[2J\nroot")
-    assert done.exit_code == 5
+    assert done.exit_code == 6
     shown = run_command("sql", "SELECT chr(27) || '[2J' AS x")
     named = run_command("ingest", "a\x1b[2J\nb.csv", "--mapping", "race_car_250lm")
     assert named.exit_code == 4

@@ -220,3 +220,23 @@ def test_more_rows_than_fit_are_refused(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(reading, "MAX_ROWS", 19)
     assert "20 rows, at most 19" in failure(parquet(tmp_path))
     assert "more than 19 rows" in failure(write(tmp_path, GOOD.encode()))
+
+
+@pytest.mark.parametrize(
+    "column",
+    [
+        pa.array([2**52, 0], pa.timestamp("s")),
+        pa.array([-(2**62), 0], pa.timestamp("us", tz="UTC")),
+        pa.array([-(2**31), 0], pa.date32()),
+        pa.array([2**62, 0], pa.date64()),
+    ],
+)
+def test_a_time_beyond_the_calendar_is_no_time(
+    tmp_path: Path, column: pa.Array, capfd: pytest.CaptureFixture[str]
+) -> None:
+    table = pa.table({"time": column})
+    file = tmp_path / "log.parquet"
+    pq.write_table(table, file)
+    (batch,) = reading.read_batches(file, ["time"], a_mapping().csv)
+    assert [value is None for value in batch["time"]] == [True, False]
+    assert capfd.readouterr().err == ""

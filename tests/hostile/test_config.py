@@ -1,0 +1,90 @@
+"""Config files that are too large, too deep, or not what they seem."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from fleet_slip.config import load_toml
+from fleet_slip.connection import data_root
+from fleet_slip.errors import ConfigError, FleetSlipError, StorageError
+from fleet_slip.resources import find_config
+from fleet_slip.track import load_track
+
+TRACK = 'name = "x"\ndescription = "d"\nclosed = {closed}\nsegments = [{segments}]\n'
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"x = " + b"9" * 5000,
+        b"x = 1e99999999999999999999",
+        b"x = " + b"[" * 50_000,
+        b"x = " + b"{a = " * 5000,
+        b"#" * 2**21,
+        b"\xff",
+        b"\xef\xbb\xbfx = 1",
+        b"x = 2024-13-45",
+        b"x = 9999-12-31T23:59:60Z",
+        b'x = "\x1b[2J',
+        b"x = 1\nx = 2",
+    ],
+)
+def test_what_is_not_toml_is_refused_on_one_line(tmp_path: Path, content: bytes) -> None:
+    file = tmp_path / "x.toml"
+    file.write_bytes(content)
+    with pytest.raises(ConfigError) as raised:
+        load_toml(file)
+    assert str(raised.value).isprintable()
+
+
+@pytest.mark.parametrize("name", ["a\0.toml", "x" * 300, "x" * 5000 + ".toml", "..", "", "\ud800"])
+def test_a_name_that_no_file_can_have_is_unknown(name: str) -> None:
+    with pytest.raises(ConfigError):
+        find_config("tracks", name)
+
+
+def test_only_regular_files_are_read(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.toml")
+    (tmp_path / "folder.toml").mkdir()
+    (tmp_path / "loop.toml").symlink_to(tmp_path / "loop.toml")
+    (tmp_path / "zero.toml").symlink_to("/dev/zero")
+    for name in ("pipe", "folder", "loop", "zero"):
+        with pytest.raises(ConfigError):
+            load_track(str(tmp_path / f"{name}.toml"))
+
+
+@pytest.mark.parametrize("closed", ["true", "false"])
+@pytest.mark.parametrize("length", ["1e9", "1e300", "inf", "nan"])
+def test_a_track_of_any_length_takes_little_memory(
+    tmp_path: Path, length: str, closed: str
+) -> None:
+    segment = f"{{length_m = {length}, curvature_1pm = [0.0, 0.0]}}"
+    file = tmp_path / "x.toml"
+    file.write_text(TRACK.format(closed=closed, segments=segment))
+    with pytest.raises(ConfigError, match="length_m"):
+        load_track(str(file))
+    half = "{length_m = 9e5, curvature_1pm = [0.0, 0.0]}"
+    file.write_text(TRACK.format(closed=closed, segments=f"{half}, {half}"))
+    with pytest.raises(ConfigError, match="long"):
+        load_track(str(file))
+
+
+def test_of_many_faults_the_first_are_told(tmp_path: Path) -> None:
+    file = tmp_path / "x.toml"
+    file.write_text("\n".join(f"{'k' * 500}{i} = 1" for i in range(500)))
+    with pytest.raises(ConfigError, match=r"and 49\d more") as raised:
+        load_track(str(file))
+    assert len(str(raised.value)) < 5000
+
+
+@pytest.mark.parametrize("root", ["a\\b", "a*", "a?", "[a]", "a\nb", "\x1b[2J"])
+def test_a_root_that_delta_or_duckdb_would_misread_is_refused(root: str) -> None:
+    with pytest.raises(StorageError, match="data root") as raised:
+        data_root(root)
+    assert str(raised.value).isprintable()
+
+
+def test_every_error_is_shown_on_one_line() -> None:
+    text = str(FleetSlipError("a\nb\x1b[2J\u202e\ud800é"))
+    assert text == r"a\nb\x1b[2J\u202e\ud800é"

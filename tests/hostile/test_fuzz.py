@@ -1,0 +1,43 @@
+"""Each target of the long fuzz run, briefly, with choices that hypothesis steers and shrinks."""
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from benchmarks.fuzz.mutate import ByteRandom
+from benchmarks.fuzz.targets import TARGETS
+from fleet_slip.errors import FleetSlipError
+
+EXAMPLES = {"csv": 60, "parquet": 60, "config": 100, "sql": 60, "manifest": 40}
+FEW = 6
+
+
+@pytest.fixture(scope="module")
+def sandbox(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("fuzz")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TARGETS)
+def test_whatever_comes_is_answered_or_refused(name: str, sandbox: Path) -> None:
+    target, _ = TARGETS[name]
+
+    @settings(
+        max_examples=EXAMPLES.get(name, FEW),
+        deadline=None,
+        database=None,
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(st.binary(min_size=64, max_size=4096))
+    def attack(data: bytes) -> None:
+        with TemporaryDirectory(dir=sandbox) as folder:
+            try:
+                target(ByteRandom(data), Path(folder))
+            except FleetSlipError as error:
+                assert str(error).isprintable()
+
+    attack()
+    assert {entry.name for entry in sandbox.iterdir()} <= {"template"}

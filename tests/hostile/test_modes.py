@@ -1,0 +1,30 @@
+"""Files of a data root follow the umask, temporary ones too."""
+
+import os
+import stat
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fleet_slip.gram_job import update_grams
+from fleet_slip.registry import Registry
+from fleet_slip.warehouse import Warehouse
+from tests.conftest import land, log_rows, random_counts
+from tests.test_registry import manifest
+
+
+@pytest.mark.parametrize("umask", [0o022, 0o077])
+def test_nobody_gets_more_rights_than_the_umask_gives(tmp_path: Path, umask: int) -> None:
+    old = os.umask(umask)
+    try:
+        warehouse = Warehouse(tmp_path / "data")
+        land(warehouse, "one", log_rows("d", random_counts(np.random.default_rng(1), 20)))
+        update_grams(warehouse, lambda _more, _total: None)
+        Registry(warehouse.root / "models").publish(manifest())
+    finally:
+        os.umask(old)
+    files = [*warehouse.root.rglob("*")]
+    assert len(files) > 10
+    for file in files:
+        assert not stat.S_IMODE(file.stat().st_mode) & umask, file
