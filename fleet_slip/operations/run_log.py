@@ -90,7 +90,7 @@ class Run:
     def start(cls, command: str, arguments: Sequence[str]) -> "Run":
         """Begin a run now. Its name sorts by time."""
         now = datetime.now(UTC)
-        run_id = f"{now:%Y%m%dT%H%M%SZ}-{uuid.uuid4().hex[:8]}"
+        run_id = f"{now:%Y%m%dT%H%M%S.%fZ}-{uuid.uuid4().hex[:8]}"
         return cls(command, tuple(arguments), now, run_id)
 
     @property
