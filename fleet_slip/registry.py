@@ -30,7 +30,7 @@ from fleet_slip.config import Config, faults_of
 from fleet_slip.documents import MAX_DIGITS, DocumentFolder
 from fleet_slip.errors import RefusedError, SelectionError, StorageError
 from fleet_slip.signals import IDENTIFIER_PATTERN, Identifier, catalogue
-from fleet_slip.signing import require_signature, sign
+from fleet_slip.signing import require_signature, require_signing_key, sign
 from fleet_slip.storage import storage_errors
 
 _IDENTIFIER = re.compile(IDENTIFIER_PATTERN)
@@ -279,6 +279,8 @@ class Registry:
 
         If an interrupted run left the same manifest as the latest version, that one is used.
         """
+        if self.signing_key is not None:
+            require_signing_key(self.signing_key)  # before anything is written
         folder = self._versions(manifest.name)
         content = manifest.model_dump(mode="json")
         number = self._same_as_latest(manifest)
@@ -300,7 +302,7 @@ class Registry:
     def rollback(self, name: str, alias: str) -> int:
         """Point an alias back at the version it had before; return that version.
 
-        Raises `RefusedError` if it never had another.
+        Raises `RefusedError` if it never had another, and what `load` raises if that is not sound.
         """
         trail: list[int] = []
         for move in self.history(name):
@@ -311,6 +313,7 @@ class Registry:
                 f"{name}@{alias} never pointed at another version, so there is nothing to go back "
                 f"to. See: fleet-slip models {name}"
             )
+        self.load(name, trail[-2])
         self._move(name, alias, trail[-2], "rollback")
         return trail[-2]
 

@@ -43,19 +43,17 @@ def make_keys(private: Path) -> Path:
     return public
 
 
+def require_signing_key(key: Path) -> None:
+    """Raise `ConfigError` for a private key that cannot be used."""
+    _signed(key, b"")
+
+
 def sign(document: Path, name: str, sha256: str, key: Path) -> None:
     """Write the signature of a version beside its document, durably.
 
     Raises `ConfigError` for a key that cannot be used.
     """
-    secret = _read_key(key, private=True)
-    try:
-        signature = _ed25519().sign(secret, _message(document, name, sha256))
-    except ValueError:
-        raise ConfigError(
-            f"{key}: not an unencrypted Ed25519 private key in PEM. Make one with: fleet-slip "
-            "keygen FILE"
-        ) from None
+    signature = _signed(key, _message(document, name, sha256))
     target = document.with_suffix(".sig")
     temporary = document.with_name(f"{TEMPORARY_PREFIX}{os.getpid()}-{target.name}")
     with storage_errors(target):
@@ -105,6 +103,18 @@ def require_signature(document: Path, name: str, sha256: str) -> None:
 
 def _message(document: Path, name: str, sha256: str) -> bytes:
     return f"fleet-slip model version\n{name}\n{document.stem}\n{sha256}\n".encode()
+
+
+def _signed(key: Path, message: bytes) -> bytes:
+    secret = _read_key(key, private=True)
+    try:
+        signature = _ed25519().sign(secret, message)
+    except ValueError:
+        raise ConfigError(
+            f"{key}: not an unencrypted Ed25519 private key in PEM. Make one with: fleet-slip "
+            "keygen FILE"
+        ) from None
+    return bytes(signature)
 
 
 def _read_key(path: Path, *, private: bool) -> bytes:

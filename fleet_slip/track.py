@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
+from typing import Annotated, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,15 +24,21 @@ CONTINUITY_TOLERANCE_1PM = 1e-6
 LONGEST_M = 1e6
 """Longest track, in m. Its points are tabulated, which takes memory."""
 
+SHARPEST_1PM = 1.0
+"""Largest curvature of a track, in 1/m. No car turns so sharply; sums of much more overflow."""
+
 INTEGRATION_STEP_M = 5.0
 QUADRATURE_POINTS = 6
+
+
+Curvature = Annotated[FiniteFloat, Field(ge=-SHARPEST_1PM, le=SHARPEST_1PM)]
 
 
 class Segment(Config):
     """A straight, an arc or a clothoid: curvature is linear in arc length between two values."""
 
     length_m: FiniteFloat = Field(gt=0, le=LONGEST_M)
-    curvature_1pm: tuple[FiniteFloat, FiniteFloat]
+    curvature_1pm: tuple[Curvature, Curvature]
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 
 from fleet_slip.database import database_errors, open_database
 from fleet_slip.documents import DocumentFolder
-from fleet_slip.errors import FleetSlipError
+from fleet_slip.errors import FleetSlipError, RefusedError, SelectionError, StorageError
 from fleet_slip.gram_check import DriveGrams, grams_by_blocks, read_counts, stored_grams
 from fleet_slip.registry import Registry
 from fleet_slip.resources import read_sql
@@ -237,7 +237,10 @@ def _verify_models(
         for number in numbers:
             try:
                 trained = registry.load(name, number).manifest.trained_on
-            except FleetSlipError:
+            except RefusedError as error:  # its signature
+                report.findings.append(Finding("model", f"{name}@{number}", str(error)))
+                continue
+            except (StorageError, SelectionError):
                 continue  # told as a document
             made_of = {"logs": trained.logs_version, "grams": trained.grams_version}
             for table, version in made_of.items():

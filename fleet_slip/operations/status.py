@@ -13,7 +13,7 @@ import pyarrow as pa
 
 from fleet_slip.connection import run_source
 from fleet_slip.database import database_errors, open_database
-from fleet_slip.errors import StorageError
+from fleet_slip.errors import RefusedError, SelectionError, StorageError
 from fleet_slip.gram_job import find_backlog
 from fleet_slip.operations.thresholds import StatusThresholds, thresholds
 from fleet_slip.registry import Registry
@@ -188,7 +188,7 @@ def _champions(
         try:
             champion = registry.champion(name)
             moves = registry.history(name)
-        except StorageError as error:
+        except (StorageError, RefusedError, SelectionError) as error:
             damaged.append(str(error))
             continue
         if champion is None:

@@ -70,6 +70,15 @@ def test_a_track_of_any_length_takes_little_memory(
         load_track(str(file))
 
 
+@pytest.mark.parametrize("curvature", ["1.1", "-1e308", "inf", "nan"])
+def test_a_track_bends_no_more_than_a_car_can(tmp_path: Path, curvature: str) -> None:
+    segment = f"{{length_m = 1e5, curvature_1pm = [{curvature}, {curvature}]}}"
+    file = tmp_path / "x.toml"
+    file.write_text(TRACK.format(closed="true", segments=segment))
+    with pytest.raises(ConfigError, match="curvature_1pm"):
+        load_track(str(file))
+
+
 def test_of_many_faults_the_first_are_told(tmp_path: Path) -> None:
     file = tmp_path / "x.toml"
     file.write_text("\n".join(f"{'k' * 500}{i} = 1" for i in range(500)))

@@ -3,6 +3,7 @@
 import json
 import os
 import stat
+from fractions import Fraction
 from pathlib import Path
 
 import pytest
@@ -125,6 +126,21 @@ def test_keys_that_are_none_are_told_without_quoting_them(
             signed.load(manifest().name, 1)
 
 
+def test_a_key_that_cannot_sign_leaves_no_version_behind(signed: Registry, key: Path) -> None:
+    key.chmod(0o644)
+    with pytest.raises(ConfigError, match="chmod 600"):
+        signed.publish(manifest(Fraction(1, 2)))
+    assert signed.versions(manifest().name) == [1]
+
+
+def test_there_is_no_way_back_to_what_is_not_signed(signed: Registry, key: Path) -> None:
+    signed.publish(manifest(Fraction(1, 2)))
+    version_file(signed, suffix="sig").unlink()
+    with pytest.raises(RefusedError, match="not signed"):
+        signed.rollback(manifest().name, "champion")
+    assert signed.aliases(manifest().name) == {"champion": 2}
+
+
 def test_the_command_line_makes_keys_signs_and_refuses(
     run_command: RunCommand, tmp_path: Path
 ) -> None:
@@ -135,8 +151,13 @@ def test_the_command_line_makes_keys_signs_and_refuses(
     asking = {**os.environ, VERIFY_VARIABLE: "mine.pub"}
     name = manifest().name
     assert run_command("show", name, env=asking).exit_code == 7
+    assert "not signed" in run_command("verify", env=asking).stdout
+    assert "not signed" in run_command("status", env=asking).stderr
     assert run_command("sign", f"{name}@1").exit_code == 3
     assert run_command("sign", f"{name}@1", "--sign-key", "mine").exit_code == 0
     assert run_command("show", name, env=asking).exit_code == 0
+    assert "not signed" not in run_command("verify", env=asking).stdout
+    missing = {**os.environ, VERIFY_VARIABLE: "none.pub"}
+    assert run_command("verify", env=missing).exit_code == 3
     history = "".join(f.read_text() for f in (tmp_path / "data").rglob("*.jsonl"))
     assert "PRIVATE" not in history
