@@ -1,7 +1,7 @@
 """One target guided by coverage: python -m benchmarks.fuzz.guided config -runs=20000.
 
-Needs atheris, which is not among our dependencies: pip install atheris. What follows the target's
-name goes to libFuzzer; -len_control=0 -max_len=4096 and a folder for the corpus are useful.
+Needs atheris: pip install --group fuzz --constraint constraints.txt. What follows the target's name
+goes to libFuzzer; -len_control=0 -max_len=4096 and a folder for the corpus are useful.
 """
 
 import importlib

@@ -62,10 +62,11 @@ def main() -> int:
         for first in range(0, cases[name], CASES_PER_PROCESS)
     ]
     with ThreadPoolExecutor(PROCESSES) as executor:
-        for _ in executor.map(
+        done = executor.map(
             lambda part: _supervise(part[0], part[1], options.seed, outcomes), parts
-        ):
-            pass
+        )
+        for (name, numbers), _ in zip(parts, done, strict=True):
+            print(f"{name} {numbers.stop} of {cases[name]}", file=sys.stderr, flush=True)
     _report(outcomes, time.monotonic() - started)
     return 1 if any(outcome.bugs for outcome in outcomes.values()) else 0
 

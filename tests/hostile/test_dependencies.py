@@ -3,16 +3,24 @@
 Known vulnerabilities are looked up by `pip-audit`, which needs a network; this does not.
 """
 
+import ast
 import re
 import subprocess
 import sys
-from importlib.metadata import PackageNotFoundError, distribution
+import tomllib
+from importlib.metadata import PackageNotFoundError, distribution, packages_distributions
+from itertools import chain
 from pathlib import Path
 
+import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 REPOSITORY = Path(__file__).parents[2]
+PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
+EXTRAS = PROJECT["project"]["optional-dependencies"].values()
+SHIPPED = [*PROJECT["project"]["dependencies"], *chain(*EXTRAS)]
+GROUPS = PROJECT["dependency-groups"]
 LICENCES = re.compile(
     r"MIT|BSD|Apache|PSF|Python Software Foundation|ISC|MPL|Mozilla|Zlib|0BSD|CC0|LGPL", re.I
 )
@@ -25,17 +33,18 @@ def pinned() -> dict[str, str]:
     return {canonicalize_name(name): version for name, version in pins}
 
 
-def required() -> dict[str, str]:
-    """Every installed package that fleet-slip needs, itself aside, with its version."""
-    found: dict[str, str] = {}
-    waiting = [Requirement("fleet-slip[signing,rivals]")]
+def required(*requirements: str) -> dict[str, str | None]:
+    """These packages and all that they need; without a version where one is not installed."""
+    found: dict[str, str | None] = {}
+    waiting = [Requirement(text) for text in requirements]
     while waiting:
         wanted = waiting.pop()
         name = canonicalize_name(wanted.name)
         try:
             package = distribution(name)
         except PackageNotFoundError:
-            continue  # of an extra that is not installed here
+            found[name] = None  # of an extra or a group that is not installed here
+            continue
         extras = wanted.extras or {""}
         for text in package.requires or ():
             needed = Requirement(text)
@@ -44,13 +53,42 @@ def required() -> dict[str, str]:
             if applies and canonicalize_name(needed.name) not in found:
                 waiting.append(needed)
         found[name] = package.version
-    del found["fleet-slip"]
     return found
 
 
+def everything() -> dict[str, str | None]:
+    """What users and developers install."""
+    return required("pip", *SHIPPED, *chain(*GROUPS.values()))
+
+
 def test_what_is_installed_is_what_was_pinned() -> None:
-    pins = pinned()
-    assert {name: pins.get(name) for name in required()} == required()
+    installed = {name: version for name, version in everything().items() if version}
+    assert {name: pinned().get(name) for name in installed} == installed
+
+
+def test_nothing_is_pinned_that_nothing_needs() -> None:
+    assert pinned().keys() - everything().keys() == set()
+
+
+@pytest.mark.parametrize(
+    ("folders", "groups"), [(["fleet_slip"], []), (["tests", "benchmarks"], ["dev", "fuzz"])]
+)
+def test_what_is_imported_is_declared(folders: list[str], groups: list[str]) -> None:
+    stated = [*SHIPPED, *chain(*(GROUPS[group] for group in groups))]
+    declared = {canonicalize_name(Requirement(text).name) for text in stated}
+    providers = packages_distributions()
+    files = chain(*((REPOSITORY / folder).rglob("*.py") for folder in folders))
+    imported = set().union(*map(modules_of, files)) & providers.keys()
+    undeclared = {m for m in imported if not declared & set(map(canonicalize_name, providers[m]))}
+    assert undeclared - {"fleet_slip", *sys.stdlib_module_names} == set()
+
+
+def modules_of(file: Path) -> set[str]:
+    """The top-level modules that a file imports."""
+    nodes = list(ast.walk(ast.parse(file.read_text())))
+    names = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
+    names += [node.module for node in nodes if isinstance(node, ast.ImportFrom) and node.module]
+    return {name.partition(".")[0] for name in names}
 
 
 def test_the_packages_fit_together() -> None:
@@ -61,7 +99,7 @@ def test_the_packages_fit_together() -> None:
 
 def test_every_licence_lets_us_use_the_package() -> None:
     unknown = []
-    for name in required():
+    for name in (name for name, version in required(*SHIPPED).items() if version):
         metadata = distribution(name).metadata.json
         stated = [metadata.get("license_expression", ""), str(metadata.get("license", ""))[:200]]
         stated += [text for text in metadata.get("classifier", []) if text.startswith("License")]
