@@ -3,8 +3,15 @@
 import subprocess
 import sys
 
-MODULES = ("simulator", "pipeline", "statistics", "observers")
+COMMANDS = (
+    "simulator",
+    "pipeline",
+    "statistics",
+    "observers",
+    "reliability",
+    "crash --kills 30",
+)
 
-for module in MODULES:
-    print(f"\n== {module}", flush=True)
-    subprocess.run([sys.executable, "-m", f"benchmarks.{module}"], check=True)
+for command in COMMANDS:
+    print(f"\n== {command}", flush=True)
+    subprocess.run([sys.executable, "-m", *f"benchmarks.{command}".split()], check=True)
