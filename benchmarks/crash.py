@@ -43,6 +43,7 @@ from fleet_slip.audit import Audit
 from fleet_slip.campaign import load_campaign
 from fleet_slip.cli.main import main as fleet_slip_main
 from fleet_slip.ingest.mapping import load_mapping
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.registry import Registry
 from fleet_slip.simulate import simulate_logs
 from fleet_slip.storage import Table
@@ -144,11 +145,11 @@ def give(root: Path, arguments: tuple[str, ...], fatal: int = 0) -> int:
 
 def state(root: Path) -> dict[str, Any]:
     """All that a root holds, apart from file names and the moments at which it was written."""
-    warehouse = Warehouse(root)
-    registry = Registry(root / "models")
+    warehouse = Warehouse(LocalFolder(root))
+    registry = Registry(LocalFolder(root / "models"))
     names = registry.names()
     return {
-        "tables": {table.path.name: _digest(table) for table in warehouse.tables},
+        "tables": {table.folder.name: _digest(table) for table in warehouse.tables},
         "versions": {
             n: [registry.load(n, number).sha256 for number in registry.versions(n)] for n in names
         },
@@ -156,7 +157,7 @@ def state(root: Path) -> dict[str, Any]:
         "moves": {n: [(move.command, move.version) for move in registry.history(n)] for n in names},
         "forgotten": [
             [entry["event"], entry.get("drives"), entry.get("models")]
-            for entry in Audit(root).entries()
+            for entry in Audit(LocalFolder(root)).entries()
         ],
         "damage": [str(finding) for finding in verify(warehouse, full=True).damage],
     }
@@ -179,7 +180,7 @@ def _plain(rows: pa.Table) -> pa.Table:
 
 
 def damage(root: Path) -> list[str]:
-    return [str(finding) for finding in verify(Warehouse(root)).damage]
+    return [str(finding) for finding in verify(Warehouse(LocalFolder(root))).damage]
 
 
 class Harness:

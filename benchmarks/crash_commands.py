@@ -8,7 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from fleet_slip import storage
+from fleet_slip.folder import TEMPORARY_PREFIX
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.resources import find_config
 from fleet_slip.warehouse import Warehouse
 
@@ -72,7 +73,7 @@ def prepare_inputs(folder: Path) -> dict[str, str]:
 def let_time_pass(root: Path) -> None:
     """Make all files old, and leave what killed jobs leave."""
     day = next((root / "logs").glob("day=*"))
-    (day / f"{storage.TEMPORARY_PREFIX}0.parquet").write_bytes(b"half a file")
+    (day / f"{TEMPORARY_PREFIX}0.parquet").write_bytes(b"half a file")
     (day / "smoke-9999-uncommitted.parquet").write_bytes(b"written, never committed")
     for file in root.rglob("*"):
         if file.is_file() and "_delta_log" not in file.parts:
@@ -89,7 +90,7 @@ def _removed_long_ago(log: str) -> str:
 
 def damage_files(root: Path) -> None:
     """Flip a bit in a simulated log file and in a Gram file."""
-    warehouse = Warehouse(root)
+    warehouse = Warehouse(LocalFolder(root))
     for table in (warehouse.logs, warehouse.grams):
         file = Path(table.snapshot().paths[-1])
         content = bytearray(file.read_bytes())

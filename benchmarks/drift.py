@@ -18,6 +18,7 @@ from typing import Any
 
 from fleet_slip.campaign import Campaign, load_campaign
 from fleet_slip.gram_job import update_grams
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.operations.chart import draw
 from fleet_slip.operations.monitor import Chart, monitor
 from fleet_slip.publishing import manifest_of, publish
@@ -91,14 +92,14 @@ def main() -> None:
     days = int(sys.argv[1]) if len(sys.argv) > 1 else 12
     with tempfile.TemporaryDirectory() as folder:
         trained = Path(folder) / "trained"
-        land(Warehouse(trained), base(days))
-        train(Warehouse(trained))
+        land(Warehouse(LocalFolder(trained)), base(days))
+        train(Warehouse(LocalFolder(trained)))
         for number, (name, update) in enumerate(CHANGES.items()):
             root = Path(folder) / str(number)
             shutil.copytree(trained, root)
-            warehouse = Warehouse(root)
+            warehouse = Warehouse(LocalFolder(root))
             land(warehouse, later(f"later_{number}", days, update))
-            version = Registry(root / "models").resolve("sideslip")
+            version = Registry(LocalFolder(root / "models")).resolve("sideslip")
             chart = monitor(warehouse, version, COHORT)
             tell(name, chart)
             draw(chart, Path(f"drift_{number}.svg"))

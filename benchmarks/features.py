@@ -17,6 +17,7 @@ from fleet_slip.cohort import TRAINING_DRIVES, Cohort, load_cohort
 from fleet_slip.features import features, input_scales
 from fleet_slip.gram import Gram
 from fleet_slip.gram_job import update_grams
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.regime_comparison import regime_names
 from fleet_slip.regression.crossval import held_out
 from fleet_slip.regression.exact import fit
@@ -70,7 +71,7 @@ def transfer(trained: Sequence[Gram], tested: Sequence[Gram], inputs: Sequence[s
 
 
 def main() -> None:
-    warehouse = Warehouse(Path(sys.argv[1]))
+    warehouse = Warehouse(LocalFolder(Path(sys.argv[1])))
     bound = float(sys.argv[2]) if len(sys.argv) > 2 else 15.0
     update_grams(warehouse)
     update_grams(warehouse, feature_set="regimes")

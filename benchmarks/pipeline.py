@@ -27,6 +27,7 @@ from fleet_slip.campaign import load_campaign
 from fleet_slip.cohort import load_cohort
 from fleet_slip.gram_job import aggregate, update_grams
 from fleet_slip.gram_statement import gram_statement
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.model_list import load_model_list
 from fleet_slip.selection import select
 from fleet_slip.signals import catalogue
@@ -183,11 +184,11 @@ def incremental(warehouse: Warehouse) -> None:
     """Time the Gram job on a new file of about 1 % of the rows, and on nothing."""
     rows = warehouse.logs.snapshot().rows
     with tempfile.TemporaryDirectory() as folder:
-        copy = Warehouse(Path(folder))
+        copy = Warehouse(LocalFolder(Path(folder)))
         logs = warehouse.logs.snapshot()
         actions = []
         for i, file in enumerate(logs.files):
-            table = pq.read_table(warehouse.logs.path / file.path, partitioning=None)
+            table = warehouse.logs.read(file.path)
             actions.append(copy.logs.write_file(f"file-{i}", table, file.day))
         copy.logs.snapshot().commit(Change(add=actions))
         start = time.perf_counter()
@@ -217,7 +218,7 @@ def selection(warehouse: Warehouse, gram_rows: int = 50_000) -> None:
     ids = pa.array([f"drive-{i}" for i in range(gram_rows)])
     many = many.set_column(many.schema.get_field_index("drive_id"), "drive_id", ids)
     with tempfile.TemporaryDirectory() as folder:
-        copy = Warehouse(Path(folder))
+        copy = Warehouse(LocalFolder(Path(folder)))
         action = copy.grams.write_file("many", many.cast(copy.grams.schema))
         copy.grams.snapshot().commit(Change(add=[action]))
         seconds = best(lambda: select(load_cohort(copy), MODELS.model, MODELS.folds))
@@ -234,7 +235,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        warehouse = Warehouse(options.root or Path(folder))
+        warehouse = Warehouse(LocalFolder(options.root or Path(folder)))
         prepare(warehouse)
         for threads in options.threads:
             gram_query(warehouse, threads)

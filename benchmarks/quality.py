@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from fleet_slip.cohort import Cohort, load_cohort
 from fleet_slip.connection import connect
 from fleet_slip.gram import Gram, GramTable
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.operations.quality import QualityReport, examine
 from fleet_slip.signals import COUNT_MAX, catalogue
 from fleet_slip.warehouse import Warehouse
@@ -205,7 +206,7 @@ def score(cohort: Cohort, report: QualityReport, chosen: Sequence[int], fault: I
 
 def main() -> None:
     root = Path(sys.argv[1])
-    cohort = load_cohort(Warehouse(root))
+    cohort = load_cohort(Warehouse(LocalFolder(root)))
     rng = np.random.default_rng(SEED)
     chosen = sample(cohort, rng)
     ids = cohort.drives["drive_id"].to_pylist()

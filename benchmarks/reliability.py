@@ -29,6 +29,7 @@ from fleet_slip.campaign import load_campaign
 from fleet_slip.compaction import compact
 from fleet_slip.forget import forget
 from fleet_slip.gram_job import update_grams
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.signals import catalogue
 from fleet_slip.simulation_job import simulate_campaign
 from fleet_slip.storage import Change, Table, Unit, retried
@@ -69,7 +70,7 @@ def write(root: Path, writer: int, commits: int) -> None:
     if writer % 2:
         real = time.time
         time.time = lambda: real() - HOST_CLOCKS_APART_S
-    logs = Warehouse(root).logs
+    logs = Warehouse(LocalFolder(root)).logs
     for number in range(commits):
         name = f"car{writer}-{number}"
         actions = [
@@ -87,7 +88,7 @@ def _land(logs: Table, change: Change) -> None:
 
 def rearrange(root: Path, stop: Event) -> None:
     """Compact, aggregate and vacuum all the while."""
-    warehouse = Warehouse(root)
+    warehouse = Warehouse(LocalFolder(root))
     while not stop.is_set():
         update_grams(warehouse)
         compact(warehouse, target_rows=400)
@@ -99,7 +100,7 @@ def read(root: Path, stop: Event, answer: "multiprocessing.Queue[Read]") -> None
     snapshots = torn = steps_back = 0
     version = -1
     while not stop.is_set():
-        snapshot = Warehouse(root).logs.snapshot()
+        snapshot = Warehouse(LocalFolder(root)).logs.snapshot()
         if snapshot.version is None:
             continue
         steps_back += snapshot.version < version
@@ -138,7 +139,7 @@ def concurrency(writers: int, commits: int) -> None:
         for process in (*working, *watching):
             process.join()
             assert process.exitcode == 0
-        warehouse = Warehouse(root)
+        warehouse = Warehouse(LocalFolder(root))
         compact(warehouse)
         update_grams(warehouse)
         logs = warehouse.logs.snapshot()
@@ -162,7 +163,7 @@ def bits(warehouse: Warehouse, count: int) -> None:
     weights = [file.size_bytes for _, file in files]
     found = 0
     for table, file in rng.choices(files, weights, k=count):
-        path = table.path / file.path
+        path = Path(table.uri(file.path))
         bit = rng.randrange(file.size_bytes * 8)
         _flip(path, bit)
         found += problem_of(table, file) is not None
@@ -183,7 +184,7 @@ def _flip(path: Path, bit: int) -> None:
 def verifying(root: Path, full: bool) -> tuple[float, int, int]:
     """Verify a root; return seconds, rows, and the most memory that this process ever had."""
     started = time.perf_counter()
-    report = verify(Warehouse(root), full=full)
+    report = verify(Warehouse(LocalFolder(root)), full=full)
     seconds = time.perf_counter() - started
     assert not report.findings
     return seconds, report.rows, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
@@ -238,7 +239,7 @@ def main() -> None:
     options = parser.parse_args()
     concurrency(options.writers, options.commits)
     with tempfile.TemporaryDirectory() as folder:
-        warehouse = Warehouse(Path(folder))
+        warehouse = Warehouse(LocalFolder(Path(folder)))
         for name, days in CAMPAIGNS.items():
             campaign = load_campaign(name)
             with ThreadPoolExecutor(os.cpu_count()) as executor:

@@ -17,6 +17,7 @@ import pyarrow as pa
 
 from benchmarks.statistics import Fleet, simulate
 from fleet_slip.gram import IntArray
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.selection_plan import SelectionPlan, run_plan
 from fleet_slip.signals import catalogue
 from fleet_slip.storage import Change
@@ -85,7 +86,7 @@ def timed(name: str, warehouse: Warehouse, plan: SelectionPlan) -> None:
 def main() -> None:
     drives = int(sys.argv[1]) if len(sys.argv) > 1 else 50_000
     with tempfile.TemporaryDirectory() as folder:
-        warehouse = Warehouse(Path(folder))
+        warehouse = Warehouse(LocalFolder(Path(folder)))
         fill(warehouse, simulate(drives))
         print(f"{drives} Gram rows")
         for name, plan in PLANS.items():

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from fleet_slip.cohort import load_cohort
 from fleet_slip.gram import IntArray
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.regression.criteria import CRITERIA, criterion_values
 from fleet_slip.regression.disturbance import disturbed
 from fleet_slip.regression.drives import DriveMoments, serving_drives
@@ -47,7 +48,7 @@ SCALES = {name: SIGNALS[name].exact_scale for name in SIGNALS.gram_signals}
 
 
 def load(root: str, campaign: str) -> tuple[Training, IntArray]:
-    cohort = load_cohort(Warehouse(Path(root)), f"campaign = '{campaign}'")
+    cohort = load_cohort(Warehouse(LocalFolder(Path(root))), f"campaign = '{campaign}'")
     table, mask = serving_drives(cohort.tables, [*NINE, LABEL])
     ids = [
         name for name, yes in zip(cohort.drives["drive_id"].to_pylist(), mask, strict=True) if yes

@@ -11,13 +11,13 @@ import secrets
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from datetime import UTC, date, datetime
-from pathlib import Path
 from typing import Any, Literal
 
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.documents import DocumentFolder
+from fleet_slip.folder import Folder
 
 FOLDER = "forgotten"
 
@@ -57,7 +57,7 @@ class Subject:
 class Audit:
     """The record of what was forgotten below a data root."""
 
-    root: Path
+    root: Folder
 
     @property
     def _folder(self) -> DocumentFolder:

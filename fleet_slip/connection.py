@@ -10,7 +10,9 @@ import pyarrow as pa
 
 from fleet_slip.database import database_errors, open_database
 from fleet_slip.errors import StorageError
+from fleet_slip.folder import Folder
 from fleet_slip.gram_statement import with_absent
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.operations.run_log import RECORD_COLUMNS, run_files
 from fleet_slip.registry import Registry
 from fleet_slip.resources import read_sql
@@ -27,22 +29,24 @@ UNFIT_CHARACTERS = "\\*?["
 """The backslash becomes a slash in Delta; the others are patterns to DuckDB."""
 
 
-def data_root(root: Path | str | None = None) -> Path:
+def data_root(root: Folder | Path | str | None = None) -> Folder:
     """Return the data root: the argument, else $FLEET_SLIP_ROOT, else ./data.
 
     Raises `StorageError` for a path with characters that Delta or DuckDB take for something else.
     """
+    if root is not None and not isinstance(root, Path | str):
+        return root
     path = Path(root or environ.get(ROOT_VARIABLE) or DEFAULT_ROOT)
     unfit = [c for c in str(path) if not c.isprintable() or c in UNFIT_CHARACTERS]
     if unfit:
         raise StorageError(
             f"{path}: a data root cannot have {unfit[0]!r} in its path. Choose another with --root."
         )
-    return path
+    return LocalFolder(path)
 
 
 def connect(
-    root: Path | str | None = None, *, threads: int | None = None, locked: bool = True
+    root: Folder | Path | str | None = None, *, threads: int | None = None, locked: bool = True
 ) -> duckdb.DuckDBPyConnection:
     """Return a DuckDB connection with the views of the warehouse at `root`.
 
@@ -55,7 +59,7 @@ def connect(
     `fleet_slip.reading_query.one_query` first, as the command line does.
     """
     warehouse = Warehouse(data_root(root))
-    database = open_database(threads=threads, spill=warehouse.root)
+    database = open_database(threads=threads, reading=warehouse.root, spill=True)
     columns = _generated_columns(warehouse.catalogue)
     logs, grams = warehouse.logs.snapshot(), warehouse.grams.snapshot()
     quarantine = warehouse.quarantine.snapshot()
@@ -80,16 +84,16 @@ def _source(database: duckdb.DuckDBPyConnection, snapshot: Snapshot, variable: s
     """Return what stands after FROM for a stored table, empty ones included."""
     database.execute(f"SET VARIABLE {variable} = $paths", {"paths": snapshot.paths})
     if snapshot.paths:
-        rows = read_sql("warehouse", f"stored_{snapshot.table.path.name}.sql").replace("{{", "{")
-        if snapshot.table.path.name != "logs":
+        rows = read_sql("warehouse", f"stored_{snapshot.table.folder.name}.sql").replace("{{", "{")
+        if snapshot.table.folder.name != "logs":
             return rows
         return with_absent(rows, absent_columns(snapshot.files, catalogue().signals))
-    empty = f"empty_{snapshot.table.path.name}"
+    empty = f"empty_{snapshot.table.folder.name}"
     _add_table(database, empty, snapshot.table.schema.empty_table())
     return empty
 
 
-def run_source(database: duckdb.DuckDBPyConnection, root: Path) -> str:
+def run_source(database: duckdb.DuckDBPyConnection, root: Folder) -> str:
     """Return what stands after FROM for the history of runs."""
     columns = ", ".join(f"{name} {kind}" for name, kind in RECORD_COLUMNS.items())
     files = run_files(root)

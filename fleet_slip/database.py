@@ -9,6 +9,7 @@ from pathlib import Path
 import duckdb
 
 from fleet_slip.errors import FleetSlipError, SelectionError, StorageError
+from fleet_slip.folder import Folder
 
 SPILL_LIMIT = "20GB"
 """Largest size of what one connection may write to disk for a query beyond its memory."""
@@ -17,23 +18,28 @@ CGROUP_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limi
 
 
 def open_database(
-    *, threads: int | None = None, spill: Path | None = None
+    *, reading: Folder | None = None, spill: bool = False, threads: int | None = None
 ) -> duckdb.DuckDBPyConnection:
     """Open an in-memory database. Data stays in Parquet, so that no lock can block a reader.
 
-    It takes at most half of the memory that the process may have. What a large query cannot hold
-    in memory goes below the folder `spill`; without one, such a query fails.
+    It can read the files below the folder `reading`. It takes at most half of the memory that the
+    process may have. What a large query cannot hold in memory goes to disk if it may `spill`;
+    otherwise such a query fails.
     """
+    aside = reading.spill / f".spill-{uuid.uuid4().hex}" if reading and spill else ""
     config: dict[str, str | bool | int | float | list[str]] = {
         "autoinstall_known_extensions": False,
         "autoload_known_extensions": False,
         "memory_limit": f"{memory_bytes() // 2 // 2**20}MiB",
-        "temp_directory": str(spill / f".spill-{uuid.uuid4().hex}") if spill else "",
+        "temp_directory": str(aside),
         "max_temp_directory_size": SPILL_LIMIT,
     }
     if threads is not None:
         config["threads"] = threads
-    return duckdb.connect(":memory:", config=config)
+    database = duckdb.connect(":memory:", config=config)
+    if reading:
+        reading.let_read(database)
+    return database
 
 
 def memory_bytes() -> int:

@@ -8,13 +8,13 @@ the files (`fleet_slip.migration`), and Delta refuses writers who began before t
 from collections.abc import Mapping
 from dataclasses import dataclass
 from decimal import Decimal
-from pathlib import Path
 
 import pyarrow as pa
 from deltalake import DeltaTable
 from deltalake.exceptions import DeltaError
 
 from fleet_slip.errors import RefusedError, StorageError
+from fleet_slip.folder import Folder
 
 SCALE = "scale"
 """Key of a field's metadata: the physical value of one count, as in the catalogue."""
@@ -77,28 +77,28 @@ def scales_of(schema: pa.Schema) -> dict[str, Decimal]:
     }
 
 
-def require_readable(path: Path, schema: pa.Schema, delta: DeltaTable) -> None:
+def require_readable(folder: Folder, schema: pa.Schema, delta: DeltaTable) -> None:
     """Raise `RefusedError` if a table's counts are in other scales than the catalogue's."""
     found = evolution(schema, delta)
     if found.rescaled:
         changes = ", ".join(f"{n} {old} -> {new}" for n, (old, new) in found.rescaled.items())
         raise RefusedError(
-            f"{path}: the counts are in other scales than those of the signal catalogue "
+            f"{folder}: the counts are in other scales than those of the signal catalogue "
             f"({changes}). Use the catalogue that the data was written with, or convert the data: "
             "fleet-slip migrate"
         )
 
 
-def require_writable(path: Path, schema: pa.Schema, delta: DeltaTable) -> None:
+def require_writable(folder: Folder, schema: pa.Schema, delta: DeltaTable) -> None:
     """Raise `RefusedError` if a table lacks columns of the catalogue or is being migrated."""
     found = evolution(schema, delta)
     if found.migrating:
         raise RefusedError(
-            f"{path}: a migration to other scales is under way, or was interrupted. Wait for it, "
+            f"{folder}: a migration to other scales is under way, or was interrupted. Wait for it, "
             "or run it again: fleet-slip migrate"
         )
     if found.added:
         raise RefusedError(
-            f"{path}: the signal catalogue has columns that the table has not: "
+            f"{folder}: the signal catalogue has columns that the table has not: "
             f"{', '.join(found.added)}. Add them with: fleet-slip migrate"
         )

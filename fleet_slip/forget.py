@@ -7,12 +7,10 @@ in one commit; the Gram rows follow by reconciliation. `fleet_slip/audit.py` is 
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from pathlib import Path
 
 import duckdb
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 
 from fleet_slip.audit import Audit, Subject
 from fleet_slip.connection import connect
@@ -24,7 +22,7 @@ from fleet_slip.reading_query import one_query
 from fleet_slip.registry import Registry
 from fleet_slip.resources import read_sql
 from fleet_slip.rewriting import read_drives
-from fleet_slip.storage import Change, Snapshot, retried, storage_errors
+from fleet_slip.storage import Change, Snapshot, retried
 from fleet_slip.warehouse import Warehouse
 
 Progress = Callable[[int, int], None]
@@ -96,9 +94,8 @@ def forget(
 def _drives_of(warehouse: Warehouse, subject: Subject) -> frozenset[str]:
     """Return the drives in the logs, and in the Gram rows where an interrupted job left them."""
     found: set[str] = set().union(*drives_by_file(warehouse.logs.snapshot(), subject).values())
-    for path in warehouse.grams.snapshot().paths:
-        with storage_errors(warehouse.grams.path):
-            rows = pq.read_table(path, columns=["drive_id", "vehicle_id", "day"])
+    for file in warehouse.grams.snapshot().files:
+        rows = warehouse.grams.read(file.path, ["drive_id", "vehicle_id", "day"])
         found.update(rows.filter(subject.mask(rows))["drive_id"].to_pylist())
     return frozenset(found)
 
@@ -107,12 +104,12 @@ def drives_by_file(logs: Snapshot, subject: Subject) -> dict[str, frozenset[str]
     """Return the drives concerned of each log file that has some, by the file's path."""
     if not logs.files:
         return {}
-    paths = {str(logs.table.path / file.path): file.path for file in logs.files}
+    paths = {logs.table.uri(file.path): file.path for file in logs.files}
     statement = read_sql("jobs", "find_drives.sql").format(condition=subject.condition)
     found: dict[str, set[str]] = {}
     with (
-        open_database() as database,
-        database_errors(f"looking for drives in {logs.table.path}"),
+        open_database(reading=logs.table.folder) as database,
+        database_errors(f"looking for drives in {logs.table.folder}"),
     ):
         database.execute("SET VARIABLE log_files = $files", {"files": list(paths)})
         rows = database.execute(statement, {"value": subject.value}).fetchall()
@@ -150,9 +147,8 @@ def _forget_quarantined(warehouse: Warehouse, drives: Collection[str]) -> None:
     def attempt() -> None:
         snapshot = warehouse.quarantine.snapshot()
         add, remove = [], []
-        for file, path in zip(snapshot.files, snapshot.paths, strict=True):
-            with storage_errors(warehouse.quarantine.path):
-                rows = pq.read_table(path)
+        for file in snapshot.files:
+            rows = warehouse.quarantine.read(file.path)
             kept = rows.filter(pc.invert(quarantined_of(rows, drives)))
             if kept.num_rows < rows.num_rows:
                 remove.append(file)
@@ -200,9 +196,8 @@ def _were_there(warehouse: Warehouse, version: int, drives: Collection[str]) -> 
     """Whether a version of the Gram rows has one of the drives. Raises `StorageError`."""
     if not drives:
         return False
-    for path in warehouse.grams.snapshot(version).paths:
-        with storage_errors(Path(path)):
-            ids = pq.read_table(path, columns=["drive_id"])["drive_id"].cast(pa.string())
+    for file in warehouse.grams.snapshot(version).files:
+        ids = warehouse.grams.read(file.path, ["drive_id"])["drive_id"].cast(pa.string())
         if not set(drives).isdisjoint(ids.unique().to_pylist()):
             return True
     return False

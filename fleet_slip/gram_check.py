@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 
 from fleet_slip.errors import SelectionError, StorageError
 from fleet_slip.features import PLAIN
 from fleet_slip.gram import Gram
 from fleet_slip.gram_job import aggregate
-from fleet_slip.storage import TableFile, storage_errors
+from fleet_slip.storage import TableFile
 from fleet_slip.warehouse import Warehouse
 
 INTEGER_ROWS = 5_000
@@ -76,12 +75,13 @@ def grams_of(rows: pa.Table) -> DriveGrams:
     return found
 
 
-def stored_grams(warehouse: Warehouse, paths: Sequence[str] | None = None) -> dict[str, DriveGrams]:
+def stored_grams(
+    warehouse: Warehouse, files: Sequence[TableFile] | None = None
+) -> dict[str, DriveGrams]:
     """Return the stored Gram rows of the logged signals, by log file; of some files, or all."""
     by_file: dict[str, DriveGrams] = defaultdict(dict)
-    for path in warehouse.grams.snapshot().paths if paths is None else paths:
-        with storage_errors(warehouse.grams.path):
-            every = pq.read_table(path)
+    for gram_file in warehouse.grams.snapshot().files if files is None else files:
+        every = warehouse.grams.read(gram_file.path)
         rows = every.filter(pc.equal(every["feature_set"], PLAIN))
         for file in rows["file"].unique().to_pylist():
             by_file[file] |= grams_of(rows.filter(pc.equal(rows["file"], file)))
@@ -90,13 +90,9 @@ def stored_grams(warehouse: Warehouse, paths: Sequence[str] | None = None) -> di
 
 def read_counts(warehouse: Warehouse, file: TableFile) -> pa.Table:
     """Return the columns of a log file that its Gram rows are made of, null where it has none."""
-    path = warehouse.logs.path / file.path
     names = ["drive_id", *warehouse.catalogue.gram_signals]
-    with storage_errors(path):
-        present = pq.read_schema(path).names
-        rows = pq.read_table(
-            path, columns=[name for name in names if name in present], partitioning=None
-        )
+    present = warehouse.logs.read_metadata(file.path).schema.to_arrow_schema().names
+    rows = warehouse.logs.read(file.path, [name for name in names if name in present])
     for name in names:
         if name not in present:
             rows = rows.append_column(name, pa.nulls(len(rows), pa.int16()))

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import duckdb
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 from deltalake.transaction import AddAction
 
 from fleet_slip.database import database_errors, open_database
@@ -25,7 +24,6 @@ from fleet_slip.storage import (
     Unit,
     absent_columns,
     retried,
-    storage_errors,
 )
 from fleet_slip.warehouse import Warehouse
 
@@ -146,12 +144,11 @@ def find_backlog(logs: Snapshot, grams: Snapshot, identity: str = PLAIN) -> Back
     """
     done: set[str] = set()
     named: set[str] = set()
-    with storage_errors(grams.table.path):
-        for path in grams.paths:
-            rows = pq.read_table(path, columns=["feature_set", "file"])
-            named.update(rows["file"].unique().to_pylist())
-            mine = rows.filter(pc.equal(rows["feature_set"], identity))
-            done.update(mine["file"].unique().to_pylist())
+    for file in grams.files:
+        rows = grams.table.read(file.path, ["feature_set", "file"])
+        named.update(rows["file"].unique().to_pylist())
+        mine = rows.filter(pc.equal(rows["feature_set"], identity))
+        done.update(mine["file"].unique().to_pylist())
     active = {file.path for file in logs.files}
     return Backlog(
         missing=tuple(file for file in logs.files if file.path not in done),
@@ -171,7 +168,7 @@ def aggregate(
     total = sum(file.rows for file in files)
     lagged = features().set(feature_set).lagged
     step = LAGGED_FILES_PER_QUERY if lagged else FILES_PER_QUERY
-    with open_database(threads=threads) as database:
+    with open_database(reading=warehouse.logs.folder, threads=threads) as database:
         for first in range(0, len(files), step):
             batch = files[first : first + step]
             parts.append(_query(database, warehouse, batch, feature_set))
@@ -185,12 +182,12 @@ def _query(
     files: Sequence[TableFile],
     feature_set: str,
 ) -> pa.Table:
-    paths = {str(warehouse.logs.path / file.path): file.path for file in files}
+    paths = {warehouse.logs.uri(file.path): file.path for file in files}
     whole = feature_set == PLAIN and _signals_are_whole(warehouse, files)
     absent = absent_columns(files, warehouse.catalogue.signals)
     statement = gram_statement(warehouse.catalogue, feature_set, whole=whole, absent=absent)
     identity = features().identity(feature_set)
-    with database_errors(f"the Gram query over {len(files)} log files in {warehouse.logs.path}"):
+    with database_errors(f"the Gram query over {len(files)} log files in {warehouse.logs.folder}"):
         database.execute("SET VARIABLE log_files = $files", {"files": list(paths)})
         rows = database.sql(statement, params={"feature_set": identity}).to_arrow_table()
     relative = pa.array([paths[path] for path in rows["file"].to_pylist()], pa.string())
@@ -228,16 +225,13 @@ def _files_to_rewrite(grams: Snapshot, stale: frozenset[str]) -> list[TableFile]
 
 
 def _log_files_of(grams: Snapshot, file: TableFile) -> set[str]:
-    with storage_errors(grams.table.path / file.path):
-        names = pq.read_table(grams.table.path / file.path, columns=["file"])["file"]
-    return set(names.unique().to_pylist())
+    return set(grams.table.read(file.path, ["file"])["file"].unique().to_pylist())
 
 
 def _rows_to_keep(grams: Snapshot, files: Sequence[TableFile], stale: frozenset[str]) -> pa.Table:
     parts = [grams.table.schema.empty_table()]
     for file in files:
-        with storage_errors(grams.table.path / file.path):
-            rows = pq.read_table(grams.table.path / file.path).cast(grams.table.schema)
+        rows = grams.table.read(file.path).cast(grams.table.schema)
         parts.append(
             rows.filter(pc.invert(pc.is_in(rows["file"], pa.array(sorted(stale), pa.string()))))
         )

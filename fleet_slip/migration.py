@@ -27,11 +27,12 @@ from deltalake.schema import Schema
 from deltalake.transaction import AddAction, RemoveAction
 from numpy.typing import NDArray
 
-from fleet_slip.errors import ConflictError, RefusedError
+from fleet_slip.errors import ConflictError, RefusedError, StorageError
 from fleet_slip.evolution import SCALE, TARGET, Evolution, evolution, scales_of
 from fleet_slip.rewriting import read_drives
 from fleet_slip.signals import COUNT_MAX
-from fleet_slip.storage import Snapshot, Table, TableFile, storage_errors
+from fleet_slip.storage import Snapshot, Table, TableFile
+from fleet_slip.storage_errors import storage_errors
 from fleet_slip.warehouse import Warehouse
 
 Progress = Callable[[int, int], None]
@@ -63,8 +64,7 @@ def migrate(warehouse: Warehouse, progress: Progress = lambda _more, _all: None)
     `ConflictError` if another process changed the table at the same moment.
     """
     table = warehouse.logs
-    with storage_errors(table.path):
-        delta = DeltaTable(str(table.path)) if DeltaTable.is_deltatable(str(table.path)) else None
+    delta = table.open_delta()
     if delta is None:
         return MigrationReport((), (), {}, 0, 0, None)
     found = evolution(table.schema, delta)
@@ -77,8 +77,7 @@ def migrate(warehouse: Warehouse, progress: Progress = lambda _more, _all: None)
         files, rows = _rescale(table, found, progress)
     elif found.migrating:
         _settle(table)
-    with storage_errors(table.path):
-        version = DeltaTable(str(table.path)).version()
+    version = _now(table).version()
     return MigrationReport(found.added, found.retired, found.rescaled, files, rows, version)
 
 
@@ -93,7 +92,7 @@ def rescaled(counts: NDArray[np.int16], ratio: Fraction) -> NDArray[np.int64]:
 def _add_columns(table: Table, delta: DeltaTable, found: Evolution) -> None:
     fields = {field.name: field for field in Schema.from_arrow(table.schema).fields}
     scales = scales_of(table.schema)
-    with storage_errors(table.path), _conflicts(table):
+    with storage_errors(table.folder), _conflicts(table):
         if found.added:
             delta.alter.add_columns([_with_scale(fields[n], scales) for n in found.added])
         for name in found.unrecorded:
@@ -106,16 +105,16 @@ def _with_scale(field: Field, scales: Mapping[str, Decimal]) -> Field:
 
 
 def _announce(table: Table, found: Evolution) -> None:
-    with storage_errors(table.path), _conflicts(table):
-        delta = DeltaTable(str(table.path))
+    with storage_errors(table.folder), _conflicts(table):
+        delta = _now(table)
         for name, (old, new) in found.rescaled.items():
             delta.alter.set_column_metadata(name, {SCALE: str(old), TARGET: str(new)})
 
 
 def _settle(table: Table) -> None:
     """Take back the announcement of a migration: the scales are those of the catalogue again."""
-    with storage_errors(table.path), _conflicts(table):
-        delta = DeltaTable(str(table.path))
+    with storage_errors(table.folder), _conflicts(table):
+        delta = _now(table)
         for field in delta.schema().fields:
             if field.metadata.get(TARGET):
                 # Keys can be set, not removed.
@@ -123,16 +122,15 @@ def _settle(table: Table) -> None:
 
 
 def _rescale(table: Table, found: Evolution, progress: Progress) -> tuple[int, int]:
-    with storage_errors(table.path):
-        before = Snapshot(table, DeltaTable(str(table.path)))
-    assert before.delta is not None  # noqa: S101 - announced a moment ago
+    delta = _now(table)
+    before = Snapshot(table, delta)
     ratios = {n: Fraction(old) / Fraction(new) for n, (old, new) in found.rescaled.items()}
     actions: list[AddAction | RemoveAction] = []
     for file in before.files:
         actions.append(_rewrite(table, file, ratios))
         progress(file.rows, before.rows)
-    with storage_errors(table.path), _conflicts(table):
-        before.delta.create_write_transaction(
+    with storage_errors(table.folder), _conflicts(table):
+        delta.create_write_transaction(
             actions,
             mode="overwrite",
             schema=table.schema,
@@ -159,6 +157,14 @@ def _rewrite(table: Table, file: TableFile, ratios: Mapping[str, Fraction]) -> A
     return table.write_file(stem, rows, file.day)
 
 
+def _now(table: Table) -> DeltaTable:
+    """Return a table that exists, as it is now."""
+    delta = table.open_delta()
+    if delta is None:
+        raise StorageError(f"{table.folder}: the table is gone. Restore it from a backup.")
+    return delta
+
+
 @contextlib.contextmanager
 def _conflicts(table: Table) -> Iterator[None]:
     """Turn a lost race into `ConflictError`."""
@@ -166,6 +172,6 @@ def _conflicts(table: Table) -> Iterator[None]:
         yield
     except CommitFailedError:
         raise ConflictError(
-            f"{table.path}: another process changed the table at the same moment. Run the same "
+            f"{table.folder}: another process changed the table at the same moment. Run the same "
             "command again."
         ) from None

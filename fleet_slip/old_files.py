@@ -5,12 +5,12 @@ from datetime import date
 
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 
 from fleet_slip.audit import Subject
 from fleet_slip.errors import FleetSlipError
-from fleet_slip.storage import Snapshot, storage_errors
-from fleet_slip.vacuum import Unreferenced, discard, replaced, unreferenced
+from fleet_slip.folder import StoredFile
+from fleet_slip.storage import Snapshot
+from fleet_slip.vacuum import replaced, unreferenced
 from fleet_slip.warehouse import Warehouse
 
 BEING_WRITTEN_HOURS = 1.0
@@ -27,30 +27,28 @@ def remove_old_files(warehouse: Warehouse, subject: Subject, *, delete: bool) ->
     old = [file for file, _ in _of_quarantine(warehouse.quarantine.snapshot(), drives)]
     old += [file for file, _ in _with_subject(warehouse.grams.snapshot(), subject)]
     old += [file for file, _ in logs]
-    deleted = sum(discard(file) for file in old) if delete else 0
+    deleted = sum(file.folder.remove(file) for file in old) if delete else 0
     return deleted, len(old) - deleted
 
 
-def _readable(snapshot: Snapshot) -> Iterator[tuple[Unreferenced, pa.Table]]:
+def _readable(snapshot: Snapshot) -> Iterator[tuple[StoredFile, pa.Table]]:
     """Yield replaced files and leftovers that are not being written, with what tells the drives."""
     known = replaced(snapshot)
     wanted = {"drive_id", "vehicle_id", "day"}
     for file in unreferenced(snapshot.table):
-        if str(file.path) not in known and file.age_hours < BEING_WRITTEN_HOURS:
+        if file.path not in known and file.age_hours < BEING_WRITTEN_HOURS:
             continue
         try:
-            with storage_errors(file.path):
-                schema = pq.read_schema(file.path)
-                columns = [name for name in schema.names if name in wanted]
-                rows = pq.read_table(file.path, columns=columns, partitioning=None)
+            names = snapshot.table.read_metadata(file.path).schema.to_arrow_schema().names
+            rows = snapshot.table.read(file.path, [name for name in names if name in wanted])
         except FleetSlipError:
             continue  # half a file, or just deleted
         yield file, _with_day(file, rows)
 
 
-def _with_day(file: Unreferenced, rows: pa.Table) -> pa.Table:
+def _with_day(file: StoredFile, rows: pa.Table) -> pa.Table:
     """Return the rows of a partitioned file with the day that its folder tells."""
-    key, _, day = file.path.parent.name.partition("=")
+    key, _, day = file.path.partition("/")[0].partition("=")
     if key != "day":
         return rows
     return rows.append_column("day", pa.repeat(date.fromisoformat(day), rows.num_rows))
@@ -58,7 +56,7 @@ def _with_day(file: Unreferenced, rows: pa.Table) -> pa.Table:
 
 def _with_subject(
     snapshot: Snapshot, subject: Subject
-) -> Iterator[tuple[Unreferenced, frozenset[str]]]:
+) -> Iterator[tuple[StoredFile, frozenset[str]]]:
     for file, rows in _readable(snapshot):
         names = rows.filter(subject.mask(rows))["drive_id"].unique().to_pylist()
         if names:
@@ -67,7 +65,7 @@ def _with_subject(
 
 def _of_quarantine(
     snapshot: Snapshot, drives: Collection[str]
-) -> Iterator[tuple[Unreferenced, frozenset[str]]]:
+) -> Iterator[tuple[StoredFile, frozenset[str]]]:
     for file, rows in _readable(snapshot):
         concerned = quarantined_of(rows, drives)
         if pc.any(concerned).as_py():

@@ -29,9 +29,9 @@ from pydantic import (
 from fleet_slip.config import Config, faults_of
 from fleet_slip.documents import MAX_DIGITS, DocumentFolder
 from fleet_slip.errors import RefusedError, SelectionError, StorageError
+from fleet_slip.folder import Folder
 from fleet_slip.signals import IDENTIFIER_PATTERN, Identifier, catalogue
 from fleet_slip.signing import require_signature, require_signing_key, sign
-from fleet_slip.storage import storage_errors
 
 _IDENTIFIER = re.compile(IDENTIFIER_PATTERN)
 
@@ -203,19 +203,16 @@ class ModelVersion:
 class Registry:
     """All models below a folder. New versions are signed with a private key, if there is one."""
 
-    path: Path
+    folder: Folder
     signing_key: Path | None = None
 
     def names(self) -> list[str]:
         """Return the names of all models, sorted."""
-        if not self.path.is_dir():
-            return []
-        with storage_errors(self.path):
-            return sorted(
-                entry.name
-                for entry in self.path.iterdir()
-                if _IDENTIFIER.fullmatch(entry.name) and (entry / "versions").is_dir()
-            )
+        return [
+            name
+            for name in self.folder.names()
+            if _IDENTIFIER.fullmatch(name) and (self.folder / name / "versions").exists()
+        ]
 
     def versions(self, name: str) -> list[int]:
         """Return the version numbers of a model, ascending."""
@@ -228,15 +225,15 @@ class Registry:
         lacks the signature that is asked for (`fleet_slip.signing`).
         """
         loaded = self._read(name, version)
-        require_signature(self._versions(name).file(version), name, loaded.sha256)
+        require_signature(self._versions(name).folder, version, name, loaded.sha256)
         return loaded
 
     def sign(self, name: str, version: int) -> None:
         """Sign a version, if there is a key to sign with."""
         if self.signing_key is not None:
             loaded = self._read(name, version)
-            document = self._versions(name).file(version)
-            sign(document, name, loaded.sha256, self.signing_key)
+            folder = self._versions(name).folder
+            sign(folder, version, name, loaded.sha256, self.signing_key)
 
     def _read(self, name: str, version: int) -> ModelVersion:
         numbers = self.versions(name) if name in self.names() else []
@@ -321,7 +318,7 @@ class Registry:
         """Return all moves of a model's aliases, oldest first."""
         folder = self._history(name)
         documents = [folder.read(number) for number in folder.numbers()]
-        with _foreign_document(f"{folder.path}: a move of an alias"):
+        with _foreign_document(f"{folder.folder}: a move of an alias"):
             return [AliasMove.model_validate(document.content) for document in documents]
 
     def aliases(self, name: str) -> dict[str, int]:
@@ -382,10 +379,10 @@ class Registry:
         self._history(name).append(move.model_dump(mode="json"))
 
     def _versions(self, name: str) -> DocumentFolder:
-        return DocumentFolder(self.path / name / "versions")
+        return DocumentFolder(self.folder / name / "versions")
 
     def _history(self, name: str) -> DocumentFolder:
-        return DocumentFolder(self.path / name / "history")
+        return DocumentFolder(self.folder / name / "history")
 
 
 _TABLE_SCHEMA = pa.schema(

@@ -4,12 +4,12 @@ Nothing is deleted that was not rebuilt. A log file is simulated again under the
 Delta log knows; since the name has the file's checksum, it is the same file or it is refused.
 """
 
+import contextlib
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from datetime import date
 
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 
 from fleet_slip.campaign import Batch, Campaign, DriveSpec, load_campaign
 from fleet_slip.errors import FleetSlipError
@@ -17,7 +17,7 @@ from fleet_slip.gram_job import reconcile
 from fleet_slip.resources import config_names
 from fleet_slip.simulate import simulate_batch
 from fleet_slip.simulation_job import file_name
-from fleet_slip.storage import Change, TableFile, checksum_in, retried, storage_errors
+from fleet_slip.storage import Change, TableFile, checksum_in, retried
 from fleet_slip.verify import Verification, problem_of
 from fleet_slip.warehouse import Warehouse
 
@@ -125,10 +125,6 @@ def _readable_grams(warehouse: Warehouse) -> dict[str, pa.Table]:
     found = {}
     for file in warehouse.grams.snapshot().files:
         if problem_of(warehouse.grams, file) is None:
-            path = warehouse.grams.path / file.path
-            try:
-                with storage_errors(path):
-                    found[file.path] = pq.read_table(path, columns=["file", "drive_id"])
-            except FleetSlipError:
-                continue
+            with contextlib.suppress(FleetSlipError):
+                found[file.path] = warehouse.grams.read(file.path, ["file", "drive_id"])
     return found

@@ -10,10 +10,9 @@ from collections.abc import Collection, Sequence
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from fleet_slip.storage import Table, TableFile, storage_errors
+from fleet_slip.storage import Table, TableFile
 
 
 def read_drives(
@@ -32,9 +31,7 @@ def read_drives(
 
 
 def _read(table: Table, file: TableFile, without: Collection[str]) -> pa.Table:
-    path = table.path / file.path
-    with storage_errors(path):
-        stored = pq.read_table(path, partitioning=None)
+    stored = table.read(file.path)
     columns = {}
     for field in table.schema:
         if field.name in table.partition_by:

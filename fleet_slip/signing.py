@@ -14,8 +14,8 @@ import stat
 from pathlib import Path
 from types import ModuleType
 
-from fleet_slip.errors import ConfigError, RefusedError
-from fleet_slip.storage import TEMPORARY_PREFIX, flush, storage_errors
+from fleet_slip.errors import ConfigError, RefusedError, StorageError
+from fleet_slip.folder import Folder
 
 SIGNING_VARIABLE = "FLEET_SLIP_SIGNING_KEY"
 """Environment variable: path of the private key that new versions are signed with."""
@@ -48,27 +48,16 @@ def require_signing_key(key: Path) -> None:
     _signed(key, b"")
 
 
-def sign(document: Path, name: str, sha256: str, key: Path) -> None:
+def sign(folder: Folder, number: int, name: str, sha256: str, key: Path) -> None:
     """Write the signature of a version beside its document, durably.
 
     Raises `ConfigError` for a key that cannot be used.
     """
-    signature = _signed(key, _message(document, name, sha256))
-    target = document.with_suffix(".sig")
-    temporary = document.with_name(f"{TEMPORARY_PREFIX}{os.getpid()}-{target.name}")
-    with storage_errors(target):
-        try:
-            with temporary.open("wb") as file:
-                file.write(base64.b64encode(signature) + b"\n")
-                file.flush()
-                os.fsync(file.fileno())
-            temporary.replace(target)
-        finally:
-            temporary.unlink(missing_ok=True)
-        flush(target.parent)
+    signature = _signed(key, _message(number, name, sha256))
+    folder.put(f"{number}.sig", base64.b64encode(signature) + b"\n")
 
 
-def require_signature(document: Path, name: str, sha256: str) -> None:
+def require_signature(folder: Folder, number: int, name: str, sha256: str) -> None:
     """Raise `RefusedError` if a public key is configured and did not sign this version.
 
     The environment is read here, not by the callers, so that none of them can forget to ask.
@@ -76,19 +65,18 @@ def require_signature(document: Path, name: str, sha256: str) -> None:
     if not (configured := os.environ.get(VERIFY_VARIABLE)):
         return
     public = _read_key(Path(configured), private=False)
-    shown, file = f"{name}@{document.stem}", document.with_suffix(".sig")
-    try:
-        with file.open("rb") as stream:
-            signature = base64.b64decode(stream.read(LONGEST_FILE_BYTES))
-    except FileNotFoundError:
+    shown, file = f"{name}@{number}", f"{number}.sig"
+    if file not in folder.names():
         raise RefusedError(
             f"{shown} is not signed, and ${VERIFY_VARIABLE} asks for a signature. If the version "
             f"is yours: fleet-slip sign {shown} --sign-key FILE"
-        ) from None
-    except (OSError, ValueError) as error:
-        raise RefusedError(f"{file}: not a signature: {error}") from None
+        )
     try:
-        signed = _ed25519().is_signed(public, signature, _message(document, name, sha256))
+        signature = base64.b64decode(folder.read(file, longest=LONGEST_FILE_BYTES))
+    except (StorageError, ValueError) as error:
+        raise RefusedError(f"{folder}/{file}: not a signature: {error}") from None
+    try:
+        signed = _ed25519().is_signed(public, signature, _message(number, name, sha256))
     except ValueError:
         raise ConfigError(
             f"{configured}: not an Ed25519 public key in PEM. ${VERIFY_VARIABLE} must name the "
@@ -101,8 +89,8 @@ def require_signature(document: Path, name: str, sha256: str) -> None:
         )
 
 
-def _message(document: Path, name: str, sha256: str) -> bytes:
-    return f"fleet-slip model version\n{name}\n{document.stem}\n{sha256}\n".encode()
+def _message(number: int, name: str, sha256: str) -> bytes:
+    return f"fleet-slip model version\n{name}\n{number}\n{sha256}\n".encode()
 
 
 def _signed(key: Path, message: bytes) -> bytes:

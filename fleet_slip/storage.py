@@ -1,7 +1,7 @@
 """The tables of a data root: Delta tables of Parquet files that we encode ourselves.
 
-A file is written under a temporary name, flushed to disk and renamed; only then is it committed to
-the table's Delta log. So a reader sees whole files of whole commits, or nothing.
+A file is written as a whole, durably; only then is it committed to the table's Delta log. So a
+reader sees whole files of whole commits, or nothing.
 
 A file's name ends in the checksum of its bytes. The name is the one thing about a file that the
 Delta log, its checkpoints, Gram rows and a listing of the folder all keep, so that damage can be
@@ -9,35 +9,29 @@ told years later; the same rows are always the same file; and a file that is mad
 source takes its place without a commit.
 """
 
-import contextlib
-import errno
-import fcntl
 import hashlib
 import json
-import os
 import random
 import re
 import time
-import uuid
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import date
 from functools import cached_property
-from itertools import count
-from pathlib import Path
 from typing import Any, TypeVar
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 from deltalake import CommitProperties, DeltaTable, Transaction
-from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundError
+from deltalake.exceptions import CommitFailedError, TableNotFoundError
 from deltalake.transaction import AddAction, RemoveAction
 
 from fleet_slip.errors import ConflictError, StorageError
 from fleet_slip.evolution import require_readable, require_writable
+from fleet_slip.folder import Folder
+from fleet_slip.storage_errors import first_line, storage_errors
 
 ROW_GROUP_ROWS = 2**17
-TEMPORARY_PREFIX = ".tmp-"
 
 _DATA_FILE = re.compile(r"[\w.=-][\w.=/-]*\.parquet", re.ASCII)
 """Path of a data file below its table: relative, and without characters that could be a pattern."""
@@ -50,46 +44,6 @@ FIRST_WAIT_S = 0.02
 LONGEST_WAIT_S = 5.0
 
 Result = TypeVar("Result")
-
-
-@contextlib.contextmanager
-def storage_errors(path: Path) -> Iterator[None]:
-    """Turn failures of the file system and of Delta into `StorageError` with a next step."""
-    try:
-        yield
-    except OSError as error:
-        raise StorageError(f"{path}: {_reason(error)}") from None
-    except DeltaError as error:
-        raise StorageError(f"{path}: the Delta log cannot be used: {_first_line(error)}") from None
-    except pa.ArrowException as error:
-        raise StorageError(f"{path}: not readable as Parquet: {_first_line(error)}") from None
-
-
-def _reason(error: OSError) -> str:
-    advice = {
-        errno.ENOSPC: "the disk is full. Free some space and run the same command again.",
-        errno.EDQUOT: "the disk quota is used up. Free some space and run the command again.",
-        errno.EACCES: "permission denied. Check the owner of the data root, or choose --root.",
-        errno.EPERM: "not permitted. Check the owner of the data root, or choose --root.",
-        errno.EROFS: "the file system is read-only. Choose a writable data root with --root.",
-        errno.ENOTDIR: "a part of the path is a file, not a folder. Choose another --root.",
-    }
-    # The Delta library tells the number in its text only.
-    stated = re.search(r"\(os error (\d+)\)", str(error))
-    number = error.errno or (int(stated[1]) if stated else 0)
-    return advice.get(number, _on_one_line(error))
-
-
-_COLOUR = re.compile(r"\x1b\[[0-9;]*m")
-
-
-def _first_line(error: BaseException) -> str:
-    return str(error).strip().partition("\n")[0]
-
-
-def _on_one_line(error: BaseException) -> str:
-    text = _COLOUR.sub("", str(error)).replace("\N{DOWNWARDS ARROW WITH TIP RIGHTWARDS}", ":")
-    return " ".join(text.split()).replace(" : ", ": ")
 
 
 def retried(attempt: Callable[[], Result]) -> Result:
@@ -170,7 +124,7 @@ class Change:
 class Table:
     """A Delta table below a data root."""
 
-    path: Path
+    folder: Folder
     schema: pa.Schema
     encoding: Encoding
     partition_by: tuple[str, ...] = ()
@@ -181,14 +135,35 @@ class Table:
 
         An earlier version can be asked for; `StorageError` is raised if it is no longer known.
         """
-        with storage_errors(self.path):
-            try:
-                delta = DeltaTable(str(self.path), version=version)
-            except TableNotFoundError:
-                return Snapshot(self, None)
-        if version is None:
-            require_readable(self.path, self.schema, delta)
+        delta = self.open_delta(version)
+        if delta is not None and version is None:
+            require_readable(self.folder, self.schema, delta)
         return Snapshot(self, delta)
+
+    def open_delta(self, version: int | None = None) -> DeltaTable | None:
+        """Return the Delta table as it is now, or was; None if nobody has written it yet."""
+        with storage_errors(self.folder):
+            try:
+                return DeltaTable(
+                    self.folder.uri, version=version, storage_options=self.folder.delta_options
+                )
+            except TableNotFoundError:
+                return None
+
+    def uri(self, path: str) -> str:
+        """Return where one of the table's files is, as DuckDB knows it."""
+        return f"{self.folder.uri}/{path}"
+
+    def read(self, path: str, columns: Sequence[str] | None = None) -> pa.Table:
+        """Return the rows of one of the table's files, or some columns of them."""
+        with storage_errors(f"{self.folder}/{path}"), self.folder.open(path) as file:
+            wanted = None if columns is None else list(columns)
+            return pq.read_table(file, columns=wanted, partitioning=None)
+
+    def read_metadata(self, path: str) -> pq.FileMetaData:
+        """Return the footer of one of the table's files."""
+        with storage_errors(f"{self.folder}/{path}"), self.folder.open(path) as file:
+            return pq.read_metadata(file)
 
     def write_file(self, name: str, rows: pa.Table, day: date | None = None) -> AddAction:
         """Write rows to the file NAME-CHECKSUM.parquet, durably.
@@ -198,19 +173,7 @@ class Table:
         """
         content = self._encoded(rows)
         path = _file_path(name, content, day)
-        target = self.path / path
-        temporary = target.with_name(f"{TEMPORARY_PREFIX}{uuid.uuid4().hex}.parquet")
-        with storage_errors(target):
-            target.parent.mkdir(parents=True, exist_ok=True)
-            try:
-                with temporary.open("wb") as file:
-                    file.write(content)
-                    file.flush()
-                    os.fsync(file.fileno())
-                temporary.replace(target)
-            finally:
-                temporary.unlink(missing_ok=True)
-            flush(target.parent)
+        self.folder.put(path, content)
         return AddAction(
             path=path,
             size=len(content),
@@ -250,7 +213,7 @@ class Snapshot:
         """Active files, sorted by path."""
         if self.delta is None:
             return ()
-        with storage_errors(self.table.path):
+        with storage_errors(self.table.folder):
             # pa.table() would import pandas, which takes half a second.
             stream = self.delta.get_add_actions(flatten=True)
             actions = pa.RecordBatchReader.from_stream(stream).read_all().to_pylist()
@@ -264,19 +227,19 @@ class Snapshot:
         parts = file.path.split("/")
         if not _DATA_FILE.fullmatch(file.path) or ".." in parts or "." in parts:
             raise StorageError(
-                f"{self.table.path}: the Delta log names the file {file.path[:200]!r}, which is "
+                f"{self.table.folder}: the Delta log names the file {file.path[:200]!r}, which is "
                 "not one of this table. Restore the log from a backup."
             )
         if file.rows is None or file.rows < 0 or file.size_bytes is None or file.size_bytes < 0:
             raise StorageError(
-                f"{self.table.path}: the Delta log does not say how large {file.path} is. Another "
-                "program wrote it, or it was damaged: restore the log from a backup."
+                f"{self.table.folder}: the Delta log does not say how large {file.path} is. "
+                "Another program wrote it, or it was damaged: restore the log from a backup."
             )
 
     @property
     def paths(self) -> list[str]:
-        """Full paths of the active files, sorted."""
-        return [str(self.table.path / file.path) for file in self.files]
+        """Where the active files are, as DuckDB knows it, sorted."""
+        return [self.table.uri(file.path) for file in self.files]
 
     @property
     def rows(self) -> int:
@@ -302,9 +265,9 @@ class Snapshot:
         cannot be written.
         """
         both = {action.path for action in change.add} & {file.path for file in change.remove}
-        with storage_errors(self.table.path):
+        with storage_errors(self.table.folder):
             delta = self.delta or _create(self.table)
-            require_writable(self.table.path, self.table.schema, delta)
+            require_writable(self.table.folder, self.table.schema, delta)
             try:
                 delta.create_write_transaction(
                     [
@@ -327,10 +290,10 @@ class Snapshot:
                 if not _CONFLICT.search(str(error)):
                     raise
                 raise ConflictError(
-                    f"{self.table.path}: another process changed the table at the same moment "
-                    f"({_first_line(error)}). Run the same command again."
+                    f"{self.table.folder}: another process changed the table at the same moment "
+                    f"({first_line(error)}). Run the same command again."
                 ) from None
-            _flush_log(self.table.path / "_delta_log", self.version)
+            self.table.folder.settle_commits(self.version)
 
 
 _CONFLICT = re.compile(
@@ -352,63 +315,20 @@ def checksum_in(path: str) -> str | None:
     return found[1] if found else None
 
 
-@contextlib.contextmanager
-def exclusive(lock: Path, waiting: Callable[[], None]) -> Iterator[None]:
-    """Hold a lock among processes of this machine; a killed process releases it.
-
-    Calls `waiting` once if another process holds it. Where the file system is read-only there is
-    nothing to protect, and no lock is taken.
-    """
-    with contextlib.ExitStack() as stack:
-        with storage_errors(lock):
-            try:
-                lock.parent.mkdir(parents=True, exist_ok=True)
-                file = stack.enter_context(lock.open("w"))
-            except OSError as error:
-                if error.errno != errno.EROFS:
-                    raise
-                file = None
-            if file is not None:
-                try:
-                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                except BlockingIOError:
-                    waiting()
-                    fcntl.flock(file, fcntl.LOCK_EX)
-        yield
-
-
-def flush(folder: Path) -> None:
-    """Make renames inside a folder durable."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
 def _file_path(name: str, content: pa.Buffer, day: date | None) -> str:
     folder = f"day={day.isoformat()}/" if day else ""
     return f"{folder}{name}-{checksum_of(content)}.parquet"
 
 
-def _flush_log(folder: Path, before: int | None) -> None:
-    """Make the commits after a version durable, which the Delta library leaves to the system."""
-    with contextlib.suppress(FileNotFoundError):
-        for version in count(0 if before is None else before + 1):
-            with (folder / f"{version:020}.json").open("rb") as file:
-                os.fsync(file.fileno())
-    flush(folder)
-
-
 def _create(table: Table) -> DeltaTable:
-    table.path.mkdir(parents=True, exist_ok=True)
     return DeltaTable.create(
-        str(table.path),
+        table.folder.uri,
         schema=table.schema,
         mode="ignore",
         partition_by=list(table.partition_by),
-        name=table.path.name,
+        name=table.folder.name,
         description=table.description,
+        storage_options=table.folder.delta_options,
     )
 
 

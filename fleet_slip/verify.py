@@ -9,19 +9,20 @@ import os
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from itertools import chain
-from pathlib import Path
 from typing import Literal
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 
 from fleet_slip.database import database_errors, open_database
 from fleet_slip.documents import DocumentFolder
 from fleet_slip.errors import FleetSlipError, RefusedError, SelectionError, StorageError
+from fleet_slip.folder import Folder, StoredFile
 from fleet_slip.gram_check import DriveGrams, grams_by_blocks, read_counts, stored_grams
 from fleet_slip.registry import Registry
 from fleet_slip.resources import read_sql
-from fleet_slip.storage import Snapshot, Table, TableFile, checksum_in, checksum_of, storage_errors
+from fleet_slip.storage import Snapshot, Table, TableFile, checksum_in, checksum_of
+from fleet_slip.storage_errors import storage_errors
 from fleet_slip.vacuum import replaced, temporary_files, unreferenced
 from fleet_slip.warehouse import Warehouse
 
@@ -99,9 +100,9 @@ def _snapshots(warehouse: Warehouse, report: Verification) -> dict[str, Snapshot
             snapshot = table.snapshot()
             _ = snapshot.files
         except FleetSlipError as error:
-            report.findings.append(Finding("log", table.path.name, str(error)))
+            report.findings.append(Finding("log", table.folder.name, str(error)))
         else:
-            found[table.path.name] = snapshot
+            found[table.folder.name] = snapshot
     return found
 
 
@@ -113,28 +114,28 @@ def _verify_files(snapshot: Snapshot, report: Verification, progress: Progress) 
         problems = executor.map(lambda file: problem_of(table, file), snapshot.files)
         for file, problem in zip(snapshot.files, problems, strict=True):
             if problem:
-                report.findings.append(Finding("file", f"{table.path.name}/{file.path}", problem))
+                report.findings.append(Finding("file", f"{table.folder.name}/{file.path}", problem))
             else:
                 good.append(file)
             progress(file.size_bytes, snapshot.size_bytes)
     report.files += len(snapshot.files)
     report.size_bytes += snapshot.size_bytes
-    report.rows += snapshot.rows if table.path.name == "logs" else 0
+    report.rows += snapshot.rows if table.folder.name == "logs" else 0
     return good
 
 
 def problem_of(table: Table, file: TableFile) -> str | None:
     """Return what is wrong with a data file, or None."""
-    path = table.path / file.path
+    path = f"{table.folder}/{file.path}"
     try:
+        content = table.folder.read(file.path)
+        if len(content) != file.size_bytes:
+            return f"has {len(content):,} bytes instead of {file.size_bytes:,}"
+        expected = checksum_in(file.path)
+        if expected and checksum_of(content) != expected:
+            return "its bytes do not match the checksum in its name"
         with storage_errors(path):
-            content = path.read_bytes()
-            if len(content) != file.size_bytes:
-                return f"has {len(content):,} bytes instead of {file.size_bytes:,}"
-            expected = checksum_in(file.path)
-            if expected and checksum_of(content) != expected:
-                return "its bytes do not match the checksum in its name"
-            metadata = pq.read_metadata(path)
+            metadata = pq.read_metadata(pa.BufferReader(content))
     except FleetSlipError as error:
         return str(error).removeprefix(f"{path}: ")
     return _contradiction(file, metadata)
@@ -166,8 +167,9 @@ def _null_counts(metadata: pq.FileMetaData) -> dict[str, int]:
 
 
 def _verify_drives(warehouse: Warehouse, files: Sequence[TableFile], report: Verification) -> None:
-    paths = [str(warehouse.logs.path / file.path) for file in files]
-    with open_database() as database, database_errors("verifying the drives"):
+    paths = [warehouse.logs.uri(file.path) for file in files]
+    database = open_database(reading=warehouse.logs.folder)
+    with database, database_errors("verifying the drives"):
         database.execute("SET VARIABLE log_files = $files", {"files": paths})
         rows = database.execute(read_sql("jobs", "verify_drives.sql")).fetchall()
     for drive, in_files, beginnings, n, file in rows:
@@ -183,14 +185,15 @@ def _verify_grams(
     full: bool,
     report: Verification,
 ) -> None:
-    paths = [str(warehouse.grams.path / file.path) for file in grams]
-    with open_database() as database, database_errors("verifying the Gram rows"):
+    paths = [warehouse.grams.uri(file.path) for file in grams]
+    database = open_database(reading=warehouse.grams.folder)
+    with database, database_errors("verifying the Gram rows"):
         database.execute("SET VARIABLE gram_files = $files", {"files": paths})
         twice = database.execute(read_sql("jobs", "verify_grams.sql")).fetchall()
     for identity, file, drive, n in twice:
         problem = f"the Gram row {identity} of drive {drive} stands {n} times"
         report.findings.append(Finding("gram", f"logs/{file}", problem))
-    stored = stored_grams(warehouse, paths)
+    stored = stored_grams(warehouse, grams)
     covered = [file for file in logs if file.path in stored]
     step = 1 if full else max(1, len(covered) // SAMPLE)
     for file in covered[::step]:
@@ -210,22 +213,24 @@ def _different(one: DriveGrams, two: DriveGrams) -> list[str]:
     return sorted({key[0] for key in one.keys() | two.keys() if one.get(key) != two.get(key)})
 
 
-def _verify_documents(root: Path, report: Verification) -> None:
+def _verify_documents(root: Folder, report: Verification) -> None:
     for folder in _document_folders(root):
         report.documents += len(folder.numbers())
         for file, problem in folder.faults().items():
-            report.findings.append(Finding("document", str(file.relative_to(root)), problem))
+            report.findings.append(Finding("document", file.removeprefix(f"{root}/"), problem))
 
 
-def _document_folders(root: Path) -> list[DocumentFolder]:
-    files = chain.from_iterable(
-        entry.rglob("*.json") for entry in sorted(root.glob("*")) if not _is_table(entry)
-    )
-    return [DocumentFolder(path) for path in sorted({file.parent for file in files})]
+def _document_folders(root: Folder) -> list[DocumentFolder]:
+    found: set[str] = set()
+    for name in root.names():
+        if not (root / name / "_delta_log").exists():
+            files = (root / name).files()
+            found.update(f"{name}/{f.path}".rpartition("/")[0] for f in files if _is_document(f))
+    return [DocumentFolder(root / path) for path in sorted(found)]
 
 
-def _is_table(folder: Path) -> bool:
-    return (folder / "_delta_log").is_dir()
+def _is_document(file: StoredFile) -> bool:
+    return file.path.endswith(".json")
 
 
 def _verify_models(
@@ -264,12 +269,12 @@ def _list_unreferenced(
     for snapshot in snapshots.values():
         known = replaced(snapshot)
         for file in unreferenced(snapshot.table):
-            what = "replaced" if str(file.path) in known else "never committed"
-            _remark(warehouse, file.path, f"{what}; fleet-slip vacuum removes it in time", report)
+            what = "replaced" if file.path in known else "never committed"
+            _remark(warehouse, file, f"{what}; fleet-slip vacuum removes it in time", report)
     for file in temporary_files(warehouse):
-        _remark(warehouse, file.path, "left by a killed job, or being written", report)
+        _remark(warehouse, file, "left by a killed job, or being written", report)
 
 
-def _remark(warehouse: Warehouse, path: Path, problem: str, report: Verification) -> None:
-    where = str(path.relative_to(warehouse.root))
+def _remark(warehouse: Warehouse, file: StoredFile, problem: str, report: Verification) -> None:
+    where = str(file).removeprefix(f"{warehouse.root}/")
     report.findings.append(Finding("unreferenced", where, problem))

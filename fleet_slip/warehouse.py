@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 import pyarrow as pa
 
+from fleet_slip.folder import Folder
 from fleet_slip.signals import SignalCatalogue, catalogue
 from fleet_slip.storage import Encoding, Table
 
@@ -26,9 +26,9 @@ that it belongs to, null if that is what is wrong; `signal` is the signal or met
 
 @dataclass(frozen=True)
 class Warehouse:
-    """The tables below a data root. Making one touches nothing on disk."""
+    """The tables below a data root. Making one touches nothing below it."""
 
-    root: Path
+    root: Folder
 
     @property
     def catalogue(self) -> SignalCatalogue:
@@ -40,7 +40,7 @@ class Warehouse:
         """Counts at 100 Hz, partitioned by day; a file holds whole drives."""
         signals = self.catalogue
         return Table(
-            path=self.root / "logs",
+            folder=self.root / "logs",
             schema=signals.stored_schema,
             encoding=Encoding(
                 dictionary=tuple(signals.drive),
@@ -54,7 +54,7 @@ class Warehouse:
     def grams(self) -> Table:
         """Gram rows of drives, by feature set: n, sums and sums of products of counts."""
         return Table(
-            path=self.root / "grams",
+            folder=self.root / "grams",
             schema=gram_schema(self.catalogue),
             encoding=Encoding(
                 dictionary=("feature_set", "file", "part", "signals", *self.catalogue.drive),
@@ -67,7 +67,7 @@ class Warehouse:
     def quarantine(self) -> Table:
         """Rows of measured logs that were refused, with the reason."""
         return Table(
-            path=self.root / "quarantine",
+            folder=self.root / "quarantine",
             schema=QUARANTINE_SCHEMA,
             encoding=Encoding(dictionary=("file", "reason", "signal"), compression="zstd"),
             description="Rows of measured logs that were refused, with the reason",

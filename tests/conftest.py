@@ -14,6 +14,8 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from fleet_slip.folder import Folder
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.signals import catalogue
 from fleet_slip.storage import Change, Unit
 from fleet_slip.warehouse import Warehouse
@@ -62,7 +64,12 @@ def run_command(tmp_path: Path) -> RunCommand:
 @pytest.fixture
 def warehouse(tmp_path: Path) -> Warehouse:
     """An empty warehouse."""
-    return Warehouse(tmp_path / "data")
+    return Warehouse(LocalFolder(tmp_path / "data"))
+
+
+def path_of(folder: Folder) -> Path:
+    """Return where a folder of a file system is."""
+    return Path(str(folder))
 
 
 def random_counts(rng: np.random.Generator, rows: int) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import fleet_slip
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.warehouse import Warehouse
 from tests.conftest import COMMAND, RunCommand
 
@@ -213,8 +214,8 @@ def test_two_runs_at_once_do_the_job_once(tmp_path: Path, smoke_root: Path) -> N
     runs = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(3)]
     reports = [json.loads(run.communicate()[0]) for run in runs]
     assert sorted(report["changed"] for report in reports) == [False, False, True]
-    alone = Warehouse(smoke_root).logs.snapshot()
-    together = Warehouse(tmp_path / "data").logs.snapshot()
+    alone = Warehouse(LocalFolder(smoke_root)).logs.snapshot()
+    together = Warehouse(LocalFolder(tmp_path / "data")).logs.snapshot()
     assert [file.path for file in together.files] == [file.path for file in alone.files]
     assert len(list((tmp_path / "data" / "models" / "smoke" / "versions").iterdir())) == 1
 

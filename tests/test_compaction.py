@@ -2,6 +2,7 @@
 
 import os
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import duckdb
@@ -12,11 +13,13 @@ import pytest
 
 import fleet_slip
 from fleet_slip.compaction import compact
+from fleet_slip.folder import TEMPORARY_PREFIX
 from fleet_slip.gram_job import update_grams
-from fleet_slip.storage import TEMPORARY_PREFIX, Change
-from fleet_slip.vacuum import Unreferenced, discard, expired, unreferenced, vacuum
+from fleet_slip.local_folder import LocalFolder
+from fleet_slip.storage import Change
+from fleet_slip.vacuum import expired, unreferenced, vacuum
 from fleet_slip.warehouse import Warehouse
-from tests.conftest import DAY, land, log_rows, random_counts
+from tests.conftest import DAY, land, log_rows, path_of, random_counts
 
 ALL_LOGS = "SELECT * FROM log_counts ORDER BY ALL"
 ALL_GRAMS = "SELECT * EXCLUDE file FROM grams ORDER BY ALL"
@@ -39,7 +42,7 @@ def six(warehouse: Warehouse) -> Warehouse:
 
 def grow_old(warehouse: Warehouse) -> None:
     """Make all data files older than any retention."""
-    for file in warehouse.root.rglob("*.parquet"):
+    for file in path_of(warehouse.root).rglob("*.parquet"):
         os.utime(file, (0, 0))
 
 
@@ -71,7 +74,7 @@ def test_the_same_drives_make_the_same_file_however_they_were_divided(
 ) -> None:
     rng = np.random.default_rng(1)
     drives = [log_rows(name, random_counts(rng, 50)) for name in "abcd"]
-    other = Warehouse(tmp_path / "other")
+    other = Warehouse(LocalFolder(tmp_path / "other"))
     land(warehouse, "one", drives[2], drives[0])
     land(warehouse, "two", drives[3], drives[1])
     for number, drive in enumerate(drives):
@@ -136,8 +139,8 @@ def test_vacuum_leaves_what_a_running_job_is_writing(six: Warehouse) -> None:
     action = six.logs.write_file(
         "new", log_rows("g", random_counts(np.random.default_rng(2), 9)), DAY
     )
-    young = six.root / "logs" / f"{TEMPORARY_PREFIX}young.parquet"
-    old = six.root / "models" / f"{TEMPORARY_PREFIX}old"
+    young = path_of(six.root) / "logs" / f"{TEMPORARY_PREFIX}young.parquet"
+    old = path_of(six.root) / "models" / f"{TEMPORARY_PREFIX}old"
     for file in (young, old):
         file.parent.mkdir(exist_ok=True)
         file.write_bytes(b"half")
@@ -149,14 +152,14 @@ def test_vacuum_leaves_what_a_running_job_is_writing(six: Warehouse) -> None:
 
 def test_vacuum_puts_back_a_file_that_was_written_again_meanwhile(six: Warehouse) -> None:
     rows = log_rows("g", random_counts(np.random.default_rng(2), 9))
-    path = six.logs.path / six.logs.write_file("again", rows, DAY).path
+    path = path_of(six.logs.folder) / six.logs.write_file("again", rows, DAY).path
     os.utime(path, (0, 0))
     (judged,) = expired(six, 1)
     content = path.read_bytes()
     six.logs.write_file("again", rows, DAY)  # the same name and bytes, about to be committed
-    assert not discard(judged)
+    assert not judged.folder.remove(judged)
     assert path.read_bytes() == content
-    assert not discard(Unreferenced(path.with_name("gone.parquet"), 0, 0, 0))
+    assert not judged.folder.remove(replace(judged, path="gone.parquet"))
 
 
 @pytest.mark.parametrize("hours", [-24 * 400, 24 * 400])

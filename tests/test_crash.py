@@ -11,8 +11,9 @@ from typing import Any
 
 import pytest
 
+from fleet_slip.folder import TEMPORARY_PREFIX
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.registry import Registry
-from fleet_slip.storage import TEMPORARY_PREFIX
 from fleet_slip.warehouse import Warehouse
 from tests.conftest import RunCommand
 
@@ -22,13 +23,13 @@ KILLS = 30
 
 def state(root: Path) -> dict[str, Any]:
     """All that a data root holds, apart from the moments at which it was written."""
-    warehouse = Warehouse(root)
+    warehouse = Warehouse(LocalFolder(root))
     files = {
         path: hashlib.sha256(Path(path).read_bytes()).hexdigest()
         for table in (warehouse.logs, warehouse.grams)
         for path in table.snapshot().paths
     }
-    registry = Registry(root / "models")
+    registry = Registry(LocalFolder(root / "models"))
     return {
         "files": {Path(path).relative_to(root): digest for path, digest in files.items()},
         "versions": [registry.load("smoke", n).sha256 for n in registry.versions("smoke")],

@@ -18,6 +18,7 @@ from fleet_slip.compaction import compact
 from fleet_slip.errors import RefusedError, SelectionError
 from fleet_slip.forget import forget
 from fleet_slip.gram_job import update_grams
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.regression.exact import fit
 from fleet_slip.retention import Retention, retain
 from fleet_slip.signals import catalogue
@@ -37,7 +38,7 @@ def drive(car: str, number: int, day: date = date(2024, 5, 1)) -> pa.Table:
 
 def fill(root: Path, *cars: str) -> Warehouse:
     """A warehouse where some cars drove; files mix them."""
-    warehouse = Warehouse(root)
+    warehouse = Warehouse(LocalFolder(root))
     for number in range(3):
         land(warehouse, f"f{number}", *(drive(car, number) for car in cars))
     update_grams(warehouse)
@@ -94,7 +95,7 @@ def test_with_now_no_byte_below_the_root_names_the_car_not_even_in_older_version
 
 def test_the_record_names_nobody_and_can_be_asked(tmp_path: Path) -> None:
     warehouse = fill(tmp_path, *CARS)
-    audit = Audit(tmp_path)
+    audit = Audit(LocalFolder(tmp_path))
     forget(warehouse, Subject("drive", "beta-1"))
     assert [entry["event"] for entry in audit.entries()] == ["begun", "done"]
     assert "beta" not in json.dumps(audit.entries())
@@ -128,7 +129,7 @@ def test_quarantined_rows_of_the_car_go_too(tmp_path: Path) -> None:
 
 
 def test_retention_forgets_by_age_and_refuses_to_leave_nothing(tmp_path: Path) -> None:
-    warehouse = Warehouse(tmp_path)
+    warehouse = Warehouse(LocalFolder(tmp_path))
     for month in (1, 2, 3):
         day = date(2024, month, 1)
         land(warehouse, f"m{month}", drive("alfa", month, day), day=day)

@@ -18,6 +18,7 @@ from fleet_slip.gram_job import (
     update_grams,
 )
 from fleet_slip.gram_statement import gram_statement
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.signals import catalogue
 from fleet_slip.storage import Change, Unit
 from fleet_slip.warehouse import Warehouse
@@ -81,7 +82,7 @@ def test_rows_do_not_depend_on_files_order_or_threads(
     drives = [log_rows(f"d{i}", random_counts(rng, int(rng.integers(2, 400)))) for i in range(4)]
     expected = None
     for split in (1, pieces):
-        warehouse = Warehouse(tmp_path_factory.mktemp("root"))
+        warehouse = Warehouse(LocalFolder(tmp_path_factory.mktemp("root")))
         shuffled = [drives[i] for i in rng.permutation(4)]
         for number, part in enumerate(np.array_split(np.arange(4), split)):
             rows = [shuffled[i].take(rng.permutation(len(shuffled[i]))) for i in part]

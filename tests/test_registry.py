@@ -10,6 +10,7 @@ import pytest
 
 from fleet_slip.documents import DocumentFolder
 from fleet_slip.errors import RefusedError, SelectionError, StorageError
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.registry import (
     CHAMPION,
     CrossValidated,
@@ -51,7 +52,7 @@ def manifest(coefficient: Fraction = Fraction(1, 3), name: str = "sideslip") -> 
 
 
 def test_versions_are_consecutive_and_the_latest_published_is_champion(tmp_path: Path) -> None:
-    registry = Registry(tmp_path)
+    registry = Registry(LocalFolder(tmp_path))
     for number in (1, 2, 3):
         assert registry.publish(manifest(Fraction(number))).version == number
     assert registry.versions("sideslip") == [1, 2, 3]
@@ -62,16 +63,18 @@ def test_versions_are_consecutive_and_the_latest_published_is_champion(tmp_path:
 
 def test_a_manifest_keeps_every_digit(tmp_path: Path) -> None:
     exact = Fraction(123456789012345678901, 98765432109876543210987)
-    Registry(tmp_path).publish(manifest(exact))
-    loaded = Registry(tmp_path).load("sideslip", 1).manifest
+    Registry(LocalFolder(tmp_path)).publish(manifest(exact))
+    loaded = Registry(LocalFolder(tmp_path)).load("sideslip", 1).manifest
     assert loaded == manifest(exact)
     assert loaded.terms[0].coefficient_exact == exact
     assert loaded.terms[0].coefficient == float(exact)
 
 
 def test_publishing_what_an_interrupted_run_left_uses_it(tmp_path: Path) -> None:
-    registry = Registry(tmp_path)
-    DocumentFolder(tmp_path / "sideslip" / "versions").append(manifest().model_dump(mode="json"))
+    registry = Registry(LocalFolder(tmp_path))
+    DocumentFolder(LocalFolder(tmp_path / "sideslip" / "versions")).append(
+        manifest().model_dump(mode="json")
+    )
     assert registry.champion("sideslip") is None
     assert registry.publish(manifest()).version == 1
     assert registry.versions("sideslip") == [1]
@@ -79,7 +82,7 @@ def test_publishing_what_an_interrupted_run_left_uses_it(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("change", ["coefficient", "sha256", "truncated"])
 def test_a_changed_version_is_refused(tmp_path: Path, change: str) -> None:
-    Registry(tmp_path).publish(manifest())
+    Registry(LocalFolder(tmp_path)).publish(manifest())
     file = tmp_path / "sideslip" / "versions" / "1.json"
     envelope = json.loads(file.read_text())
     if change == "coefficient":
@@ -88,11 +91,11 @@ def test_a_changed_version_is_refused(tmp_path: Path, change: str) -> None:
         envelope["sha256"] = "0" * 64
     file.write_text(json.dumps(envelope)[: 40 if change == "truncated" else None])
     with pytest.raises(StorageError, match=r"1\.json"):
-        Registry(tmp_path).load("sideslip", 1)
+        Registry(LocalFolder(tmp_path)).load("sideslip", 1)
 
 
 def test_aliases_move_and_go_back(tmp_path: Path) -> None:
-    registry = Registry(tmp_path)
+    registry = Registry(LocalFolder(tmp_path))
     for number in (1, 2, 3):
         registry.publish(manifest(Fraction(number)))
     registry.promote("sideslip", 1, CHAMPION)
@@ -106,7 +109,7 @@ def test_aliases_move_and_go_back(tmp_path: Path) -> None:
 
 
 def test_unknown_names_versions_and_aliases_say_what_there_is(tmp_path: Path) -> None:
-    registry = Registry(tmp_path)
+    registry = Registry(LocalFolder(tmp_path))
     with pytest.raises(SelectionError, match=r"no model is called 'x'.*publish one with"):
         registry.resolve("x")
     registry.publish(manifest())
@@ -120,7 +123,7 @@ def test_unknown_names_versions_and_aliases_say_what_there_is(tmp_path: Path) ->
 
 def _publish_ten(path: Path, writer: int) -> None:
     for number in range(10):
-        Registry(path).publish(manifest(Fraction(writer * 100 + number, 7)))
+        Registry(LocalFolder(path)).publish(manifest(Fraction(writer * 100 + number, 7)))
 
 
 def test_writers_at_once_never_share_a_number_or_lose_a_version(tmp_path: Path) -> None:
@@ -130,7 +133,7 @@ def test_writers_at_once_never_share_a_number_or_lose_a_version(tmp_path: Path) 
         process.start()
     for process in writers:
         process.join()
-    registry = Registry(tmp_path)
+    registry = Registry(LocalFolder(tmp_path))
     numbers = registry.versions("sideslip")
     assert numbers == list(range(1, 41))
     published = {registry.load("sideslip", n).manifest.terms[0].coefficient_exact for n in numbers}

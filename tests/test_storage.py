@@ -9,9 +9,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from fleet_slip.errors import ConflictError, StorageError
-from fleet_slip.storage import TEMPORARY_PREFIX, Change, Unit, checksum_in, checksum_of, retried
+from fleet_slip.folder import TEMPORARY_PREFIX
+from fleet_slip.local_folder import LocalFolder
+from fleet_slip.storage import Change, Unit, checksum_in, checksum_of, retried
 from fleet_slip.warehouse import Warehouse
-from tests.conftest import DAY, log_rows, random_counts
+from tests.conftest import DAY, log_rows, path_of, random_counts
 
 
 def rows(drive: str, count: int = 1000) -> object:
@@ -37,7 +39,7 @@ def test_a_written_file_is_not_part_of_the_table_before_its_commit(warehouse: Wa
 
 def test_counts_are_delta_packed_and_strings_are_dictionaries(warehouse: Warehouse) -> None:
     action = warehouse.logs.write_file("one", rows("a"), DAY)
-    columns = pq.read_metadata(warehouse.logs.path / action.path).row_group(0)
+    columns = pq.read_metadata(path_of(warehouse.logs.folder) / action.path).row_group(0)
     encodings = {
         columns.column(i).path_in_schema: columns.column(i).encodings
         for i in range(columns.num_columns)
@@ -49,7 +51,7 @@ def test_counts_are_delta_packed_and_strings_are_dictionaries(warehouse: Warehou
 
 def test_the_same_rows_make_the_same_bytes(warehouse: Warehouse) -> None:
     action = warehouse.logs.write_file("one", rows("a"), DAY)
-    path = warehouse.logs.path / action.path
+    path = path_of(warehouse.logs.folder) / action.path
     first = path.read_bytes()
     assert warehouse.logs.write_file("one", rows("a"), DAY).path == action.path
     assert path.read_bytes() == first
@@ -58,7 +60,7 @@ def test_the_same_rows_make_the_same_bytes(warehouse: Warehouse) -> None:
 
 def test_a_file_is_named_by_its_checksum(warehouse: Warehouse) -> None:
     action = warehouse.logs.write_file("one", rows("a"), DAY)
-    content = (warehouse.logs.path / action.path).read_bytes()
+    content = (path_of(warehouse.logs.folder) / action.path).read_bytes()
     assert action.path == f"day=2024-05-01/one-{hashlib.sha256(content).hexdigest()[:32]}.parquet"
     assert checksum_in(action.path) == checksum_of(content)
     assert checksum_in("day=2024-05-01/smoke-0000-0123456789ab.parquet") is None
@@ -110,7 +112,7 @@ def test_a_root_that_is_a_file_is_told_with_a_next_step(tmp_path: Path) -> None:
     with pytest.raises(
         StorageError, match=r"Choose another --root|not a directory|Not a directory"
     ):
-        Warehouse(tmp_path / "data").logs.write_file("one", rows("a"), DAY)
+        Warehouse(LocalFolder(tmp_path / "data")).logs.write_file("one", rows("a"), DAY)
 
 
 def test_a_conflict_is_retried_and_the_last_one_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -171,7 +173,7 @@ def test_a_fault_during_a_commit_is_told_as_what_it_is(
 def test_a_damaged_log_is_told(warehouse: Warehouse) -> None:
     action = warehouse.logs.write_file("one", rows("a"), DAY)
     warehouse.logs.snapshot().commit(Change(add=[action], units=[Unit("u", 1)]))
-    for entry in (warehouse.root / "logs/_delta_log").glob("*.json"):
+    for entry in (path_of(warehouse.root) / "logs/_delta_log").glob("*.json"):
         entry.write_text("{ damaged")
     with pytest.raises(StorageError, match="the Delta log cannot be used"):
         warehouse.logs.snapshot()

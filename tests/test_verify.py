@@ -20,7 +20,7 @@ from fleet_slip.simulation_job import simulate_campaign
 from fleet_slip.storage import Change
 from fleet_slip.verify import verify
 from fleet_slip.warehouse import Warehouse
-from tests.conftest import DAY, RunCommand, land, log_rows, random_counts
+from tests.conftest import DAY, RunCommand, land, log_rows, path_of, random_counts
 
 
 @pytest.fixture
@@ -54,13 +54,13 @@ def test_nothing_is_found_where_nothing_is_wrong(filled: Warehouse) -> None:
 def test_every_flipped_bit_is_found(filled: Warehouse) -> None:
     rng = random.Random(0)  # noqa: S311
     files = [Path(path) for table in filled.tables for path in table.snapshot().paths]
-    files += sorted(filled.root.glob("evaluations/*.json"))
+    files += sorted(path_of(filled.root).glob("evaluations/*.json"))
     for _ in range(12):
         bits = {file: rng.randrange(file.stat().st_size * 8) for file in files}
         for file, bit in bits.items():
             flip(file, bit)
         found = {finding.path for finding in verify(filled).damage}
-        assert found >= {str(file.relative_to(filled.root)) for file in files}, bits
+        assert found >= {str(file.relative_to(path_of(filled.root))) for file in files}, bits
         for file, bit in bits.items():
             flip(file, bit)
     assert not verify(filled).damage
@@ -81,12 +81,12 @@ def test_a_harmed_file_is_named_with_what_is_wrong(
     file = Path(filled.logs.snapshot().paths[0])
     harm(file)
     (finding,) = verify(filled).damage
-    assert finding.path == str(file.relative_to(filled.root))
+    assert finding.path == str(file.relative_to(path_of(filled.root)))
     assert problem in finding.problem
 
 
 def test_a_log_of_the_table_that_tells_other_counts_is_found(filled: Warehouse) -> None:
-    log = max(filled.root.glob("logs/_delta_log/*.json"))
+    log = max(path_of(filled.root).glob("logs/_delta_log/*.json"))
     log.write_text(log.read_text().replace('numRecords\\": 300', 'numRecords\\": 301'))
     (finding,) = verify(filled).damage
     assert "has 300 rows, the Delta log says 301" in finding.problem
@@ -130,16 +130,16 @@ def test_an_unknown_log_file_is_told_and_never_deleted(filled: Warehouse) -> Non
     before = file.read_bytes()
     assert repair(filled, verify(filled)) == []
     assert file.read_bytes() == before
-    assert damaged(filled) == {("file", str(file.relative_to(filled.root)))}
+    assert damaged(filled) == {("file", str(file.relative_to(path_of(filled.root))))}
 
 
 def test_a_document_is_checked_to_the_last_byte(filled: Warehouse) -> None:
     folder = DocumentFolder(filled.root / "models" / "m" / "history")
     for number in range(3):
         folder.append({"number": number})
-    (folder.path / "2.json").unlink()
-    text = (folder.path / "3.json").read_text()
-    (folder.path / "3.json").write_text(json.dumps(json.loads(text)))
+    (path_of(folder.folder) / "2.json").unlink()
+    text = (path_of(folder.folder) / "3.json").read_text()
+    (path_of(folder.folder) / "3.json").write_text(json.dumps(json.loads(text)))
     assert damaged(filled) == {
         ("document", "models/m/history/2.json"),
         ("document", "models/m/history/3.json"),

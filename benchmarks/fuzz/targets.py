@@ -31,6 +31,7 @@ from fleet_slip.features import load_features
 from fleet_slip.gram_job import update_grams
 from fleet_slip.ingest.mapping import Mapping, load_mapping
 from fleet_slip.ingest_job import ingest_file
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.model_list import FoldKey, check_model_name, load_model_list
 from fleet_slip.reading_query import one_query
 from fleet_slip.registry import Registry
@@ -74,7 +75,7 @@ def _ingest(rng: random.Random, place: Path, data: bytes, suffix: str) -> None:
     """Ingest a file. It lands as its report says, or leaves the warehouse as it was."""
     file = place / f"measured{suffix}"
     file.write_bytes(data)
-    warehouse = Warehouse(place / "data")
+    warehouse = Warehouse(LocalFolder(place / "data"))
     try:
         report = ingest_file(warehouse, file, rng.choice([*MAPPINGS, *MAPPINGS[:1] * 4]))
     except FleetSlipError:
@@ -119,7 +120,7 @@ def names(rng: random.Random, place: Path) -> None:
 
 def references(rng: random.Random, place: Path) -> None:
     """Name models, aliases, configs and signals that do not exist."""
-    warehouse = Warehouse(template(place))
+    warehouse = Warehouse(LocalFolder(template(place)))
     registry = Registry(warehouse.root / "models")
     word = rng.choice([*WORDS, f"{MODEL}@{rng.choice(WORDS)}", f"{rng.choice(WORDS)}@1"])
     match rng.randrange(7):
@@ -188,7 +189,7 @@ def config(rng: random.Random, place: Path) -> None:
 def _template(temporary: str) -> Path:
     """Make a small warehouse with a published model, once in a process."""
     root = Path(temporary) / "template"
-    warehouse = Warehouse(root)
+    warehouse = Warehouse(LocalFolder(root))
     rng = np.random.default_rng(0)
     tables = [_drive(f"d{i}", rng.integers(-3000, 3000, (40, 5))) for i in range(6)]
     for number, drives in enumerate((tables[:3], tables[3:])):
@@ -245,11 +246,11 @@ def manifest(rng: random.Random, place: Path) -> None:
         file.write_text(text, encoding="utf-8", errors="surrogatepass")
     if rng.random() < 0.1:
         file.rename(file.with_name(rng.choice(["2.json", "01.json", "9" * 200 + ".json"])))
-    registry = Registry(root / "models")
+    registry = Registry(LocalFolder(root / "models"))
     steps: list[Callable[[], object]] = [
         registry.as_table,
         lambda: registry.history(MODEL),
-        lambda: score(Warehouse(root), registry.resolve(MODEL).manifest, "true"),
+        lambda: score(Warehouse(LocalFolder(root)), registry.resolve(MODEL).manifest, "true"),
     ]
     _all_refuse_or_answer(steps)
 
@@ -283,7 +284,7 @@ def data_file(rng: random.Random, place: Path) -> None:
 
 
 def _use(root: Path) -> None:
-    warehouse = Warehouse(root)
+    warehouse = Warehouse(LocalFolder(root))
 
     def read(view: str) -> None:
         with connect(root) as database, contextlib.suppress(duckdb.Error):
@@ -292,7 +293,7 @@ def _use(root: Path) -> None:
     def stays_inside() -> None:
         for table in (warehouse.logs, warehouse.grams):
             for path in table.snapshot().paths:
-                assert Path(path).resolve().is_relative_to(table.path.resolve()), path
+                assert Path(path).resolve().is_relative_to(Path(str(table.folder)).resolve()), path
 
     _all_refuse_or_answer(
         [
@@ -301,7 +302,9 @@ def _use(root: Path) -> None:
             lambda: read("grams"),
             lambda: load_cohort(warehouse),
             lambda: run_plan(warehouse, SelectionPlan(nested="ax,ay", folds=2)),
-            lambda: score(warehouse, Registry(root / "models").resolve(MODEL).manifest, "true"),
+            lambda: score(
+                warehouse, Registry(LocalFolder(root / "models")).resolve(MODEL).manifest, "true"
+            ),
             lambda: update_grams(warehouse, no_progress),
         ]
     )
@@ -385,7 +388,7 @@ def sql(rng: random.Random, place: Path) -> None:
         text = mutate_bytes(rng, text.encode()).decode("utf-8", "surrogateescape")
     try:
         if rng.random() < 0.1:
-            load_cohort(Warehouse(root), text)
+            load_cohort(Warehouse(LocalFolder(root)), text)
             return
         query = one_query(_connection(root), text)
         with contextlib.suppress(duckdb.Error):

@@ -76,7 +76,7 @@ def _print_status(found: Status) -> None:
                 "waiting for the Gram job",
                 f"{found.backlog_files} files, {found.backlog_rows:,} rows",
             ],
-            ["disk", f"{found.disk_free_bytes / 1e9:,.1f} GB free, {found.disk_free_fraction:.0%}"],
+            *_disk(found),
         ],
         left=2,
     )
@@ -97,6 +97,12 @@ def _print_status(found: Status) -> None:
             ],
             left=2,
         )
+
+
+def _disk(found: Status) -> list[list[str]]:
+    if found.disk_free_bytes is None or found.disk_free_fraction is None:
+        return []
+    return [["disk", f"{found.disk_free_bytes / 1e9:,.1f} GB free, {found.disk_free_fraction:.0%}"]]
 
 
 def _print_runs(found: Status) -> None:

@@ -9,6 +9,7 @@ import typer
 from fleet_slip.cli.models import registry_of
 from fleet_slip.cli.output import Json, print_json, say
 from fleet_slip.cli.run import DEFAULT_CAMPAIGN
+from fleet_slip.local_folder import LocalFolder
 
 
 def register(app: typer.Typer) -> None:
@@ -31,14 +32,14 @@ def report(
 
     The page needs nothing but itself; the same figures stand beside it as SVG and PNG files.
     """
-    from fleet_slip.report.write import write_report  # noqa: PLC0415 - matplotlib takes a while
+    from fleet_slip.report.write import FIGURES, write_report  # noqa: PLC0415 - takes a while
 
-    folder = output or context.obj.root / "report"
+    folder = LocalFolder(output) if output else context.obj.root / "report"
     written = write_report(context.obj, registry_of(context.obj).resolve(model), folder)
     if json:
-        print_json({name: str(v) if name == "page" else v for name, v in asdict(written).items()})
+        print_json(asdict(written))
     else:
         say(
             f"{written.page}: {written.size_bytes / 1e6:.1f} MB, {written.figures} figures, "
-            f"which are in {folder / 'figures'} too"
+            f"which are in {folder / FIGURES} too"
         )

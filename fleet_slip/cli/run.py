@@ -18,7 +18,6 @@ from fleet_slip.operations.run_log import step
 from fleet_slip.publishing import Publication, manifest_of, publish
 from fleet_slip.selection import Selection
 from fleet_slip.selection_plan import PlannedSelection, SelectionPlan, run_plan
-from fleet_slip.storage import exclusive
 
 DEFAULT_CAMPAIGN = "waterford"
 
@@ -56,8 +55,8 @@ def run(
     started = time.monotonic()
     plan = load_campaign(campaign)
     model_name = check_model_name(name or plan.name)
-    lock = context.obj.root / f".run-{plan.name}.lock"
-    with exclusive(lock, lambda: say(f"{plan.name}: waiting for another run to end")):
+    lock = f".run-{plan.name}.lock"
+    with context.obj.root.exclusive(lock, lambda: say(f"{plan.name}: waiting for another run")):
         simulation = run_simulation(context.obj, plan, chosen_days(plan, days, through), threads)
         gram = run_gram(context.obj)
         condition = f"campaign = '{plan.name}'"

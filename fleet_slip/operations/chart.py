@@ -6,7 +6,7 @@ from typing import Any
 
 from fleet_slip.errors import ConfigError
 from fleet_slip.operations.monitor import Chart, Limits
-from fleet_slip.storage import storage_errors
+from fleet_slip.storage_errors import storage_errors
 
 TRAINING = ("training, predicted without the day", "0.55")
 NEW = ("new", "tab:blue")

@@ -174,7 +174,7 @@ def _last_training_day(warehouse: Warehouse, version: ModelVersion) -> date | No
         then = logs.snapshot(number)
     except StorageError:
         raise StorageError(
-            f"{logs.path}: version {number}, which {version.reference} was trained on, is no "
+            f"{logs.folder}: version {number}, which {version.reference} was trained on, is no "
             "longer in the Delta log. Say where new days begin with --since."
         ) from None
     return max((file.day for file in then.files if file.day), default=None)

@@ -21,8 +21,10 @@ from contextvars import ContextVar
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
+
+from fleet_slip.errors import StorageError
+from fleet_slip.folder import Folder
 
 RECORD_COLUMNS = {
     "run_id": "VARCHAR",
@@ -135,17 +137,17 @@ def current_run_id() -> str | None:
 
 
 @contextlib.contextmanager
-def recording(root: Path, command: str, arguments: Sequence[str]) -> Iterator[Run]:
+def recording(root: Folder, command: str, arguments: Sequence[str]) -> Iterator[Run]:
     """Record a command that may change the warehouse at `root`, whatever comes of it.
 
     A data root that does not exist is not made: then both lines are written at the end, if the
     command has made it.
     """
     run = Run.start(command, arguments)
-    file = root / FOLDER / f"{run.started_at:%Y-%m}.jsonl"
+    file = f"{FOLDER}/{run.started_at:%Y-%m}.jsonl"
     begun = time.monotonic()
     token = _current.set(run)
-    told = root.is_dir() and _append(file, run.beginning())
+    told = _exists(root) and _append(root, file, run.beginning())
     _log("run started", command=command, arguments=run.shown_arguments)
     error: BaseException | None = None
     try:
@@ -156,8 +158,8 @@ def recording(root: Path, command: str, arguments: Sequence[str]) -> Iterator[Ru
     finally:
         end = run.end(error, time.monotonic() - begun)
         _log("run ended", **{key: end[key] for key in ("outcome", "exit_code", "seconds")})
-        if root.is_dir():
-            _append(file, *([] if told else [run.beginning()]), end)
+        if _exists(root):
+            _append(root, file, *([] if told else [run.beginning()]), end)
         _current.reset(token)
 
 
@@ -176,12 +178,14 @@ def step(name: str) -> Iterator[Step]:
         _log("step ended", step=name, **{k: v for k, v in one.as_dict().items() if k != "name"})
 
 
-def run_files(root: Path) -> list[str]:
-    """Return the files of the history, oldest first; none if there is no history."""
+def run_files(root: Folder) -> list[str]:
+    """Return the URIs of the history's files, oldest first; none if there is no history."""
+    folder = root / FOLDER
     try:
-        return sorted(str(file) for file in (root / FOLDER).glob("*.jsonl"))
-    except OSError:
+        files = folder.files()
+    except StorageError:
         return []
+    return [f"{folder.uri}/{file.path}" for file in files if file.path.endswith(".jsonl")]
 
 
 def publishable(arguments: Sequence[str]) -> list[str]:
@@ -222,19 +226,19 @@ def _shortened(arguments: list[str]) -> list[str]:
     return [*arguments[:ARGUMENTS_MAX], f"... and {more} more"] if more > 0 else arguments
 
 
-def _append(file: Path, *records: Mapping[str, Any]) -> bool:
+def _exists(root: Folder) -> bool:
+    with contextlib.suppress(StorageError):
+        return root.exists()
+    return False
+
+
+def _append(root: Folder, file: str, *records: Mapping[str, Any]) -> bool:
     """Append records in one write; False where that is not possible."""
     text = "".join(f"\n{json.dumps(record, separators=(',', ':'))}\n" for record in records)
     try:
-        file.parent.mkdir(exist_ok=True)
-        descriptor = os.open(file, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
-        try:
-            os.write(descriptor, text.encode())
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-    except OSError as error:
-        _log("run not recorded", logging.WARNING, file=str(file), reason=str(error))
+        root.append(file, text.encode())
+    except StorageError as error:
+        _log("run not recorded", logging.WARNING, file=f"{root}/{file}", reason=str(error))
         return False
     return True
 

@@ -1,12 +1,10 @@
 """The health of a warehouse on one page: freshness, backlog, last runs, disk, champions."""
 
 import os
-import shutil
 import socket
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, date, datetime
-from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
@@ -14,11 +12,13 @@ import pyarrow as pa
 from fleet_slip.connection import run_source
 from fleet_slip.database import database_errors, open_database
 from fleet_slip.errors import RefusedError, SelectionError, StorageError
+from fleet_slip.folder import Folder
 from fleet_slip.gram_job import find_backlog
 from fleet_slip.operations.thresholds import StatusThresholds, thresholds
 from fleet_slip.registry import Registry
 from fleet_slip.resources import read_sql
-from fleet_slip.storage import Snapshot, storage_errors
+from fleet_slip.storage import Snapshot
+from fleet_slip.storage_errors import storage_errors
 from fleet_slip.warehouse import Warehouse
 
 SECONDS_PER_HOUR = 3600
@@ -61,8 +61,9 @@ class Status:
     tables: Mapping[str, TableStatus]
     backlog_files: int
     backlog_rows: int
-    disk_free_bytes: int
-    disk_free_fraction: float
+    disk_free_bytes: int | None
+    """None where the root is not on a disk of this machine."""
+    disk_free_fraction: float | None
     last_runs: tuple[Mapping[str, Any], ...]
     champions: tuple[ChampionStatus, ...]
     problems: tuple[str, ...]
@@ -82,14 +83,15 @@ def status_of(
     cannot be loaded. Raises `StorageError` if there is no data root.
     """
     now = now or datetime.now(UTC)
-    if not warehouse.root.is_dir():
+    if not warehouse.root.exists():
         raise StorageError(f"{warehouse.root}: there is no data root. Choose another with --root.")
     parts = (warehouse.logs, warehouse.grams, warehouse.quarantine)
-    snapshots = {table.path.name: table.snapshot() for table in parts}
+    snapshots = {table.folder.name: table.snapshot() for table in parts}
     tables = {name: _table(snapshot) for name, snapshot in snapshots.items()}
     logs, grams = snapshots["logs"], snapshots["grams"]
     backlog = find_backlog(logs, grams).missing
-    disk = shutil.disk_usage(warehouse.root)
+    free_bytes, disk_bytes = warehouse.root.free_bytes() or (None, 0)
+    free = None if free_bytes is None else free_bytes / disk_bytes
     champions, damaged = _champions(warehouse, logs, grams, now)
     last_runs = tuple(_last_runs(warehouse.root))
     age = _age_hours(tables["logs"].committed_at, now)
@@ -97,7 +99,7 @@ def status_of(
     problems = [
         *_stale(age, _oldest_hours(logs, {f.path for f in backlog}, now), max_age_hours),
         *_failed(last_runs),
-        *_full(disk.free / disk.total, limits),
+        *_full(free, limits),
         *damaged,
     ]
     return Status(
@@ -108,8 +110,8 @@ def status_of(
         tables=tables,
         backlog_files=len(backlog),
         backlog_rows=sum(file.rows for file in backlog),
-        disk_free_bytes=disk.free,
-        disk_free_fraction=disk.free / disk.total,
+        disk_free_bytes=free_bytes,
+        disk_free_fraction=free,
         last_runs=last_runs,
         champions=champions,
         problems=tuple(problems),
@@ -129,7 +131,7 @@ def _table(snapshot: Snapshot) -> TableStatus:
 def _committed_at(snapshot: Snapshot) -> datetime | None:
     if snapshot.delta is None:
         return None
-    with storage_errors(snapshot.table.path):
+    with storage_errors(snapshot.table.folder):
         last = snapshot.delta.history(limit=1)
     return _from_ms(last[0].get("timestamp") if last else None)
 
@@ -138,7 +140,7 @@ def _oldest_hours(logs: Snapshot, paths: set[str], now: datetime) -> float | Non
     """Return how long ago the oldest of some files was written."""
     if logs.delta is None or not paths:
         return None
-    with storage_errors(logs.table.path):
+    with storage_errors(logs.table.folder):
         actions = pa.table(logs.delta.get_add_actions()).to_pylist()
     moments = [action["modification_time"] for action in actions if action["path"] in paths]
     return _age_hours(_from_ms(min(moments, default=None)), now)
@@ -152,9 +154,12 @@ def _from_ms(milliseconds: int | None) -> datetime | None:
     return None if milliseconds is None else datetime.fromtimestamp(milliseconds / 1000, UTC)
 
 
-def _last_runs(root: Path) -> list[dict[str, Any]]:
+def _last_runs(root: Folder) -> list[dict[str, Any]]:
     # Not through connect(), which fails with a damaged manifest: that is for the status to tell.
-    with open_database() as database, database_errors(f"reading the history of runs in {root}"):
+    with (
+        open_database(reading=root) as database,
+        database_errors(f"reading the history of runs in {root}"),
+    ):
         view = read_sql("warehouse", "runs.sql")
         database.execute(view.format(stored_runs=run_source(database, root)))
         rows = database.sql(read_sql("jobs", "last_runs.sql")).to_arrow_table().to_pylist()
@@ -232,7 +237,7 @@ def _failed(runs: Sequence[Mapping[str, Any]]) -> list[str]:
     return problems
 
 
-def _full(free: float, limits: StatusThresholds) -> list[str]:
-    if free >= limits.min_free_fraction:
+def _full(free: float | None, limits: StatusThresholds) -> list[str]:
+    if free is None or free >= limits.min_free_fraction:
         return []
     return [f"the disk has {free:.1%} left, less than {limits.min_free_fraction:.0%}"]

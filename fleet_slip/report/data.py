@@ -199,7 +199,7 @@ def _tables(warehouse: Warehouse) -> tuple[TableSize, ...]:
         snapshot = table.snapshot()
         sizes.append(
             TableSize(
-                name=table.path.name,
+                name=table.folder.name,
                 version=snapshot.version,
                 files=len(snapshot.files),
                 rows=snapshot.rows,

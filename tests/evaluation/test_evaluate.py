@@ -15,6 +15,7 @@ from fleet_slip.errors import RefusedError
 from fleet_slip.evaluation.drives import load_drives
 from fleet_slip.evaluation.estimators import LinearEstimate
 from fleet_slip.evaluation.filters import FILTERS, bound
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.observers import kalman
 from fleet_slip.observers.signals import read_drive
 from fleet_slip.registry import Registry
@@ -49,10 +50,10 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_evaluating_again_changes_nothing(root: Path) -> None:
-    logs_version = Warehouse(root).logs.snapshot().version
+    logs_version = Warehouse(LocalFolder(root)).logs.snapshot().version
     again = evaluate(root, *SCENARIOS)
     assert again["number"] == 1
-    assert Warehouse(root).logs.snapshot().version == logs_version
+    assert Warehouse(LocalFolder(root)).logs.snapshot().version == logs_version
 
 
 def test_no_model_is_trained_on_scenarios(root: Path) -> None:
@@ -77,8 +78,8 @@ def test_a_changed_scenario_is_refused(root: Path, tmp_path: Path) -> None:
 
 def test_the_published_model_gets_the_same_estimates_as_in_sql(root: Path) -> None:
     """SQL measures against the noisy label, here the truth counts: 0.03 degrees between them."""
-    manifest = Registry(root / "models").resolve("smoke").manifest
-    in_sql = score(Warehouse(root), manifest, "drive_id = 'scenario-nominal'")
+    manifest = Registry(LocalFolder(root / "models")).resolve("smoke").manifest
+    in_sql = score(Warehouse(LocalFolder(root)), manifest, "drive_id = 'scenario-nominal'")
     one = evaluate(root, *SCENARIOS)["scenarios"][0]
     here = one["results"]["smoke@1"]
     assert here["rows"] == in_sql.rows == one["truth"]["rows"]
@@ -111,9 +112,9 @@ def test_a_missing_signal_costs_the_models_that_need_it(root: Path) -> None:
 
 
 def test_an_estimator_does_not_see_the_truth(root: Path) -> None:
-    (drive,) = load_drives(Warehouse(root), [load_scenario("nominal")])
+    (drive,) = load_drives(Warehouse(LocalFolder(root)), [load_scenario("nominal")])
     assert not {"vx_mps", "vy_mps", "sideslip_rad", "station_m"} & set(drive.signals)
-    manifest = Registry(root / "models").resolve("smoke").manifest
+    manifest = Registry(LocalFolder(root / "models")).resolve("smoke").manifest
     estimate = LinearEstimate.published(manifest)(drive.signals)
     assert np.corrcoef(estimate, drive.sideslip_rad)[0, 1] > 0.9
 
@@ -129,7 +130,7 @@ def test_the_filters_are_tuned_once(root: Path) -> None:
 
 def test_a_filter_gives_the_same_estimates_here_as_by_itself(root: Path) -> None:
     scenario = load_scenario("nominal")
-    (drive,) = load_drives(Warehouse(root), [scenario])
+    (drive,) = load_drives(Warehouse(LocalFolder(root)), [scenario])
     with connect(root) as database:
         alone = read_drive(database, scenario.drive_id)
     expected = kalman.estimate(alone.signals, scenario.car, kalman.FilterNoise())

@@ -9,7 +9,9 @@ import pytest
 
 from fleet_slip.documents import DocumentFolder, checksum
 from fleet_slip.errors import FleetSlipError, StorageError
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.registry import Registry
+from tests.conftest import path_of
 from tests.test_registry import manifest
 
 NAME = manifest().name
@@ -18,14 +20,14 @@ NAME = manifest().name
 @pytest.fixture
 def registry(tmp_path: Path) -> Registry:
     """A registry with one version."""
-    registry = Registry(tmp_path / "models")
+    registry = Registry(LocalFolder(tmp_path / "models"))
     registry.publish(manifest())
     return registry
 
 
 def forge(registry: Registry, kind: str, **changes: Any) -> None:
     """Change keys of a document, `term` in its first term, and make its checksum right."""
-    file = registry.path / NAME / kind / "1.json"
+    file = path_of(registry.folder) / NAME / kind / "1.json"
     document = json.loads(file.read_text())
     term = changes.pop("term", {})
     document["content"] |= changes
@@ -104,21 +106,21 @@ def test_a_forged_history_is_refused(registry: Registry, changes: dict[str, Any]
     ],
 )
 def test_a_document_that_is_none_is_refused(registry: Registry, text: str) -> None:
-    (registry.path / NAME / "versions" / "1.json").write_text(text, encoding="latin-1")
+    (path_of(registry.folder) / NAME / "versions" / "1.json").write_text(text, encoding="latin-1")
     with pytest.raises(StorageError, match="not a document"):
         registry.load(NAME, 1)
 
 
 def test_only_numbers_are_documents(registry: Registry) -> None:
-    folder = DocumentFolder(registry.path / NAME / "versions")
+    folder = DocumentFolder(registry.folder / NAME / "versions")
     for stem in ("01", "0", "-1", "1e3", "٣", "9" * 200, "x"):
-        (folder.path / f"{stem}.json").write_text("{}")
+        (path_of(folder.folder) / f"{stem}.json").write_text("{}")
     assert folder.numbers() == [1]
 
 
 @pytest.mark.parametrize("name", ["..", "Evil", "a b", "x\n", "x'; DROP TABLE y", "\x1b[2J"])
 def test_folders_that_are_no_models_are_passed_over(registry: Registry, name: str) -> None:
-    (registry.path / name / "versions").mkdir(parents=True)
+    (path_of(registry.folder) / name / "versions").mkdir(parents=True)
     assert registry.names() == [NAME]
     with pytest.raises(FleetSlipError):
         registry.resolve(name)

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from fleet_slip.gram_job import update_grams
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.registry import Registry
 from fleet_slip.warehouse import Warehouse
-from tests.conftest import land, log_rows, random_counts
+from tests.conftest import land, log_rows, path_of, random_counts
 from tests.test_registry import manifest
 
 
@@ -18,13 +19,13 @@ from tests.test_registry import manifest
 def test_nobody_gets_more_rights_than_the_umask_gives(tmp_path: Path, umask: int) -> None:
     old = os.umask(umask)
     try:
-        warehouse = Warehouse(tmp_path / "data")
+        warehouse = Warehouse(LocalFolder(tmp_path / "data"))
         land(warehouse, "one", log_rows("d", random_counts(np.random.default_rng(1), 20)))
         update_grams(warehouse, lambda _more, _total: None)
         Registry(warehouse.root / "models").publish(manifest())
     finally:
         os.umask(old)
-    files = [*warehouse.root.rglob("*")]
+    files = [*path_of(warehouse.root).rglob("*")]
     assert len(files) > 10
     for file in files:
         assert not stat.S_IMODE(file.stat().st_mode) & umask, file

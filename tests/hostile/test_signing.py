@@ -10,9 +10,10 @@ import pytest
 
 from fleet_slip.documents import checksum
 from fleet_slip.errors import ConfigError, RefusedError
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.registry import Registry
 from fleet_slip.signing import VERIFY_VARIABLE, make_keys
-from tests.conftest import RunCommand
+from tests.conftest import RunCommand, path_of
 from tests.test_registry import manifest
 
 pytest.importorskip("cryptography", reason="signatures need the extra 'signing'")
@@ -27,14 +28,14 @@ def key(tmp_path: Path) -> Path:
 @pytest.fixture
 def signed(tmp_path: Path, key: Path, monkeypatch: pytest.MonkeyPatch) -> Registry:
     """A registry with one signed version, where signatures are asked for."""
-    registry = Registry(tmp_path / "models", key)
+    registry = Registry(LocalFolder(tmp_path / "models"), key)
     registry.publish(manifest())
     monkeypatch.setenv(VERIFY_VARIABLE, f"{key}.pub")
     return registry
 
 
 def version_file(registry: Registry, number: int = 1, suffix: str = "json") -> Path:
-    return registry.path / manifest().name / "versions" / f"{number}.{suffix}"
+    return path_of(registry.folder) / manifest().name / "versions" / f"{number}.{suffix}"
 
 
 def test_keys_are_private_and_never_replaced(tmp_path: Path) -> None:
@@ -57,7 +58,7 @@ def test_a_signed_version_is_loaded(signed: Registry) -> None:
 
 
 def test_a_signature_leaves_the_document_as_it_is(signed: Registry, tmp_path: Path) -> None:
-    unsigned = Registry(tmp_path / "others")
+    unsigned = Registry(LocalFolder(tmp_path / "others"))
     unsigned.publish(manifest())
     assert version_file(signed).read_bytes() == version_file(unsigned).read_bytes()
     assert not version_file(unsigned, suffix="sig").exists()
@@ -99,9 +100,9 @@ def test_another_key_is_refused(
 def test_an_unsigned_version_is_refused_until_it_is_signed(
     tmp_path: Path, key: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    Registry(tmp_path / "models").publish(manifest())
+    Registry(LocalFolder(tmp_path / "models")).publish(manifest())
     monkeypatch.setenv(VERIFY_VARIABLE, f"{key}.pub")
-    registry = Registry(tmp_path / "models", key)
+    registry = Registry(LocalFolder(tmp_path / "models"), key)
     with pytest.raises(RefusedError, match=r"is not signed.*fleet-slip sign"):
         registry.load(manifest().name, 1)
     registry.sign(manifest().name, 1)
@@ -119,7 +120,7 @@ def test_keys_that_are_none_are_told_without_quoting_them(
         bad.touch(0o600)
         bad.write_bytes(content)
         with pytest.raises(ConfigError, match="Ed25519 private key") as raised:
-            Registry(signed.path, bad).sign(manifest().name, 1)
+            Registry(signed.folder, bad).sign(manifest().name, 1)
         assert "SECRET" not in str(raised.value)
         monkeypatch.setenv(VERIFY_VARIABLE, str(bad))
         with pytest.raises(ConfigError, match="Ed25519 public key"):
@@ -147,7 +148,7 @@ def test_the_command_line_makes_keys_signs_and_refuses(
     made = run_command("keygen", "mine")
     assert made.exit_code == 0
     assert (tmp_path / "mine").read_text().splitlines()[1] not in made.stderr
-    Registry(tmp_path / "data" / "models").publish(manifest())
+    Registry(LocalFolder(tmp_path / "data" / "models")).publish(manifest())
     asking = {**os.environ, VERIFY_VARIABLE: "mine.pub"}
     name = manifest().name
     assert run_command("show", name, env=asking).exit_code == 7

@@ -14,19 +14,20 @@ from fleet_slip.cohort import load_cohort
 from fleet_slip.connection import connect
 from fleet_slip.errors import FleetSlipError, SelectionError
 from fleet_slip.gram_job import update_grams
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.reading_query import one_query
 from fleet_slip.warehouse import Warehouse
-from tests.conftest import RunCommand, land, log_rows, random_counts
+from tests.conftest import RunCommand, land, log_rows, path_of, random_counts
 
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A warehouse of one file with two drives."""
-    warehouse = Warehouse(tmp_path_factory.mktemp("sql") / "data")
+    warehouse = Warehouse(LocalFolder(tmp_path_factory.mktemp("sql") / "data"))
     rng = np.random.default_rng(1)
     land(warehouse, "one", *(log_rows(f"d{i}", random_counts(rng, 50)) for i in range(2)))
     update_grams(warehouse, lambda _more, _total: None)
-    return warehouse.root
+    return path_of(warehouse.root)
 
 
 def contents(folder: Path) -> dict[str, str]:
@@ -131,7 +132,7 @@ def test_a_cohort_condition_cannot_break_out(
     monkeypatch.chdir(tmp_path)
     before = contents(root)
     try:
-        cohort = load_cohort(Warehouse(root), condition)
+        cohort = load_cohort(Warehouse(LocalFolder(root)), condition)
     except FleetSlipError as error:
         assert str(error).isprintable()
     else:

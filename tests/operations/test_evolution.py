@@ -15,12 +15,13 @@ from fleet_slip.errors import ConflictError, RefusedError
 from fleet_slip.evolution import evolution
 from fleet_slip.gram_check import check_grams
 from fleet_slip.gram_job import update_grams
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.migration import migrate, rescaled
 from fleet_slip.resources import folder
 from fleet_slip.signals import CATALOGUE_VARIABLE, catalogue
 from fleet_slip.storage import Change, Table
 from fleet_slip.warehouse import Warehouse
-from tests.conftest import RunCommand, land, log_rows, random_counts
+from tests.conftest import RunCommand, land, log_rows, path_of, random_counts
 
 SHIPPED = (folder("configs") / "signals.toml").read_text()
 
@@ -154,7 +155,7 @@ def test_a_finer_scale_is_exact_and_refused_where_counts_do_not_fit(
     migrate(Warehouse(warehouse.root))
     assert fetch(Warehouse(warehouse.root), "SELECT ax_mps2 FROM log ORDER BY tick") == before
     use(SHIPPED)
-    other = Warehouse(warehouse.root.parent / "other")
+    other = Warehouse(LocalFolder(path_of(warehouse.root).parent / "other"))
     land(other, "a", log_rows("a", random_counts(np.random.default_rng(1), 20)))
     use(FINER_AX)
     with pytest.raises(RefusedError, match="do not fit 16 bits"):

@@ -13,6 +13,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.errors import InputError
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.operations.run_log import (
     HIDDEN,
     current_run_id,
@@ -31,7 +32,7 @@ def runs(root: Path) -> list[dict[str, Any]]:
 
 
 def test_a_run_is_two_lines_and_one_row(tmp_path: Path) -> None:
-    with recording(tmp_path, "simulate", ["simulate", "smoke"]) as run:
+    with recording(LocalFolder(tmp_path), "simulate", ["simulate", "smoke"]) as run:
         assert current_run_id() == run.run_id
         assert runs(tmp_path)[0]["outcome"] is None
         with step("simulate") as figures:
@@ -55,11 +56,11 @@ def test_a_run_is_two_lines_and_one_row(tmp_path: Path) -> None:
 def test_a_failure_is_recorded_with_its_exit_code_and_raised(tmp_path: Path) -> None:
     with (
         pytest.raises(InputError),
-        recording(tmp_path, "ingest", ["ingest", "/data/anna.csv"]),
+        recording(LocalFolder(tmp_path), "ingest", ["ingest", "/data/anna.csv"]),
         step("ingest"),
     ):
         raise InputError("/data/anna.csv: no such file.")
-    with pytest.raises(KeyboardInterrupt), recording(tmp_path, "gram", []):
+    with pytest.raises(KeyboardInterrupt), recording(LocalFolder(tmp_path), "gram", []):
         raise KeyboardInterrupt
     failed, interrupted = runs(tmp_path)
     assert (failed["outcome"], failed["exit_code"]) == ("failed", 4)
@@ -69,10 +70,10 @@ def test_a_failure_is_recorded_with_its_exit_code_and_raised(tmp_path: Path) -> 
 
 
 def test_a_data_root_that_does_not_exist_is_not_made(tmp_path: Path) -> None:
-    with recording(tmp_path / "data", "gram", []):
+    with recording(LocalFolder(tmp_path / "data"), "gram", []):
         pass
     assert not (tmp_path / "data").exists()
-    with recording(tmp_path / "data", "simulate", []):
+    with recording(LocalFolder(tmp_path / "data"), "simulate", []):
         (tmp_path / "data").mkdir()
     assert [row["outcome"] for row in runs(tmp_path / "data")] == ["done"]
 
@@ -82,19 +83,19 @@ def test_what_cannot_be_recorded_does_not_fail_the_command(
 ) -> None:
     (tmp_path / "runs").write_text("a file where the folder should be")
     logging.getLogger("fleet_slip").propagate = True
-    with recording(tmp_path, "gram", []):
+    with recording(LocalFolder(tmp_path), "gram", []):
         pass
     assert "run not recorded" in caplog.messages
-    assert run_files(tmp_path) == []
+    assert run_files(LocalFolder(tmp_path)) == []
 
 
 def test_a_torn_line_costs_no_other_record(tmp_path: Path) -> None:
-    with recording(tmp_path, "gram", []):
+    with recording(LocalFolder(tmp_path), "gram", []):
         pass
     (file,) = (tmp_path / "runs").iterdir()
     with file.open("a") as lines:
         lines.write('{"run_id":"torn","comm')
-    with recording(tmp_path, "gram", []):
+    with recording(LocalFolder(tmp_path), "gram", []):
         pass
     assert [row["outcome"] for row in runs(tmp_path)] == ["done", "done"]
 
@@ -102,9 +103,10 @@ def test_a_torn_line_costs_no_other_record(tmp_path: Path) -> None:
 def test_processes_at_once_lose_no_record(tmp_path: Path) -> None:
     code = (
         "import sys\nfrom pathlib import Path\n"
+        "from fleet_slip.local_folder import LocalFolder\n"
         "from fleet_slip.operations.run_log import recording\n"
         "for i in range(100):\n"
-        "    with recording(Path(sys.argv[1]), 'gram', ['x' * i]): pass"
+        "    with recording(LocalFolder(Path(sys.argv[1])), 'gram', ['x' * i]): pass"
     )
     writers = [subprocess.Popen([sys.executable, "-c", code, str(tmp_path)]) for _ in range(4)]
     assert [writer.wait() for writer in writers] == [0] * 4
@@ -134,7 +136,7 @@ def test_connecting_costs_no_more_with_a_hundred_thousand_runs(tmp_path: Path) -
         fleet_slip.connect(tmp_path).close()
         return time.perf_counter() - started
 
-    with recording(tmp_path, "gram", []):
+    with recording(LocalFolder(tmp_path), "gram", []):
         pass
     few = min(seconds() for _ in range(3))
     (file,) = (tmp_path / "runs").iterdir()

@@ -10,10 +10,11 @@ import pytest
 
 from fleet_slip.errors import StorageError
 from fleet_slip.gram_job import update_grams
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.operations.run_log import recording
 from fleet_slip.operations.status import status_of
 from fleet_slip.warehouse import Warehouse
-from tests.conftest import DAY, RunCommand, land, log_rows, random_counts
+from tests.conftest import DAY, RunCommand, land, log_rows, path_of, random_counts
 
 
 def test_freshness_backlog_and_age(warehouse: Warehouse) -> None:
@@ -38,7 +39,7 @@ def test_freshness_backlog_and_age(warehouse: Warehouse) -> None:
 
 
 def test_the_last_run_of_each_command_counts(warehouse: Warehouse) -> None:
-    warehouse.root.mkdir()
+    path_of(warehouse.root).mkdir()
     with pytest.raises(StorageError), recording(warehouse.root, "gram", []):
         raise StorageError("the disk is full")
     assert "gram" in status_of(warehouse).problems[0]
@@ -51,11 +52,13 @@ def test_the_last_run_of_each_command_counts(warehouse: Warehouse) -> None:
 
 
 def test_a_killed_run_is_known(warehouse: Warehouse) -> None:
-    warehouse.root.mkdir()
+    path_of(warehouse.root).mkdir()
     code = (
         "import os, signal, sys\nfrom pathlib import Path\n"
+        "from fleet_slip.local_folder import LocalFolder\n"
         "from fleet_slip.operations.run_log import recording\n"
-        "with recording(Path(sys.argv[1]), 'run', []): os.kill(os.getpid(), signal.SIGKILL)"
+        "with recording(LocalFolder(Path(sys.argv[1])), 'run', []):\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)"
     )
     done = subprocess.run([sys.executable, "-c", code, str(warehouse.root)], check=False)
     assert done.returncode == -9
@@ -66,7 +69,7 @@ def test_a_killed_run_is_known(warehouse: Warehouse) -> None:
 
 def test_a_missing_data_root_is_a_storage_error(tmp_path: Path) -> None:
     with pytest.raises(StorageError, match="no data root"):
-        status_of(Warehouse(tmp_path / "nothing"))
+        status_of(Warehouse(LocalFolder(tmp_path / "nothing")))
 
 
 def test_the_command_tells_a_monitor(run_command: RunCommand, tmp_path: Path) -> None:

@@ -9,9 +9,9 @@ import pytest
 from typer.testing import CliRunner
 
 from fleet_slip.cli.main import app
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.registry import Registry
 from fleet_slip.report.data import ReportData, gather
-from fleet_slip.storage import exclusive
 from fleet_slip.warehouse import Warehouse
 
 SCENARIOS = (
@@ -52,7 +52,7 @@ def reported(tmp_path_factory: pytest.TempPathFactory) -> Reported:
     base = tmp_path_factory.getbasetemp()
     shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
     made = Reported(shared / "reported")
-    with exclusive(shared / "reported.lock", lambda: None):
+    with LocalFolder(shared).exclusive("reported.lock", lambda: None):
         if not made.page.exists():
             call(made.root, "run", "--campaign", "smoke")
             options = [word for name in SCENARIOS for word in ("--scenario", name)]
@@ -63,5 +63,5 @@ def reported(tmp_path_factory: pytest.TempPathFactory) -> Reported:
 
 @pytest.fixture(scope="session")
 def data(reported: Reported) -> ReportData:
-    version = Registry(reported.root / "models").resolve("smoke")
-    return gather(Warehouse(reported.root), version)
+    version = Registry(LocalFolder(reported.root / "models")).resolve("smoke")
+    return gather(Warehouse(LocalFolder(reported.root)), version)

@@ -16,6 +16,7 @@ from fleet_slip.connection import connect
 from fleet_slip.documents import Document
 from fleet_slip.errors import SelectionError
 from fleet_slip.evaluation.results import keep
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.report import tables
 from fleet_slip.report.blocks import blocks_won, difference
 from fleet_slip.report.claims import CLAIMS, judged
@@ -120,7 +121,7 @@ def test_held_out_estimates_are_those_of_cross_validation(
     """Pooled from exact sums there, from the rows in SQL here."""
     selection = data.trained.selection
     model = next(model for model in selection.models if model.name == "4")
-    signals = Warehouse(reported.root).catalogue
+    signals = Warehouse(LocalFolder(reported.root)).catalogue
     terms = " + ".join(f"h.{name} * l.{signals[name].column}" for name in model.signals)
     with connect(reported.root) as database:
         database.register("h", held_out_coefficients(selection, model))
@@ -212,7 +213,7 @@ def test_an_evaluation_of_other_data_is_refused(reported: Reported, data: Report
         for key in path[:-1]:
             place = place[key]
         place[path[-1]] += 0.001
-        keep(Warehouse(copy), content)
+        keep(Warehouse(LocalFolder(copy)), content)
         with pytest.raises(SelectionError, match=f"{told}.* has changed since evaluation 2"):
             call(copy, "report", "--model", "smoke")
 
