@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numba
 import numpy as np
@@ -14,6 +15,8 @@ from fleet_slip.signals import SAMPLE_TIME_S, Signal, catalogue
 SAMPLE_RATE_HZ = int(1 / SAMPLE_TIME_S)
 GPS_SIGNALS = {"gps_vx": "vx_mps", "gps_vy": "vy_mps"}
 """The signals that are null between fixes, each with the true column that it measures."""
+
+Scalar = TypeVar("Scalar", bound=np.generic)
 
 EXACT = (0.0, 0.0)
 """Bias and standard deviation of a signal that is not measured but known."""
@@ -85,44 +88,91 @@ class Measurement:
     saturated: int
 
 
+class Recorder:
+    """What the sensors of one car report of one drive, recorded block by block.
+
+    The draws come in a fixed order: for every block white noise signal by signal in catalogue
+    order, then the GPS outages, then the GPS noise. Signals without an entry in
+    `Sensors.bias_and_std` are exact. So the counts depend on where a drive is cut into blocks.
+    """
+
+    def __init__(self, sensors: Sensors, generator: np.random.Generator) -> None:
+        """Begin a drive."""
+        self._sensors = sensors
+        self._generator = generator
+        self._outages = _Outages(sensors.gps, generator)
+        self._ticks = 0
+        self._counts: dict[str, list[NDArray[np.int16]]] = {}
+        self._gps_fix: list[NDArray[np.bool_]] = []
+        self._saturated = 0
+
+    def record(self, truth: Mapping[str, NDArray[np.float64]]) -> None:
+        """Measure the next block.
+
+        `truth` holds a float64 array of one length for the SI column of every signal but GPS; a
+        signal without one is not measured, as by a car that lacks the sensor.
+        """
+        ticks = len(next(iter(truth.values())))
+        noise = np.zeros(ticks, dtype=np.float32)
+        errors = self._sensors.bias_and_std
+        for name, signal in catalogue().signals.items():
+            if name in GPS_SIGNALS or signal.column not in truth:
+                continue
+            if name in errors:
+                self._generator.standard_normal(out=noise, dtype=np.float32)
+            self._add(name, truth[signal.column], noise, errors.get(name, EXACT))
+        self._record_gps(truth, ticks)
+        self._ticks += ticks
+
+    def _record_gps(self, truth: Mapping[str, NDArray[np.float64]], ticks: int) -> None:
+        fix = self._outages.fixes(self._ticks, ticks)
+        self._gps_fix.append(fix)
+        for name, column in GPS_SIGNALS.items():
+            if name not in catalogue().signals:
+                continue
+            fixed = truth[column][fix]
+            noise = self._generator.standard_normal(len(fixed), dtype=np.float32)
+            self._add(name, fixed, noise, (0.0, self._sensors.gps.velocity_std_mps))
+            counts = np.zeros(ticks, dtype=np.int16)
+            counts[fix] = self._counts[name].pop()
+            self._counts[name].append(counts)
+
+    def _add(
+        self,
+        name: str,
+        physical: NDArray[np.float64],
+        noise: NDArray[np.float32],
+        bias_and_std: tuple[float, float],
+    ) -> None:
+        counts, clipped = _noisy_counts(physical, noise, bias_and_std, catalogue()[name])
+        self._counts.setdefault(name, []).append(counts)
+        self._saturated += clipped
+
+    def measurement(self) -> Measurement:
+        """Return all blocks as one measurement."""
+        return Measurement(
+            {
+                name: _joined(self._counts[name])
+                for name in catalogue().signals
+                if name in self._counts
+            },
+            _joined(self._gps_fix),
+            self._saturated,
+        )
+
+
+def _joined(parts: list[NDArray[Scalar]]) -> NDArray[Scalar]:
+    """Return the parts as one array, without a copy if there is only one."""
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+
 def measure(
     truth: Mapping[str, NDArray[np.float64]], sensors: Sensors, generator: np.random.Generator
 ) -> Measurement:
-    """Measure one drive.
-
-    `truth` holds a float64 array of one length for the SI column of every signal but GPS; a
-    signal without one is not measured, as by a car that lacks the sensor. The draws come in a fixed
-    order: white noise signal by signal in catalogue order, then the GPS outages, then the GPS
-    noise. Signals without an entry in `Sensors.bias_and_std` are exact.
-    """
-    ticks = len(next(iter(truth.values())))
-    noise = np.zeros(ticks, dtype=np.float32)
-    errors = sensors.bias_and_std
-    counts = {}
-    saturated = 0
-    for name, signal in catalogue().signals.items():
-        if name in GPS_SIGNALS or signal.column not in truth:
-            continue
-        if name in errors:
-            generator.standard_normal(out=noise, dtype=np.float32)
-        counts[name], clipped = _noisy_counts(
-            truth[signal.column], noise, errors.get(name, EXACT), signal
-        )
-        saturated += clipped
-    gps_fix = _gps_fixes(ticks, sensors.gps, generator)
-    for name, column in GPS_SIGNALS.items():
-        if name not in catalogue().signals:
-            continue
-        fixed = truth[column][gps_fix]
-        drawn = generator.standard_normal(len(fixed), dtype=np.float32)
-        counts[name] = np.zeros(ticks, dtype=np.int16)
-        counts[name][gps_fix], clipped = _noisy_counts(
-            fixed, drawn, (0.0, sensors.gps.velocity_std_mps), catalogue()[name]
-        )
-        saturated += clipped
-    return Measurement(
-        {name: counts[name] for name in catalogue().signals if name in counts}, gps_fix, saturated
-    )
+    """Measure one drive in one block; see `Recorder`."""
+    recorder = Recorder(sensors, generator)
+    recorder.record(truth)
+    return recorder.measurement()
 
 
 def quantise(physical: NDArray[np.float64], signal: Signal) -> tuple[NDArray[np.int16], int]:
@@ -168,14 +218,30 @@ def _quantise(
     return clipped
 
 
-def _gps_fixes(ticks: int, gps: Gps, generator: np.random.Generator) -> NDArray[np.bool_]:
-    """Return for each tick whether there is a fix: one a period, none in an outage."""
-    fix = np.zeros(ticks, dtype=np.bool_)
-    fix[:: SAMPLE_RATE_HZ // gps.rate_hz] = True
-    means_s = (gps.time_between_outages_s, gps.outage_duration_s)
-    end_s = 0.0
-    while end_s * SAMPLE_RATE_HZ < ticks:
-        begin_s = end_s + generator.exponential(means_s[0])
-        end_s = begin_s + generator.exponential(means_s[1])
-        fix[int(begin_s * SAMPLE_RATE_HZ) : int(end_s * SAMPLE_RATE_HZ)] = False
-    return fix
+class _Outages:
+    """When a drive has a GPS fix: once a period, and never in an outage."""
+
+    def __init__(self, gps: Gps, generator: np.random.Generator) -> None:
+        """Begin a drive, with a fix."""
+        self._gps = gps
+        self._generator = generator
+        self._begin_s = 0.0
+        self._end_s = 0.0
+
+    def fixes(self, first: int, ticks: int) -> NDArray[np.bool_]:
+        """Return for so many ticks from a first one, the next ones, whether there is a fix."""
+        period = SAMPLE_RATE_HZ // self._gps.rate_hz
+        fix = np.zeros(ticks, dtype=np.bool_)
+        fix[-first % period :: period] = True
+        self._clear(fix, first)
+        while self._end_s * SAMPLE_RATE_HZ < first + ticks:
+            self._begin_s = self._end_s + self._generator.exponential(
+                self._gps.time_between_outages_s
+            )
+            self._end_s = self._begin_s + self._generator.exponential(self._gps.outage_duration_s)
+            self._clear(fix, first)
+        return fix
+
+    def _clear(self, fix: NDArray[np.bool_], first: int) -> None:
+        begin, end = (int(s * SAMPLE_RATE_HZ) - first for s in (self._begin_s, self._end_s))
+        fix[max(begin, 0) : max(end, 0)] = False

@@ -7,12 +7,12 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.campaign import Batch, DriveSpec
-from fleet_slip.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ, Measurement, measure
+from fleet_slip.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ, Measurement, Recorder
 from fleet_slip.signals import catalogue
-from fleet_slip.vehicle.lanes import LaneDrive, Road, Truth, simulate_drives
+from fleet_slip.vehicle.lanes import LaneDrive, Road, simulate_blocks
 
-DRIVES_AT_ONCE = 32
-"""Drives of a batch that are simulated together, which bounds the memory for their true signals."""
+DRIVES_AT_ONCE = 128
+"""Drives of a batch that are simulated together, which bounds the memory for their roads."""
 
 
 @dataclass(frozen=True)
@@ -74,42 +74,53 @@ def simulate_batch(batch: Batch) -> pa.Table:
 
 
 def simulate_logs(specs: Sequence[DriveSpec]) -> list[DriveLog]:
-    """Simulate and measure drives together."""
-    truths = simulate_drives([lane_drive(spec) for spec in specs])
-    return [log_drive(spec, truth) for spec, truth in zip(specs, truths, strict=True)]
+    """Simulate drives together, each measured with its own sensors and random generator.
 
-
-def log_drive(spec: DriveSpec, truth: Truth) -> DriveLog:
-    """Measure one drive with its own sensors and random generator."""
-    columns = {
-        signal.column: getattr(truth, signal.column)
-        for name, signal in catalogue().signals.items()
-        if name not in GPS_SIGNALS and hasattr(truth, signal.column)
-    }
-    lost = truth.lost_control_tick
-    return DriveLog(
-        spec,
-        measure(columns, spec.sensors, spec.generator()),
-        None if lost is None else lost / SAMPLE_RATE_HZ,
-    )
+    A block of a drive is measured as soon as it is there: of true signals nothing is kept.
+    """
+    recorders = [Recorder(spec.sensors, spec.generator()) for spec in specs]
+    logs: dict[int, DriveLog] = {}
+    for block in simulate_blocks([lane_drive(spec) for spec in specs]):
+        recorder = recorders[block.drive]
+        recorder.record(block.channels)
+        if block.last:
+            lost = block.lost_control_tick
+            logs[block.drive] = DriveLog(
+                specs[block.drive],
+                recorder.measurement(),
+                None if lost is None else lost / SAMPLE_RATE_HZ,
+            )
+    return [logs[drive] for drive in range(len(specs))]
 
 
 def tabulate(batch: Batch, logs: Sequence[DriveLog]) -> pa.Table:
     """Return the rows of the logs as one table."""
     rows = [log.rows for log in logs]
-    drive_of_row = pa.array(np.repeat(np.arange(len(logs), dtype=np.int32), rows))
     columns = {"day": pa.repeat(pa.scalar(batch.day), sum(rows))}
     for field in catalogue().drive_schema:
         values = pa.array([log.metadata[field.name] for log in logs], type=field.type)
-        if pa.types.is_string(field.type):
-            values = values.dictionary_encode()
-        columns[field.name] = values.take(drive_of_row)
-    columns["tick"] = pa.array(np.concatenate([np.arange(n, dtype=np.int32) for n in rows]))
-    no_fix = ~np.concatenate([log.measurement.gps_fix for log in logs])
+        columns[field.name] = _repeated(values, rows)
+    ticks = pa.array(np.arange(max(rows), dtype=np.int32))
+    columns["tick"] = pa.chunked_array([ticks[:n] for n in rows])
     for name in catalogue().signals:
-        if name not in logs[0].measurement.counts:
-            columns[name] = pa.nulls(len(drive_of_row), pa.int16())
-            continue
-        counts = np.concatenate([log.measurement.counts[name] for log in logs])
-        columns[name] = pa.array(counts, mask=no_fix if name in GPS_SIGNALS else None)
+        columns[name] = pa.chunked_array([_counts(log, name) for log in logs])
     return pa.table({name: columns[name] for name in catalogue().log_schema.names})
+
+
+def _counts(log: DriveLog, name: str) -> pa.Array:
+    """Return the counts of a signal without a copy; all null if the car lacks the sensor."""
+    if name not in log.measurement.counts:
+        return pa.nulls(log.rows, pa.int16())
+    no_fix = ~log.measurement.gps_fix if name in GPS_SIGNALS else None
+    return pa.array(log.measurement.counts[name], mask=no_fix)
+
+
+def _repeated(values: pa.Array, times: Sequence[int]) -> pa.Array:
+    """Return each value so many times; strings as a dictionary."""
+    if pa.types.is_string(values.type):
+        encoded = values.dictionary_encode()
+        codes = np.repeat(encoded.indices.to_numpy(), times)
+        return pa.DictionaryArray.from_arrays(codes, encoded.dictionary)
+    missing = np.repeat(values.is_null().to_numpy(zero_copy_only=False), times)
+    present = values.fill_null(0).to_numpy()
+    return pa.array(np.repeat(present, times), mask=missing if missing.any() else None)

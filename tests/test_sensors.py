@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from fleet_slip.config import load_config
 from fleet_slip.errors import ConfigError
-from fleet_slip.sensors import Gps, Sensors, measure, quantise
+from fleet_slip.sensors import Gps, Recorder, Sensors, measure, quantise
 from fleet_slip.signals import catalogue
 
 TICKS = 200_000
@@ -94,6 +94,30 @@ def test_same_generator_same_counts_and_another_one_others() -> None:
     for name in catalogue().signals:
         assert np.array_equal(first.counts[name], again.counts[name])
     assert not np.array_equal(first.counts["ax"], other.counts["ax"])
+
+
+def test_outages_and_fixes_go_on_from_block_to_block() -> None:
+    recorder = Recorder(SENSORS, generator())
+    lengths = [12_347, 1, 9, 70_003, 20_000]
+    for ticks in lengths:
+        recorder.record(constant_truth(ticks))
+    measured = recorder.measurement()
+    assert len(measured.gps_fix) == sum(lengths)
+    fixes = np.flatnonzero(measured.gps_fix)
+    assert np.all(fixes % 10 == 0)
+    lost = 1 - len(fixes) / (sum(lengths) / 10)
+    assert lost == pytest.approx(5 / 65, rel=0.6)
+    for name, counts in measured.counts.items():
+        assert len(counts) == sum(lengths), name
+    assert not measured.counts["gps_vx"][~measured.gps_fix].any()
+
+
+def test_blocks_do_not_repeat_their_noise() -> None:
+    recorder = Recorder(SENSORS, generator())
+    for _ in range(2):
+        recorder.record(constant_truth(20_000))
+    ax = recorder.measurement().counts["ax"].astype(float)
+    assert abs(np.corrcoef(ax[:20_000], ax[20_000:])[0, 1]) < 0.04
 
 
 def test_more_noise_scales_the_same_draws() -> None:

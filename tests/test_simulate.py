@@ -1,7 +1,7 @@
 """From drives to rows: the table's shape, and that its bytes depend on the batch alone."""
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import fields, replace
+from dataclasses import replace
 from datetime import date
 
 import numpy as np
@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from fleet_slip import simulate
 from fleet_slip.campaign import Batch, DriveSpec, load_campaign
-from fleet_slip.sensors import SAMPLE_RATE_HZ
+from fleet_slip.sensors import SAMPLE_RATE_HZ, measure
 from fleet_slip.signals import catalogue
-from fleet_slip.simulate import log_drive, simulate_batch, tabulate
+from fleet_slip.simulate import DriveLog, simulate_batch, simulate_logs, tabulate
 from fleet_slip.track import load_track
-from fleet_slip.vehicle.lanes import Truth
+from fleet_slip.vehicle.kernel import BLOCK, CHANNELS
 
 DAY = date(2024, 5, 1)
 
@@ -27,18 +27,21 @@ def short_batch(laps: float = 0.05) -> Batch:
     return Batch("smoke", DAY, 0, tuple(replace(drive, laps=laps) for drive in drives))
 
 
-def synthetic_truth(ticks: int, lost_control_tick: int | None = None) -> Truth:
-    columns = {
-        field.name: np.full(ticks, 0.01 * (i + 1))
-        for i, field in enumerate(fields(Truth))
-        if field.name != "lost_control_tick"
-    }
-    return Truth(**columns, lost_control_tick=lost_control_tick)
+Truth = dict[str, NDArray[np.float64]]
 
 
-def synthetic_table(*truths: Truth) -> pa.Table:
+def synthetic_truth(ticks: int) -> Truth:
+    return {name: np.full(ticks, 0.01 * (i + 1)) for i, name in enumerate(CHANNELS)}
+
+
+def synthetic_table(*truths: Truth, lost_control_s: float | None = None) -> pa.Table:
+    """Return the rows of drives; the last one is lost."""
     batch = short_batch()
-    logs = [log_drive(spec, truth) for spec, truth in zip(batch.drives, truths, strict=False)]
+    lost = [None] * (len(truths) - 1) + [lost_control_s]
+    logs = [
+        DriveLog(spec, measure(truth, spec.sensors, spec.generator()), at_s)
+        for spec, truth, at_s in zip(batch.drives, truths, lost, strict=False)
+    ]
     return tabulate(batch, logs)
 
 
@@ -67,7 +70,9 @@ def test_rows_are_sorted_by_drive_then_tick() -> None:
 
 def test_drive_columns_say_what_was_driven() -> None:
     spec = short_batch().drives[1]
-    row = synthetic_table(synthetic_truth(3), synthetic_truth(2, 1)).to_pylist()[-1]
+    row = synthetic_table(synthetic_truth(3), synthetic_truth(2), lost_control_s=0.01).to_pylist()[
+        -1
+    ]
     expected = {
         "drive_id": spec.drive_id,
         "vehicle_id": "smoke-0000",
@@ -86,7 +91,7 @@ def test_drive_columns_say_what_was_driven() -> None:
 
 
 def test_lost_control_is_null_where_the_driver_kept_the_car() -> None:
-    table = synthetic_table(synthetic_truth(3), synthetic_truth(2, 1))
+    table = synthetic_table(synthetic_truth(3), synthetic_truth(2), lost_control_s=0.01)
     assert table["lost_control_s"].to_pylist() == [None, None, None, 0.01, 0.01]
 
 
@@ -100,7 +105,7 @@ def test_only_gps_between_fixes_is_null() -> None:
 
 def test_clipped_values_are_counted_in_every_row_of_their_drive() -> None:
     truth = synthetic_truth(12)
-    truth.ay_mps2[3:5] = 99.0
+    truth["ay_mps2"][3:5] = 99.0
     table = synthetic_table(synthetic_truth(30), truth)
     assert table["saturated"].to_pylist() == [0] * 30 + [2] * 12
     assert table["ay"].to_pylist()[33:35] == [30000, 30000]
@@ -169,3 +174,20 @@ def test_gps_measures_the_true_velocity() -> None:
         error = physical(fixes, f"gps_{name}") - physical(fixes, name)
         assert np.std(error) == pytest.approx(0.05, rel=0.15)
         assert abs(np.mean(error)) < 0.02
+
+
+def test_a_drive_longer_than_a_block_goes_on_where_the_block_ended() -> None:
+    drive = on_skid_pad(short_batch().drives[0], 4.0)
+    long = replace(drive, laps=2 * BLOCK / drive.expected_rows * 1.1)
+    log, short = simulate_logs([long, replace(drive, laps=0.5)])
+    assert log.rows > 2 * BLOCK
+    table = tabulate(Batch("test", DAY, 0, (long, drive)), [log, short])
+    assert table["tick"].to_pylist() == [*range(log.rows), *range(short.rows)]
+    for name in ("vx", "station", "yaw_rate"):
+        counts = log.measurement.counts[name].astype(int)
+        steps = np.abs(np.diff(counts[BLOCK // 2 :]))
+        at_border = steps[BLOCK // 2 - 1 :: BLOCK]
+        assert at_border.max() <= np.sort(steps)[-len(steps) // 1000], name
+    fixes = np.flatnonzero(log.measurement.gps_fix)
+    assert np.all(fixes % 10 == 0)
+    assert fixes[-1] > 2 * BLOCK

@@ -3,6 +3,10 @@
 Each lane carries one drive; a lane whose drive has ended takes the next one. At every sample the
 scalar part looks up the road and records; the driver's law and the physics are loops over all lanes
 that the compiler turns into vector instructions.
+
+A lane records a block of samples. When a block is full or a drive ends the loop stops, so that the
+caller takes the block; then it is called again. So a drive of any length needs the same memory, and
+a block is still in the processor's cache when it is measured.
 """
 
 import hashlib
@@ -48,7 +52,6 @@ PLAN = np.dtype(
         ("closed", np.bool_),
         ("distance_m", np.float64),
         ("samples", np.int64),  # most that the drive may take
-        ("output", np.int64),  # where in the output its channels stand, one after the other
     ]
 )
 """What the kernel knows of a drive."""
@@ -56,8 +59,9 @@ PLAN = np.dtype(
 CURVATURE, SPEED, ACCELERATION = range(3)
 """Columns of the table of all roads: curvature, target speed, target acceleration."""
 
-DRIVE, TICK, LAP = range(3)
-"""Rows of the book of lanes: which drive a lane carries, its next sample and its lap."""
+DRIVE, TICK, LAP, FIRST = range(4)
+"""Rows of the book of lanes: which drive a lane carries, its next sample, its lap, and the tick of
+the first sample of its block."""
 
 SAMPLES, LOST = range(2)
 """Columns of the result: number of samples of a drive, and the tick of its loss or `NOBODY`."""
@@ -79,7 +83,17 @@ CHANNELS = (
     "station_m",
     "lateral_offset_m",
 )
-"""Channels of a drive's output, each with room for the samples of its plan."""
+"""What a lane records."""
+
+BLOCK = 2**16
+"""Samples of a block: 11 minutes of a drive."""
+
+STRIDE = BLOCK + 8
+"""Distance between two channels of a block: with a power of two all channels would share the same
+few lines of the processor's cache."""
+
+BLOCK_SHAPE = (LANES, len(CHANNELS), STRIDE)
+"""Shape of the blocks of all lanes."""
 
 STATE = 0
 SLOPES = STATE + len(State._fields)
@@ -97,6 +111,7 @@ ROWS = HANDLING + len(Handling._fields)
 
 STEER = Constants._fields.index("steer_per_wheel")
 ACKERMANN = Constants._fields.index("ackermann")
+INVERSE_RADIUS = Constants._fields.index("inverse_radius")
 
 
 @equation
@@ -127,25 +142,6 @@ def _look_up(roads: Any, plan: Any, x: State, station: float, lost: bool) -> Pat
         (1.0 - bit) * roads[soon, ACCELERATION] + bit * roads[soon + 1, ACCELERATION],
         1.0 if lost else 0.0,
     )
-
-
-@equation
-def _clear(memory: Any, lane: int) -> None:
-    """Let nothing stand on a lane: a car at rest."""
-    for row in range(ROWS):
-        memory[row * LANES + lane] = 0.0
-
-
-@equation
-def _begin(memory: Any, lane: int, car: Any, speed: float) -> None:
-    """Put a drive on a lane: rolling straight along the line at a speed."""
-    _clear(memory, lane)
-    for row in range(len(car)):
-        memory[(CAR + row) * LANES + lane] = car[row]
-    spin = speed * read(memory, CAR, lane, Constants).inverse_radius
-    start = State(speed, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, spin, spin, spin, spin)
-    write(memory, STATE, lane, start)
-    write(memory, POSE, lane, Pose(0.0, 0.0, 1.0, 0.0))
 
 
 @equation
@@ -197,19 +193,24 @@ def _has_lost(x: State, pose: Pose) -> bool:
 
 
 @equation
-def _record(truth: Any, plan: Any, tick: int, x: State, pose: Pose) -> None:
+def _at(lane: int, channel: int, sample: int) -> int:
+    """Return where a sample of a channel stands in the blocks."""
+    return (lane * len(CHANNELS) + channel) * STRIDE + sample
+
+
+@equation
+def _record(truth: Any, lane: int, sample: int, x: State, pose: Pose) -> None:
     """Write the sample that begins here, but for the specific force, which the next step gives."""
-    at = plan.output + tick
-    truth[at + 2 * plan.samples] = x.yaw_rate
-    truth[at + 3 * plan.samples] = x.steering_wheel
-    truth[at + 4 * plan.samples] = x.wheel_fl
-    truth[at + 5 * plan.samples] = x.wheel_fr
-    truth[at + 6 * plan.samples] = x.wheel_rl
-    truth[at + 7 * plan.samples] = x.wheel_rr
-    truth[at + 11 * plan.samples] = x.vx
-    truth[at + 12 * plan.samples] = x.vy
-    truth[at + 13 * plan.samples] = pose.station
-    truth[at + 14 * plan.samples] = pose.offset
+    truth[_at(lane, 2, sample)] = x.yaw_rate
+    truth[_at(lane, 3, sample)] = x.steering_wheel
+    truth[_at(lane, 4, sample)] = x.wheel_fl
+    truth[_at(lane, 5, sample)] = x.wheel_fr
+    truth[_at(lane, 6, sample)] = x.wheel_rl
+    truth[_at(lane, 7, sample)] = x.wheel_rr
+    truth[_at(lane, 11, sample)] = x.vx
+    truth[_at(lane, 12, sample)] = x.vy
+    truth[_at(lane, 13, sample)] = pose.station
+    truth[_at(lane, 14, sample)] = pose.offset
 
 
 @equation
@@ -222,21 +223,22 @@ def _look(memory: Any, book: Any, plans: Any, roads: Any, truth: Any, ended: Any
             pose = read(memory, POSE, lane, Pose)
             if ended[drive, LOST] == NOBODY and _has_lost(x, pose):
                 ended[drive, LOST] = tick
-            _record(truth, plans[drive], tick, x, pose)
+            _record(truth, lane, tick - book[FIRST, lane], x, pose)
             lost = ended[drive, LOST] != NOBODY
             write(memory, PATH, lane, _look_up(roads, plans[drive], x, pose.station, lost))
 
 
 @equation
 def _move_on(memory: Any, book: Any, plans: Any, truth: Any, ended: Any) -> int:
-    """Count the sample and the laps of all cars; return the number of drives that end here."""
-    finished = 0
+    """Count the sample and the laps of all cars; return how many blocks are complete."""
+    complete = 0
     for lane in range(LANES):
         drive, tick = book[DRIVE, lane], book[TICK, lane]
         if drive != NOBODY:
             plan = plans[drive]
-            truth[plan.output + tick] = memory[FORCE * LANES + lane]
-            truth[plan.output + plan.samples + tick] = memory[(FORCE + 1) * LANES + lane]
+            sample = tick - book[FIRST, lane]
+            truth[_at(lane, 0, sample)] = memory[FORCE * LANES + lane]
+            truth[_at(lane, 1, sample)] = memory[(FORCE + 1) * LANES + lane]
             station = memory[POSE * LANES + lane]
             gone = book[LAP, lane] * plan.length_m + station
             if plan.closed:
@@ -248,14 +250,15 @@ def _move_on(memory: Any, book: Any, plans: Any, truth: Any, ended: Any) -> int:
             given_up = lost != NOBODY and tick >= lost + AFTER_LOSS
             if given_up or gone >= plan.distance_m or tick + 1 == plan.samples:
                 ended[drive, SAMPLES] = tick + 1
-                book[DRIVE, lane] = NOBODY
-                finished += 1
-    return finished
+                complete += 1
+            elif sample + 1 == BLOCK:
+                complete += 1
+    return complete
 
 
 @equation
 def _angles(wheel: Any, left: Any, right: Any, vx: Any, vy: Any, slip: Any, car: Any) -> None:
-    """Fill in the road wheels' angles and the side-slip angle of a drive."""
+    """Fill in the road wheels' angles and the side-slip angle of a block."""
     steer, ackermann = car[STEER], car[ACKERMANN]
     for tick in range(len(wheel)):
         tangent = steer * wheel[tick]
@@ -268,17 +271,48 @@ def _angles(wheel: Any, left: Any, right: Any, vx: Any, vy: Any, slip: Any, car:
 
 
 @equation
-def _finish(truth: Any, plans: Any, ended: Any, cars: Any) -> None:
-    """Fill in what follows from the recorded."""
-    for drive in range(len(plans)):
-        size, samples = plans[drive].samples, ended[drive, SAMPLES]
-        channels = truth[plans[drive].output :][: len(CHANNELS) * size]
-        wheel, left, right = channels[3 * size :], channels[8 * size :], channels[9 * size :]
-        slip, vx, vy = channels[10 * size :], channels[11 * size :], channels[12 * size :]
-        _angles(wheel[:samples], left, right, vx, vy, slip, cars[drive])
+def _finish(truth: Any, book: Any, ended: Any, cars: Any) -> None:
+    """Fill in what follows from the recorded in the blocks that are complete."""
+    for lane in range(LANES):
+        drive, samples = book[DRIVE, lane], book[TICK, lane] - book[FIRST, lane]
+        if drive != NOBODY and (samples == BLOCK or ended[drive, SAMPLES] != NOBODY):
+            wheel = truth[_at(lane, 3, 0) :][:samples]
+            left, right = truth[_at(lane, 8, 0) :][:samples], truth[_at(lane, 9, 0) :][:samples]
+            slip = truth[_at(lane, 10, 0) :][:samples]
+            vx, vy = truth[_at(lane, 11, 0) :][:samples], truth[_at(lane, 12, 0) :][:samples]
+            _angles(wheel, left, right, vx, vy, slip, cars[drive])
 
 
-def build_kernel(sources: str) -> Callable[..., NDArray[np.int64]]:
+def empty_lanes() -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return the memory and the book of lanes without a drive: cars at rest."""
+    return np.zeros(ROWS * LANES), np.full((4, LANES), NOBODY)
+
+
+def begin(
+    memory: NDArray[np.float64],
+    book: NDArray[np.int64],
+    lane: int,
+    drive: int,
+    car: NDArray[np.float64],
+    speed_mps: float,
+) -> None:
+    """Put a drive on a lane: rolling straight along the line at a speed."""
+    book[:, lane] = drive, 0, 0, 0
+    spin = speed_mps * car[INVERSE_RADIUS]
+    column = memory.reshape(ROWS, LANES)[:, lane]
+    column[:] = 0.0
+    column[CAR : CAR + len(car)] = car
+    column[STATE : STATE + len(State._fields)] = State(speed_mps, *6 * (0.0,), *4 * (spin,))
+    column[POSE : POSE + len(Pose._fields)] = Pose(0.0, 0.0, 1.0, 0.0)
+
+
+def clear(memory: NDArray[np.float64], book: NDArray[np.int64], lane: int) -> None:
+    """Let nothing stand on a lane: a car at rest."""
+    book[DRIVE, lane] = NOBODY
+    memory.reshape(ROWS, LANES)[:, lane] = 0.0
+
+
+def build_kernel(sources: str) -> Callable[..., None]:
     """Return the kernel, not yet compiled.
 
     Its closure holds a digest of the `sources`, and so does the key under which numba keeps the
@@ -286,40 +320,31 @@ def build_kernel(sources: str) -> Callable[..., NDArray[np.int64]]:
     """
 
     def simulate(
-        plans: Any, cars: Any, roads: Any, queue: Any, steps: int, truth: Any
-    ) -> NDArray[np.int64]:
-        """Fill `truth`; return the number of samples and the tick of the loss of each drive.
+        plans: Any,
+        cars: Any,
+        roads: Any,
+        steps: int,
+        memory: Any,
+        book: Any,
+        truth: Any,
+        ended: Any,
+    ) -> None:
+        """Drive on, from sample to sample, until a lane's block is complete.
 
         `plans` are of dtype `PLAN` and point into the table `roads`; `cars` has `Constants` and
-        `Handling` in rows; drives get a lane in the order of `queue`; a sample takes `steps` steps.
+        `Handling` in rows; a sample takes `steps` steps. `truth` has `BLOCK_SHAPE`, made flat;
+        `ended` gets the number of samples and the tick of the loss of each drive. There must be a
+        drive on some lane.
         """
         _ = sources
-        ended = np.full((len(plans), 2), NOBODY)
-        memory = np.zeros(ROWS * LANES)
-        book = np.full((3, LANES), NOBODY)
-        waiting = 0
-        running = 0
-        while True:
-            for lane in range(LANES):
-                if book[DRIVE, lane] == NOBODY and waiting < len(queue):
-                    drive = queue[waiting]
-                    _begin(memory, lane, cars[drive], roads[plans[drive].first, SPEED])
-                    book[DRIVE, lane], book[TICK, lane], book[LAP, lane] = drive, 0, 0
-                    waiting += 1
-                    running += 1
-                elif book[DRIVE, lane] == NOBODY:
-                    _clear(memory, lane)
-            if running == 0:
-                _finish(truth, plans, ended, cars)
-                return ended
-            finished = 0
-            while finished == 0:
-                _look(memory, book, plans, roads, truth, ended)
-                _decide(memory)
-                for step in range(steps):
-                    _integrate(memory, SAMPLE_S / steps, step == 0)
-                finished = _move_on(memory, book, plans, truth, ended)
-            running -= finished
+        complete = 0
+        while complete == 0:
+            _look(memory, book, plans, roads, truth, ended)
+            _decide(memory)
+            for step in range(steps):
+                _integrate(memory, SAMPLE_S / steps, step == 0)
+            complete = _move_on(memory, book, plans, truth, ended)
+        _finish(truth, book, ended, cars)
 
     return simulate
 

@@ -1,9 +1,9 @@
 """Drives many cars at once: each drive is a lane of a loop that the compiler vectorises."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,46 +81,83 @@ class Truth:
     """First tick at which the driver had lost the car; None where he never did."""
 
 
-def simulate_drives(
-    drives: Sequence[LaneDrive], steps_per_sample: int = STEPS_PER_SAMPLE
-) -> list[Truth]:
-    """Return what happens in each drive, sampled at 100 Hz from its start.
+@dataclass(frozen=True)
+class Block:
+    """What happened in a part of a drive: at most `kernel.BLOCK` samples, without a gap."""
 
-    A drive ends after its laps, at the end of an open road, `kernel.AFTER_LOSS` samples after the
-    driver lost the car, or when it takes `PATIENCE` times as long as planned. The bits of a drive
-    depend on nothing but the drive: not on the others, their number or order, the thread or the
-    machine. Releases the GIL. The arrays of one call share memory; it is some 120 bytes a sample.
+    drive: int
+    """Which of the drives."""
+    channels: dict[str, NDArray[np.float64]]
+    """The arrays of `Truth`. Their memory is used again for the next block."""
+    last: bool
+    """Whether the drive ends with it."""
+    lost_control_tick: int | None
+    """As in `Truth`, counted from the start of the drive; None in a block before the loss."""
+
+
+def simulate_blocks(
+    drives: Sequence[LaneDrive], steps_per_sample: int = STEPS_PER_SAMPLE
+) -> Iterator[Block]:
+    """Yield what happens in each drive, sampled at 100 Hz from its start, block by block.
+
+    The blocks of a drive come in order, those of different drives in any. A drive ends after its
+    laps, at the end of an open road, `kernel.AFTER_LOSS` samples after the driver lost the car, or
+    when it takes `PATIENCE` times as long as planned. The bits of a drive depend on nothing but the
+    drive: not on the others, their number or order, the thread or the machine. Releases the GIL.
+    The memory does not depend on the number and the length of the drives: at most 63 MB.
 
     Raises `ConfigError` if a road's table is not usable.
     """
     if not drives:
-        return []
+        return
     for drive in drives:
         _check(drive)
-    roads = {id(drive.road): drive.road for drive in drives}
-    tables = [_table(road) for road in roads.values()]
-    ends = np.cumsum([len(table) for table in tables])
-    spans = dict(zip(roads, zip([0, *ends[:-1]], ends - 1, strict=True), strict=True))
-    plans = np.array([_plan(drive, *spans[id(drive.road)]) for drive in drives], dtype=kernel.PLAN)
+    plans, roads = _plans(drives)
     cars = np.array([(*constants(d.vehicle, d.adhesion), *handling(d.vehicle)) for d in drives])
-    longest_first = np.argsort(-plans["samples"], kind="stable")
-    sizes = len(kernel.CHANNELS) * plans["samples"]
-    plans["output"] = np.cumsum(sizes) - sizes
-    memory = np.empty(int(sizes.sum()))
-    ended = kernel.simulate(
-        plans, cars, np.concatenate(tables), longest_first, steps_per_sample, memory
-    )
-    return [_truth(memory, plan, *end) for plan, end in zip(plans, ended, strict=True)]
+    waiting = np.argsort(plans["samples"], kind="stable").tolist()
+    ended = np.full((len(drives), 2), kernel.NOBODY)
+    memory, book = kernel.empty_lanes()
+    truth = np.empty(kernel.BLOCK_SHAPE)
+    while True:
+        for lane in np.flatnonzero(book[kernel.DRIVE] == kernel.NOBODY)[: len(waiting)]:
+            drive = waiting.pop()
+            speed_mps = roads[plans["first"][drive], kernel.SPEED]
+            kernel.begin(memory, book, lane, drive, cars[drive], speed_mps)
+        if (book[kernel.DRIVE] == kernel.NOBODY).all():
+            return
+        kernel.simulate(
+            plans, cars, roads, steps_per_sample, memory, book, truth.reshape(-1), ended
+        )
+        for lane, (drive, tick, _, first) in enumerate(book.T.tolist()):
+            last = drive != kernel.NOBODY and ended[drive, kernel.SAMPLES] != kernel.NOBODY
+            if last or tick - first == kernel.BLOCK:
+                lost = int(ended[drive, kernel.LOST])
+                channels = dict(zip(kernel.CHANNELS, truth[lane, :, : tick - first], strict=True))
+                yield Block(drive, channels, last, None if lost == kernel.NOBODY else lost)
+                book[kernel.FIRST, lane] = tick
+            if last:
+                kernel.clear(memory, book, lane)
 
 
-def _truth(memory: NDArray[np.float64], plan: Any, samples: int, lost: int) -> Truth:
-    """Return what the kernel wrote of one drive."""
-    size = len(kernel.CHANNELS) * int(plan["samples"])
-    channels = memory[plan["output"] : plan["output"] + size].reshape(len(kernel.CHANNELS), -1)
-    return Truth(
-        **{name: channels[row, :samples] for row, name in enumerate(kernel.CHANNELS)},
-        lost_control_tick=None if lost == kernel.NOBODY else int(lost),
-    )
+def simulate_drives(
+    drives: Sequence[LaneDrive], steps_per_sample: int = STEPS_PER_SAMPLE
+) -> list[Truth]:
+    """Return what happens in each drive as a whole; see `simulate_blocks`.
+
+    Takes 120 bytes a sample.
+    """
+    parts: list[list[dict[str, NDArray[np.float64]]]] = [[] for _ in drives]
+    lost: dict[int, int | None] = {}
+    for block in simulate_blocks(drives, steps_per_sample):
+        parts[block.drive].append({name: x.copy() for name, x in block.channels.items()})
+        lost[block.drive] = block.lost_control_tick
+    return [
+        Truth(
+            **{name: np.concatenate([part[name] for part in some]) for name in kernel.CHANNELS},
+            lost_control_tick=lost[drive],
+        )
+        for drive, some in enumerate(parts)
+    ]
 
 
 def planned_time_s(road: Road, distance_m: float) -> float:
@@ -152,14 +189,24 @@ def _table(road: Road) -> NDArray[np.float64]:
     return np.take(columns, range(len(columns) + further), axis=0, mode="wrap")
 
 
+def _plans(drives: Sequence[LaneDrive]) -> tuple[NDArray[np.void], NDArray[np.float64]]:
+    """Return what the kernel knows of the drives, `kernel.PLAN`, and the table of all roads."""
+    roads = {id(drive.road): drive.road for drive in drives}
+    tables = [_table(road) for road in roads.values()]
+    ends = np.cumsum([len(table) for table in tables])
+    spans = dict(zip(roads, zip([0, *ends[:-1]], ends - 1, strict=True), strict=True))
+    plans = np.array([_plan(drive, *spans[id(drive.road)]) for drive in drives], dtype=kernel.PLAN)
+    return plans, np.concatenate(tables)
+
+
 def _plan(
     drive: LaneDrive, first: int, last: int
-) -> tuple[int, int, float, float, bool, float, int, int]:
+) -> tuple[int, int, float, float, bool, float, int]:
     """Return a drive's row of `kernel.PLAN`."""
     road = drive.road
     distance_m = (drive.laps if road.closed else min(drive.laps, 1.0)) * road.length_m
     samples = math.ceil((PATIENCE * planned_time_s(road, distance_m) + GRACE_S) / SAMPLE_S)
-    return first, last, 1 / road.spacing_m, road.length_m, road.closed, distance_m, samples, 0
+    return first, last, 1 / road.spacing_m, road.length_m, road.closed, distance_m, samples
 
 
 def _check(drive: LaneDrive) -> None:

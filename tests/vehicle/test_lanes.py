@@ -12,7 +12,7 @@ from fleet_slip.errors import ConfigError
 from fleet_slip.speed_profile import SpeedLimits, speed_profile
 from fleet_slip.track import load_track
 from fleet_slip.vehicle import kernel
-from fleet_slip.vehicle.lanes import LaneDrive, Road, Truth, simulate_drives
+from fleet_slip.vehicle.lanes import LaneDrive, Road, Truth, simulate_blocks, simulate_drives
 from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
 from tests.vehicle.harness import SEDAN
 
@@ -130,6 +130,26 @@ def test_a_drive_does_not_depend_on_the_others() -> None:
     for i, lane_drive in enumerate(drives):
         assert_same_bits(together[i], backwards[i])
         assert_same_bits(together[i], simulate_drives([lane_drive])[0])
+
+
+def test_a_long_drive_comes_in_blocks_that_fit_together() -> None:
+    """Side by side with short ones, whose lanes are taken again in the middle of a block."""
+    on = circle(50.0, 15.0)
+    laps = 1.2 * kernel.BLOCK * 0.01 * 15.0 / on.length_m
+    long, short = LaneDrive(SEDAN, on, 1.0, laps), LaneDrive(SEDAN, on, 0.9, 3.0)
+    blocks = [
+        (len(block.channels["vx_mps"]), block.last)
+        for block in simulate_blocks([short, long, short])
+        if block.drive == 1
+    ]
+    assert [last for _, last in blocks] == [False, True]
+    assert blocks[0][0] == kernel.BLOCK
+    truth = simulate_drives([short, long, *[short] * 20])[1]
+    assert len(truth.vx_mps) == sum(samples for samples, _ in blocks)
+    assert_same_bits(truth, simulate_drives([long])[0])
+    border = slice(kernel.BLOCK - 3, kernel.BLOCK + 3)
+    heading_rate = np.diff(truth.station_m)[border] % on.length_m / 0.5
+    np.testing.assert_allclose(heading_rate, heading_rate.mean(), rtol=1e-3)
 
 
 def test_a_drive_does_not_depend_on_threads() -> None:
