@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import date, timedelta
+from functools import cached_property
 from itertools import groupby
 from operator import itemgetter
 from typing import Annotated, Self
@@ -54,7 +55,7 @@ class DriveSpec:
         """The speed profile of the track within the limits, before the speed factor."""
         return speed_profile(self.track, self.limits, ROAD_SPACING_M)
 
-    @property
+    @cached_property
     def expected_rows(self) -> int:
         """Rows of the drive if the car holds its target speed."""
         time_s = self.profile.time_s(self.laps) / self.speed_factor
@@ -74,7 +75,7 @@ class Batch:
     index: int
     drives: tuple[DriveSpec, ...]
 
-    @property
+    @cached_property
     def digest(self) -> str:
         """SHA-256 over all that determines the batch's bytes, as canonical JSON."""
         content = _BATCH.dump_python(self, mode="json")

@@ -4,11 +4,12 @@ Each batch of drives is one file and one unit of work that lands exactly once: a
 interrupted job goes on with the batches that have not landed.
 """
 
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import date
-from itertools import islice
+from itertools import islice, pairwise
 
 from deltalake.transaction import AddAction
 
@@ -25,16 +26,38 @@ Progress = Callable[[int, int], None]
 """Called with rows landed since the last call, and rows expected in all."""
 
 
-@dataclass(frozen=True)
+@dataclass
+class Seconds:
+    """Where the time went. Tasks run side by side, so that their seconds add up to more than
+    `elapsed`."""
+
+    elapsed: float = 0.0
+    simulate: float = 0.0
+    """Driving, measuring and tabulating, summed over tasks."""
+    encode: float = 0.0
+    """Parquet and its checksum, summed over tasks."""
+    write: float = 0.0
+    """Writing and flushing files, summed over tasks."""
+    commit: float = 0.0
+    """Committing to the Delta log, which the coordinator does."""
+
+    @property
+    def tasks(self) -> float:
+        """Time of all tasks."""
+        return self.simulate + self.encode + self.write
+
+
+@dataclass
 class SimulationReport:
     """What a run of the job did."""
 
-    batches_written: int
-    batches_present: int
-    drives: int
-    rows: int
-    size_bytes: int
-    logs_version: int | None
+    batches_written: int = 0
+    batches_present: int = 0
+    drives: int = 0
+    rows: int = 0
+    size_bytes: int = 0
+    logs_version: int | None = None
+    seconds: Seconds = field(default_factory=Seconds)
 
     @property
     def changed(self) -> bool:
@@ -47,6 +70,9 @@ class _Written:
     batch: Batch
     action: AddAction
     rows: int
+    simulate_s: float
+    encode_s: float
+    write_s: float
 
 
 def simulate_campaign(
@@ -56,9 +82,19 @@ def simulate_campaign(
     executor: Executor,
     progress: Progress = lambda _rows, _all: None,
 ) -> SimulationReport:
-    """Simulate what has not landed of the given days of a campaign; see `simulate_batches`."""
-    batches = [batch for day in days for batch in campaign.batches(day)]
-    return simulate_batches(warehouse, batches, executor, progress)
+    """Simulate what has not landed of the given days of a campaign, and land each batch.
+
+    A day is planned when its turn comes: a plan of years takes no time before the first row and no
+    memory. Raises like `simulate_batches`.
+    """
+    snapshot = warehouse.logs.snapshot()
+    days = tuple(days)
+    begun = [day for day in days if snapshot.landed(unit_name(campaign.name, day, 0)) is not None]
+    for day in begun:  # before anything is written, so that a changed campaign is refused
+        for batch in campaign.batches(day):
+            has_landed(snapshot, batch)
+    plan = (campaign.batches(day) for day in days)
+    return _simulate(warehouse, plan, len(days), executor, progress)
 
 
 def simulate_batches(
@@ -73,29 +109,74 @@ def simulate_batches(
     `StorageError` if the warehouse cannot be written.
     """
     snapshot = warehouse.logs.snapshot()
-    missing = [batch for batch in batches if not has_landed(snapshot, batch)]
-    expected = sum(drive.expected_rows for batch in missing for drive in batch.drives)
-    progress(0, expected)
-    written: list[_Written] = []
-    for result in _in_flight(warehouse, missing, executor):
+    for batch in batches:
+        has_landed(snapshot, batch)
+    return _simulate(warehouse, [batches], 1, executor, progress)
+
+
+def _simulate(
+    warehouse: Warehouse,
+    plan: Iterable[Sequence[Batch]],
+    days: int,
+    executor: Executor,
+    progress: Progress,
+) -> SimulationReport:
+    start = time.perf_counter()
+    backlog = _Backlog(warehouse.logs.snapshot(), plan, days)
+    report = SimulationReport()
+    for result in _in_flight(warehouse, backlog, executor):
+        before_s = time.perf_counter()
         if _land(warehouse, result):
-            written.append(result)
-        progress(result.rows, expected)
-    return SimulationReport(
-        batches_written=len(written),
-        batches_present=len(batches) - len(missing),
-        drives=sum(len(result.batch.drives) for result in written),
-        rows=sum(result.rows for result in written),
-        size_bytes=sum(result.action.size for result in written),
-        logs_version=warehouse.logs.snapshot().version,
-    )
+            _count(report, result)
+        report.seconds.commit += time.perf_counter() - before_s
+        progress(result.rows, backlog.expected_rows)
+    report.batches_present = backlog.present
+    report.logs_version = warehouse.logs.snapshot().version
+    report.seconds.elapsed = time.perf_counter() - start
+    return report
+
+
+def _count(report: SimulationReport, result: _Written) -> None:
+    report.batches_written += 1
+    report.drives += len(result.batch.drives)
+    report.rows += result.rows
+    report.size_bytes += result.action.size
+    report.seconds.simulate += result.simulate_s
+    report.seconds.encode += result.encode_s
+    report.seconds.write += result.write_s
+
+
+class _Backlog:
+    """Batches that have not landed, planned day by day as they are asked for."""
+
+    def __init__(self, snapshot: Snapshot, plan: Iterable[Sequence[Batch]], days: int) -> None:
+        """Take what has landed, the batches of each day, and how many days there are."""
+        self._snapshot = snapshot
+        self._plan = plan
+        self._days = days
+        self._days_planned = 0
+        self._rows = 0
+        self.present = 0
+
+    @property
+    def expected_rows(self) -> int:
+        """Rows to simulate; those of days not planned yet are taken to be like the others'."""
+        return self._rows * self._days // max(self._days_planned, 1)
+
+    def __iter__(self) -> Iterator[Batch]:
+        """Yield the batches in order."""
+        for batches in self._plan:
+            missing = [batch for batch in batches if not has_landed(self._snapshot, batch)]
+            self.present += len(batches) - len(missing)
+            self._days_planned += 1
+            self._rows += sum(drive.expected_rows for batch in missing for drive in batch.drives)
+            yield from missing
 
 
 def has_landed(snapshot: Snapshot, batch: Batch) -> bool:
     """Whether a batch is in the logs. Raises `RefusedError` if another batch has its place."""
-    unit = unit_of(batch)
-    landed = snapshot.landed(unit.name)
-    if landed is not None and landed != unit.version:
+    landed = snapshot.landed(unit_name(batch.campaign, batch.day, batch.index))
+    if landed is not None and landed != unit_of(batch).version:
         raise RefusedError(
             f"{batch.day}: the campaign {batch.campaign!r} was changed since this day was "
             "simulated, and logs are never replaced. Give the changed campaign another name, or "
@@ -106,9 +187,13 @@ def has_landed(snapshot: Snapshot, batch: Batch) -> bool:
 
 def unit_of(batch: Batch) -> Unit:
     """Return the unit of work that lands a batch; its version is from the batch's content."""
-    return Unit(
-        f"simulate/{batch.campaign}/{batch.day}/{batch.index}", int(batch.digest[:15], base=16)
-    )
+    name = unit_name(batch.campaign, batch.day, batch.index)
+    return Unit(name, int(batch.digest[:15], base=16))
+
+
+def unit_name(campaign: str, day: date, index: int) -> str:
+    """Return the name of the unit of work that lands a day's batch of an index."""
+    return f"simulate/{campaign}/{day}/{index}"
 
 
 def _in_flight(
@@ -132,9 +217,15 @@ def _in_flight(
 
 
 def _write(warehouse: Warehouse, batch: Batch) -> _Written:
+    times = [time.perf_counter()]
     rows = simulate_batch(batch)
-    action = warehouse.logs.write_file(file_name(batch), rows, batch.day)
-    return _Written(batch, action, rows.num_rows)
+    times.append(time.perf_counter())
+    content = warehouse.logs.encode(rows)
+    times.append(time.perf_counter())
+    action = warehouse.logs.put(file_name(batch), content, batch.day)
+    times.append(time.perf_counter())
+    simulate_s, encode_s, write_s = (b - a for a, b in pairwise(times))
+    return _Written(batch, action, rows.num_rows, simulate_s, encode_s, write_s)
 
 
 def file_name(batch: Batch) -> str:

@@ -82,9 +82,10 @@ def _pass(
     count = len(cap)
     first = np.argmin(cap) if periodic else 0
     squared = cap.copy()
-    for i in range(1, count):
-        before = squared[(first + i - 1) % count]
-        at = (first + i) % count
+    at = first
+    for _ in range(1, count):
+        before = squared[at]
+        at = at + 1 if at + 1 < count else 0
         if before < cap[at]:
             k2 = load[at] ** 2
             root = gain * np.sqrt(1 + k2 * (gain**2 - before**2))

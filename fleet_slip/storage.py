@@ -123,6 +123,15 @@ class Change:
 
 
 @dataclass(frozen=True)
+class Encoded:
+    """The content of a Parquet file, its checksum, and its statistics for the Delta log."""
+
+    content: pa.Buffer
+    checksum: str
+    statistics: str
+
+
+@dataclass(frozen=True)
 class Table:
     """A Delta table below a data root."""
 
@@ -168,13 +177,17 @@ class Table:
             return pq.read_metadata(file)
 
     def write_file(self, name: str, rows: pa.Table, day: date | None = None) -> AddAction:
-        """Write rows to the file NAME-CHECKSUM.parquet, durably.
+        """Write rows to the file NAME-CHECKSUM.parquet, durably; see `put`."""
+        return self.put(name, self.encode(rows), day)
+
+    def put(self, name: str, encoded: Encoded, day: date | None = None) -> AddAction:
+        """Write a file's content to the file NAME-CHECKSUM.parquet, durably.
 
         Returns the action that adds it to the table; it is not part of the table before that is
         committed. A file of that name left by an interrupted run is replaced.
         """
-        content = self._encoded(rows)
-        path = _file_path(name, content, day)
+        content = encoded.content
+        path = _file_path(name, encoded, day)
         self.folder.put(path, content)
         return AddAction(
             path=path,
@@ -182,14 +195,15 @@ class Table:
             partition_values={"day": day.isoformat()} if day else {},
             modification_time=_now_ms(),
             data_change=True,
-            stats=json.dumps(_statistics(rows)),
+            stats=encoded.statistics,
         )
 
     def path_of(self, name: str, rows: pa.Table, day: date | None = None) -> str:
         """Return the path below the table that `write_file` gives to rows."""
-        return _file_path(name, self._encoded(rows), day)
+        return _file_path(name, self.encode(rows), day)
 
-    def _encoded(self, rows: pa.Table) -> pa.Buffer:
+    def encode(self, rows: pa.Table) -> Encoded:
+        """Return the content of a file with these rows."""
         stored = rows.drop_columns(
             [name for name in self.partition_by if name in rows.schema.names]
         )
@@ -201,7 +215,8 @@ class Table:
             write_batch_size=WRITE_BATCH_ROWS,
             **self.encoding.options(),
         )
-        return sink.getvalue()
+        content = sink.getvalue()
+        return Encoded(content, checksum_of(content), json.dumps(_statistics(rows)))
 
 
 @dataclass(frozen=True)
@@ -323,9 +338,9 @@ def checksum_in(path: str) -> str | None:
     return found[1] if found else None
 
 
-def _file_path(name: str, content: pa.Buffer, day: date | None) -> str:
+def _file_path(name: str, encoded: Encoded, day: date | None) -> str:
     folder = f"day={day.isoformat()}/" if day else ""
-    return f"{folder}{name}-{checksum_of(content)}.parquet"
+    return f"{folder}{name}-{encoded.checksum}.parquet"
 
 
 def _create(table: Table) -> DeltaTable:

@@ -96,6 +96,11 @@ class Track(Config):
         """Stations of the segments' ends, from 0 to the length of the track."""
         return np.concatenate([[0.0], np.cumsum([s.length_m for s in self.segments])])
 
+    @cached_property
+    def _curvature_at_knots_1pm(self) -> NDArray[np.float64]:
+        first = [segment.curvature_1pm[0] for segment in self.segments]
+        return np.array([*first, self.segments[-1].curvature_1pm[1]])
+
     @property
     def length_m(self) -> float:
         """Length of the centre line, in m."""
@@ -109,9 +114,7 @@ class Track(Config):
         station = np.asarray(station_m, dtype=np.float64)
         if self.closed:
             station = np.mod(station, self.length_m)
-        at_knots = [s.curvature_1pm[0] for s in self.segments]
-        at_knots.append(self.segments[-1].curvature_1pm[1])
-        return np.interp(station, self._knots_m, at_knots)
+        return np.interp(station, self._knots_m, self._curvature_at_knots_1pm)
 
     def grid(self, spacing_m: float) -> tuple[NDArray[np.float64], float]:
         """Return evenly spaced stations in m and their spacing, as near `spacing_m` as fits.

@@ -113,8 +113,26 @@ def simulate(
             f"{plan.name}: {report.drives} drives, {report.rows:,} rows in "
             f"{report.batches_written} files, {report.size_bytes / report.rows:.1f} bytes a row"
         )
+        say(_where_the_time_went(report))
     else:
         say(f"{plan.name}: nothing to do, all {report.batches_present} files are there")
+
+
+def _where_the_time_went(report: "SimulationReport") -> str:
+    seconds = report.seconds
+    shares = ", ".join(
+        f"{name} {spent / seconds.tasks:.0%}"
+        for name, spent in (
+            ("simulate", seconds.simulate),
+            ("encode", seconds.encode),
+            ("write", seconds.write),
+        )
+    )
+    return (
+        f"{seconds.elapsed:.1f} s, {report.rows / seconds.elapsed:,.0f} rows/s: "
+        f"{seconds.tasks / seconds.elapsed:.1f} workers busy ({shares}), commits "
+        f"{seconds.commit:.1f} s"
+    )
 
 
 @recorded
