@@ -24,7 +24,9 @@ def campaign(**changes: object) -> Campaign:
 
 def run(root: Path, plan: Campaign, progress: Callable[[int, int], None]) -> SimulationReport:
     with ThreadPoolExecutor(2) as executor:
-        return simulate_campaign(Warehouse(LocalFolder(root)), plan, plan.days(), executor, progress)
+        return simulate_campaign(
+            Warehouse(LocalFolder(root)), plan, plan.days(), executor, progress
+        )
 
 
 def test_days_are_planned_while_others_are_simulated(
