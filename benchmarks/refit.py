@@ -1,0 +1,60 @@
+"""Times the refit of a cohort inside a running process, as a service or a notebook would do it.
+
+    python -m benchmarks.refit ROOT CONDITION
+
+Prints JSON: milliseconds, the median of several after one to warm up, of reading the cohort's Gram
+rows from disk and fitting one model; of the fit alone; and of a whole selection.
+"""
+
+import json
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from fleet_slip.cohort import load_cohort
+from fleet_slip.model_list import load_model_list
+from fleet_slip.regression.exact import fit
+from fleet_slip.selection import select
+from fleet_slip.signals import catalogue
+from fleet_slip.warehouse import Warehouse
+
+ROUNDS = 7
+MODELS = load_model_list("table1")
+INPUTS = MODELS.model[1].signals
+
+
+def median_ms(function: Callable[[], Any]) -> float:
+    """Return the median time of a call after the first, in ms."""
+    function()
+    times = []
+    for _ in range(ROUNDS):
+        started = time.perf_counter()
+        function()
+        times.append(time.perf_counter() - started)
+    return 1e3 * statistics.median(times)
+
+
+def main(root: str, condition: str) -> None:
+    warehouse = Warehouse(Path(root))
+    label = catalogue().label
+    cohort = load_cohort(warehouse, condition)
+
+    def fitted_from_disk() -> None:
+        fit(load_cohort(warehouse, condition).serving(INPUTS).table.total(), INPUTS, label)
+
+    figures = {
+        "gram_rows": len(cohort.drives),
+        "read_and_fit_ms": median_ms(fitted_from_disk),
+        "fit_ms": median_ms(lambda: fit(cohort.serving(INPUTS).table.total(), INPUTS, label)),
+        "select_ms": median_ms(
+            lambda: select(load_cohort(warehouse, condition), MODELS.model, MODELS.folds)
+        ),
+    }
+    print(json.dumps(figures))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
