@@ -33,7 +33,7 @@ SLACK_BYTES = 2 * 2**30
 REWRITTEN_SHARE = 0.1
 """More than the share of the files that forgetting one of 300 cars writes again."""
 
-PROGRAM = (sys.executable, "-c", "from fleet_slip.cli.main import main; main()")
+PROGRAM = (str(Path(sys.executable).with_name("fleet-slip")),)
 
 
 @dataclass

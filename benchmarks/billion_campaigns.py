@@ -22,7 +22,7 @@ ROWS_PER_FILE = 1_100_000
 DAYS_MAX = 100
 LAPS = 5.0
 DRIVES_MIN = 4
-PROBED_DRIVES = 200
+PROBED_DRIVES = 2000
 NEW_SHARE = 0.01
 """A new day brings so much of the rows that are there."""
 
@@ -70,11 +70,12 @@ def _sized(name: str, first_day: date, days: int, rows: int) -> Sized:
 
 
 def _mean_rows(sized: Sized) -> float:
-    campaign = _loaded(sized)
+    campaign = sized_campaign(sized)
     return float(np.mean([drive.expected_rows for drive in campaign.drives(campaign.first_day)]))
 
 
-def _loaded(sized: Sized) -> Campaign:
+def sized_campaign(sized: Sized) -> Campaign:
+    """Return the campaign itself."""
     return load_campaign(SHIPPED).model_copy(
         update={
             "name": sized.name,

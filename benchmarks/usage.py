@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,18 +32,15 @@ class Usage:
     output: str
 
 
-def measured(command: Sequence[str], environment: Mapping[str, str] | None = None) -> Usage:
-    """Run a command to its end. Raises `RuntimeError` with what it said if it fails."""
+def measured(command: Sequence[str], answers: Collection[int] = (0,)) -> Usage:
+    """Run a command to its end.
+
+    Raises `RuntimeError` with what it said if its exit code is not among the answers.
+    """
     with tempfile.NamedTemporaryFile() as answer:
         launcher = [sys.executable, "-I", "-S", __file__, answer.name, *command]
-        done = subprocess.run(
-            launcher,
-            capture_output=True,
-            text=True,
-            check=False,
-            env=None if environment is None else {**os.environ, **environment},
-        )
-        if done.returncode:
+        done = subprocess.run(launcher, capture_output=True, text=True, check=False)
+        if done.returncode not in answers:
             raise RuntimeError(f"{' '.join(command)} failed: {done.stderr.strip()[-2000:]}")
         return Usage(**json.loads(Path(answer.name).read_text("ascii")), output=done.stdout)
 

@@ -1,0 +1,193 @@
+"""What each command costs as a warehouse's history grows: files, Gram rows, versions, runs ...
+
+    python -m benchmarks.growth --root FOLDER [--part files gram-rows ...] [--sizes 1e3 1e4]
+
+Every command runs in a process of its own. Prints a Markdown table for each part: seconds at each
+size, the slope between the two largest, and the peak memory at the largest. A command that does
+not need what grows should have a slope near 0; none should have more than 1.
+"""
+
+import argparse
+import json
+import math
+import shutil
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+from benchmarks import growth_history as history
+from benchmarks.billion import PROGRAM
+from benchmarks.billion_campaigns import Sized, write
+from benchmarks.usage import Usage, measured
+from fleet_slip.campaign import load_campaign
+from fleet_slip.warehouse import Warehouse
+
+MODEL = "growth"
+BASE_FILES = 10
+BASE_GRAMS = 100
+
+GRAM = ("gram",)
+SELECT = ("select",)
+COHORT = ("select", "--cohort", "adhesion < 0.8")
+PUBLISH = ("publish", MODEL)
+STATUS = ("status",)
+MODELS = ("models",)
+SHOW = ("show", MODEL)
+MONITOR = ("monitor", MODEL, "--since", "2020-01-06")
+QUALITY = ("quality",)
+COUNT_GRAMS = ("sql", "SELECT count(*) FROM grams")
+COUNT_MODELS = ("sql", "SELECT count(*) FROM models")
+COUNT_RUNS = ("sql", "SELECT count(*) FROM runs")
+ONE_DAY = ("sql", "SELECT count(*) FROM log_counts WHERE day = DATE '2020-01-02'")
+LAND = ("simulate", "smoke", "--days", "1")
+FORGET = ("forget", "--vehicle", "car-00000003", "--now")
+VERIFY = ("verify",)
+
+Command = tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Part:
+    """One thing that grows.
+
+    Attributes:
+        make: fills a data root with so many.
+        sizes: how many.
+        commands: what is measured, in this order, on the same root.
+    """
+
+    make: Callable[[Path, int], None]
+    sizes: tuple[int, ...]
+    commands: tuple[Command, ...]
+
+
+def files(root: Path, count: int) -> None:
+    history.write_fleet(Warehouse(root), count)
+
+
+def gram_rows(root: Path, count: int) -> None:
+    history.write_fleet(Warehouse(root), max(BASE_FILES, min(1000, count // 1000)), count)
+
+
+def base(root: Path) -> None:
+    history.write_fleet(Warehouse(root), BASE_FILES, BASE_GRAMS)
+
+
+def versions(root: Path, count: int) -> None:
+    base(root)
+    command(root, PUBLISH)
+    history.write_versions(root, MODEL, count)
+
+
+def runs(root: Path, count: int) -> None:
+    base(root)
+    history.write_runs(root, count)
+
+
+def commits(root: Path, count: int) -> None:
+    base(root)
+    history.write_commits(Warehouse(root), count)
+
+
+def campaign_file(root: Path, days: int) -> str:
+    sized = Sized("growth_days", date(2000, 1, 1), days, 4, 1.0)
+    return str(write(sized, root.parent))
+
+
+def days(root: Path, count: int) -> None:
+    base(root)
+    history.land_campaign(Warehouse(root), load_campaign(campaign_file(root, count)))
+
+
+EVERY_NIGHT = (LAND, GRAM, SELECT, PUBLISH, STATUS)
+PARTS = {
+    "files": Part(
+        files,
+        (1000, 10_000, 100_000),
+        (
+            *(PUBLISH, GRAM, SELECT, STATUS, MONITOR, QUALITY, COUNT_GRAMS, COUNT_RUNS, ONE_DAY),
+            *(LAND, GRAM, FORGET),
+        ),
+    ),
+    "gram-rows": Part(
+        gram_rows,
+        (10_000, 100_000, 1_000_000),
+        (PUBLISH, GRAM, SELECT, COHORT, STATUS, MONITOR, QUALITY, COUNT_GRAMS, LAND, GRAM),
+    ),
+    "versions": Part(
+        versions,
+        (1000, 10_000, 100_000),
+        (MODELS, SHOW, SELECT, PUBLISH, STATUS, COUNT_GRAMS, COUNT_MODELS),
+    ),
+    "runs": Part(runs, (10_000, 100_000, 1_000_000), (GRAM, STATUS, COUNT_GRAMS, COUNT_RUNS)),
+    "commits": Part(commits, (1000, 10_000, 100_000), EVERY_NIGHT),
+    "days": Part(days, (100, 1000, 10_000), (("simulate", "growth_days.toml"), STATUS)),
+}
+
+
+def command(root: Path, arguments: Sequence[str]) -> Usage:
+    """Run a command; an alarm (exit code 10) is an answer, too."""
+    shown = [str(root.parent / a) if a.endswith(".toml") else a for a in arguments]
+    return measured([*PROGRAM, "--root", str(root), *shown, "--json"], answers=(0, 10))
+
+
+def grow(name: str, sizes: Sequence[int], folder: Path) -> dict[str, Any]:
+    """Measure every command of a part at every size."""
+    part = PARTS[name]
+    found: dict[str, list[dict[str, float]]] = {}
+    for size in sizes:
+        root = folder / f"{name}-{size}" / "data"
+        root.mkdir(parents=True)
+        part.make(root, size)
+        seen: dict[str, int] = {}
+        for arguments in part.commands:
+            usage = command(root, arguments)
+            text = " ".join(arguments)
+            seen[text] = seen.get(text, 0) + 1
+            text += " (again)" * (seen[text] - 1)
+            found.setdefault(text, []).append(
+                {"seconds": usage.seconds, "peak_bytes": usage.peak_bytes}
+            )
+            print(f"{name} {size:>9,}  {text:<70} {usage.seconds:8.2f} s", file=sys.stderr)
+        shutil.rmtree(root.parent)
+    return {"sizes": list(sizes), "commands": found}
+
+
+def markdown(name: str, part: dict[str, Any]) -> str:
+    """Return a part's figures as a Markdown table."""
+    sizes = part["sizes"]
+    head = [name, *(f"{n:,}" for n in sizes), "slope", "peak MiB"]
+    lines = [" | ".join(head), " | ".join(["---", *["---:"] * (len(head) - 1)])]
+    for text, figures in part["commands"].items():
+        seconds = [figure["seconds"] for figure in figures]
+        cells = [f"`{text}`", *(f"{s:.2f}" for s in seconds)]
+        rise = math.nan
+        if len(sizes) > 1:
+            rise = math.log(seconds[-1] / seconds[-2]) / math.log(sizes[-1] / sizes[-2])
+        cells += [f"{rise:.2f}", f"{figures[-1]['peak_bytes'] / 2**20:,.0f}"]
+        lines.append(" | ".join(cells))
+    return "\n".join(f"| {line} |" for line in lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--root", type=Path, default=Path("data-growth"), help="where to work")
+    parser.add_argument("--part", nargs="*", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--sizes", type=float, nargs="*", help="default: those of the part")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
+    options = parser.parse_args()
+    found = {}
+    for name in options.part:
+        sizes = [round(s) for s in options.sizes] if options.sizes else PARTS[name].sizes
+        found[name] = grow(name, sizes, options.root)
+        if not options.json:
+            print(markdown(name, found[name]) + "\n", flush=True)
+    if options.json:
+        print(json.dumps(found, indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,295 @@
+"""Makes the long histories that `benchmarks.growth` measures: real tables and documents, quickly.
+
+Drives are a few dozen rows of Gaussian signals, some of them many times over (weights), so that
+Gram rows have the size of real ones; each Gram row is computed from its rows, exactly. Files are
+written in the encoding of the warehouse and committed through it, without waiting for the disk.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, date, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from deltalake.transaction import AddAction
+from numpy.typing import NDArray
+
+from fleet_slip.campaign import Campaign
+from fleet_slip.features import PLAIN, features
+from fleet_slip.gram_job import unit_name
+from fleet_slip.signals import catalogue
+from fleet_slip.simulation_job import unit_of
+from fleet_slip.storage import Change, Unit, checksum_of
+from fleet_slip.warehouse import Warehouse
+
+SIGNALS = catalogue().gram_signals
+INPUTS = len(catalogue().inputs)
+ROWS = 32
+WEIGHT = 6000
+CHUNK = 50_000
+FIRST_DAY = date(2020, 1, 1)
+FILES_PER_DAY = 100
+
+
+@dataclass(frozen=True)
+class Drives:
+    """Consecutive drives: their number, the counts of their rows, and how often each row stands.
+
+    Attributes:
+        numbers: shape (drives,).
+        counts: shape (drives, ROWS, signals).
+        weights: shape (drives, ROWS).
+    """
+
+    numbers: NDArray[np.int64]
+    counts: NDArray[np.int64]
+    weights: NDArray[np.int64]
+
+    @classmethod
+    def drawn(cls, first: int, count: int, weight: int) -> "Drives":
+        """Draw drives; with `weight` above 1 each row stands up to so many times."""
+        rng = np.random.default_rng([first, count])
+        inputs = rng.normal(0, 700, (count, ROWS, INPUTS))
+        label = inputs @ np.linspace(-0.2, 0.2, INPUTS) + rng.normal(0, 20, (count, ROWS))
+        counts = np.concatenate([inputs, label[..., None]], axis=2).round().astype(np.int64)
+        weights = rng.integers(1, weight + 1, (count, ROWS))
+        return cls(np.arange(first, first + count), counts, weights)
+
+    def metadata(self, rows_each: int = 1) -> dict[str, pa.Array]:
+        """Return the columns of drive metadata, each value so many times."""
+        tens = (self.numbers * 7919 % 97) / 97
+        values: dict[str, Sequence[Any]] = {
+            "drive_id": [f"drive-{i:09d}" for i in self.numbers],
+            "vehicle_id": [f"car-{i:08d}" for i in self.numbers],
+            "vehicle_model": [f"model_{i % 4}" for i in self.numbers],
+            "source": ["simulated"] * len(self.numbers),
+            "campaign": ["growth"] * len(self.numbers),
+            "track": [f"track_{i % 2}" for i in self.numbers],
+            "mass_kg": (1200 + 600 * tens).tolist(),
+            "adhesion": (0.6 + 0.4 * tens).tolist(),
+            "speed_factor": (0.75 + 0.25 * tens).tolist(),
+            "saturated": [0] * len(self.numbers),
+        }
+        schema = catalogue().drive_schema
+        columns = {
+            field.name: pa.array(
+                values.get(field.name, [None] * len(self.numbers)), type=field.type
+            )
+            for field in schema
+        }
+        at = pa.array(np.repeat(np.arange(len(self.numbers)), rows_each))
+        return {name: column.take(at) for name, column in columns.items()}
+
+    def grams(self, warehouse: Warehouse, files: Sequence[str], days: Sequence[date]) -> pa.Table:
+        """Return the drives' Gram rows, which came from the log files given for each drive."""
+        sums = np.einsum("dr,dri->di", self.weights, self.counts)
+        weighted = self.counts * self.weights[..., None]
+        matrices = np.matmul(weighted.transpose(0, 2, 1), self.counts)
+        row, column = np.tril_indices(len(SIGNALS))
+        products = matrices[:, row, column]
+        count = len(self.numbers)
+        columns = self.metadata() | {
+            "feature_set": pa.repeat(features().identity(PLAIN), count),
+            "file": pa.array(files),
+            "day": pa.array(days),
+            "part": pa.nulls(count, pa.string()),
+            "signals": pa.repeat(",".join(SIGNALS), count),
+            "n": pa.array(self.weights.sum(axis=1)),
+            "clipped": pa.repeat(0, count),
+            "sums": _lists(sums),
+            "products": _lists(products),
+        }
+        schema = warehouse.grams.schema
+        return pa.table(
+            {name: columns[name].cast(schema.field(name).type) for name in schema.names}
+        )
+
+    def log(self, warehouse: Warehouse) -> pa.Table:
+        """Return the drives' rows as a log file has them; other signals are absent."""
+        count = len(self.numbers)
+        columns = self.metadata(ROWS) | {
+            "tick": pa.array(np.tile(np.arange(ROWS, dtype=np.int32), count))
+        }
+        for i, name in enumerate(SIGNALS):
+            columns[name] = pa.array(self.counts[:, :, i].reshape(-1).astype(np.int16))
+        names = [name for name in warehouse.logs.schema.names if name != "day"]
+        missing = pa.nulls(count * ROWS, pa.int16())
+        return pa.table({name: columns.get(name, missing) for name in names})
+
+
+def _lists(values: NDArray[np.int64]) -> pa.Array:
+    offsets = np.arange(0, values.size + 1, values.shape[1], dtype=np.int32)
+    return pa.ListArray.from_arrays(pa.array(offsets), pa.array(values.reshape(-1)))
+
+
+def day_of(file: int) -> date:
+    """Return the day of a log file by its number."""
+    return FIRST_DAY + timedelta(days=file // FILES_PER_DAY)
+
+
+def write_logs(warehouse: Warehouse, files: int, *, real: int | None = None) -> list[str]:
+    """Commit log files of one drive each; return their paths. With `real`, only so many exist."""
+    actions = []
+    template = b""
+    for number in range(files):
+        if real is None or number < real:
+            rows = Drives.drawn(number, 1, 1).log(warehouse)
+            sink = pa.BufferOutputStream()
+            pq.write_table(rows, sink, **warehouse.logs.encoding.options())
+            template = sink.getvalue().to_pybytes()
+            stats = _stats(rows)
+        name = f"growth-{number:07d}-{checksum_of(template)}.parquet"
+        path = f"day={day_of(number)}/{name}"
+        if real is None or number < real:
+            target = warehouse.root / "logs" / path
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(template)
+        actions.append(_action(path, len(template), stats, day_of(number)))
+    snapshot = warehouse.logs.snapshot()
+    snapshot.commit(Change(add=actions, note={"job": "growth"}))
+    _checkpoint(warehouse)
+    return [action.path for action in actions]
+
+
+def write_grams(warehouse: Warehouse, paths: Sequence[str], rows: int, weight: int = 1) -> None:
+    """Commit Gram rows, evenly of the log files, through the writer of the warehouse."""
+    actions = []
+    for first in range(0, rows, CHUNK):
+        drives = Drives.drawn(first, min(CHUNK, rows - first), weight)
+        files = (drives.numbers * len(paths) // rows).tolist()
+        table = drives.grams(warehouse, [paths[f] for f in files], [day_of(f) for f in files])
+        actions.append(warehouse.grams.write_file(f"growth-{first:09d}", table))
+    identity = features().identity(PLAIN)
+    unit = Unit(unit_name(identity), warehouse.logs.snapshot().version or 0)
+    warehouse.grams.snapshot().commit(Change(add=actions, units=[unit]))
+
+
+def write_fleet(warehouse: Warehouse, files: int, grams: int | None = None) -> None:
+    """Write log files, and a Gram row of each, or as many Gram rows as given."""
+    paths = write_logs(warehouse, files)
+    if grams is None:  # the very rows of the log files, so that they agree
+        parts = [
+            Drives.drawn(i, 1, 1).grams(warehouse, [path], [day_of(i)])
+            for i, path in enumerate(paths)
+        ]
+        action = warehouse.grams.write_file("growth", pa.concat_tables(parts))
+        unit = Unit(unit_name(features().identity(PLAIN)), warehouse.logs.snapshot().version or 0)
+        warehouse.grams.snapshot().commit(Change(add=[action], units=[unit]))
+    else:
+        write_grams(warehouse, paths, grams, WEIGHT)
+
+
+def write_commits(warehouse: Warehouse, commits: int) -> None:
+    """Let the Delta log of the logs have so many commits, each of a unit of work of its own."""
+    snapshot = warehouse.logs.snapshot()
+    folder = warehouse.root / "logs" / "_delta_log"
+    first = (snapshot.version or 0) + 1
+    for number in range(first, first + commits):
+        lines = [
+            {"txn": {"appId": f"simulate/growth/{number}", "version": number}},
+            {"commitInfo": {"timestamp": _now_ms(), "operation": "WRITE"}},
+        ]
+        text = "\n".join(json.dumps(line) for line in lines)
+        (folder / f"{number:020}.json").write_text(text, encoding="ascii")
+    _checkpoint(warehouse)
+
+
+def write_versions(root: Path, name: str, versions: int) -> None:
+    """Repeat the first version of a model and the first move of its alias so many times."""
+    for kind, number in (("versions", "trained_on"), ("history", "version")):
+        folder = root / "models" / name / kind
+        first = json.loads((folder / "1.json").read_text("utf-8"))["content"]
+        for i in range(2, versions + 1):
+            content = dict(first)
+            if kind == "versions":
+                content[number] = {**content[number], "grams_version": i % 2}
+            else:
+                content[number] = i
+            (folder / f"{i}.json").write_text(_document(content), encoding="utf-8")
+
+
+def write_runs(root: Path, runs: int) -> None:
+    """Write the history of so many nightly runs: two lines each, a file a month."""
+    folder = root / "runs"
+    folder.mkdir(exist_ok=True)
+    for month, numbers in _months(runs):
+        lines = []
+        for i in numbers:
+            at = datetime(2000, 1, 1, tzinfo=UTC) + timedelta(hours=i)
+            run = f"{at:%Y%m%dT%H%M%SZ}-{i:08x}"
+            begun: dict[str, Any] = {
+                "run_id": run,
+                "command": "gram",
+                "arguments": ["gram"],
+                "host": "growth",
+            }
+            begun |= {"started_at": at.isoformat(), "process": 1, "package_version": "0.1.0"}
+            ended: dict[str, Any] = {
+                "run_id": run,
+                "ended_at": at.isoformat(),
+                "seconds": 1.5,
+                "outcome": "done",
+            }
+            step = {"name": "gram", "seconds": 1.0, "rows": 1000, "size_bytes": None}
+            ended |= {"exit_code": 0, "error": None, "steps": [step]}
+            lines += [json.dumps(begun), json.dumps(ended)]
+        (folder / f"{month}.jsonl").write_text("\n".join(lines) + "\n", encoding="ascii")
+
+
+def _months(runs: int) -> Iterator[tuple[str, range]]:
+    first = 0
+    while first < runs:
+        start = datetime(2000, 1, 1, tzinfo=UTC) + timedelta(hours=first)
+        end = datetime(start.year + start.month // 12, start.month % 12 + 1, 1, tzinfo=UTC)
+        last = min(runs, first + int((end - start) / timedelta(hours=1)))
+        yield f"{start:%Y-%m}", range(first, last)
+        first = last
+
+
+def land_campaign(warehouse: Warehouse, campaign: Campaign) -> None:
+    """Commit every file of a campaign as landed, without simulating it."""
+    batches = [batch for day in campaign.days() for batch in campaign.batches(day)]
+    stats = _stats(Drives.drawn(0, 1, 1).log(warehouse))
+    actions = [
+        _action(f"day={b.day}/{b.campaign}-{b.index:04d}-{'0' * 32}.parquet", 4000, stats, b.day)
+        for b in batches
+    ]
+    units = [unit_of(batch) for batch in batches]
+    warehouse.logs.snapshot().commit(Change(add=actions, units=units))
+
+
+def _stats(rows: pa.Table) -> str:
+    nulls = {name: rows[name].null_count for name in rows.schema.names} | {"day": 0}
+    return json.dumps({"numRecords": rows.num_rows, "nullCount": nulls})
+
+
+def _action(path: str, size_bytes: int, stats: str, day: date) -> AddAction:
+    return AddAction(
+        path=path,
+        size=size_bytes,
+        partition_values={"day": day.isoformat()},
+        modification_time=_now_ms(),
+        data_change=True,
+        stats=stats,
+    )
+
+
+def _checkpoint(warehouse: Warehouse) -> None:
+    delta = warehouse.logs.snapshot().delta
+    assert delta is not None
+    delta.create_checkpoint()
+
+
+def _document(content: Mapping[str, Any]) -> str:
+    canonical = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
+    document = {"content": content, "sha256": hashlib.sha256(canonical.encode()).hexdigest()}
+    return json.dumps(document, indent=1, ensure_ascii=False) + "\n"
+
+
+def _now_ms() -> int:
+    return int(datetime.now(UTC).timestamp() * 1000)
