@@ -27,6 +27,7 @@ from fleet_slip.warehouse import Warehouse
 
 MODEL = "growth"
 BASE_FILES = 10
+GRAM_FILES = 1000
 BASE_GRAMS = 100
 
 GRAM = ("gram",)
@@ -69,7 +70,7 @@ def files(root: Path, count: int) -> None:
 
 
 def gram_rows(root: Path, count: int) -> None:
-    history.write_fleet(Warehouse(root), max(BASE_FILES, min(1000, count // 1000)), count)
+    history.write_fleet(Warehouse(root), GRAM_FILES, count)
 
 
 def base(root: Path) -> None:

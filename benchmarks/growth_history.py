@@ -33,7 +33,7 @@ ROWS = 32
 WEIGHT = 6000
 CHUNK = 50_000
 FIRST_DAY = date(2020, 1, 1)
-FILES_PER_DAY = 100
+FILES_PER_DAY = 20
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """Cohorts: the Gram rows of the drives that satisfy an SQL condition."""
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -112,7 +113,7 @@ class Cohort:
         made none.
         """
         if by == ROW_FOLDS:
-            self._require_row_folds(count)
+            require_row_folds(self.feature_set, count)
         values = self.drives[FOLD_KEYS[by]].to_pylist()
         return CohortFolds.of(self.tables, assign(values, by, count), self.drive_numbers)
 
@@ -153,24 +154,31 @@ class Cohort:
 
     def gram_condition(self, inputs: Sequence[str]) -> str:
         """Return the SQL condition on the view `grams` of the rows that a model is made of."""
-        wanted = ", ".join(f"'{name}'" for name in [*inputs, catalogue().label])
-        return (
-            f"feature_set = '{features().identity(self.feature_set)}' AND ({self.condition}) AND "
-            f"list_has_all(string_split(signals, ','), [{wanted}])"
-        )
+        return gram_condition(self.condition, self.feature_set, inputs)
 
-    def _require_row_folds(self, count: int) -> None:
-        made = features().set(self.feature_set).row_folds
-        if made is None:
-            known = ", ".join(name for name, one in features().sets.items() if one.row_folds)
-            raise SelectionError(
-                f"the Gram rows of the feature set {self.feature_set} are of whole drives: folds "
-                f"of rows are made when the logs are read. Feature sets that make them: {known}."
-            )
-        if count > made:
-            raise SelectionError(
-                f"the feature set {self.feature_set} made {made} folds of rows; choose no more."
-            )
+
+def gram_condition(condition: str, feature_set: str, inputs: Sequence[str]) -> str:
+    """Return the SQL condition on the view `grams` of a cohort's rows that have some inputs."""
+    wanted = ", ".join(f"'{name}'" for name in [*inputs, catalogue().label])
+    return (
+        f"feature_set = '{features().identity(feature_set)}' AND ({condition}) AND "
+        f"list_has_all(string_split(signals, ','), [{wanted}])"
+    )
+
+
+def require_row_folds(feature_set: str, count: int) -> None:
+    """Raise `SelectionError` if a feature set has not made so many folds of rows."""
+    made = features().set(feature_set).row_folds
+    if made is None:
+        known = ", ".join(name for name, one in features().sets.items() if one.row_folds)
+        raise SelectionError(
+            f"the Gram rows of the feature set {feature_set} are of whole drives: folds of rows "
+            f"are made when the logs are read. Feature sets that make them: {known}."
+        )
+    if count > made:
+        raise SelectionError(
+            f"the feature set {feature_set} made {made} folds of rows; choose no more."
+        )
 
 
 def assign(values: Sequence[Any], by: str, count: int) -> Assignment:
@@ -191,6 +199,46 @@ def load_cohort(
     feature set has not been computed for all logs; `RefusedError` if a drive of an evaluation
     scenario satisfies it.
     """
+    with open_grams(warehouse, condition, feature_set) as opened:
+        statement = opened.statement("cohort.sql", condition)
+        with database_errors(f"the cohort {condition!r}"):
+            rows = opened.database.sql(statement).to_arrow_table()
+        if not rows.num_rows:
+            raise nothing(opened.database, condition)
+    require_training(rows["source"].unique().to_pylist(), condition)
+    tables = tuple(
+        gram_table(signals, rows.filter(pc.equal(rows["signals"], signals)))
+        for signals in rows["signals"].unique().to_pylist()
+    )
+    return Cohort(
+        condition=condition,
+        tables=tables,
+        drives=rows.drop_columns(["sums", "products"]),
+        logs_version=opened.logs_version,
+        grams_version=opened.grams_version,
+        feature_set=feature_set,
+    )
+
+
+@dataclass(frozen=True)
+class OpenedGrams:
+    """A connection to the Gram rows of a feature set, and what stood in the warehouse then."""
+
+    database: duckdb.DuckDBPyConnection
+    identity: str
+    logs_version: int
+    grams_version: int
+
+    def statement(self, name: str, condition: str) -> str:
+        """Return a statement of `jobs/` for a condition. Raises `SelectionError`."""
+        text = read_sql("jobs", name).format(condition=condition, feature_set=self.identity)
+        with database_errors(f"the cohort {condition!r}"):
+            return one_query(self.database, text)
+
+
+@contextlib.contextmanager
+def open_grams(warehouse: Warehouse, condition: str, feature_set: str) -> Iterator[OpenedGrams]:
+    """Open what a cohort's condition may ask for. Raises like `load_cohort`."""
     logs, grams = warehouse.logs.snapshot(), warehouse.grams.snapshot()
     if not grams.rows:
         raise SelectionError(
@@ -200,27 +248,17 @@ def load_cohort(
     identity = features().identity(feature_set)
     if feature_set != PLAIN:
         _require_complete(logs, grams, feature_set, identity)
-    with connect(warehouse.root) as database:
-        rows = _query(database, condition, identity)
-        if not rows.num_rows:
-            raise SelectionError(_nothing(database, condition))
-    if SCENARIO in rows["source"].unique().to_pylist():
+    with connect(warehouse.root, query=f"FROM grams WHERE {condition}") as database:
+        yield OpenedGrams(database, identity, logs.version or 0, grams.version or 0)
+
+
+def require_training(sources: Iterable[str], condition: str) -> None:
+    """Raise `RefusedError` if drives of a scenario are among those of a condition."""
+    if SCENARIO in sources:
         raise RefusedError(
             f"the cohort {condition!r} has drives of evaluation scenarios, which no model may be "
             f"trained on. Add to the condition: AND {TRAINING_DRIVES}"
         )
-    tables = tuple(
-        _gram_table(signals, rows.filter(pc.equal(rows["signals"], signals)))
-        for signals in rows["signals"].unique().to_pylist()
-    )
-    return Cohort(
-        condition=condition,
-        tables=tables,
-        drives=rows.drop_columns(["sums", "products"]),
-        logs_version=logs.version or 0,
-        grams_version=grams.version or 0,
-        feature_set=feature_set,
-    )
 
 
 def _require_complete(logs: Snapshot, grams: Snapshot, feature_set: str, identity: str) -> None:
@@ -233,13 +271,8 @@ def _require_complete(logs: Snapshot, grams: Snapshot, feature_set: str, identit
         )
 
 
-def _query(database: duckdb.DuckDBPyConnection, condition: str, identity: str) -> pa.Table:
-    statement = read_sql("jobs", "cohort.sql").format(condition=condition, feature_set=identity)
-    with database_errors(f"the cohort {condition!r}"):
-        return database.sql(one_query(database, statement)).to_arrow_table()
-
-
-def _gram_table(signals: str, rows: pa.Table) -> GramTable:
+def gram_table(signals: str, rows: pa.Table) -> GramTable:
+    """Return Gram rows, all of the same signals, as arrays."""
     names = tuple(signals.split(","))
     k = len(names)
     return GramTable(
@@ -255,12 +288,13 @@ def _matrix(lists: pa.ChunkedArray, width: int) -> NDArray[np.int64]:
     return values.reshape(-1, width)
 
 
-def _nothing(database: duckdb.DuckDBPyConnection, condition: str) -> str:
+def nothing(database: duckdb.DuckDBPyConnection, condition: str) -> SelectionError:
+    """Return the error that no drive satisfies a condition."""
     examples = database.execute(
         "SELECT string_agg(DISTINCT source, ', '), string_agg(DISTINCT campaign, ', ') FROM grams"
     ).fetchone()
     sources, campaigns = examples or ("", "")
-    return (
+    return SelectionError(
         f"no drive satisfies the cohort condition {condition!r}. The warehouse has sources "
         f"{sources} and campaigns {campaigns}. See the columns with: "
         'fleet-slip sql "DESCRIBE drives"'

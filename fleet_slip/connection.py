@@ -1,5 +1,6 @@
 """A DuckDB connection on the warehouse: views in SI units over one snapshot of its tables."""
 
+import re
 from collections.abc import Mapping
 from os import environ
 from pathlib import Path
@@ -22,6 +23,14 @@ from fleet_slip.warehouse import Warehouse
 
 VIEWS = ("log_counts", "log", "grams", "drives", "quarantine", "runs")
 """In the order of their dependence; each is a file in `warehouse/`."""
+
+VIEWS_ON_VIEWS = {"log": {"log_counts"}, "drives": {"log_counts", "grams"}}
+STORED_IN = {"log_counts": "logs", "grams": "grams", "quarantine": "quarantine"}
+TABLES = frozenset({*VIEWS, "models", "dictionary"})
+
+_ABOUT_ALL_TABLES = re.compile(
+    r"duckdb_|information_schema|pragma_|pg_|sqlite_|\b(?:show|tables|databases|dictionary)\b", re.I
+)
 
 DEFAULT_ROOT = Path("data")
 ROOT_VARIABLE = "FLEET_SLIP_ROOT"
@@ -46,13 +55,18 @@ def data_root(root: Folder | Path | str | None = None) -> Folder:
 
 
 def connect(
-    root: Folder | Path | str | None = None, *, threads: int | None = None, locked: bool = True
+    root: Folder | Path | str | None = None,
+    *,
+    threads: int | None = None,
+    locked: bool = True,
+    query: str | None = None,
 ) -> duckdb.DuckDBPyConnection:
     """Return a DuckDB connection with the views of the warehouse at `root`.
 
     `log` (SI units), `log_counts`, `drives`, `grams`, `models`, `quarantine`, `runs` and
     `dictionary`, which documents every column. The connection sees one snapshot; connect again to
-    see later commits.
+    see later commits. With a `query`, only the views that it names are there: opening the logs
+    takes longer the more files there are, and so does reading every model version.
 
     Locked, it can open the files of the snapshot and no others, and its settings cannot be
     changed. DuckDB knows no right to read without the right to write: run SQL of others through
@@ -60,28 +74,45 @@ def connect(
     """
     warehouse = Warehouse(data_root(root))
     database = open_database(threads=threads, reading=warehouse.root, spill=True)
-    columns = _generated_columns(warehouse.catalogue)
-    logs, grams = warehouse.logs.snapshot(), warehouse.grams.snapshot()
-    quarantine = warehouse.quarantine.snapshot()
-    stored = {
-        "stored_logs": _source(database, logs, "log_files"),
-        "stored_grams": _source(database, grams, "gram_files"),
-        "stored_quarantine": _source(database, quarantine, "quarantine_files"),
-        "stored_runs": run_source(database, warehouse.root),
+    wanted = TABLES if query is None else tables_in(query)
+    stored = {name: STORED_IN[name] for name in wanted & STORED_IN.keys()}
+    snapshots = {name: getattr(warehouse, table).snapshot() for name, table in stored.items()}
+    sources = {
+        f"stored_{stored[name]}": _source(database, snapshot)
+        for name, snapshot in snapshots.items()
     }
+    paths = [path for snapshot in snapshots.values() for path in snapshot.paths]
+    if "runs" in wanted:
+        sources["stored_runs"] = run_source(database, warehouse.root)
+        paths += run_files(warehouse.root)
+    columns = _generated_columns(warehouse.catalogue)
     with database_errors(f"opening the warehouse {warehouse.root}"):
         for view in VIEWS:
-            database.execute(read_sql("warehouse", f"{view}.sql").format(**columns, **stored))
-    _add_table(database, "models", Registry(warehouse.root / "models").as_table())
-    _add_table(database, "dictionary", _dictionary(database, warehouse.catalogue))
+            if view in wanted:
+                database.execute(read_sql("warehouse", f"{view}.sql").format(**columns, **sources))
+    if "models" in wanted:
+        _add_table(database, "models", Registry(warehouse.root / "models").as_table())
+    if "dictionary" in wanted:
+        _add_table(database, "dictionary", _dictionary(database, warehouse.catalogue))
     if locked:
-        paths = [*logs.paths, *grams.paths, *quarantine.paths, *run_files(warehouse.root)]
         _lock(database, paths)
     return database
 
 
-def _source(database: duckdb.DuckDBPyConnection, snapshot: Snapshot, variable: str) -> str:
+def tables_in(query: str) -> frozenset[str]:
+    """Return the tables and views that a query may need: those whose name occurs in it as a word.
+
+    And what these are made of. All, if it names none, or asks about tables.
+    """
+    named = {name for name in TABLES if re.search(rf"\b{name}\b", query, re.I)}
+    if not named or _ABOUT_ALL_TABLES.search(query):
+        return TABLES
+    return frozenset(named.union(*(VIEWS_ON_VIEWS.get(name, ()) for name in named)))
+
+
+def _source(database: duckdb.DuckDBPyConnection, snapshot: Snapshot) -> str:
     """Return what stands after FROM for a stored table, empty ones included."""
+    variable = f"{snapshot.table.folder.name.removesuffix('s')}_files"
     database.execute(f"SET VARIABLE {variable} = $paths", {"paths": snapshot.paths})
     if snapshot.paths:
         rows = read_sql("warehouse", f"stored_{snapshot.table.folder.name}.sql").replace("{{", "{")

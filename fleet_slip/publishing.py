@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from fractions import Fraction
 from importlib.metadata import version as package_version
+from typing import Any
 
 from fleet_slip.errors import RefusedError, SelectionError
 from fleet_slip.features import features
@@ -31,7 +32,9 @@ class Publication:
     reason: str
 
 
-def manifest_of(selection: Selection, name: str, model_list: str, config_sha256: str) -> Manifest:
+def manifest_of(
+    selection: Selection[Any], name: str, model_list: str, config_sha256: str
+) -> Manifest:
     """Describe the winner of a selection as a manifest."""
     signals = catalogue()
     winner = selection.winner.model
@@ -81,7 +84,7 @@ def _term(name: str, coefficient: Fraction) -> ModelTerm:
 
 
 def publish(
-    registry: Registry, manifest: Manifest, selection: Selection, *, force: bool = False
+    registry: Registry, manifest: Manifest, selection: Selection[Any], *, force: bool = False
 ) -> Publication:
     """Make the winner the next version and champion of its model.
 
@@ -109,7 +112,7 @@ def publish(
     return Publication(registry.publish(manifest), True, f"It has a {comparison}.")
 
 
-def _revalidate(champion: ModelVersion, selection: Selection) -> CrossValidation:
+def _revalidate(champion: ModelVersion, selection: Selection[Any]) -> CrossValidation:
     folds = selection.cohort.folds(selection.folds.by, selection.folds.count)
     try:
         _require_same_features(champion)
@@ -129,7 +132,7 @@ def _require_same_features(champion: ModelVersion) -> None:
             raise SelectionError(f"its feature {name} is not defined as it was then.")
 
 
-def _cross_validated(winner: CrossValidation, selection: Selection) -> CrossValidated:
+def _cross_validated(winner: CrossValidation, selection: Selection[Any]) -> CrossValidated:
     figures = winner.pooled
     return CrossValidated(
         folds_by=selection.folds.by,

@@ -69,8 +69,9 @@ def _rows(manifest: Manifest) -> str:
 
 def score(warehouse: Warehouse, manifest: Manifest, condition: str) -> Score:
     """Score a model. Raises `SelectionError` if the cohort has no row with its signals."""
-    with connect(warehouse.root) as database:
-        statement = one_query(database, score_statement(manifest, condition))
+    text = score_statement(manifest, condition)
+    with connect(warehouse.root, query=text) as database:
+        statement = one_query(database, text)
         with database_errors(f"scoring on the cohort {condition!r}"):
             result = database.execute(statement)
             names = [column[0] for column in result.description or ()]

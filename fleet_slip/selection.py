@@ -2,7 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Generic
+
+from typing_extensions import TypeVar
 
 from fleet_slip.cohort import ROW_FOLDS, Cohort
 from fleet_slip.errors import SelectionError
@@ -13,15 +15,18 @@ from fleet_slip.regression.crossval import CrossValidation, cross_validate_input
 from fleet_slip.regression.folds import CohortFolds
 from fleet_slip.regression.winner import Winner, choose
 from fleet_slip.signals import catalogue
+from fleet_slip.summed_cohort import SummedCohort
 from fleet_slip.uncertainty import Uncertainty
+
+AnyCohort = TypeVar("AnyCohort", bound=Cohort | SummedCohort, default=Cohort)
 
 
 @dataclass(frozen=True)
-class Selection:
+class Selection(Generic[AnyCohort]):
     """All candidates with their figures, in the order of the list, and the winner.
 
     Attributes:
-        cohort: the Gram rows.
+        cohort: the Gram rows, or their sums.
         folds: how they were divided.
         models: the candidates that the cohort can serve, cross-validated.
         winner: the chosen one and why.
@@ -30,7 +35,7 @@ class Selection:
         uncertainty: how sure the winner's figures are, if that was asked for.
     """
 
-    cohort: Cohort
+    cohort: AnyCohort
     folds: FoldPlan
     models: tuple[CrossValidation, ...]
     winner: Winner
@@ -65,7 +70,9 @@ class Selection:
         return document
 
 
-def select(cohort: Cohort, candidates: Sequence[CandidateModel], folds: FoldPlan) -> Selection:
+def select(
+    cohort: AnyCohort, candidates: Sequence[CandidateModel], folds: FoldPlan
+) -> Selection[AnyCohort]:
     """Cross-validate each candidate and choose the winner.
 
     A candidate that needs signals which no drive of the cohort has, or whose signals are linearly

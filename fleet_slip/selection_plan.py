@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from fleet_slip.cohort import ROW_FOLDS, TRAINING_DRIVES, Cohort, load_cohort
 from fleet_slip.documents import canonical_json
@@ -19,6 +20,7 @@ from fleet_slip.model_list import (
 from fleet_slip.ordered_selection import check_criterion, select_ranked, select_subsets
 from fleet_slip.regression.selection import Rule
 from fleet_slip.selection import Selection, select
+from fleet_slip.summed_cohort import SummedCohort, sum_cohort
 from fleet_slip.uncertainty import uncertainty
 from fleet_slip.warehouse import Warehouse
 
@@ -62,12 +64,17 @@ class SelectionPlan:
         """Whether inputs are ranked or searched, rather than given models compared."""
         return bool(self.rank or self.criterion or self.all_subsets or self.naive)
 
+    @property
+    def resampled(self) -> bool:
+        """Whether the winner's figures are resampled."""
+        return bool(self.bootstrap or self.repeat)
+
 
 @dataclass(frozen=True)
 class PlannedSelection:
     """A selection, what it was made from, and a checksum of that."""
 
-    selection: Selection
+    selection: Selection[Any]
     label: str
     config_sha256: str
 
@@ -85,21 +92,21 @@ def run_plan(warehouse: Warehouse, plan: SelectionPlan) -> PlannedSelection:
     name = plan.models or (None if plan.nested or plan.ordered else DEFAULT_MODELS)
     model_list = load_model_list(name) if name else None
     folds = _fold_plan(plan, model_list)
-    cohort = load_cohort(warehouse, plan.cohort, _feature_set(plan, model_list))
-    if plan.ordered:
-        planned = _ordered(cohort, plan, folds)
-    else:
-        planned = _listed(cohort, plan, model_list, folds)
-    if plan.bootstrap or plan.repeat:
-        figures = uncertainty(
-            cohort,
-            planned.selection.winner.model,
-            folds,
-            bootstrap=plan.bootstrap,
-            repeat=plan.repeat,
+    feature_set = _feature_set(plan, model_list)
+    if not plan.ordered and not plan.resampled:
+        return _listed(
+            sum_cohort(warehouse, folds, plan.cohort, feature_set), plan, model_list, folds
         )
-        planned = replace(planned, selection=replace(planned.selection, uncertainty=figures))
-    return planned
+    cohort = load_cohort(warehouse, plan.cohort, feature_set)
+    planned = (
+        _ordered(cohort, plan, folds) if plan.ordered else _listed(cohort, plan, model_list, folds)
+    )
+    if not plan.resampled:
+        return planned
+    figures = uncertainty(
+        cohort, planned.selection.winner.model, folds, bootstrap=plan.bootstrap, repeat=plan.repeat
+    )
+    return replace(planned, selection=replace(planned.selection, uncertainty=figures))
 
 
 def _fold_plan(plan: SelectionPlan, model_list: ModelList | None) -> FoldPlan:
@@ -115,7 +122,10 @@ def _feature_set(plan: SelectionPlan, model_list: ModelList | None) -> str:
 
 
 def _listed(
-    cohort: Cohort, plan: SelectionPlan, model_list: ModelList | None, folds: FoldPlan
+    cohort: Cohort | SummedCohort,
+    plan: SelectionPlan,
+    model_list: ModelList | None,
+    folds: FoldPlan,
 ) -> PlannedSelection:
     listed = model_list.model if model_list else ()
     nested = nested_models(inputs_of(cohort, plan.nested)) if plan.nested else ()
@@ -154,7 +164,7 @@ def _ordered(cohort: Cohort, plan: SelectionPlan, folds: FoldPlan) -> PlannedSel
     )
 
 
-def inputs_of(cohort: Cohort, order: str) -> tuple[str, ...]:
+def inputs_of(cohort: Cohort | SummedCohort, order: str) -> tuple[str, ...]:
     """Return an order of inputs from text, `catalogue` meaning all that the cohort has.
 
     Raises `ConfigError` for an unknown input, or one that stands twice.

@@ -48,7 +48,7 @@ def sql(
     else.
     """
     text = _read_stdin() if query == "-" else query
-    with connect(context.obj.root, locked=not unsafe) as database:
+    with connect(context.obj.root, locked=not unsafe, query=text) as database:
         _answer(database, text if unsafe else one_query(database, text), json=json, csv=csv)
 
 

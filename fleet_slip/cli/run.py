@@ -97,7 +97,7 @@ def _publish(
 
 def _print_summary(
     summary: dict[str, Any],
-    selection: Selection,
+    selection: Selection[Any],
     publication: Publication | None,
     refusal: str,
 ) -> None:

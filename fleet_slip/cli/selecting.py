@@ -1,7 +1,7 @@
 """Selecting: the command select, its options, and how a selection is printed."""
 
 from collections.abc import Iterator, Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -147,7 +147,7 @@ def select(
         print_selection(selection)
 
 
-def print_selection(selection: Selection) -> None:
+def print_selection(selection: Selection[Any]) -> None:
     """Print the table of a selection, the winner and why, and how sure that is."""
     where = selection.cohort.condition
     # The signals of an order or of subsets stand in the table above it.

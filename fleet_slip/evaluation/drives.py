@@ -82,7 +82,10 @@ def load_drives(warehouse: Warehouse, scenarios: Sequence[Scenario]) -> tuple[Dr
         columns=",\n    ".join(signals[name].column for name in names), source=SCENARIO
     )
     drives = sorted({scenario.drive_id for scenario in scenarios})
-    with connect(warehouse.root) as database, database_errors("reading the drives of scenarios"):
+    with (
+        connect(warehouse.root, query=statement) as database,
+        database_errors("reading the drives of scenarios"),
+    ):
         rows = database.sql(statement, params={"drives": drives}).to_arrow_table()
     return tuple(_drive(scenario, rows) for scenario in scenarios)
 

@@ -19,10 +19,14 @@ from fleet_slip.errors import SelectionError
 from fleet_slip.gram import Gram, GramTable, IntArray, positions
 
 
+def hash_number(key: str) -> int:
+    """Return a key's number below 2^64, the same on every machine and for ever."""
+    return int.from_bytes(hashlib.sha256(key.encode("utf-8")).digest()[:8], "big")
+
+
 def hash_fold(key: str, count: int) -> int:
-    """Return the fold 0..count-1 of a key, the same on every machine and for ever."""
-    digest = hashlib.sha256(key.encode("utf-8")).digest()
-    return int.from_bytes(digest[:8], "big") % count
+    """Return the fold 0..count-1 of a key."""
+    return hash_number(key) % count
 
 
 @dataclass(frozen=True)
