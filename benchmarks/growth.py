@@ -23,6 +23,7 @@ from benchmarks.billion import PROGRAM
 from benchmarks.billion_campaigns import Sized, write
 from benchmarks.usage import Usage, measured
 from fleet_slip.campaign import load_campaign
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.warehouse import Warehouse
 
 MODEL = "growth"
@@ -66,15 +67,15 @@ class Part:
 
 
 def files(root: Path, count: int) -> None:
-    history.write_fleet(Warehouse(root), count)
+    history.write_fleet(Warehouse(LocalFolder(root)), count)
 
 
 def gram_rows(root: Path, count: int) -> None:
-    history.write_fleet(Warehouse(root), GRAM_FILES, count)
+    history.write_fleet(Warehouse(LocalFolder(root)), GRAM_FILES, count)
 
 
 def base(root: Path) -> None:
-    history.write_fleet(Warehouse(root), BASE_FILES, BASE_GRAMS)
+    history.write_fleet(Warehouse(LocalFolder(root)), BASE_FILES, BASE_GRAMS)
 
 
 def versions(root: Path, count: int) -> None:
@@ -90,7 +91,7 @@ def runs(root: Path, count: int) -> None:
 
 def commits(root: Path, count: int) -> None:
     base(root)
-    history.write_commits(Warehouse(root), count)
+    history.write_commits(Warehouse(LocalFolder(root)), count)
 
 
 def campaign_file(root: Path, days: int) -> str:
@@ -100,7 +101,7 @@ def campaign_file(root: Path, days: int) -> str:
 
 def days(root: Path, count: int) -> None:
     base(root)
-    history.land_campaign(Warehouse(root), load_campaign(campaign_file(root, count)))
+    history.land_campaign(Warehouse(LocalFolder(root)), load_campaign(campaign_file(root, count)))
 
 
 EVERY_NIGHT = (LAND, GRAM, SELECT, PUBLISH, STATUS)

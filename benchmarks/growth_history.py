@@ -146,7 +146,7 @@ def write_logs(warehouse: Warehouse, files: int, *, real: int | None = None) -> 
         name = f"growth-{number:07d}-{checksum_of(template)}.parquet"
         path = f"day={day_of(number)}/{name}"
         if real is None or number < real:
-            target = warehouse.root / "logs" / path
+            target = Path(warehouse.logs.uri(path))
             target.parent.mkdir(parents=True, exist_ok=True)
             target.write_bytes(template)
         actions.append(_action(path, len(template), stats, day_of(number)))
@@ -187,7 +187,7 @@ def write_fleet(warehouse: Warehouse, files: int, grams: int | None = None) -> N
 def write_commits(warehouse: Warehouse, commits: int) -> None:
     """Let the Delta log of the logs have so many commits, each of a unit of work of its own."""
     snapshot = warehouse.logs.snapshot()
-    folder = warehouse.root / "logs" / "_delta_log"
+    folder = Path(warehouse.logs.uri("_delta_log"))
     first = (snapshot.version or 0) + 1
     for number in range(first, first + commits):
         lines = [

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from fleet_slip.cohort import load_cohort
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.model_list import load_model_list
 from fleet_slip.regression.exact import fit
 from fleet_slip.selection import select
@@ -38,7 +39,7 @@ def median_ms(function: Callable[[], Any]) -> float:
 
 
 def main(root: str, condition: str) -> None:
-    warehouse = Warehouse(Path(root))
+    warehouse = Warehouse(LocalFolder(Path(root)))
     label = catalogue().label
     cohort = load_cohort(warehouse, condition)
 

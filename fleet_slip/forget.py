@@ -8,7 +8,6 @@ in one commit; the Gram rows follow by reconciliation. `fleet_slip/audit.py` is 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
-import duckdb
 import pyarrow as pa
 import pyarrow.compute as pc
 
@@ -19,7 +18,7 @@ from fleet_slip.errors import FleetSlipError, SelectionError
 from fleet_slip.gram_job import reconcile
 from fleet_slip.old_files import quarantined_of, remove_old_files
 from fleet_slip.reading_query import one_query
-from fleet_slip.registry import Registry
+from fleet_slip.registry import Registry, TrainedOn
 from fleet_slip.resources import read_sql
 from fleet_slip.rewriting import read_drives
 from fleet_slip.storage import Change, Snapshot, retried
@@ -168,36 +167,80 @@ def models_trained_on(warehouse: Warehouse, drives: Collection[str]) -> list[str
     is damaged, the version counts as trained on them.
     """
     registry = Registry(warehouse.root / "models")
-    marked = []
-    with connect(warehouse.root) as database:
-        for name in registry.names():
-            for number in registry.versions(name):
-                try:
-                    trained = registry.load(name, number).manifest.trained_on
-                    drives_of_cohort = _in_cohort(database, trained.cohort, drives)
-                    concerned = _were_there(warehouse, trained.grams_version, drives_of_cohort)
-                except FleetSlipError:
-                    concerned = True
-                if concerned:
-                    marked.append(f"{name}@{number}")
-    return marked
+    versions = {
+        f"{name}@{number}": _trained_on(registry, name, number)
+        for name in registry.names()
+        for number in registry.versions(name)
+    }
+    cohorts = {trained.cohort for trained in versions.values() if trained}
+    chosen = _in_cohorts(warehouse, cohorts, drives)
+    seen = _Seen(warehouse, drives)
+    return [
+        reference
+        for reference, trained in versions.items()
+        if trained is None or seen.any(chosen[trained.cohort], trained.grams_version)
+    ]
 
 
-def _in_cohort(
-    database: duckdb.DuckDBPyConnection, cohort: str, drives: Collection[str]
-) -> set[str]:
-    statement = f"SELECT DISTINCT drive_id FROM grams WHERE ({cohort}\n)"
-    with database_errors(f"the cohort {cohort!r}"):
-        rows = database.execute(one_query(database, statement)).fetchall()
-    return {row[0] for row in rows}.intersection(drives)
+def _trained_on(registry: Registry, name: str, number: int) -> TrainedOn | None:
+    try:
+        return registry.load(name, number).manifest.trained_on
+    except FleetSlipError:
+        return None
 
 
-def _were_there(warehouse: Warehouse, version: int, drives: Collection[str]) -> bool:
-    """Whether a version of the Gram rows has one of the drives. Raises `StorageError`."""
-    if not drives:
-        return False
-    for file in warehouse.grams.snapshot(version).files:
-        ids = warehouse.grams.read(file.path, ["drive_id"])["drive_id"].cast(pa.string())
-        if not set(drives).isdisjoint(ids.unique().to_pylist()):
+def _in_cohorts(
+    warehouse: Warehouse, cohorts: Collection[str], drives: Collection[str]
+) -> dict[str, frozenset[str]]:
+    """Return which of some drives each cohort has; all, of a cohort that cannot be asked for."""
+    found = {}
+    with connect(warehouse.root, query=" ".join(["grams", *cohorts])) as database:
+        database.register(
+            "forgotten", pa.table({"drive_id": pa.array(sorted(drives), pa.string())})
+        )
+        for cohort in cohorts:
+            statement = (
+                "SELECT DISTINCT drive_id FROM grams WHERE drive_id IN (FROM forgotten) AND "
+                f"({cohort}\n)"
+            )
+            try:
+                with database_errors(f"the cohort {cohort!r}"):
+                    rows = database.execute(one_query(database, statement)).fetchall()
+                found[cohort] = frozenset(row[0] for row in rows)
+            except FleetSlipError:
+                found[cohort] = frozenset(drives)
+    return found
+
+
+class _Seen:
+    """Which of some drives the Gram rows of each version of their table have.
+
+    A file of Gram rows is read once, however many versions it is part of.
+    """
+
+    def __init__(self, warehouse: Warehouse, drives: Collection[str]) -> None:
+        self._grams = warehouse.grams
+        self._drives = frozenset(drives)
+        self._of_file: dict[str, frozenset[str]] = {}
+        self._of_version: dict[int, frozenset[str]] = {}
+
+    def any(self, drives: frozenset[str], version: int) -> bool:
+        """Whether a version has one of the drives; true where the version is gone."""
+        if not drives:
+            return False
+        try:
+            return not drives.isdisjoint(self._at(version))
+        except FleetSlipError:
             return True
-    return False
+
+    def _at(self, version: int) -> frozenset[str]:
+        if version not in self._of_version:
+            files = self._grams.snapshot(version).files
+            self._of_version[version] = frozenset().union(*(self._in(f.path) for f in files))
+        return self._of_version[version]
+
+    def _in(self, path: str) -> frozenset[str]:
+        if path not in self._of_file:
+            ids = self._grams.read(path, ["drive_id"])["drive_id"].cast(pa.string())
+            self._of_file[path] = self._drives.intersection(ids.unique().to_pylist())
+        return self._of_file[path]

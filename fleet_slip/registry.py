@@ -236,10 +236,16 @@ class Registry:
             sign(folder, version, name, loaded.sha256, self.signing_key)
 
     def _read(self, name: str, version: int) -> ModelVersion:
-        numbers = self.versions(name) if name in self.names() else []
-        if version not in numbers:
-            raise SelectionError(_unknown(name, str(version), self.names(), numbers))
-        document = self._versions(name).read(version)
+        if not _IDENTIFIER.fullmatch(name):
+            raise SelectionError(_unknown(name, str(version), self.names(), []))
+        try:
+            document = self._versions(name).read(version)
+        except StorageError:
+            # Looked up only now: a model may have very many versions.
+            numbers = self.versions(name) if name in self.names() else []
+            if version in numbers:
+                raise
+            raise SelectionError(_unknown(name, str(version), self.names(), numbers)) from None
         with _foreign_document(f"{name}@{version}: its manifest"):
             manifest = Manifest.model_validate(document.content)
         if manifest.name != name:
@@ -261,14 +267,17 @@ class Registry:
         which = which or CHAMPION
         if which.isascii() and which.isdigit() and len(which) <= MAX_DIGITS:
             return self.load(name, int(which))
-        aliases = self.aliases(name)
-        if which not in aliases:
-            raise SelectionError(_unknown(name, which, self.names(), self.versions(name), aliases))
-        return self.load(name, aliases[which])
+        version = self.pointed_at(name, which)
+        if version is None:
+            known_aliases = self.aliases(name)
+            raise SelectionError(
+                _unknown(name, which, self.names(), self.versions(name), known_aliases)
+            )
+        return self.load(name, version)
 
     def champion(self, name: str) -> ModelVersion | None:
         """Return the version in use, or None before the first."""
-        version = self.aliases(name).get(CHAMPION)
+        version = self.pointed_at(name, CHAMPION)
         return None if version is None else self.load(name, version)
 
     def publish(self, manifest: Manifest) -> ModelVersion:
@@ -293,7 +302,7 @@ class Registry:
         one `rollback`.
         """
         self.load(name, version)
-        if self.aliases(name).get(alias) != version:
+        if self.pointed_at(name, alias) != version:
             self._move(name, alias, version, "promote")
 
     def rollback(self, name: str, alias: str) -> int:
@@ -316,10 +325,27 @@ class Registry:
 
     def history(self, name: str) -> list[AliasMove]:
         """Return all moves of a model's aliases, oldest first."""
+        return list(self.latest_moves(name))[::-1]
+
+    def latest_moves(self, name: str) -> Iterator[AliasMove]:
+        """Yield the moves of a model's aliases, newest first, each read when it is asked for."""
         folder = self._history(name)
-        documents = [folder.read(number) for number in folder.numbers()]
-        with _foreign_document(f"{folder.folder}: a move of an alias"):
-            return [AliasMove.model_validate(document.content) for document in documents]
+        for number in reversed(folder.numbers()):
+            document = folder.read(number)
+            with _foreign_document(f"{folder.folder}: a move of an alias"):
+                move = AliasMove.model_validate(document.content)
+            yield move
+
+    def pointed_at(self, name: str, alias: str) -> int | None:
+        """Return the version that an alias points at, or None."""
+        moves = self.latest_moves(name)
+        return next((move.version for move in moves if move.alias == alias), None)
+
+    def published_at(self, name: str, version: int) -> datetime | None:
+        """Return when a version was published last; None if no move tells."""
+        moves = self.latest_moves(name)
+        published = (m.at for m in moves if m.version == version and m.command == "publish")
+        return next(published, None)
 
     def aliases(self, name: str) -> dict[str, int]:
         """Return each alias of a model and the version that it points at."""
@@ -331,18 +357,19 @@ class Registry:
         return pa.Table.from_pylist(rows, schema=_TABLE_SCHEMA)
 
     def _rows(self, name: str) -> list[Mapping[str, Any]]:
-        history = self.history(name)
-        aliases = self.aliases(name)
+        aliases: dict[int, list[str]] = {}
+        for alias, number in sorted(self.aliases(name).items()):
+            aliases.setdefault(number, []).append(alias)
+        published = {move.version: move.at for move in self.latest_moves(name)}
         rows: list[Mapping[str, Any]] = []
         for number in self.versions(name):
             version = self._read(name, number)
             manifest = version.manifest
-            published = [move.at for move in history if move.version == number]
             rows.append(
                 {
                     "name": name,
                     "version": number,
-                    "aliases": ",".join(sorted(a for a, v in aliases.items() if v == number)),
+                    "aliases": ",".join(aliases.get(number, [])),
                     "signals": ",".join(manifest.signals),
                     "correlation": manifest.cross_validation.correlation,
                     "rmse_deg": manifest.cross_validation.rmse_deg,
@@ -351,7 +378,7 @@ class Registry:
                     "cohort": manifest.trained_on.cohort,
                     "drives": manifest.trained_on.drives,
                     "rows": manifest.trained_on.rows,
-                    "published_at": published[0] if published else None,
+                    "published_at": published.get(number),
                     "sha256": version.sha256,
                 }
             )

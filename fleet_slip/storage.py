@@ -14,7 +14,7 @@ import json
 import random
 import re
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import date
 from functools import cached_property
@@ -92,8 +92,13 @@ class TableFile:
 
 def absent_columns(files: Iterable[TableFile], names: Iterable[str]) -> tuple[str, ...]:
     """Return the columns that none of the files has: they came to the table later."""
-    present = {name for file in files for name in file.null_counts}
-    return tuple(name for name in names if name not in present)
+    absent = dict.fromkeys(names)
+    for file in files:
+        if not absent:
+            break
+        for name in [name for name in absent if name in file.null_counts]:
+            del absent[name]
+    return tuple(absent)
 
 
 @dataclass(frozen=True)
@@ -239,8 +244,8 @@ class Snapshot:
         with storage_errors(self.table.folder):
             # pa.table() would import pandas, which takes half a second.
             stream = self.delta.get_add_actions(flatten=True)
-            actions = pa.RecordBatchReader.from_stream(stream).read_all().to_pylist()
-        files = sorted(map(_table_file, actions), key=lambda file: file.path)
+            actions = pa.RecordBatchReader.from_stream(stream).read_all().combine_chunks()
+        files = sorted(_table_files(actions), key=lambda file: file.path)
         for file in files:
             self._require_sound(file)
         return tuple(files)
@@ -369,19 +374,47 @@ def _statistics(rows: pa.Table) -> dict[str, Any]:
     return {"numRecords": rows.num_rows, "nullCount": nulls}
 
 
-def _table_file(action: Mapping[str, Any]) -> TableFile:
+class _NullCounts(Mapping[str, int]):
+    """The null counts of one file, looked up among those of all files when they are asked for.
+
+    A table may have 100,000 files, and few jobs ask for more than a few of them.
+    """
+
+    def __init__(self, columns: Mapping[str, pa.ChunkedArray], row: int) -> None:
+        self._columns = columns
+        self._row = row
+
+    def __getitem__(self, name: str) -> int:
+        count: int | None = self._columns[name][self._row].as_py()
+        if count is None:
+            raise KeyError(name)
+        return count
+
+    def __iter__(self) -> Iterator[str]:
+        return (name for name in self._columns if name in self)
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+    def __reduce__(self) -> tuple[type[dict[str, int]], tuple[dict[str, int]]]:
+        """Send another process what is of this file only."""
+        return dict, (dict(self),)
+
+
+def _table_files(actions: pa.Table) -> Iterator[TableFile]:
     prefix = "null_count."
-    return TableFile(
-        path=action["path"],
-        rows=action["num_records"],
-        size_bytes=action["size_bytes"],
-        null_counts={
-            key.removeprefix(prefix): value
-            for key, value in action.items()
-            if key.startswith(prefix) and value is not None
-        },
-        day=action.get("partition.day"),
+    nulls = {
+        name.removeprefix(prefix): actions[name]
+        for name in actions.column_names
+        if name.startswith(prefix)
+    }
+    unknown = [None] * actions.num_rows
+    columns = (
+        actions[name].to_pylist() if name in actions.column_names else unknown
+        for name in ("path", "num_records", "size_bytes", "partition.day")
     )
+    for row, (path, rows, size_bytes, day) in enumerate(zip(*columns, strict=True)):
+        yield TableFile(path, rows, size_bytes, _NullCounts(nulls, row), day)
 
 
 def _remove_action(file: TableFile, *, data_change: bool) -> RemoveAction:

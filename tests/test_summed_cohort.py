@@ -12,6 +12,7 @@ from fleet_slip.cohort import load_cohort
 from fleet_slip.connection import TABLES, connect, tables_in
 from fleet_slip.errors import FleetSlipError, SelectionError
 from fleet_slip.gram_job import update_grams
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.model_list import FoldKey, FoldPlan, load_model_list
 from fleet_slip.selection import select
 from fleet_slip.selection_plan import SelectionPlan, run_plan
@@ -25,7 +26,7 @@ MODELS = load_model_list("table1")
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Warehouse:
     """Return a warehouse of 60 drives, each of its own car, over three days."""
-    warehouse = Warehouse(tmp_path_factory.mktemp("fleet"))
+    warehouse = Warehouse(LocalFolder(tmp_path_factory.mktemp("fleet")))
     write_fleet(warehouse, 60)
     return warehouse
 
@@ -115,7 +116,7 @@ def test_a_query_opens_what_it_names(query: str, expected: set[str]) -> None:
 
 
 def test_a_query_of_gram_rows_needs_no_log_file(tmp_path: Path) -> None:
-    warehouse = Warehouse(tmp_path)
+    warehouse = Warehouse(LocalFolder(tmp_path))
     write_fleet(warehouse, 20)
     for path in warehouse.logs.snapshot().paths:
         Path(path).unlink()

@@ -192,20 +192,19 @@ def _champions(
     for name in registry.names():
         try:
             champion = registry.champion(name)
-            moves = registry.history(name)
+            published_at = registry.published_at(name, champion.version) if champion else None
         except (StorageError, RefusedError, SelectionError) as error:
             damaged.append(str(error))
             continue
         if champion is None:
             continue
         trained = champion.manifest.trained_on
-        published = [move.at for move in moves if move.version == champion.version]
         found.append(
             ChampionStatus(
                 model=name,
                 version=champion.version,
-                published_at=published[0] if published else None,
-                age_hours=_age_hours(published[0], now) if published else None,
+                published_at=published_at,
+                age_hours=_age_hours(published_at, now),
                 logs_behind=(logs.version or 0) - trained.logs_version,
                 grams_behind=(grams.version or 0) - trained.grams_version,
             )
