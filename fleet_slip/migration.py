@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from fleet_slip.errors import ConflictError, RefusedError, StorageError
 from fleet_slip.evolution import SCALE, TARGET, Evolution, evolution, scales_of
 from fleet_slip.rewriting import read_drives
+from fleet_slip.sealing import NOTE, sealed
 from fleet_slip.signals import COUNT_MAX
 from fleet_slip.storage import Snapshot, Table, TableFile
 from fleet_slip.storage_errors import storage_errors
@@ -135,7 +136,9 @@ def _rescale(table: Table, found: Evolution, progress: Progress) -> tuple[int, i
             mode="overwrite",
             schema=table.schema,
             partition_by=list(table.partition_by),
-            commit_properties=CommitProperties(custom_metadata={"fleet_slip": '{"job":"migrate"}'}),
+            commit_properties=CommitProperties(
+                custom_metadata={NOTE: sealed({"job": "migrate"}, actions, {})}
+            ),
         )
     return len(actions), before.rows
 

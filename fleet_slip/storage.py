@@ -29,6 +29,7 @@ from deltalake.transaction import AddAction, RemoveAction
 from fleet_slip.errors import ConflictError, StorageError
 from fleet_slip.evolution import require_readable, require_writable
 from fleet_slip.folder import Folder
+from fleet_slip.sealing import NOTE, sealed
 from fleet_slip.storage_errors import first_line, storage_errors
 
 ROW_GROUP_ROWS = 2**17
@@ -295,22 +296,24 @@ class Snapshot:
         both = {action.path for action in change.add} & {file.path for file in change.remove}
         with storage_errors(self.table.folder):
             delta = self.delta or _create(self.table)
+            actions: list[AddAction | RemoveAction] = [
+                *(action for action in change.add if action.path not in both),
+                *(
+                    _remove_action(file, data_change=change.data_change)
+                    for file in change.remove
+                    if file.path not in both
+                ),
+            ]
+            note = sealed(change.note, actions, {u.name: u.version for u in change.units})
             require_writable(self.table.folder, self.table.schema, delta)
             try:
                 delta.create_write_transaction(
-                    [
-                        *(action for action in change.add if action.path not in both),
-                        *(
-                            _remove_action(file, data_change=change.data_change)
-                            for file in change.remove
-                            if file.path not in both
-                        ),
-                    ],
+                    actions,
                     mode="append",
                     schema=self.table.schema,
                     partition_by=list(self.table.partition_by),
                     commit_properties=CommitProperties(
-                        custom_metadata={"fleet_slip": json.dumps(dict(change.note))},
+                        custom_metadata={NOTE: note},
                         app_transactions=[Transaction(u.name, u.version) for u in change.units],
                     ),
                 )
@@ -357,6 +360,7 @@ def _create(table: Table) -> DeltaTable:
         name=table.folder.name,
         description=table.description,
         storage_options=table.folder.delta_options,
+        commit_properties=CommitProperties(custom_metadata={NOTE: sealed({}, [], {})}),
     )
 
 

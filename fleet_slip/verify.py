@@ -19,6 +19,7 @@ from fleet_slip.documents import DocumentFolder
 from fleet_slip.errors import FleetSlipError, RefusedError, SelectionError, StorageError
 from fleet_slip.folder import Folder, StoredFile
 from fleet_slip.gram_check import DriveGrams, grams_by_blocks, read_counts, stored_grams
+from fleet_slip.log_check import log_problems
 from fleet_slip.registry import Registry
 from fleet_slip.resources import read_sql
 from fleet_slip.storage import Snapshot, Table, TableFile, checksum_in, checksum_of
@@ -103,6 +104,9 @@ def _snapshots(warehouse: Warehouse, report: Verification) -> dict[str, Snapshot
             report.findings.append(Finding("log", table.folder.name, str(error)))
         else:
             found[table.folder.name] = snapshot
+            for file, problem in log_problems(snapshot):
+                path = f"{table.folder.name}/_delta_log/{file}"
+                report.findings.append(Finding("log", path, problem))
     return found
 
 

@@ -88,8 +88,9 @@ def test_a_harmed_file_is_named_with_what_is_wrong(
 def test_a_log_of_the_table_that_tells_other_counts_is_found(filled: Warehouse) -> None:
     log = max(path_of(filled.root).glob("logs/_delta_log/*.json"))
     log.write_text(log.read_text().replace('numRecords\\": 300', 'numRecords\\": 301'))
-    (finding,) = verify(filled).damage
-    assert "has 300 rows, the Delta log says 301" in finding.problem
+    (in_log, in_file) = verify(filled).damage
+    assert "does not match the checksum" in in_log.problem
+    assert "has 300 rows, the Delta log says 301" in in_file.problem
     log.write_text(log.read_text()[:-20])
     assert ("log", "logs") in damaged(filled)
 
