@@ -68,3 +68,9 @@ class AlarmError(FleetSlipError):
     """The answer calls for attention: stale data, a failed run, a faulty sensor, drift."""
 
     exit_code = 10
+
+
+class ClusterError(FleetSlipError):
+    """The cluster cannot be reached or used, or its workers died of a task."""
+
+    exit_code = 11

@@ -7,7 +7,10 @@ interrupted runs, repeated runs, deletions and compaction.
 
 import hashlib
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
+from functools import partial
+from math import ceil
 
 import duckdb
 import pyarrow as pa
@@ -25,6 +28,7 @@ from fleet_slip.storage import (
     absent_columns,
     retried,
 )
+from fleet_slip.tasks import completed, in_flight
 from fleet_slip.warehouse import Warehouse
 
 FILES_PER_QUERY = 16
@@ -73,13 +77,15 @@ def update_grams(
     warehouse: Warehouse,
     progress: Progress = lambda _more, _all: None,
     feature_set: str = PLAIN,
+    executor: Executor | None = None,
 ) -> GramReport:
     """Bring the Gram rows of a feature set up to date. Running it again does nothing.
 
-    Raises `SelectionError` for an unknown set, `StorageError`, or `ConflictError` if other
-    processes keep changing the table.
+    An executor runs the queries elsewhere; see `aggregate`. Raises `SelectionError` for an unknown
+    set, `StorageError`, `ConflictError` if other processes keep changing the table, or
+    `ClusterError`.
     """
-    return retried(lambda: _update_once(warehouse, progress, feature_set))
+    return retried(lambda: _update_once(warehouse, progress, feature_set, executor))
 
 
 def reconcile(
@@ -99,7 +105,9 @@ def unit_name(identity: str) -> str:
     return f"gram/{identity}"
 
 
-def _update_once(warehouse: Warehouse, progress: Progress, feature_set: str) -> GramReport:
+def _update_once(
+    warehouse: Warehouse, progress: Progress, feature_set: str, executor: Executor | None
+) -> GramReport:
     # The logs are looked at last: if they lose a drive from now on, whoever removed it changes the
     # Gram rows after this snapshot of them, and this job's commit is a conflict.
     grams = warehouse.grams.snapshot()
@@ -108,7 +116,7 @@ def _update_once(warehouse: Warehouse, progress: Progress, feature_set: str) -> 
     backlog = find_backlog(logs, grams, identity)
     version, gram_rows = grams.version, grams.rows
     if backlog.missing or backlog.stale:
-        new_rows = aggregate(warehouse, backlog.missing, progress, feature_set=feature_set)
+        new_rows = aggregate(warehouse, backlog.missing, progress, None, feature_set, executor)
         replaced = _files_to_rewrite(grams, backlog.stale)
         kept = _rows_to_keep(grams, replaced, backlog.stale)
         rows = pa.concat_tables([kept, new_rows])
@@ -162,18 +170,45 @@ def aggregate(
     progress: Progress = lambda _more, _all: None,
     threads: int | None = None,
     feature_set: str = PLAIN,
+    executor: Executor | None = None,
 ) -> pa.Table:
-    """Return the Gram rows of log files, in the schema of `grams`, sorted by file and drive."""
-    parts = [warehouse.grams.schema.empty_table()]
-    total = sum(file.rows for file in files)
+    """Return the Gram rows of log files, in the schema of `grams`, sorted by file and drive.
+
+    The query runs in this process, on all of its cores unless `threads` says how many; or, with an
+    executor of other processes, as tasks of some files and one thread each.
+    """
     lagged = features().set(feature_set).lagged
     step = LAGGED_FILES_PER_QUERY if lagged else FILES_PER_QUERY
-    with open_database(reading=warehouse.logs.folder, threads=threads) as database:
-        for first in range(0, len(files), step):
-            batch = files[first : first + step]
-            parts.append(_query(database, warehouse, batch, feature_set))
-            progress(sum(file.rows for file in batch), total)
-    return pa.concat_tables(parts)
+    total = sum(file.rows for file in files)
+    parts = [warehouse.grams.schema.empty_table()]
+    if executor is None:
+        with open_database(reading=warehouse.logs.folder, threads=threads) as database:
+            for group in _groups(files, step):
+                parts.append(_query(database, warehouse, group, feature_set))
+                progress(sum(file.rows for file in group), total)
+        return pa.concat_tables(parts)
+    groups = _groups(files, min(step, max(1, ceil(len(files) / in_flight(executor)))))
+    task = partial(_aggregate_group, warehouse, feature_set)
+    done: dict[str, pa.Table] = {}
+    for group, rows in completed(executor, task, groups, _group_name):
+        done[group[0].path] = rows
+        progress(sum(file.rows for file in group), total)
+    return pa.concat_tables([*parts, *(done[group[0].path] for group in groups)])
+
+
+def _groups(files: Sequence[TableFile], step: int) -> list[Sequence[TableFile]]:
+    return [files[first : first + step] for first in range(0, len(files), step)]
+
+
+def _group_name(group: Sequence[TableFile]) -> str:
+    return f"the Gram rows of {len(group)} log files from {group[0].path}"
+
+
+def _aggregate_group(
+    warehouse: Warehouse, feature_set: str, files: Sequence[TableFile]
+) -> pa.Table:
+    with open_database(reading=warehouse.logs.folder, threads=1) as database:
+        return _query(database, warehouse, files, feature_set)
 
 
 def _query(

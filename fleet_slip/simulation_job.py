@@ -6,10 +6,11 @@ interrupted job goes on with the batches that have not landed.
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from datetime import date
-from itertools import islice, pairwise
+from functools import partial
+from itertools import pairwise
 
 from deltalake.transaction import AddAction
 
@@ -17,10 +18,8 @@ from fleet_slip.campaign import Batch, Campaign
 from fleet_slip.errors import RefusedError
 from fleet_slip.simulate import simulate_batch
 from fleet_slip.storage import Change, Snapshot, Unit, retried
+from fleet_slip.tasks import completed
 from fleet_slip.warehouse import Warehouse
-
-IN_FLIGHT = 4
-"""Batches that may be under way or done and not yet committed: bounds memory and lost work."""
 
 Progress = Callable[[int, int], None]
 """Called with rows landed since the last call, and rows expected in all."""
@@ -105,8 +104,9 @@ def simulate_batches(
 ) -> SimulationReport:
     """Simulate the batches that have not landed, and land each.
 
-    Raises `RefusedError` if a batch's place was taken by a different version of it, and
-    `StorageError` if the warehouse cannot be written.
+    Raises `RefusedError` if a batch's place was taken by a different version of it, `StorageError`
+    if the warehouse cannot be written, and `ClusterError` at the end for batches that the workers
+    of a cluster died of.
     """
     snapshot = warehouse.logs.snapshot()
     for batch in batches:
@@ -124,7 +124,7 @@ def _simulate(
     start = time.perf_counter()
     backlog = _Backlog(warehouse.logs.snapshot(), plan, days)
     report = SimulationReport()
-    for result in _in_flight(warehouse, backlog, executor):
+    for _, result in completed(executor, partial(_write, warehouse), backlog, _name):
         before_s = time.perf_counter()
         if _land(warehouse, result):
             _count(report, result)
@@ -196,24 +196,8 @@ def unit_name(campaign: str, day: date, index: int) -> str:
     return f"simulate/{campaign}/{day}/{index}"
 
 
-def _in_flight(
-    warehouse: Warehouse, batches: Iterable[Batch], executor: Executor
-) -> Iterator[_Written]:
-    """Yield batches as they are written, with a bounded number under way."""
-    waiting = iter(batches)
-    running: set[Future[_Written]] = set()
-    try:
-        while True:
-            for batch in islice(waiting, IN_FLIGHT - len(running)):
-                running.add(executor.submit(_write, warehouse, batch))
-            if not running:
-                return
-            done, running = wait(running, return_when=FIRST_COMPLETED)
-            for future in done:
-                yield future.result()
-    finally:
-        for future in running:
-            future.cancel()
+def _name(batch: Batch) -> str:
+    return f"{batch.campaign}, {batch.day}, file {batch.index}"
 
 
 def _write(warehouse: Warehouse, batch: Batch) -> _Written:

@@ -1,7 +1,6 @@
 """Commands that fill the warehouse: simulate, ingest, gram, check."""
 
-import os
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor
 from dataclasses import asdict
 from datetime import date
 from pathlib import Path
@@ -11,6 +10,7 @@ import typer
 
 from fleet_slip.cli.output import Json, print_json, print_table, progress, say
 from fleet_slip.cli.recorded import recorded
+from fleet_slip.cli.workers import Cluster, Threads, elsewhere, workers
 from fleet_slip.errors import ConfigError
 from fleet_slip.features import PLAIN, features
 from fleet_slip.gram_job import GramReport, update_grams
@@ -35,9 +35,6 @@ Through = Annotated[
 ]
 Days = Annotated[
     int | None, typer.Option(min=1, help="Simulate the first N days only. Default: all.")
-]
-Threads = Annotated[
-    int | None, typer.Option(min=1, help="Threads. The result is the same. Default: all cores.")
 ]
 
 
@@ -69,25 +66,24 @@ def _date(text: str) -> date:
 
 
 def run_simulation(
-    warehouse: Warehouse, campaign: "Campaign", days: tuple[date, ...], threads: int | None
+    warehouse: Warehouse, campaign: "Campaign", days: tuple[date, ...], executor: Executor
 ) -> "SimulationReport":
-    """Simulate with local threads and a progress bar."""
+    """Simulate with a progress bar."""
     from fleet_slip.simulation_job import simulate_campaign  # noqa: PLC0415 - the simulator
 
     with (
         step("simulate") as figures,
-        ThreadPoolExecutor(threads or os.cpu_count()) as executor,
-        progress(f"simulate {campaign.name}", "rows") as advance,
+        progress(f"simulate {campaign.name}", "rows", executor) as advance,
     ):
         report = simulate_campaign(warehouse, campaign, days, executor, advance)
         figures.rows, figures.size_bytes = report.rows, report.size_bytes
     return report
 
 
-def run_gram(warehouse: Warehouse, feature_set: str = PLAIN) -> GramReport:
+def run_gram(warehouse: Warehouse, executor: Executor, feature_set: str = PLAIN) -> GramReport:
     """Run the Gram job for a feature set with a progress bar."""
-    with step("gram") as figures, progress(f"gram {feature_set}", "rows") as advance:
-        report = update_grams(warehouse, advance, feature_set)
+    with step("gram") as figures, progress(f"gram {feature_set}", "rows", executor) as advance:
+        report = update_grams(warehouse, advance, feature_set, elsewhere(executor))
         figures.rows = report.rows_read
     return report
 
@@ -99,13 +95,16 @@ def simulate(
     days: Days = None,
     through: Through = None,
     threads: Threads = None,
+    cluster: Cluster = None,
     json: Json = False,
 ) -> None:
     """Simulate what is missing of a campaign and write it to the logs."""
     from fleet_slip.campaign import load_campaign  # noqa: PLC0415 - takes a while
 
     plan = load_campaign(campaign)
-    report = run_simulation(context.obj, plan, chosen_days(plan, days, through), threads)
+    chosen = chosen_days(plan, days, through)
+    with workers(context, cluster, threads) as (warehouse, executor):
+        report = run_simulation(warehouse, plan, chosen, executor)
     if json:
         print_json(asdict(report))
     elif report.changed:
@@ -185,6 +184,7 @@ def gram(
         ),
     ] = PLAIN,
     sql: Annotated[bool, typer.Option("--sql", help="Print the statement and do nothing.")] = False,
+    cluster: Cluster = None,
     json: Json = False,
 ) -> None:
     """Reduce new log files to Gram rows, and drop the rows of files that are gone.
@@ -197,7 +197,8 @@ def gram(
         for name in names:
             typer.echo(gram_statement(catalogue(), name))
         return
-    reports = [run_gram(context.obj, name) for name in names]
+    with workers(context, cluster) as (warehouse, executor):
+        reports = [run_gram(warehouse, executor, name) for name in names]
     if json:
         documents = [asdict(report) for report in reports]
         print_json(documents if feature_set == ALL_SETS else documents[0])

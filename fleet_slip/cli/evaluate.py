@@ -7,11 +7,11 @@ from typing import Annotated, Any
 
 import typer
 
-from fleet_slip.cli.data import Threads
 from fleet_slip.cli.models import registry_of
 from fleet_slip.cli.output import Json, print_json, print_table, progress, say, stdout
 from fleet_slip.cli.recorded import recorded
 from fleet_slip.cli.run import DEFAULT_CAMPAIGN
+from fleet_slip.cli.workers import Threads
 
 OneCar = Annotated[
     str,

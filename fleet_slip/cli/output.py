@@ -6,6 +6,7 @@ import math
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Executor
 from contextlib import contextmanager
 from decimal import Decimal
 from typing import Annotated, Any
@@ -92,6 +93,14 @@ class _Rate(ProgressColumn):
         return Text(f"{_short(speed)} {unit}/s" if speed else "")
 
 
+class _Workers(ProgressColumn):
+    """How many workers a cluster has at the moment."""
+
+    def render(self, task: Task) -> Text:
+        number = getattr(task.fields.get("executor"), "workers", None)
+        return Text("" if number is None else f"{number} workers")
+
+
 def _short(value: float) -> str:
     for limit, suffix in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
         if value >= limit:
@@ -100,10 +109,13 @@ def _short(value: float) -> str:
 
 
 @contextmanager
-def progress(doing: str, unit: str) -> Iterator[Callable[[int, int], None]]:
+def progress(
+    doing: str, unit: str, executor: Executor | None = None
+) -> Iterator[Callable[[int, int], None]]:
     """Show a bar with rate and time left on stderr while a job runs, if a person watches.
 
-    Yields the callback that jobs take: how much more is done, and how much there is in all.
+    And the number of workers, if the executor is of a cluster. Yields the callback that jobs take:
+    how much more is done, and how much there is in all.
     """
     console = stderr()
     bar = Progress(
@@ -111,6 +123,7 @@ def progress(doing: str, unit: str) -> Iterator[Callable[[int, int], None]]:
         BarColumn(),
         TextColumn("{task.percentage:>3.0f}%"),
         _Rate(),
+        _Workers(),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
         console=console,
@@ -118,7 +131,7 @@ def progress(doing: str, unit: str) -> Iterator[Callable[[int, int], None]]:
         disable=not (console.is_terminal and for_people()) or bool(os.environ.get("CI")),
     )
     with bar:
-        task = bar.add_task(doing, total=None, unit=unit)
+        task = bar.add_task(doing, total=None, unit=unit, executor=executor)
 
         def advance(more: int, total: int) -> None:
             bar.update(task, advance=more, total=total)

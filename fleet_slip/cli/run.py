@@ -7,11 +7,12 @@ from typing import Annotated, Any
 import typer
 
 from fleet_slip.audit import Audit
-from fleet_slip.cli.data import Days, Threads, Through, chosen_days, run_gram, run_simulation
+from fleet_slip.cli.data import Days, Through, chosen_days, run_gram, run_simulation
 from fleet_slip.cli.models import print_publication, published, registry_of
 from fleet_slip.cli.output import Json, print_json, say
 from fleet_slip.cli.recorded import recorded
 from fleet_slip.cli.selecting import print_selection
+from fleet_slip.cli.workers import Cluster, Threads, workers
 from fleet_slip.errors import RefusedError
 from fleet_slip.model_list import check_model_name
 from fleet_slip.operations.run_log import step
@@ -42,6 +43,7 @@ def run(
         str | None, typer.Option(help="A model list of configs/models, or a TOML file.")
     ] = None,
     threads: Threads = None,
+    cluster: Cluster = None,
     json: Json = False,
 ) -> None:
     """Do the whole job: simulate what is missing, gram, select, publish if it is not worse.
@@ -57,8 +59,9 @@ def run(
     model_name = check_model_name(name or plan.name)
     lock = f".run-{plan.name}.lock"
     with context.obj.root.exclusive(lock, lambda: say(f"{plan.name}: waiting for another run")):
-        simulation = run_simulation(context.obj, plan, chosen_days(plan, days, through), threads)
-        gram = run_gram(context.obj)
+        with workers(context, cluster, threads) as (warehouse, executor):
+            simulation = run_simulation(warehouse, plan, chosen_days(plan, days, through), executor)
+            gram = run_gram(warehouse, executor)
         condition = f"campaign = '{plan.name}'"
         with step("select"):
             planned = run_plan(context.obj, SelectionPlan(cohort=condition, models=models))

@@ -148,7 +148,7 @@ def recording(root: Folder, command: str, arguments: Sequence[str]) -> Iterator[
     begun = time.monotonic()
     token = _current.set(run)
     told = _exists(root) and _append(root, file, run.beginning())
-    _log("run started", command=command, arguments=run.shown_arguments)
+    log_event("run started", command=command, arguments=run.shown_arguments)
     error: BaseException | None = None
     try:
         yield run
@@ -157,7 +157,7 @@ def recording(root: Folder, command: str, arguments: Sequence[str]) -> Iterator[
         raise
     finally:
         end = run.end(error, time.monotonic() - begun)
-        _log("run ended", **{key: end[key] for key in ("outcome", "exit_code", "seconds")})
+        log_event("run ended", **{key: end[key] for key in ("outcome", "exit_code", "seconds")})
         if _exists(root):
             _append(root, file, *([] if told else [run.beginning()]), end)
         _current.reset(token)
@@ -175,7 +175,9 @@ def step(name: str) -> Iterator[Step]:
         one.seconds = time.monotonic() - begun
         if run:
             run.steps.append(one)
-        _log("step ended", step=name, **{k: v for k, v in one.as_dict().items() if k != "name"})
+        log_event(
+            "step ended", step=name, **{k: v for k, v in one.as_dict().items() if k != "name"}
+        )
 
 
 def run_files(root: Folder) -> list[str]:
@@ -238,12 +240,13 @@ def _append(root: Folder, file: str, *records: Mapping[str, Any]) -> bool:
     try:
         root.append(file, text.encode())
     except StorageError as error:
-        _log("run not recorded", logging.WARNING, file=f"{root}/{file}", reason=str(error))
+        log_event("run not recorded", logging.WARNING, file=f"{root}/{file}", reason=str(error))
         return False
     return True
 
 
-def _log(event: str, level: int = logging.INFO, **fields: Any) -> None:
+def log_event(event: str, level: int = logging.INFO, **fields: Any) -> None:
+    """Log what happened, with figures: a line for machines, nothing for people."""
     LOGGER.log(level, event, extra={"event": event, "fields": fields})
 
 
