@@ -55,8 +55,9 @@ MARKER_AGE_MAX_H = 7 * 24
 def cluster_executor(address: str, root: Folder) -> Iterator["ClusterExecutor"]:
     """Connect to the Dask scheduler at an address, such as `tcp://10.0.0.1:8786`.
 
-    `root` is the data root that the workers must see too. Raises `ClusterError` if there is no scheduler within the time that Dask's own settings
-    allow, 30 s by default, and `RefusedError` if the cluster has other versions.
+    `root` is the data root that the workers must see too. Raises `ClusterError` if there is no
+    scheduler within the time that Dask's own settings allow, 30 s by default, and `RefusedError` if
+    the cluster has other versions.
     """
     _route_logs()
     client = _connected(address)
