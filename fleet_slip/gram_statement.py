@@ -70,10 +70,16 @@ def gram_statement(
             f"sum({a}::INTEGER * {b}::INTEGER)" for i, a in enumerate(names) for b in names[: i + 1]
         ),
         counts=rows,
-        group="drive_id, absent, part" if parts else "drive_id, absent",
+        group=", ".join(_group(whole=whole, divided=parts is not None)),
         part_name=_part_name(parts) if parts else "NULL::VARCHAR",
         names=", ".join(f"'{name}'" for name in names),
     )
+
+
+def _group(*, whole: bool, divided: bool) -> list[str]:
+    """Return the columns to group by. DuckDB hashes a dictionary's entries, not its rows, if the
+    dictionary's column is the only one; so a constant is left out."""
+    return ["drive_id", *([] if whole else ["absent"]), *(["part"] if divided else [])]
 
 
 def _absent(names: Sequence[str]) -> str:

@@ -3,7 +3,8 @@
 -- Integer sums are exact, so the result does not depend on row order, threads or file layout. A row that lacks a
 -- signal must not count for the others' products alone: rows are grouped by which signals they lack ("absent", a
 -- number with one bit for each signal). Where the Delta log proves that no file has a signal in only some of its
--- rows, "absent" is the constant 0, which is faster and gives the same rows.
+-- rows, "absent" is the constant 0 and not grouped by, which is faster and gives the same rows: grouped by the one
+-- dictionary column drive_id, rows are not hashed at all.
 --
 -- A feature set may also divide the rows of a drive ("part"), and its features may be clipped to int16 ("clipped" says
 -- how often). The set of the catalogue's own signals has neither, and constants cost nothing.
