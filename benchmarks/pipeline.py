@@ -1,4 +1,4 @@
-"""How fast logs become Gram rows and models, beside other ways to the same coefficients.
+"""How fast logs become Gram rows and models.
 
     python -m benchmarks.pipeline [--root DATA] [--threads 2]
 
@@ -7,25 +7,22 @@ Runs on the `waterford` campaign, which is simulated into the data root first if
 """
 
 import argparse
+import json
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import duckdb
-import numpy as np
-import polars as pl
 import pyarrow as pa
 import pyarrow.parquet as pq
-from sklearn.linear_model import LinearRegression
 
 from fleet_slip.campaign import load_campaign
 from fleet_slip.cohort import load_cohort
-from fleet_slip.gram_job import aggregate, update_grams
+from fleet_slip.gram_job import update_grams
 from fleet_slip.gram_statement import gram_statement
 from fleet_slip.local_folder import LocalFolder
 from fleet_slip.model_list import load_model_list
@@ -38,9 +35,6 @@ from fleet_slip.warehouse import Warehouse
 ROUNDS = 5
 MODELS = load_model_list("table1")
 SIGNALS = catalogue().gram_signals
-INPUTS = list(MODELS.model[-1].signals)
-LABEL = catalogue().label
-COLUMNS = [*INPUTS, LABEL]
 
 
 def best(function: Callable[[], Any], rounds: int = ROUNDS) -> float:
@@ -96,88 +90,31 @@ def gram_query(warehouse: Warehouse, threads: int) -> None:
     line("  Gram query: 77 sums by drive", gram_s, snapshot.rows, ratios)
 
 
-def peers(warehouse: Warehouse, threads: int) -> None:
-    """Compare ways from the files to the coefficients of model 5, loading included."""
-    paths, rows = warehouse.logs.snapshot().paths, warehouse.logs.snapshot().rows
-    found: dict[str, list[float]] = {}
-    ways: dict[str, Callable[[list[str]], list[float]]] = {
-        "numpy lstsq": _by_lstsq,
-        "scikit-learn LinearRegression": _by_scikit_learn,
-        "Polars streaming, Gram and solve": _by_polars,
-    }
-    seconds = best(lambda: found.update({"fleet_slip": _by_grams(warehouse, threads)}))
-    line("from files to coefficients: Gram query, exact", seconds, rows)
-    for name, way in ways.items():
-        other = best(partial(_keep, found, name, way, paths), rounds=3)
-        digits = _digits(found[name], found["fleet_slip"])
-        line(
-            f"  {name}", other, rows, f"{other / seconds:.1f}x the time; {digits:.1f} digits agree"
-        )
+def operators(warehouse: Warehouse) -> None:
+    """Say where the Gram query's time goes on one thread, as DuckDB's profiler tells it."""
+    snapshot = warehouse.logs.snapshot()
+    database = duckdb.connect(config={"threads": 1})
+    database.execute("SET VARIABLE log_files = $files", {"files": snapshot.paths})
+    explain = f"EXPLAIN (ANALYZE, FORMAT JSON) {gram_statement(catalogue(), whole=True)}"
+    profiles = []
+    for _ in range(ROUNDS):
+        answer = database.execute(explain, {"feature_set": "signals"}).fetchone()
+        assert answer is not None
+        profiles.append(json.loads(answer[1]))
+    profile = min(profiles, key=lambda one: float(one["query"]["total_time"]))
+    planning_s = sum(profile[part]["total_time"] for part in ("planner", "optimizer"))
+    line("  planning", planning_s, snapshot.rows)
+    for operator in sorted(_flat(profile["operator"]), key=lambda one: -one["timing"]):
+        if operator["timing"] > 0.001:
+            what = f"  {operator['type'].lower()}, {operator['intermediate_rows']:,} rows out"
+            size = f"{operator['intermediate_size_bytes'] / 2**20:,.0f} MiB out"
+            line(what, operator["timing"], snapshot.rows, size)
 
 
-def _keep(
-    found: dict[str, list[float]],
-    name: str,
-    way: Callable[[list[str]], list[float]],
-    paths: list[str],
-) -> None:
-    found[name] = way(paths)
-
-
-def _digits(values: list[float], exact: list[float]) -> float:
-    errors = np.abs((np.array(values) - np.array(exact)) / np.array(exact))
-    return float(-np.log10(max(errors.max(), 1e-16)))
-
-
-def _by_grams(warehouse: Warehouse, threads: int) -> list[float]:
-    from fleet_slip.gram import GramTable, packed_size  # noqa: PLC0415
-    from fleet_slip.regression.exact import fit  # noqa: PLC0415
-
-    table = aggregate(warehouse, warehouse.logs.snapshot().files, threads=threads)
-    table = table.combine_chunks()
-    k = len(SIGNALS)
-    grams = GramTable(
-        SIGNALS,
-        table["n"].to_numpy(),
-        table["sums"].combine_chunks().flatten().to_numpy().reshape(-1, k),
-        table["products"].combine_chunks().flatten().to_numpy().reshape(-1, packed_size(k)),
-    )
-    model = fit(grams.total(), INPUTS, LABEL).model
-    return [*model.weights.values(), model.offset]
-
-
-def _read(paths: list[str]) -> Any:
-    parts = [pq.read_table(path, columns=COLUMNS, partitioning=None) for path in paths]
-    columns = pa.concat_tables(parts)
-    return np.column_stack([columns[name].to_numpy().astype(np.float64) for name in COLUMNS])
-
-
-def _by_lstsq(paths: list[str]) -> list[float]:
-    data = _read(paths)
-    design = np.column_stack([data[:, :-1], np.ones(len(data))])
-    return list(np.linalg.lstsq(design, data[:, -1])[0])
-
-
-def _by_scikit_learn(paths: list[str]) -> list[float]:
-    data = _read(paths)
-    model = LinearRegression(tol=0).fit(data[:, :-1], data[:, -1])
-    return [*model.coef_, model.intercept_]
-
-
-def _by_polars(paths: list[str]) -> list[float]:
-    x = [pl.col(name).cast(pl.Float64) for name in COLUMNS]
-    sums = [pl.len().cast(pl.Float64).alias("n")]
-    sums += [a.sum().alias(f"s{i}") for i, a in enumerate(x)]
-    sums += [
-        (a * b).sum().alias(f"p{i}_{j}") for i, a in enumerate(x) for j, b in enumerate(x[: i + 1])
-    ]
-    row = pl.scan_parquet(paths).select(sums).collect(engine="streaming").row(0, named=True)
-    n, k = row["n"], len(COLUMNS)
-    mean = np.array([row[f"s{i}"] for i in range(k)]) / n
-    centred = np.array([[row[f"p{max(i, j)}_{min(i, j)}"] for j in range(k)] for i in range(k)])
-    centred -= n * np.outer(mean, mean)
-    slopes = np.linalg.solve(centred[:-1, :-1], centred[:-1, -1])
-    return [*slopes, mean[-1] - mean[:-1] @ slopes]
+def _flat(tree: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    for operator in tree:
+        yield operator
+        yield from _flat(operator.get("children", []))
 
 
 def incremental(warehouse: Warehouse) -> None:
@@ -240,7 +177,7 @@ def main() -> None:
         for threads in options.threads:
             gram_query(warehouse, threads)
         print()
-        peers(warehouse, max(options.threads))
+        operators(warehouse)
         print()
         incremental(warehouse)
         print()
