@@ -26,6 +26,7 @@ import pyarrow.parquet as pq
 from benchmarks.pipeline import SIGNALS, prepare
 from fleet_slip.gram_job import FILES_PER_QUERY
 from fleet_slip.gram_statement import gram_statement
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.signals import catalogue
 from fleet_slip.storage import ROW_GROUP_ROWS
 from fleet_slip.warehouse import Warehouse
@@ -228,7 +229,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="+")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        warehouse = Warehouse(options.root or Path(folder) / "data")
+        warehouse = Warehouse(LocalFolder(options.root or Path(folder) / "data"))
         prepare(warehouse)
         rows = source_rows(warehouse, options.copies)
         print(f"{rows.num_rows:,} rows of {options.copies} copies", flush=True)

@@ -33,6 +33,7 @@ from benchmarks.peer_ways import COLUMNS, INPUTS, LABEL, WAYS, thread_variables
 from benchmarks.pipeline import prepare
 from fleet_slip.features import input_scales
 from fleet_slip.gram import Gram
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.regression.exact import LinearModel, fit
 from fleet_slip.report.style import PALETTE, STYLE
 from fleet_slip.warehouse import Warehouse
@@ -141,7 +142,7 @@ def main() -> None:
     parser.add_argument("--plot", type=Path)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        warehouse = Warehouse(options.root or Path(folder))
+        warehouse = Warehouse(LocalFolder(options.root or Path(folder)))
         prepare(warehouse)
         logs = warehouse.logs.snapshot()
         exact = exact_model(logs.paths)
