@@ -116,9 +116,10 @@ PARTS = {
     ),
     "gram-rows": Part(
         gram_rows,
-        (10_000, 100_000, 1_000_000),
-        (PUBLISH, GRAM, SELECT, COHORT, STATUS, MONITOR, QUALITY, COUNT_GRAMS, LAND, GRAM),
+        (100_000, 1_000_000, 10_000_000),
+        (PUBLISH, GRAM, SELECT, COHORT, STATUS, COUNT_GRAMS, LAND, GRAM),
     ),
+    "gram-rows-in-memory": Part(gram_rows, (10_000, 100_000), (PUBLISH, MONITOR, QUALITY)),
     "versions": Part(
         versions,
         (1000, 10_000, 100_000),

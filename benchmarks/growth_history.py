@@ -1,6 +1,6 @@
 """Makes the long histories that `benchmarks.growth` measures: real tables and documents, quickly.
 
-Drives are a few dozen rows of Gaussian signals, some of them many times over (weights), so that
+Drives are a dozen rows of Gaussian signals, some of them many times over (weights), so that
 Gram rows have the size of real ones; each Gram row is computed from its rows, exactly. Files are
 written in the encoding of the warehouse and committed through it, without waiting for the disk.
 """
@@ -29,8 +29,8 @@ from fleet_slip.warehouse import Warehouse
 
 SIGNALS = catalogue().gram_signals
 INPUTS = len(catalogue().inputs)
-ROWS = 32
-WEIGHT = 6000
+ROWS = 12
+WEIGHT = 16_000
 CHUNK = 50_000
 FIRST_DAY = date(2020, 1, 1)
 FILES_PER_DAY = 20
@@ -87,9 +87,11 @@ class Drives:
 
     def grams(self, warehouse: Warehouse, files: Sequence[str], days: Sequence[date]) -> pa.Table:
         """Return the drives' Gram rows, which came from the log files given for each drive."""
-        sums = np.einsum("dr,dri->di", self.weights, self.counts)
-        weighted = self.counts * self.weights[..., None]
-        matrices = np.matmul(weighted.transpose(0, 2, 1), self.counts)
+        # In float64, where every partial sum is an integer below 2^53.
+        counts = self.counts.astype(np.float64)
+        weighted = (counts * self.weights[..., None]).transpose(0, 2, 1)
+        sums = weighted.sum(axis=2).astype(np.int64)
+        matrices = np.matmul(weighted, counts).astype(np.int64)
         row, column = np.tril_indices(len(SIGNALS))
         products = matrices[:, row, column]
         count = len(self.numbers)

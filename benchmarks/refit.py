@@ -18,8 +18,9 @@ from fleet_slip.cohort import load_cohort
 from fleet_slip.local_folder import LocalFolder
 from fleet_slip.model_list import load_model_list
 from fleet_slip.regression.exact import fit
-from fleet_slip.selection import select
+from fleet_slip.selection_plan import SelectionPlan, run_plan
 from fleet_slip.signals import catalogue
+from fleet_slip.summed_cohort import sum_cohort
 from fleet_slip.warehouse import Warehouse
 
 ROUNDS = 7
@@ -44,15 +45,14 @@ def main(root: str, condition: str) -> None:
     cohort = load_cohort(warehouse, condition)
 
     def fitted_from_disk() -> None:
-        fit(load_cohort(warehouse, condition).serving(INPUTS).table.total(), INPUTS, label)
+        sums = sum_cohort(warehouse, MODELS.folds, condition).folds("drive", MODELS.folds.count)
+        fit(sums.serving(INPUTS, label).total, INPUTS, label)
 
     figures = {
         "gram_rows": len(cohort.drives),
         "read_and_fit_ms": median_ms(fitted_from_disk),
         "fit_ms": median_ms(lambda: fit(cohort.serving(INPUTS).table.total(), INPUTS, label)),
-        "select_ms": median_ms(
-            lambda: select(load_cohort(warehouse, condition), MODELS.model, MODELS.folds)
-        ),
+        "select_ms": median_ms(lambda: run_plan(warehouse, SelectionPlan(cohort=condition))),
     }
     print(json.dumps(figures))
 
