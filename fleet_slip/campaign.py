@@ -107,6 +107,13 @@ class Campaign(Config):
                 raise ValueError(f"laps is {self.laps}, but the track {track.name!r} is open")
         return self
 
+    @property
+    def digest(self) -> str:
+        """SHA-256 over all that determines a day's bytes: all but how many days there are."""
+        content = self.model_dump(mode="json", exclude={"number_of_days", "description"})
+        canonical = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
+        return hashlib.sha256(canonical.encode()).hexdigest()
+
     def days(self) -> tuple[date, ...]:
         """Return all days, in order."""
         return tuple(self.first_day + timedelta(days=day) for day in range(self.number_of_days))

@@ -52,6 +52,9 @@ class SimulationReport:
 
     batches_written: int = 0
     batches_present: int = 0
+    """Batches of the days that were planned that had landed before."""
+    days_present: int = 0
+    """Days that were complete, and so not planned."""
     drives: int = 0
     rows: int = 0
     size_bytes: int = 0
@@ -84,16 +87,50 @@ def simulate_campaign(
     """Simulate what has not landed of the given days of a campaign, and land each batch.
 
     A day is planned when its turn comes: a plan of years takes no time before the first row and no
-    memory. Raises like `simulate_batches`.
+    memory. A day that is complete is recorded as such and never planned again, so that a night
+    takes as long after years as after a week. Raises like `simulate_batches`.
     """
     snapshot = warehouse.logs.snapshot()
-    days = tuple(days)
-    begun = [day for day in days if snapshot.landed(unit_name(campaign.name, day, 0)) is not None]
+    every = tuple(days)
+    open_days = _open_days(snapshot, campaign, every)
+    begun = [d for d in open_days if snapshot.landed(unit_name(campaign.name, d, 0)) is not None]
     for day in begun:  # before anything is written, so that a changed campaign is refused
         for batch in campaign.batches(day):
             has_landed(snapshot, batch)
-    plan = (campaign.batches(day) for day in days)
-    return _simulate(warehouse, plan, len(days), executor, progress)
+    plan = (campaign.batches(day) for day in open_days)
+    report = _simulate(warehouse, plan, len(open_days), executor, progress)
+    report.days_present = len(every) - len(open_days)
+    retried(lambda: _complete(warehouse, campaign, open_days))
+    report.logs_version = warehouse.logs.snapshot().version
+    return report
+
+
+def _open_days(snapshot: Snapshot, campaign: Campaign, days: Iterable[date]) -> tuple[date, ...]:
+    """Return the days that are not recorded as complete.
+
+    Raises `RefusedError` if a day was completed by the campaign as it was before a change.
+    """
+    found = []
+    for unit, day in _day_units(campaign, days):
+        landed = snapshot.landed(unit.name)
+        if landed is None:
+            found.append(day)
+        elif landed != unit.version:
+            raise _changed(campaign.name, day)
+    return tuple(found)
+
+
+def _complete(warehouse: Warehouse, campaign: Campaign, days: Iterable[date]) -> None:
+    """Record that all batches of some days have landed."""
+    snapshot = warehouse.logs.snapshot()
+    units = [unit for unit, _ in _day_units(campaign, _open_days(snapshot, campaign, days))]
+    if units:
+        snapshot.commit(Change(units=units, note={"job": "simulate", "campaign": campaign.name}))
+
+
+def _day_units(campaign: Campaign, days: Iterable[date]) -> Iterator[tuple[Unit, date]]:
+    version = int(campaign.digest[:15], base=16)
+    return ((Unit(f"simulate/{campaign.name}/{day}", version), day) for day in days)
 
 
 def simulate_batches(
@@ -177,12 +214,15 @@ def has_landed(snapshot: Snapshot, batch: Batch) -> bool:
     """Whether a batch is in the logs. Raises `RefusedError` if another batch has its place."""
     landed = snapshot.landed(unit_name(batch.campaign, batch.day, batch.index))
     if landed is not None and landed != unit_of(batch).version:
-        raise RefusedError(
-            f"{batch.day}: the campaign {batch.campaign!r} was changed since this day was "
-            "simulated, and logs are never replaced. Give the changed campaign another name, or "
-            "use another --root."
-        )
+        raise _changed(batch.campaign, batch.day)
     return landed is not None
+
+
+def _changed(campaign: str, day: date) -> RefusedError:
+    return RefusedError(
+        f"{day}: the campaign {campaign!r} was changed since this day was simulated, and logs are "
+        "never replaced. Give the changed campaign another name, or use another --root."
+    )
 
 
 def unit_of(batch: Batch) -> Unit:

@@ -10,7 +10,7 @@ import pytest
 from fleet_slip.campaign import Batch, Campaign, load_campaign
 from fleet_slip.errors import RefusedError
 from fleet_slip.local_folder import LocalFolder
-from fleet_slip.simulation_job import SimulationReport, simulate_campaign
+from fleet_slip.simulation_job import SimulationReport, simulate_batches, simulate_campaign
 from fleet_slip.warehouse import Warehouse
 
 DAYS = 12
@@ -73,4 +73,27 @@ def test_the_report_says_where_the_time_went(tmp_path: Path) -> None:
     assert seconds.commit < seconds.elapsed
     assert seconds.tasks < 2 * seconds.elapsed
     again = run(tmp_path, campaign(), lambda _rows, _all: None)
-    assert (again.rows, again.batches_present, again.seconds.tasks) == (0, DAYS, 0)
+    assert (again.rows, again.days_present, again.seconds.tasks) == (0, DAYS, 0)
+
+
+def test_a_complete_day_is_never_planned_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run(tmp_path, campaign(), lambda _rows, _all: None)
+    before = Warehouse(LocalFolder(tmp_path)).logs.snapshot()
+    monkeypatch.setattr(type(campaign()), "batches", None)
+    again = run(tmp_path, campaign(), lambda _rows, _all: None)
+    assert (again.days_present, again.logs_version) == (DAYS, before.version)
+    with pytest.raises(RefusedError, match="was changed"):
+        run(tmp_path, campaign(seed=77), lambda _rows, _all: None)
+
+
+def test_days_that_landed_before_they_were_recorded_are_recorded(tmp_path: Path) -> None:
+    warehouse = Warehouse(LocalFolder(tmp_path))
+    batches = [batch for day in campaign().days() for batch in campaign().batches(day)]
+    with ThreadPoolExecutor(2) as executor:
+        simulate_batches(warehouse, batches, executor)
+    found = [run(tmp_path, campaign(), lambda _rows, _all: None) for _ in range(2)]
+    assert [report.rows for report in found] == [0, 0]
+    assert [report.days_present for report in found] == [0, DAYS]
+    assert found[0].logs_version == found[1].logs_version

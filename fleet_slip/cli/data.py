@@ -114,7 +114,7 @@ def simulate(
         )
         say(_where_the_time_went(report))
     else:
-        say(f"{plan.name}: nothing to do, all {report.batches_present} files are there")
+        say(f"{plan.name}: nothing to do, all {len(chosen)} days are there")
 
 
 def _where_the_time_went(report: "SimulationReport") -> str:
