@@ -73,7 +73,7 @@ def forget(
     if drives and state != "begun":
         models = models_trained_on(warehouse, drives)
         audit.begin(subject, len(drives), models)
-    _forget_quarantined(warehouse, drives)
+    _forget_quarantined(warehouse, subject, drives)
     rows, rewritten, removed = _rewrite_logs(warehouse, subject, progress)
     reconcile(warehouse)
     deleted, left = remove_old_files(warehouse, subject, delete=now)
@@ -91,11 +91,15 @@ def forget(
 
 
 def _drives_of(warehouse: Warehouse, subject: Subject) -> frozenset[str]:
-    """Return the drives in the logs, and in the Gram rows where an interrupted job left them."""
+    """Return the drives in the logs and the quarantine, and what interrupted jobs left in grams."""
     found: set[str] = set().union(*drives_by_file(warehouse.logs.snapshot(), subject).values())
     for file in warehouse.grams.snapshot().files:
         rows = warehouse.grams.read(file.path, ["drive_id", "vehicle_id", "day"])
         found.update(rows.filter(subject.mask(rows))["drive_id"].to_pylist())
+    for file in warehouse.quarantine.snapshot().files:
+        rows = warehouse.quarantine.read(file.path)
+        names = rows.filter(quarantined_of(rows, subject, ()))["drive_id"].drop_null()
+        found.update(names.to_pylist())
     return frozenset(found)
 
 
@@ -142,13 +146,13 @@ def _rewrite_logs(
     return retried(attempt)
 
 
-def _forget_quarantined(warehouse: Warehouse, drives: Collection[str]) -> None:
+def _forget_quarantined(warehouse: Warehouse, subject: Subject, drives: Collection[str]) -> None:
     def attempt() -> None:
         snapshot = warehouse.quarantine.snapshot()
         add, remove = [], []
         for file in snapshot.files:
             rows = warehouse.quarantine.read(file.path)
-            kept = rows.filter(pc.invert(quarantined_of(rows, drives)))
+            kept = rows.filter(pc.invert(quarantined_of(rows, subject, drives)))
             if kept.num_rows < rows.num_rows:
                 remove.append(file)
                 if kept.num_rows:

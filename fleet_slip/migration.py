@@ -1,5 +1,7 @@
 """Brings the table `logs` to the signal catalogue: new columns, other scales.
 
+The quarantine, whose columns do not depend on the catalogue, gets those that came later.
+
 New columns need no file to be touched: where a file lacks a column, its values are null. Another
 scale needs every count of the signal rewritten, and no reader may ever mix the two:
 
@@ -64,6 +66,7 @@ def migrate(warehouse: Warehouse, progress: Progress = lambda _more, _all: None)
     the announcement, which a migration back to the old catalogue takes away. Raises
     `ConflictError` if another process changed the table at the same moment.
     """
+    _add_columns_that_came_later(warehouse.quarantine)
     table = warehouse.logs
     delta = table.open_delta()
     if delta is None:
@@ -80,6 +83,12 @@ def migrate(warehouse: Warehouse, progress: Progress = lambda _more, _all: None)
         _settle(table)
     version = _now(table).version()
     return MigrationReport(found.added, found.retired, found.rescaled, files, rows, version)
+
+
+def _add_columns_that_came_later(table: Table) -> None:
+    delta = table.open_delta()
+    if delta is not None and (found := evolution(table.schema, delta)).added:
+        _add_columns(table, delta, found)
 
 
 def rescaled(counts: NDArray[np.int16], ratio: Fraction) -> NDArray[np.int64]:

@@ -20,11 +20,11 @@ BEING_WRITTEN_HOURS = 1.0
 def remove_old_files(warehouse: Warehouse, subject: Subject, *, delete: bool) -> tuple[int, int]:
     """Delete the files with the drives that no version refers to, or count them.
 
-    The logs come last: their old files are what tells the drives of a car in the quarantine.
+    The logs come last: their old files may be all that tells the drives of a car in the quarantine.
     """
     logs = list(_with_subject(warehouse.logs.snapshot(), subject))
     drives = {drive for _, names in logs for drive in names}
-    old = [file for file, _ in _of_quarantine(warehouse.quarantine.snapshot(), drives)]
+    old = list(_of_quarantine(warehouse.quarantine.snapshot(), subject, drives))
     old += [file for file, _ in _with_subject(warehouse.grams.snapshot(), subject)]
     old += [file for file, _ in logs]
     deleted = sum(file.folder.remove(file) for file in old) if delete else 0
@@ -64,23 +64,28 @@ def _with_subject(
 
 
 def _of_quarantine(
-    snapshot: Snapshot, drives: Collection[str]
-) -> Iterator[tuple[StoredFile, frozenset[str]]]:
+    snapshot: Snapshot, subject: Subject, drives: Collection[str]
+) -> Iterator[StoredFile]:
     for file, rows in _readable(snapshot):
-        concerned = quarantined_of(rows, drives)
-        if pc.any(concerned).as_py():
-            yield file, frozenset(rows.filter(concerned)["drive_id"].to_pylist())
+        if pc.any(quarantined_of(rows, subject, drives)).as_py():
+            yield file
 
 
-def quarantined_of(rows: pa.Table, drives: Collection[str]) -> pa.Array:
-    """Return which rows of the quarantine are of some drives.
+def quarantined_of(rows: pa.Table, subject: Subject, drives: Collection[str]) -> pa.ChunkedArray:
+    """Return which rows of the quarantine are of a subject, or of drives that are known to be.
 
     A row that was refused before its drive was cut at a gap in time names the drive as a whole.
+    Rows that an earlier version of this program refused do not name the vehicle.
     """
+    if subject.kind == "drive":
+        drives = {*drives, subject.value}
     ids = rows["drive_id"].cast(pa.string())
     concerned = {
         name
         for name in ids.unique().to_pylist()
         if name and any(drive == name or drive.startswith(f"{name}-") for drive in drives)
     }
-    return pc.is_in(ids, pa.array(sorted(concerned), pa.string()))
+    of_drives = pc.is_in(ids, pa.array(sorted(concerned), pa.string()))
+    if subject.kind != "vehicle" or "vehicle_id" not in rows.schema.names:
+        return of_drives
+    return pc.or_(of_drives, pc.fill_null(subject.mask(rows), False))

@@ -14,14 +14,15 @@ QUARANTINE_SCHEMA = pa.schema(
         ("file", pa.string()),
         ("row", pa.int64()),
         ("drive_id", pa.string()),
+        ("vehicle_id", pa.string()),
         ("reason", pa.string()),
         ("signal", pa.string()),
         ("value", pa.string()),
     ]
 )
 """One row per rejected row of a file. `row` counts its rows of data from 1; `drive_id` is the drive
-that it belongs to, null if that is what is wrong; `signal` is the signal or metadata concerned, or
-`time`; `value` is what stood there, as text."""
+that it belongs to and `vehicle_id` its car, null if that is what is wrong; `signal` is the signal
+or metadata concerned, or `time`; `value` is what stood there, as text."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,9 @@ class Warehouse:
         return Table(
             folder=self.root / "quarantine",
             schema=QUARANTINE_SCHEMA,
-            encoding=Encoding(dictionary=("file", "reason", "signal"), compression="zstd"),
+            encoding=Encoding(
+                dictionary=("file", "vehicle_id", "reason", "signal"), compression="zstd"
+            ),
             description="Rows of measured logs that were refused, with the reason",
         )
 

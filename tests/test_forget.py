@@ -18,6 +18,7 @@ from fleet_slip.compaction import compact
 from fleet_slip.errors import RefusedError, SelectionError
 from fleet_slip.forget import forget
 from fleet_slip.gram_job import update_grams
+from fleet_slip.ingest_job import ingest_file
 from fleet_slip.local_folder import LocalFolder
 from fleet_slip.regression.exact import fit
 from fleet_slip.retention import Retention, retain
@@ -26,6 +27,7 @@ from fleet_slip.storage import Change
 from fleet_slip.vacuum import unreferenced
 from fleet_slip.warehouse import Warehouse
 from tests.conftest import COMMAND, RunCommand, land, log_rows, random_counts
+from tests.ingest.samples import a_mapping, csv_text, good_columns
 
 CARS = ("alfa", "beta", "gamma")
 
@@ -126,6 +128,30 @@ def test_quarantined_rows_of_the_car_go_too(tmp_path: Path) -> None:
     (path,) = warehouse.quarantine.snapshot().paths
     assert pq.read_table(path)["drive_id"].to_pylist() == ["alfa-1", None, "beta-10"]
     assert not unreferenced(warehouse.quarantine)
+
+
+@pytest.mark.parametrize("subject", ["vehicle", "drive"])
+def test_a_car_all_of_whose_rows_were_refused_goes_too(tmp_path: Path, subject: Any) -> None:
+    columns = {name: values * 2 for name, values in good_columns(50).items()}
+    columns["car"] = ["sound"] * 50 + ["secretive"] * 50
+    columns["ax"][50:] = ["777.125"] * 50
+    file = tmp_path / "x.csv"
+    file.write_text(csv_text(columns))
+    warehouse = Warehouse(LocalFolder(tmp_path / "data"))
+    mapping = a_mapping(drive={"vehicle_id": {"column": "car"}})
+    assert ingest_file(warehouse, file, mapping).counts.drives == 1
+    update_grams(warehouse)
+    (path,) = warehouse.quarantine.snapshot().paths
+    (name,) = pq.read_table(path)["drive_id"].unique().to_pylist()
+    chosen = Subject(subject, name if subject == "drive" else "secretive")
+    before = warehouse.logs.snapshot()
+    report = forget(warehouse, chosen, now=True)
+    assert (report.drives, report.rows) == (1, 0)
+    assert warehouse.logs.snapshot().files == before.files
+    assert not warehouse.quarantine.snapshot().files
+    left = mentions(tmp_path / "data", "secretive") + mentions(tmp_path / "data", "777.125")
+    assert not left
+    assert not forget(warehouse, chosen).changed
 
 
 def test_retention_forgets_by_age_and_refuses_to_leave_nothing(tmp_path: Path) -> None:

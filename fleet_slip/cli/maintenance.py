@@ -14,6 +14,7 @@ from fleet_slip.compaction import compact as compact_logs
 from fleet_slip.errors import DamageError
 from fleet_slip.forget import ForgetReport
 from fleet_slip.forget import forget as forget_drives
+from fleet_slip.operations.run_log import step
 from fleet_slip.retention import load_retention
 from fleet_slip.retention import retain as apply_retention
 from fleet_slip.vacuum import RETENTION_HOURS, VacuumReport
@@ -113,8 +114,9 @@ def compact(
     json: Json = False,
 ) -> None:
     """Turn the small log files of each day into large ones. Readers and jobs are not disturbed."""
-    with progress("compact", "days") as advance:
+    with step("compact") as figures, progress("compact", "days") as advance:
         report = compact_logs(context.obj, target_rows, advance)
+        figures.rows, figures.size_bytes = report.rows_rewritten, report.size_bytes_after
     if json:
         print_json(asdict(report))
     elif report.changed:
@@ -142,7 +144,9 @@ def vacuum(
     json: Json = False,
 ) -> None:
     """Remove replaced files and leftovers of killed jobs when they are old enough."""
-    report = remove_expired(context.obj, retention_hours, dry_run=dry_run)
+    with step("vacuum") as figures:
+        report = remove_expired(context.obj, retention_hours, dry_run=dry_run)
+        figures.size_bytes = report.size_bytes
     if json:
         print_json(asdict(report))
         return
@@ -174,8 +178,9 @@ def forget(
     if (vehicle is None) == (drive is None):
         raise typer.BadParameter("give one of --vehicle and --drive.")
     subject = Subject("drive", drive) if drive else Subject("vehicle", vehicle or "")
-    with progress("forget", "files") as advance:
+    with step("forget") as figures, progress("forget", "files") as advance:
         report = forget_drives(context.obj, subject, now=now, progress=advance)
+        figures.rows = report.rows
     if json:
         print_json(asdict(report))
     else:
@@ -211,8 +216,9 @@ def retain(
     json: Json = False,
 ) -> None:
     """Forget drives that are older than the retention says, then vacuum. For a schedule."""
-    with progress("retain", "files") as advance:
+    with step("retain") as figures, progress("retain", "files") as advance:
         report = apply_retention(context.obj, load_retention(config), date.today(), advance)
+        figures.rows, figures.size_bytes = report.forgotten.rows, report.vacuumed.size_bytes
     if json:
         print_json(asdict(report))
         return

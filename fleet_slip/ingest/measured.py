@@ -88,7 +88,7 @@ def read_measured(file: Path, mapping: Mapping) -> MeasuredLog:
         drives_resampled=sum(drive.method != "snap" for drive in ticked),
         ticks=table.num_rows,
     )
-    return MeasuredLog(table, _quarantine_table(file, bad, prefix), counts, digest)
+    return MeasuredLog(table, _quarantine_table(file, bad, prefix, mapping, keys), counts, digest)
 
 
 def _identity(file: Path, mapping: Mapping) -> str:
@@ -152,14 +152,25 @@ def _check_usable(file: Path, mapping: Mapping, rows: pl.DataFrame, bad: pl.Data
         )
 
 
-def _quarantine_table(file: Path, bad: pl.DataFrame, prefix: str) -> pa.Table:
+def _quarantine_table(
+    file: Path, bad: pl.DataFrame, prefix: str, mapping: Mapping, keys: DriveKeys
+) -> pa.Table:
     name = os.fsencode(file.name).decode("utf-8", "replace")
     groups = bad["group"].unique().drop_nulls()
     ids = {group: drive_id(prefix, group) for group in groups}
+    stated = mapping.drive.vehicle_id
+    vehicle = stated if isinstance(stated, str) else None
+    metadata = keys.metadata()
+    vehicles = {str(group): metadata[group].get("vehicle_id", vehicle) for group in groups}
     frame = bad.select(
         pl.lit(name).alias("file"),
         "row",
         pl.col("group").replace_strict(ids, return_dtype=pl.String).alias("drive_id"),
+        pl.col("group")
+        .cast(pl.String)
+        .replace_strict(vehicles, return_dtype=pl.String)
+        .fill_null(pl.lit(vehicle, pl.String))
+        .alias("vehicle_id"),
         "reason",
         "signal",
         "value",
