@@ -1,15 +1,20 @@
 """Brings measured logs into the warehouse; the same file through the same mapping lands once."""
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
+from deltalake.transaction import AddAction
 
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.measured import IngestCounts, MeasuredLog, read_measured
 from fleet_slip.storage import Change, Table, Unit, retried
+from fleet_slip.tasks import completed
 from fleet_slip.warehouse import Warehouse
 
 
@@ -36,22 +41,56 @@ class IngestReport:
         }
 
 
+@dataclass(frozen=True)
+class _Written:
+    """What one file became: data files that are not committed yet, none if it has landed before."""
+
+    digest: str
+    counts: IngestCounts
+    quarantine: tuple[AddAction, ...] = ()
+    logs: tuple[AddAction, ...] = ()
+
+    @property
+    def unit(self) -> Unit:
+        return Unit(f"ingest/{self.digest}", 1)
+
+
 def ingest_file(warehouse: Warehouse, file: Path, mapping: Mapping) -> IngestReport:
     """Read a measured log and commit its drives, and its quarantined rows before them.
 
     Raises `InputError` or `ConfigError` for a file or mapping that is not usable; then nothing is
     written.
     """
-    log = read_measured(file, mapping)
-    unit = Unit(f"ingest/{log.digest}", 1)
-    new = warehouse.logs.snapshot().landed(unit.name) is None
-    if new:
+    return next(ingest_files(warehouse, [file], mapping))
+
+
+def ingest_files(
+    warehouse: Warehouse, files: Iterable[Path], mapping: Mapping, executor: Executor | None = None
+) -> Iterator[IngestReport]:
+    """Ingest files, and yield a report of each as it is committed.
+
+    With an executor they are read and written by its workers, in any order. Raises like
+    `ingest_file`, and `ClusterError` at the end for files that workers died of.
+    """
+    for file, written in completed(executor, partial(_write, warehouse, mapping), files, str):
         # Not the file's name: it may name a car, and the Delta log outlives what is forgotten.
-        note = {"job": "ingest", "mapping": mapping.name, "digest": log.digest}
-        if log.quarantine.num_rows:
-            _land(warehouse.quarantine, {None: log.quarantine}, log, unit, note)
-        new = _land(warehouse.logs, _by_day(log.drives), log, unit, note)
-    return IngestReport(str(file), new, log.counts)
+        note = {"job": "ingest", "mapping": mapping.name, "digest": written.digest}
+        _commit(warehouse.quarantine, written.quarantine, written.unit, note)
+        new = _commit(warehouse.logs, written.logs, written.unit, note)
+        yield IngestReport(str(file), new, written.counts)
+
+
+def _write(warehouse: Warehouse, mapping: Mapping, file: Path) -> _Written:
+    log = read_measured(file, mapping)
+    written = _Written(log.digest, log.counts)
+    if warehouse.logs.snapshot().landed(written.unit.name) is not None:
+        return written
+    quarantine = {None: log.quarantine} if log.quarantine.num_rows else {}
+    return replace(
+        written,
+        quarantine=_write_parts(warehouse.quarantine, quarantine, log),
+        logs=_write_parts(warehouse.logs, _by_day(log.drives), log),
+    )
 
 
 def _by_day(rows: pa.Table) -> dict[Any, pa.Table]:
@@ -59,19 +98,20 @@ def _by_day(rows: pa.Table) -> dict[Any, pa.Table]:
     return {day: rows.filter(pc.equal(rows["day"], pa.scalar(day, pa.date32()))) for day in days}
 
 
-def _land(
-    table: Table, parts: dict[Any, pa.Table], log: MeasuredLog, unit: Unit, note: dict[str, str]
-) -> bool:
-    """Commit the parts as files of one commit; False if the unit has landed before."""
-    if table.snapshot().landed(unit.name) is not None:
-        return False
+def _write_parts(
+    table: Table, parts: dict[Any, pa.Table], log: MeasuredLog
+) -> tuple[AddAction, ...]:
     name = f"measured-{log.digest[:24]}"
-    actions = [table.write_file(name, rows, day) for day, rows in parts.items()]
+    return tuple(table.write_file(name, rows, day) for day, rows in parts.items())
+
+
+def _commit(table: Table, actions: Sequence[AddAction], unit: Unit, note: dict[str, str]) -> bool:
+    """Commit files as one; False if there are none, or the unit has landed before."""
     change = Change(add=actions, units=[unit], note=note)
 
     def attempt() -> bool:
         snapshot = table.snapshot()
-        if snapshot.landed(unit.name) is not None:
+        if not actions or snapshot.landed(unit.name) is not None:
             return False
         snapshot.commit(change)
         return True

@@ -50,17 +50,23 @@ def in_flight(executor: Executor) -> int:
 
 
 def completed(
-    executor: Executor,
+    executor: Executor | None,
     function: Callable[[Item], Result],
     items: Iterable[Item],
     name_of: Callable[[Item], str],
 ) -> Iterator[tuple[Item, Result]]:
     """Call a function on items, and yield each with its result when it is done, in any order.
 
+    Without an executor that is here and now, one after the other.
+
     A task whose worker died is set aside. It may be innocent: a worker does several tasks at once,
     and all are suspected. When the others are done, each is tried alone; then `ClusterError` names
     those that failed again. Any other error ends the whole at once.
     """
+    if executor is None:
+        for item in items:
+            yield item, function(item)
+        return
     suspects: list[Item] = []
     yield from _completed(executor, function, items, lambda: in_flight(executor), suspects)
     for item in suspects:

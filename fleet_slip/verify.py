@@ -6,9 +6,10 @@ documents with their checksums; model versions with the tables that they were ma
 """
 
 import os
-from collections.abc import Callable, Collection, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Collection, Iterator, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Literal
 
 import pyarrow as pa
@@ -24,11 +25,16 @@ from fleet_slip.registry import Registry
 from fleet_slip.resources import read_sql
 from fleet_slip.storage import Snapshot, Table, TableFile, checksum_in, checksum_of
 from fleet_slip.storage_errors import storage_errors
+from fleet_slip.tasks import LocalThreads, completed
 from fleet_slip.vacuum import replaced, temporary_files, unreferenced
 from fleet_slip.warehouse import Warehouse
 
 SAMPLE = 4
 """Log files whose Gram rows are computed again, evenly chosen, unless all are asked for."""
+
+TASK_BYTES = 2**27
+TASK_FILES = 64
+"""A task reads about so many bytes, or so many files."""
 
 Progress = Callable[[int, int], None]
 """Called with bytes read since the last call, and bytes to read in all."""
@@ -77,17 +83,21 @@ def verify(
     *,
     full: bool = False,
     progress: Progress = lambda _more, _all: None,
+    executor: Executor | None = None,
 ) -> Verification:
-    """Verify a data root; `full` computes the Gram rows of all log files again."""
+    """Verify a data root; `full` computes the Gram rows of all log files again.
+
+    Files are read by the workers of an executor, if there is one, else by threads.
+    """
     report = Verification()
     snapshots = _snapshots(warehouse, report)
-    good = {table: _verify_files(s, report, progress) for table, s in snapshots.items()}
+    good = {table: _verify_files(s, report, progress, executor) for table, s in snapshots.items()}
     logs, grams = (good.get(table, []) for table in ("logs", "grams"))
     if logs:
         _verify_drives(warehouse, logs, report)
     if grams:
         active = {file.path for file in snapshots["logs"].files} if "logs" in snapshots else set()
-        _verify_grams(warehouse, logs, grams, active, full, report)
+        _verify_grams(warehouse, logs, grams, active, full, report, executor)
     _verify_documents(warehouse.root, report)
     _verify_models(warehouse, snapshots, report)
     _list_unreferenced(warehouse, snapshots, report)
@@ -110,22 +120,45 @@ def _snapshots(warehouse: Warehouse, report: Verification) -> dict[str, Snapshot
     return found
 
 
-def _verify_files(snapshot: Snapshot, report: Verification, progress: Progress) -> list[TableFile]:
+def _verify_files(
+    snapshot: Snapshot, report: Verification, progress: Progress, executor: Executor | None
+) -> list[TableFile]:
     """Return the files of a table that are what they must be."""
     table = snapshot.table
-    good = []
-    with ThreadPoolExecutor(os.cpu_count()) as executor:
-        problems = executor.map(lambda file: problem_of(table, file), snapshot.files)
-        for file, problem in zip(snapshot.files, problems, strict=True):
-            if problem:
-                report.findings.append(Finding("file", f"{table.folder.name}/{file.path}", problem))
-            else:
-                good.append(file)
-            progress(file.size_bytes, snapshot.size_bytes)
+    problems: dict[str, str | None] = {}
+    with LocalThreads(os.cpu_count() or 1) as threads:
+        groups = _groups(snapshot.files)
+        task = partial(_problems_of, table)
+        for group, found in completed(executor or threads, task, groups, _group_name):
+            problems |= found
+            progress(sum(file.size_bytes for file in group), snapshot.size_bytes)
+    for path, problem in sorted(problems.items()):
+        if problem:
+            report.findings.append(Finding("file", f"{table.folder.name}/{path}", problem))
     report.files += len(snapshot.files)
     report.size_bytes += snapshot.size_bytes
     report.rows += snapshot.rows if table.folder.name == "logs" else 0
-    return good
+    return [file for file in snapshot.files if not problems[file.path]]
+
+
+def _groups(files: Sequence[TableFile]) -> Iterator[tuple[TableFile, ...]]:
+    """Divide files into groups that each take a task about a second."""
+    group: tuple[TableFile, ...] = ()
+    for file in files:
+        group = (*group, file)
+        if sum(one.size_bytes for one in group) >= TASK_BYTES or len(group) == TASK_FILES:
+            yield group
+            group = ()
+    if group:
+        yield group
+
+
+def _group_name(group: Sequence[TableFile]) -> str:
+    return f"the bytes of {len(group)} files from {group[0].path}"
+
+
+def _problems_of(table: Table, files: Sequence[TableFile]) -> dict[str, str | None]:
+    return {file.path: problem_of(table, file) for file in files}
 
 
 def problem_of(table: Table, file: TableFile) -> str | None:
@@ -188,6 +221,7 @@ def _verify_grams(
     active: Collection[str],
     full: bool,
     report: Verification,
+    executor: Executor | None,
 ) -> None:
     paths = [warehouse.grams.uri(file.path) for file in grams]
     database = open_database(reading=warehouse.grams.folder)
@@ -200,8 +234,8 @@ def _verify_grams(
     stored = stored_grams(warehouse, grams)
     covered = [file for file in logs if file.path in stored]
     step = 1 if full else max(1, len(covered) // SAMPLE)
-    for file in covered[::step]:
-        computed = grams_by_blocks(warehouse, read_counts(warehouse, file))
+    task = partial(_computed, warehouse)
+    for file, computed in completed(executor, task, covered[::step], _recomputing):
         for drive in _different(stored[file.path], computed):
             problem = f"the stored Gram row of drive {drive} is not that of its rows"
             report.findings.append(Finding("gram", f"logs/{file.path}", problem))
@@ -211,6 +245,14 @@ def _verify_grams(
     if missing or stale:
         problem = f"{missing} log files have no Gram rows, {len(stale)} with Gram rows are gone"
         report.findings.append(Finding("backlog", "grams", f"{problem}; run: fleet-slip gram"))
+
+
+def _computed(warehouse: Warehouse, file: TableFile) -> DriveGrams:
+    return grams_by_blocks(warehouse, read_counts(warehouse, file))
+
+
+def _recomputing(file: TableFile) -> str:
+    return f"the Gram rows of {file.path}"
 
 
 def _different(one: DriveGrams, two: DriveGrams) -> list[str]:

@@ -141,6 +141,7 @@ def ingest(
     mapping: Annotated[
         str, typer.Option(help="A mapping of configs/mappings, or the path of a TOML file.")
     ],
+    cluster: Cluster = None,
     json: Json = False,
 ) -> None:
     """Bring measured logs into the warehouse through a mapping of columns, units and axes.
@@ -148,19 +149,24 @@ def ingest(
     Rows that cannot be used go to the quarantine with a reason: fleet-slip sql "FROM quarantine"
     """
     from fleet_slip.ingest.mapping import load_mapping  # noqa: PLC0415 - Polars takes a while
-    from fleet_slip.ingest_job import ingest_file  # noqa: PLC0415
+    from fleet_slip.ingest_job import ingest_files  # noqa: PLC0415
 
     plan = load_mapping(mapping)
-    reports = []
-    for file in files:
-        with step("ingest") as figures:
-            report = ingest_file(context.obj, file, plan).as_dict()
-            figures.rows = report["ticks"] if report["new"] else 0
-        reports.append(report)
-        if not json:
-            say(_ingested(report))
+    reports = {}
+    if cluster:  # a worker has a working directory of its own
+        files = [file.absolute() for file in files]
+    with (
+        workers(context, cluster) as (warehouse, executor),
+        step("ingest") as figures,
+    ):
+        figures.rows = 0
+        for done in ingest_files(warehouse, files, plan, elsewhere(executor)):
+            report = reports[done.file] = done.as_dict()
+            figures.rows += report["ticks"] if report["new"] else 0
+            if not json:
+                say(_ingested(report))
     if json:
-        print_json(reports)
+        print_json([reports[str(file)] for file in files])
 
 
 def _ingested(report: dict[str, Any]) -> str:

@@ -1,5 +1,6 @@
 """Commands that look after the warehouse: verify, compact, vacuum, forget, retain."""
 
+from concurrent.futures import Executor
 from dataclasses import asdict
 from datetime import date
 from typing import Annotated, Any
@@ -9,6 +10,7 @@ import typer
 from fleet_slip.audit import Subject
 from fleet_slip.cli.output import Json, print_json, print_table, progress, say
 from fleet_slip.cli.recorded import recorded
+from fleet_slip.cli.workers import Cluster, elsewhere, workers
 from fleet_slip.compaction import TARGET_ROWS
 from fleet_slip.compaction import compact as compact_logs
 from fleet_slip.errors import DamageError
@@ -45,19 +47,21 @@ def verify(
         list[str] | None,
         typer.Option(help="A campaign's TOML file for --repair, besides those that ship."),
     ] = None,
+    cluster: Cluster = None,
     json: Json = False,
 ) -> None:
     """Verify every byte against its checksum, and everything against everything else.
 
     Exits with 9 if there is damage that was not repaired.
     """
-    report = _verify(context.obj, full=full)
-    rebuilt: list[str] = []
-    if repair:
-        from fleet_slip.repair import repair as rebuild  # noqa: PLC0415 - the simulator
+    with workers(context, cluster) as (warehouse, executor):
+        report = _verify(warehouse, executor, full=full)
+        rebuilt: list[str] = []
+        if repair:
+            from fleet_slip.repair import repair as rebuild  # noqa: PLC0415 - the simulator
 
-        rebuilt = rebuild(context.obj, report, campaign or ())
-        report = _verify(context.obj, full=full)
+            rebuilt = rebuild(warehouse, report, campaign or ())
+            report = _verify(warehouse, executor, full=full)
     if json:
         print_json(_verified(report, rebuilt))
     else:
@@ -71,9 +75,9 @@ def verify(
         raise DamageError(f"{context.obj.root}: {len(report.damage)} damaged. {advice}")
 
 
-def _verify(warehouse: Warehouse, *, full: bool) -> Verification:
-    with progress("verify", "bytes") as advance:
-        return verify_root(warehouse, full=full, progress=advance)
+def _verify(warehouse: Warehouse, executor: Executor, *, full: bool) -> Verification:
+    with progress("verify", "bytes", executor) as advance:
+        return verify_root(warehouse, full=full, progress=advance, executor=elsewhere(executor))
 
 
 def _verified(report: Verification, rebuilt: list[str]) -> dict[str, Any]:
