@@ -6,6 +6,7 @@ task again where its worker died. What is added here: every task is checked wher
 waits for ever for a scheduler or for workers that do not come back.
 """
 
+import asyncio
 import contextlib
 import logging
 import time
@@ -21,6 +22,7 @@ from typing import Any
 
 from distributed import Client
 from distributed.client import ClosedClientError
+from distributed.comm.addressing import resolve_address
 from distributed.scheduler import KilledWorker
 from distributed.versions import VersionMismatchWarning
 
@@ -45,6 +47,7 @@ POLL_S = 1.0
 PATIENCE_S = 120.0
 """How long a cluster may be without workers: so long may a container take to start."""
 
+ANSWER_S = 20.0
 CLOSE_S = 5.0
 MARKER_FOLDER = ".cluster"
 MARKER_AGE_MAX_H = 7 * 24
@@ -60,20 +63,10 @@ def cluster_executor(address: str, root: Folder) -> Iterator["ClusterExecutor"]:
     the cluster has other versions.
     """
     _route_logs()
-    client = _connected(address)
     try:
-        with _marker(root) as marker:
-            _require_same_versions(client)
-            with ClusterExecutor(client, address, marker) as executor:
-                yield executor
-    finally:
-        with contextlib.suppress(OSError, TimeoutError, AssertionError):
-            client.close(timeout=CLOSE_S)
-
-
-def _connected(address: str) -> Client:
-    try:
-        return Client(address, set_as_default=False, name="fleet-slip")
+        resolve_address(address)
+        _require_same_versions(asyncio.run(_versions(address)))
+        client = Client(address, set_as_default=False, name="fleet-slip")
     except (OSError, ValueError, TypeError, ImportError, RuntimeError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ClusterError(
@@ -81,12 +74,30 @@ def _connected(address: str) -> Client:
             "scheduler; or leave --cluster out, and DASK_SCHEDULER_ADDRESS unset, to work on this "
             "machine."
         ) from None
+    try:
+        with _marker(root) as marker, ClusterExecutor(client, address, marker) as executor:
+            yield executor
+    finally:
+        with contextlib.suppress(OSError, AssertionError):
+            client.close(timeout=CLOSE_S)
 
 
-def _require_same_versions(client: Client) -> None:
+async def _versions(address: str) -> dict[str, Any]:
+    """Return the versions of scheduler and workers; of none, if one of them does not answer.
+
+    By a client of its own: one that cannot connect leaves a thread behind unless it is a coroutine.
+    """
+    async with Client(address, asynchronous=True, set_as_default=False) as client:
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(ANSWER_S):
+                found: Any = await client.get_versions(packages=PACKAGES)
+                return {"the scheduler": found["scheduler"], **found["workers"]}
+    return {}
+
+
+def _require_same_versions(found: dict[str, Any]) -> None:
     """Refuse other versions before any work; a worker that comes later is told by its tasks."""
-    found: Any = client.get_versions(packages=PACKAGES)
-    for where, theirs in {"the scheduler": found["scheduler"], **found["workers"]}.items():
+    for where, theirs in found.items():
         packages = {name: theirs["packages"].get(name) or "none" for name in PACKAGES}
         python = ".".join(theirs["packages"]["python"].split(".")[:3])
         require_same(where, versions(), {"python": python, **packages})

@@ -1,0 +1,184 @@
+"""The commands on a cluster: the same bits as on one machine, or clear words."""
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from benchmarks.dask_processes import DaskProcesses, dask_processes
+from fleet_slip.cluster import cluster_executor
+from fleet_slip.cluster_worker import Marker, environment, pickled, work
+from fleet_slip.errors import RefusedError, StorageError
+from fleet_slip.local_folder import LocalFolder
+from fleet_slip.tasks import LocalThreads, completed
+from tests.cluster.work import Order, obey
+from tests.conftest import COMMAND, RunCommand
+from tests.ingest.samples import csv_text, good_columns
+
+MAPPING = """
+name = "test"
+time = {column = "t", unit = "s"}
+drive = {day = 2024-05-31, vehicle_id = "car", vehicle_model = "sedan"}
+signals.ax = {column = "ax", unit = "m/s^2"}
+signals.sideslip = {column = "beta", unit = "deg"}
+"""
+
+
+@pytest.fixture(scope="module")
+def dask(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DaskProcesses]:
+    with dask_processes(tmp_path_factory.mktemp("dask"), workers=2) as found:
+        found.wait_for_workers(2)
+        yield found
+
+
+def stored(root: Path) -> dict[str, bytes]:
+    """Names of data files, which tell their bytes, and model versions as they are."""
+    names = dict.fromkeys((str(f.relative_to(root)) for f in root.rglob("*.parquet")), b"")
+    return names | {str(f.relative_to(root)): f.read_bytes() for f in root.rglob("versions/*.json")}
+
+
+def run_orders(dask: DaskProcesses, folder: Path, number: int, seconds: float) -> int:
+    orders = [Order(f"task-{i}", folder, seconds) for i in range(number)]
+    with cluster_executor(dask.address, LocalFolder(folder)) as executor:
+        return len(list(completed(executor, obey, orders, str)))
+
+
+@pytest.mark.slow
+def test_every_command_gives_the_same_bits_as_on_one_machine(
+    dask: DaskProcesses, run_command: RunCommand, tmp_path: Path
+) -> None:
+    (tmp_path / "test.toml").write_text(MAPPING)
+    for n in range(3):
+        rows = good_columns(30 + n)
+        rows["ax"][3] = "broken"
+        (tmp_path / f"{n}.csv").write_text(csv_text(rows))
+    ingest = ["ingest", "0.csv", "1.csv", "2.csv", "--mapping", "test.toml", "--json"]
+    local, there = tmp_path / "local", tmp_path / "there"
+    cluster = ["--cluster", dask.address]
+    for root, options in ((local, []), (there, cluster)):
+        for command in (["run", "--campaign", "smoke"], ingest, ["gram"]):
+            done = run_command(*command, *options, root=root)
+            assert done.exit_code == 0, done.stderr
+            assert "distributed" not in done.stderr
+            if command is ingest:
+                assert [(r["new"], r["rows_quarantined"]) for r in done.json] == [(True, 1)] * 3
+    assert stored(there) == stored(local)
+
+    by_variable = {"env": os.environ | {"DASK_SCHEDULER_ADDRESS": dask.address}}
+    again = run_command("run", "--campaign", "smoke", root=there, **by_variable)
+    assert "nothing to do" in again.stderr
+    verified = run_command("verify", "--full", "--json", *cluster, root=there)
+    assert verified.json == run_command("verify", "--full", "--json", root=local).json
+    assert (verified.json["damage"], verified.json["remarks"]) == ([], [])
+
+    damaged = min((there / "logs").rglob("*.parquet"))
+    damaged.write_bytes(damaged.read_bytes()[:-1] + b"?")
+    found = run_command("verify", *cluster, root=there)
+    assert found.exit_code == 9
+    assert damaged.name in found.stdout + found.stderr
+
+
+@pytest.mark.slow
+def test_a_killed_command_is_finished_by_the_next(
+    dask: DaskProcesses, run_command: RunCommand, tmp_path: Path
+) -> None:
+    local, there = tmp_path / "local", tmp_path / "there"
+    assert run_command("simulate", "smoke", root=local).exit_code == 0
+    command = ["simulate", "smoke", "--cluster", dask.address]
+    with subprocess.Popen([COMMAND, "--root", there, *command], stderr=subprocess.PIPE) as killed:
+        while not list(there.glob("logs/_delta_log/*.json")) and killed.poll() is None:
+            time.sleep(0.01)
+        killed.kill()
+    assert run_command(*command, root=there).exit_code == 0
+    assert stored(there) == stored(local)
+    assert run_command("verify", root=there).exit_code == 0
+
+
+@pytest.mark.slow
+def test_a_worker_of_other_versions_is_refused_early_and_late(
+    dask: DaskProcesses, tmp_path: Path
+) -> None:
+    other = tmp_path / "site" / "numba-0.1.dist-info"
+    other.mkdir(parents=True)
+    (other / "METADATA").write_text("Metadata-Version: 2.1\nName: numba\nVersion: 0.1\n")
+    path = os.pathsep.join([str(other.parent), os.environ.get("PYTHONPATH", "")])
+    with cluster_executor(dask.address, LocalFolder(tmp_path)) as executor:
+        worker = dask.start_worker(environment={"PYTHONPATH": path})
+        try:
+            dask.wait_for_workers(3)
+            orders = [Order(f"task-{i}", tmp_path, 0.2) for i in range(12)]
+            with pytest.raises(RefusedError, match=r"^worker .* has numba 0\.1 instead of "):
+                list(completed(executor, obey, orders, str))
+            with pytest.raises(RefusedError, match=r"^tcp://.* has numba 0\.1 instead of "):
+                run_orders(dask, tmp_path, 1, 0)
+        finally:
+            dask.kill(worker)
+
+
+@pytest.mark.slow
+def test_a_worker_that_does_not_see_the_data_root_writes_nothing(
+    dask: DaskProcesses, tmp_path: Path
+) -> None:
+    own_mounts = ["unshare", "--mount"]
+    if subprocess.run([*own_mounts, "true"], check=False, capture_output=True).returncode:
+        pytest.skip("not permitted to hide a folder from a process")
+    hide = f'mount -t tmpfs none {tmp_path} && exec "$0" "$@"'
+    blind = dask.start_worker("--name", "blind", before=(*own_mounts, "sh", "-c", hide))
+    try:
+        dask.wait_for_workers(3)
+        with pytest.raises(StorageError, match="does not see the data root of this command"):
+            run_orders(dask, tmp_path, 12, 0.2)
+    finally:
+        dask.kill(blind)
+    assert run_orders(dask, tmp_path, 4, 0) == 4
+
+
+def test_a_task_makes_sure_of_its_ground(tmp_path: Path) -> None:
+    task = pickled(Marker(LocalFolder(tmp_path), "marker"), obey, Order("a", tmp_path))
+    with pytest.raises(StorageError, match="does not see the data root"):
+        work(environment(), task)
+    (tmp_path / "marker").touch()
+    assert work(environment(), task) == "A"
+    with pytest.raises(RefusedError, match=r"fleet-slip .* instead of 9"):
+        work({**environment(), "fleet-slip": "9"}, b"is not even unpickled")
+
+
+def test_an_unreachable_scheduler_is_told_in_bounded_time(run_command: RunCommand) -> None:
+    hasty = {"env": os.environ | {"DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "1s"}}
+    for address in ("tcp://127.0.0.1:9", "nonsense://x:1", "127.0.0.1:9"):
+        done = run_command("gram", "--cluster", address, **hasty)
+        assert done.exit_code == 11
+        assert f"{address}: no Dask scheduler can be reached there" in done.stderr
+        assert len(done.stderr.splitlines()) == 1
+
+
+def test_without_dask_the_option_says_what_to_install(tmp_path: Path) -> None:
+    program = (
+        "import sys; sys.modules['distributed'] = None\n"
+        "from fleet_slip.cli.main import main; main()"
+    )
+    options = ["--root", str(tmp_path), "gram", "--cluster", "tcp://x:1"]
+    command = [sys.executable, "-c", program, *options]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 3
+    assert "pip install 'fleet-slip[cluster]'" in done.stderr
+
+
+def test_a_bounded_number_of_tasks_is_under_way() -> None:
+    taken: list[int] = []
+
+    def items() -> Iterator[int]:
+        for i in range(50):
+            taken.append(i)
+            yield i
+
+    with LocalThreads(2) as threads:
+        done = []
+        for item, result in completed(threads, lambda i: i * i, items(), str):
+            done.append((item, result))
+            assert len(taken) - len(done) < threads.in_flight
+    assert sorted(done) == [(i, i * i) for i in range(50)]
