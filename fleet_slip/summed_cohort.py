@@ -33,7 +33,7 @@ from fleet_slip.model_list import FoldPlan
 from fleet_slip.regression.folds import CohortFolds, hash_number
 from fleet_slip.warehouse import Warehouse
 
-BATCH_ROWS = 2**15
+BATCH_ROWS = 2**13
 """Gram rows of one batch: some 700 bytes each."""
 
 FoldOf = Callable[[pa.RecordBatch, NDArray[np.uint64]], IntArray]
@@ -147,6 +147,8 @@ class _Sums:
     tables: dict[str, list[Gram]] = field(default_factory=dict)
     drives: dict[str, list[NDArray[np.uint64]]] = field(default_factory=dict)
     used: set[int] = field(default_factory=set)
+    divided: bool = False
+    """Whether a drive may have several Gram rows of the same signals."""
 
     def add(self, batch: pa.RecordBatch) -> None:
         """Add a batch of Gram rows."""
@@ -154,6 +156,7 @@ class _Sums:
         drives = np.fromiter(map(hash_number, ids), dtype=np.uint64, count=len(ids))
         folds = self.fold_of(batch, drives)
         self.used.update(np.unique(folds).tolist())
+        self.divided |= batch["part"].null_count < len(batch)
         rows = pa.Table.from_batches([batch])
         for signals in batch["signals"].unique().to_pylist():
             mask = pc.equal(batch["signals"], signals)
@@ -166,9 +169,15 @@ class _Sums:
             self.drives.setdefault(signals, []).append(drives[here])
 
     @property
+    def _one_each(self) -> bool:
+        """Whether every Gram row is of a drive of its own: then nothing must be sorted to tell."""
+        return len(self.tables) == 1 and not self.divided
+
+    @property
     def drive_count(self) -> int:
         """Number of drives."""
-        return len(np.unique(np.concatenate([part for p in self.drives.values() for part in p])))
+        every = [part for parts in self.drives.values() for part in parts]
+        return sum(map(len, every)) if self._one_each else len(np.unique(np.concatenate(every)))
 
     def folds(self, names: Sequence[str]) -> CohortFolds:
         """Return the folds that a drive fell into. Raises `SelectionError` if it is one only."""
@@ -179,10 +188,16 @@ class _Sums:
                 f"{names[used[0]]}. Widen the cohort, or fold by another key."
             )
         order = sorted(self.tables)
-        each = [np.concatenate(self.drives[signals]) for signals in order]
-        _, numbers = np.unique(np.concatenate(each), return_inverse=True)
         return CohortFolds(
             tuple(names[fold] for fold in used),
             tuple(tuple(self.tables[signals][fold] for fold in used) for signals in order),
-            tuple(np.split(numbers, np.cumsum([len(part) for part in each])[:-1])),
+            self._numbers(order),
         )
+
+    def _numbers(self, order: Sequence[str]) -> tuple[IntArray, ...]:
+        """Return the number of each Gram row's drive, table by table."""
+        if self._one_each:
+            return (np.arange(self.drive_count),)
+        each = [np.concatenate(self.drives[signals]) for signals in order]
+        _, numbers = np.unique(np.concatenate(each), return_inverse=True)
+        return tuple(np.split(numbers, np.cumsum([len(part) for part in each])[:-1]))
