@@ -23,6 +23,7 @@ from typing import Any
 
 from benchmarks import billion_campaigns as campaigns
 from benchmarks.billion_figures import markdown, plot
+from benchmarks.documents import insert
 from benchmarks.usage import Usage, measured
 
 COHORT = "adhesion < 0.8"
@@ -119,9 +120,14 @@ def run_size(rows: int, folder: Path) -> dict[str, Any]:
         "files": simulated["told"]["batches_written"],
         "drives": simulated["told"]["drives"],
         "size_bytes": simulated["told"]["size_bytes"],
-        "steps": steps.done,
+        "steps": {name: _without_answer(name, step) for name, step in steps.done.items()},
         "machine": machine(),
     }
+
+
+def _without_answer(name: str, step: dict[str, Any]) -> dict[str, Any]:
+    """Return a step without what the command printed, unless that is what was measured."""
+    return step if name == "cohort: in process" else {k: v for k, v in step.items() if k != "told"}
 
 
 def require_space(rows: int, folder: Path, root: Path) -> None:
@@ -178,6 +184,7 @@ def main() -> None:
     parser.add_argument("--rows", type=float, nargs="*", default=[], help="sizes to run, as 1e9")
     parser.add_argument("--figures", type=Path, help="JSON file of figures; default: below --root")
     parser.add_argument("--plot", type=Path, help="draw cost against rows, as .svg or .png")
+    parser.add_argument("--document", type=Path, help="a page to put the table into")
     parser.add_argument("--json", action="store_true", help="print the figures instead of a table")
     parser.add_argument("--keep", action="store_true", help="do not delete the data afterwards")
     options = parser.parse_args()
@@ -189,6 +196,8 @@ def main() -> None:
     sizes = [figures[key] for key in sorted(figures, key=int)]
     if options.plot:
         plot(sizes, options.plot)
+    if options.document:
+        insert(options.document, "billion", markdown(sizes))
     print(json.dumps(figures, indent=1) if options.json else markdown(sizes))
 
 

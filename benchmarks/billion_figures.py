@@ -111,7 +111,7 @@ def plot(sizes: Sequence[Size], file: Path) -> None:
         )
         left.set_xlabel("rows")
         left.set_title("time, s (slope between the two largest)")
-        left.legend(frameon=False, fontsize=7)
+        left.legend(frameon=False, fontsize=7, loc="upper left")
         names = {"simulate": "model_4", "gram": "model_3", "select": "model_2"}
         for step, colour in {**names, "forget a car": "unstable"}.items():
             values = [_peak_mib(size, step) for size in sizes]
@@ -122,7 +122,7 @@ def plot(sizes: Sequence[Size], file: Path) -> None:
         right.set_ylim(0, None)
         right.set_xlabel("rows")
         right.set_title("peak memory of the process, MiB")
-        right.legend(frameon=False, fontsize=7)
+        right.legend(frameon=False, fontsize=7, loc="center right")
         file.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(file, bbox_inches="tight", metadata=_dateless(file))
         plt.close(figure)

@@ -21,6 +21,7 @@ from typing import Any
 from benchmarks import growth_history as history
 from benchmarks.billion import PROGRAM
 from benchmarks.billion_campaigns import Sized, write
+from benchmarks.documents import insert
 from benchmarks.usage import Usage, measured
 from fleet_slip.campaign import load_campaign
 from fleet_slip.local_folder import LocalFolder
@@ -180,12 +181,15 @@ def main() -> None:
     parser.add_argument("--root", type=Path, default=Path("data-growth"), help="where to work")
     parser.add_argument("--part", nargs="*", choices=PARTS, default=list(PARTS))
     parser.add_argument("--sizes", type=float, nargs="*", help="default: those of the part")
+    parser.add_argument("--document", type=Path, help="a page to put the tables into")
     parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
     options = parser.parse_args()
     found = {}
     for name in options.part:
         sizes = [round(s) for s in options.sizes] if options.sizes else PARTS[name].sizes
         found[name] = grow(name, sizes, options.root)
+        if options.document:
+            insert(options.document, f"growth: {name}", markdown(name, found[name]))
         if not options.json:
             print(markdown(name, found[name]) + "\n", flush=True)
     if options.json:

@@ -154,3 +154,19 @@ def test_the_check_finds_a_gram_row_that_is_not_of_its_file(
     ):
         check_grams(warehouse, 1)
     assert DAY in rows["day"].to_pylist()
+
+
+def test_a_car_can_compute_its_gram_row_tick_by_tick(warehouse: Warehouse) -> None:
+    """78 64-bit integers, and as many multiplications a tick: what an ECU would do on board."""
+    counts = random_counts(np.random.default_rng(5), 200)
+    land(warehouse, "one", log_rows("car", counts))
+    update_grams(warehouse)
+    [gram] = stored(warehouse).values()
+    on_board = np.zeros(78, dtype=np.int64)
+    row, column = np.tril_indices(12)
+    for tick in range(200):
+        values = np.array([1, *(counts[name][tick] for name in NAMES)], dtype=np.int64)
+        on_board += values[row] * values[column]
+    n, products = on_board[0], on_board[(row > 0) & (column > 0)]
+    sums = on_board[(row > 0) & (column == 0)]
+    assert [n, *sums, *products] == [gram.n, *gram.sums, *gram.products]
