@@ -2,9 +2,10 @@
 
     python -m benchmarks.growth --root FOLDER [--part files gram-rows ...] [--sizes 1e3 1e4]
 
-Every command runs in a process of its own. Prints a Markdown table for each part: seconds at each
-size, the slope between the two largest, and the peak memory at the largest. A command that does
-not need what grows should have a slope near 0; none should have more than 1.
+Every command runs in a process of its own. Prints a Markdown table for each part: processor
+seconds at each size, which other work on the machine disturbs little, the slope between the two
+largest, and the peak memory at the largest. A command that does not need what grows should have a
+slope near 0; none should have more than 1.
 """
 
 import argparse
@@ -153,9 +154,13 @@ def grow(name: str, sizes: Sequence[int], folder: Path) -> dict[str, Any]:
             seen[text] = seen.get(text, 0) + 1
             text += " (again)" * (seen[text] - 1)
             found.setdefault(text, []).append(
-                {"seconds": usage.seconds, "peak_bytes": usage.peak_bytes}
+                {
+                    "seconds": usage.seconds,
+                    "cpu_s": usage.cpu_s,
+                    "peak_bytes": usage.peak_bytes,
+                }
             )
-            print(f"{name} {size:>9,}  {text:<70} {usage.seconds:8.2f} s", file=sys.stderr)
+            print(f"{name} {size:>9,}  {text:<70} {usage.cpu_s:8.2f} CPU-s", file=sys.stderr)
         shutil.rmtree(root.parent)
     return {"sizes": list(sizes), "commands": found}
 
@@ -163,14 +168,14 @@ def grow(name: str, sizes: Sequence[int], folder: Path) -> dict[str, Any]:
 def markdown(name: str, part: dict[str, Any]) -> str:
     """Return a part's figures as a Markdown table."""
     sizes = part["sizes"]
-    head = [name, *(f"{n:,}" for n in sizes), "slope", "peak MiB"]
+    head = [f"{name}: processor seconds", *(f"{n:,}" for n in sizes), "slope", "peak MiB"]
     lines = [" | ".join(head), " | ".join(["---", *["---:"] * (len(head) - 1)])]
     for text, figures in part["commands"].items():
-        seconds = [figure["seconds"] for figure in figures]
-        cells = [f"`{text}`", *(f"{s:.2f}" for s in seconds)]
+        times = [figure["cpu_s"] for figure in figures]
+        cells = [f"`{text}`", *(f"{s:.2f}" for s in times)]
         rise = math.nan
         if len(sizes) > 1:
-            rise = math.log(seconds[-1] / seconds[-2]) / math.log(sizes[-1] / sizes[-2])
+            rise = math.log(times[-1] / times[-2]) / math.log(sizes[-1] / sizes[-2])
         cells += [f"{rise:.2f}", f"{figures[-1]['peak_bytes'] / 2**20:,.0f}"]
         lines.append(" | ".join(cells))
     return "\n".join(f"| {line} |" for line in lines)

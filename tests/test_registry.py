@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from fleet_slip.documents import DocumentFolder
+from fleet_slip.documents import Document, DocumentFolder
 from fleet_slip.errors import RefusedError, SelectionError, StorageError
 from fleet_slip.local_folder import LocalFolder
 from fleet_slip.registry import (
@@ -139,3 +139,40 @@ def test_writers_at_once_never_share_a_number_or_lose_a_version(tmp_path: Path) 
     published = {registry.load("sideslip", n).manifest.terms[0].coefficient_exact for n in numbers}
     assert len(published) == 40
     assert len(registry.history("sideslip")) == 40
+
+
+def test_a_version_and_the_champion_are_found_without_reading_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    registry = Registry(LocalFolder(tmp_path))
+    for number in range(1, 21):
+        registry.publish(manifest(Fraction(number)))
+    read: list[int] = []
+
+    def counted(folder: DocumentFolder, number: int) -> Document:
+        read.append(number)
+        return original(folder, number)
+
+    original = DocumentFolder.read
+    monkeypatch.setattr(DocumentFolder, "read", counted)
+    champion = registry.champion("sideslip")
+    assert champion is not None
+    assert registry.published_at("sideslip", champion.version) is not None
+    assert registry.load("sideslip", 7).version == 7
+    assert read == [20, 20, 20, 7]
+    read.clear()
+    assert registry.as_table().num_rows == 20
+    assert len(read) <= 3 * 20
+
+
+def test_an_alias_points_where_its_last_move_left_it(tmp_path: Path) -> None:
+    registry = Registry(LocalFolder(tmp_path))
+    for number in (1, 2, 3):
+        registry.publish(manifest(Fraction(number)))
+    registry.promote("sideslip", 1, "tested")
+    registry.rollback("sideslip", CHAMPION)
+    for alias in (CHAMPION, "tested", "unknown"):
+        assert registry.pointed_at("sideslip", alias) == registry.aliases("sideslip").get(alias)
+    rows = registry.as_table().to_pylist()
+    assert [row["aliases"] for row in rows] == ["tested", "champion", ""]
+    assert [row["published_at"] for row in rows] == sorted(row["published_at"] for row in rows)
