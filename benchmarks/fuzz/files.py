@@ -39,6 +39,8 @@ def csv_file(rng: random.Random) -> bytes:
     separator = rng.choice([*[","] * 12, ";", "\t"])
     columns = _names(rng)
     rows = rng.choice([0, 1, 5, 30, 30, 200, 200])
+    if len(columns) > 100:  # to write many cells takes longer than to refuse them
+        rows = min(rows, 1)
     lines = [separator.join(columns)]
     for tick in range(rows):
         cells = [_cell(rng, name, tick) for name in columns]
