@@ -5,6 +5,8 @@ import sys
 
 COMMANDS = (
     "simulator",
+    "simulator_profile",
+    "work_precision",
     "pipeline",
     "statistics",
     "observers",

@@ -20,7 +20,13 @@ from fleet_slip.speed_profile import SpeedLimits, speed_profile
 from fleet_slip.track import load_track
 from fleet_slip.vehicle.driver import SAMPLE_S
 from fleet_slip.vehicle.highway import FourWheelVehicle
-from fleet_slip.vehicle.lanes import STEPS_PER_SAMPLE, LaneDrive, Road, simulate_drives
+from fleet_slip.vehicle.lanes import (
+    STEPS_PER_SAMPLE,
+    LaneDrive,
+    Road,
+    simulate_blocks,
+    simulate_drives,
+)
 from fleet_slip.vehicle.parameters import load_vehicle
 
 ROUNDS = 5
@@ -73,7 +79,7 @@ def lanes_rate(
     def work(_: int) -> int:
         samples, start = 0, time.perf_counter()
         while time.perf_counter() - start < seconds:
-            samples += sum(len(truth.vx_mps) for truth in simulate_drives(drives, steps))
+            samples += sum(len(b.channels["vx_mps"]) for b in simulate_blocks(drives, steps))
         return samples
 
     start = time.perf_counter()
