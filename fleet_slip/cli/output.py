@@ -5,6 +5,7 @@ import logging
 import math
 import os
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
@@ -27,7 +28,10 @@ from rich.text import Text
 
 from fleet_slip.cli.logs import for_people, stderr
 from fleet_slip.errors import printable
-from fleet_slip.operations.run_log import LOGGER
+from fleet_slip.operations.run_log import LOGGER, log_event
+
+TOLD_EVERY_S = 30.0
+"""How often the log tells the progress of a job."""
 
 Json = Annotated[bool, typer.Option("--json", help="Print machine-readable JSON on stdout.")]
 
@@ -114,8 +118,8 @@ def progress(
 ) -> Iterator[Callable[[int, int], None]]:
     """Show a bar with rate and time left on stderr while a job runs, if a person watches.
 
-    And the number of workers, if the executor is of a cluster. Yields the callback that jobs take:
-    how much more is done, and how much there is in all.
+    And the number of workers, if the executor is of a cluster. Machines are told by an event now
+    and then. Yields the callback that jobs take: how much more is done, and how much there is.
     """
     console = stderr()
     bar = Progress(
@@ -133,7 +137,17 @@ def progress(
     with bar:
         task = bar.add_task(doing, total=None, unit=unit, executor=executor)
 
+        begun = told = time.monotonic()
+        done = 0
+
         def advance(more: int, total: int) -> None:
+            nonlocal told, done
             bar.update(task, advance=more, total=total)
+            done += more
+            if (now := time.monotonic()) - told > TOLD_EVERY_S:
+                told = now
+                rate = {f"{unit}_per_s": round(done / (now - begun))}
+                workers = getattr(executor, "workers", None)
+                log_event("progress", doing=doing, done=done, total=total, workers=workers, **rate)
 
         yield advance

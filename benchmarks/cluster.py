@@ -1,0 +1,93 @@
+"""Simulation and Gram rows by threads of one process, and by the workers of a Dask cluster.
+
+    python -m benchmarks.cluster [--days 6] [--workers 2]
+
+Both run the first days of the campaign `fleet` on this machine, with as many threads as the cluster
+has workers of one thread, and are timed after a first batch has warmed them up. Whether both wrote
+the same bits is checked: the names of data files carry their checksums.
+"""
+
+import argparse
+import tempfile
+import time
+from collections.abc import Callable
+from concurrent.futures import Executor
+from pathlib import Path
+
+from benchmarks.dask_processes import dask_processes
+from fleet_slip.campaign import Campaign, load_campaign
+from fleet_slip.cluster import cluster_executor
+from fleet_slip.gram_job import update_grams
+from fleet_slip.local_folder import LocalFolder
+from fleet_slip.simulation_job import simulate_campaign
+from fleet_slip.tasks import LocalThreads
+from fleet_slip.warehouse import Warehouse
+
+WARM_UP = "smoke"
+
+
+def timed(function: Callable[[], object]) -> float:
+    """Return the time of a call, in s."""
+    start = time.perf_counter()
+    function()
+    return time.perf_counter() - start
+
+
+def measure(
+    root: Path, campaign: Campaign, days: int, executor: Executor, elsewhere: Executor | None
+) -> tuple[float, float]:
+    """Return the time to simulate and the time for the Gram rows, in s."""
+    warm = load_campaign(WARM_UP)
+    other = Warehouse(LocalFolder(root.with_name(f"{root.name}-warm")))
+    simulate_campaign(other, warm, warm.days(), executor)
+    update_grams(other, executor=elsewhere)
+    warehouse = Warehouse(LocalFolder(root))
+    chosen = campaign.days()[:days]
+    return (
+        timed(lambda: simulate_campaign(warehouse, campaign, chosen, executor)),
+        timed(lambda: update_grams(warehouse, executor=elsewhere)),
+    )
+
+
+def peak_memory_bytes(process: int) -> int:
+    """Return the most memory that a process has held."""
+    status = Path(f"/proc/{process}/status").read_text()
+    return int(status.partition("VmHWM:")[2].split()[0]) * 1024
+
+
+def data_files(root: Path) -> set[str]:
+    """Return the names of all data files."""
+    return {str(file.relative_to(root)) for file in root.rglob("*.parquet")}
+
+
+def main() -> None:
+    """Measure both, and compare."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--days", type=int, default=6)
+    parser.add_argument("--workers", type=int, default=2)
+    arguments = parser.parse_args()
+    campaign = load_campaign("fleet")
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        here, there = folder / "here", folder / "there"
+        with LocalThreads(arguments.workers) as threads:
+            local = measure(here, campaign, arguments.days, threads, None)
+        with dask_processes(folder, arguments.workers) as dask:
+            dask.wait_for_workers(arguments.workers)
+            with cluster_executor(dask.address, LocalFolder(folder)) as executor:
+                cluster = measure(there, campaign, arguments.days, executor, executor)
+            memory = max(peak_memory_bytes(process.pid) for process in dask.processes[1:])
+        assert data_files(here) == data_files(there), "the bits differ"
+        rows = Warehouse(LocalFolder(here)).logs.snapshot().rows
+    print(f"{rows:,} rows; the same bits from {arguments.workers} threads and from Dask workers")
+    for what, ours, theirs in zip(("simulate", "gram"), local, cluster, strict=True):
+        print(
+            f"{what:10s} threads {ours:6.2f} s, {rows / ours / 1e6:6.2f} Mrows/s   "
+            f"cluster {theirs:6.2f} s, {rows / theirs / 1e6:6.2f} Mrows/s   "
+            f"ratio {ours / theirs:.2f}"
+        )
+    print(f"a worker of one thread held at most {memory / 2**20:.0f} MiB")
+
+
+if __name__ == "__main__":
+    main()
