@@ -261,3 +261,5 @@ def _route_logs() -> None:
             logger.handlers.clear()
             logger.propagate = True
     warnings.filterwarnings("ignore", category=VersionMismatchWarning)
+    # A client that could not even begin to connect complains of itself when it is collected.
+    warnings.filterwarnings("ignore", r"coroutine '(Client\._close|wait_for)' was never awaited")
