@@ -30,6 +30,11 @@ def seconds(size: Size, steps: Sequence[str]) -> float:
     return math.fsum(size["steps"][name]["seconds"] for name in steps)
 
 
+def processor_s(size: Size, steps: Sequence[str]) -> float:
+    """Return the time that some steps together took on processors."""
+    return math.fsum(size["steps"][name]["cpu_s"] for name in steps)
+
+
 def slope(rows: Sequence[float], values: Sequence[float]) -> float:
     """Return the slope of log value over log rows, by least squares."""
     return float(np.polyfit(np.log(rows), np.log(values), 1)[0])
@@ -69,7 +74,9 @@ def _figures(
         ("drives", lambda s: s["drives"], "{:,}".format),
         ("bytes a row", lambda s: s["size_bytes"] / s["rows"], "{:.2f}".format),
         ("**from nothing to a published model, s**", lambda s: seconds(s, FROM_NOTHING), time),
+        ("the same, processor seconds", lambda s: processor_s(s, FROM_NOTHING), time),
         ("**a new day of 1 %, s**", lambda s: seconds(s, NEW_DAY), time),
+        ("the same, processor seconds", lambda s: processor_s(s, NEW_DAY), time),
         *((f"{name}, s", lambda s, name=name: seconds(s, [name]), time) for name in commands),
         *(
             (name, lambda s, key=key: s["steps"]["cohort: in process"]["told"][key], time)

@@ -48,7 +48,8 @@ COUNT_RUNS = ("sql", "SELECT count(*) FROM runs")
 ONE_DAY = ("sql", "SELECT count(*) FROM log_counts WHERE day = DATE '2020-01-02'")
 LAND = ("simulate", "smoke", "--days", "1")
 FORGET = ("forget", "--vehicle", "car-00000003", "--now")
-VERIFY = ("verify",)
+PLAN = ("simulate", "growth_days.toml")
+"""The first time, complete days are recorded, which a campaign that grows night by night has."""
 
 Command = tuple[str, ...]
 
@@ -129,7 +130,7 @@ PARTS = {
     ),
     "runs": Part(runs, (10_000, 100_000, 1_000_000), (GRAM, STATUS, COUNT_GRAMS, COUNT_RUNS)),
     "commits": Part(commits, (1000, 10_000, 100_000), EVERY_NIGHT),
-    "days": Part(days, (100, 1000, 10_000), (("simulate", "growth_days.toml"), STATUS)),
+    "days": Part(days, (100, 1000, 10_000), (PLAN, PLAN, STATUS)),
 }
 
 
