@@ -1,6 +1,7 @@
 """The commands that `benchmarks/crash.py` kills, what must be there before, and small inputs."""
 
 import csv
+import json
 import math
 import os
 import random
@@ -11,6 +12,7 @@ from pathlib import Path
 from fleet_slip.folder import TEMPORARY_PREFIX
 from fleet_slip.local_folder import LocalFolder
 from fleet_slip.resources import find_config
+from fleet_slip.sealing import NOTE, SEAL, seal
 from fleet_slip.warehouse import Warehouse
 
 SIMULATE = ("simulate", "{campaign}", "--threads", "1")
@@ -83,9 +85,18 @@ def let_time_pass(root: Path) -> None:
 
 
 def _removed_long_ago(log: str) -> str:
-    key = '"deletionTimestamp":'
-    head, *tails = log.split(key)
-    return head + "".join(key + "1" + tail.lstrip("0123456789") for tail in tails)
+    """Return a commit whose files were removed long ago, with the checksum that it then states."""
+    actions = [json.loads(line) for line in log.splitlines()]
+    for action in actions:
+        if "remove" in action:
+            action["remove"]["deletionTimestamp"] = 1
+    for info in (
+        action["commitInfo"] for action in actions if NOTE in action.get("commitInfo", ())
+    ):
+        note = json.loads(info[NOTE])
+        stated = [action for action in actions if action.keys() & {"add", "remove", "txn"}]
+        info[NOTE] = json.dumps({**note, SEAL: seal(note, stated)})
+    return "\n".join(map(json.dumps, actions))
 
 
 def damage_files(root: Path) -> None:
