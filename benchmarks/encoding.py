@@ -28,7 +28,7 @@ from fleet_slip.gram_job import FILES_PER_QUERY
 from fleet_slip.gram_statement import gram_statement
 from fleet_slip.local_folder import LocalFolder
 from fleet_slip.signals import catalogue
-from fleet_slip.storage import ROW_GROUP_ROWS
+from fleet_slip.storage import ROW_GROUP_ROWS, WRITE_BATCH_ROWS
 from fleet_slip.warehouse import Warehouse
 
 ROUNDS = 3
@@ -141,7 +141,10 @@ def source_rows(warehouse: Warehouse, copies: int) -> pa.Table:
         names = pa.array([f"{copy}-{name}" for name in drives.dictionary.to_pylist()])
         renamed = pa.DictionaryArray.from_arrays(drives.indices, names)
         parts.append(rows.set_column(place, "drive_id", renamed))
-    return pa.concat_tables(parts).unify_dictionaries()
+    every = pa.concat_tables(parts).unify_dictionaries()
+    # As the jobs write them: columns without a null are declared so.
+    fields = [field.with_nullable(every[field.name].null_count > 0) for field in every.schema]
+    return every.cast(pa.schema(fields))
 
 
 def drive_starts(rows: pa.Table) -> list[int]:
@@ -166,7 +169,13 @@ def write(layout: Layout, rows: pa.Table, folder: Path) -> Measured:
     files = [str(folder / f"{number:06d}.parquet") for number in range(len(tables))]
     start = time.process_time()
     for path, table in zip(files, tables, strict=True):
-        pq.write_table(table, path, row_group_size=layout.row_group_rows, **layout.options)
+        pq.write_table(
+            table,
+            path,
+            row_group_size=layout.row_group_rows,
+            write_batch_size=WRITE_BATCH_ROWS,
+            **layout.options,
+        )
     write_s = time.process_time() - start
     return Measured(layout, files, sum(Path(path).stat().st_size for path in files), write_s)
 
