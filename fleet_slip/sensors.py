@@ -149,10 +149,10 @@ class Recorder:
         self._saturated += clipped
 
     def measurement(self) -> Measurement:
-        """Return all blocks as one measurement."""
+        """Return all blocks as one measurement, once, at the end: their memory is given back."""
         return Measurement(
             {
-                name: _joined(self._counts[name])
+                name: _joined(self._counts.pop(name))
                 for name in catalogue().signals
                 if name in self._counts
             },

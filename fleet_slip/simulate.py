@@ -14,6 +14,9 @@ from fleet_slip.vehicle.lanes import LaneDrive, Road, simulate_blocks
 DRIVES_AT_ONCE = 128
 """Drives of a batch that are simulated together, which bounds the memory for their roads."""
 
+CHUNK_ROWS = 2**16
+"""Rows of a chunk of a column that is the same in all rows of a drive."""
+
 
 @dataclass(frozen=True)
 class DriveLog:
@@ -115,12 +118,14 @@ def _counts(log: DriveLog, name: str) -> pa.Array:
     return pa.array(log.measurement.counts[name], mask=no_fix)
 
 
-def _repeated(values: pa.Array, times: Sequence[int]) -> pa.Array:
-    """Return each value so many times; strings as a dictionary."""
-    if pa.types.is_string(values.type):
-        encoded = values.dictionary_encode()
-        codes = np.repeat(encoded.indices.to_numpy(), times)
-        return pa.DictionaryArray.from_arrays(codes, encoded.dictionary)
-    missing = np.repeat(values.is_null().to_numpy(zero_copy_only=False), times)
-    present = values.fill_null(0).to_numpy()
-    return pa.array(np.repeat(present, times), mask=missing if missing.any() else None)
+def _repeated(values: pa.Array, times: Sequence[int]) -> pa.ChunkedArray:
+    """Return each value so many times; strings as a dictionary.
+
+    Chunks of one drive share their memory, which does not grow with the length of the drive.
+    """
+    encoded = values.dictionary_encode() if pa.types.is_string(values.type) else values
+    chunks = []
+    for drive, count in enumerate(times):
+        same = encoded.take(pa.array(np.full(min(count, CHUNK_ROWS), drive)))
+        chunks += [same[: count - first] for first in range(0, count, CHUNK_ROWS)]
+    return pa.chunked_array(chunks, type=encoded.type)
