@@ -6,10 +6,11 @@ interrupted runs, repeated runs, deletions and compaction.
 """
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
+from itertools import accumulate, chain
 from math import ceil
 
 import duckdb
@@ -37,9 +38,12 @@ FILES_PER_QUERY = 16
 LAGGED_FILES_PER_QUERY = 2
 """Rows are sorted to find the one before, which takes memory for all rows of a query."""
 
-SMALL_FILE_ROWS = 100_000
+FILE_ROWS = 100_000
+"""Gram rows of a file, some 700 bytes each; a file with fewer is small. Rewriting takes the memory
+of a few files, however many Gram rows there are."""
+
 SMALL_FILES_MAX = 32
-"""So many small Gram files may stand side by side before a commit merges them."""
+"""So many small Gram files may stand side by side before a commit merges some."""
 
 Progress = Callable[[int, int], None]
 """Called with rows read since the last call, and rows to read in all."""
@@ -119,10 +123,9 @@ def _update_once(
         new_rows = aggregate(warehouse, backlog.missing, progress, None, feature_set, executor)
         replaced = _files_to_rewrite(grams, backlog.stale)
         kept = _rows_to_keep(grams, replaced, backlog.stale)
-        rows = pa.concat_tables([kept, new_rows])
         grams.commit(
             Change(
-                add=_write_files(warehouse, rows),
+                add=_write_rows(warehouse, chain(kept, [new_rows])),
                 remove=replaced,
                 units=[Unit(unit_name(identity), logs.version or 0)],
                 note={
@@ -240,6 +243,18 @@ def _signals_are_whole(warehouse: Warehouse, files: Sequence[TableFile]) -> bool
     )
 
 
+def _write_rows(warehouse: Warehouse, parts: Iterable[pa.Table]) -> list[AddAction]:
+    actions: list[AddAction] = []
+    waiting: list[pa.Table] = []
+    for part in parts:
+        for first in range(0, part.num_rows, FILE_ROWS):
+            waiting.append(part.slice(first, FILE_ROWS))
+            if sum(rows.num_rows for rows in waiting) >= FILE_ROWS:
+                actions += _write_files(warehouse, pa.concat_tables(waiting))
+                waiting.clear()
+    return actions + (_write_files(warehouse, pa.concat_tables(waiting)) if waiting else [])
+
+
 def _write_files(warehouse: Warehouse, rows: pa.Table) -> list[AddAction]:
     """Write one file for each feature set, so that reading one set reads no other."""
     actions = []
@@ -250,8 +265,7 @@ def _write_files(warehouse: Warehouse, rows: pa.Table) -> list[AddAction]:
 
 
 def _files_to_rewrite(grams: Snapshot, stale: frozenset[str]) -> list[TableFile]:
-    small = [file for file in grams.files if file.rows < SMALL_FILE_ROWS]
-    merged = {file.path for file in small} if len(small) > SMALL_FILES_MAX else set()
+    merged = _files_to_merge(grams)
     return [
         file
         for file in grams.files
@@ -259,18 +273,29 @@ def _files_to_rewrite(grams: Snapshot, stale: frozenset[str]) -> list[TableFile]
     ]
 
 
+def _files_to_merge(grams: Snapshot) -> set[str]:
+    """Return the smallest files, enough for one file of the usual size, where too many are small.
+
+    Each night merges a few, so that none has to merge all.
+    """
+    small = sorted((file.rows, file.path) for file in grams.files if file.rows < FILE_ROWS)
+    if len(small) <= SMALL_FILES_MAX:
+        return set()
+    rows = list(accumulate(rows for rows, _ in small))
+    return {path for (_, path), so_far in zip(small, rows, strict=True) if so_far <= 2 * FILE_ROWS}
+
+
 def _log_files_of(grams: Snapshot, file: TableFile) -> set[str]:
     return set(grams.table.read(file.path, ["file"])["file"].unique().to_pylist())
 
 
-def _rows_to_keep(grams: Snapshot, files: Sequence[TableFile], stale: frozenset[str]) -> pa.Table:
-    parts = [grams.table.schema.empty_table()]
+def _rows_to_keep(
+    grams: Snapshot, files: Sequence[TableFile], stale: frozenset[str]
+) -> Iterator[pa.Table]:
+    dropped = pa.array(sorted(stale), pa.string())
     for file in files:
         rows = grams.table.read(file.path).cast(grams.table.schema)
-        parts.append(
-            rows.filter(pc.invert(pc.is_in(rows["file"], pa.array(sorted(stale), pa.string()))))
-        )
-    return pa.concat_tables(parts)
+        yield rows.filter(pc.invert(pc.is_in(rows["file"], dropped)))
 
 
 def _content_digest(rows: pa.Table) -> str:

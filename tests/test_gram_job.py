@@ -10,6 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from fleet_slip import gram_job
 from fleet_slip.gram_check import check_grams, grams_of
 from fleet_slip.gram_job import (
     SMALL_FILES_MAX,
@@ -126,6 +127,30 @@ def test_many_small_gram_files_are_merged_without_changing_a_row(warehouse: Ware
     assert len(warehouse.grams.snapshot().files) < SMALL_FILES_MAX
     assert len(stored(warehouse)) == SMALL_FILES_MAX + 2
     assert check_grams(warehouse, 100).drives == SMALL_FILES_MAX + 2
+
+
+def test_merging_and_rewriting_take_few_rows_at_a_time(
+    warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(gram_job, "FILE_ROWS", 5)
+    monkeypatch.setattr(gram_job, "SMALL_FILES_MAX", 4)
+    rng = np.random.default_rng(6)
+    for number in range(9):
+        drives = [log_rows(f"d{number}-{i}", random_counts(rng, 3)) for i in range(3)]
+        land(warehouse, f"f{number}", *drives)
+        before = {file.path: file.rows for file in warehouse.grams.snapshot().files}
+        update_grams(warehouse)
+        files = {file.path: file.rows for file in warehouse.grams.snapshot().files}
+        assert sum(rows for path, rows in before.items() if path not in files) <= 10
+        assert max(files.values()) < 10
+    assert sum(rows < 5 for rows in files.values()) <= 5
+    first, *others = warehouse.logs.snapshot().files
+    warehouse.logs.snapshot().commit(Change(remove=[first, *others[:5]]))
+    update_grams(warehouse)
+    assert {drive for drive, _ in stored(warehouse)} == {
+        f"d{number}-{i}" for number in range(6, 9) for i in range(3)
+    }
+    assert check_grams(warehouse, 100).drives == 9
 
 
 def test_the_statement_names_each_product_once() -> None:
