@@ -2,18 +2,16 @@
 
 import re
 from collections.abc import Mapping
-from os import environ
 from pathlib import Path
 from typing import Any
 
 import duckdb
 import pyarrow as pa
 
+from fleet_slip.data_root import data_root
 from fleet_slip.database import database_errors, open_database
-from fleet_slip.errors import StorageError
 from fleet_slip.folder import Folder
 from fleet_slip.gram_statement import with_absent
-from fleet_slip.local_folder import LocalFolder
 from fleet_slip.operations.run_log import RECORD_COLUMNS, run_files
 from fleet_slip.registry import Registry
 from fleet_slip.resources import read_sql
@@ -32,27 +30,6 @@ _ABOUT_ALL_TABLES = re.compile(
     r"duckdb_|information_schema|pragma_|pg_|sqlite_|\b(?:show|tables|databases|dictionary)\b", re.I
 )
 
-DEFAULT_ROOT = Path("data")
-ROOT_VARIABLE = "FLEET_SLIP_ROOT"
-UNFIT_CHARACTERS = "\\*?["
-"""The backslash becomes a slash in Delta; the others are patterns to DuckDB."""
-
-
-def data_root(root: Folder | Path | str | None = None) -> Folder:
-    """Return the data root: the argument, else $FLEET_SLIP_ROOT, else ./data.
-
-    Raises `StorageError` for a path with characters that Delta or DuckDB take for something else.
-    """
-    if root is not None and not isinstance(root, Path | str):
-        return root
-    path = Path(root or environ.get(ROOT_VARIABLE) or DEFAULT_ROOT)
-    unfit = [c for c in str(path) if not c.isprintable() or c in UNFIT_CHARACTERS]
-    if unfit:
-        raise StorageError(
-            f"{path}: a data root cannot have {unfit[0]!r} in its path. Choose another with --root."
-        )
-    return LocalFolder(path)
-
 
 def connect(
     root: Folder | Path | str | None = None,
@@ -61,7 +38,7 @@ def connect(
     locked: bool = True,
     query: str | None = None,
 ) -> duckdb.DuckDBPyConnection:
-    """Return a DuckDB connection with the views of the warehouse at `root`.
+    """Return a DuckDB connection with the views of the warehouse at `root`, a path or a URL.
 
     `log` (SI units), `log_counts`, `drives`, `grams`, `models`, `quarantine`, `runs` and
     `dictionary`, which documents every column. The connection sees one snapshot; connect again to

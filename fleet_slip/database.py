@@ -78,7 +78,10 @@ def database_errors(doing: str) -> Iterator[None]:
 
 def first_line(error: duckdb.Error) -> str:
     """Return DuckDB's message on one line, without the excerpt of the statement."""
-    return " ".join(str(error).partition("\n\nLINE ")[0].split()).rstrip(".")
+    text = str(error).partition("\n\nLINE ")[0]
+    if "Traceback (most recent call last)" in text:  # of Python that DuckDB called to read a file
+        text = text.strip().rpartition("\n")[2].partition(": ")[2]
+    return " ".join(text.split()).rstrip(".")
 
 
 _RESTORE = "If a file is missing or damaged, restore it from a backup."

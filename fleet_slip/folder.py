@@ -2,7 +2,8 @@
 
 Data files, documents and signatures are written once and are immutable, so that a folder needs
 neither locks nor directories: whole files appear, are read, are listed and are deleted. Nothing
-else knows what a data root is made of. `fleet_slip.local_folder` is a folder of a file system.
+else knows what a data root is made of. `fleet_slip.local_folder` is a folder of a file system,
+`fleet_slip.object_folder` one of an object store.
 """
 
 import time
@@ -75,6 +76,13 @@ class Folder(Protocol):
     @property
     def spill(self) -> Path:
         """A folder of this machine for what a query cannot hold in memory."""
+
+    @property
+    def reuses_names(self) -> bool:
+        """Whether a data file's name may be written again after it was deleted, or meanwhile.
+
+        Not where `remove` could delete what was written a moment ago under the same name.
+        """
 
     def __truediv__(self, name: str) -> Self:
         """Return a folder below this one."""

@@ -54,6 +54,11 @@ class LocalFolder:
         """A folder of this machine for what a query cannot hold in memory."""
         return self.path
 
+    @property
+    def reuses_names(self) -> bool:
+        """Return True: `remove` deletes the very file that was found."""
+        return True
+
     def __truediv__(self, name: str) -> Self:
         """Return a folder below this one."""
         return type(self)(self.path / name)

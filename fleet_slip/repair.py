@@ -17,7 +17,7 @@ from fleet_slip.gram_job import reconcile
 from fleet_slip.resources import config_names
 from fleet_slip.simulate import simulate_batch
 from fleet_slip.simulation_job import file_name
-from fleet_slip.storage import Change, TableFile, checksum_in, retried
+from fleet_slip.storage import Change, TableFile, retried
 from fleet_slip.verify import Verification, problem_of
 from fleet_slip.warehouse import Warehouse
 
@@ -47,10 +47,7 @@ def _simulate_again(
     rebuilt = []
     for file in files:
         for batch in _candidates(file, drives.get(file.path, frozenset()), known):
-            name = file.path.rpartition("/")[2].removesuffix(f"-{checksum_in(file.path)}.parquet")
-            rows = simulate_batch(batch)
-            if warehouse.logs.path_of(name, rows, file.day) == file.path:
-                warehouse.logs.write_file(name, rows, file.day)
+            if warehouse.logs.restore_file(file, simulate_batch(batch)):
                 rebuilt.append(f"logs/{file.path}")
                 break
     return rebuilt

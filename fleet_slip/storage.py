@@ -14,6 +14,7 @@ import json
 import random
 import re
 import time
+import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import date
@@ -190,11 +191,16 @@ class Table:
         """Write a file's content to the file NAME-CHECKSUM.parquet, durably.
 
         Returns the action that adds it to the table; it is not part of the table before that is
-        committed. A file of that name left by an interrupted run is replaced.
+        committed. Where an interrupted run left a file of that name, it is replaced, or the new one
+        gets a longer name.
         """
         content = encoded.content
         path = _file_path(name, encoded, day)
-        self.folder.put(path, content)
+        if self.folder.reuses_names:
+            self.folder.put(path, content)
+        else:
+            while not self.folder.create(path, content):
+                path = _file_path(f"{name}-{uuid.uuid4().hex[:8]}", encoded, day)
         return AddAction(
             path=path,
             size=len(content),
@@ -204,9 +210,13 @@ class Table:
             stats=encoded.statistics,
         )
 
-    def path_of(self, name: str, rows: pa.Table, day: date | None = None) -> str:
-        """Return the path below the table that `write_file` gives to rows."""
-        return _file_path(name, self.encode(rows), day)
+    def restore_file(self, file: TableFile, rows: pa.Table) -> bool:
+        """Write a file again if rows make the very bytes that its name tells; False if not."""
+        encoded = self.encode(rows)
+        if encoded.checksum != checksum_in(file.path):
+            return False
+        self.folder.put(file.path, encoded.content)
+        return True
 
     def encode(self, rows: pa.Table) -> Encoded:
         """Return the content of a file with these rows."""
@@ -295,7 +305,6 @@ class Snapshot:
         """
         both = {action.path for action in change.add} & {file.path for file in change.remove}
         with storage_errors(self.table.folder):
-            delta = self.delta or _create(self.table)
             actions: list[AddAction | RemoveAction] = [
                 *(action for action in change.add if action.path not in both),
                 *(
@@ -305,8 +314,9 @@ class Snapshot:
                 ),
             ]
             note = sealed(change.note, actions, {u.name: u.version for u in change.units})
-            require_writable(self.table.folder, self.table.schema, delta)
             try:
+                delta = self.delta or self._created()
+                require_writable(self.table.folder, self.table.schema, delta)
                 delta.create_write_transaction(
                     actions,
                     mode="append",
@@ -325,6 +335,14 @@ class Snapshot:
                     f"({first_line(error)}). Run the same command again."
                 ) from None
             self.table.folder.settle_commits(self.version)
+
+    def _created(self) -> DeltaTable:
+        """Make the table, and return it as it was made, even if others have written to it since.
+
+        So a commit on top of it meets theirs, and is told of a unit that has landed in one.
+        """
+        delta = _create(self.table)
+        return (self.table.open_delta(version=0) if delta.version() else delta) or delta
 
 
 _CONFLICT = re.compile(

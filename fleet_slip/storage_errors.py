@@ -9,20 +9,24 @@ import pyarrow as pa
 from deltalake.exceptions import DeltaError
 
 from fleet_slip.errors import StorageError
+from fleet_slip.object_errors import known_meaning, meaning_of
 
 
 @contextlib.contextmanager
 def storage_errors(path: object) -> Iterator[None]:
-    """Turn failures of the file system and of Delta into `StorageError` with a next step.
+    """Turn failures of the file system, of an object store and of Delta into `StorageError`.
 
     `path` says where, as text.
     """
     try:
         yield
     except OSError as error:
-        raise StorageError(f"{path}: {_reason(error)}") from None
+        reason = meaning_of(error) if "://" in str(path) else _reason(error)
+        raise StorageError(f"{path}: {reason}") from None
     except DeltaError as error:
-        raise StorageError(f"{path}: the Delta log cannot be used: {first_line(error)}") from None
+        known = known_meaning(error) if "://" in str(path) else None
+        reason = known or f"the Delta log cannot be used: {first_line(error)}"
+        raise StorageError(f"{path}: {reason}") from None
     except pa.ArrowException as error:
         raise StorageError(f"{path}: not readable as Parquet: {first_line(error)}") from None
 

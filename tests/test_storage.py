@@ -90,6 +90,18 @@ def test_a_unit_lands_once_however_many_try(warehouse: Warehouse) -> None:
     assert len(warehouse.logs.snapshot().files) == 2
 
 
+def test_a_unit_lands_once_in_a_table_that_was_not_there_a_moment_ago(
+    warehouse: Warehouse,
+) -> None:
+    action = warehouse.logs.write_file("one", rows("a"), DAY)
+    change = Change(add=[action], units=[Unit("u", 1)])
+    before, also_before = (warehouse.logs.snapshot() for _ in range(2))
+    before.commit(change)
+    with pytest.raises(ConflictError, match="Run the same command again"):
+        also_before.commit(change)
+    assert warehouse.logs.snapshot().rows == 1000
+
+
 def test_different_units_land_side_by_side(warehouse: Warehouse) -> None:
     snapshots = [warehouse.logs.snapshot() for _ in range(4)]
     for number, snapshot in enumerate(snapshots):

@@ -24,7 +24,8 @@ from benchmarks.fuzz.files import MAPPINGS, csv_file, parquet_file
 from benchmarks.fuzz.mutate import WORDS, mutate_bytes, mutate_tree, to_json, to_toml
 from fleet_slip.campaign import load_campaign
 from fleet_slip.cohort import load_cohort
-from fleet_slip.connection import connect, data_root
+from fleet_slip.connection import connect
+from fleet_slip.data_root import data_root
 from fleet_slip.documents import checksum
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.features import load_features

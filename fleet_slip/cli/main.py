@@ -3,7 +3,6 @@
 import logging
 import sys
 from importlib.metadata import version
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -24,7 +23,7 @@ from fleet_slip.cli import (
 )
 from fleet_slip.cli.logs import LOG_VARIABLE, LogFormat, configure_logs
 from fleet_slip.cli.output import say
-from fleet_slip.connection import ROOT_VARIABLE, data_root
+from fleet_slip.data_root import ROOT_VARIABLE, data_root
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.warehouse import Warehouse
 
@@ -68,9 +67,11 @@ def _print_version(wanted: bool) -> None:
 def options(
     context: typer.Context,
     root: Annotated[
-        Path | None,
+        str | None,
         typer.Option(
-            help=f"Data root. Default: ${ROOT_VARIABLE}, else ./data.", show_default=False
+            help="Data root: a folder, or the URL of an object store such as s3://BUCKET/PATH. "
+            f"Default: ${ROOT_VARIABLE}, else ./data.",
+            show_default=False,
         ),
     ] = None,
     log: Annotated[

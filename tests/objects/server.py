@@ -1,0 +1,129 @@
+"""An S3 server for tests: moto's, on 127.0.0.1, behind a layer that can be told to misbehave.
+
+The layer makes conditional puts atomic, which moto's are not among threads, and knows one access
+key, since moto takes any.
+"""
+
+import io
+import random
+import threading
+import time
+import urllib.request
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field
+from typing import Any
+
+from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
+from werkzeug.serving import BaseWSGIServer, WSGIRequestHandler, make_server
+
+ACCESS_KEY = "AKIDFORTESTS"
+SECRET_KEY = "s3cr3t/of+tests"  # noqa: S105 - for a server of our own
+SCOPE = "20260101/us-east-1/s3/aws4_request, SignedHeaders=host, Signature=0"
+
+Environ = dict[str, Any]
+StartResponse = Callable[..., Any]
+
+
+@dataclass
+class Faults:
+    """How the server misbehaves; by default it does not.
+
+    Attributes:
+        failing: share of the requests that are answered by 500, half of them after they were done.
+        slow_s: longest time by which an answer is late.
+        refuse: methods that are answered by 403.
+        seen: requests that came, as METHOD PATH.
+    """
+
+    failing: float = 0.0
+    slow_s: float = 0.0
+    refuse: tuple[str, ...] = ()
+    seen: list[str] = field(default_factory=list)
+
+
+class Server:
+    """A running server; every bucket that is asked for by `bucket` is new."""
+
+    def __init__(self) -> None:
+        self.faults = Faults()
+        self._rng = random.Random(0)  # noqa: S311
+        self._conditional = threading.Lock()
+        self._moto = DomainDispatcherApplication(create_backend_app)
+        self._server: BaseWSGIServer = make_server(
+            "127.0.0.1", 0, self, threaded=True, request_handler=_Quiet
+        )
+        self._buckets = 0
+        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """Where the server is, and how to be let in."""
+        return {
+            "AWS_ENDPOINT_URL": f"http://127.0.0.1:{self._server.server_port}",
+            "AWS_ALLOW_HTTP": "true",
+            "AWS_REGION": "us-east-1",
+            "AWS_ACCESS_KEY_ID": ACCESS_KEY,
+            "AWS_SECRET_ACCESS_KEY": SECRET_KEY,
+            "AWS_EC2_METADATA_DISABLED": "true",
+        }
+
+    def stop(self) -> None:
+        self._server.shutdown()
+
+    def bucket(self) -> str:
+        """Make a bucket and return its URL."""
+        self._buckets += 1
+        name = f"fleet-{self._buckets}"
+        request = urllib.request.Request(
+            f"http://127.0.0.1:{self._server.server_port}/{name}",
+            method="PUT",
+            headers={"Authorization": f"AWS4-HMAC-SHA256 Credential={ACCESS_KEY}/{SCOPE}"},
+        )
+        urllib.request.urlopen(request).close()  # noqa: S310
+        return f"s3://{name}"
+
+    @contextmanager
+    def misbehaving(self, **faults: Any) -> Iterator[Faults]:
+        """Misbehave for a while."""
+        self.faults = Faults(**faults)
+        try:
+            yield self.faults
+        finally:
+            self.faults = Faults()
+
+    def __call__(self, environ: Environ, start: StartResponse) -> Iterable[bytes]:
+        faults, method = self.faults, environ["REQUEST_METHOD"]
+        faults.seen.append(f"{method} {environ['PATH_INFO']}")
+        length = int(environ.get("CONTENT_LENGTH") or 0)
+        environ["wsgi.input"] = io.BytesIO(environ["wsgi.input"].read(length))
+        if faults.slow_s:
+            time.sleep(self._rng.uniform(0, faults.slow_s))
+        if f"Credential={ACCESS_KEY}/" not in environ.get("HTTP_AUTHORIZATION", ""):
+            return _answer(start, "403 Forbidden", "InvalidAccessKeyId")
+        if method in faults.refuse:
+            return _answer(start, "403 Forbidden", "AccessDenied")
+        fate = self._rng.random()
+        if fate < faults.failing / 2:
+            return _answer(start, "500 Internal Server Error", "InternalError")
+        if fate < faults.failing:
+            list(self._served(environ, lambda *_: None))
+            return _answer(start, "500 Internal Server Error", "InternalError")
+        return self._served(environ, start)
+
+    def _served(self, environ: Environ, start: StartResponse) -> Iterable[bytes]:
+        guard = self._conditional if "HTTP_IF_NONE_MATCH" in environ else nullcontext()
+        with guard:
+            answer: Iterable[bytes] = self._moto(environ, start)
+            return answer
+
+
+def _answer(start: StartResponse, status: str, code: str) -> Iterable[bytes]:
+    body = f"<Error><Code>{code}</Code><AWSAccessKeyId>{ACCESS_KEY}</AWSAccessKeyId></Error>"
+    start(status, [("Content-Type", "application/xml"), ("Content-Length", str(len(body)))])
+    return [body.encode()]
+
+
+class _Quiet(WSGIRequestHandler):
+    def log(self, type: str, message: str, *args: Any) -> None:  # noqa: A002
+        """Say nothing."""
