@@ -44,12 +44,16 @@ def problems(warehouse: Warehouse) -> dict[str, str]:
 
 
 def consequences(content: bytes) -> Any:
-    """What a commit does: all of it but the Delta library's remarks on time, program and mode."""
+    """What a commit does: all of it but the Delta library's remarks on time, program and mode.
+
+    The note of the commit that only makes the table has nothing to tell but its own checksum.
+    """
     actions = [json.loads(line) for line in content.splitlines()]
     done = [action for action in actions if "commitInfo" not in action]
     (info,) = (action["commitInfo"] for action in actions if "commitInfo" in action)
     tidy = [{k: _without_nulls(v) for k, v in action.items()} for action in done]
-    return sorted(map(str, tidy)), json.loads(info["fleet_slip"])
+    sealed = any(not action.keys() <= {"metaData", "protocol"} for action in done)
+    return sorted(map(str, tidy)), json.loads(info["fleet_slip"]) if sealed else None
 
 
 def _without_nulls(content: dict[str, Any]) -> dict[str, Any]:
