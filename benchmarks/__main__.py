@@ -1,4 +1,7 @@
-"""Runs every benchmark, one after the other: python -m benchmarks."""
+"""Runs the benchmarks that need nothing but minutes, one after the other: python -m benchmarks.
+
+The others are run by name: billion and growth need a folder and time, peers and weka other programs.
+"""
 
 import subprocess
 import sys
@@ -8,6 +11,9 @@ COMMANDS = (
     "simulator_profile",
     "work_precision",
     "pipeline",
+    "gram_variants",
+    "encoding --copies 1",
+    "cluster",
     "statistics",
     "observers",
     "reliability",
