@@ -1,6 +1,7 @@
 """Runs the benchmarks that need nothing but minutes, one after the other: python -m benchmarks.
 
-The others are run by name: billion and growth need a folder and time, peers and weka other programs.
+The others are run by name: billion and growth need a folder and time, peers and weka other
+programs.
 """
 
 import subprocess
