@@ -16,9 +16,10 @@ from fleet_slip.connection import connect
 from fleet_slip.database import database_errors, open_database
 from fleet_slip.errors import FleetSlipError, SelectionError
 from fleet_slip.gram_job import reconcile
+from fleet_slip.manifest import TrainedOn
 from fleet_slip.old_files import quarantined_of, remove_old_files
 from fleet_slip.reading_query import one_query
-from fleet_slip.registry import Registry, TrainedOn
+from fleet_slip.registry import Registry
 from fleet_slip.resources import read_sql
 from fleet_slip.rewriting import read_drives
 from fleet_slip.storage import Change, Snapshot, retried

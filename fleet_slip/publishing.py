@@ -7,17 +7,16 @@ from typing import Any
 
 from fleet_slip.errors import RefusedError, SelectionError
 from fleet_slip.features import features
-from fleet_slip.model_list import CandidateModel
-from fleet_slip.registry import (
+from fleet_slip.manifest import (
     CrossValidated,
     Manifest,
     ModelLabel,
     ModelTerm,
-    ModelVersion,
-    Registry,
     SelectedBy,
     TrainedOn,
 )
+from fleet_slip.model_list import CandidateModel
+from fleet_slip.registry import ModelVersion, Registry
 from fleet_slip.regression.crossval import CrossValidation
 from fleet_slip.selection import Selection, validate
 from fleet_slip.signals import catalogue

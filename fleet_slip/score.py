@@ -7,8 +7,8 @@ from fleet_slip.connection import connect
 from fleet_slip.database import database_errors
 from fleet_slip.errors import SelectionError
 from fleet_slip.features import with_features
+from fleet_slip.manifest import Manifest
 from fleet_slip.reading_query import one_query
-from fleet_slip.registry import Manifest
 from fleet_slip.resources import read_sql
 from fleet_slip.signals import catalogue
 from fleet_slip.warehouse import Warehouse

@@ -7,7 +7,7 @@ from typing import Any
 from fleet_slip.cohort import Cohort
 from fleet_slip.errors import SelectionError
 from fleet_slip.features import features, input_scales
-from fleet_slip.registry import Manifest
+from fleet_slip.manifest import Manifest
 from fleet_slip.regression.disturbance import disturbed
 from fleet_slip.regression.exact import LinearModel
 from fleet_slip.regression.figures import Figures, error_sums

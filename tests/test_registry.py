@@ -11,16 +11,15 @@ import pytest
 from fleet_slip.documents import Document, DocumentFolder
 from fleet_slip.errors import RefusedError, SelectionError, StorageError
 from fleet_slip.local_folder import LocalFolder
-from fleet_slip.registry import (
-    CHAMPION,
+from fleet_slip.manifest import (
     CrossValidated,
     Manifest,
     ModelLabel,
     ModelTerm,
-    Registry,
     SelectedBy,
     TrainedOn,
 )
+from fleet_slip.registry import CHAMPION, Registry
 
 
 def manifest(coefficient: Fraction = Fraction(1, 3), name: str = "sideslip") -> Manifest:

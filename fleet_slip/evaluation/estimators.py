@@ -9,8 +9,9 @@ import numpy as np
 from fleet_slip.cohort import load_cohort
 from fleet_slip.errors import SelectionError
 from fleet_slip.evaluation.drives import FloatArray
+from fleet_slip.manifest import Manifest
 from fleet_slip.model_list import load_model_list
-from fleet_slip.registry import Manifest, ModelVersion
+from fleet_slip.registry import ModelVersion
 from fleet_slip.regression.exact import LinearModel
 from fleet_slip.selection import Selection, select
 from fleet_slip.signals import catalogue
