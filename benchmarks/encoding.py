@@ -28,7 +28,7 @@ from fleet_slip.gram_job import FILES_PER_QUERY
 from fleet_slip.gram_statement import gram_statement
 from fleet_slip.local_folder import LocalFolder
 from fleet_slip.signals import catalogue
-from fleet_slip.storage import ROW_GROUP_ROWS, WRITE_BATCH_ROWS
+from fleet_slip.storage.encoding import ROW_GROUP_ROWS, WRITE_BATCH_ROWS
 from fleet_slip.warehouse import Warehouse
 
 ROUNDS = 3

@@ -123,7 +123,7 @@ def test_a_query_that_began_before_is_not_disturbed_by_compaction_and_vacuum(
 def test_vacuum_removes_replaced_files_after_the_retention(
     six: Warehouse, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fleet_slip.storage._now_ms", lambda: 1000)
+    monkeypatch.setattr("fleet_slip.storage.change._now_ms", lambda: 1000)
     before = answers(six)
     compact(six)
     grow_old(six)

@@ -129,7 +129,7 @@ def test_a_root_that_is_a_file_is_told_with_a_next_step(tmp_path: Path) -> None:
 
 def test_a_conflict_is_retried_and_the_last_one_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     waits: list[float] = []
-    monkeypatch.setattr("fleet_slip.storage.time.sleep", waits.append)
+    monkeypatch.setattr("fleet_slip.storage.conflicts.time.sleep", waits.append)
     outcomes = [ConflictError("once"), ConflictError("twice"), "done"]
 
     def attempt() -> object:
