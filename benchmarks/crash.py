@@ -148,13 +148,17 @@ def state(root: Path) -> dict[str, Any]:
     warehouse = Warehouse(LocalFolder(root))
     registry = Registry(LocalFolder(root / "models"))
     names = registry.names()
+    histories = {name: registry.history(name) for name in names}
     return {
         "tables": {table.folder.name: _digest(table) for table in warehouse.tables},
         "versions": {
             n: [registry.load(n, number).sha256 for number in registry.versions(n)] for n in names
         },
-        "aliases": {name: registry.aliases(name) for name in names},
-        "moves": {n: [(move.command, move.version) for move in registry.history(n)] for n in names},
+        "aliases": {name: moves.aliases() for name, moves in histories.items()},
+        "moves": {
+            name: [(move.command, move.version) for move in moves.moves()]
+            for name, moves in histories.items()
+        },
         "forgotten": [
             [entry["event"], entry.get("drives"), entry.get("models")]
             for entry in Audit(LocalFolder(root)).entries()

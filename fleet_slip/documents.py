@@ -1,20 +1,23 @@
 """Numbered, immutable JSON documents in a folder: 1.json, 2.json, ... with a checksum each.
 
 A document is created under the next free number as a whole, which fails if another process took
-that number first. So numbers are consecutive, no document is ever half there, and none is replaced.
+that number first. So numbers are consecutive, no document is ever half there, none is replaced, and
+what is decided by the newest document can be added right after it or not at all.
 """
 
 import hashlib
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 from fleet_slip.errors import ConflictError, StorageError
 from fleet_slip.folder import Folder
 
 ATTEMPTS = 1000
+
+T = TypeVar("T")
 
 MAX_DIGITS = 9
 """Digits of a document's number."""
@@ -87,15 +90,28 @@ class DocumentFolder:
 
     def append(self, content: Mapping[str, Any]) -> Document:
         """Add a document under the next free number, durably."""
-        sha256 = checksum(content)
-        first = max(self.numbers(), default=0) + 1
-        for number in range(first, first + ATTEMPTS):
-            document = Document(number, content, sha256)
-            file, text = file_name(number), _rendered(document)
-            # An object store's answer may be lost: then the attempt is made again and finds itself.
-            if self.folder.create(file, text) or self.folder.read(file) == text:
-                return document
+        return self.after_newest(lambda newest: self.create(newest + 1, content))
+
+    def after_newest(self, attempt: Callable[[int], T | None]) -> T:
+        """Return what an attempt to add the next document comes to.
+
+        The attempt gets the number of the newest document, 0 without one. It is made again while it
+        comes to None: another process was faster. Raises `ConflictError` after very many of them.
+        """
+        for _ in range(ATTEMPTS):
+            outcome = attempt(max(self.numbers(), default=0))
+            if outcome is not None:
+                return outcome
         raise ConflictError(f"{self.folder}: too many writers at once. Run the same command again.")
+
+    def create(self, number: int, content: Mapping[str, Any]) -> Document | None:
+        """Add a document under this number, durably; return None if the number is taken."""
+        document = Document(number, content, checksum(content))
+        file, text = file_name(number), _rendered(document)
+        # An object store's answer may be lost: then the attempt is made again and finds itself.
+        if self.folder.create(file, text) or self.folder.read(file) == text:
+            return document
+        return None
 
     def file(self, number: int) -> str:
         """Return where a document of this number is."""

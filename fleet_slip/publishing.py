@@ -1,5 +1,6 @@
 """From a selection's winner to a published model version, unless the champion is better."""
 
+import functools
 from dataclasses import dataclass
 from fractions import Fraction
 from importlib.metadata import version as package_version
@@ -89,13 +90,30 @@ def publish(
 
     The champion's signals are cross-validated on the same cohort and folds; a challenger with a
     lower correlation is refused (`RefusedError`) unless forced. A challenger that is the same
-    estimator from the same rows changes nothing.
+    estimator from the same rows changes nothing. If the champion changes meanwhile, all is decided
+    again.
     """
-    champion = registry.champion(manifest.name)
+
+    @functools.cache
+    def added() -> ModelVersion:
+        return registry.add(manifest)
+
+    def decision(newest_move: int) -> Publication | None:
+        champion = registry.champion(manifest.name)
+        if champion and champion.manifest.same_estimator(manifest):
+            return Publication(champion, False, "The champion is this very model.")
+        reason = _why_publish(champion, manifest, selection, force=force)
+        published = registry.make_champion(added(), after=newest_move)
+        return Publication(added(), True, reason) if published else None
+
+    return registry.history(manifest.name).decide(decision)
+
+
+def _why_publish(
+    champion: ModelVersion | None, manifest: Manifest, selection: Selection[Any], *, force: bool
+) -> str:
     if champion is None:
-        return Publication(registry.publish(manifest), True, "It is the first version.")
-    if champion.manifest.same_estimator(manifest):
-        return Publication(champion, False, "The champion is this very model.")
+        return "It is the first version."
     challenger = selection.winner.model
     incumbent = _revalidate(champion, selection)
     comparison = (
@@ -108,7 +126,7 @@ def publish(
             f"{manifest.name} was not published: it is worse than the champion ({comparison}). "
             "Use --force to publish it all the same."
         )
-    return Publication(registry.publish(manifest), True, f"It has a {comparison}.")
+    return f"It has a {comparison}."
 
 
 def _revalidate(champion: ModelVersion, selection: Selection[Any]) -> CrossValidation:

@@ -6,38 +6,25 @@
 A manifest is a function of data, configuration and program alone; the time stands in the history.
 """
 
-import contextlib
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import pyarrow as pa
-from pydantic import Field, ValidationError
+from pydantic import ValidationError
 
-from fleet_slip.config import Config, faults_of
+from fleet_slip.aliases import CHAMPION, AliasHistory
+from fleet_slip.config import faults_of
 from fleet_slip.documents import MAX_DIGITS, DocumentFolder
 from fleet_slip.errors import RefusedError, SelectionError, StorageError
 from fleet_slip.folder import Folder
 from fleet_slip.manifest import Manifest
-from fleet_slip.signals import IDENTIFIER_PATTERN, Identifier
+from fleet_slip.signals import IDENTIFIER_PATTERN
 from fleet_slip.signing import require_signature, require_signing_key, sign
 
 _IDENTIFIER = re.compile(IDENTIFIER_PATTERN)
-
-CHAMPION = "champion"
-"""The alias of the version in use."""
-
-
-class AliasMove(Config):
-    """One entry of the history: an alias points at a version from this moment on."""
-
-    alias: Identifier
-    version: Annotated[int, Field(ge=1, lt=10**MAX_DIGITS)]
-    command: Literal["publish", "promote", "rollback"]
-    at: datetime
 
 
 @dataclass(frozen=True)
@@ -101,8 +88,13 @@ class Registry:
             if version in numbers:
                 raise
             raise SelectionError(_unknown(name, str(version), self.names(), numbers)) from None
-        with _foreign_document(f"{name}@{version}: its manifest"):
+        try:
             manifest = Manifest.model_validate(document.content)
+        except ValidationError as error:
+            raise StorageError(
+                f"{name}@{version}: this program does not understand its manifest: "
+                f"{faults_of(error)}. Update fleet-slip, or publish again."
+            ) from None
         if manifest.name != name:
             raise StorageError(
                 f"{name}@{version}: its manifest is of the model {manifest.name}. Restore the file "
@@ -122,9 +114,10 @@ class Registry:
         which = which or CHAMPION
         if which.isascii() and which.isdigit() and len(which) <= MAX_DIGITS:
             return self.load(name, int(which))
-        version = self.pointed_at(name, which)
+        history = self.history(name)
+        version = history.pointed_at(which)
         if version is None:
-            known_aliases = self.aliases(name)
+            known_aliases = history.aliases()
             raise SelectionError(
                 _unknown(name, which, self.names(), self.versions(name), known_aliases)
             )
@@ -132,23 +125,45 @@ class Registry:
 
     def champion(self, name: str) -> ModelVersion | None:
         """Return the version in use, or None before the first."""
-        version = self.pointed_at(name, CHAMPION)
+        version = self.history(name).pointed_at(CHAMPION)
         return None if version is None else self.load(name, version)
 
-    def publish(self, manifest: Manifest) -> ModelVersion:
-        """Make a manifest the next version of its model, and its champion.
+    def history(self, name: str) -> AliasHistory:
+        """Return the moves of a model's aliases."""
+        return AliasHistory(DocumentFolder(self.folder / name / "history"))
 
-        If an interrupted run left the same manifest as the latest version, that one is used.
+    def publish(self, manifest: Manifest) -> ModelVersion:
+        """Make a manifest the next version of its model, and its champion."""
+        version = self.add(manifest)
+        history = self.history(manifest.name)
+        history.decide(lambda newest: self.make_champion(version, after=newest) or None)
+        return version
+
+    def add(self, manifest: Manifest) -> ModelVersion:
+        """Make a manifest the next version of its model, to which nothing points yet.
+
+        If the latest version is the same estimator from the same rows, that one is used: another
+        process added it just now, or was interrupted.
         """
         if self.signing_key is not None:
             require_signing_key(self.signing_key)  # before anything is written
-        folder = self._versions(manifest.name)
-        content = manifest.model_dump(mode="json")
-        number = self._same_as_latest(manifest)
-        document = folder.read(number) if number else folder.append(content)
-        self.sign(manifest.name, document.number)
-        self._move(manifest.name, CHAMPION, document.number, "publish")
-        return ModelVersion(document.number, manifest, document.sha256)
+        name, versions = manifest.name, self._versions(manifest.name)
+
+        def next_version(latest: int) -> int | None:
+            if latest and self._read(name, latest).manifest.same_estimator(manifest):
+                return latest
+            document = versions.create(latest + 1, manifest.model_dump(mode="json"))
+            return document.number if document else None
+
+        version = versions.after_newest(next_version)
+        self.sign(name, version)
+        return self._read(name, version)
+
+    def make_champion(self, version: ModelVersion, *, after: int) -> bool:
+        """Point the champion at a version; return False if an alias moved after the move given."""
+        history = self.history(version.manifest.name)
+        there = history.pointed_at(CHAMPION) == version.version
+        return there or history.move(CHAMPION, version.version, "publish", after=after)
 
     def promote(self, name: str, version: int, alias: str) -> None:
         """Point an alias at a version. Raises `SelectionError` for an unknown version.
@@ -157,54 +172,33 @@ class Registry:
         one `rollback`.
         """
         self.load(name, version)
-        if self.pointed_at(name, alias) != version:
-            self._move(name, alias, version, "promote")
+        history = self.history(name)
+
+        def move(newest: int) -> int | None:
+            there = history.pointed_at(alias) == version
+            moved = there or history.move(alias, version, "promote", after=newest)
+            return version if moved else None
+
+        history.decide(move)
 
     def rollback(self, name: str, alias: str) -> int:
         """Point an alias back at the version it had before; return that version.
 
         Raises `RefusedError` if it never had another, and what `load` raises if that is not sound.
         """
-        trail: list[int] = []
-        for move in self.history(name):
-            if move.alias == alias:
-                trail = trail[:-1] if move.command == "rollback" else [*trail, move.version]
-        if len(trail) < 2:
-            raise RefusedError(
-                f"{name}@{alias} never pointed at another version, so there is nothing to go back "
-                f"to. See: fleet-slip models {name}"
-            )
-        self.load(name, trail[-2])
-        self._move(name, alias, trail[-2], "rollback")
-        return trail[-2]
+        history = self.history(name)
 
-    def history(self, name: str) -> list[AliasMove]:
-        """Return all moves of a model's aliases, oldest first."""
-        return list(self.latest_moves(name))[::-1]
+        def move(newest: int) -> int | None:
+            version = history.before(alias)
+            if version is None:
+                raise RefusedError(
+                    f"{name}@{alias} never pointed at another version, so there is nothing to go "
+                    f"back to. See: fleet-slip models {name}"
+                )
+            self.load(name, version)
+            return version if history.move(alias, version, "rollback", after=newest) else None
 
-    def latest_moves(self, name: str) -> Iterator[AliasMove]:
-        """Yield the moves of a model's aliases, newest first, each read when it is asked for."""
-        folder = self._history(name)
-        for number in reversed(folder.numbers()):
-            document = folder.read(number)
-            with _foreign_document(f"{folder.folder}: a move of an alias"):
-                move = AliasMove.model_validate(document.content)
-            yield move
-
-    def pointed_at(self, name: str, alias: str) -> int | None:
-        """Return the version that an alias points at, or None."""
-        moves = self.latest_moves(name)
-        return next((move.version for move in moves if move.alias == alias), None)
-
-    def published_at(self, name: str, version: int) -> datetime | None:
-        """Return when a version was published last; None if no move tells."""
-        moves = self.latest_moves(name)
-        published = (m.at for m in moves if m.version == version and m.command == "publish")
-        return next(published, None)
-
-    def aliases(self, name: str) -> dict[str, int]:
-        """Return each alias of a model and the version that it points at."""
-        return {move.alias: move.version for move in self.history(name)}
+        return history.decide(move)
 
     def as_table(self) -> pa.Table:
         """Return all versions of all models as rows."""
@@ -212,10 +206,11 @@ class Registry:
         return pa.Table.from_pylist(rows, schema=_TABLE_SCHEMA)
 
     def _rows(self, name: str) -> list[Mapping[str, Any]]:
+        moves = self.history(name).moves()
         aliases: dict[int, list[str]] = {}
-        for alias, number in sorted(self.aliases(name).items()):
+        for alias, number in sorted({move.alias: move.version for move in moves}.items()):
             aliases.setdefault(number, []).append(alias)
-        published = {move.version: move.at for move in self.latest_moves(name)}
+        published = {move.version: move.at for move in reversed(moves)}
         rows: list[Mapping[str, Any]] = []
         for number in self.versions(name):
             version = self._read(name, number)
@@ -239,32 +234,8 @@ class Registry:
             )
         return rows
 
-    def _same_as_latest(self, manifest: Manifest) -> int | None:
-        latest = max(self.versions(manifest.name), default=None)
-        if latest is not None and self._read(manifest.name, latest).manifest == manifest:
-            return latest
-        return None
-
-    def _move(
-        self,
-        name: str,
-        alias: str,
-        version: int,
-        command: Literal["publish", "promote", "rollback"],
-    ) -> None:
-        if not _IDENTIFIER.fullmatch(alias):
-            raise SelectionError(
-                f"{alias!r} cannot be an alias: use small letters, digits and _, beginning with a "
-                "letter, at most 41."
-            )
-        move = AliasMove(alias=alias, version=version, command=command, at=datetime.now(UTC))
-        self._history(name).append(move.model_dump(mode="json"))
-
     def _versions(self, name: str) -> DocumentFolder:
         return DocumentFolder(self.folder / name / "versions")
-
-    def _history(self, name: str) -> DocumentFolder:
-        return DocumentFolder(self.folder / name / "history")
 
 
 _TABLE_SCHEMA = pa.schema(
@@ -284,18 +255,6 @@ _TABLE_SCHEMA = pa.schema(
         ("sha256", pa.string()),
     ]
 )
-
-
-@contextlib.contextmanager
-def _foreign_document(what: str) -> Iterator[None]:
-    """Explain a document that is whole and yet not one of ours."""
-    try:
-        yield
-    except ValidationError as error:
-        raise StorageError(
-            f"{what} is not one that this program understands: {faults_of(error)}. Update "
-            "fleet-slip, or publish again."
-        ) from None
 
 
 def _unknown(

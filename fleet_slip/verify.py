@@ -300,7 +300,7 @@ def _verify_models(
                     problem = f"was made of version {version} of {table}, which does not exist"
                     report.findings.append(Finding("model", f"{name}@{number}", problem))
         try:
-            aliases = registry.aliases(name)
+            aliases = registry.history(name).aliases()
         except (FleetSlipError, ValueError):
             continue
         for alias, version in aliases.items():

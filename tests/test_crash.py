@@ -33,8 +33,8 @@ def state(root: Path) -> dict[str, Any]:
     return {
         "files": {Path(path).relative_to(root): digest for path, digest in files.items()},
         "versions": [registry.load("smoke", n).sha256 for n in registry.versions("smoke")],
-        "aliases": registry.aliases("smoke"),
-        "moves": [(move.command, move.version) for move in registry.history("smoke")],
+        "aliases": registry.history("smoke").aliases(),
+        "moves": [(move.command, move.version) for move in registry.history("smoke").moves()],
     }
 
 

@@ -5,9 +5,11 @@ import multiprocessing
 from decimal import Decimal
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from fleet_slip.aliases import CHAMPION, AliasHistory
 from fleet_slip.documents import Document, DocumentFolder
 from fleet_slip.errors import RefusedError, SelectionError, StorageError
 from fleet_slip.local_folder import LocalFolder
@@ -19,7 +21,7 @@ from fleet_slip.manifest import (
     SelectedBy,
     TrainedOn,
 )
-from fleet_slip.registry import CHAMPION, Registry
+from fleet_slip.registry import Registry
 
 
 def manifest(coefficient: Fraction = Fraction(1, 3), name: str = "sideslip") -> Manifest:
@@ -99,11 +101,11 @@ def test_aliases_move_and_go_back(tmp_path: Path) -> None:
         registry.publish(manifest(Fraction(number)))
     registry.promote("sideslip", 1, CHAMPION)
     registry.promote("sideslip", 2, "shadow")
-    assert registry.aliases("sideslip") == {CHAMPION: 1, "shadow": 2}
+    assert registry.history("sideslip").aliases() == {CHAMPION: 1, "shadow": 2}
     assert [registry.rollback("sideslip", CHAMPION) for _ in range(3)] == [3, 2, 1]
     with pytest.raises(RefusedError, match="never pointed at another version"):
         registry.rollback("sideslip", CHAMPION)
-    commands = [move.command for move in registry.history("sideslip")]
+    commands = [move.command for move in registry.history("sideslip").moves()]
     assert commands == ["publish"] * 3 + ["promote"] * 2 + ["rollback"] * 3
 
 
@@ -137,7 +139,69 @@ def test_writers_at_once_never_share_a_number_or_lose_a_version(tmp_path: Path) 
     assert numbers == list(range(1, 41))
     published = {registry.load("sideslip", n).manifest.terms[0].coefficient_exact for n in numbers}
     assert len(published) == 40
-    assert len(registry.history("sideslip")) == 40
+    assert len(registry.history("sideslip").moves()) == 40
+
+
+def _publish_the_same(path: Path, logs_version: int, barrier: Any) -> None:
+    trained_on = manifest().trained_on.model_copy(update={"logs_version": logs_version})
+    for model in range(20):
+        barrier.wait()
+        same = manifest(name=f"m{model}").model_copy(update={"trained_on": trained_on})
+        Registry(LocalFolder(path)).publish(same)
+
+
+def test_writers_at_once_publish_the_same_estimator_once(tmp_path: Path) -> None:
+    context = multiprocessing.get_context("spawn")
+    barrier = context.Barrier(3)
+    writers = [
+        context.Process(target=_publish_the_same, args=(tmp_path, n, barrier)) for n in range(3)
+    ]
+    for process in writers:
+        process.start()
+    for process in writers:
+        process.join()
+    registry = Registry(LocalFolder(tmp_path))
+    for model in range(20):
+        assert registry.versions(f"m{model}") == [1]
+        moves = registry.history(f"m{model}").moves()
+        assert [(move.alias, move.version) for move in moves] == [(CHAMPION, 1)]
+
+
+def test_what_was_decided_on_another_champion_is_decided_again(tmp_path: Path) -> None:
+    registry = Registry(LocalFolder(tmp_path))
+    history = registry.history("sideslip")
+    challenger = registry.add(manifest(Fraction(2)))
+    seen: list[int | None] = []
+
+    def decision(newest_move: int) -> bool | None:
+        seen.append(history.pointed_at(CHAMPION))
+        if len(seen) == 1:
+            registry.publish(manifest(Fraction(1)))  # another process, in between
+        return registry.make_champion(challenger, after=newest_move) or None
+
+    history.decide(decision)
+    assert seen == [None, 2]
+    assert [move.version for move in history.moves()] == [2, 1]
+
+
+def test_two_who_go_back_at_once_go_back_two_versions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    registry = Registry(LocalFolder(tmp_path))
+    for number in (1, 2, 3):
+        registry.publish(manifest(Fraction(number)))
+
+    def slow_move(history: AliasHistory, *arguments: Any, after: int) -> bool:
+        monkeypatch.setattr(AliasHistory, "move", move)
+        assert registry.rollback("sideslip", CHAMPION) == 2  # another process, in between
+        return move(history, *arguments, after=after)
+
+    move = AliasHistory.move
+    monkeypatch.setattr(AliasHistory, "move", slow_move)
+    assert registry.rollback("sideslip", CHAMPION) == 1
+    assert registry.history("sideslip").pointed_at(CHAMPION) == 1
+    with pytest.raises(RefusedError, match="never pointed at another version"):
+        registry.rollback("sideslip", CHAMPION)
 
 
 def test_a_version_and_the_champion_are_found_without_reading_the_others(
@@ -156,7 +220,7 @@ def test_a_version_and_the_champion_are_found_without_reading_the_others(
     monkeypatch.setattr(DocumentFolder, "read", counted)
     champion = registry.champion("sideslip")
     assert champion is not None
-    assert registry.published_at("sideslip", champion.version) is not None
+    assert registry.history("sideslip").published_at(champion.version) is not None
     assert registry.load("sideslip", 7).version == 7
     assert read == [20, 20, 20, 7]
     read.clear()
@@ -170,8 +234,9 @@ def test_an_alias_points_where_its_last_move_left_it(tmp_path: Path) -> None:
         registry.publish(manifest(Fraction(number)))
     registry.promote("sideslip", 1, "tested")
     registry.rollback("sideslip", CHAMPION)
+    history = registry.history("sideslip")
     for alias in (CHAMPION, "tested", "unknown"):
-        assert registry.pointed_at("sideslip", alias) == registry.aliases("sideslip").get(alias)
+        assert history.pointed_at(alias) == history.aliases().get(alias)
     rows = registry.as_table().to_pylist()
     assert [row["aliases"] for row in rows] == ["tested", "champion", ""]
     assert [row["published_at"] for row in rows] == sorted(row["published_at"] for row in rows)

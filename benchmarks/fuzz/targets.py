@@ -250,7 +250,7 @@ def manifest(rng: random.Random, place: Path) -> None:
     registry = Registry(LocalFolder(root / "models"))
     steps: list[Callable[[], object]] = [
         registry.as_table,
-        lambda: registry.history(MODEL),
+        registry.history(MODEL).moves,
         lambda: score(Warehouse(LocalFolder(root)), registry.resolve(MODEL).manifest, "true"),
     ]
     _all_refuse_or_answer(steps)

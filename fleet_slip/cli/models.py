@@ -5,6 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
+from fleet_slip.aliases import CHAMPION
 from fleet_slip.audit import Audit
 from fleet_slip.cli.output import Json, print_json, print_table, say
 from fleet_slip.cli.recorded import recorded
@@ -27,7 +28,7 @@ from fleet_slip.model_list import check_model_name
 from fleet_slip.operations.run_log import step
 from fleet_slip.publishing import Publication, manifest_of
 from fleet_slip.publishing import publish as publish_selection
-from fleet_slip.registry import CHAMPION, ModelVersion, Registry
+from fleet_slip.registry import ModelVersion, Registry
 from fleet_slip.selection_plan import SelectionPlan, run_plan
 from fleet_slip.warehouse import Warehouse
 
@@ -166,7 +167,7 @@ def models(
             ["at", "command", "alias", "version"],
             [
                 [f"{move.at:%Y-%m-%d %H:%M:%S}", move.command, move.alias, str(move.version)]
-                for move in registry.history(name)
+                for move in registry.history(name).moves()
             ],
             left=3,
         )

@@ -192,7 +192,8 @@ def _champions(
     for name in registry.names():
         try:
             champion = registry.champion(name)
-            published_at = registry.published_at(name, champion.version) if champion else None
+            history = registry.history(name)
+            published_at = history.published_at(champion.version) if champion else None
         except (StorageError, RefusedError, SelectionError) as error:
             damaged.append(str(error))
             continue

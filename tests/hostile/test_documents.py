@@ -88,7 +88,7 @@ def test_integer_arithmetic_is_what_a_feature_may_be(registry: Registry, sql: st
 def test_a_forged_history_is_refused(registry: Registry, changes: dict[str, Any]) -> None:
     forge(registry, "history", **changes)
     with pytest.raises(StorageError, match="move of an alias"):
-        registry.aliases(NAME)
+        registry.history(NAME).aliases()
 
 
 @pytest.mark.parametrize(
@@ -132,4 +132,4 @@ def test_folders_that_are_no_models_are_passed_over(registry: Registry, name: st
 def test_an_alias_is_a_plain_name(registry: Registry, alias: str) -> None:
     with pytest.raises(FleetSlipError):
         registry.promote(NAME, 1, alias)
-    assert registry.aliases(NAME) == {"champion": 1}
+    assert registry.history(NAME).aliases() == {"champion": 1}

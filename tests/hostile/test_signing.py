@@ -139,7 +139,7 @@ def test_there_is_no_way_back_to_what_is_not_signed(signed: Registry, key: Path)
     version_file(signed, suffix="sig").unlink()
     with pytest.raises(RefusedError, match="not signed"):
         signed.rollback(manifest().name, "champion")
-    assert signed.aliases(manifest().name) == {"champion": 2}
+    assert signed.history(manifest().name).aliases() == {"champion": 2}
 
 
 def test_the_command_line_makes_keys_signs_and_refuses(
