@@ -1,7 +1,6 @@
 """Cohorts: the Gram rows of the drives that satisfy an SQL condition."""
 
-import contextlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -12,18 +11,14 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from fleet_slip.connection import connect
 from fleet_slip.database import database_errors
 from fleet_slip.errors import RefusedError, SelectionError
 from fleet_slip.features import PLAIN, features
 from fleet_slip.gram import GramTable, IntArray, packed_size
-from fleet_slip.gram_job import find_backlog
-from fleet_slip.reading_query import one_query
+from fleet_slip.gram_reader import GramReader, open_grams
 from fleet_slip.regression.drives import serving_drives
 from fleet_slip.regression.folds import Assignment, CohortFolds, by_hash, by_value
-from fleet_slip.resources import read_sql
 from fleet_slip.signals import catalogue
-from fleet_slip.storage import Snapshot
 from fleet_slip.warehouse import Warehouse
 
 FOLD_KEYS = {
@@ -191,7 +186,9 @@ def assign(values: Sequence[Any], by: str, count: int) -> Assignment:
 
 
 def load_cohort(
-    warehouse: Warehouse, condition: str = TRAINING_DRIVES, feature_set: str = PLAIN
+    warehouse: Warehouse | GramReader,
+    condition: str = TRAINING_DRIVES,
+    feature_set: str = PLAIN,
 ) -> Cohort:
     """Read the Gram rows of the drives that satisfy a condition.
 
@@ -220,38 +217,6 @@ def load_cohort(
     )
 
 
-@dataclass(frozen=True)
-class OpenedGrams:
-    """A connection to the Gram rows of a feature set, and what stood in the warehouse then."""
-
-    database: duckdb.DuckDBPyConnection
-    identity: str
-    logs_version: int
-    grams_version: int
-
-    def statement(self, name: str, condition: str) -> str:
-        """Return a statement of `jobs/` for a condition. Raises `SelectionError`."""
-        text = read_sql("jobs", name).format(condition=condition, feature_set=self.identity)
-        with database_errors(f"the cohort {condition!r}"):
-            return one_query(self.database, text)
-
-
-@contextlib.contextmanager
-def open_grams(warehouse: Warehouse, condition: str, feature_set: str) -> Iterator[OpenedGrams]:
-    """Open what a cohort's condition may ask for. Raises like `load_cohort`."""
-    logs, grams = warehouse.logs.snapshot(), warehouse.grams.snapshot()
-    if not grams.rows:
-        raise SelectionError(
-            f"{warehouse.root}: there are no Gram rows yet. Run: fleet-slip simulate CAMPAIGN (or "
-            "fleet-slip ingest FILE --mapping M), then fleet-slip gram."
-        )
-    identity = features().identity(feature_set)
-    if feature_set != PLAIN:
-        _require_complete(logs, grams, feature_set, identity)
-    with connect(warehouse.root, query=f"FROM grams WHERE {condition}") as database:
-        yield OpenedGrams(database, identity, logs.version or 0, grams.version or 0)
-
-
 def require_training(sources: Iterable[str], condition: str) -> None:
     """Raise `RefusedError` if drives of a scenario are among those of a condition."""
     if SCENARIO in sources:
@@ -261,30 +226,21 @@ def require_training(sources: Iterable[str], condition: str) -> None:
         )
 
 
-def _require_complete(logs: Snapshot, grams: Snapshot, feature_set: str, identity: str) -> None:
-    backlog = find_backlog(logs, grams, identity)
-    if backlog.missing or backlog.stale:
-        raise SelectionError(
-            f"the feature set {feature_set}, as it is defined now, has not been computed for "
-            f"{len(backlog.missing)} of {len(logs.files)} log files. Run: fleet-slip gram "
-            f"--features {feature_set}"
-        )
-
-
-def gram_table(signals: str, rows: pa.Table) -> GramTable:
+def gram_table(signals: str, rows: pa.Table | pa.RecordBatch) -> GramTable:
     """Return Gram rows, all of the same signals, as arrays."""
     names = tuple(signals.split(","))
     k = len(names)
     return GramTable(
         names,
-        rows["n"].combine_chunks().to_numpy(),
+        rows["n"].to_numpy(),
         _matrix(rows["sums"], k),
         _matrix(rows["products"], packed_size(k)),
     )
 
 
-def _matrix(lists: pa.ChunkedArray, width: int) -> NDArray[np.int64]:
-    values: NDArray[np.int64] = lists.combine_chunks().flatten().to_numpy()
+def _matrix(lists: pa.ChunkedArray | pa.ListArray, width: int) -> NDArray[np.int64]:
+    whole = lists.combine_chunks() if isinstance(lists, pa.ChunkedArray) else lists
+    values: NDArray[np.int64] = whole.flatten().to_numpy()
     return values.reshape(-1, width)
 
 

@@ -1,7 +1,7 @@
 """A DuckDB connection on the warehouse: views in SI units over one snapshot of its tables."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -50,15 +50,27 @@ def connect(
     `fleet_slip.reading_query.one_query` first, as the command line does.
     """
     warehouse = Warehouse(data_root(root))
-    database = open_database(threads=threads, reading=warehouse.root, spill=True)
     wanted = TABLES if query is None else tables_in(query)
-    stored = {name: STORED_IN[name] for name in wanted & STORED_IN.keys()}
-    snapshots = {name: getattr(warehouse, table).snapshot() for name, table in stored.items()}
+    stored = [STORED_IN[name] for name in VIEWS if name in wanted and name in STORED_IN]
+    snapshots = [getattr(warehouse, table).snapshot() for table in stored]
+    return open_views(warehouse, wanted, snapshots, threads=threads, locked=locked)
+
+
+def open_views(
+    warehouse: Warehouse,
+    wanted: frozenset[str],
+    snapshots: Sequence[Snapshot],
+    *,
+    threads: int | None = None,
+    locked: bool = True,
+) -> duckdb.DuckDBPyConnection:
+    """Return a connection with some of the views, on snapshots of the tables that they stand on."""
+    database = open_database(threads=threads, reading=warehouse.root, spill=True)
     sources = {
-        f"stored_{stored[name]}": _source(database, snapshot)
-        for name, snapshot in snapshots.items()
+        f"stored_{snapshot.table.folder.name}": _source(database, snapshot)
+        for snapshot in snapshots
     }
-    paths = [path for snapshot in snapshots.values() for path in snapshot.paths]
+    paths = [path for snapshot in snapshots for path in snapshot.paths]
     if "runs" in wanted:
         sources["stored_runs"] = run_source(database, warehouse.root)
         paths += run_files(warehouse.root)

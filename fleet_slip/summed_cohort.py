@@ -16,12 +16,10 @@ from fleet_slip.cohort import (
     FOLD_KEYS,
     ROW_FOLDS,
     TRAINING_DRIVES,
-    OpenedGrams,
     assign,
     gram_condition,
     gram_table,
     nothing,
-    open_grams,
     require_row_folds,
     require_training,
 )
@@ -29,6 +27,7 @@ from fleet_slip.database import database_errors
 from fleet_slip.errors import SelectionError
 from fleet_slip.features import PLAIN, features
 from fleet_slip.gram import Gram, IntArray
+from fleet_slip.gram_reader import GramReader, OpenedGrams, open_grams
 from fleet_slip.model_list import FoldPlan
 from fleet_slip.regression.folds import CohortFolds, hash_number
 from fleet_slip.warehouse import Warehouse
@@ -80,7 +79,7 @@ class SummedCohort:
 
 
 def sum_cohort(
-    warehouse: Warehouse,
+    warehouse: Warehouse | GramReader,
     plan: FoldPlan,
     condition: str = TRAINING_DRIVES,
     feature_set: str = PLAIN,
@@ -157,11 +156,13 @@ class _Sums:
         folds = self.fold_of(batch, drives)
         self.used.update(np.unique(folds).tolist())
         self.divided |= batch["part"].null_count < len(batch)
-        rows = pa.Table.from_batches([batch])
-        for signals in batch["signals"].unique().to_pylist():
-            mask = pc.equal(batch["signals"], signals)
-            here = mask.to_numpy(zero_copy_only=False)
-            totals = gram_table(signals, rows.filter(mask)).totals(folds[here], self.count)
+        names = batch["signals"].unique().to_pylist()
+        for signals in names:
+            rows, here = batch, np.ones(len(batch), dtype=np.bool_)
+            if len(names) > 1:
+                mask = pc.equal(batch["signals"], signals)
+                rows, here = batch.filter(mask), mask.to_numpy(zero_copy_only=False)
+            totals = gram_table(signals, rows).totals(folds[here], self.count)
             known = self.tables.get(signals)
             self.tables[signals] = (
                 [a + b for a, b in zip(known, totals, strict=True)] if known else totals

@@ -6,12 +6,14 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from benchmarks.growth_history import write_fleet
+from benchmarks.growth_history import write_fleet, write_grams
 from fleet_slip import summed_cohort
 from fleet_slip.cohort import load_cohort
 from fleet_slip.connection import TABLES, connect, tables_in
 from fleet_slip.errors import FleetSlipError, SelectionError
+from fleet_slip.features import PLAIN
 from fleet_slip.gram_job import update_grams
+from fleet_slip.gram_reader import GramReader
 from fleet_slip.local_folder import LocalFolder
 from fleet_slip.model_list import FoldKey, FoldPlan, load_model_list
 from fleet_slip.selection import select
@@ -124,3 +126,30 @@ def test_a_query_of_gram_rows_needs_no_log_file(tmp_path: Path) -> None:
     with connect(tmp_path, query=query) as database:
         assert database.execute(query).fetchone() == (20,)
     assert run_plan(warehouse, SelectionPlan()).selection.cohort.drive_count == 20
+
+
+def test_a_reader_opens_anew_only_what_changed(tmp_path: Path) -> None:
+    warehouse = Warehouse(LocalFolder(tmp_path))
+    write_fleet(warehouse, 20)
+    plan = FoldPlan(count=3)
+    elsewhere = "drive_id IN (SELECT drive_id FROM drives WHERE adhesion > 0.7)"
+    with GramReader(warehouse) as reader:
+        before = sum_cohort(reader, plan)
+        opened = reader.opened("true", PLAIN).database
+        assert reader.opened("adhesion > 0.7", PLAIN).database is opened
+        assert sum_cohort(reader, plan, elsewhere).drive_count == 14
+        assert sum_cohort(reader, plan).sums.tables == before.sums.tables
+        write_grams(warehouse, warehouse.logs.snapshot().paths[:1], 10)
+        after = sum_cohort(reader, plan)
+        assert after.sums.tables == sum_cohort(warehouse, plan).sums.tables
+        assert after.grams_version == before.grams_version + 1
+        assert after.rows > before.rows
+
+
+def test_a_reader_reads_again_what_came_after_the_table(tmp_path: Path) -> None:
+    warehouse = Warehouse(LocalFolder(tmp_path))
+    with GramReader(warehouse) as reader:
+        with pytest.raises(SelectionError, match="no Gram rows yet"):
+            sum_cohort(reader, FoldPlan())
+        write_fleet(warehouse, 20)
+        assert sum_cohort(reader, FoldPlan()).drive_count == 20

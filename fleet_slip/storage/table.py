@@ -152,6 +152,18 @@ class Snapshot:
         """Size of all active files."""
         return sum(file.size_bytes for file in self.files)
 
+    def renewed(self) -> "Snapshot":
+        """Return the newest version: this very snapshot, if nobody has committed since.
+
+        If somebody has, this snapshot is not to be used any more.
+        """
+        if self.delta is None:
+            return self.table.snapshot()
+        version = self.version
+        with storage_errors(self.table.folder):
+            self.delta.update_incremental()
+        return self if self.version == version else self.table.snapshot()
+
     def landed(self, unit_name: str) -> int | None:
         """Return the version of a unit of work that has landed, or None."""
         if self.delta is None:
