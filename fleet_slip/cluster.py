@@ -18,7 +18,7 @@ from contextvars import copy_context
 from dataclasses import dataclass, field
 from functools import partial
 from threading import Event, Thread
-from typing import Any
+from typing import Any, TypeVar
 
 from distributed import Client
 from distributed.client import ClosedClientError
@@ -47,11 +47,14 @@ POLL_S = 1.0
 PATIENCE_S = 120.0
 """How long a cluster may be without workers: so long may a container take to start."""
 
+CONNECT_ATTEMPTS = 5
 ANSWER_S = 20.0
 CLOSE_S = 5.0
 MARKER_FOLDER = ".cluster"
 MARKER_AGE_MAX_H = 7 * 24
 """A marker that is older was left by a killed command."""
+
+Connected = TypeVar("Connected")
 
 
 @contextlib.contextmanager
@@ -65,9 +68,9 @@ def cluster_executor(address: str, root: Folder) -> Iterator["ClusterExecutor"]:
     _route_logs()
     try:
         resolve_address(address)
-        _require_same_versions(asyncio.run(_versions(address)))
-        client = Client(address, set_as_default=False, name="fleet-slip")
-    except (OSError, ValueError, TypeError, ImportError, RuntimeError) as error:
+        _require_same_versions(_connected(lambda: asyncio.run(_versions(address))))
+        client: Client = _connected(lambda: _Client(address))
+    except (OSError, ValueError, TypeError, ImportError, RuntimeError, AssertionError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ClusterError(
             f"{address}: no Dask scheduler can be reached there ({reason}). Start one with: dask "
@@ -80,6 +83,34 @@ def cluster_executor(address: str, root: Folder) -> Iterator["ClusterExecutor"]:
     finally:
         with contextlib.suppress(OSError, AssertionError):
             client.close(timeout=CLOSE_S)
+
+
+class _Client(Client):
+    """A client that leaves no thread behind where it cannot begin."""
+
+    def __init__(self, address: str) -> None:
+        """Connect to the scheduler at an address."""
+        Client.__init__(self, address, set_as_default=False, name="fleet-slip")
+
+    def start(self, **options: Any) -> None:
+        """Connect."""
+        try:
+            Client.start(self, **options)
+        except AssertionError:
+            Client.close(self, timeout=CLOSE_S)
+            raise
+
+
+def _connected(connect: Callable[[], Connected]) -> Connected:
+    """Connect, again if Dask takes what the scheduler says for a fault.
+
+    It asserts that the first message comes alone. One to all clients, as of a task that another
+    command has just given up, may arrive together with it.
+    """
+    for _ in range(CONNECT_ATTEMPTS - 1):
+        with contextlib.suppress(AssertionError):
+            return connect()
+    return connect()
 
 
 async def _versions(address: str) -> dict[str, Any]:
@@ -204,9 +235,9 @@ class ClusterExecutor(Executor):
             elif status == "running":
                 self._send_again()
                 self._count_workers()
-                waited_s = time.monotonic() - self._last_seen_s
-                if self._tasks and waited_s > PATIENCE_S:
-                    self._fail(f"the cluster has had no worker for {waited_s:.0f} s")
+            waited_s = time.monotonic() - self._last_seen_s
+            if self._tasks and waited_s > PATIENCE_S:
+                self._fail(f"the cluster has had no worker for {waited_s:.0f} s")
 
     def _send_again(self) -> None:
         connection = self._client.scheduler_comm

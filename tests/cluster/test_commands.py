@@ -6,8 +6,10 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+from distributed import Client
 
 from benchmarks.dask_processes import DaskProcesses, dask_processes
 from fleet_slip.cluster import cluster_executor
@@ -18,6 +20,9 @@ from fleet_slip.tasks import LocalThreads, completed
 from tests.cluster.work import Order, obey
 from tests.conftest import COMMAND, RunCommand
 from tests.ingest.samples import csv_text, good_columns
+
+UNTIL_ALL_HAD_ONE = 1000
+"""So many tasks that every worker gets one, however late it comes and busy the machine is."""
 
 MAPPING = """
 name = "test"
@@ -42,9 +47,12 @@ def stored(root: Path) -> dict[str, bytes]:
 
 
 def run_orders(dask: DaskProcesses, folder: Path, number: int, seconds: float) -> int:
-    orders = [Order(f"task-{i}", folder, seconds) for i in range(number)]
     with cluster_executor(dask.address, LocalFolder(folder)) as executor:
-        return len(list(completed(executor, obey, orders, str)))
+        return len(list(completed(executor, obey, orders(folder, number, seconds), str)))
+
+
+def orders(folder: Path, number: int, seconds: float) -> Iterator[Order]:
+    return (Order(f"task-{i}", folder, seconds) for i in range(number))
 
 
 @pytest.mark.slow
@@ -109,9 +117,8 @@ def test_a_worker_of_other_versions_is_refused_early_and_late(
         worker = dask.start_worker(environment={"PYTHONPATH": path})
         try:
             dask.wait_for_workers(3)
-            orders = [Order(f"task-{i}", tmp_path, 0.2) for i in range(12)]
             with pytest.raises(RefusedError, match=r"^worker .* has numba 0\.1 instead of "):
-                list(completed(executor, obey, orders, str))
+                list(completed(executor, obey, orders(tmp_path, UNTIL_ALL_HAD_ONE, 0.2), str))
             with pytest.raises(RefusedError, match=r"^tcp://.* has numba 0\.1 instead of "):
                 run_orders(dask, tmp_path, 1, 0)
         finally:
@@ -130,10 +137,27 @@ def test_a_worker_that_does_not_see_the_data_root_writes_nothing(
     try:
         dask.wait_for_workers(3)
         with pytest.raises(StorageError, match="does not see the data root of this command"):
-            run_orders(dask, tmp_path, 12, 0.2)
+            run_orders(dask, tmp_path, UNTIL_ALL_HAD_ONE, 0.2)
     finally:
         dask.kill(blind)
     assert run_orders(dask, tmp_path, 4, 0) == 4
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_tells_other_news_at_once_is_asked_again(
+    dask: DaskProcesses, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As Dask's client fails where a task of another command is given up at that moment."""
+    faults = iter([True, False, True, False])
+    connect: Any = Client._ensure_connected
+
+    async def disturbed(client: Client, timeout: float | None = None) -> None:
+        await connect(client, timeout)
+        assert not next(faults)
+
+    monkeypatch.setattr(Client, "_ensure_connected", disturbed)
+    assert run_orders(dask, tmp_path, 3, 0) == 3
+    assert list(faults) == []
 
 
 def test_a_task_makes_sure_of_its_ground(tmp_path: Path) -> None:
