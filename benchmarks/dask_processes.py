@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import random
 import signal
 import socket
 import subprocess
@@ -14,7 +15,7 @@ from distributed import Client
 
 DASK = str(Path(sys.executable).with_name("dask"))
 REPOSITORY = Path(__file__).parents[1]
-START_S = 60.0
+START_S = 300.0
 
 Process = subprocess.Popen[bytes]
 
@@ -93,6 +94,12 @@ def dask_processes(folder: Path, workers: int = 2, **settings: str) -> Iterator[
 
 
 def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    """Return a port that nobody uses, from below those that the kernel gives away by itself.
+
+    The scheduler takes it only later, and once more when it is started again.
+    """
+    while True:
+        port = random.SystemRandom().randrange(10_000, 32_768)
+        with contextlib.suppress(OSError), socket.socket() as probe:
+            probe.bind(("127.0.0.1", port))
+            return port

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
+from hypothesis import HealthCheck, settings
 
 from fleet_slip.folder import Folder
 from fleet_slip.local_folder import LocalFolder
@@ -24,6 +25,12 @@ COMMAND = str(Path(sys.executable).with_name("fleet-slip"))
 DAY = date(2024, 5, 1)
 
 os.environ["FLEET_SLIP_LOG"] = "text"  # a test reads what a person would
+
+# The same examples in every run, and none that fails because the machine is busy. The option
+# --hypothesis-profile=search looks for new ones.
+settings.register_profile("search", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("fixed", settings.get_profile("search"), derandomize=True)
+settings.load_profile("fixed")
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from benchmarks.reliability import concurrency
+from fleet_slip.local_folder import LocalFolder
 from tests.conftest import COMMAND, RunCommand
 from tests.ingest.samples import csv_text, good_columns
 from tests.test_crash import state
@@ -28,17 +29,19 @@ def test_writers_lose_nothing_and_readers_see_whole_commits_in_order(
     assert "nothing lost or doubled" in capsys.readouterr().out
 
 
+def started(root: Path, command: list[str]) -> subprocess.Popen[str]:
+    """Start a command in a process of its own."""
+    return subprocess.Popen(
+        [COMMAND, "--root", str(root), *command],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
 def at_once(root: Path, *commands: list[str]) -> list[tuple[int, str]]:
     """Run commands in processes of their own at the same time; return exit codes and stderr."""
-    running = [
-        subprocess.Popen(
-            [COMMAND, "--root", str(root), *command],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        for command in commands
-    ]
+    running = [started(root, command) for command in commands]
     answers = [process.communicate()[1] for process in running]
     return [(p.returncode, text) for p, text in zip(running, answers, strict=True)]
 
@@ -87,10 +90,15 @@ def test_the_second_run_of_a_campaign_waits_and_has_nothing_to_do(
     run_command: RunCommand, tmp_path: Path
 ) -> None:
     job = ["run", "--campaign", "smoke", "--threads", "1"]
-    answers = at_once(tmp_path / "data", job, job)
-    assert [code for code, _ in answers] == [0, 0]
-    assert sum("waiting for another run" in text for _, text in answers) == 1
-    assert sum("nothing to do, smoke@1 is up to date" in text for _, text in answers) == 1
+    root = tmp_path / "data"
+    with LocalFolder(root).exclusive(".run-smoke.lock", lambda: None):
+        running = [started(root, job) for _ in range(2)]
+        for process in running:
+            assert process.stderr
+            assert process.stderr.readline() == "smoke: waiting for another run\n"
+    answers = [process.communicate()[1] for process in running]
+    assert [process.returncode for process in running] == [0, 0]
+    assert sum("nothing to do, smoke@1 is up to date" in text for text in answers) == 1
     alone = tmp_path / "alone"
     run_command(*job, root=alone)
     both, one = state(tmp_path / "data"), state(alone)

@@ -73,7 +73,8 @@ def test_rows_that_lack_signals_have_gram_rows_of_their_own(warehouse: Warehouse
 
 
 @settings(
-    max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=8,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 @given(seed=st.integers(0, 2**32), pieces=st.integers(1, 4), threads=st.integers(1, 3))
 def test_rows_do_not_depend_on_files_order_or_threads(

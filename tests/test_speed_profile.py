@@ -42,7 +42,7 @@ def accelerations(profile: SpeedProfile) -> NDArray[np.float64]:
     return np.diff(squared) / (2 * profile.spacing_m)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(name=st.sampled_from(sorted(TRACKS)), plan=limits)
 def test_friction_ellipse_holds_at_every_point(name: str, plan: SpeedLimits) -> None:
     profile = speed_profile(TRACKS[name], plan, 1.0)
@@ -61,7 +61,7 @@ def test_friction_ellipse_holds_at_every_point(name: str, plan: SpeedLimits) -> 
     assert np.all(np.where(along < 0, falling**2 + begins**2, 0) <= 1 + 1e-6)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     name=st.sampled_from(sorted(TRACKS)),
     plan=limits,

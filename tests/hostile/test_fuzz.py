@@ -27,7 +27,6 @@ def test_whatever_comes_is_answered_or_refused(name: str, sandbox: Path) -> None
 
     @settings(
         max_examples=EXAMPLES.get(name, FEW),
-        deadline=None,
         database=None,
         suppress_health_check=list(HealthCheck),
     )

@@ -167,7 +167,7 @@ def test_what_reads_is_answered(root: Path, query: str) -> None:
         assert database.sql(one_query(database, query)).fetchall() is not None
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(
     st.lists(
         st.sampled_from(

@@ -18,7 +18,8 @@ from fleet_slip.signals import catalogue
 from .samples import a_mapping, csv_text, good_columns
 
 CASES = settings(
-    max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=100,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 MAPPINGS = (
     a_mapping(),

@@ -311,7 +311,7 @@ bad_rows = st.lists(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(bad_rows)
 def test_bad_rows_anywhere_leave_the_good_ones_as_they_are(
     tmp_path_factory: pytest.TempPathFactory, bad: list[tuple[int, str]]
@@ -327,7 +327,7 @@ def test_bad_rows_anywhere_leave_the_good_ones_as_they_are(
     assert log.quarantine["row"].to_pylist() == positions
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.lists(st.tuples(st.integers(-30, 400), st.floats(-40, 40)), min_size=2, max_size=60))
 def test_every_row_is_kept_or_quarantined(
     tmp_path_factory: pytest.TempPathFactory, rows: list[tuple[int, float]]

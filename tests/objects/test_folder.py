@@ -2,9 +2,8 @@
 
 import pickle
 import socket
-import threading
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -165,33 +164,41 @@ def test_a_file_url_is_a_folder(tmp_path: Path) -> None:
     assert str(data_root("az://container/some/path/")) == "az://container/some/path"
 
 
-def refuse_writes(server: Server, _patch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def silent() -> Iterator[socket.socket]:
+    """A port on which nobody listens, and that nobody else can take."""
+    with socket.socket() as bound:
+        bound.bind(("127.0.0.1", 0))
+        yield bound
+
+
+Fault = Callable[[Server, pytest.MonkeyPatch, socket.socket], None]
+
+
+def refuse_writes(server: Server, _patch: pytest.MonkeyPatch, _silent: socket.socket) -> None:
     server.faults.refuse = ("PUT",)
 
 
-def fail_always(server: Server, _patch: pytest.MonkeyPatch) -> None:
+def fail_always(server: Server, _patch: pytest.MonkeyPatch, _silent: socket.socket) -> None:
     server.faults.failing = 1.0
 
 
-def use_another_key(_server: Server, patch: pytest.MonkeyPatch) -> None:
+def use_another_key(_server: Server, patch: pytest.MonkeyPatch, _silent: socket.socket) -> None:
     patch.setenv("AWS_ACCESS_KEY_ID", "AKIDOFSOMEBODY")
 
 
-def use_no_encryption(_server: Server, patch: pytest.MonkeyPatch) -> None:
+def use_no_encryption(_server: Server, patch: pytest.MonkeyPatch, _silent: socket.socket) -> None:
     patch.delenv("AWS_ALLOW_HTTP")
 
 
-def close_the_port(_server: Server, patch: pytest.MonkeyPatch) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as closed:
-        patch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{closed.getsockname()[1]}")
-
-
-def never_answer(_server: Server, patch: pytest.MonkeyPatch) -> None:
-    silent = socket.create_server(("127.0.0.1", 0))
-    closing = threading.Timer(30, silent.close)
-    closing.daemon = True  # the tests end without it
-    closing.start()
+def close_the_port(_server: Server, patch: pytest.MonkeyPatch, silent: socket.socket) -> None:
     patch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{silent.getsockname()[1]}")
+
+
+def never_answer(server: Server, patch: pytest.MonkeyPatch, silent: socket.socket) -> None:
+    silent.listen()
+    patch.setattr(object_folder, "TIMEOUT_S", 1)
+    close_the_port(server, patch, silent)
 
 
 @pytest.mark.parametrize(
@@ -209,16 +216,16 @@ def test_a_fault_is_told_in_one_line_without_credentials(
     root: Folder,
     server: Server,
     monkeypatch: pytest.MonkeyPatch,
-    fault: Callable[[Server, pytest.MonkeyPatch], None],
+    silent: socket.socket,
+    fault: Fault,
     told: str,
 ) -> None:
-    monkeypatch.setattr(object_folder, "TIMEOUT_S", 1)
     monkeypatch.setattr(object_folder, "RETRY_S", 2)
     logs = Warehouse(root).logs
     action = logs.write_file("one", rows("a"), DAY)
     with server.misbehaving():
         object_folder._store.cache_clear()
-        fault(server, monkeypatch)
+        fault(server, monkeypatch, silent)
         attempts: tuple[Callable[[], None], ...] = (
             lambda: root.put("runs/1", b"x"),
             lambda: Warehouse(root).logs.snapshot().commit(Change(add=[action])),

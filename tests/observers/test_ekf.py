@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet_slip.observers import ekf
@@ -45,7 +45,6 @@ motions = {
 }
 
 
-@settings(deadline=None)
 @given(**motions)
 def test_force_is_that_of_a_fiala_tyre(vx: float, vy: float, r: float, steer: float) -> None:
     alpha = np.arctan2(vy + TRACK.front_m * r, vx) - steer
@@ -55,7 +54,6 @@ def test_force_is_that_of_a_fiala_tyre(vx: float, vy: float, r: float, steer: fl
         assert found.force == pytest.approx(expected, rel=1e-9, abs=1e-6)
 
 
-@settings(deadline=None)
 @given(**motions)
 def test_derivatives_are_those_of_finite_differences(
     vx: float, vy: float, r: float, steer: float

@@ -135,7 +135,7 @@ def test_gain_that_overshoots_its_layer_is_refused() -> None:
         SlidingGains(lateral_gain_mps2=20.0, lateral_layer_mps=0.1)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(vx=st.floats(0, 4.9))
 def test_slip_is_finite_at_rest_and_continuous_at_the_slowest_speed(vx: float) -> None:
     s = state_space(TRACK, np.array([vx, 5.0 - 1e-9, 5.0 + 1e-9]))

@@ -138,7 +138,7 @@ def test_mixtures_find_the_groups_of_effects() -> None:
     assert [len(g) for g in separable_groups(np.sort(data), NormalKernel())] == [40, 10]
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 10**6))
 def test_the_orthogonal_basis_is_a_rotation(seed: int) -> None:
     gram = gram_of(np.concatenate(random_drives(seed, drives=2)))

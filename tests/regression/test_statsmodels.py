@@ -31,7 +31,7 @@ def drives_of(
     return result
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     seed=st.integers(0, 10**6),
     inputs=st.integers(1, 8),
@@ -62,7 +62,7 @@ def test_coefficients_and_both_kinds_of_errors_agree(
     assert abs(ours[0].residual_std / np.sqrt(theirs[0].scale) - 1) < AGREEMENT
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 10**6), rho=st.floats(-0.8, 0.9))
 def test_the_autoregressive_fit_agrees_at_its_correlation(seed: int, rho: float) -> None:
     drive = autoregressive_drives(seed, rho, drives=1)[0]

@@ -7,7 +7,7 @@ import math
 
 import numba
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -38,13 +38,11 @@ def test_arctangent_over_a_million_ratios() -> None:
         assert np.abs(arctangents(y, x) - np.arctan2(y, x)).max() < 1e-12
 
 
-@settings(deadline=None)  # the first call compiles
 @given(SIZES, SIZES, st.sampled_from([1.0, -1.0]), st.sampled_from([1.0, -1.0]))
 def test_arctangent_of_any_vector(y: float, x: float, up: float, right: float) -> None:
     assert abs(arctan2(up * y, right * x) - math.atan2(up * y, right * x)) < 1e-12
 
 
-@settings(deadline=None)  # the first call compiles
 @given(st.floats(1.0, 60_000.0), st.sampled_from(CARS))
 def test_cornering_stiffness_without_sine_is_an_identity(load: float, name: str) -> None:
     c = constants(load_vehicle(name), adhesion=1.0)
@@ -52,7 +50,6 @@ def test_cornering_stiffness_without_sine_is_an_identity(load: float, name: str)
     assert abs(cornering_stiffness(load, c.stiffness_front, c) - exact) < 1e-12 * c.stiffness_front
 
 
-@settings(deadline=None)  # the first call compiles
 @given(st.floats(-math.pi, math.pi), st.floats(-20.0, 20.0))
 def test_the_heading_keeps_its_length(angle: float, rate: float) -> None:
     """One Newton iteration for 1/√n leaves 3/8 (n − 1)² of the error; n − 1 = (rate · step)²."""
@@ -66,7 +63,6 @@ def test_the_heading_keeps_its_length(angle: float, rate: float) -> None:
     assert abs(wrapped) <= abs(rate * STEP_S) ** 3 / 3 + 1e-14
 
 
-@settings(deadline=None)  # the first call compiles
 @given(st.floats(-100.0, 100.0), st.floats(1.0, 1.0 / STEP_S))
 def test_a_lag_is_followed_to_third_order(rate: float, inverse_lag: float) -> None:
     """Against rate · lag · (1 − exp(−h / lag)); the next term of the series bounds the error."""

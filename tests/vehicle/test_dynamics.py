@@ -196,7 +196,7 @@ def test_energy_never_grows_in_coasting(start: State) -> None:
     assert energy[-1] < energy[0]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(x=STATES, u=CONTROLS, adhesion=st.sampled_from([0.05, 0.1, 0.4, 1.0, 1.2]))
 def test_nothing_blows_up_in_any_spin(x: State, u: Controls, adhesion: float) -> None:
     start = kinetic_energy(np.array([x]))[0]
