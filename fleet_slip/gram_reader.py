@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Self
 
 import duckdb
+import pyarrow as pa
 
 from fleet_slip.connection import connect, open_views, tables_in
 from fleet_slip.database import database_errors
@@ -20,6 +21,9 @@ from fleet_slip.warehouse import Warehouse
 
 GRAMS_ALONE = frozenset({"grams"})
 """What most conditions ask for: columns of the Gram rows themselves."""
+
+BATCH_ROWS = 2**13
+"""Gram rows of one batch: some 700 bytes each."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,12 @@ class OpenedGrams:
         text = read_sql("jobs", name).format(condition=condition, feature_set=self.identity)
         with database_errors(f"the cohort {condition!r}"):
             return one_query(self.database, text)
+
+    def batches(self, condition: str) -> Iterator[pa.RecordBatch]:
+        """Yield the Gram rows of a cohort in any order, with what their fold is told from."""
+        statement = self.statement("cohort_sums.sql", condition)
+        with database_errors(f"the cohort {condition!r}"):
+            yield from self.database.sql(statement).to_arrow_reader(BATCH_ROWS)
 
 
 class GramReader:

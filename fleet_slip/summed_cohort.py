@@ -32,9 +32,6 @@ from fleet_slip.model_list import FoldPlan
 from fleet_slip.regression.folds import CohortFolds, hash_number
 from fleet_slip.warehouse import Warehouse
 
-BATCH_ROWS = 2**13
-"""Gram rows of one batch: some 700 bytes each."""
-
 FoldOf = Callable[[pa.RecordBatch, NDArray[np.uint64]], IntArray]
 """Tells the fold of each Gram row, from its metadata and its drive's hash."""
 
@@ -93,7 +90,7 @@ def sum_cohort(
     with open_grams(warehouse, condition, feature_set) as opened:
         names, fold_of = _folding(opened, plan, condition)
         sums = _Sums(len(names), fold_of)
-        for batch in _batches(opened, condition):
+        for batch in opened.batches(condition):
             require_training(batch["source"].unique().to_pylist(), condition)
             sums.add(batch)
         if not sums.tables:
@@ -108,12 +105,6 @@ def sum_cohort(
         grams_version=opened.grams_version,
         feature_set=feature_set,
     )
-
-
-def _batches(opened: OpenedGrams, condition: str) -> Iterator[pa.RecordBatch]:
-    statement = opened.statement("cohort_sums.sql", condition)
-    with database_errors(f"the cohort {condition!r}"):
-        yield from opened.database.sql(statement).to_arrow_reader(BATCH_ROWS)
 
 
 def _folding(opened: OpenedGrams, plan: FoldPlan, condition: str) -> tuple[list[str], FoldOf]:
@@ -137,6 +128,22 @@ def _folding(opened: OpenedGrams, plan: FoldPlan, condition: str) -> tuple[list[
     return list(assignment.names), fold_of
 
 
+def hash_numbers(ids: pa.Array) -> NDArray[np.uint64]:
+    """Return the hash of each drive's id: what tells it from others, in 8 bytes."""
+    return np.fromiter(map(hash_number, ids.to_pylist()), dtype=np.uint64, count=len(ids))
+
+
+def by_signals(batch: pa.RecordBatch) -> Iterator[tuple[str, pa.RecordBatch, NDArray[np.bool_]]]:
+    """Yield each set of signals in a batch of Gram rows, its rows, and which those are."""
+    names = batch["signals"].unique().to_pylist()
+    if len(names) == 1:
+        yield names[0], batch, np.ones(len(batch), dtype=np.bool_)
+        return
+    for signals in names:
+        mask = pc.equal(batch["signals"], signals)
+        yield signals, batch.filter(mask), mask.to_numpy(zero_copy_only=False)
+
+
 @dataclass
 class _Sums:
     """Adds up Gram rows by set of signals and fold, and remembers which drives they are of."""
@@ -151,17 +158,11 @@ class _Sums:
 
     def add(self, batch: pa.RecordBatch) -> None:
         """Add a batch of Gram rows."""
-        ids = batch["drive_id"].to_pylist()
-        drives = np.fromiter(map(hash_number, ids), dtype=np.uint64, count=len(ids))
+        drives = hash_numbers(batch["drive_id"])
         folds = self.fold_of(batch, drives)
         self.used.update(np.unique(folds).tolist())
         self.divided |= batch["part"].null_count < len(batch)
-        names = batch["signals"].unique().to_pylist()
-        for signals in names:
-            rows, here = batch, np.ones(len(batch), dtype=np.bool_)
-            if len(names) > 1:
-                mask = pc.equal(batch["signals"], signals)
-                rows, here = batch.filter(mask), mask.to_numpy(zero_copy_only=False)
+        for signals, rows, here in by_signals(batch):
             totals = gram_table(signals, rows).totals(folds[here], self.count)
             known = self.tables.get(signals)
             self.tables[signals] = (

@@ -1,5 +1,6 @@
 """The sums of a cohort are those of its Gram rows, whatever the batches and the folds."""
 
+from datetime import timedelta
 from pathlib import Path
 
 import numpy as np
@@ -7,9 +8,10 @@ import pyarrow as pa
 import pytest
 
 from benchmarks.growth_history import write_fleet, write_grams
-from fleet_slip import summed_cohort
+from fleet_slip import gram_reader
 from fleet_slip.cohort import load_cohort
 from fleet_slip.connection import TABLES, connect, tables_in
+from fleet_slip.daily_sums import sum_days
 from fleet_slip.errors import FleetSlipError, SelectionError
 from fleet_slip.features import PLAIN
 from fleet_slip.gram_job import update_grams
@@ -20,7 +22,7 @@ from fleet_slip.selection import select
 from fleet_slip.selection_plan import SelectionPlan, run_plan
 from fleet_slip.summed_cohort import sum_cohort
 from fleet_slip.warehouse import Warehouse
-from tests.conftest import land, log_rows, random_counts
+from tests.conftest import DAY, land, log_rows, random_counts
 
 MODELS = load_model_list("table1")
 
@@ -38,7 +40,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Warehouse:
 def test_sums_equal_those_of_the_cohort(
     fleet: Warehouse, monkeypatch: pytest.MonkeyPatch, by: FoldKey, batch: int
 ) -> None:
-    monkeypatch.setattr(summed_cohort, "BATCH_ROWS", batch)
+    monkeypatch.setattr(gram_reader, "BATCH_ROWS", batch)
     plan = FoldPlan(by=by, count=4)
     cohort = load_cohort(fleet, "adhesion > 0.65")
     summed = sum_cohort(fleet, plan, "adhesion > 0.65")
@@ -66,6 +68,36 @@ def test_drives_with_fewer_signals_serve_the_models_that_they_can(warehouse: War
     summed = select(sum_cohort(warehouse, plan), MODELS.model, plan)
     assert summed.as_dict() == whole.as_dict()
     assert {model.drives for model in summed.models} == {30, 36}, summed.skipped
+
+
+@pytest.mark.parametrize("batch", [7, 1000])
+def test_days_add_up_to_those_of_the_drives(
+    warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch, batch: int
+) -> None:
+    monkeypatch.setattr(gram_reader, "BATCH_ROWS", batch)
+    rng = np.random.default_rng(1)
+    for number in range(3):
+        rows = []
+        for i in range(12):
+            counts = random_counts(rng, 40)
+            if i % 3 == 0:  # the steering wheel in no row, or in some: then two Gram rows
+                mask = np.arange(40) >= 20 * (i % 2)
+                counts["steering_wheel"] = pa.array(counts["steering_wheel"], mask=mask)
+            rows.append(log_rows(f"drive-{number}-{i}", counts))
+        land(warehouse, str(number), *rows, day=DAY + timedelta(days=number))
+    update_grams(warehouse)
+    for inputs in (["ax"], ["ax", "steering_wheel"]):
+        served = load_cohort(warehouse).serving(inputs)
+        sums = sum_days(warehouse, inputs)
+        days = served.drives["day"].to_pylist()
+        assert sums.days == tuple(sorted(set(days)))
+        assert sums.drives == tuple(days.count(day) for day in sums.days)
+        for day, gram in zip(sums.days, sums.grams, strict=True):
+            assert gram == served.table.total(np.array([one == day for one in days]))
+    with pytest.raises(SelectionError, match="no drive satisfies"):
+        sum_days(warehouse, ["ax"], "mass_kg > 1e9")
+    with pytest.raises(SelectionError, match="no drive of the cohort has all of"):
+        sum_days(warehouse, ["steering_wheel"], "drive_id IN ('drive-0-0', 'drive-0-6')")
 
 
 def test_a_listed_selection_is_the_same_either_way(fleet: Warehouse) -> None:

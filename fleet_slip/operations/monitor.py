@@ -16,9 +16,7 @@ from datetime import date
 from statistics import fmean, stdev
 from typing import Any
 
-import numpy as np
-
-from fleet_slip.cohort import load_cohort
+from fleet_slip.daily_sums import sum_days
 from fleet_slip.errors import SelectionError, StorageError
 from fleet_slip.features import input_scales
 from fleet_slip.gram import Gram
@@ -115,13 +113,8 @@ def monitor(
     limits = limits or thresholds().monitor
     manifest = version.manifest
     condition = condition or manifest.trained_on.cohort
-    cohort = load_cohort(warehouse, condition, manifest.trained_on.feature_set)
-    served = cohort.serving(manifest.signals)
-    dates = served.drives["day"].to_pylist()
-    days = sorted(set(dates))
-    numbers = np.array([days.index(day) for day in dates], dtype=np.int64)
-    grams = served.table.totals(numbers, len(days))
-    drives = np.bincount(numbers, minlength=len(days)).tolist()
+    sums = sum_days(warehouse, manifest.signals, condition, manifest.trained_on.feature_set)
+    days, grams = sums.days, sums.grams
     last = _last_training_day(warehouse, version) if since is None else None
     training = [day < since if since else last is not None and day <= last for day in days]
     if sum(training) < limits.min_training_days:
@@ -134,7 +127,7 @@ def monitor(
     found = [
         _day(day, gram, count, model, known)
         for day, gram, count, model, known in zip(
-            days, grams, drives, models, training, strict=True
+            days, grams, sums.drives, models, training, strict=True
         )
     ]
     usual = [day for day in found if day.training]

@@ -17,6 +17,14 @@ from fleet_slip.regression.exact import LinearModel
 from fleet_slip.regression.special import FloatArray
 
 
+def no_drive_has(signals: Sequence[str]) -> SelectionError:
+    """Return the error that no drive of a cohort has all of some signals."""
+    return SelectionError(
+        f"no drive of the cohort has all of {', '.join(signals)}. Use fewer signals, or another "
+        "cohort."
+    )
+
+
 def serving_drives(
     tables: Sequence[GramTable], signals: Sequence[str]
 ) -> tuple[GramTable, NDArray[np.bool_]]:
@@ -27,10 +35,7 @@ def serving_drives(
     """
     served = [set(signals) <= set(table.signals) for table in tables]
     if not any(served):
-        raise SelectionError(
-            f"no drive of the cohort has all of {', '.join(signals)}. Use fewer signals, or "
-            "another cohort."
-        )
+        raise no_drive_has(signals)
     parts = [table.restrict(signals) for table, yes in zip(tables, served, strict=True) if yes]
     mask = np.repeat(served, [len(table) for table in tables])
     if len(parts) == 1:
