@@ -11,14 +11,14 @@ from collections.abc import Iterator
 from fleet_slip.errors import StorageError
 
 _CREDENTIALS = (
-    "AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, GOOGLE_APPLICATION_CREDENTIALS, or "
-    "AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY"
+    "AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY or AWS_PROFILE, "
+    "GOOGLE_APPLICATION_CREDENTIALS, or AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY"
 )
 
 _MEANINGS: tuple[tuple[str, str], ...] = (
     (
         r"169\.254\.169\.254|computeMetadata|metadata\.google|Account must be specified|"
-        r"CredentialsNotLoaded|no providers in chain",
+        r"CredentialsNotLoaded|no providers in chain|no credentials found in chain",
         f"there are no credentials. Set {_CREDENTIALS}.",
     ),
     (

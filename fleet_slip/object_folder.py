@@ -24,6 +24,7 @@ from obstore.exceptions import AlreadyExistsError
 from obstore.store import from_url
 
 from fleet_slip.folder import Content, StoredFile
+from fleet_slip.object_credentials import AwsProfile, aws_profile
 from fleet_slip.object_errors import object_errors
 from fleet_slip.object_files import ObjectFilesystem, ObjectReader
 
@@ -75,13 +76,15 @@ class ObjectFolder:
 
     @property
     def delta_options(self) -> dict[str, str] | None:
-        """Options of the Delta library; credentials it finds in the environment, as we do."""
+        """Options of the Delta library; credentials it finds where we do."""
+        profile = _profile(self.bucket)
         return {
             "timeout": f"{TIMEOUT_S}s",
             "connect_timeout": f"{CONNECT_TIMEOUT_S}s",
             "max_retries": f"{RETRIES}",
             "retry_timeout": f"{RETRY_S}s",
             "conditional_put": "etag",
+            **(profile.delta_options if profile else {}),
         }
 
     @property
@@ -207,9 +210,15 @@ class ObjectFolder:
         )
 
 
+def _profile(bucket: str) -> AwsProfile | None:
+    """Return where credentials are, if it is a bucket of S3 and they are not in the environment."""
+    return aws_profile() if bucket.startswith("s3://") else None
+
+
 @functools.cache
 def _store(bucket: str) -> "ObjectStore":
     """Return the client for a bucket, which a process makes when it first needs it."""
+    profile = _profile(bucket)
     with object_errors(bucket):
         return from_url(
             bucket,
@@ -219,4 +228,5 @@ def _store(bucket: str) -> "ObjectStore":
                 "connect_timeout": timedelta(seconds=CONNECT_TIMEOUT_S),
             },
             retry_config={"max_retries": RETRIES, "retry_timeout": timedelta(seconds=RETRY_S)},
+            **(profile.store_options if profile else {}),
         )

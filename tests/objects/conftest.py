@@ -6,6 +6,7 @@ import pytest
 
 from fleet_slip.data_root import data_root
 from fleet_slip.folder import Folder
+from fleet_slip.object_credentials import aws_profile
 from fleet_slip.object_folder import _store
 from tests.objects.server import Server
 
@@ -23,6 +24,12 @@ def environment(server: Server, monkeypatch: pytest.MonkeyPatch) -> Iterator[Non
     for name, value in server.environment.items():
         monkeypatch.setenv(name, value)
     yield
+    forget_clients()
+
+
+def forget_clients() -> None:
+    """Let this process look anew for credentials, as a new one would."""
+    aws_profile.cache_clear()
     _store.cache_clear()
 
 

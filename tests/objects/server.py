@@ -33,12 +33,14 @@ class Faults:
         failing: share of the requests that are answered by 500, half of them after they were done.
         slow_s: longest time by which an answer is late.
         refuse: methods that are answered by 403.
+        access_key: the one that is let in.
         seen: requests that came, as METHOD PATH.
     """
 
     failing: float = 0.0
     slow_s: float = 0.0
     refuse: tuple[str, ...] = ()
+    access_key: str = ACCESS_KEY
     seen: list[str] = field(default_factory=list)
 
 
@@ -99,7 +101,7 @@ class Server:
         environ["wsgi.input"] = io.BytesIO(environ["wsgi.input"].read(length))
         if faults.slow_s:
             time.sleep(self._rng.uniform(0, faults.slow_s))
-        if f"Credential={ACCESS_KEY}/" not in environ.get("HTTP_AUTHORIZATION", ""):
+        if f"Credential={faults.access_key}/" not in environ.get("HTTP_AUTHORIZATION", ""):
             return _answer(start, "403 Forbidden", "InvalidAccessKeyId")
         if method in faults.refuse:
             return _answer(start, "403 Forbidden", "AccessDenied")
