@@ -14,6 +14,8 @@ import obstore
 from fleet_slip.object_errors import object_errors
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from obstore.store import ObjectStore
 
 
@@ -63,11 +65,14 @@ class ObjectFilesystem(fsspec.AbstractFileSystem):  # type: ignore[misc]
 
     cachable = False
 
-    def __init__(self, bucket: str, store: "ObjectStore") -> None:
-        """Serve a bucket, such as s3://BUCKET."""
+    def __init__(self, bucket: str, store: "Callable[[], ObjectStore]") -> None:
+        """Serve a bucket, such as s3://BUCKET, of the store that is returned when asked for.
+
+        fsspec makes text of all that it is given, which not every store survives.
+        """
         super().__init__()
         self.protocol, _, self._name = bucket.partition("://")
-        self._store = store
+        self._store = store()
         self._sizes: dict[str, int] = {}
 
     def _key(self, path: str) -> str:

@@ -182,7 +182,7 @@ class ObjectFolder:
 
     def let_read(self, database: duckdb.DuckDBPyConnection) -> None:
         """Enable a connection to read the objects of this bucket."""
-        database.register_filesystem(ObjectFilesystem(self.bucket, self._store))
+        database.register_filesystem(ObjectFilesystem(self.bucket, lambda: self._store))
 
     @property
     def _store(self) -> "ObjectStore":
@@ -201,12 +201,14 @@ class ObjectFolder:
         return True
 
     def _found(self, meta: Any) -> StoredFile:
+        # Of one object some stores list milliseconds, or a tag without quotes, and tell seconds
+        # and quotes when they are asked for it alone.
         return StoredFile(
             self,
             meta["path"][len(self.prefix) :].lstrip("/"),
             meta["size"],
-            int(meta["last_modified"].timestamp() * 1e9),
-            meta["e_tag"] or "",
+            int(meta["last_modified"].timestamp()) * 10**9,
+            (meta["e_tag"] or "").strip('"'),
         )
 
 

@@ -5,10 +5,13 @@ import socket
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 import duckdb
 import numpy as np
+import obstore
 import pytest
 
 import fleet_slip
@@ -47,6 +50,22 @@ def test_what_is_put_is_read_listed_and_removed(root: Folder) -> None:
     assert root.remove(file)
     assert not root.remove(file)
     assert not root.exists()
+
+
+def test_a_file_is_known_again_where_listings_tell_its_state_otherwise(
+    root: Folder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root.put("one", b"1")
+    (file,) = root.files()
+    head = obstore.head
+
+    def as_others_do(store: Any, key: str) -> Any:
+        meta = head(store, key)
+        moment = meta["last_modified"] + timedelta(milliseconds=500)
+        return {**meta, "last_modified": moment, "e_tag": f'"{file.identity}"'}
+
+    monkeypatch.setattr(obstore, "head", as_others_do)
+    assert root.remove(file)
 
 
 def test_of_many_that_create_a_file_one_has_made_it(root: Folder) -> None:
