@@ -91,10 +91,9 @@ class Audit:
 
     def _of(self, subject: Subject) -> list[Mapping[str, Any]]:
         entries = self.entries()
-        if not entries:
-            return []
-        digest = subject.digest(entries[0]["salt"])
-        return [entry for entry in entries if entry["subject"] == digest]
+        # One salt, or more if several processes made the first entries at once.
+        digests = {salt: subject.digest(salt) for salt in {entry["salt"] for entry in entries}}
+        return [entry for entry in entries if entry["subject"] == digests[entry["salt"]]]
 
     def _append(self, subject: Subject, content: Mapping[str, Any]) -> None:
         entries = self.entries()

@@ -19,6 +19,7 @@ import pyarrow.compute as pc
 from deltalake.transaction import AddAction
 
 from fleet_slip.database import database_errors, open_database
+from fleet_slip.errors import ConflictError
 from fleet_slip.features import PLAIN, features
 from fleet_slip.gram_statement import gram_statement
 from fleet_slip.storage import (
@@ -112,13 +113,14 @@ def unit_name(identity: str) -> str:
 def _update_once(
     warehouse: Warehouse, progress: Progress, feature_set: str, executor: Executor | None
 ) -> GramReport:
-    # The logs are looked at last: if they lose a drive from now on, whoever removed it changes the
+    # The logs are looked at last: if they lose a drive from now on, whoever removed it changes its
     # Gram rows after this snapshot of them, and this job's commit is a conflict.
     grams = warehouse.grams.snapshot()
     logs = warehouse.logs.snapshot()
     identity = features().identity(feature_set)
     backlog = find_backlog(logs, grams, identity)
     version, gram_rows = grams.version, grams.rows
+    logs_version = logs.version
     if backlog.missing or backlog.stale:
         new_rows = aggregate(warehouse, backlog.missing, progress, None, feature_set, executor)
         replaced = _files_to_rewrite(grams, backlog.stale)
@@ -127,14 +129,15 @@ def _update_once(
             Change(
                 add=_write_rows(warehouse, chain(kept, [new_rows])),
                 remove=replaced,
-                units=[Unit(unit_name(identity), logs.version or 0)],
+                units=[Unit(unit_name(identity), logs_version or 0)],
                 note={
                     "job": "gram",
                     "feature_set": identity,
-                    "logs_version": logs.version,
+                    "logs_version": logs_version,
                 },
             )
         )
+        _require_active(logs, backlog.missing)
         after = warehouse.grams.snapshot()
         version, gram_rows = after.version, after.rows
     return GramReport(
@@ -143,9 +146,23 @@ def _update_once(
         rows_read=sum(file.rows for file in backlog.missing),
         files_dropped=len(backlog.stale),
         gram_rows=gram_rows,
-        logs_version=logs.version,
+        logs_version=logs_version,
         grams_version=version,
     )
+
+
+def _require_active(logs: Snapshot, files: Iterable[TableFile]) -> None:
+    """Raise `ConflictError` if the logs have lost a file whose Gram rows have just landed.
+
+    Who removed it may have found no Gram row of its drives, and so have changed none. The next
+    attempt drops those that landed.
+    """
+    lost = {file.path for file in files} - {file.path for file in logs.renewed().files}
+    if lost:
+        raise ConflictError(
+            f"{logs.table.folder}: other processes keep removing files, such as {min(lost)}. Run "
+            "the same command again."
+        )
 
 
 def find_backlog(logs: Snapshot, grams: Snapshot, identity: str = PLAIN) -> Backlog:

@@ -75,8 +75,9 @@ class LocalFolder:
     def files(self) -> list[StoredFile]:
         """Return all files below, at any depth, sorted by path."""
         with storage_errors(self):
-            paths = sorted(path for path in self.path.rglob("*") if path.is_file())
-            return [file for file in map(self._judge, paths) if file]
+            walked = os.walk(self.path, onerror=_pass_over)
+            paths = sorted(Path(folder) / name for folder, _, names in walked for name in names)
+            return [file for file in map(self._judge, filter(Path.is_file, paths)) if file]
 
     def read(self, path: str, longest: int | None = None) -> bytes:
         """Return the content of a file, or only its first bytes."""
@@ -209,6 +210,12 @@ def _written_aside(target: Path, content: Content) -> Iterator[Path]:
         finally:
             temporary.unlink(missing_ok=True)
         _flush(target.parent)
+
+
+def _pass_over(error: OSError) -> None:
+    """Go on where a folder is gone, or not ours to see, or none; raise any other error."""
+    if not isinstance(error, FileNotFoundError | NotADirectoryError | PermissionError):
+        raise error
 
 
 def _flush(folder: Path) -> None:

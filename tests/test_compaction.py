@@ -4,6 +4,7 @@ import os
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import duckdb
 import numpy as np
@@ -148,6 +149,24 @@ def test_vacuum_leaves_what_a_running_job_is_writing(six: Warehouse) -> None:
     assert vacuum(six, 1).files == (f"models/{old.name}",)
     six.logs.snapshot().commit(Change(add=[action]))
     assert six.logs.snapshot().rows == 609
+
+
+def test_a_folder_that_is_gone_before_it_is_listed_is_passed_over(
+    six: Warehouse, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As the one of a query that went beyond its memory and is over."""
+    spill = path_of(six.root) / ".spill-1"
+    spill.mkdir()
+    scandir = os.scandir
+
+    def late(path: Any) -> Any:
+        if Path(path) == spill:
+            spill.rmdir()
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", late)
+    assert not vacuum(six).files
+    assert not spill.exists()
 
 
 def test_vacuum_puts_back_a_file_that_was_written_again_meanwhile(six: Warehouse) -> None:

@@ -12,12 +12,13 @@ import pyarrow.parquet as pq
 import pytest
 
 import fleet_slip
+from fleet_slip import gram_job
 from fleet_slip.audit import Audit, Subject
 from fleet_slip.cohort import load_cohort
 from fleet_slip.compaction import compact
 from fleet_slip.errors import RefusedError, SelectionError
 from fleet_slip.forget import forget
-from fleet_slip.gram_job import update_grams
+from fleet_slip.gram_job import aggregate, update_grams
 from fleet_slip.ingest_job import ingest_file
 from fleet_slip.local_folder import LocalFolder
 from fleet_slip.regression.exact import fit
@@ -106,6 +107,41 @@ def test_the_record_names_nobody_and_can_be_asked(tmp_path: Path) -> None:
     assert not forget(warehouse, Subject("drive", "beta-1"), now=True).drives
     with pytest.raises(SelectionError, match="no drive has vehicle_id 'delta'"):
         forget(warehouse, Subject("vehicle", "delta"))
+
+
+def test_whoever_forgets_first_at_the_same_moment_is_found_in_the_record(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    audit = Audit(LocalFolder(tmp_path))
+    one, other = (Subject("vehicle", name) for name in ("alfa", "beta"))
+    audit.begin(one, 1, [])
+    with monkeypatch.context() as patch:
+        patch.setattr(Audit, "entries", lambda _: [])  # as they were a moment ago
+        audit.begin(other, 2, ["m@1"])
+    assert [audit.state(subject) for subject in (one, other)] == ["begun"] * 2
+    audit.end(other)
+    assert [audit.state(subject) for subject in (one, other)] == ["begun", "done"]
+    assert audit.models_of(other) == ["m@1"]
+
+
+def test_a_gram_job_under_way_does_not_bring_a_forgotten_drive_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its file is removed when no Gram row of it has landed, so that there is none to drop."""
+    warehouse = fill(tmp_path, "alfa")
+    land(warehouse, "new", drive("beta", 1))
+
+    def overtaken(*arguments: Any) -> pa.Table:
+        rows = aggregate(*arguments)
+        monkeypatch.undo()
+        forget(warehouse, Subject("vehicle", "beta"))
+        return rows
+
+    monkeypatch.setattr(gram_job, "aggregate", overtaken)
+    update_grams(warehouse)
+    with fleet_slip.connect(warehouse.root) as database:
+        cars = database.execute("SELECT DISTINCT vehicle_id FROM grams").fetchall()
+    assert cars == [("alfa",)]
 
 
 def test_a_file_of_forgotten_drives_only_is_removed(tmp_path: Path) -> None:

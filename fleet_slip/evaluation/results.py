@@ -92,10 +92,14 @@ def folder(warehouse: Warehouse) -> DocumentFolder:
 
 def keep(warehouse: Warehouse, content: Mapping[str, Any]) -> Document:
     """Add an evaluation, unless the latest one is the same; return its document."""
-    before = latest(warehouse)
-    if before is not None and before.sha256 == checksum(content):
-        return before
-    return folder(warehouse).append(content)
+    documents = folder(warehouse)
+
+    def attempt(newest: int) -> Document | None:
+        if newest and (before := documents.read(newest)).sha256 == checksum(content):
+            return before
+        return documents.create(newest + 1, content)
+
+    return documents.after_newest(attempt)
 
 
 def latest(warehouse: Warehouse) -> Document | None:

@@ -11,10 +11,12 @@ from typer.testing import CliRunner
 
 from fleet_slip.cli.main import app
 from fleet_slip.connection import connect
+from fleet_slip.documents import DocumentFolder
 from fleet_slip.errors import RefusedError
 from fleet_slip.evaluation.drives import load_drives
 from fleet_slip.evaluation.estimators import LinearEstimate
 from fleet_slip.evaluation.filters import FILTERS, bound
+from fleet_slip.evaluation.results import keep
 from fleet_slip.local_folder import LocalFolder
 from fleet_slip.observers import kalman
 from fleet_slip.observers.signals import read_drive
@@ -54,6 +56,24 @@ def test_evaluating_again_changes_nothing(root: Path) -> None:
     again = evaluate(root, *SCENARIOS)
     assert again["number"] == 1
     assert Warehouse(LocalFolder(root)).logs.snapshot().version == logs_version
+
+
+def test_an_evaluation_that_another_process_has_just_kept_is_not_kept_twice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    warehouse = Warehouse(LocalFolder(tmp_path))
+    numbers = DocumentFolder.numbers
+
+    def overtaken(folder: DocumentFolder) -> list[int]:
+        before = numbers(folder)
+        monkeypatch.undo()
+        keep(warehouse, {"models": 5})
+        return before
+
+    monkeypatch.setattr(DocumentFolder, "numbers", overtaken)
+    assert keep(warehouse, {"models": 5}).number == 1
+    assert keep(warehouse, {"models": 6}).number == 2
+    assert keep(warehouse, {"models": 6}).number == 2
 
 
 def test_no_model_is_trained_on_scenarios(root: Path) -> None:
