@@ -13,16 +13,16 @@ import pyarrow.compute as pc
 
 from fleet_slip.audit import Audit, Subject
 from fleet_slip.connection import connect
-from fleet_slip.database import database_errors, open_database
+from fleet_slip.database import database_errors
 from fleet_slip.errors import FleetSlipError, SelectionError
+from fleet_slip.find_drives import Located, drives_by_file, locate
 from fleet_slip.gram_job import reconcile
 from fleet_slip.manifest import TrainedOn
 from fleet_slip.old_files import quarantined_of, remove_old_files
 from fleet_slip.reading_query import one_query
 from fleet_slip.registry import Registry
-from fleet_slip.resources import read_sql
 from fleet_slip.rewriting import read_drives
-from fleet_slip.storage import Change, Snapshot, retried
+from fleet_slip.storage import Change, retried
 from fleet_slip.warehouse import Warehouse
 
 Progress = Callable[[int, int], None]
@@ -63,7 +63,8 @@ def forget(
     drive, `StorageError`, or `ConflictError`.
     """
     audit = Audit(warehouse.root)
-    drives = _drives_of(warehouse, subject)
+    located = locate(warehouse.grams.snapshot(), subject)
+    drives = _drives_of(warehouse, subject, located)
     state = audit.state(subject)
     if not drives and state is None and subject.kind != "before":
         raise SelectionError(
@@ -75,7 +76,7 @@ def forget(
         models = models_trained_on(warehouse, drives)
         audit.begin(subject, len(drives), models)
     _forget_quarantined(warehouse, subject, drives)
-    rows, rewritten, removed = _rewrite_logs(warehouse, subject, progress)
+    rows, rewritten, removed = _rewrite_logs(warehouse, subject, located, progress)
     reconcile(warehouse)
     deleted, left = remove_old_files(warehouse, subject, delete=now)
     if drives or state == "begun":
@@ -91,12 +92,10 @@ def forget(
     )
 
 
-def _drives_of(warehouse: Warehouse, subject: Subject) -> frozenset[str]:
+def _drives_of(warehouse: Warehouse, subject: Subject, located: Located) -> frozenset[str]:
     """Return the drives in the logs and the quarantine, and what interrupted jobs left in grams."""
-    found: set[str] = set().union(*drives_by_file(warehouse.logs.snapshot(), subject).values())
-    for file in warehouse.grams.snapshot().files:
-        rows = warehouse.grams.read(file.path, ["drive_id", "vehicle_id", "day"])
-        found.update(rows.filter(subject.mask(rows))["drive_id"].to_pylist())
+    in_logs = drives_by_file(warehouse.logs.snapshot(), subject, located)
+    found: set[str] = set().union(*in_logs.values(), *located.drives.values())
     for file in warehouse.quarantine.snapshot().files:
         rows = warehouse.quarantine.read(file.path)
         names = rows.filter(quarantined_of(rows, subject, ()))["drive_id"].drop_null()
@@ -104,32 +103,14 @@ def _drives_of(warehouse: Warehouse, subject: Subject) -> frozenset[str]:
     return frozenset(found)
 
 
-def drives_by_file(logs: Snapshot, subject: Subject) -> dict[str, frozenset[str]]:
-    """Return the drives concerned of each log file that has some, by the file's path."""
-    if not logs.files:
-        return {}
-    paths = {logs.table.uri(file.path): file.path for file in logs.files}
-    statement = read_sql("jobs", "find_drives.sql").format(condition=subject.condition)
-    found: dict[str, set[str]] = {}
-    with (
-        open_database(reading=logs.table.folder) as database,
-        database_errors(f"looking for drives in {logs.table.folder}"),
-    ):
-        database.execute("SET VARIABLE log_files = $files", {"files": list(paths)})
-        rows = database.execute(statement, {"value": subject.value}).fetchall()
-    for drive, path in rows:
-        found.setdefault(paths[path], set()).add(drive)
-    return {path: frozenset(drives) for path, drives in found.items()}
-
-
 def _rewrite_logs(
-    warehouse: Warehouse, subject: Subject, progress: Progress
+    warehouse: Warehouse, subject: Subject, located: Located, progress: Progress
 ) -> tuple[int, int, int]:
     """Commit the logs without the drives; return rows forgotten, files rewritten, removed."""
 
     def attempt() -> tuple[int, int, int]:
         logs = warehouse.logs.snapshot()
-        drives = drives_by_file(logs, subject)
+        drives = drives_by_file(logs, subject, located)
         concerned = [file for file in logs.files if file.path in drives]
         if not concerned:
             return 0, 0, 0

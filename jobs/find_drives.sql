@@ -4,7 +4,7 @@ SELECT
     filename AS file
 FROM read_parquet(
     getvariable('log_files'),
-    union_by_name => true, filename => true, hive_partitioning => true, hive_types => {{'day': DATE}}
+    filename => true, hive_partitioning => true, hive_types => {{'day': DATE}}
 )
 WHERE tick = 0 AND {condition}
 ORDER BY ALL

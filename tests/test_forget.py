@@ -16,7 +16,8 @@ from fleet_slip import gram_job
 from fleet_slip.audit import Audit, Subject
 from fleet_slip.cohort import load_cohort
 from fleet_slip.compaction import compact
-from fleet_slip.errors import RefusedError, SelectionError
+from fleet_slip.errors import RefusedError, SelectionError, StorageError
+from fleet_slip.find_drives import Located, drives_by_file, locate
 from fleet_slip.forget import forget
 from fleet_slip.gram_job import aggregate, update_grams
 from fleet_slip.ingest_job import ingest_file
@@ -79,6 +80,23 @@ def test_afterwards_every_coefficient_is_that_of_a_world_where_the_car_never_dro
         assert one.execute(query).fetchall() == two.execute(query).fetchall()
         logs = "FROM log_counts ORDER BY ALL"
         assert one.execute(logs).fetchall() == two.execute(logs).fetchall()
+
+
+def test_a_car_is_found_in_files_with_and_without_gram_rows_and_no_other_is_opened(
+    tmp_path: Path,
+) -> None:
+    warehouse = fill(tmp_path, "alfa", "beta")
+    land(warehouse, "other", drive("gamma", 7))
+    update_grams(warehouse)
+    land(warehouse, "later", drive("gamma", 8), drive("beta", 8))  # without Gram rows
+    (other,) = (path for path in warehouse.logs.snapshot().paths if "other" in path)
+    Path(other).write_bytes(b"no Parquet file")
+    subject = Subject("vehicle", "beta")
+    logs = warehouse.logs.snapshot()
+    found = drives_by_file(logs, subject, locate(warehouse.grams.snapshot(), subject))
+    assert sorted(found.values(), key=min) == [{f"beta-{number}"} for number in (0, 1, 2, 8)]
+    with pytest.raises(StorageError):
+        drives_by_file(logs, subject, Located(frozenset(), {}))
 
 
 def test_with_now_no_byte_below_the_root_names_the_car_not_even_in_older_versions(
