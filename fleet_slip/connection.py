@@ -107,6 +107,8 @@ def _source(database: duckdb.DuckDBPyConnection, snapshot: Snapshot) -> str:
         rows = read_sql("warehouse", f"stored_{snapshot.table.folder.name}.sql").replace("{{", "{")
         if snapshot.table.folder.name != "logs":
             return rows
+        differ = not snapshot.has_same_columns
+        database.execute("SET VARIABLE log_columns_differ = $differ", {"differ": differ})
         return with_absent(rows, absent_columns(snapshot.files, catalogue().signals))
     empty = f"empty_{snapshot.table.folder.name}"
     _add_table(database, empty, snapshot.table.schema.empty_table())

@@ -13,6 +13,9 @@ from fleet_slip.errors import StorageError
 _DATA_FILE = re.compile(r"[\w.=-][\w.=/-]*\.parquet", re.ASCII)
 """Path of a data file below its table: relative, and without characters that could be a pattern."""
 
+_NULLS = "null_count."
+"""Before a column's name: how many nulls a file has in it. Null, if it has no such column."""
+
 
 @dataclass(frozen=True)
 class TableFile:
@@ -36,18 +39,30 @@ def absent_columns(files: Iterable[TableFile], names: Iterable[str]) -> tuple[st
     return tuple(absent)
 
 
-def active_files(delta: DeltaTable, where: object) -> tuple[TableFile, ...]:
+def read_actions(delta: DeltaTable | None) -> pa.Table:
+    """Return what the log says of each active file, a row a file; none without a table."""
+    if delta is None:
+        return pa.Table.from_pylist([])
+    # pa.table() would import pandas, which takes half a second.
+    stream = delta.get_add_actions(flatten=True)
+    return pa.RecordBatchReader.from_stream(stream).read_all().combine_chunks()
+
+
+def active_files(actions: pa.Table, where: object) -> tuple[TableFile, ...]:
     """Return the active files of a Delta table, sorted by path.
 
     Raises `StorageError`, which says where, if the log names a file as this program never does.
     """
-    # pa.table() would import pandas, which takes half a second.
-    stream = delta.get_add_actions(flatten=True)
-    actions = pa.RecordBatchReader.from_stream(stream).read_all().combine_chunks()
     files = sorted(_table_files(actions), key=lambda file: file.path)
     for file in files:
         _require_sound(file, where)
     return tuple(files)
+
+
+def have_same_columns(actions: pa.Table, names: Iterable[str]) -> bool:
+    """Whether each of the columns is in all active files or in none."""
+    counts = [actions[f"{_NULLS}{n}"] for n in names if f"{_NULLS}{n}" in actions.column_names]
+    return all(column.null_count in (0, len(column)) for column in counts)
 
 
 def _require_sound(file: TableFile, where: object) -> None:
@@ -92,11 +107,10 @@ class _NullCounts(Mapping[str, int]):
 
 
 def _table_files(actions: pa.Table) -> Iterator[TableFile]:
-    prefix = "null_count."
     nulls = {
-        name.removeprefix(prefix): actions[name]
+        name.removeprefix(_NULLS): actions[name]
         for name in actions.column_names
-        if name.startswith(prefix)
+        if name.startswith(_NULLS)
     }
     unknown = [None] * actions.num_rows
     columns = (

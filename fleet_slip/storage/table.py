@@ -19,7 +19,7 @@ from fleet_slip.sealing import NOTE, sealed
 from fleet_slip.storage.change import Change, addition
 from fleet_slip.storage.conflicts import is_conflict
 from fleet_slip.storage.encoding import Encoded, Encoding, checksum_in
-from fleet_slip.storage.files import TableFile, active_files
+from fleet_slip.storage.files import TableFile, active_files, have_same_columns, read_actions
 from fleet_slip.storage_errors import first_line, storage_errors
 
 
@@ -135,7 +135,17 @@ class Snapshot:
         if self.delta is None:
             return ()
         with storage_errors(self.table.folder):
-            return active_files(self.delta, self.table.folder)
+            return active_files(self._actions, self.table.folder)
+
+    @property
+    def has_same_columns(self) -> bool:
+        """Whether all active files have the same ones of the table's columns."""
+        with storage_errors(self.table.folder):
+            return have_same_columns(self._actions, self.table.schema.names)
+
+    @cached_property
+    def _actions(self) -> pa.Table:
+        return read_actions(self.delta)
 
     @property
     def paths(self) -> list[str]:
