@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from fleet_slip import gram_job
 from fleet_slip.gram_check import check_grams, grams_of
 from fleet_slip.gram_job import (
-    SMALL_FILES_MAX,
     aggregate,
     find_backlog,
     update_grams,
@@ -120,14 +119,18 @@ def test_gram_rows_of_a_file_that_is_gone_are_dropped(warehouse: Warehouse) -> N
     assert not update_grams(warehouse).changed
 
 
-def test_many_small_gram_files_are_merged_without_changing_a_row(warehouse: Warehouse) -> None:
+def test_many_small_gram_files_are_merged_without_changing_a_row(
+    warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    most = 8
+    monkeypatch.setattr(gram_job, "SMALL_FILES_MAX", most)
     rng = np.random.default_rng(4)
-    for number in range(SMALL_FILES_MAX + 2):
+    for number in range(most + 2):
         land(warehouse, f"f{number}", log_rows(f"d{number}", random_counts(rng, 3)))
         update_grams(warehouse)
-    assert len(warehouse.grams.snapshot().files) < SMALL_FILES_MAX
-    assert len(stored(warehouse)) == SMALL_FILES_MAX + 2
-    assert check_grams(warehouse, 100).drives == SMALL_FILES_MAX + 2
+    assert len(warehouse.grams.snapshot().files) < most
+    assert len(stored(warehouse)) == most + 2
+    assert check_grams(warehouse, 100).drives == most + 2
 
 
 def test_merging_and_rewriting_take_few_rows_at_a_time(
