@@ -12,7 +12,8 @@ from fleet_slip.data_root import data_root
 from fleet_slip.database import database_errors, open_database
 from fleet_slip.folder import Folder
 from fleet_slip.gram_statement import with_absent
-from fleet_slip.operations.run_log import RECORD_COLUMNS, run_files
+from fleet_slip.operations.run_history import lend_runs
+from fleet_slip.operations.run_log import RECORD_COLUMNS
 from fleet_slip.registry import Registry
 from fleet_slip.resources import read_sql
 from fleet_slip.signals import SAMPLE_TIME_S, SignalCatalogue, catalogue
@@ -72,8 +73,9 @@ def open_views(
     }
     paths = [path for snapshot in snapshots for path in snapshot.paths]
     if "runs" in wanted:
-        sources["stored_runs"] = run_source(database, warehouse.root)
-        paths += run_files(warehouse.root)
+        runs = lend_runs(warehouse.root, database)
+        sources["stored_runs"] = run_source(database, runs)
+        paths += runs
     columns = _generated_columns(warehouse.catalogue)
     with database_errors(f"opening the warehouse {warehouse.root}"):
         for view in VIEWS:
@@ -115,10 +117,9 @@ def _source(database: duckdb.DuckDBPyConnection, snapshot: Snapshot) -> str:
     return empty
 
 
-def run_source(database: duckdb.DuckDBPyConnection, root: Folder) -> str:
-    """Return what stands after FROM for the history of runs."""
+def run_source(database: duckdb.DuckDBPyConnection, files: list[str]) -> str:
+    """Return what stands after FROM for the history of runs, or some of its files."""
     columns = ", ".join(f"{name} {kind}" for name, kind in RECORD_COLUMNS.items())
-    files = run_files(root)
     database.execute("SET VARIABLE run_files = $paths", {"paths": files})
     if files:
         return read_sql("warehouse", "stored_runs.sql").format(run_columns=RECORD_COLUMNS)

@@ -7,7 +7,7 @@ else knows what a data root is made of. `fleet_slip.local_folder` is a folder of
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -99,6 +99,9 @@ class Folder(Protocol):
     def read(self, path: str, longest: int | None = None) -> bytes:
         """Return the content of a file, or only its first bytes."""
 
+    def read_many(self, paths: Sequence[str]) -> list[bytes | None]:
+        """Return the content of files, None for one that is gone."""
+
     def open(self, path: str) -> pa.NativeFile:
         """Open a file for reading anywhere in it."""
 
@@ -125,3 +128,9 @@ class Folder(Protocol):
 
     def let_read(self, database: duckdb.DuckDBPyConnection) -> None:
         """Enable a connection to read files below this folder."""
+
+    def lend(self, database: duckdb.DuckDBPyConnection, wanted: Callable[[str], bool]) -> list[str]:
+        """Enable a connection to read the files whose paths are wanted; return their URIs, sorted.
+
+        For files that may be many and small, and may be replaced by others at any moment.
+        """

@@ -11,7 +11,7 @@ import fcntl
 import os
 import shutil
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
@@ -83,6 +83,10 @@ class LocalFolder:
         """Return the content of a file, or only its first bytes."""
         with storage_errors(self.path / path), (self.path / path).open("rb") as file:
             return file.read(-1 if longest is None else longest)
+
+    def read_many(self, paths: Sequence[str]) -> list[bytes | None]:
+        """Return the content of files, None for one that is gone."""
+        return [self.read(path) if (self.path / path).is_file() else None for path in paths]
 
     def open(self, path: str) -> pa.NativeFile:
         """Open a file for reading anywhere in it."""
@@ -180,6 +184,14 @@ class LocalFolder:
 
     def let_read(self, database: duckdb.DuckDBPyConnection) -> None:
         """Enable a connection to read files below this folder, as every one is."""
+
+    def lend(
+        self,
+        database: duckdb.DuckDBPyConnection,  # noqa: ARG002
+        wanted: Callable[[str], bool],
+    ) -> list[str]:
+        """Return the URIs of the files whose paths are wanted: a connection can read them."""
+        return [f"{self.uri}/{file.path}" for file in self.files() if wanted(file.path)]
 
     def _judge(self, path: Path) -> StoredFile | None:
         try:

@@ -105,3 +105,38 @@ class ObjectFilesystem(fsspec.AbstractFileSystem):  # type: ignore[misc]
         key = self._key(path)
         where = f"{self.protocol}://{self._name}/{key}"
         return ObjectReader(self._store, key, where, self.info(path)["size"])
+
+
+class LentFile(fsspec.AbstractFileSystem):  # type: ignore[misc]
+    """A file in memory, for a connection that it is registered with; read only."""
+
+    cachable = False
+    protocol = "lent"
+    uri = "lent://file"
+
+    def __init__(self, content: memoryview) -> None:
+        """Serve a content; a view of it, since fsspec makes text of all that it is given."""
+        super().__init__()
+        self._content = content
+
+    def info(self, path: str, **_options: Any) -> dict[str, Any]:
+        """Return the name, type and size."""
+        return {"name": path, "type": "file", "size": len(self._content)}
+
+    def modified(self, path: str) -> datetime:  # noqa: ARG002 - it never changes
+        """Return some moment."""
+        return datetime.fromtimestamp(0, UTC)
+
+    def glob(self, path: str, **_options: Any) -> list[str]:
+        """Return the path."""
+        return [path]
+
+    def exists(self, path: str, **_options: Any) -> bool:
+        """Return whether it is this file."""
+        return path.removeprefix("lent://") == "file"
+
+    def open(self, path: str, mode: str = "rb", **_options: Any) -> io.BytesIO:
+        """Open the file for reading. Raises `PermissionError` for any other mode."""
+        if mode != "rb":
+            raise PermissionError(f"{path}: it is only lent")
+        return io.BytesIO(self._content)

@@ -11,7 +11,8 @@ import os
 import tempfile
 import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import timedelta
 from pathlib import Path
@@ -23,10 +24,11 @@ import pyarrow as pa
 from obstore.exceptions import AlreadyExistsError
 from obstore.store import from_url
 
+from fleet_slip.errors import StorageError
 from fleet_slip.folder import Content, StoredFile
 from fleet_slip.object_credentials import AwsProfile, aws_profile
 from fleet_slip.object_errors import object_errors
-from fleet_slip.object_files import ObjectFilesystem, ObjectReader
+from fleet_slip.object_files import LentFile, ObjectFilesystem, ObjectReader
 
 if TYPE_CHECKING:
     from obstore.store import ObjectStore
@@ -41,6 +43,10 @@ CONNECT_TIMEOUT_S = 5
 RETRIES = 5
 RETRY_S = 60
 """No attempt begins later than so long after the first."""
+
+READS_AT_ONCE = 32
+LISTINGS = 20
+"""So often files are listed again that were replaced before they were read."""
 
 
 @dataclass(frozen=True)
@@ -126,6 +132,11 @@ class ObjectFolder:
                 )
             return bytes(answer.bytes())
 
+    def read_many(self, paths: Sequence[str]) -> list[bytes | None]:
+        """Return the content of files, None for one that is gone. Many are asked for at once."""
+        with ThreadPoolExecutor(READS_AT_ONCE) as executor:
+            return list(executor.map(self._read_or_none, paths))
+
     def open(self, path: str) -> pa.NativeFile:
         """Open a file for reading anywhere in it."""
         return pa.PythonFile(ObjectReader(self._store, self._key(path), f"{self}/{path}"), "r")
@@ -184,9 +195,35 @@ class ObjectFolder:
         """Enable a connection to read the objects of this bucket."""
         database.register_filesystem(ObjectFilesystem(self.bucket, lambda: self._store))
 
+    def lend(self, database: duckdb.DuckDBPyConnection, wanted: Callable[[str], bool]) -> list[str]:
+        """Read the files whose paths are wanted into memory, as one; return its URI.
+
+        DuckDB would ask for them one after the other. Raises `StorageError` if they are replaced as
+        fast as they are listed.
+        """
+        for _ in range(LISTINGS):
+            paths = [file.path for file in self.files() if wanted(file.path)]
+            contents = self.read_many(paths)
+            if None not in contents:
+                break
+        else:
+            raise StorageError(f"{self}: other processes keep changing it. Run the command again.")
+        if not paths:
+            return []
+        lent = LentFile(memoryview(b"".join(content for content in contents if content)))
+        database.register_filesystem(lent)
+        return [lent.uri]
+
     @property
     def _store(self) -> "ObjectStore":
         return _store(self.bucket)
+
+    def _read_or_none(self, path: str) -> bytes | None:
+        with object_errors(f"{self}/{path}"):
+            try:
+                return bytes(obstore.get(self._store, self._key(path)).bytes())
+            except FileNotFoundError:
+                return None
 
     def _key(self, path: str) -> str:
         return f"{self.prefix}/{path}" if self.prefix else path

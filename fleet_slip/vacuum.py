@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from fleet_slip.folder import TEMPORARY_PREFIX, StoredFile
+from fleet_slip.operations.run_history import gather_runs
 from fleet_slip.storage import Snapshot, Table
 from fleet_slip.storage_errors import storage_errors
 from fleet_slip.warehouse import Warehouse
@@ -31,11 +32,16 @@ class VacuumReport:
 def vacuum(
     warehouse: Warehouse, retention_hours: float = RETENTION_HOURS, *, dry_run: bool = False
 ) -> VacuumReport:
-    """Remove what nothing has referred to for some hours. Raises `StorageError`."""
+    """Remove what nothing has referred to for some hours, and gather the records of runs.
+
+    Raises `StorageError`.
+    """
     removed = []
     for file in expired(warehouse, retention_hours):
         if dry_run or file.folder.remove(file):
             removed.append(file)
+    if not dry_run:
+        gather_runs(warehouse.root)
     return VacuumReport(
         files=tuple(str(file).removeprefix(f"{warehouse.root}/") for file in removed),
         size_bytes=sum(file.size_bytes for file in removed),

@@ -180,16 +180,6 @@ def step(name: str) -> Iterator[Step]:
         )
 
 
-def run_files(root: Folder) -> list[str]:
-    """Return the URIs of the history's files, oldest first; none if there is no history."""
-    folder = root / FOLDER
-    try:
-        files = folder.files()
-    except StorageError:
-        return []
-    return [f"{folder.uri}/{file.path}" for file in files if file.path.endswith(".jsonl")]
-
-
 def publishable(arguments: Sequence[str]) -> list[str]:
     """Return command line arguments without what the history must not keep.
 

@@ -4,7 +4,7 @@ import os
 import socket
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from datetime import UTC, date, datetime
+from datetime import UTC, date, datetime, timedelta
 from typing import Any
 
 import pyarrow as pa
@@ -14,6 +14,7 @@ from fleet_slip.database import database_errors, open_database
 from fleet_slip.errors import RefusedError, SelectionError, StorageError
 from fleet_slip.folder import Folder
 from fleet_slip.gram_job import find_backlog
+from fleet_slip.operations.run_history import lend_runs
 from fleet_slip.operations.thresholds import StatusThresholds, thresholds
 from fleet_slip.registry import Registry
 from fleet_slip.resources import read_sql
@@ -22,6 +23,9 @@ from fleet_slip.storage_errors import storage_errors
 from fleet_slip.warehouse import Warehouse
 
 SECONDS_PER_HOUR = 3600
+
+REMEMBERED = timedelta(days=366)
+"""Commands that last ran before that are not shown, so that old runs need not be read."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +97,7 @@ def status_of(
     free_bytes, disk_bytes = warehouse.root.free_bytes() or (None, 0)
     free = None if free_bytes is None else free_bytes / disk_bytes
     champions, damaged = _champions(warehouse, logs, grams, now)
-    last_runs = tuple(_last_runs(warehouse.root))
+    last_runs = tuple(_last_runs(warehouse.root, now))
     age = _age_hours(tables["logs"].committed_at, now)
     limits = thresholds().status
     problems = [
@@ -154,14 +158,15 @@ def _from_ms(milliseconds: int | None) -> datetime | None:
     return None if milliseconds is None else datetime.fromtimestamp(milliseconds / 1000, UTC)
 
 
-def _last_runs(root: Folder) -> list[dict[str, Any]]:
+def _last_runs(root: Folder, now: datetime) -> list[dict[str, Any]]:
     # Not through connect(), which fails with a damaged manifest: that is for the status to tell.
     with (
         open_database(reading=root) as database,
         database_errors(f"reading the history of runs in {root}"),
     ):
         view = read_sql("warehouse", "runs.sql")
-        database.execute(view.format(stored_runs=run_source(database, root)))
+        runs = lend_runs(root, database, since=f"{now - REMEMBERED:%Y-%m}")
+        database.execute(view.format(stored_runs=run_source(database, runs)))
         rows = database.sql(read_sql("jobs", "last_runs.sql")).to_arrow_table().to_pylist()
     return [row | {"state": _state(row)} for row in rows]
 

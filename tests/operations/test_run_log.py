@@ -18,7 +18,6 @@ from fleet_slip.operations.run_log import (
     current_run_id,
     publishable,
     recording,
-    run_files,
     step,
 )
 from tests.conftest import COMMAND, RunCommand
@@ -85,7 +84,7 @@ def test_what_cannot_be_recorded_does_not_fail_the_command(
     with recording(LocalFolder(tmp_path), "gram", []):
         pass
     assert "run not recorded" in caplog.messages
-    assert run_files(LocalFolder(tmp_path)) == []
+    assert runs(tmp_path) == []
 
 
 def test_a_torn_line_costs_no_other_record(tmp_path: Path) -> None:
