@@ -1,6 +1,7 @@
 """The commands on a cluster: the same bits as on one machine, or clear words."""
 
 import os
+import shlex
 import subprocess
 import sys
 import time
@@ -132,7 +133,7 @@ def test_a_worker_that_does_not_see_the_data_root_writes_nothing(
     own_mounts = ["unshare", "--mount"]
     if subprocess.run([*own_mounts, "true"], check=False, capture_output=True).returncode:
         pytest.skip("not permitted to hide a folder from a process")
-    hide = f'mount -t tmpfs none {tmp_path} && exec "$0" "$@"'
+    hide = f'mount -t tmpfs none {shlex.quote(str(tmp_path))} && exec "$0" "$@"'
     blind = dask.start_worker("--name", "blind", before=(*own_mounts, "sh", "-c", hide))
     try:
         dask.wait_for_workers(3)
