@@ -47,6 +47,7 @@ def show(
             "--headless",
             "--no-sandbox",
             "--disable-gpu",
+            "--disable-dev-shm-usage",
             "--no-first-run",
             "--disable-background-networking",
             "--disable-component-update",
@@ -63,7 +64,7 @@ def show(
         capture_output=True,
         text=True,
         check=True,
-        timeout=120,
+        timeout=300,
     )
     console = [line for line in done.stderr.splitlines() if "CONSOLE" in line]
     return Shown(np.asarray(Image.open(shot).convert("RGB")), console)
