@@ -107,12 +107,12 @@ def test_temporary_credentials_are_had_anew_before_they_end(
     key, program = tmp_path / "key", tmp_path / "program"
     answer = {"Version": 1, "AccessKeyId": "$KEY", "SecretAccessKey": SECRET_KEY}
     answer |= {"SessionToken": "token", "Expiration": "$END"}
-    program.write_text(  # the credentials that it gives last for four seconds
-        f"#!/bin/sh\nKEY=$(cat {key})\nEND=$(date -u -d '+4 seconds' +%Y-%m-%dT%H:%M:%SZ)\n"
+    program.write_text(  # the credentials that it gives last for eight seconds
+        f"#!/bin/sh\nKEY=$(cat '{key}')\nEND=$(date -u -d '+8 seconds' +%Y-%m-%dT%H:%M:%SZ)\n"
         f"cat <<!\n{json.dumps(answer)}\n!\n"
     )
     program.chmod(0o755)
-    files("", f"[default]\nregion = us-east-1\nENDPOINT\ncredential_process = {program}\n")
+    files("", f"[default]\nregion = us-east-1\nENDPOINT\ncredential_process = '{program}'\n")
     key.write_text("AKIDTHATENDS")
     root = data_root(f"{server.bucket()}/data")
     logs = Warehouse(root).logs
@@ -120,7 +120,7 @@ def test_temporary_credentials_are_had_anew_before_they_end(
         land(logs.snapshot(), "a")
         snapshot = logs.snapshot()
     key.write_text(ACCESS_KEY)
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 240
     while time.monotonic() < deadline:
         with contextlib.suppress(StorageError):
             land(snapshot, "b")
