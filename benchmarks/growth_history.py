@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from deltalake.transaction import AddAction
 from numpy.typing import NDArray
 
@@ -24,7 +23,7 @@ from fleet_slip.features import PLAIN, features
 from fleet_slip.gram_job import unit_name
 from fleet_slip.signals import catalogue
 from fleet_slip.simulation_job import unit_of
-from fleet_slip.storage import Change, Unit, checksum_of
+from fleet_slip.storage import Change, Unit
 from fleet_slip.warehouse import Warehouse
 
 SIGNALS = catalogue().gram_signals
@@ -32,6 +31,7 @@ INPUTS = len(catalogue().inputs)
 ROWS = 12
 WEIGHT = 16_000
 CHUNK = 50_000
+LOGS_AT_ONCE = 1000
 FIRST_DAY = date(2020, 1, 1)
 FILES_PER_DAY = 20
 
@@ -134,28 +134,28 @@ def day_of(file: int) -> date:
     return FIRST_DAY + timedelta(days=file // FILES_PER_DAY)
 
 
-def write_logs(warehouse: Warehouse, files: int, *, real: int | None = None) -> list[str]:
-    """Commit log files of one drive each; return their paths. With `real`, only so many exist."""
+def write_logs(warehouse: Warehouse, files: int) -> list[str]:
+    """Commit log files of one drive each; return their paths."""
     actions = []
-    template = b""
-    for number in range(files):
-        if real is None or number < real:
-            rows = Drives.drawn(number, 1, 1).log(warehouse)
-            sink = pa.BufferOutputStream()
-            pq.write_table(rows, sink, **warehouse.logs.encoding.options())
-            template = sink.getvalue().to_pybytes()
-            stats = _stats(rows)
-        name = f"growth-{number:07d}-{checksum_of(template)}.parquet"
-        path = f"day={day_of(number)}/{name}"
-        if real is None or number < real:
+    for drives in drawn_for(files):
+        rows = drives.log(warehouse)
+        for i, number in enumerate(drives.numbers.tolist()):
+            encoded = warehouse.logs.encode(rows.slice(i * ROWS, ROWS))
+            path = f"day={day_of(number)}/growth-{number:07d}-{encoded.checksum}.parquet"
             target = Path(warehouse.logs.uri(path))
             target.parent.mkdir(parents=True, exist_ok=True)
-            target.write_bytes(template)
-        actions.append(_action(path, len(template), stats, day_of(number)))
+            target.write_bytes(encoded.content)
+            actions.append(_action(path, encoded.content.size, encoded.statistics, day_of(number)))
     snapshot = warehouse.logs.snapshot()
     snapshot.commit(Change(add=actions, note={"job": "growth"}))
     _checkpoint(warehouse)
     return [action.path for action in actions]
+
+
+def drawn_for(files: int) -> Iterator[Drives]:
+    """Draw the drives of log files that have one each."""
+    for first in range(0, files, LOGS_AT_ONCE):
+        yield Drives.drawn(first, min(LOGS_AT_ONCE, files - first), 1)
 
 
 def write_grams(warehouse: Warehouse, paths: Sequence[str], rows: int, weight: int = 1) -> None:
@@ -176,8 +176,12 @@ def write_fleet(warehouse: Warehouse, files: int, grams: int | None = None) -> N
     paths = write_logs(warehouse, files)
     if grams is None:  # the very rows of the log files, so that they agree
         parts = [
-            Drives.drawn(i, 1, 1).grams(warehouse, [path], [day_of(i)])
-            for i, path in enumerate(paths)
+            drives.grams(
+                warehouse,
+                [paths[i] for i in drives.numbers],
+                [day_of(i) for i in drives.numbers.tolist()],
+            )
+            for drives in drawn_for(files)
         ]
         action = warehouse.grams.write_file("growth", pa.concat_tables(parts))
         unit = Unit(unit_name(features().identity(PLAIN)), warehouse.logs.snapshot().version or 0)
