@@ -203,9 +203,12 @@ def load_cohort(
         if not rows.num_rows:
             raise nothing(opened.database, condition)
     require_training(rows["source"].unique().to_pylist(), condition)
+    sets = rows["signals"].unique().to_pylist()
     tables = tuple(
-        gram_table(signals, rows.filter(pc.equal(rows["signals"], signals)))
-        for signals in rows["signals"].unique().to_pylist()
+        gram_table(
+            signals, rows.filter(pc.equal(rows["signals"], signals)) if len(sets) > 1 else rows
+        )
+        for signals in sets
     )
     return Cohort(
         condition=condition,
@@ -239,8 +242,9 @@ def gram_table(signals: str, rows: pa.Table | pa.RecordBatch) -> GramTable:
 
 
 def _matrix(lists: pa.ChunkedArray | pa.ListArray, width: int) -> NDArray[np.int64]:
-    whole = lists.combine_chunks() if isinstance(lists, pa.ChunkedArray) else lists
-    values: NDArray[np.int64] = whole.flatten().to_numpy()
+    chunks = lists.chunks if isinstance(lists, pa.ChunkedArray) else [lists]
+    parts = [chunk.flatten().to_numpy() for chunk in chunks]
+    values: NDArray[np.int64] = parts[0] if len(parts) == 1 else np.concatenate(parts)
     return values.reshape(-1, width)
 
 

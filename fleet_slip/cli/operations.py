@@ -11,12 +11,12 @@ from fleet_slip.cli.models import Reference, registry_of
 from fleet_slip.cli.output import Json, print_json, print_table, progress, say
 from fleet_slip.cli.recorded import recorded
 from fleet_slip.cli.run import DEFAULT_CAMPAIGN
-from fleet_slip.cohort import TRAINING_DRIVES, load_cohort
+from fleet_slip.cohort import TRAINING_DRIVES
 from fleet_slip.errors import AlarmError, ConfigError
 from fleet_slip.migration import migrate as migrate_logs
 from fleet_slip.operations.monitor import Chart
 from fleet_slip.operations.monitor import monitor as chart_errors
-from fleet_slip.operations.quality import QualityReport, examine
+from fleet_slip.operations.quality import QualityReport, examine_drives
 from fleet_slip.operations.run_log import step
 from fleet_slip.operations.status import Status, status_of
 
@@ -137,7 +137,7 @@ def quality(
 
     Reads Gram rows only. Exit code 10 if a drive's sensors are not in order.
     """
-    found = examine(load_cohort(context.obj, cohort))
+    found = examine_drives(context.obj, cohort)
     if json:
         print_json(found.as_dict())
     else:

@@ -18,7 +18,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.operations.moments import MeanMoments
+from fleet_slip.gram import GramTable
+from fleet_slip.operations.moments import DriveBatches, MeanMoments
 from fleet_slip.operations.plausibility import Fault
 from fleet_slip.operations.thresholds import QualityThresholds
 from fleet_slip.regression.special import FloatArray
@@ -64,22 +65,21 @@ class Prediction:
     @classmethod
     def fit(
         cls,
-        reference: MeanMoments,
+        reference: DriveBatches,
         targets: Sequence[int],
         predictors: Sequence[int],
         limits: QualityThresholds,
     ) -> "Prediction":
         """Fit on drives that are in order; every drive counts the same."""
-        total = reference.matrices.mean(axis=0)
+        total = reference.mean
         at = np.array(targets, dtype=np.intp)
         weights = np.zeros((len(at), len(total)))
         for row, target in enumerate(at.tolist()):
             used = [0, *(p for p in predictors if p != target)]
             weights[row, used] = _least_squares(total, used, target)
         bare = cls(at, weights, np.zeros((len(at), 3)), np.ones((len(at), 3)))
-        figures = bare.figures(reference).stacked
-        middle = np.median(figures, axis=0)
-        spread = MAD_TO_STD * np.median(np.abs(figures - middle), axis=0)
+        figures = reference.each(lambda batch: bare.figures(batch).stacked)
+        middle, spread = _middle_and_spread(figures)
         floors = [limits.offset_floor_counts, limits.gain_floor, limits.noise_floor]
         return cls(at, weights, middle, np.maximum(spread, floors))
 
@@ -110,7 +110,7 @@ class Prediction:
 class Peers:
     """What is normal in a cohort: predictions from all other signals, and without each of them."""
 
-    reference: MeanMoments
+    reference: DriveBatches
     label: str
     limits: QualityThresholds
 
@@ -119,13 +119,18 @@ class Peers:
         """Every signal, from all the others but the label."""
         return self._prediction(without=None)
 
-    def without(self, signal: str) -> Prediction:
-        """Every signal but one, from the others but that one."""
-        return self._prediction(without=signal)
+    @cached_property
+    def without(self) -> dict[str, Prediction]:
+        """For each signal: every signal but that one, from the others but that one."""
+        return {name: self._prediction(without=name) for name in self.reference.table.signals}
 
     def _prediction(self, without: str | None) -> Prediction:
-        signals = [name for name in self.reference.signals if name != without]
-        position = self.reference.position
+        known = self.reference.table.signals
+        signals = [name for name in known if name != without]
+
+        def position(name: str) -> int:
+            return known.index(name) + 1
+
         return Prediction.fit(
             self.reference,
             [position(name) for name in signals],
@@ -133,24 +138,28 @@ class Peers:
             self.limits,
         )
 
-    def suspects(self, moments: MeanMoments) -> NDArray[np.bool_]:
+    def suspects(self, drives: DriveBatches) -> NDArray[np.bool_]:
         """Say which drives have a figure beyond the limit."""
-        return np.asarray(self.worst(self.full, moments) > self.limits.limit)
+        worst = drives.each(lambda batch: self.worst(self.full, batch))
+        return np.asarray(worst > self.limits.limit)
 
     def worst(self, prediction: Prediction, moments: MeanMoments) -> FloatArray:
         """Return the largest score of each drive."""
         return np.asarray(prediction.scores(moments).max(axis=(1, 2)))
 
-    def explain(self, moments: MeanMoments) -> list[Fault]:
+    def explain(self, drives: DriveBatches) -> list[Fault]:
         """Return the fault of each drive: the repair that leaves the least to explain.
 
         Two signals exchanged back, or one signal left out. If neither brings all other figures
         within the limit, the fault is unexplained.
         """
+        return [fault for batch in drives for fault in self._explain(batch)]
+
+    def _explain(self, moments: MeanMoments) -> list[Fault]:
         signals = moments.signals
         pairs = [pair for pair in PAIRS if set(pair) <= set(signals)]
         exchanged = [self.worst(self.full, moments.exchanged(*pair)) for pair in pairs]
-        left_out = [self.worst(self.without(name), moments) for name in signals]
+        left_out = [self.worst(self.without[name], moments) for name in signals]
         scores = self.full.scores(moments)
         figures = self.full.figures(moments)
         faults = []
@@ -192,7 +201,7 @@ class Peers:
 
 
 def settle(
-    moments: MeanMoments, in_order: NDArray[np.bool_], label: str, limits: QualityThresholds
+    table: GramTable, in_order: NDArray[np.bool_], label: str, limits: QualityThresholds
 ) -> tuple[Peers, NDArray[np.bool_]]:
     """Fit a cohort's peers on the drives in order, leaving suspects out until they stay the same.
 
@@ -200,12 +209,25 @@ def settle(
     """
     suspects = ~in_order
     for _ in range(ROUNDS):
-        peers = Peers(MeanMoments(moments.signals, moments.matrices[~suspects]), label, limits)
-        now = peers.suspects(moments) | ~in_order
+        peers = Peers(DriveBatches.of(table, ~suspects), label, limits)
+        now = peers.suspects(DriveBatches.of(table)) | ~in_order
         if (now == suspects).all() or (~now).sum() < limits.min_drives:
             break
         suspects = now
     return peers, suspects & in_order
+
+
+def _middle_and_spread(figures: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return median and scaled median absolute deviation of each figure; the first axis is drives.
+
+    One figure after another: a median takes a copy of what it looks at.
+    """
+    middle, spread = np.empty(figures.shape[1:]), np.empty(figures.shape[1:])
+    for at in np.ndindex(*figures.shape[1:]):
+        column = figures[(slice(None), *at)]
+        middle[at] = np.median(column)
+        spread[at] = MAD_TO_STD * np.median(np.abs(column - middle[at]))
+    return middle, spread
 
 
 def _least_squares(total: FloatArray, used: Sequence[int], target: int) -> FloatArray:

@@ -7,12 +7,13 @@ and a reversed difference of two wheels means that the two are swapped.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.gram import GramTable
-from fleet_slip.operations.moments import MeanMoments
+from fleet_slip.operations.moments import AT_ONCE, DriveBatches, MeanMoments
 from fleet_slip.regression.special import FloatArray
 from fleet_slip.signals import catalogue
 
@@ -50,9 +51,12 @@ class Fault:
 
 def implausible(table: GramTable, min_correlation: float) -> dict[int, Fault]:
     """Return the drives whose sensors contradict one another or stand still, with the fault."""
-    moments = MeanMoments.of(table)
-    turning = reversed_or_swapped(moments, min_correlation)
-    return steering_swapped(moments) | turning | stuck(table)
+    faults: dict[int, Fault] = {}
+    for first, moments in zip(count(0, AT_ONCE), DriveBatches.of(table)):
+        turning = reversed_or_swapped(moments, min_correlation)
+        found = steering_swapped(moments) | turning
+        faults |= {first + drive: fault for drive, fault in found.items()}
+    return faults | stuck(table)
 
 
 def stuck(table: GramTable) -> dict[int, Fault]:

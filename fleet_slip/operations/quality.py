@@ -8,13 +8,17 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from fleet_slip.cohort import Cohort
+from fleet_slip.cohort import TRAINING_DRIVES, Cohort, load_cohort, nothing, require_training
+from fleet_slip.database import database_errors
+from fleet_slip.features import PLAIN
 from fleet_slip.gram import GramTable
-from fleet_slip.operations.moments import MeanMoments
+from fleet_slip.gram_reader import GramReader
+from fleet_slip.operations.moments import DriveBatches
 from fleet_slip.operations.peers import settle
 from fleet_slip.operations.plausibility import Fault, implausible
 from fleet_slip.operations.thresholds import QualityThresholds, thresholds
 from fleet_slip.signals import catalogue
+from fleet_slip.warehouse import Warehouse
 
 
 @dataclass(frozen=True)
@@ -55,6 +59,50 @@ class QualityReport:
         }
 
 
+def examine_drives(
+    warehouse: Warehouse,
+    condition: str = TRAINING_DRIVES,
+    limits: QualityThresholds | None = None,
+) -> QualityReport:
+    """Examine the drives that satisfy a condition, with one vehicle model's at a time in memory.
+
+    Raises like `fleet_slip.cohort.load_cohort`.
+    """
+    with GramReader(warehouse) as reader:
+        reports = [
+            examine(load_cohort(reader, f"({condition}\n) AND {of_model}"), limits)
+            for of_model in _vehicle_models(reader, condition)
+        ]
+    findings = [finding for report in reports for finding in report.findings]
+    return QualityReport(
+        sum(report.drives for report in reports),
+        sum(report.compared for report in reports),
+        tuple(sorted(findings, key=_day_and_drive)),
+    )
+
+
+def _vehicle_models(reader: GramReader, condition: str) -> list[str]:
+    """Return, for each vehicle model of a cohort, the condition that a drive is of it."""
+    opened = reader.opened(condition, PLAIN)
+    cohort = opened.statement("cohort.sql", condition)
+    with database_errors(f"the cohort {condition!r}"):
+        statement = f"SELECT DISTINCT vehicle_model, source FROM ({cohort}\n)"
+        found = opened.database.sql(statement).fetchall()
+    if not found:
+        raise nothing(opened.database, condition)
+    require_training({source for _, source in found}, condition)
+    models = sorted({model for model, _ in found}, key=str)
+    return [f"vehicle_model IS NOT DISTINCT FROM {_literal(model)}" for model in models]
+
+
+def _literal(text: str | None) -> str:
+    return "NULL" if text is None else "'" + text.replace("'", "''") + "'"
+
+
+def _day_and_drive(finding: Finding) -> tuple[date, str]:
+    return finding.day, finding.drive_id
+
+
 def examine(cohort: Cohort, limits: QualityThresholds | None = None) -> QualityReport:
     """Examine each drive of a cohort, beside the drives of its vehicle model.
 
@@ -73,7 +121,7 @@ def examine(cohort: Cohort, limits: QualityThresholds | None = None) -> QualityR
             faults |= _unlike_peers(table, in_order, limits)
         drives += len(table)
         findings += _findings(metadata, faults)
-    findings.sort(key=lambda finding: (finding.day, finding.drive_id))
+    findings.sort(key=_day_and_drive)
     return QualityReport(drives, compared, tuple(findings))
 
 
@@ -102,12 +150,11 @@ def _saturated(table: GramTable, metadata: pa.Table, limits: QualityThresholds) 
 def _unlike_peers(
     table: GramTable, in_order: "np.ndarray[Any, np.dtype[np.bool_]]", limits: QualityThresholds
 ) -> dict[int, Fault]:
-    moments = MeanMoments.of(table)
-    peers, suspects = settle(moments, in_order, catalogue().label, limits)
+    peers, suspects = settle(table, in_order, catalogue().label, limits)
     at = np.flatnonzero(suspects)
     if not len(at):
         return {}
-    faults = peers.explain(MeanMoments(moments.signals, moments.matrices[at]))
+    faults = peers.explain(DriveBatches.of(table, suspects))
     return dict(zip(at.tolist(), faults, strict=True))
 
 

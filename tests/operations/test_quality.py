@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from fleet_slip.cohort import load_cohort
+from fleet_slip.errors import SelectionError
 from fleet_slip.gram_job import update_grams
 from fleet_slip.operations.plausibility import Fault
-from fleet_slip.operations.quality import QualityReport, examine
+from fleet_slip.operations.quality import QualityReport, examine, examine_drives
 from fleet_slip.operations.thresholds import QualityThresholds, thresholds
 from fleet_slip.warehouse import Warehouse
-from tests.conftest import RunCommand, land, log_rows
+from tests.conftest import RunCommand, land, log_rows, random_counts
 from tests.operations.cars import TICKS, Signals, broken, counts, drive
 
 DRIVES = 30
@@ -88,6 +89,27 @@ def test_drives_in_order_raise_no_alarm(warehouse: Warehouse) -> None:
     fleet(warehouse, lambda _: None)
     report = examine(load_cohort(warehouse))
     assert (report.drives, report.compared, report.findings) == (DRIVES, DRIVES, ())
+
+
+def test_vehicle_models_are_examined_one_after_the_other(warehouse: Warehouse) -> None:
+    rng = np.random.default_rng(3)
+    for file, model in enumerate(("beetle", "driver's", None)):
+        rows = [
+            log_rows(f"{model}-{i}", random_counts(rng, 200), vehicle_model=model)
+            for i in range(12)
+        ]
+        land(warehouse, str(file), *rows)
+    update_grams(warehouse)
+    for condition in ("true", "drive_id LIKE '%-1' -- and '%-11'", "vehicle_model IS NULL"):
+        together = examine(load_cohort(warehouse, f"{condition}\n"), few())
+        assert examine_drives(warehouse, condition, few()) == together
+        assert together.drives > 0
+    with pytest.raises(SelectionError, match="no drive satisfies"):
+        examine_drives(warehouse, "mass_kg > 1e9")
+
+
+def few() -> QualityThresholds:
+    return thresholds().quality.model_copy(update={"min_rows": 100, "min_drives": 8})
 
 
 def test_values_at_the_end_of_their_range_are_told(warehouse: Warehouse) -> None:
