@@ -8,6 +8,7 @@ import subprocess
 import sys
 
 COMMANDS = (
+    "start",
     "simulator",
     "simulator_profile",
     "work_precision",

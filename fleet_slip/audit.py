@@ -10,11 +10,8 @@ import hashlib
 import secrets
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from datetime import UTC, date, datetime
+from datetime import UTC, datetime
 from typing import Any, Literal
-
-import pyarrow as pa
-import pyarrow.compute as pc
 
 from fleet_slip.documents import DocumentFolder
 from fleet_slip.folder import Folder
@@ -40,12 +37,6 @@ class Subject:
         if self.kind == "before":
             return "day < $value::DATE"
         return f"{self.column} = $value"
-
-    def mask(self, rows: pa.Table) -> pa.Array:
-        """Return which rows of a table are concerned."""
-        if self.kind == "before":
-            return pc.less(rows["day"], pa.scalar(date.fromisoformat(self.value)))
-        return pc.equal(rows[self.column].cast(pa.string()), self.value)
 
     def digest(self, salt: str) -> str:
         """Return the salted hash of the name, slow on purpose: names of cars can be listed."""

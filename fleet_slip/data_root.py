@@ -7,7 +7,6 @@ from urllib.parse import unquote, urlsplit
 
 from fleet_slip.errors import StorageError
 from fleet_slip.folder import Folder
-from fleet_slip.local_folder import LocalFolder
 
 DEFAULT_ROOT = Path("data")
 ROOT_VARIABLE = "FLEET_SLIP_ROOT"
@@ -36,12 +35,14 @@ def data_root(root: Folder | Path | str | None = None) -> Folder:
     return _local(Path(where))
 
 
-def _local(path: Path) -> LocalFolder:
+def _local(path: Path) -> Folder:
     unfit = [c for c in str(path) if not c.isprintable() or c in UNFIT_CHARACTERS]
     if unfit:
         raise StorageError(
             f"{path}: a data root cannot have {unfit[0]!r} in its path. Choose another with --root."
         )
+    from fleet_slip.local_folder import LocalFolder  # noqa: PLC0415 - pyarrow and Delta
+
     return LocalFolder(path)
 
 

@@ -8,6 +8,7 @@ import pyarrow.compute as pc
 from fleet_slip.audit import Subject
 from fleet_slip.database import database_errors, open_database
 from fleet_slip.features import PLAIN, features
+from fleet_slip.old_files import rows_of
 from fleet_slip.resources import read_sql
 from fleet_slip.storage import Snapshot
 
@@ -39,7 +40,7 @@ def locate(grams: Snapshot, subject: Subject) -> Located:
         rows = grams.table.read(file.path, columns)
         whole = pc.equal(rows["feature_set"], features().identity(PLAIN))
         known.update(rows["file"].filter(whole).unique().to_pylist())
-        found = rows.filter(subject.mask(rows))
+        found = rows.filter(rows_of(rows, subject))
         for path, drive in zip(
             found["file"].to_pylist(), found["drive_id"].to_pylist(), strict=True
         ):

@@ -11,15 +11,16 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, Self, TypeAlias
+from typing import TYPE_CHECKING, Protocol, Self, TypeAlias
 
-import duckdb
-import pyarrow as pa
+if TYPE_CHECKING:
+    import duckdb
+    import pyarrow as pa
 
 TEMPORARY_PREFIX = ".tmp-"
 """Beginning of the name of a file that is not whole yet."""
 
-Content: TypeAlias = bytes | pa.Buffer
+Content: TypeAlias = "bytes | pa.Buffer"
 
 
 @dataclass(frozen=True)
@@ -102,7 +103,7 @@ class Folder(Protocol):
     def read_many(self, paths: Sequence[str]) -> list[bytes | None]:
         """Return the content of files, None for one that is gone."""
 
-    def open(self, path: str) -> pa.NativeFile:
+    def open(self, path: str) -> "pa.NativeFile":
         """Open a file for reading anywhere in it."""
 
     def put(self, path: str, content: Content) -> None:
@@ -126,10 +127,12 @@ class Folder(Protocol):
     def exclusive(self, name: str, waiting: Callable[[], None]) -> AbstractContextManager[None]:
         """Hold a lock among the processes of this machine, where the folder can have one."""
 
-    def let_read(self, database: duckdb.DuckDBPyConnection) -> None:
+    def let_read(self, database: "duckdb.DuckDBPyConnection") -> None:
         """Enable a connection to read files below this folder."""
 
-    def lend(self, database: duckdb.DuckDBPyConnection, wanted: Callable[[str], bool]) -> list[str]:
+    def lend(
+        self, database: "duckdb.DuckDBPyConnection", wanted: Callable[[str], bool]
+    ) -> list[str]:
         """Enable a connection to read the files whose paths are wanted; return their URIs, sorted.
 
         For files that may be many and small, and may be replaced by others at any moment.

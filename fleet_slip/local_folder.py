@@ -15,13 +15,15 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
-import duckdb
 import pyarrow as pa
 
 from fleet_slip.folder import TEMPORARY_PREFIX, Content, StoredFile
 from fleet_slip.storage_errors import storage_errors
+
+if TYPE_CHECKING:
+    import duckdb
 
 
 @dataclass(frozen=True)
@@ -182,12 +184,12 @@ class LocalFolder:
                         fcntl.flock(file, fcntl.LOCK_EX)
             yield
 
-    def let_read(self, database: duckdb.DuckDBPyConnection) -> None:
+    def let_read(self, database: "duckdb.DuckDBPyConnection") -> None:
         """Enable a connection to read files below this folder, as every one is."""
 
     def lend(
         self,
-        database: duckdb.DuckDBPyConnection,  # noqa: ARG002
+        database: "duckdb.DuckDBPyConnection",  # noqa: ARG002
         wanted: Callable[[str], bool],
     ) -> list[str]:
         """Return the URIs of the files whose paths are wanted: a connection can read them."""

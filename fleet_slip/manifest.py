@@ -12,7 +12,8 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, FiniteFloat, PlainSerializer, PlainValidator
 
 from fleet_slip.config import Config
-from fleet_slip.signals import Identifier, catalogue
+from fleet_slip.errors import ConfigError
+from fleet_slip.signals import IDENTIFIER_PATTERN, Identifier, catalogue
 
 _FRACTION = re.compile(r"-?[0-9]{1,4000}/[0-9]{1,4000}")
 
@@ -150,3 +151,13 @@ class Manifest(Config):
             and self.trained_on.rows == other.trained_on.rows
             and self.trained_on.drives == other.trained_on.drives
         )
+
+
+def check_model_name(name: str) -> str:
+    """Return a name that a model or an alias may have. Raises `ConfigError` otherwise."""
+    if not re.fullmatch(IDENTIFIER_PATTERN, name):
+        raise ConfigError(
+            f"{name!r} cannot be the name of a model: use small letters, digits and _, beginning "
+            "with a letter, at most 41."
+        )
+    return name

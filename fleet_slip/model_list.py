@@ -4,30 +4,15 @@ import hashlib
 from collections.abc import Sequence
 from typing import Literal
 
-from pydantic import Field, TypeAdapter, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from fleet_slip.config import Config, load_config
 from fleet_slip.documents import canonical_json
-from fleet_slip.errors import ConfigError
 from fleet_slip.features import PLAIN, features
 from fleet_slip.resources import find_config
 from fleet_slip.signals import Identifier, catalogue
 
 FoldKey = Literal["drive", "vehicle", "track", "day", "mass", "adhesion", "row"]
-
-
-_MODEL_NAME = TypeAdapter(Identifier)
-
-
-def check_model_name(name: str) -> str:
-    """Return a name that a model may have. Raises `ConfigError` otherwise."""
-    try:
-        return _MODEL_NAME.validate_python(name)
-    except ValidationError:
-        raise ConfigError(
-            f"{name!r} cannot be the name of a model: use small letters, digits and _, beginning "
-            "with a letter, at most 41."
-        ) from None
 
 
 class CandidateModel(Config):

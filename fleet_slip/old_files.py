@@ -58,7 +58,7 @@ def _with_subject(
     snapshot: Snapshot, subject: Subject
 ) -> Iterator[tuple[StoredFile, frozenset[str]]]:
     for file, rows in _readable(snapshot):
-        names = rows.filter(subject.mask(rows))["drive_id"].unique().to_pylist()
+        names = rows.filter(rows_of(rows, subject))["drive_id"].unique().to_pylist()
         if names:
             yield file, frozenset(names)
 
@@ -69,6 +69,13 @@ def _of_quarantine(
     for file, rows in _readable(snapshot):
         if pc.any(quarantined_of(rows, subject, drives)).as_py():
             yield file
+
+
+def rows_of(rows: pa.Table, subject: Subject) -> pa.ChunkedArray:
+    """Return which rows of `logs` or `grams` are of a subject."""
+    if subject.kind == "before":
+        return pc.less(rows["day"], pa.scalar(date.fromisoformat(subject.value)))
+    return pc.equal(rows[subject.column].cast(pa.string()), subject.value)
 
 
 def quarantined_of(rows: pa.Table, subject: Subject, drives: Collection[str]) -> pa.ChunkedArray:
@@ -88,4 +95,4 @@ def quarantined_of(rows: pa.Table, subject: Subject, drives: Collection[str]) ->
     of_drives = pc.is_in(ids, pa.array(sorted(concerned), pa.string()))
     if subject.kind != "vehicle" or "vehicle_id" not in rows.schema.names:
         return of_drives
-    return pc.or_(of_drives, pc.fill_null(subject.mask(rows), False))
+    return pc.or_(of_drives, pc.fill_null(rows_of(rows, subject), False))

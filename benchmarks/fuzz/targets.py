@@ -33,7 +33,8 @@ from fleet_slip.gram_job import update_grams
 from fleet_slip.ingest.mapping import Mapping, load_mapping
 from fleet_slip.ingest_job import ingest_file
 from fleet_slip.local_folder import LocalFolder
-from fleet_slip.model_list import FoldKey, check_model_name, load_model_list
+from fleet_slip.manifest import check_model_name
+from fleet_slip.model_list import FoldKey, load_model_list
 from fleet_slip.reading_query import one_query
 from fleet_slip.registry import Registry
 from fleet_slip.resources import find_config, folder

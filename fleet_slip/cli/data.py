@@ -13,6 +13,7 @@ from fleet_slip.cli.recorded import recorded
 from fleet_slip.cli.workers import Cluster, Threads, elsewhere, workers
 from fleet_slip.errors import ConfigError
 from fleet_slip.features import PLAIN, features
+from fleet_slip.gram_check import check_grams
 from fleet_slip.gram_job import GramReport, update_grams
 from fleet_slip.gram_statement import gram_statement
 from fleet_slip.operations.run_log import step
@@ -238,8 +239,6 @@ def check(
     By the SQL statement, by float64 matrix products on blocks in which every partial sum is an
     exact integer, and (for one drive of each file) by Python integers; and with the stored rows.
     """
-    from fleet_slip.gram_check import check_grams  # noqa: PLC0415
-
     with progress("check", "files") as advance:
         report = check_grams(context.obj, files, advance)
     if json:

@@ -1,4 +1,4 @@
-"""The command that evaluates estimators on test drives."""
+"""Commands that evaluate: score on the rows of a cohort, evaluate on test drives."""
 
 import os
 from collections.abc import Sequence
@@ -7,11 +7,15 @@ from typing import Annotated, Any
 
 import typer
 
-from fleet_slip.cli.models import registry_of
+from fleet_slip.cli.models import Reference, registry_of
 from fleet_slip.cli.output import Json, print_json, print_table, progress, say, stdout
 from fleet_slip.cli.recorded import recorded
 from fleet_slip.cli.run import DEFAULT_CAMPAIGN
+from fleet_slip.cli.selecting import Cohort
 from fleet_slip.cli.workers import Threads
+from fleet_slip.cohort import ALL_DRIVES
+from fleet_slip.score import score as score_rows
+from fleet_slip.score import score_statement
 
 OneCar = Annotated[
     str,
@@ -35,8 +39,36 @@ Scenarios = Annotated[
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command of this module."""
+    """Add the commands of this module."""
+    app.command()(score)
     app.command()(evaluate)
+
+
+def score(
+    context: typer.Context,
+    reference: Reference,
+    cohort: Cohort = ALL_DRIVES,
+    sql: Annotated[bool, typer.Option("--sql", help="Print the statement and do nothing.")] = False,
+    json: Json = False,
+) -> None:
+    """Evaluate a model on the rows of a cohort: also the largest error and percentiles."""
+    version = registry_of(context.obj).resolve(reference)
+    if sql:
+        typer.echo(score_statement(version.manifest, cohort))
+        return
+    result = score_rows(context.obj, version.manifest, cohort).as_dict()
+    if json:
+        print_json({"model": version.reference, "cohort": cohort, **result})
+        return
+    print_table(
+        f"{version.reference} on {result['rows']:,} rows",
+        ["figure", "value"],
+        [
+            [name.replace("_deg", ", deg").replace("_", " "), f"{value:.4f}"]
+            for name, value in result.items()
+            if name != "rows" and value is not None
+        ],
+    )
 
 
 @recorded

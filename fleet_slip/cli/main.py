@@ -7,32 +7,19 @@ from typing import Annotated
 
 import typer
 
-from fleet_slip.cli import (
-    data,
-    diagnosing,
-    evaluate,
-    maintenance,
-    models,
-    operations,
-    query,
-    report,
-    run,
-    selecting,
-    signing,
-    statistics,
-)
+from fleet_slip.cli.commands import MARKUP, CommandGroup
 from fleet_slip.cli.logs import LOG_VARIABLE, LogFormat, configure_logs
 from fleet_slip.cli.output import say
 from fleet_slip.data_root import ROOT_VARIABLE, data_root
 from fleet_slip.errors import FleetSlipError
-from fleet_slip.warehouse import Warehouse
 
 INTERRUPTED = 130
 
 app = typer.Typer(
+    cls=CommandGroup,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    rich_markup_mode="markdown",
+    rich_markup_mode=MARKUP,
     context_settings={"help_option_names": ["-h", "--help"]},
     epilog=(
         "Exit codes: 0 done, 1 a bug, 2 wrong usage, 3 a config file, 4 input data, 5 the data "
@@ -40,21 +27,6 @@ app = typer.Typer(
         "found, 10 something calls for attention, 11 a cluster, 130 interrupted."
     ),
 )
-for module in (
-    run,
-    data,
-    selecting,
-    models,
-    diagnosing,
-    statistics,
-    evaluate,
-    report,
-    operations,
-    maintenance,
-    signing,
-    query,
-):
-    module.register(app)
 
 
 def _print_version(wanted: bool) -> None:
@@ -93,6 +65,8 @@ def options(
 
     Start with: **fleet-slip run --campaign smoke**
     """
+    from fleet_slip.warehouse import Warehouse  # noqa: PLC0415 - pyarrow and Delta, not for --help
+
     configure_logs(log)
     context.obj = Warehouse(data_root(root))
 

@@ -1,7 +1,7 @@
-"""Commands that make and serve models: publish, models, show, promote, rollback, score."""
+"""Commands that serve models: models, show, promote, rollback."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -9,27 +9,9 @@ from fleet_slip.aliases import CHAMPION
 from fleet_slip.audit import Audit
 from fleet_slip.cli.output import Json, print_json, print_table, say
 from fleet_slip.cli.recorded import recorded
-from fleet_slip.cli.selecting import (
-    AllSubsets,
-    Cohort,
-    Criterion,
-    Features,
-    FoldBy,
-    FoldCount,
-    Models,
-    Naive,
-    Nested,
-    Rank,
-    print_selection,
-)
-from fleet_slip.cli.signing import SignKey, signing_key
-from fleet_slip.cohort import ALL_DRIVES, TRAINING_DRIVES
-from fleet_slip.model_list import check_model_name
-from fleet_slip.operations.run_log import step
-from fleet_slip.publishing import Publication, manifest_of
-from fleet_slip.publishing import publish as publish_selection
+from fleet_slip.cli.signing import signing_key
+from fleet_slip.manifest import check_model_name
 from fleet_slip.registry import ModelVersion, Registry
-from fleet_slip.selection_plan import SelectionPlan, run_plan
 from fleet_slip.warehouse import Warehouse
 
 Reference = Annotated[
@@ -40,81 +22,13 @@ Alias = Annotated[str, typer.Option(help="The alias to move.")]
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
-    for command in (publish, models, show, promote, rollback, score):
+    for command in (models, show, promote, rollback):
         app.command()(command)
 
 
 def registry_of(warehouse: Warehouse, sign_key: Path | None = None) -> Registry:
     """Return the registry of a data root; it signs new versions if a key is configured."""
     return Registry(warehouse.root / "models", signing_key(sign_key))
-
-
-@recorded
-def publish(
-    context: typer.Context,
-    name: Annotated[str, typer.Argument(help="Name of the model, such as sideslip.")],
-    cohort: Cohort = TRAINING_DRIVES,
-    models: Models = None,
-    nested: Nested = None,
-    features: Features = None,
-    by: FoldBy = None,
-    folds: FoldCount = None,
-    rank: Rank = None,
-    criterion: Criterion = None,
-    all_subsets: AllSubsets = False,
-    naive: Naive = False,
-    force: Annotated[
-        bool, typer.Option("--force", help="Publish even what is worse than the champion.")
-    ] = False,
-    sign_key: SignKey = None,
-    json: Json = False,
-) -> None:
-    """Select on a cohort and make the winner the next version of a model, and its champion.
-
-    The options are those of select.
-    """
-    check_model_name(name)
-    plan = SelectionPlan(
-        cohort=cohort,
-        models=models,
-        nested=nested,
-        features=features,
-        by=by,
-        folds=folds,
-        rank=rank,
-        criterion=criterion,
-        all_subsets=all_subsets,
-        naive=naive,
-    )
-    with step("select"):
-        planned = run_plan(context.obj, plan)
-    selection = planned.selection
-    manifest = manifest_of(selection, name, planned.label, planned.config_sha256)
-    registry = registry_of(context.obj, sign_key)
-    publication = publish_selection(registry, manifest, selection, force=force)
-    if json:
-        print_json(published(publication))
-    else:
-        print_selection(selection)
-        print_publication(publication)
-
-
-def published(publication: Publication) -> dict[str, Any]:
-    """Return what `publish --json` prints."""
-    version = publication.version
-    return {
-        "model": version.manifest.name,
-        "version": version.version,
-        "new": publication.new,
-        "reason": publication.reason,
-        "sha256": version.sha256,
-    }
-
-
-def print_publication(publication: Publication) -> None:
-    """Say what was published."""
-    done = "published" if publication.new else "nothing to publish:"
-    say(f"{done} {publication.version.reference}. {publication.reason}")
 
 
 def models(
@@ -258,33 +172,3 @@ def rollback(
     """Point an alias back at the version that it had before."""
     version = registry_of(context.obj).rollback(name, alias)
     say(f"{name}@{alias} is version {version} again")
-
-
-def score(
-    context: typer.Context,
-    reference: Reference,
-    cohort: Cohort = ALL_DRIVES,
-    sql: Annotated[bool, typer.Option("--sql", help="Print the statement and do nothing.")] = False,
-    json: Json = False,
-) -> None:
-    """Evaluate a model on the rows of a cohort: also the largest error and percentiles."""
-    from fleet_slip.score import score as score_rows  # noqa: PLC0415
-    from fleet_slip.score import score_statement  # noqa: PLC0415
-
-    version = registry_of(context.obj).resolve(reference)
-    if sql:
-        typer.echo(score_statement(version.manifest, cohort))
-        return
-    result = score_rows(context.obj, version.manifest, cohort).as_dict()
-    if json:
-        print_json({"model": version.reference, "cohort": cohort, **result})
-        return
-    print_table(
-        f"{version.reference} on {result['rows']:,} rows",
-        ["figure", "value"],
-        [
-            [name.replace("_deg", ", deg").replace("_", " "), f"{value:.4f}"]
-            for name, value in result.items()
-            if name != "rows" and value is not None
-        ],
-    )

@@ -8,13 +8,14 @@ import typer
 
 from fleet_slip.audit import Audit
 from fleet_slip.cli.data import Days, Through, chosen_days, run_gram, run_simulation
-from fleet_slip.cli.models import print_publication, published, registry_of
+from fleet_slip.cli.models import registry_of
 from fleet_slip.cli.output import Json, print_json, say
+from fleet_slip.cli.publishing import print_publication, published
 from fleet_slip.cli.recorded import recorded
 from fleet_slip.cli.selecting import print_selection
 from fleet_slip.cli.workers import Cluster, Threads, workers
 from fleet_slip.errors import RefusedError
-from fleet_slip.model_list import check_model_name
+from fleet_slip.manifest import check_model_name
 from fleet_slip.operations.run_log import step
 from fleet_slip.publishing import Publication, manifest_of, publish
 from fleet_slip.selection import Selection

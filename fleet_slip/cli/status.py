@@ -1,0 +1,114 @@
+"""The command that tells the warehouse's health."""
+
+from typing import Annotated, Any
+
+import typer
+
+from fleet_slip.cli.output import Json, print_json, print_table
+from fleet_slip.errors import AlarmError
+from fleet_slip.operations.status import Status, status_of
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command of this module."""
+    app.command()(status)
+
+
+def status(
+    context: typer.Context,
+    max_age_hours: Annotated[
+        float | None,
+        typer.Option(min=0, help="Data, or a backlog, older than this is a problem."),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Tell the warehouse's health: freshness, backlog, last runs, disk, champions.
+
+    Exit code 10 if something calls for attention.
+    """
+    found = status_of(context.obj, max_age_hours)
+    if json:
+        print_json(found.as_dict())
+    else:
+        _print_status(found)
+    if found.problems:
+        raise AlarmError("; ".join(found.problems))
+
+
+def _print_status(found: Status) -> None:
+    print_table(
+        f"{found.root} at {found.checked_at:%Y-%m-%d %H:%M} UTC",
+        ["table", "last commit", "version", "files", "rows", "size MB"],
+        [
+            [
+                name,
+                f"{one.committed_at:%Y-%m-%d %H:%M}" if one.committed_at else "never",
+                "" if one.version is None else str(one.version),
+                f"{one.files:,}",
+                f"{one.rows:,}",
+                f"{one.size_bytes / 1e6:,.1f}",
+            ]
+            for name, one in found.tables.items()
+        ],
+        left=2,
+    )
+    print_table(
+        "",
+        ["", ""],
+        [
+            ["newest day", str(found.newest_day or "none")],
+            [
+                "waiting for the Gram job",
+                f"{found.backlog_files} files, {found.backlog_rows:,} rows",
+            ],
+            *_disk(found),
+        ],
+        left=2,
+    )
+    _print_runs(found)
+    if found.champions:
+        print_table(
+            "\nchampions",
+            ["model", "published", "age h", "logs behind", "grams behind"],
+            [
+                [
+                    f"{one.model}@{one.version}",
+                    f"{one.published_at:%Y-%m-%d %H:%M}" if one.published_at else "",
+                    "" if one.age_hours is None else f"{one.age_hours:,.1f}",
+                    str(one.logs_behind),
+                    str(one.grams_behind),
+                ]
+                for one in found.champions
+            ],
+            left=2,
+        )
+
+
+def _disk(found: Status) -> list[list[str]]:
+    if found.disk_free_bytes is None or found.disk_free_fraction is None:
+        return []
+    return [["disk", f"{found.disk_free_bytes / 1e9:,.1f} GB free, {found.disk_free_fraction:.0%}"]]
+
+
+def _print_runs(found: Status) -> None:
+    if not found.last_runs:
+        return
+    print_table(
+        "\nlast runs",
+        ["command", "started", "state", "seconds", "rows"],
+        [
+            [
+                run["command"],
+                f"{run['started_at']:%Y-%m-%d %H:%M:%S}",
+                run["state"],
+                _number(run["seconds"], ".1f"),
+                _number(run["rows"], ","),
+            ]
+            for run in found.last_runs
+        ],
+        left=3,
+    )
+
+
+def _number(value: Any, form: str) -> str:
+    return "" if value is None else format(value, form)
