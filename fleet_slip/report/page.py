@@ -8,14 +8,14 @@ from importlib.resources import files
 from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
 
-from fleet_slip.report import tables
+from fleet_slip.report import paper_tables, tables
 from fleet_slip.report.claims import Judged, judged
 from fleet_slip.report.claims.claim import Status
 from fleet_slip.report.data import ReportData
 from fleet_slip.report.drawing import inline_svgs
 from fleet_slip.report.pictures import Picture
 from fleet_slip.report.style import PALETTE
-from fleet_slip.report.tables import Table
+from fleet_slip.report.table import Table
 from fleet_slip.report.text import count, degrees, size
 
 TEMPLATES = files("fleet_slip.report") / "templates"
@@ -58,9 +58,9 @@ def render(data: ReportData, shown: Sequence[Picture]) -> str:
         evaluation=data.evaluated.document,
         paper=[one for one in drawn if one.picture.key.startswith("figure-")],
         beyond=[one for one in drawn if not one.picture.key.startswith("figure-")],
-        table_one=tables.table_one(data),
-        table_two=tables.table_two(data),
-        targets=list(tables.targets(data)),
+        table_one=paper_tables.table_one(data),
+        table_two=paper_tables.table_two(data),
+        targets=list(paper_tables.targets(data)),
         further=_further(data),
         coefficients=list(tables.coefficient_tables(data)),
         storage=tables.storage(data),
@@ -106,7 +106,7 @@ def _tiles(data: ReportData, claims: Sequence[Judged]) -> list[Tile]:
     ]
     nominal = data.evaluated.figures("nominal", data.choice)
     if nominal is not None and nominal.error_std_deg is not None:
-        paper = tables.PAPER_TABLE_TWO["4"][1]
+        paper = paper_tables.PAPER_TABLE_TWO["4"][1]
         tiles.append(
             Tile(
                 degrees(nominal.error_std_deg),

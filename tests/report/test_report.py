@@ -17,7 +17,7 @@ from fleet_slip.documents import Document
 from fleet_slip.errors import SelectionError
 from fleet_slip.evaluation.results import keep
 from fleet_slip.local_folder import LocalFolder
-from fleet_slip.report import tables
+from fleet_slip.report import paper_tables
 from fleet_slip.report.blocks import blocks_won, difference
 from fleet_slip.report.claims import CLAIMS, judged
 from fleet_slip.report.claims.claim import Status
@@ -103,7 +103,7 @@ def test_the_same_data_give_the_same_bytes(reported: Reported, data: ReportData)
 
 
 def test_table_two_has_the_evaluations_numbers(data: ReportData) -> None:
-    rows = tables.table_two(data).rows
+    rows = paper_tables.table_two(data).rows
     assert [row[0].text for row in rows] == ["1", "2", "3", "4", "5"]
     for row in rows:
         estimator = data.evaluated.models[row[0].text]
@@ -111,7 +111,7 @@ def test_table_two_has_the_evaluations_numbers(data: ReportData) -> None:
         assert row[2].text == number(found["error_mean_deg"], 4, sign=True)
         assert row[4].text == number(found["error_std_deg"], 4)
         assert (row[4].mark == "good") == (
-            found["error_std_deg"] <= tables.PAPER_TABLE_TWO[row[0].text][1]
+            found["error_std_deg"] <= paper_tables.PAPER_TABLE_TWO[row[0].text][1]
         )
 
 

@@ -14,7 +14,7 @@ from fleet_slip.report.claims.claim import (
     verdict,
 )
 from fleet_slip.report.data import ReportData
-from fleet_slip.report.tables import PAPER_TABLE_TWO
+from fleet_slip.report.paper_tables import PAPER_TABLE_TWO
 from fleet_slip.report.text import count, degrees, listed, number
 from fleet_slip.sensors import SAMPLE_RATE_HZ
 
