@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from fleet_slip.errors import SelectionError
 from fleet_slip.gram import Gram
 from fleet_slip.regression import rounding
+from fleet_slip.regression.eigenvalues import symmetric_eigenvalues
 from fleet_slip.regression.elimination import Elimination, eliminate
 
 Scales = Mapping[str, Fraction]
@@ -194,7 +195,6 @@ def condition_number(gram: Gram, inputs: Sequence[str]) -> float:
     """
     if not inputs:
         return 1.0
-    eigenvalues = np.linalg.eigvalsh(correlation_matrix(gram.restrict(inputs)))
-    if eigenvalues[0] <= 0:
-        return float("inf")
-    return float(eigenvalues[-1] / eigenvalues[0])
+    eigenvalues = symmetric_eigenvalues(correlation_matrix(gram.restrict(inputs)))
+    smallest, largest = eigenvalues[0], eigenvalues[-1]
+    return largest / smallest if smallest > 0 else float("inf")
