@@ -48,6 +48,7 @@ def compact(
     Running it again does nothing. Raises `StorageError`, or `ConflictError` if other processes keep
     changing the same files.
     """
+    warehouse.require()
     before = warehouse.logs.snapshot()
     days = sorted({file.day for file in before.files if file.day is not None})
     rewritten = 0

@@ -51,6 +51,7 @@ def connect(
     `fleet_slip.reading_query.one_query` first, as the command line does.
     """
     warehouse = Warehouse(data_root(root))
+    warehouse.require()
     wanted = TABLES if query is None else tables_in(query)
     stored = [STORED_IN[name] for name in VIEWS if name in wanted and name in STORED_IN]
     snapshots = [getattr(warehouse, table).snapshot() for table in stored]

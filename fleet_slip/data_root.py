@@ -1,5 +1,6 @@
 """Where a warehouse is: a folder of a file system, or the URL of an object store."""
 
+import os
 import re
 from os import environ
 from pathlib import Path
@@ -13,6 +14,9 @@ ROOT_VARIABLE = "FLEET_SLIP_ROOT"
 UNFIT_CHARACTERS = "\\*?["
 """The backslash becomes a slash in Delta; the others are patterns to DuckDB."""
 
+_ESCAPE = re.compile("%[0-9A-Fa-f]{2}")
+"""What stands for another character in a URL, as which the Delta library takes a path."""
+
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
 _OBJECT_URL = re.compile(
     r"(?P<bucket>(?:s3|gs|az)://[a-z0-9][a-z0-9._-]{1,62})(?P<path>(?:/[A-Za-z0-9_=+-][\w.=+-]*)*)/?",
@@ -25,7 +29,7 @@ def data_root(root: Folder | Path | str | None = None) -> Folder:
 
     A text with `://` in it is a URL: `s3://BUCKET/PATH`, `gs://`, `az://CONTAINER/PATH`, or
     `file:///PATH`. Raises `StorageError` for a path with characters that Delta or DuckDB take for
-    something else, and for a URL that is none of these.
+    something else, for a folder inside a table, and for a URL that is none of these.
     """
     if root is not None and not isinstance(root, Path | str):
         return root
@@ -41,6 +45,18 @@ def _local(path: Path) -> Folder:
         raise StorageError(
             f"{path}: a data root cannot have {unfit[0]!r} in its path. Choose another with --root."
         )
+    if found := _ESCAPE.search(str(path.absolute())):
+        raise StorageError(
+            f"{path}: a data root cannot have {found[0]!r} in its full path: Delta reads it as one "
+            "character. Choose another with --root."
+        )
+    for folder in (place := Path(os.path.realpath(path)), *place.parents):
+        # Whatever lies in a table and is not part of it, vacuum removes.
+        if os.access(folder / "_delta_log", os.F_OK):
+            raise StorageError(
+                f"{path}: it is inside the table {folder}. Choose the folder that the table is in, "
+                "or another, with --root."
+            )
     from fleet_slip.local_folder import LocalFolder  # noqa: PLC0415 - pyarrow and Delta
 
     return LocalFolder(path)

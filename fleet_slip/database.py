@@ -2,9 +2,12 @@
 
 import contextlib
 import os
+import resource
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import TypeVar
 
 import duckdb
 
@@ -13,6 +16,8 @@ from fleet_slip.folder import Folder
 
 SPILL_LIMIT = "20GB"
 """Largest size of what one connection may write to disk for a query beyond its memory."""
+
+Result = TypeVar("Result")
 
 CGROUP_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 
@@ -51,10 +56,37 @@ def memory_bytes() -> int:
     return memory
 
 
+def limit_memory() -> None:
+    """Have the system refuse this process more than three quarters of the memory.
+
+    DuckDB keeps to its own limit for what it buffers, not for one value: a list of 2e9 numbers.
+    """
+    limit = memory_bytes() // 4 * 3
+    _, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    if hard == resource.RLIM_INFINITY or limit < hard:
+        resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))
+
+
+def interruptible(database: duckdb.DuckDBPyConnection, work: Callable[[], Result]) -> Result:
+    """Do work with a connection so that Ctrl-C ends it, in the middle of an operator, too.
+
+    DuckDB asks whether to stop between tasks only, and a recursive query is one task.
+    """
+    with ThreadPoolExecutor(1) as pool:
+        answer = pool.submit(work)
+        try:
+            return answer.result()
+        except KeyboardInterrupt:
+            database.interrupt()
+            raise
+
+
+_INTERRUPTED = "Query interrupted"
+"""What DuckDB's Python client says when it stopped at a Ctrl-C."""
+
 _OF_FILES = (
     duckdb.IOException,
     duckdb.InvalidInputException,
-    duckdb.OutOfMemoryException,
     duckdb.InternalException,
 )
 
@@ -66,6 +98,15 @@ def database_errors(doing: str) -> Iterator[None]:
         yield
     except FleetSlipError:
         raise
+    except duckdb.InterruptException:
+        raise KeyboardInterrupt from None
+    except RuntimeError as error:
+        if str(error) == _INTERRUPTED:
+            raise KeyboardInterrupt from None
+        raise
+    except (duckdb.OutOfMemoryException, MemoryError) as error:
+        reason = first_line(error) or "out of memory"
+        raise StorageError(f"{doing} failed: {reason}. Ask for less at once.") from None
     except _OF_FILES as error:
         raise StorageError(f"{doing} failed: {first_line(error)}. {_RESTORE}") from None
     except duckdb.Error as error:
@@ -76,9 +117,9 @@ def database_errors(doing: str) -> Iterator[None]:
         raise StorageError(f"{doing} failed: a file is damaged. {_RESTORE}") from None
 
 
-def first_line(error: duckdb.Error) -> str:
-    """Return DuckDB's message on one line, without the excerpt of the statement."""
-    text = str(error).partition("\n\nLINE ")[0]
+def first_line(error: BaseException) -> str:
+    """Return DuckDB's message on one line, without the excerpt of the statement or its advice."""
+    text = str(error).partition("\n\nLINE ")[0].partition("\n\nPossible solutions:")[0]
     if "Traceback (most recent call last)" in text:  # of Python that DuckDB called to read a file
         text = text.strip().rpartition("\n")[2].partition(": ")[2]
     return " ".join(text.split()).rstrip(".")

@@ -19,7 +19,7 @@ import pyarrow.compute as pc
 from deltalake.transaction import AddAction
 
 from fleet_slip.database import database_errors, open_database
-from fleet_slip.errors import ConflictError
+from fleet_slip.errors import ConflictError, StorageError
 from fleet_slip.features import PLAIN, features
 from fleet_slip.gram_statement import gram_statement
 from fleet_slip.storage import (
@@ -90,6 +90,7 @@ def update_grams(
     set, `StorageError`, `ConflictError` if other processes keep changing the table, or
     `ClusterError`.
     """
+    warehouse.require()
     return retried(lambda: _update_once(warehouse, progress, feature_set, executor))
 
 
@@ -117,6 +118,11 @@ def _update_once(
     # Gram rows after this snapshot of them, and this job's commit is a conflict.
     grams = warehouse.grams.snapshot()
     logs = warehouse.logs.snapshot()
+    if logs.version is None and grams.rows:
+        raise StorageError(
+            f"{warehouse.logs.folder}: the logs that {grams.rows:,} Gram rows were computed from "
+            "are gone. Nothing is changed: restore the folder from a backup."
+        )
     identity = features().identity(feature_set)
     backlog = find_backlog(logs, grams, identity)
     version, gram_rows = grams.version, grams.rows

@@ -67,7 +67,8 @@ class LocalFolder:
 
     def exists(self) -> bool:
         """Whether there is such a folder."""
-        return self.path.is_dir()
+        with storage_errors(self):
+            return self.path.is_dir()
 
     def names(self) -> list[str]:
         """Return the names of files and folders directly below, sorted."""

@@ -66,6 +66,7 @@ def migrate(warehouse: Warehouse, progress: Progress = lambda _more, _all: None)
     the announcement, which a migration back to the old catalogue takes away. Raises
     `ConflictError` if another process changed the table at the same moment.
     """
+    warehouse.require()
     _add_columns_that_came_later(warehouse.quarantine)
     table = warehouse.logs
     delta = table.open_delta()

@@ -49,6 +49,7 @@ def retain(
 
     Raises `RefusedError` if not one drive would be left, as with a clock that is wrong.
     """
+    warehouse.require()
     try:
         before = today - timedelta(days=retention.drives_days)
     except OverflowError:

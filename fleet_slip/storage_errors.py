@@ -39,6 +39,12 @@ def _reason(error: OSError) -> str:
         errno.EPERM: "not permitted. Check the owner of the data root, or choose --root.",
         errno.EROFS: "the file system is read-only. Choose a writable data root with --root.",
         errno.ENOTDIR: "a part of the path is a file, not a folder. Choose another --root.",
+        errno.EEXIST: "a file, or a link to nothing, is where a folder must be. Choose another "
+        "--root.",
+        errno.ELOOP: "the path is a loop of links. Choose another --root.",
+        errno.ENAMETOOLONG: "the path is too long. Choose another --root.",
+        errno.EIO: "the disk cannot be read or written (I/O error). Have it examined, then restore "
+        "what is damaged from a backup: fleet-slip verify",
     }
     # The Delta library tells the number in its text only.
     stated = re.search(r"\(os error (\d+)\)", str(error))

@@ -2,7 +2,7 @@
 
 A file stays while a version of the last `retention_hours` refers to it, so that a query that began
 then goes on undisturbed; and while it is younger than that, because a job may be about to commit
-it. A clock that was set back keeps files longer.
+it. A clock that was set back keeps files longer. Files of a table without a Delta log all stay.
 """
 
 import math
@@ -36,6 +36,7 @@ def vacuum(
 
     Raises `StorageError`.
     """
+    warehouse.require()
     removed = []
     for file in expired(warehouse, retention_hours):
         if dry_run or file.folder.remove(file):
@@ -54,7 +55,10 @@ def expired(warehouse: Warehouse, retention_hours: float) -> list[StoredFile]:
     found = []
     for table in warehouse.tables:
         files = unreferenced(table)
-        kept = removed_since(table.snapshot(), retention_hours)
+        snapshot = table.snapshot()
+        if snapshot.version is None:  # its Delta log may have been lost, and these be its data
+            continue
+        kept = removed_since(snapshot, retention_hours)
         found += [file for file in files if file.path not in kept]
     found += temporary_files(warehouse)
     return [file for file in found if file.age_hours >= retention_hours]

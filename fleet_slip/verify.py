@@ -6,7 +6,7 @@ documents with their checksums; model versions with the tables that they were ma
 """
 
 import os
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from functools import partial
@@ -90,17 +90,24 @@ def verify(
     Files are read by the workers of an executor, if there is one, else by threads.
     """
     report = Verification()
+    warehouse.require()
     snapshots = _snapshots(warehouse, report)
     good = {table: _verify_files(s, report, progress, executor) for table, s in snapshots.items()}
     logs, grams = (good.get(table, []) for table in ("logs", "grams"))
     if logs:
         _verify_drives(warehouse, logs, report)
+    _require_logs(snapshots, report)
     if grams:
         active = {file.path for file in snapshots["logs"].files} if "logs" in snapshots else set()
         _verify_grams(warehouse, logs, grams, active, full, report, executor)
     _verify_documents(warehouse.root, report)
     _verify_models(warehouse, snapshots, report)
     _list_unreferenced(warehouse, snapshots, report)
+    if not report.findings and not report.documents and not _any_table(snapshots):
+        raise StorageError(
+            f"{warehouse.root}: there is nothing to verify, neither tables nor models. Is it the "
+            "right folder, and is its disk there? Choose another with --root."
+        )
     return report
 
 
@@ -118,6 +125,18 @@ def _snapshots(warehouse: Warehouse, report: Verification) -> dict[str, Snapshot
                 path = f"{table.folder.name}/_delta_log/{file}"
                 report.findings.append(Finding("log", path, problem))
     return found
+
+
+def _any_table(snapshots: Mapping[str, Snapshot]) -> bool:
+    return any(snapshot.version is not None for snapshot in snapshots.values())
+
+
+def _require_logs(snapshots: Mapping[str, Snapshot], report: Verification) -> None:
+    """Report a table of logs that is gone, as a folder that was not mounted is."""
+    logs, grams = snapshots.get("logs"), snapshots.get("grams")
+    if logs and grams and logs.version is None and grams.rows:
+        problem = f"the table is gone that {grams.rows:,} Gram rows were computed from"
+        report.findings.append(Finding("log", "logs", problem))
 
 
 def _verify_files(
@@ -316,7 +335,10 @@ def _list_unreferenced(
         known = replaced(snapshot)
         for file in unreferenced(snapshot.table):
             what = "replaced" if file.path in known else "never committed"
-            _remark(warehouse, file, f"{what}; fleet-slip vacuum removes it in time", report)
+            then = "fleet-slip vacuum removes it in time"
+            if snapshot.version is None:
+                then = "if the table had a Delta log, restore that from a backup"
+            _remark(warehouse, file, f"{what}; {then}", report)
     for file in temporary_files(warehouse):
         _remark(warehouse, file, "left by a killed job, or being written", report)
 

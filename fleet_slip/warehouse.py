@@ -5,6 +5,7 @@ from functools import cached_property
 
 import pyarrow as pa
 
+from fleet_slip.errors import StorageError
 from fleet_slip.folder import Folder
 from fleet_slip.signals import SignalCatalogue, catalogue
 from fleet_slip.storage import Encoding, Table
@@ -35,6 +36,11 @@ class Warehouse:
     def catalogue(self) -> SignalCatalogue:
         """The signal catalogue of the logs."""
         return catalogue()
+
+    def require(self) -> None:
+        """Raise `StorageError` if there is no data root: a wrong path is not an empty warehouse."""
+        if not self.root.exists():
+            raise StorageError(f"{self.root}: there is no data root. Choose another with --root.")
 
     @cached_property
     def logs(self) -> Table:

@@ -205,7 +205,10 @@ def test_a_mistake_is_one_line_and_its_exit_code(
     assert done.stdout == "" or message == ""
 
 
-def test_commands_on_an_empty_warehouse_say_how_to_begin(run_command: RunCommand) -> None:
+def test_commands_on_an_empty_warehouse_say_how_to_begin(
+    run_command: RunCommand, tmp_path: Path
+) -> None:
+    (tmp_path / "data").mkdir()
     assert run_command("select").exit_code == 5
     assert "fleet-slip simulate" in run_command("select").stderr
     assert run_command("check").exit_code == 5

@@ -1,7 +1,9 @@
 """Verification: whatever is damaged is found and named; what can be rebuilt is, and no more."""
 
 import json
+import os
 import random
+import shutil
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -13,11 +15,14 @@ import pytest
 from fleet_slip.campaign import load_campaign
 from fleet_slip.compaction import compact
 from fleet_slip.documents import DocumentFolder
+from fleet_slip.errors import StorageError
 from fleet_slip.gram_job import update_grams
+from fleet_slip.local_folder import LocalFolder
 from fleet_slip.repair import repair
 from fleet_slip.resources import find_config
 from fleet_slip.simulation_job import simulate_campaign
 from fleet_slip.storage import Change
+from fleet_slip.vacuum import vacuum
 from fleet_slip.verify import verify
 from fleet_slip.warehouse import Warehouse
 from tests.conftest import DAY, RunCommand, land, log_rows, path_of, random_counts
@@ -48,7 +53,27 @@ def test_nothing_is_found_where_nothing_is_wrong(filled: Warehouse) -> None:
     report = verify(filled, full=True)
     assert report.findings == []
     assert (report.files, report.log_files_recomputed, report.documents) == (3, 2, 1)
-    assert verify(Warehouse(filled.root / "empty")).findings == []
+
+
+def test_a_folder_without_a_warehouse_is_not_called_sound(tmp_path: Path) -> None:
+    with pytest.raises(StorageError, match="nothing to verify"):
+        verify(Warehouse(LocalFolder(tmp_path)))
+    with pytest.raises(StorageError, match="no data root"):
+        verify(Warehouse(LocalFolder(tmp_path / "absent")))
+
+
+def test_logs_that_are_gone_are_found_and_nothing_follows_them(filled: Warehouse) -> None:
+    paths = [Path(path) for path in filled.logs.snapshot().paths]
+    rows = filled.grams.snapshot().rows
+    shutil.rmtree(path_of(filled.root) / "logs" / "_delta_log")
+    for path in paths:
+        os.utime(path, (0, 0))
+    assert ("log", "logs") in damaged(filled)
+    assert vacuum(filled).files == ()
+    assert all(path.exists() for path in paths)
+    with pytest.raises(StorageError, match="are gone"):
+        update_grams(filled)
+    assert filled.grams.snapshot().rows == rows
 
 
 def test_every_flipped_bit_is_found(filled: Warehouse) -> None:

@@ -39,6 +39,7 @@ def models(
     json: Json = False,
 ) -> None:
     """List the published model versions."""
+    context.obj.require()
     registry = registry_of(context.obj)
     marked = Audit(context.obj.root).marked_models()
     rows = [

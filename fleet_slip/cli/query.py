@@ -4,6 +4,7 @@ import contextlib
 import shutil
 import sys
 from collections.abc import Iterator
+from functools import partial
 from typing import Annotated
 
 import duckdb
@@ -13,7 +14,7 @@ from pyarrow.csv import write_csv
 
 from fleet_slip.cli.output import Json, print_json, say
 from fleet_slip.connection import connect
-from fleet_slip.database import database_errors
+from fleet_slip.database import database_errors, interruptible, limit_memory
 from fleet_slip.errors import FleetSlipError, SelectionError
 from fleet_slip.reading_query import one_query
 
@@ -48,8 +49,11 @@ def sql(
     else.
     """
     text = _read_stdin() if query == "-" else query
+    if not unsafe:
+        limit_memory()
     with connect(context.obj.root, locked=not unsafe, query=text) as database:
-        _answer(database, text if unsafe else one_query(database, text), json=json, csv=csv)
+        allowed = text if unsafe else one_query(database, text)
+        interruptible(database, lambda: _answer(database, allowed, json=json, csv=csv))
 
 
 def _read_stdin() -> str:
@@ -93,12 +97,14 @@ def shell(context: typer.Context) -> None:
     """Type SQL queries against the warehouse, one after the other. End with .quit or Ctrl-D."""
     import readline  # noqa: F401, PLC0415 - gives input() history and editing
 
+    limit_memory()
     with connect(context.obj.root) as database:
         say("Views: log, log_counts, drives, grams, models, quarantine, dictionary. End: .quit")
         while (text := _read_statement()) is not None:
             try:
                 if text.strip():
-                    _answer(database, one_query(database, text))
+                    allowed = one_query(database, text)
+                    interruptible(database, partial(_answer, database, allowed))
             except FleetSlipError as error:
                 say(f"error: {error}")
             except KeyboardInterrupt:

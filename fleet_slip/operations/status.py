@@ -87,8 +87,7 @@ def status_of(
     cannot be loaded. Raises `StorageError` if there is no data root.
     """
     now = now or datetime.now(UTC)
-    if not warehouse.root.exists():
-        raise StorageError(f"{warehouse.root}: there is no data root. Choose another with --root.")
+    warehouse.require()
     parts = (warehouse.logs, warehouse.grams, warehouse.quarantine)
     snapshots = {table.folder.name: table.snapshot() for table in parts}
     tables = {name: _table(snapshot) for name, snapshot in snapshots.items()}

@@ -10,6 +10,7 @@ from fleet_slip.data_root import data_root
 from fleet_slip.errors import ConfigError, FleetSlipError, StorageError
 from fleet_slip.resources import find_config
 from fleet_slip.track import load_track
+from tests.conftest import RunCommand
 
 TRACK = 'name = "x"\ndescription = "d"\nclosed = {closed}\nsegments = [{segments}]\n'
 
@@ -87,11 +88,36 @@ def test_of_many_faults_the_first_are_told(tmp_path: Path) -> None:
     assert len(str(raised.value)) < 5000
 
 
-@pytest.mark.parametrize("root", ["a\\b", "a*", "a?", "[a]", "a\nb", "\x1b[2J"])
+@pytest.mark.parametrize("root", ["a\\b", "a*", "a?", "[a]", "a\nb", "\x1b[2J", "a%20b"])
 def test_a_root_that_delta_or_duckdb_would_misread_is_refused(root: str) -> None:
     with pytest.raises(StorageError, match="data root") as raised:
         data_root(root)
     assert str(raised.value).isprintable()
+
+
+def test_a_root_inside_a_table_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "logs" / "_delta_log").mkdir(parents=True)
+    (tmp_path / "link").symlink_to(tmp_path / "logs")
+    for inside in ("logs", "logs/day=2024-05-01/x", "link"):
+        with pytest.raises(StorageError, match="inside the table"):
+            data_root(tmp_path / inside)
+    data_root(tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["file", "link", "loop", "long"])
+def test_a_root_that_is_no_folder_is_told(
+    run_command: RunCommand, tmp_path: Path, kind: str
+) -> None:
+    root = tmp_path / ("a" * 300 if kind == "long" else "root")
+    if kind == "file":
+        root.touch()
+    elif kind != "long":
+        root.symlink_to(root if kind == "loop" else "nowhere")
+    for command in (["run", "--campaign", "smoke"], ["sql", "FROM drives"], ["verify"]):
+        result = run_command("--root", str(root), *command)
+        assert result.exit_code == StorageError.exit_code
+        assert "--root" in result.stderr
+        assert "Errno" not in result.stderr
 
 
 def test_every_error_is_shown_on_one_line() -> None:

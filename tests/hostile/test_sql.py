@@ -2,6 +2,9 @@
 
 import hashlib
 import json
+import os
+import signal
+import threading
 from pathlib import Path
 
 import duckdb
@@ -12,7 +15,8 @@ from hypothesis import strategies as st
 
 from fleet_slip.cohort import load_cohort
 from fleet_slip.connection import connect
-from fleet_slip.errors import FleetSlipError, SelectionError
+from fleet_slip.database import database_errors, interruptible
+from fleet_slip.errors import FleetSlipError, SelectionError, StorageError
 from fleet_slip.gram_job import update_grams
 from fleet_slip.local_folder import LocalFolder
 from fleet_slip.reading_query import one_query
@@ -203,6 +207,28 @@ def test_any_text_is_a_reading_query_or_refused(words: list[str] | str) -> None:
         else:
             (statement,) = database.extract_statements(text)
             assert statement.type in {duckdb.StatementType.SELECT, duckdb.StatementType.EXPLAIN}
+
+
+@pytest.mark.parametrize(
+    "endless",
+    [
+        "WITH RECURSIVE r AS (SELECT 1 AS n UNION ALL SELECT n FROM r) SELECT count(*) FROM r",
+        "SELECT count(*) FROM range(10000000) a, range(1000000) b WHERE a.range * b.range % 7 = 1",
+    ],
+)
+def test_an_endless_query_can_be_interrupted(root: Path, endless: str) -> None:
+    with connect(root) as database:
+        timer = threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT))
+        timer.start()
+        with pytest.raises(KeyboardInterrupt), database_errors("the query"):
+            interruptible(database, database.sql(endless).fetchall)
+        timer.join()
+
+
+def test_one_value_cannot_take_all_memory(root: Path, run_command: RunCommand) -> None:
+    result = run_command("sql", "SELECT len(range(1000000000000))", root=root)
+    assert result.exit_code == StorageError.exit_code
+    assert "Ask for less" in result.stderr
 
 
 def test_a_connection_opens_no_other_file_and_writes_none_anew(root: Path, tmp_path: Path) -> None:
