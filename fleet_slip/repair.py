@@ -12,12 +12,19 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.campaign import Batch, Campaign, DriveSpec, load_campaign
+from fleet_slip.checkpoints import (
+    checkpoint_faults,
+    dispensable,
+    remove_checkpoint,
+    seal_checkpoints,
+)
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.gram_job import reconcile
 from fleet_slip.resources import config_names
 from fleet_slip.simulate import simulate_batch
 from fleet_slip.simulation_job import file_name
 from fleet_slip.storage import Change, TableFile, retried
+from fleet_slip.storage_errors import storage_errors
 from fleet_slip.verify import Verification, problem_of
 from fleet_slip.warehouse import Warehouse
 
@@ -29,10 +36,28 @@ def repair(
 
     `campaigns` names campaign files besides those that ship. Verify again to see what is left.
     """
+    rebuilt = _sum_up_again(warehouse)
     damaged = {finding.path for finding in verification.damage if finding.kind == "file"}
     wrong = {f.path.removeprefix("logs/") for f in verification.damage if f.kind == "gram"}
-    rebuilt = _simulate_again(warehouse, damaged, campaigns)
+    rebuilt += _simulate_again(warehouse, damaged, campaigns)
     rebuilt += _aggregate_again(warehouse, damaged, wrong)
+    return rebuilt
+
+
+def _sum_up_again(warehouse: Warehouse) -> list[str]:
+    """Write damaged checkpoints again that can be spared: from what is before them in the log."""
+    rebuilt = []
+    for table in warehouse.tables:
+        for fault in list(checkpoint_faults(table.folder)):
+            if not dispensable(table.folder, fault.name):
+                continue
+            remove_checkpoint(table.folder, fault.name)
+            delta = table.open_delta()
+            if delta is not None:
+                with storage_errors(table.folder):
+                    delta.create_checkpoint()
+                seal_checkpoints(table.folder, again=f"{delta.version():020}.checkpoint.parquet")
+            rebuilt.append(f"{table.folder.name}/_delta_log/{fault.name}")
     return rebuilt
 
 

@@ -15,6 +15,8 @@ from typing import Literal
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from fleet_slip.checkpoints import FOLDER as CHECKSUMS
+from fleet_slip.checkpoints import checkpoint_faults, unsealed_checkpoints
 from fleet_slip.database import database_errors, open_database
 from fleet_slip.documents import DocumentFolder
 from fleet_slip.errors import FleetSlipError, RefusedError, SelectionError, StorageError
@@ -114,6 +116,7 @@ def verify(
 def _snapshots(warehouse: Warehouse, report: Verification) -> dict[str, Snapshot]:
     found = {}
     for table in warehouse.tables:
+        _verify_checkpoints(table, report)
         try:
             snapshot = table.snapshot()
             _ = snapshot.files
@@ -125,6 +128,23 @@ def _snapshots(warehouse: Warehouse, report: Verification) -> dict[str, Snapshot
                 path = f"{table.folder.name}/_delta_log/{file}"
                 report.findings.append(Finding("log", path, problem))
     return found
+
+
+def _verify_checkpoints(table: Table, report: Verification) -> None:
+    name = table.folder.name
+    documents = DocumentFolder(table.folder / CHECKSUMS)
+    report.documents += len(documents.numbers())
+    if faults := documents.faults():
+        for file, problem in faults.items():
+            where = f"{name}/{CHECKSUMS}/{file.rpartition('/')[2]}"
+            report.findings.append(Finding("document", where, problem))
+        return
+    for fault in checkpoint_faults(table.folder):
+        where = f"{name}/_delta_log/{fault.name}"
+        report.findings.append(Finding("log", where, fault.problem))
+    for checkpoint in unsealed_checkpoints(table.folder):
+        problem = "no checksum was kept of this checkpoint; the next one comes with both"
+        report.findings.append(Finding("backlog", f"{name}/_delta_log/{checkpoint}", problem))
 
 
 def _any_table(snapshots: Mapping[str, Snapshot]) -> bool:

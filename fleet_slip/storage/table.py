@@ -12,6 +12,7 @@ from deltalake import CommitProperties, DeltaTable, Transaction
 from deltalake.exceptions import CommitFailedError, TableNotFoundError
 from deltalake.transaction import AddAction
 
+from fleet_slip.checkpoints import seal_new_checkpoint
 from fleet_slip.errors import ConflictError
 from fleet_slip.evolution import require_readable, require_writable
 from fleet_slip.folder import Folder
@@ -210,6 +211,7 @@ class Snapshot:
                     f"({first_line(error)}). Run the same command again."
                 ) from None
             table.folder.settle_commits(self.version)
+            seal_new_checkpoint(table.folder, self.version)
 
 
 def _file_path(name: str, encoded: Encoded, day: date | None) -> str:
