@@ -1,0 +1,121 @@
+"""How often `fleet-slip monitor` warns of nothing, and after how many days of a growing bias.
+
+    python -m benchmarks.drift_days ROOT
+
+Takes a warehouse with at least 480 simulated drives and their Gram rows. Its drives are dealt to
+days of 24 anew, again and again; ten days train, the others are judged. A bias of a sensor of all
+cars that grows from day to day is brought into the Gram rows themselves, which is exact: adding a
+constant to a signal changes sums and products by known amounts.
+"""
+
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from statistics import fmean, median
+
+import numpy as np
+
+from fleet_slip.cohort import load_cohort
+from fleet_slip.features import input_scales
+from fleet_slip.gram import Gram, GramTable
+from fleet_slip.local_folder import LocalFolder
+from fleet_slip.operations.monitor import Limits
+from fleet_slip.operations.thresholds import thresholds
+from fleet_slip.regression.exact import LinearModel, fit
+from fleet_slip.regression.figures import error_sums
+from fleet_slip.warehouse import Warehouse
+
+WHEELS = ("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")
+SIGNALS = ("ax", "ay", "yaw_rate", "steering_wheel", *WHEELS)
+LABEL = "sideslip"
+TRAINING_DAYS = 10
+DRIVES_PER_DAY = 24
+DEALS = 30
+SEED = 20180418
+
+GROWING = {
+    "ay + 0.005 m/s2 a day": ("ay", 0.005),
+    "ay + 0.02 m/s2 a day": ("ay", 0.02),
+    "yaw_rate + 0.0005 rad/s a day": ("yaw_rate", 0.0005),
+    "steering_wheel + 0.0005 rad a day": ("steering_wheel", 0.0005),
+    "steering_wheel + 0.002 rad a day": ("steering_wheel", 0.002),
+    "sideslip + 0.0001 rad a day": ("sideslip", 0.0001),
+}
+
+
+def deals(table: GramTable) -> Iterator[list[Gram]]:
+    """Yield the sums of days that the drives were dealt to."""
+    rng = np.random.default_rng(SEED)
+    days = len(table) // DRIVES_PER_DAY
+    for _ in range(DEALS):
+        numbers = np.full(len(table), days)
+        numbers[rng.permutation(len(table))[: days * DRIVES_PER_DAY]] = np.repeat(
+            np.arange(days), DRIVES_PER_DAY
+        )
+        yield list(table.totals(numbers, days + 1))[:days]
+
+
+def biased(gram: Gram, signal: str, counts: int) -> Gram:
+    """Return the Gram of the same rows with a constant added to a signal."""
+    shift = [counts if name == signal else 0 for name in gram.signals]
+    s, n = gram.sums, gram.n
+    pairs = [(i, j) for i in range(len(shift)) for j in range(i + 1)]
+    products = tuple(
+        product + shift[i] * s[j] + shift[j] * s[i] + n * shift[i] * shift[j]
+        for (i, j), product in zip(pairs, gram.products, strict=True)
+    )
+    return Gram(gram.signals, n, tuple(a + n * c for a, c in zip(s, shift, strict=True)), products)
+
+
+def errors(model: LinearModel, gram: Gram) -> tuple[float, float]:
+    figures = error_sums(model, gram).figures(input_scales()[LABEL])
+    return figures.error_mean_deg, figures.error_std_deg
+
+
+class Watch:
+    """A model made of training days, and the limits that the monitor would draw."""
+
+    def __init__(self, training: Sequence[Gram]) -> None:
+        """Fit the model, and predict each training day without it."""
+        total = sum(training[1:], training[0])
+        self.model = fit(total, SIGNALS, LABEL).model
+        usual = [errors(fit(total - day, SIGNALS, LABEL).model, day) for day in training]
+        share = thresholds().monitor.false_alarms_per_day
+        self.mean = Limits.of([mean for mean, _ in usual], share)
+        self.std = Limits.above([std for _, std in usual], share)
+
+    def warns(self, day: Gram) -> bool:
+        mean, std = errors(self.model, day)
+        return self.mean.beyond(mean) or self.std.beyond(std)
+
+
+def main() -> None:
+    warehouse = Warehouse(LocalFolder(Path(sys.argv[1])))
+    table = load_cohort(warehouse, "source = 'simulated'").serving(SIGNALS).table
+    watched = [(Watch(days[:TRAINING_DAYS]), days[TRAINING_DAYS:]) for days in deals(table)]
+    warnings = [watch.warns(day) for watch, days in watched for day in days]
+    print(f"{len(table)} drives; no drift: {len(warnings)} days", end=", ")
+    print(f"{1000 * fmean(warnings):.1f} warnings per 1,000 days")
+    print("\n| bias of all cars | median days to the first warning | longest | never |")
+    print("| --- | ---: | ---: | ---: |")
+    for name, (signal, per_day) in GROWING.items():
+        step = per_day / float(input_scales()[signal])
+        first = [
+            next(
+                (
+                    number
+                    for number, day in enumerate(days, 1)
+                    if watch.warns(biased(day, signal, round(step * number)))
+                ),
+                None,
+            )
+            for watch, days in watched
+        ]
+        told = [number for number in first if number]
+        never = f"{len(first) - len(told)} of {len(first)}"
+        typical, longest = (median(told), max(told)) if told else ("-", "-")
+        print(f"| {name} | {typical} | {longest} | {never} |")
+
+
+if __name__ == "__main__":
+    main()
