@@ -90,7 +90,6 @@ def update_grams(
     set, `StorageError`, `ConflictError` if other processes keep changing the table, or
     `ClusterError`.
     """
-    warehouse.require()
     return retried(lambda: _update_once(warehouse, progress, feature_set, executor))
 
 
