@@ -5,7 +5,7 @@ import os
 import resource
 import uuid
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import TypeVar
 
@@ -16,6 +16,9 @@ from fleet_slip.folder import Folder
 
 SPILL_LIMIT = "20GB"
 """Largest size of what one connection may write to disk for a query beyond its memory."""
+
+LOOK_S = 0.1
+"""How often a waiting query looks whether Ctrl-C was pressed."""
 
 Result = TypeVar("Result")
 
@@ -75,10 +78,13 @@ def interruptible(database: duckdb.DuckDBPyConnection, work: Callable[[], Result
     with ThreadPoolExecutor(1) as pool:
         answer = pool.submit(work)
         try:
-            return answer.result()
+            # Where a library has set a handler that restarts system calls, a signal ends no wait.
+            while not wait([answer], LOOK_S).done:
+                pass
         except KeyboardInterrupt:
             database.interrupt()
             raise
+        return answer.result()
 
 
 _INTERRUPTED = "Query interrupted"

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import resource
 import signal
 import threading
 from pathlib import Path
@@ -226,7 +227,13 @@ def test_an_endless_query_can_be_interrupted(root: Path, endless: str) -> None:
 
 
 def test_one_value_cannot_take_all_memory(root: Path, run_command: RunCommand) -> None:
-    result = run_command("sql", "SELECT len(range(1000000000000))", root=root)
+    limit = 2 * 2**30
+    result = run_command(
+        "sql",
+        "SELECT len(range(2000000000))",
+        root=root,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_DATA, (limit, limit)),
+    )
     assert result.exit_code == StorageError.exit_code
     assert "Ask for less" in result.stderr
 
