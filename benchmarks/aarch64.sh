@@ -18,7 +18,7 @@ if [ ! -e "$system/usr/bin/python3.11" ]; then
 fi
 
 if [ ! -d "$packages" ]; then
-    # Versions as here. What has no wheel for AArch64 and Python 3.11 is no package that computes.
+    # Versions as here; a package without a wheel for AArch64 is named and left out.
     platforms=$(seq -f '--platform manylinux_2_%.0f_aarch64' 17 36)
     "$python" -m pip freeze --exclude-editable | while read -r package; do
         # shellcheck disable=SC2086 # many words
