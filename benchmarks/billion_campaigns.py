@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fleet_slip.campaign import Campaign, load_campaign
 from fleet_slip.resources import find_config
+from fleet_slip.simulation.campaign import Campaign, load_campaign
 
 SHIPPED = "fleet"
 FIRST_DAY = date(2024, 6, 1)

@@ -15,13 +15,13 @@ from concurrent.futures import Executor
 from pathlib import Path
 
 from benchmarks.dask_processes import dask_processes
-from fleet_slip.campaign import Campaign, load_campaign
-from fleet_slip.cluster import cluster_executor
-from fleet_slip.gram_job import update_grams
-from fleet_slip.local_folder import LocalFolder
-from fleet_slip.simulation_job import simulate_campaign
-from fleet_slip.tasks import LocalThreads
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.compute.cluster import cluster_executor
+from fleet_slip.compute.tasks import LocalThreads
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.grams.job import update_grams
+from fleet_slip.simulation.campaign import Campaign, load_campaign
+from fleet_slip.simulation.job import simulate_campaign
+from fleet_slip.warehouse.tables import Warehouse
 
 WARM_UP = "smoke"
 

@@ -33,22 +33,20 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from deltalake import DeltaTable
 
+import fleet_slip.ingest.job  # whatever a command imports late is here before the fork
+import fleet_slip.maintenance.repair
+import fleet_slip.simulation.job  # noqa: F401
 from benchmarks.crash_commands import COMMANDS, Command, prepare_inputs
-from fleet_slip import (  # whatever a command imports late is here before the fork
-    ingest_job,  # noqa: F401
-    repair,  # noqa: F401
-    simulation_job,  # noqa: F401
-)
-from fleet_slip.audit import Audit
-from fleet_slip.campaign import load_campaign
 from fleet_slip.cli.main import main as fleet_slip_main
+from fleet_slip.delta import Table
+from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.ingest.mapping import load_mapping
-from fleet_slip.local_folder import LocalFolder
-from fleet_slip.registry import Registry
-from fleet_slip.simulate import simulate_logs
-from fleet_slip.storage import Table
-from fleet_slip.verify import verify
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.maintenance.audit import Audit
+from fleet_slip.maintenance.verify import verify
+from fleet_slip.models.versions import Registry
+from fleet_slip.simulation.campaign import load_campaign
+from fleet_slip.simulation.drives import simulate_logs
+from fleet_slip.warehouse.tables import Warehouse
 
 POINTS: tuple[tuple[Any, str], ...] = (
     (pq, "write_table"),

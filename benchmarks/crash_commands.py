@@ -9,11 +9,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from fleet_slip.folder import TEMPORARY_PREFIX
-from fleet_slip.local_folder import LocalFolder
+from fleet_slip.delta.sealing import NOTE, SEAL, seal
+from fleet_slip.files.folder import TEMPORARY_PREFIX
+from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.resources import find_config
-from fleet_slip.sealing import NOTE, SEAL, seal
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.warehouse.tables import Warehouse
 
 SIMULATE = ("simulate", "{campaign}", "--threads", "1")
 INGEST = ("ingest", "{measured}", "--mapping", "{mapping}")

@@ -16,16 +16,16 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
-from fleet_slip.campaign import Campaign, load_campaign
-from fleet_slip.gram_job import update_grams
-from fleet_slip.local_folder import LocalFolder
-from fleet_slip.operations.chart import draw
-from fleet_slip.operations.monitor import Chart, monitor
-from fleet_slip.publishing import manifest_of, publish
-from fleet_slip.registry import Registry
-from fleet_slip.selection_plan import SelectionPlan, run_plan
-from fleet_slip.simulation_job import simulate_campaign
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.grams.job import update_grams
+from fleet_slip.models.publish import manifest_of, publish
+from fleet_slip.models.versions import Registry
+from fleet_slip.monitoring.chart import draw
+from fleet_slip.monitoring.monitor import Chart, monitor
+from fleet_slip.selection.request import SelectionPlan, run_plan
+from fleet_slip.simulation.campaign import Campaign, load_campaign
+from fleet_slip.simulation.job import simulate_campaign
+from fleet_slip.warehouse.tables import Warehouse
 
 NEW_DAYS = 6
 COHORT = "source = 'simulated'"

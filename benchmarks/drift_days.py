@@ -15,15 +15,15 @@ from statistics import fmean, median
 
 import numpy as np
 
-from fleet_slip.cohort import load_cohort
-from fleet_slip.features import input_scales
-from fleet_slip.gram import Gram, GramTable
-from fleet_slip.local_folder import LocalFolder
-from fleet_slip.operations.monitor import Limits
-from fleet_slip.operations.thresholds import thresholds
+from fleet_slip.catalogue.features import input_scales
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.monitoring.monitor import Limits
+from fleet_slip.monitoring.thresholds import thresholds
 from fleet_slip.regression.exact import LinearModel, fit
 from fleet_slip.regression.figures import error_sums
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.regression.gram import Gram, GramTable
+from fleet_slip.warehouse.tables import Warehouse
 
 WHEELS = ("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")
 SIGNALS = ("ax", "ay", "yaw_rate", "steering_wheel", *WHEELS)

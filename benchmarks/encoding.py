@@ -24,12 +24,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from benchmarks.pipeline import SIGNALS, prepare
-from fleet_slip.gram_job import FILES_PER_QUERY
-from fleet_slip.gram_statement import gram_statement
-from fleet_slip.local_folder import LocalFolder
-from fleet_slip.signals import catalogue
-from fleet_slip.storage.encoding import ROW_GROUP_ROWS, WRITE_BATCH_ROWS
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.delta.encoding import ROW_GROUP_ROWS, WRITE_BATCH_ROWS
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.grams.job import FILES_PER_QUERY
+from fleet_slip.grams.statement import gram_statement
+from fleet_slip.warehouse.tables import Warehouse
 
 ROUNDS = 3
 FILE_ROWS = 2**19

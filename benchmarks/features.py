@@ -13,18 +13,18 @@ from pathlib import Path
 
 import numpy as np
 
-from fleet_slip.cohort import TRAINING_DRIVES, Cohort, load_cohort
-from fleet_slip.features import features, input_scales
-from fleet_slip.gram import Gram
-from fleet_slip.gram_job import update_grams
-from fleet_slip.local_folder import LocalFolder
-from fleet_slip.regime_comparison import regime_names
+from fleet_slip.catalogue.features import features, input_scales
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.grams.cohort import TRAINING_DRIVES, Cohort, load_cohort
+from fleet_slip.grams.job import update_grams
 from fleet_slip.regression.crossval import held_out
 from fleet_slip.regression.exact import fit
 from fleet_slip.regression.figures import Figures
 from fleet_slip.regression.folds import CohortFolds, by_hash
-from fleet_slip.signals import catalogue
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.regression.gram import Gram
+from fleet_slip.selection.regimes import regime_names
+from fleet_slip.warehouse.tables import Warehouse
 
 FOLDS = 5
 LABEL = catalogue().label

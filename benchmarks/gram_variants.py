@@ -16,10 +16,10 @@ from pathlib import Path
 import duckdb
 
 from benchmarks.pipeline import SIGNALS, prepare
-from fleet_slip.gram_statement import LOGS, gram_statement
-from fleet_slip.local_folder import LocalFolder
-from fleet_slip.signals import catalogue
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.grams.statement import LOGS, gram_statement
+from fleet_slip.warehouse.tables import Warehouse
 
 ROUNDS = 7
 PAIRS = [(a, b) for i, a in enumerate(SIGNALS) for b in SIGNALS[: i + 1]]

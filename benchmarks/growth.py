@@ -24,9 +24,9 @@ from benchmarks.billion import PROGRAM
 from benchmarks.billion_campaigns import Sized, write
 from benchmarks.documents import insert
 from benchmarks.usage import Usage, measured
-from fleet_slip.campaign import load_campaign
-from fleet_slip.local_folder import LocalFolder
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.simulation.campaign import load_campaign
+from fleet_slip.warehouse.tables import Warehouse
 
 MODEL = "growth"
 BASE_FILES = 10

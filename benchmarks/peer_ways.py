@@ -22,8 +22,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from fleet_slip.model_list import load_model_list
-from fleet_slip.signals import catalogue
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.selection.model_list import load_model_list
 
 INPUTS = list(load_model_list("table1").model[-1].signals)
 LABEL = catalogue().label
@@ -58,10 +58,10 @@ def _read(paths: list[str]) -> NDArray[np.float64]:
 
 
 def fleet_slip(threads: int) -> Fit:
-    from fleet_slip.gram import Gram  # noqa: PLC0415
-    from fleet_slip.gram_job import FILES_PER_QUERY  # noqa: PLC0415
-    from fleet_slip.gram_statement import gram_statement  # noqa: PLC0415
+    from fleet_slip.grams.job import FILES_PER_QUERY  # noqa: PLC0415
+    from fleet_slip.grams.statement import gram_statement  # noqa: PLC0415
     from fleet_slip.regression.exact import fit  # noqa: PLC0415
+    from fleet_slip.regression.gram import Gram  # noqa: PLC0415
 
     statement = gram_statement(catalogue(), whole=True)
 

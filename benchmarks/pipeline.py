@@ -20,17 +20,17 @@ import duckdb
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from fleet_slip.campaign import load_campaign
-from fleet_slip.cohort import load_cohort
-from fleet_slip.gram_job import update_grams
-from fleet_slip.gram_statement import gram_statement
-from fleet_slip.local_folder import LocalFolder
-from fleet_slip.model_list import load_model_list
-from fleet_slip.selection import select
-from fleet_slip.signals import catalogue
-from fleet_slip.simulation_job import simulate_campaign
-from fleet_slip.storage import Change
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.delta import Change
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.statement import gram_statement
+from fleet_slip.selection.compare import select
+from fleet_slip.selection.model_list import load_model_list
+from fleet_slip.simulation.campaign import load_campaign
+from fleet_slip.simulation.job import simulate_campaign
+from fleet_slip.warehouse.tables import Warehouse
 
 ROUNDS = 5
 MODELS = load_model_list("table1")

@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.cohort import Cohort, load_cohort
-from fleet_slip.connection import connect
-from fleet_slip.gram import Gram, GramTable
-from fleet_slip.local_folder import LocalFolder
-from fleet_slip.operations.quality import QualityReport, examine
-from fleet_slip.signals import COUNT_MAX, catalogue
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.catalogue.signals import COUNT_MAX, catalogue
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.grams.cohort import Cohort, load_cohort
+from fleet_slip.monitoring.quality import QualityReport, examine
+from fleet_slip.regression.gram import Gram, GramTable
+from fleet_slip.views import connect
+from fleet_slip.warehouse.tables import Warehouse
 
 Counts = NDArray[np.float64]
 Change = Callable[[Counts, np.random.Generator], Counts]

@@ -15,15 +15,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from fleet_slip.cohort import load_cohort
-from fleet_slip.gram_reader import GramReader
-from fleet_slip.local_folder import LocalFolder
-from fleet_slip.model_list import load_model_list
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.fold_sums import sum_cohort
+from fleet_slip.grams.reader import GramReader
 from fleet_slip.regression.exact import fit
-from fleet_slip.selection_plan import SelectionPlan, run_plan
-from fleet_slip.signals import catalogue
-from fleet_slip.summed_cohort import sum_cohort
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.selection.model_list import load_model_list
+from fleet_slip.selection.request import SelectionPlan, run_plan
+from fleet_slip.warehouse.tables import Warehouse
 
 ROUNDS = 7
 MODELS = load_model_list("table1")

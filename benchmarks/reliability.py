@@ -24,18 +24,18 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from fleet_slip.audit import Subject
-from fleet_slip.campaign import load_campaign
-from fleet_slip.compaction import compact
-from fleet_slip.forget import forget
-from fleet_slip.gram_job import update_grams
-from fleet_slip.local_folder import LocalFolder
-from fleet_slip.signals import catalogue
-from fleet_slip.simulation_job import simulate_campaign
-from fleet_slip.storage import Change, Table, Unit, retried
-from fleet_slip.vacuum import vacuum
-from fleet_slip.verify import problem_of, verify
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.delta import Change, Table, Unit, retried
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.grams.job import update_grams
+from fleet_slip.maintenance.audit import Subject
+from fleet_slip.maintenance.compaction import compact
+from fleet_slip.maintenance.forget import forget
+from fleet_slip.maintenance.vacuum import vacuum
+from fleet_slip.maintenance.verify import problem_of, verify
+from fleet_slip.simulation.campaign import load_campaign
+from fleet_slip.simulation.job import simulate_campaign
+from fleet_slip.warehouse.tables import Warehouse
 
 DAY = date(2024, 5, 1)
 ROWS = 20

@@ -16,12 +16,12 @@ import numpy as np
 import pyarrow as pa
 
 from benchmarks.statistics import Fleet, simulate
-from fleet_slip.gram import IntArray
-from fleet_slip.local_folder import LocalFolder
-from fleet_slip.selection_plan import SelectionPlan, run_plan
-from fleet_slip.signals import catalogue
-from fleet_slip.storage import Change
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.delta import Change
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.regression.gram import IntArray
+from fleet_slip.selection.request import SelectionPlan, run_plan
+from fleet_slip.warehouse.tables import Warehouse
 
 DRIVES_PER_FILE = 500
 

@@ -24,15 +24,15 @@ import numba
 import numpy as np
 import pyarrow as pa
 
-from fleet_slip.campaign import Batch, load_campaign
-from fleet_slip.local_folder import LocalFolder
-from fleet_slip.sensors import Recorder
-from fleet_slip.signals import catalogue
-from fleet_slip.simulate import lane_drive, simulate_logs, tabulate
-from fleet_slip.storage import Change, checksum_of
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.delta import Change, checksum_of
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.simulation.campaign import Batch, load_campaign
+from fleet_slip.simulation.drives import lane_drive, simulate_logs, tabulate
+from fleet_slip.simulation.sensors import Recorder
 from fleet_slip.vehicle import kernel
 from fleet_slip.vehicle.lanes import LaneDrive, simulate_blocks, simulate_drives
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.warehouse.tables import Warehouse
 
 ROUNDS = 5
 DAY = date(2024, 6, 1)

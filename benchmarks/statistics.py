@@ -17,12 +17,18 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.linear_model import LinearRegression
 
-from fleet_slip.gram import GramTable
 from fleet_slip.regression.crossval import cross_validate_inputs
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.exact import correlation_matrix, fit
 from fleet_slip.regression.folds import CohortFolds, by_hash
+from fleet_slip.regression.gram import GramTable
 from fleet_slip.regression.inference import cluster
+from fleet_slip.regression.nested_choice import (
+    Rule,
+    Training,
+    cross_validate_selection,
+    select_nested,
+)
 from fleet_slip.regression.ranking import RANKINGS, rank
 from fleet_slip.regression.resampling import (
     bootstrap_coefficients,
@@ -30,7 +36,6 @@ from fleet_slip.regression.resampling import (
     held_out_products,
     repeated_cross_validation,
 )
-from fleet_slip.regression.selection import Rule, Training, cross_validate_selection, select_nested
 from fleet_slip.regression.subsets import all_rss, best_subsets
 from fleet_slip.regression.winner import choose
 

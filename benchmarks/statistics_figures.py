@@ -11,17 +11,25 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
-from fleet_slip.cohort import load_cohort
-from fleet_slip.gram import IntArray
-from fleet_slip.local_folder import LocalFolder
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.regression.criteria import CRITERIA, criterion_values
 from fleet_slip.regression.disturbance import disturbed
 from fleet_slip.regression.drives import DriveMoments, serving_drives
 from fleet_slip.regression.evidence import Evidence
 from fleet_slip.regression.exact import correlation_matrix, fit
 from fleet_slip.regression.folds import CohortFolds, by_hash
+from fleet_slip.regression.gram import IntArray
 from fleet_slip.regression.inference import classical, cluster
 from fleet_slip.regression.nested import nested_fits
+from fleet_slip.regression.nested_choice import (
+    CROSS_VALIDATION,
+    Rule,
+    Training,
+    cross_validate_nested,
+    cross_validate_selection,
+)
 from fleet_slip.regression.ranking import RANKINGS, rank
 from fleet_slip.regression.resampling import (
     bootstrap_correlations,
@@ -29,16 +37,8 @@ from fleet_slip.regression.resampling import (
     percentile_interval,
     repeated_cross_validation,
 )
-from fleet_slip.regression.selection import (
-    CROSS_VALIDATION,
-    Rule,
-    Training,
-    cross_validate_nested,
-    cross_validate_selection,
-)
 from fleet_slip.regression.subsets import all_rss, best_subsets, choices, subset_sizes
-from fleet_slip.signals import catalogue
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.warehouse.tables import Warehouse
 
 IMAGES = Path(__file__).parents[1] / "docs" / "images"
 SIGNALS = catalogue()

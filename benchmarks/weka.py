@@ -25,9 +25,9 @@ import pyarrow.parquet as pq
 from benchmarks.peer_ways import COLUMNS, INPUTS
 from benchmarks.peers import digits, exact_model, in_process
 from benchmarks.pipeline import prepare
-from fleet_slip.local_folder import LocalFolder
+from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.regression.exact import LinearModel
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.warehouse.tables import Warehouse
 
 JAR = Path("/usr/share/java/weka.jar")
 

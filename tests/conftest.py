@@ -15,11 +15,11 @@ import pyarrow as pa
 import pytest
 from hypothesis import HealthCheck, settings
 
-from fleet_slip.folder import Folder
-from fleet_slip.local_folder import LocalFolder
-from fleet_slip.signals import catalogue
-from fleet_slip.storage import Change, Unit
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.delta import Change, Unit
+from fleet_slip.files.folder import Folder
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.warehouse.tables import Warehouse
 
 COMMAND = str(Path(sys.executable).with_name("fleet-slip"))
 DAY = date(2024, 5, 1)

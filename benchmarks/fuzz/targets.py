@@ -22,31 +22,31 @@ import pyarrow as pa
 
 from benchmarks.fuzz.files import MAPPINGS, csv_file, parquet_file
 from benchmarks.fuzz.mutate import WORDS, mutate_bytes, mutate_tree, to_json, to_toml
-from fleet_slip.campaign import load_campaign
-from fleet_slip.cohort import load_cohort
-from fleet_slip.connection import connect
-from fleet_slip.data_root import data_root
-from fleet_slip.documents import checksum
+from fleet_slip.catalogue.features import load_features
+from fleet_slip.catalogue.signals import catalogue, load_catalogue
+from fleet_slip.delta import Change, Unit
 from fleet_slip.errors import FleetSlipError
-from fleet_slip.features import load_features
-from fleet_slip.gram_job import update_grams
+from fleet_slip.files.data_root import data_root
+from fleet_slip.files.documents import checksum
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.job import update_grams
+from fleet_slip.ingest.job import ingest_file
 from fleet_slip.ingest.mapping import Mapping, load_mapping
-from fleet_slip.ingest_job import ingest_file
-from fleet_slip.local_folder import LocalFolder
-from fleet_slip.manifest import check_model_name
-from fleet_slip.model_list import FoldKey, load_model_list
-from fleet_slip.reading_query import one_query
-from fleet_slip.registry import Registry
+from fleet_slip.maintenance.retention import load_retention
+from fleet_slip.models.manifest import check_model_name
+from fleet_slip.models.score import score
+from fleet_slip.models.versions import Registry
 from fleet_slip.resources import find_config, folder
-from fleet_slip.retention import load_retention
-from fleet_slip.scenario import load_scenario
-from fleet_slip.score import score
-from fleet_slip.selection_plan import SelectionPlan, run_plan
-from fleet_slip.signals import catalogue, load_catalogue
-from fleet_slip.storage import Change, Unit
-from fleet_slip.track import load_track
+from fleet_slip.selection.model_list import FoldKey, load_model_list
+from fleet_slip.selection.request import SelectionPlan, run_plan
+from fleet_slip.simulation.campaign import load_campaign
+from fleet_slip.simulation.scenario import load_scenario
+from fleet_slip.simulation.track import load_track
 from fleet_slip.vehicle.parameters import load_vehicle
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.views import connect
+from fleet_slip.warehouse.read_only_sql import one_query
+from fleet_slip.warehouse.tables import Warehouse
 
 Target = Callable[[random.Random, Path], None]
 """Takes the source of all choices, and an empty folder: all that may be written is below it."""

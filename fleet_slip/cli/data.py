@@ -8,21 +8,21 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.cli.output import Json, print_json, print_table, progress, say
 from fleet_slip.cli.recorded import recorded
 from fleet_slip.cli.workers import Cluster, Threads, elsewhere, workers
 from fleet_slip.errors import ConfigError
-from fleet_slip.features import PLAIN, features
-from fleet_slip.gram_check import check_grams
-from fleet_slip.gram_job import GramReport, update_grams
-from fleet_slip.gram_statement import gram_statement
-from fleet_slip.operations.run_log import step
-from fleet_slip.signals import catalogue
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.grams.check import check_grams
+from fleet_slip.grams.job import GramReport, update_grams
+from fleet_slip.grams.statement import gram_statement
+from fleet_slip.runs.log import step
+from fleet_slip.warehouse.tables import Warehouse
 
 if TYPE_CHECKING:
-    from fleet_slip.campaign import Campaign
-    from fleet_slip.simulation_job import SimulationReport
+    from fleet_slip.simulation.campaign import Campaign
+    from fleet_slip.simulation.job import SimulationReport
 
 ALL_SETS = "all"
 """Instead of the name of a feature set: every one."""
@@ -70,7 +70,7 @@ def run_simulation(
     warehouse: Warehouse, campaign: "Campaign", days: tuple[date, ...], executor: Executor
 ) -> "SimulationReport":
     """Simulate with a progress bar."""
-    from fleet_slip.simulation_job import simulate_campaign  # noqa: PLC0415 - the simulator
+    from fleet_slip.simulation.job import simulate_campaign  # noqa: PLC0415 - the simulator
 
     with (
         step("simulate") as figures,
@@ -100,7 +100,7 @@ def simulate(
     json: Json = False,
 ) -> None:
     """Simulate what is missing of a campaign and write it to the logs."""
-    from fleet_slip.campaign import load_campaign  # noqa: PLC0415 - takes a while
+    from fleet_slip.simulation.campaign import load_campaign  # noqa: PLC0415 - takes a while
 
     plan = load_campaign(campaign)
     chosen = chosen_days(plan, days, through)
@@ -149,8 +149,8 @@ def ingest(
 
     Rows that cannot be used go to the quarantine with a reason: fleet-slip sql "FROM quarantine"
     """
+    from fleet_slip.ingest.job import ingest_files  # noqa: PLC0415
     from fleet_slip.ingest.mapping import load_mapping  # noqa: PLC0415 - Polars takes a while
-    from fleet_slip.ingest_job import ingest_files  # noqa: PLC0415
 
     plan = load_mapping(mapping)
     reports = {}

@@ -4,15 +4,15 @@ from typing import Annotated
 
 import typer
 
+from fleet_slip.catalogue.features import features
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.cli.output import Json, print_json, print_table, say, stdout
 from fleet_slip.cli.selecting import Cohort
 from fleet_slip.cli.subject import FeatureSetOption, Model, Signals, quantities, subject_of
-from fleet_slip.cohort import TRAINING_DRIVES, load_cohort
-from fleet_slip.diagnostics import Comparison, Diagnosis
-from fleet_slip.diagnostics import diagnose as diagnose_fit
-from fleet_slip.features import features
+from fleet_slip.grams.cohort import TRAINING_DRIVES, load_cohort
 from fleet_slip.regression.inference import INTERCEPT, Estimate
-from fleet_slip.signals import catalogue
+from fleet_slip.selection.diagnostics import Comparison, Diagnosis
+from fleet_slip.selection.diagnostics import diagnose as diagnose_fit
 
 
 def register(app: typer.Typer) -> None:

@@ -13,9 +13,9 @@ from fleet_slip.cli.recorded import recorded
 from fleet_slip.cli.run import DEFAULT_CAMPAIGN
 from fleet_slip.cli.selecting import Cohort
 from fleet_slip.cli.workers import Threads
-from fleet_slip.cohort import ALL_DRIVES
-from fleet_slip.score import score as score_rows
-from fleet_slip.score import score_statement
+from fleet_slip.grams.cohort import ALL_DRIVES
+from fleet_slip.models.score import score as score_rows
+from fleet_slip.models.score import score_statement
 
 OneCar = Annotated[
     str,
@@ -91,7 +91,7 @@ def evaluate(
     from fleet_slip.evaluation.evaluate import evaluate as evaluate_models  # noqa: PLC0415
     from fleet_slip.evaluation.results import keep  # noqa: PLC0415
     from fleet_slip.evaluation.runs import simulate_scenarios  # noqa: PLC0415
-    from fleet_slip.scenario import load_scenario, shipped_scenarios  # noqa: PLC0415
+    from fleet_slip.simulation.scenario import load_scenario, shipped_scenarios  # noqa: PLC0415
 
     scenarios = tuple(map(load_scenario, scenario)) if scenario else shipped_scenarios()
     versions = [registry_of(context.obj).resolve(name) for name in (one_car, *(fleet or ()))]

@@ -10,7 +10,7 @@ from typing import Any
 from rich.console import Console
 
 from fleet_slip.errors import printable
-from fleet_slip.operations.run_log import LOGGER, current_run_id
+from fleet_slip.runs.log import LOGGER, current_run_id
 
 LOG_VARIABLE = "FLEET_SLIP_LOG"
 

@@ -10,8 +10,8 @@ import typer
 from fleet_slip.cli.commands import MARKUP, CommandGroup
 from fleet_slip.cli.logs import LOG_VARIABLE, LogFormat, configure_logs
 from fleet_slip.cli.output import say
-from fleet_slip.data_root import ROOT_VARIABLE, data_root
 from fleet_slip.errors import FleetSlipError
+from fleet_slip.files.data_root import ROOT_VARIABLE, data_root
 
 INTERRUPTED = 130
 
@@ -65,7 +65,7 @@ def options(
 
     Start with: **fleet-slip run --campaign smoke**
     """
-    from fleet_slip.warehouse import Warehouse  # noqa: PLC0415 - pyarrow and Delta, not for --help
+    from fleet_slip.warehouse.tables import Warehouse  # noqa: PLC0415 - pyarrow and Delta, not for --help
 
     configure_logs(log)
     context.obj = Warehouse(data_root(root))

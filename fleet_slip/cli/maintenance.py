@@ -7,23 +7,23 @@ from typing import Annotated, Any
 
 import typer
 
-from fleet_slip.audit import Subject
 from fleet_slip.cli.output import Json, print_json, print_table, progress, say
 from fleet_slip.cli.recorded import recorded
 from fleet_slip.cli.workers import Cluster, elsewhere, workers
-from fleet_slip.compaction import TARGET_ROWS
-from fleet_slip.compaction import compact as compact_logs
 from fleet_slip.errors import DamageError
-from fleet_slip.forget import ForgetReport
-from fleet_slip.forget import forget as forget_drives
-from fleet_slip.operations.run_log import step
-from fleet_slip.retention import load_retention
-from fleet_slip.retention import retain as apply_retention
-from fleet_slip.vacuum import RETENTION_HOURS, VacuumReport
-from fleet_slip.vacuum import vacuum as remove_expired
-from fleet_slip.verify import Finding, Verification
-from fleet_slip.verify import verify as verify_root
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.maintenance.audit import Subject
+from fleet_slip.maintenance.compaction import TARGET_ROWS
+from fleet_slip.maintenance.compaction import compact as compact_logs
+from fleet_slip.maintenance.forget import ForgetReport
+from fleet_slip.maintenance.forget import forget as forget_drives
+from fleet_slip.maintenance.retention import load_retention
+from fleet_slip.maintenance.retention import retain as apply_retention
+from fleet_slip.maintenance.vacuum import RETENTION_HOURS, VacuumReport
+from fleet_slip.maintenance.vacuum import vacuum as remove_expired
+from fleet_slip.maintenance.verify import Finding, Verification
+from fleet_slip.maintenance.verify import verify as verify_root
+from fleet_slip.runs.log import step
+from fleet_slip.warehouse.tables import Warehouse
 
 
 def register(app: typer.Typer) -> None:
@@ -58,7 +58,7 @@ def verify(
         report = _verify(warehouse, executor, full=full)
         rebuilt: list[str] = []
         if repair:
-            from fleet_slip.repair import repair as rebuild  # noqa: PLC0415 - the simulator
+            from fleet_slip.maintenance.repair import repair as rebuild  # noqa: PLC0415 - the simulator
 
             rebuilt = rebuild(warehouse, report, campaign or ())
             report = _verify(warehouse, executor, full=full)

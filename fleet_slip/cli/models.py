@@ -5,14 +5,14 @@ from typing import Annotated
 
 import typer
 
-from fleet_slip.aliases import CHAMPION
-from fleet_slip.audit import Audit
 from fleet_slip.cli.output import Json, print_json, print_table, say
 from fleet_slip.cli.recorded import recorded
 from fleet_slip.cli.signing import signing_key
-from fleet_slip.manifest import check_model_name
-from fleet_slip.registry import ModelVersion, Registry
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.maintenance.audit import Audit
+from fleet_slip.models.aliases import CHAMPION
+from fleet_slip.models.manifest import check_model_name
+from fleet_slip.models.versions import ModelVersion, Registry
+from fleet_slip.warehouse.tables import Warehouse
 
 Reference = Annotated[
     str, typer.Argument(help="NAME, NAME@VERSION or NAME@ALIAS. NAME alone is its champion.")

@@ -11,13 +11,13 @@ from fleet_slip.cli.models import Reference, registry_of
 from fleet_slip.cli.output import Json, print_json, print_table, progress, say
 from fleet_slip.cli.recorded import recorded
 from fleet_slip.cli.run import DEFAULT_CAMPAIGN
-from fleet_slip.cohort import TRAINING_DRIVES
 from fleet_slip.errors import AlarmError, ConfigError
-from fleet_slip.migration import migrate as migrate_logs
-from fleet_slip.operations.monitor import Chart
-from fleet_slip.operations.monitor import monitor as chart_errors
-from fleet_slip.operations.quality import QualityReport, examine_drives
-from fleet_slip.operations.run_log import step
+from fleet_slip.grams.cohort import TRAINING_DRIVES
+from fleet_slip.maintenance.migration import migrate as migrate_logs
+from fleet_slip.monitoring.monitor import Chart
+from fleet_slip.monitoring.monitor import monitor as chart_errors
+from fleet_slip.monitoring.quality import QualityReport, examine_drives
+from fleet_slip.runs.log import step
 
 
 def register(app: typer.Typer) -> None:
@@ -95,7 +95,7 @@ def monitor(
     version = registry_of(context.obj).resolve(reference)
     chart = chart_errors(context.obj, version, cohort, _first_new_day(since))
     if plot:
-        from fleet_slip.operations.chart import draw  # noqa: PLC0415 - an optional dependency
+        from fleet_slip.monitoring.chart import draw  # noqa: PLC0415 - an optional dependency
 
         draw(chart, plot)
     if json:

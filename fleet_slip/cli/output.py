@@ -28,7 +28,7 @@ from rich.text import Text
 
 from fleet_slip.cli.logs import for_people, stderr
 from fleet_slip.errors import printable
-from fleet_slip.operations.run_log import LOGGER, log_event
+from fleet_slip.runs.log import LOGGER, log_event
 
 TOLD_EVERY_S = 30.0
 """How often the log tells the progress of a job."""

@@ -21,12 +21,12 @@ from fleet_slip.cli.selecting import (
     print_selection,
 )
 from fleet_slip.cli.signing import SignKey
-from fleet_slip.cohort import TRAINING_DRIVES
-from fleet_slip.manifest import check_model_name
-from fleet_slip.operations.run_log import step
-from fleet_slip.publishing import Publication, manifest_of
-from fleet_slip.publishing import publish as publish_selection
-from fleet_slip.selection_plan import SelectionPlan, run_plan
+from fleet_slip.grams.cohort import TRAINING_DRIVES
+from fleet_slip.models.manifest import check_model_name
+from fleet_slip.models.publish import Publication, manifest_of
+from fleet_slip.models.publish import publish as publish_selection
+from fleet_slip.runs.log import step
+from fleet_slip.selection.request import SelectionPlan, run_plan
 
 
 def register(app: typer.Typer) -> None:

@@ -13,10 +13,10 @@ import typer
 from pyarrow.csv import write_csv
 
 from fleet_slip.cli.output import Json, print_json, say
-from fleet_slip.connection import connect
-from fleet_slip.database import database_errors, interruptible, limit_memory
 from fleet_slip.errors import FleetSlipError, SelectionError
-from fleet_slip.reading_query import one_query
+from fleet_slip.views import connect
+from fleet_slip.warehouse.database import database_errors, interruptible, limit_memory
+from fleet_slip.warehouse.read_only_sql import one_query
 
 ROWS_SHOWN = 40
 

@@ -7,7 +7,7 @@ from typing import ParamSpec, TypeVar, cast
 
 import typer
 
-from fleet_slip.operations.run_log import recording
+from fleet_slip.runs.log import recording
 
 P = ParamSpec("P")
 R = TypeVar("R")

@@ -9,7 +9,7 @@ import typer
 from fleet_slip.cli.models import registry_of
 from fleet_slip.cli.output import Json, print_json, say
 from fleet_slip.cli.run import DEFAULT_CAMPAIGN
-from fleet_slip.local_folder import LocalFolder
+from fleet_slip.files.local_folder import LocalFolder
 
 
 def register(app: typer.Typer) -> None:

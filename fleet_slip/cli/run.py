@@ -6,7 +6,6 @@ from typing import Annotated, Any
 
 import typer
 
-from fleet_slip.audit import Audit
 from fleet_slip.cli.data import Days, Through, chosen_days, run_gram, run_simulation
 from fleet_slip.cli.models import registry_of
 from fleet_slip.cli.output import Json, print_json, say
@@ -15,11 +14,12 @@ from fleet_slip.cli.recorded import recorded
 from fleet_slip.cli.selecting import print_selection
 from fleet_slip.cli.workers import Cluster, Threads, workers
 from fleet_slip.errors import RefusedError
-from fleet_slip.manifest import check_model_name
-from fleet_slip.operations.run_log import step
-from fleet_slip.publishing import Publication, manifest_of, publish
-from fleet_slip.selection import Selection
-from fleet_slip.selection_plan import PlannedSelection, SelectionPlan, run_plan
+from fleet_slip.maintenance.audit import Audit
+from fleet_slip.models.manifest import check_model_name
+from fleet_slip.models.publish import Publication, manifest_of, publish
+from fleet_slip.runs.log import step
+from fleet_slip.selection.compare import Selection
+from fleet_slip.selection.request import PlannedSelection, SelectionPlan, run_plan
 
 DEFAULT_CAMPAIGN = "waterford"
 
@@ -53,7 +53,7 @@ def run(
     second run of the campaign at the same time waits for the first. A nightly run appends the next
     day with --through today.
     """
-    from fleet_slip.campaign import load_campaign  # noqa: PLC0415 - the simulator takes a while
+    from fleet_slip.simulation.campaign import load_campaign  # noqa: PLC0415 - the simulator takes a while
 
     started = time.monotonic()
     plan = load_campaign(campaign)

@@ -6,16 +6,16 @@ from typing import Annotated, Any
 import typer
 
 from fleet_slip.cli.output import Json, print_json, print_table, say, stdout
-from fleet_slip.cohort import ROW_FOLDS, TRAINING_DRIVES
-from fleet_slip.model_list import FoldKey
-from fleet_slip.ordered_selection import OrderedChoice
+from fleet_slip.grams.cohort import ROW_FOLDS, TRAINING_DRIVES
 from fleet_slip.regression.criteria import CRITERIA
 from fleet_slip.regression.crossval import CrossValidation
+from fleet_slip.regression.nested_choice import CROSS_VALIDATION
 from fleet_slip.regression.ranking import RANKINGS
-from fleet_slip.regression.selection import CROSS_VALIDATION
-from fleet_slip.selection import Selection
-from fleet_slip.selection_plan import DEFAULT_MODELS, SelectionPlan, run_plan
-from fleet_slip.uncertainty import Uncertainty
+from fleet_slip.selection.compare import Selection
+from fleet_slip.selection.model_list import FoldKey
+from fleet_slip.selection.request import DEFAULT_MODELS, SelectionPlan, run_plan
+from fleet_slip.selection.search import OrderedChoice
+from fleet_slip.selection.uncertainty import Uncertainty
 
 Cohort = Annotated[
     str,

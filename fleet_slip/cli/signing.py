@@ -8,8 +8,8 @@ import typer
 
 from fleet_slip.cli.output import say
 from fleet_slip.errors import ConfigError
-from fleet_slip.registry import Registry
-from fleet_slip.signing import SIGNING_VARIABLE, VERIFY_VARIABLE, make_keys
+from fleet_slip.models.signing import SIGNING_VARIABLE, VERIFY_VARIABLE, make_keys
+from fleet_slip.models.versions import Registry
 
 SignKey = Annotated[
     Path | None,

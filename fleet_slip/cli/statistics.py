@@ -4,21 +4,21 @@ from typing import Annotated
 
 import typer
 
+from fleet_slip.catalogue.features import PLAIN, FeatureSet, features
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.cli.output import Json, print_json, print_table, stdout
 from fleet_slip.cli.selecting import Cohort, FoldCount, Naive
 from fleet_slip.cli.subject import FeatureSetOption, Model, Signals, quantities, subject_of
-from fleet_slip.cohort import TRAINING_DRIVES, load_cohort
 from fleet_slip.errors import ConfigError
-from fleet_slip.features import PLAIN, FeatureSet, features
-from fleet_slip.model_list import FoldKey, FoldPlan
-from fleet_slip.regime_comparison import RegimeComparison, compare_regimes
+from fleet_slip.grams.cohort import TRAINING_DRIVES, load_cohort
 from fleet_slip.regression.exact import fit
 from fleet_slip.regression.figures import Figures
 from fleet_slip.regression.inference import INTERCEPT
-from fleet_slip.selection_plan import WHOLE_SET, inputs_of
-from fleet_slip.shrinkage import compare_shrinkage
-from fleet_slip.signals import catalogue
-from fleet_slip.what_if import WhatIf, counts_model, what_if
+from fleet_slip.selection.model_list import FoldKey, FoldPlan
+from fleet_slip.selection.regimes import RegimeComparison, compare_regimes
+from fleet_slip.selection.request import WHOLE_SET, inputs_of
+from fleet_slip.selection.shrinkage import compare_shrinkage
+from fleet_slip.selection.what_if import WhatIf, counts_model, what_if
 
 By = Annotated[FoldKey, typer.Option(help="What a fold is made of.")]
 

@@ -6,7 +6,7 @@ import typer
 
 from fleet_slip.cli.output import Json, print_json, print_table
 from fleet_slip.errors import AlarmError
-from fleet_slip.operations.status import Status, status_of
+from fleet_slip.monitoring.status import Status, status_of
 
 
 def register(app: typer.Typer) -> None:

@@ -6,13 +6,13 @@ from typing import Annotated
 
 import typer
 
+from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.cli.models import registry_of
-from fleet_slip.cohort import load_cohort
 from fleet_slip.errors import ConfigError, SelectionError
-from fleet_slip.features import PLAIN, features
-from fleet_slip.registry import ModelVersion, Registry
-from fleet_slip.selection_plan import WHOLE_SET, inputs_of
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.models.versions import ModelVersion, Registry
+from fleet_slip.selection.request import WHOLE_SET, inputs_of
+from fleet_slip.warehouse.tables import Warehouse
 
 Model = Annotated[
     str | None,

@@ -8,10 +8,10 @@ from typing import Annotated
 
 import typer
 
+from fleet_slip.compute.tasks import LocalThreads
 from fleet_slip.errors import ConfigError
-from fleet_slip.local_folder import LocalFolder
-from fleet_slip.tasks import LocalThreads
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.warehouse.tables import Warehouse
 
 CLUSTER_VARIABLE = "DASK_SCHEDULER_ADDRESS"
 
@@ -48,7 +48,7 @@ def workers(
             yield warehouse, executor
         return
     try:
-        from fleet_slip.cluster import cluster_executor  # noqa: PLC0415 - an extra, and slow
+        from fleet_slip.compute.cluster import cluster_executor  # noqa: PLC0415 - an extra, and slow
     except ModuleNotFoundError as error:
         raise ConfigError(
             f"--cluster needs the package {error.name}: pip install 'fleet-slip[cluster]'"

@@ -9,15 +9,15 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from fleet_slip.cohort import SCENARIO
-from fleet_slip.connection import connect
-from fleet_slip.database import database_errors
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import SelectionError
+from fleet_slip.grams.cohort import SCENARIO
 from fleet_slip.resources import read_sql
-from fleet_slip.scenario import Failure, Scenario
-from fleet_slip.sensors import GPS_SIGNALS
-from fleet_slip.signals import catalogue
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.simulation.scenario import Failure, Scenario
+from fleet_slip.simulation.sensors import GPS_SIGNALS
+from fleet_slip.views import connect
+from fleet_slip.warehouse.database import database_errors
+from fleet_slip.warehouse.tables import Warehouse
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

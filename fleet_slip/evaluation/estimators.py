@@ -6,16 +6,16 @@ from typing import Any
 
 import numpy as np
 
-from fleet_slip.cohort import load_cohort
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import SelectionError
 from fleet_slip.evaluation.drives import FloatArray
-from fleet_slip.manifest import Manifest
-from fleet_slip.model_list import load_model_list
-from fleet_slip.registry import ModelVersion
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.models.manifest import Manifest
+from fleet_slip.models.versions import ModelVersion
 from fleet_slip.regression.exact import LinearModel
-from fleet_slip.selection import Selection, select
-from fleet_slip.signals import catalogue
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.selection.compare import Selection, select
+from fleet_slip.selection.model_list import load_model_list
+from fleet_slip.warehouse.tables import Warehouse
 
 Signals = Mapping[str, FloatArray]
 """One drive at 100 Hz: an array of shape (ticks,) for each SI column; NaN where null."""

@@ -11,9 +11,9 @@ from fleet_slip.evaluation.filters import filter_bank
 from fleet_slip.evaluation.results import document
 from fleet_slip.evaluation.runs import Run, run_all
 from fleet_slip.evaluation.targets import Check, checks, filter_checks
-from fleet_slip.registry import ModelVersion
-from fleet_slip.scenario import Scenario, load_scenario
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.models.versions import ModelVersion
+from fleet_slip.simulation.scenario import Scenario, load_scenario
+from fleet_slip.warehouse.tables import Warehouse
 
 if TYPE_CHECKING:
     from fleet_slip.rivals.compare import Rival

@@ -13,17 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from fleet_slip.cohort import Cohort
 from fleet_slip.config import Config
-from fleet_slip.connection import connect
-from fleet_slip.documents import DocumentFolder
 from fleet_slip.evaluation.drives import FloatArray
 from fleet_slip.evaluation.estimators import Estimate, Signals
+from fleet_slip.files.documents import DocumentFolder
+from fleet_slip.grams.cohort import Cohort
 from fleet_slip.observers import ekf, kalman, luenberger, sliding_mode
 from fleet_slip.observers.signals import DriveSignals, LabelledDrive, read_drive
 from fleet_slip.observers.tuning import tune
 from fleet_slip.vehicle.parameters import VehicleParameters
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.views import connect
+from fleet_slip.warehouse.tables import Warehouse
 
 GROUP = "filters and observers"
 TUNING_DRIVES = 4

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from fleet_slip.documents import Document, DocumentFolder, checksum
 from fleet_slip.evaluation.drives import Drive
 from fleet_slip.evaluation.runs import Result, Run, Section
 from fleet_slip.evaluation.stability import rear_compliance, stretches
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.files.documents import Document, DocumentFolder, checksum
+from fleet_slip.warehouse.tables import Warehouse
 
 FORMAT = 1
 

@@ -11,11 +11,11 @@ from fleet_slip.evaluation.drives import BoolArray, Drive, FloatArray, load_driv
 from fleet_slip.evaluation.errors import ErrorFigures, error_figures
 from fleet_slip.evaluation.estimators import Estimate
 from fleet_slip.evaluation.stability import CRITERION, unstable
-from fleet_slip.gram_job import update_grams
-from fleet_slip.scenario import Scenario
-from fleet_slip.sensors import SAMPLE_RATE_HZ
-from fleet_slip.simulation_job import Progress, SimulationReport, simulate_batches
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.grams.job import update_grams
+from fleet_slip.simulation.job import Progress, SimulationReport, simulate_batches
+from fleet_slip.simulation.scenario import Scenario
+from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
+from fleet_slip.warehouse.tables import Warehouse
 
 GPS_OUTAGE_S = 1.0
 """Time without a fix after which satellite navigation counts as lost."""

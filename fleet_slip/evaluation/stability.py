@@ -16,7 +16,7 @@ from itertools import pairwise
 import numpy as np
 
 from fleet_slip.evaluation.drives import BoolArray, Drive, FloatArray
-from fleet_slip.sensors import SAMPLE_RATE_HZ
+from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.vehicle.parameters import VehicleParameters, constants
 from fleet_slip.vehicle.tyre import brush_force
 

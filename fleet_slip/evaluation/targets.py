@@ -8,12 +8,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.evaluation.errors import ErrorFigures
 from fleet_slip.evaluation.estimators import LinearEstimate
 from fleet_slip.evaluation.runs import GPS_OUTAGE_S, Run
 from fleet_slip.evaluation.stability import rear_compliance, stretches
-from fleet_slip.sensors import Sensors
-from fleet_slip.signals import catalogue
+from fleet_slip.simulation.sensors import Sensors
 
 TABLE_TWO_STD_DEG = {"1": 0.3018, "2": 0.1754, "3": 0.1556, "4": 0.1549, "5": 0.1505}
 """The paper's error standard deviations on its nominal drive."""

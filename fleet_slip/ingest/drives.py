@@ -10,9 +10,9 @@ import polars as pl
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from fleet_slip.catalogue.signals import Signal, catalogue
 from fleet_slip.ingest.mapping import FromColumn, Mapping
 from fleet_slip.ingest.resampling import FloatArray, Method, choose_method, resampler
-from fleet_slip.signals import Signal, catalogue
 
 SOURCE = "measured"
 _SECONDS_PER_DAY = 86_400

@@ -7,10 +7,10 @@ from typing import Annotated
 import polars as pl
 from pydantic import AfterValidator, Field, StringConstraints, field_validator, model_validator
 
+from fleet_slip.catalogue.signals import Identifier, catalogue
 from fleet_slip.config import Config, load_config
 from fleet_slip.ingest.units import conversion_factor
 from fleet_slip.resources import find_config
-from fleet_slip.signals import Identifier, catalogue
 
 
 def _printable(text: str) -> str:

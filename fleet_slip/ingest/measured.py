@@ -16,7 +16,7 @@ from fleet_slip.ingest.quarantine import DriveKeys, check_rows, with_values
 from fleet_slip.ingest.reading import MAX_ROWS, file_digest, read_batches, shown, unchanged
 from fleet_slip.ingest.resampling import STEP_S
 from fleet_slip.ingest.timebase import cut_into_drives, sample_interval_s
-from fleet_slip.warehouse import QUARANTINE_SCHEMA
+from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA
 
 MAX_DRIVES = 10_000
 """Drives in one file. More means that time or the drive's column is not what the mapping says."""

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.signals import SAMPLE_TIME_S
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 
 FloatArray = NDArray[np.float64]
 Method = Literal["snap", "interpolate", "average"]

@@ -18,7 +18,7 @@ from fleet_slip.observers import yaw_rate
 from fleet_slip.observers.angle import sideslip_angle
 from fleet_slip.observers.signals import STEP_S, DriveSignals, Floats, held
 from fleet_slip.observers.yaw_rate import YawRateNoise
-from fleet_slip.sensors import Sensors
+from fleet_slip.simulation.sensors import Sensors
 from fleet_slip.vehicle.parameters import VehicleParameters
 
 

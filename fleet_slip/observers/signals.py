@@ -6,9 +6,9 @@ import duckdb
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.database import database_errors
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.errors import SelectionError
-from fleet_slip.signals import SAMPLE_TIME_S, catalogue
+from fleet_slip.warehouse.database import database_errors
 
 STEP_S = float(SAMPLE_TIME_S)
 """Time Δt between two rows."""
@@ -50,7 +50,7 @@ class LabelledDrive:
 
 
 def read_drive(database: duckdb.DuckDBPyConnection, drive_id: str) -> LabelledDrive:
-    """Read a drive from the view `log` of a warehouse (`fleet_slip.connection.connect`).
+    """Read a drive from the view `log` of a warehouse (`fleet_slip.views.connect`).
 
     Raises `SelectionError` if there is no such drive.
     """

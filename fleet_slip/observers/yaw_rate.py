@@ -22,7 +22,7 @@ from pydantic import Field, FiniteFloat
 from fleet_slip.config import Config
 from fleet_slip.observers.signals import STEP_S, DriveSignals, Floats
 from fleet_slip.observers.wheel_speeds import undriven_axle
-from fleet_slip.sensors import Sensors
+from fleet_slip.simulation.sensors import Sensors
 from fleet_slip.vehicle.parameters import VehicleParameters
 
 INITIAL_STD_RAD_S = 1.0

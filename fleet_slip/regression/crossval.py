@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
-from fleet_slip.gram import Gram
 from fleet_slip.regression.exact import LinearModel, Scales, condition_number, fit
 from fleet_slip.regression.figures import ErrorSums, Figures, error_sums
 from fleet_slip.regression.folds import CohortFolds, Folds
+from fleet_slip.regression.gram import Gram
 
 Procedure = Callable[[Gram], LinearModel]
 """Makes a model of counts from a training Gram: any fit, with any selection inside."""

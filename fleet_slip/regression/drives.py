@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.errors import SelectionError
-from fleet_slip.gram import GramTable, packed_position, packed_size
 from fleet_slip.regression.exact import LinearModel
+from fleet_slip.regression.gram import GramTable, packed_position, packed_size
 from fleet_slip.regression.special import FloatArray
 
 

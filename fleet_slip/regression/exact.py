@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.errors import SelectionError
-from fleet_slip.gram import Gram
 from fleet_slip.regression import rounding
 from fleet_slip.regression.eigenvalues import symmetric_eigenvalues
 from fleet_slip.regression.elimination import Elimination, eliminate
+from fleet_slip.regression.gram import Gram
 
 Scales = Mapping[str, Fraction]
 """Physical value of one count of each signal: `catalogue()[name].exact_scale`."""

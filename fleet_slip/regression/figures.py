@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
-from fleet_slip.gram import Gram
 from fleet_slip.regression import rounding
 from fleet_slip.regression.exact import LinearModel
+from fleet_slip.regression.gram import Gram
 
 
 @dataclass(frozen=True)

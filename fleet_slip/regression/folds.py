@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.errors import SelectionError
-from fleet_slip.gram import Gram, GramTable, IntArray, positions
+from fleet_slip.regression.gram import Gram, GramTable, IntArray, positions
 
 
 def hash_number(key: str) -> int:

@@ -13,11 +13,11 @@ from typing import Literal
 import numpy as np
 
 from fleet_slip.errors import SelectionError
-from fleet_slip.gram import Gram
 from fleet_slip.regression import rounding, special
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.elimination import inverse_matrix
 from fleet_slip.regression.exact import Fit, Scales, dependence, fit, moments
+from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.special import FloatArray
 
 INTERCEPT = "intercept"

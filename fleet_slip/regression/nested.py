@@ -5,7 +5,6 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from fleet_slip.errors import SelectionError
-from fleet_slip.gram import Gram
 from fleet_slip.regression.elimination import eliminate
 from fleet_slip.regression.evidence import Evidence
 from fleet_slip.regression.exact import (
@@ -16,6 +15,7 @@ from fleet_slip.regression.exact import (
     fit_leading,
     moments,
 )
+from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.inference import Inference, classical, noise_variance
 
 

@@ -12,8 +12,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from fleet_slip.errors import SelectionError
-from fleet_slip.gram import Gram
 from fleet_slip.regression.exact import LinearModel
+from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.mixture import (
     ChiSquareKernel,
     Mixture,

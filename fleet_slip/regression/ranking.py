@@ -8,9 +8,9 @@ from collections.abc import Callable, Sequence
 from fractions import Fraction
 
 from fleet_slip.errors import SelectionError
-from fleet_slip.gram import Gram
 from fleet_slip.regression.elimination import adjugate, eliminate
 from fleet_slip.regression.exact import dependence, moments
+from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.lars import lars_path
 
 Matrix = list[list[int]]

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 from fleet_slip.errors import SelectionError
-from fleet_slip.gram import Gram
 from fleet_slip.regression.exact import Fit, LinearModel, fit
 from fleet_slip.regression.figures import error_sums
+from fleet_slip.regression.gram import Gram
 
 LAG = "_lag"
 

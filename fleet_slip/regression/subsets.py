@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.errors import SelectionError
-from fleet_slip.gram import Gram
 from fleet_slip.regression.criteria import CRITERIA, subset_values
 from fleet_slip.regression.evidence import Evidence
 from fleet_slip.regression.exact import Fit, correlation_matrix, dependence, fit
+from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.special import FloatArray
 
 DOUBLING_LIMIT = 22

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from fractions import Fraction
 from typing import Literal
 
-from fleet_slip.gram import Gram
 from fleet_slip.regression.exact import LinearModel
 from fleet_slip.regression.figures import error_sums
+from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.ridge import penalised, standardised_penalty, standardised_size
 
 Selection = Literal["none", "m5", "greedy"]

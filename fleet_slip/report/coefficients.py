@@ -4,11 +4,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from fleet_slip.cohort import Cohort
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.grams.cohort import Cohort
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.exact import fit
 from fleet_slip.regression.inference import INTERCEPT, classical, cluster, variance_inflation
-from fleet_slip.signals import catalogue
 
 
 @dataclass(frozen=True)

@@ -5,23 +5,23 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from fleet_slip.cohort import SCENARIO
-from fleet_slip.connection import connect
-from fleet_slip.documents import canonical_json
 from fleet_slip.errors import SelectionError
 from fleet_slip.evaluation.estimators import TABLE_ONE, Estimate, LinearEstimate, Training, training
 from fleet_slip.evaluation.filters import FILTERS, bound
 from fleet_slip.evaluation.runs import Run, run_all
 from fleet_slip.evaluation.targets import THE_PAPERS_CHOICE
-from fleet_slip.model_list import load_model_list
-from fleet_slip.registry import ModelVersion
+from fleet_slip.files.documents import canonical_json
+from fleet_slip.grams.cohort import SCENARIO
+from fleet_slip.models.versions import ModelVersion
 from fleet_slip.report.coefficients import Coefficients, coefficient_table
 from fleet_slip.report.evaluated import Evaluated, latest_of
 from fleet_slip.report.histogram import Histogram, held_out_histogram
 from fleet_slip.report.ordering import Ordering, compare_orders
 from fleet_slip.resources import folder
-from fleet_slip.scenario import Scenario, load_scenario, shipped_scenarios
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.selection.model_list import load_model_list
+from fleet_slip.simulation.scenario import Scenario, load_scenario, shipped_scenarios
+from fleet_slip.views import connect
+from fleet_slip.warehouse.tables import Warehouse
 
 DRAWN_FILTERS = ("kalman", "kalman_tuned")
 DRAWN_SCENARIOS = (

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
 
-from fleet_slip.documents import Document
 from fleet_slip.errors import SelectionError
 from fleet_slip.evaluation.errors import ErrorFigures
 from fleet_slip.evaluation.results import folder
-from fleet_slip.registry import ModelVersion
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.files.documents import Document
+from fleet_slip.models.versions import ModelVersion
+from fleet_slip.warehouse.tables import Warehouse
 
 Side = Literal["inside", "outside"]
 

@@ -9,16 +9,16 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from fleet_slip.cohort import FOLD_KEYS, assign
-from fleet_slip.connection import connect
-from fleet_slip.database import database_errors
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.evaluation.drives import FloatArray
+from fleet_slip.grams.cohort import FOLD_KEYS, assign
 from fleet_slip.regression.crossval import CrossValidation, least_squares
 from fleet_slip.regression.exact import LinearModel
 from fleet_slip.resources import read_sql
-from fleet_slip.selection import Selection
-from fleet_slip.signals import catalogue
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.selection.compare import Selection
+from fleet_slip.views import connect
+from fleet_slip.warehouse.database import database_errors
+from fleet_slip.warehouse.tables import Warehouse
 
 ANGLE_DEG = 0.05
 ACCELERATION_MPS2 = 0.1

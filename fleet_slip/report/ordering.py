@@ -7,11 +7,11 @@ subsets of that size.
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from fleet_slip.cohort import Cohort
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.grams.cohort import Cohort
 from fleet_slip.regression.nested import nested_fits
 from fleet_slip.regression.ranking import RANKINGS, rank
 from fleet_slip.regression.subsets import best_subsets
-from fleet_slip.signals import catalogue
 
 CLOSE = 0.001
 """A model explains nearly all if it leaves no more than this of the variance to the full one."""

@@ -3,12 +3,12 @@
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.evaluation.errors import ErrorFigures
 from fleet_slip.report.coefficients import Coefficient, Coefficients
 from fleet_slip.report.data import ReportData
 from fleet_slip.report.table import Cell, Table, table
 from fleet_slip.report.text import count, degrees, number, percent, scientific, size
-from fleet_slip.signals import catalogue
 
 SHOWN_MODELS = ("1", "2", "4", "5")
 """Model 3 hardly differs from model 2 anywhere."""

@@ -2,13 +2,13 @@
 
 from dataclasses import dataclass
 
-from fleet_slip.folder import Folder
-from fleet_slip.registry import ModelVersion
+from fleet_slip.files.folder import Folder
+from fleet_slip.models.versions import ModelVersion
 from fleet_slip.report.data import gather
 from fleet_slip.report.drawing import png_file, svg_file
 from fleet_slip.report.page import render
 from fleet_slip.report.pictures import pictures
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.warehouse.tables import Warehouse
 
 PAGE = "report.html"
 FIGURES = "figures"

@@ -5,15 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.cohort import Cohort, assign
-from fleet_slip.connection import connect
-from fleet_slip.database import database_errors
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import SelectionError
+from fleet_slip.grams.cohort import Cohort, assign
 from fleet_slip.regression.folds import Assignment
 from fleet_slip.resources import read_sql
-from fleet_slip.sensors import SAMPLE_RATE_HZ
-from fleet_slip.signals import catalogue
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
+from fleet_slip.views import connect
+from fleet_slip.warehouse.database import database_errors
+from fleet_slip.warehouse.tables import Warehouse
 
 SAMPLE_ROWS = 20_000
 """Rows of a sample, about. Neighbours at 100 Hz say almost the same, so that little is lost."""

@@ -13,11 +13,11 @@ import pytest
 from distributed import Client
 
 from benchmarks.dask_processes import DaskProcesses, dask_processes
-from fleet_slip.cluster import cluster_executor
-from fleet_slip.cluster_worker import Marker, environment, pickled, work
+from fleet_slip.compute.cluster import cluster_executor
+from fleet_slip.compute.cluster_worker import Marker, environment, pickled, work
+from fleet_slip.compute.tasks import LocalThreads, completed
 from fleet_slip.errors import RefusedError, StorageError
-from fleet_slip.local_folder import LocalFolder
-from fleet_slip.tasks import LocalThreads, completed
+from fleet_slip.files.local_folder import LocalFolder
 from tests.cluster.work import Order, obey
 from tests.conftest import COMMAND, RunCommand
 from tests.ingest.samples import csv_text, good_columns

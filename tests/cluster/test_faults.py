@@ -11,11 +11,11 @@ import pytest
 from dask.config import set as dask_config
 
 from benchmarks.dask_processes import DaskProcesses, dask_processes
-from fleet_slip import cluster as cluster_module
-from fleet_slip.cluster import ClusterExecutor, cluster_executor
+from fleet_slip.compute import cluster as cluster_module
+from fleet_slip.compute.cluster import ClusterExecutor, cluster_executor
+from fleet_slip.compute.tasks import completed
 from fleet_slip.errors import ClusterError
-from fleet_slip.local_folder import LocalFolder
-from fleet_slip.tasks import completed
+from fleet_slip.files.local_folder import LocalFolder
 from tests.cluster.work import Order, obey
 
 pytestmark = pytest.mark.slow

@@ -10,21 +10,21 @@ import pytest
 from typer.testing import CliRunner
 
 from fleet_slip.cli.main import app
-from fleet_slip.connection import connect
-from fleet_slip.documents import DocumentFolder
 from fleet_slip.errors import RefusedError
 from fleet_slip.evaluation.drives import load_drives
 from fleet_slip.evaluation.estimators import LinearEstimate
 from fleet_slip.evaluation.filters import FILTERS, bound
 from fleet_slip.evaluation.results import keep
-from fleet_slip.local_folder import LocalFolder
+from fleet_slip.files.documents import DocumentFolder
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.models.score import score
+from fleet_slip.models.versions import Registry
 from fleet_slip.observers import kalman
 from fleet_slip.observers.signals import read_drive
-from fleet_slip.registry import Registry
 from fleet_slip.rivals.learners import LEARNERS
-from fleet_slip.scenario import load_scenario
-from fleet_slip.score import score
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.simulation.scenario import load_scenario
+from fleet_slip.views import connect
+from fleet_slip.warehouse.tables import Warehouse
 
 SCENARIOS = ("nominal", "adhesion_0_4", "wheel_missing")
 

@@ -12,7 +12,7 @@ from fleet_slip.evaluation.errors import error_figures
 from fleet_slip.evaluation.estimators import LinearEstimate
 from fleet_slip.evaluation.stability import join, peak_slip
 from fleet_slip.evaluation.targets import passed_noise_deg
-from fleet_slip.scenario import Failure, load_scenario
+from fleet_slip.simulation.scenario import Failure, load_scenario
 from fleet_slip.vehicle.parameters import constants, load_vehicle
 from fleet_slip.vehicle.tyre import cornering_stiffness
 

@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 
-from fleet_slip.documents import DocumentFolder, checksum
 from fleet_slip.errors import FleetSlipError, StorageError
-from fleet_slip.local_folder import LocalFolder
-from fleet_slip.registry import Registry
+from fleet_slip.files.documents import DocumentFolder, checksum
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.models.versions import Registry
 from tests.conftest import path_of
-from tests.test_registry import manifest
+from tests.models.test_versions import manifest
 
 NAME = manifest().name
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest_job import ingest_file
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.ingest.job import ingest_file
+from fleet_slip.warehouse.tables import Warehouse
 from tests.ingest.samples import a_mapping, csv_text, good_columns
 
 MIB = 2**20

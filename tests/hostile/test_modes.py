@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleet_slip.gram_job import update_grams
-from fleet_slip.local_folder import LocalFolder
-from fleet_slip.registry import Registry
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.grams.job import update_grams
+from fleet_slip.models.versions import Registry
+from fleet_slip.warehouse.tables import Warehouse
 from tests.conftest import land, log_rows, path_of, random_counts
-from tests.test_registry import manifest
+from tests.models.test_versions import manifest
 
 
 @pytest.mark.parametrize("umask", [0o022, 0o077])

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from fleet_slip.documents import checksum
 from fleet_slip.errors import ConfigError, RefusedError
-from fleet_slip.local_folder import LocalFolder
-from fleet_slip.registry import Registry
-from fleet_slip.signing import VERIFY_VARIABLE, make_keys
+from fleet_slip.files.documents import checksum
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.models.signing import VERIFY_VARIABLE, make_keys
+from fleet_slip.models.versions import Registry
 from tests.conftest import RunCommand, path_of
-from tests.test_registry import manifest
+from tests.models.test_versions import manifest
 
 pytest.importorskip("cryptography", reason="signatures need the extra 'signing'")
 

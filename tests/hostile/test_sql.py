@@ -14,14 +14,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.cohort import load_cohort
-from fleet_slip.connection import connect
-from fleet_slip.database import database_errors, interruptible
 from fleet_slip.errors import FleetSlipError, SelectionError, StorageError
-from fleet_slip.gram_job import update_grams
-from fleet_slip.local_folder import LocalFolder
-from fleet_slip.reading_query import one_query
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.job import update_grams
+from fleet_slip.views import connect
+from fleet_slip.warehouse.database import database_errors, interruptible
+from fleet_slip.warehouse.read_only_sql import one_query
+from fleet_slip.warehouse.tables import Warehouse
 from tests.conftest import RunCommand, land, log_rows, path_of, random_counts
 
 

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.ingest import MeasuredLog, read_measured
-from fleet_slip.signals import catalogue
 
 from .samples import a_mapping, csv_text, good_columns
 

@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import InputError
 from fleet_slip.ingest import load_mapping, measured, read_measured
-from fleet_slip.signals import catalogue
-from fleet_slip.warehouse import QUARANTINE_SCHEMA
+from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA
 
 from .samples import (
     a_mapping,

@@ -4,10 +4,10 @@ from collections.abc import Iterator
 
 import pytest
 
-from fleet_slip.data_root import data_root
-from fleet_slip.folder import Folder
-from fleet_slip.object_credentials import aws_profile
-from fleet_slip.object_folder import _store
+from fleet_slip.files.data_root import data_root
+from fleet_slip.files.folder import Folder
+from fleet_slip.files.object_credentials import aws_profile
+from fleet_slip.files.object_folder import _store
 from tests.objects.server import Server
 
 

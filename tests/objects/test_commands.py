@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from benchmarks.dask_processes import dask_processes
-from fleet_slip.data_root import data_root
-from fleet_slip.folder import Folder
-from fleet_slip.local_folder import LocalFolder
+from fleet_slip.files.data_root import data_root
+from fleet_slip.files.folder import Folder
+from fleet_slip.files.local_folder import LocalFolder
 from tests.conftest import COMMAND, Finished
 from tests.objects.server import ACCESS_KEY, SECRET_KEY, Server
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleet_slip.data_root import data_root
+from fleet_slip.delta import Change, Snapshot
 from fleet_slip.errors import StorageError
-from fleet_slip.storage import Change, Snapshot
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.files.data_root import data_root
+from fleet_slip.warehouse.tables import Warehouse
 from tests.conftest import DAY, log_rows, random_counts
 from tests.objects.conftest import forget_clients
 from tests.objects.server import ACCESS_KEY, SECRET_KEY, Server

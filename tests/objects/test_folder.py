@@ -15,16 +15,16 @@ import obstore
 import pytest
 
 import fleet_slip
-from fleet_slip import object_folder
-from fleet_slip.connection import connect
-from fleet_slip.data_root import data_root
-from fleet_slip.documents import DocumentFolder
+from fleet_slip.delta import Change, Unit, retried
 from fleet_slip.errors import StorageError
-from fleet_slip.folder import Folder
-from fleet_slip.gram_job import update_grams
-from fleet_slip.local_folder import LocalFolder
-from fleet_slip.storage import Change, Unit, retried
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.files import object_folder
+from fleet_slip.files.data_root import data_root
+from fleet_slip.files.documents import DocumentFolder
+from fleet_slip.files.folder import Folder
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.grams.job import update_grams
+from fleet_slip.views import connect
+from fleet_slip.warehouse.tables import Warehouse
 from tests.conftest import DAY, land, log_rows, random_counts
 from tests.objects.server import ACCESS_KEY, SECRET_KEY, Server
 

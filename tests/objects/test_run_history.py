@@ -5,13 +5,13 @@ from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 
-from fleet_slip.connection import connect
-from fleet_slip.folder import Folder
-from fleet_slip.operations.run_history import gather_runs
-from fleet_slip.operations.run_log import Run, recording, step
-from fleet_slip.operations.status import status_of
-from fleet_slip.vacuum import vacuum
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.files.folder import Folder
+from fleet_slip.maintenance.vacuum import vacuum
+from fleet_slip.monitoring.status import status_of
+from fleet_slip.runs.history import gather_runs
+from fleet_slip.runs.log import Run, recording, step
+from fleet_slip.views import connect
+from fleet_slip.warehouse.tables import Warehouse
 from tests.objects.server import Server
 
 

@@ -5,10 +5,10 @@ from datetime import date
 
 import numpy as np
 
-from fleet_slip.campaign import Batch, load_campaign
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.observers.signals import STEP_S, DriveSignals, Floats, LabelledDrive
-from fleet_slip.signals import catalogue
-from fleet_slip.simulate import simulate_batch
+from fleet_slip.simulation.campaign import Batch, load_campaign
+from fleet_slip.simulation.drives import simulate_batch
 from fleet_slip.vehicle.parameters import VehicleParameters
 
 GPS_EVERY = 10

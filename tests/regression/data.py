@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fleet_slip.gram import Gram
+from fleet_slip.regression.gram import Gram
 
 REFERENCE = Path(__file__).parents[2].parent / "shared" / "reference"
 

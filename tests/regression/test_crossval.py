@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet_slip.errors import SelectionError
-from fleet_slip.gram import Gram, GramTable
 from fleet_slip.regression.crossval import CrossValidation, cross_validate_inputs
 from fleet_slip.regression.folds import CohortFolds, by_hash, by_value, hash_fold
+from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.regression.winner import choose
 
 from .data import dense_fit, gram_of, names, random_drives

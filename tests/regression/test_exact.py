@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet_slip.errors import SelectionError
-from fleet_slip.gram import Gram
 from fleet_slip.regression.elimination import eliminate, inverse_matrix
 from fleet_slip.regression.exact import (
     condition_number,
@@ -16,6 +15,7 @@ from fleet_slip.regression.exact import (
     dependence,
     fit,
 )
+from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.nested import nested_fits
 from fleet_slip.regression.rounding import sqrt
 

@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 from scipy.special import betainc
 
 from fleet_slip.errors import SelectionError
-from fleet_slip.gram import GramTable
 from fleet_slip.regression import special
 from fleet_slip.regression.drives import DriveMoments, serving_drives
 from fleet_slip.regression.exact import fit
+from fleet_slip.regression.gram import GramTable
 from fleet_slip.regression.inference import (
     chow,
     classical,

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleet_slip.gram import Gram
 from fleet_slip.regression.exact import fit
+from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.inference import classical
 
 from .data import columns_to_counts, reference

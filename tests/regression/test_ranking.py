@@ -11,11 +11,11 @@ from scipy import integrate, stats
 from sklearn.linear_model import ElasticNet, lars_path_gram
 
 from fleet_slip.errors import SelectionError
-from fleet_slip.gram import Gram, GramTable
 from fleet_slip.regression import criteria
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.evidence import Evidence
 from fleet_slip.regression.exact import correlation_matrix, fit
+from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.regression.inference import cluster
 from fleet_slip.regression.lars import lars_path, lasso_model, path_of_moments
 from fleet_slip.regression.leaps import best_by_leaps

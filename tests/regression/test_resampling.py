@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from fleet_slip.errors import SelectionError
-from fleet_slip.gram import GramTable
 from fleet_slip.regression.crossval import cross_validate, least_squares
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.exact import fit
 from fleet_slip.regression.folds import CohortFolds, by_value
+from fleet_slip.regression.gram import GramTable
 from fleet_slip.regression.inference import cluster
 from fleet_slip.regression.resampling import (
     bootstrap_coefficients,

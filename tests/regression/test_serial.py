@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet_slip.errors import SelectionError
-from fleet_slip.gram import Gram
 from fleet_slip.regression.disturbance import disturbed
 from fleet_slip.regression.exact import fit
 from fleet_slip.regression.figures import error_sums
+from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.serial import (
     autoregressive_fit,
     lag_signals,

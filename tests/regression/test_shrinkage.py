@@ -11,12 +11,12 @@ from hypothesis.extra import numpy as hnp
 from sklearn.linear_model import Ridge
 
 from fleet_slip.errors import SelectionError
-from fleet_slip.gram import Gram
 from fleet_slip.regression import pace as pace_module
 from fleet_slip.regression.crossval import Procedure, cross_validate
 from fleet_slip.regression.evidence import Evidence
 from fleet_slip.regression.exact import fit
 from fleet_slip.regression.folds import Folds
+from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.mixture import (
     ChiSquareKernel,
     NormalKernel,

@@ -5,9 +5,9 @@ import statsmodels.api as sm
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.gram import GramTable
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.exact import fit
+from fleet_slip.regression.gram import GramTable
 from fleet_slip.regression.inference import classical, cluster
 from fleet_slip.regression.serial import autoregressive_fit
 

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleet_slip.gram import Gram
 from fleet_slip.regression.crossval import CrossValidation, cross_validate
 from fleet_slip.regression.evidence import Evidence
 from fleet_slip.regression.exact import LinearModel, fit
 from fleet_slip.regression.folds import Folds
+from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.nested import nested_fits
 from fleet_slip.regression.pace import pace, shrink, threshold
 from fleet_slip.regression.ranking import backward

@@ -9,10 +9,10 @@ import pytest
 from typer.testing import CliRunner
 
 from fleet_slip.cli.main import app
-from fleet_slip.local_folder import LocalFolder
-from fleet_slip.registry import Registry
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.models.versions import Registry
 from fleet_slip.report.data import ReportData, gather
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.warehouse.tables import Warehouse
 
 SCENARIOS = (
     "nominal",

@@ -12,11 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleet_slip.connection import connect
-from fleet_slip.documents import Document
 from fleet_slip.errors import SelectionError
 from fleet_slip.evaluation.results import keep
-from fleet_slip.local_folder import LocalFolder
+from fleet_slip.files.documents import Document
+from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.report import paper_tables
 from fleet_slip.report.blocks import blocks_won, difference
 from fleet_slip.report.claims import CLAIMS, judged
@@ -28,7 +27,8 @@ from fleet_slip.report.histogram import ANGLE_DEG, held_out_coefficients
 from fleet_slip.report.page import render
 from fleet_slip.report.pictures import pictures
 from fleet_slip.report.text import number
-from fleet_slip.warehouse import Warehouse
+from fleet_slip.views import connect
+from fleet_slip.warehouse.tables import Warehouse
 from tests.conftest import RunCommand
 from tests.report.conftest import Reported, call
 

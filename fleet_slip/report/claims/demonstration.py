@@ -16,7 +16,7 @@ from fleet_slip.report.claims.claim import (
 from fleet_slip.report.data import ReportData
 from fleet_slip.report.paper_tables import PAPER_TABLE_TWO
 from fleet_slip.report.text import count, degrees, listed, number
-from fleet_slip.sensors import SAMPLE_RATE_HZ
+from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 
 GRAVITY_MPS2 = 9.81
 LAST_TWO = frozenset({"4", "5"})

@@ -10,7 +10,7 @@ from fleet_slip.evaluation.runs import Run
 from fleet_slip.report.figures.lines import smoothed
 from fleet_slip.report.figures.series import Line
 from fleet_slip.report.style import Size, colour
-from fleet_slip.sensors import SAMPLE_RATE_HZ
+from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 
 BIN_MPS2 = 0.5
 LEAST_ROWS = 200

@@ -11,7 +11,7 @@ from fleet_slip.evaluation.drives import Drive, FloatArray
 from fleet_slip.evaluation.runs import Run
 from fleet_slip.report.figures.lines import smoothed
 from fleet_slip.report.style import Size, colour
-from fleet_slip.sensors import SAMPLE_RATE_HZ
+from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 
 SMOOTHED_S = 0.5
 """Noise of single samples would hide where the error is."""

@@ -1,0 +1,169 @@
+"""The signal catalogue `configs/signals.toml` as types: scales, ranges, roles, Arrow schema."""
+
+from decimal import Decimal
+from fractions import Fraction
+from functools import cache, cached_property
+from importlib.resources.abc import Traversable
+from os import environ
+from pathlib import Path
+from typing import Annotated, Literal
+
+import pyarrow as pa
+from pydantic import Field, StringConstraints, model_validator
+
+from fleet_slip.config import Config, load_config
+from fleet_slip.delta.schema import SCALE
+from fleet_slip.errors import SelectionError
+from fleet_slip.resources import folder
+
+CATALOGUE_VARIABLE = "FLEET_SLIP_SIGNALS"
+"""Names a signal catalogue to use instead of the shipped one: another fleet, other signals."""
+
+COUNT_MAX = 2**15 - 1
+"""Largest count. The range is symmetric, so that mirroring a drive never overflows."""
+
+SAMPLE_TIME_S = Fraction(1, 100)
+"""Time between two rows of a drive, in s: the paper's 0.01 s."""
+
+IDENTIFIER_PATTERN = r"^[a-z][a-z0-9_]{0,40}$"
+
+Identifier = Annotated[str, StringConstraints(pattern=IDENTIFIER_PATTERN)]
+"""A name that is safe to stand in SQL unquoted."""
+
+
+_SYMBOL = r"(?:m|s|kg|rad|N|Pa|W|K|A|V)(?:\^[2-9])?"
+
+SIUnit = Annotated[str, StringConstraints(pattern=rf"^{_SYMBOL}(?:[*/]{_SYMBOL})*$")]
+"""A product or quotient of coherent SI units without prefixes, such as m/s^2. A pattern, because a
+units library takes half a second to start and every command needs the catalogue."""
+
+
+class Signal(Config):
+    """One signal. `physical = scale * count`."""
+
+    unit: SIUnit
+    column: Identifier
+    scale: Decimal = Field(gt=0)
+    min: Decimal
+    max: Decimal
+    role: Literal["input", "label", "truth"]
+    description: str = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _range_fits_counts(self) -> "Signal":
+        if self.min >= self.max:
+            raise ValueError(f"min {self.min} is not below max {self.max}")
+        largest = max(abs(self.min), abs(self.max)) / self.scale
+        if largest > COUNT_MAX:
+            raise ValueError(f"the range needs counts up to {largest:f}, int16 ends at {COUNT_MAX}")
+        return self
+
+    @property
+    def exact_scale(self) -> Fraction:
+        """Physical value of one count, exactly."""
+        return Fraction(self.scale)
+
+    @property
+    def min_count(self) -> int:
+        """Smallest valid count."""
+        return -int(-self.min / self.scale)
+
+    @property
+    def max_count(self) -> int:
+        """Largest valid count."""
+        return int(self.max / self.scale)
+
+
+class DriveColumn(Config):
+    """One column of metadata, the same in every row of a drive."""
+
+    type: Literal["string", "double", "integer"]
+    description: str = Field(min_length=1)
+
+    @property
+    def arrow_type(self) -> pa.DataType:
+        """Arrow type of the column."""
+        return {"string": pa.string(), "double": pa.float64(), "integer": pa.int64()}[self.type]
+
+
+class SignalCatalogue(Config):
+    """All signals and drive columns, in the file's order."""
+
+    signals: dict[Identifier, Signal]
+    drive: dict[Identifier, DriveColumn]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "SignalCatalogue":
+        labels = [name for name, signal in self.signals.items() if signal.role == "label"]
+        if len(labels) != 1:
+            raise ValueError(f"exactly one signal must have the role 'label', not {labels}")
+        names = [*self.signals, *(s.column for s in self.signals.values()), *self.drive]
+        names += ["day", "tick", "time_s"]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"names must differ: {', '.join(twice)}")
+        return self
+
+    def __getitem__(self, name: str) -> Signal:
+        """Return a signal by name. Raises `SelectionError` for an unknown one."""
+        try:
+            return self.signals[name]
+        except KeyError:
+            known = ", ".join(self.signals)
+            raise SelectionError(f"unknown signal {name!r}. Known signals: {known}.") from None
+
+    @cached_property
+    def label(self) -> str:
+        """Name of the signal that is estimated."""
+        return next(name for name, signal in self.signals.items() if signal.role == "label")
+
+    @cached_property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the signals that a model may use, in catalogue order."""
+        return tuple(name for name, signal in self.signals.items() if signal.role == "input")
+
+    @cached_property
+    def gram_signals(self) -> tuple[str, ...]:
+        """Names of the signals of a Gram row: the inputs, then the label."""
+        return (*self.inputs, self.label)
+
+    @cached_property
+    def drive_schema(self) -> pa.Schema:
+        """Arrow schema of a drive's metadata."""
+        return pa.schema([(name, column.arrow_type) for name, column in self.drive.items()])
+
+    @cached_property
+    def log_schema(self) -> pa.Schema:
+        """Arrow schema of the table `logs`: day, drive metadata, tick, then the counts."""
+        return pa.schema(
+            [
+                ("day", pa.date32()),
+                *self.drive_schema,
+                ("tick", pa.int32()),
+                *((name, pa.int16()) for name in self.signals),
+            ]
+        )
+
+    @cached_property
+    def stored_schema(self) -> pa.Schema:
+        """The log schema with the scale of each signal in its field's metadata."""
+        return pa.schema(
+            [
+                field.with_metadata({SCALE: str(self.signals[field.name].scale)})
+                if field.name in self.signals
+                else field
+                for field in self.log_schema
+            ]
+        )
+
+
+def load_catalogue(file: Traversable) -> SignalCatalogue:
+    """Read a catalogue from a TOML file. Raises `ConfigError`."""
+    return load_config(file, SignalCatalogue)
+
+
+@cache
+def catalogue() -> SignalCatalogue:
+    """Return the catalogue of `$FLEET_SLIP_SIGNALS`, else the one that ships with the package."""
+    chosen = environ.get(CATALOGUE_VARIABLE)
+    return load_catalogue(Path(chosen) if chosen else folder("configs") / "signals.toml")

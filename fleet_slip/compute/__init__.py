@@ -1,0 +1,1 @@
+"""Pure tasks on this machine's threads or on a Dask cluster."""

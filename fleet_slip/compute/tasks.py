@@ -1,0 +1,110 @@
+"""Calls a function on many items in an executor: a bounded number at once, results as they come.
+
+An executor that is not of this machine may have two things that a plain one has not: `in_flight`,
+how many tasks it can take, and futures that raise `LostTaskError`.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    Executor,
+    Future,
+    ThreadPoolExecutor,
+    wait,
+)
+from itertools import islice
+from typing import TypeVar
+
+from fleet_slip.errors import ClusterError
+from fleet_slip.runs.log import LOGGER
+
+IN_FLIGHT = 4
+"""Tasks that may be under way, or done and not yet looked at, where the executor does not say."""
+
+NAMED_MAX = 5
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+class LostTaskError(BrokenExecutor):
+    """The processes that a task ran in died, again and again."""
+
+
+class LocalThreads(ThreadPoolExecutor):
+    """Threads of this process."""
+
+    def __init__(self, number: int) -> None:
+        """Take the number of threads."""
+        super().__init__(number)
+        self.in_flight = 2 * number
+
+
+def in_flight(executor: Executor) -> int:
+    """Return how many tasks may be under way, or done and not yet looked at.
+
+    That bounds memory, and the work that is lost if this process is killed.
+    """
+    return int(getattr(executor, "in_flight", IN_FLIGHT))
+
+
+def completed(
+    executor: Executor | None,
+    function: Callable[[Item], Result],
+    items: Iterable[Item],
+    name_of: Callable[[Item], str],
+) -> Iterator[tuple[Item, Result]]:
+    """Call a function on items, and yield each with its result when it is done, in any order.
+
+    Without an executor that is here and now, one after the other.
+
+    A task whose worker died is set aside. It may be innocent: a worker does several tasks at once,
+    and all are suspected. When the others are done, each is tried alone; then `ClusterError` names
+    those that failed again. Any other error ends the whole at once.
+    """
+    if executor is None:
+        for item in items:
+            yield item, function(item)
+        return
+    suspects: list[Item] = []
+    yield from _completed(executor, function, items, lambda: in_flight(executor), suspects)
+    for item in suspects:
+        LOGGER.warning(f"{name_of(item)}: its worker died; it is tried once more, alone")
+    lost: list[Item] = []
+    yield from _completed(executor, function, suspects, lambda: 1, lost)
+    if lost:
+        more = f" and {len(lost) - NAMED_MAX} more" if len(lost) > NAMED_MAX else ""
+        raise ClusterError(
+            f"{', '.join(map(name_of, lost[:NAMED_MAX]))}{more}: every worker that tried it died, "
+            "often for want of memory; the workers' logs tell. All else is done. Give the workers "
+            "more memory, and run the same command again."
+        )
+
+
+def _completed(
+    executor: Executor,
+    function: Callable[[Item], Result],
+    items: Iterable[Item],
+    limit: Callable[[], int],
+    lost: list[Item],
+) -> Iterator[tuple[Item, Result]]:
+    waiting = iter(items)
+    running: dict[Future[Result], Item] = {}
+    try:
+        while True:
+            for item in islice(waiting, max(0, limit() - len(running))):
+                running[executor.submit(function, item)] = item
+            if not running:
+                return
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                item = running.pop(future)
+                try:
+                    result = future.result()
+                except LostTaskError:
+                    lost.append(item)
+                else:
+                    yield item, result
+    finally:
+        for future in running:
+            future.cancel()

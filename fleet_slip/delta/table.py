@@ -1,0 +1,219 @@
+"""A Delta table of a data root, and one version of it: reading, writing files, committing."""
+
+import uuid
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import date
+from functools import cached_property
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+from deltalake import CommitProperties, DeltaTable, Transaction
+from deltalake.exceptions import CommitFailedError, TableNotFoundError
+from deltalake.transaction import AddAction
+
+from fleet_slip.delta.change import Change, addition
+from fleet_slip.delta.checkpoints import seal_new_checkpoint
+from fleet_slip.delta.conflicts import is_conflict
+from fleet_slip.delta.encoding import Encoded, Encoding, checksum_in
+from fleet_slip.delta.files import TableFile, active_files, have_same_columns, read_actions
+from fleet_slip.delta.schema import require_readable, require_writable
+from fleet_slip.delta.sealing import NOTE, sealed
+from fleet_slip.errors import ConflictError
+from fleet_slip.files.folder import Folder
+from fleet_slip.files.storage_errors import first_line, storage_errors
+
+
+@dataclass(frozen=True)
+class Table:
+    """A Delta table below a data root."""
+
+    folder: Folder
+    schema: pa.Schema
+    encoding: Encoding
+    partition_by: tuple[str, ...] = ()
+    description: str = ""
+
+    def snapshot(self, version: int | None = None) -> "Snapshot":
+        """Return the table as it is now; a table that nobody has written yet is empty.
+
+        An earlier version can be asked for; `StorageError` is raised if it is no longer known.
+        """
+        delta = self.open_delta(version)
+        if delta is not None and version is None:
+            require_readable(self.folder, self.schema, delta)
+        return Snapshot(self, delta)
+
+    def open_delta(self, version: int | None = None) -> DeltaTable | None:
+        """Return the Delta table as it is now, or was; None if nobody has written it yet."""
+        with storage_errors(self.folder):
+            try:
+                return DeltaTable(
+                    self.folder.uri, version=version, storage_options=self.folder.delta_options
+                )
+            except TableNotFoundError:
+                return None
+
+    def uri(self, path: str) -> str:
+        """Return where one of the table's files is, as DuckDB knows it."""
+        return f"{self.folder.uri}/{path}"
+
+    def read(self, path: str, columns: Sequence[str] | None = None) -> pa.Table:
+        """Return the rows of one of the table's files, or some columns of them."""
+        with storage_errors(f"{self.folder}/{path}"), self.folder.open(path) as file:
+            wanted = None if columns is None else list(columns)
+            return pq.read_table(file, columns=wanted, partitioning=None)
+
+    def read_metadata(self, path: str) -> pq.FileMetaData:
+        """Return the footer of one of the table's files."""
+        with storage_errors(f"{self.folder}/{path}"), self.folder.open(path) as file:
+            return pq.read_metadata(file)
+
+    def write_file(self, name: str, rows: pa.Table, day: date | None = None) -> AddAction:
+        """Write rows to the file NAME-CHECKSUM.parquet, durably; see `put`."""
+        return self.put(name, self.encode(rows), day)
+
+    def put(self, name: str, encoded: Encoded, day: date | None = None) -> AddAction:
+        """Write a file's content to the file NAME-CHECKSUM.parquet, durably.
+
+        Returns the action that adds it to the table; it is not part of the table before that is
+        committed. Where an interrupted run left a file of that name, it is replaced, or the new one
+        gets a longer name.
+        """
+        path = _file_path(name, encoded, day)
+        if self.folder.reuses_names:
+            self.folder.put(path, encoded.content)
+        else:
+            while not self.folder.create(path, encoded.content):
+                path = _file_path(f"{name}-{uuid.uuid4().hex[:8]}", encoded, day)
+        return addition(path, encoded, day)
+
+    def restore_file(self, file: TableFile, rows: pa.Table) -> bool:
+        """Write a file again if rows make the very bytes that its name tells; False if not."""
+        encoded = self.encode(rows)
+        if encoded.checksum != checksum_in(file.path):
+            return False
+        self.folder.put(file.path, encoded.content)
+        return True
+
+    def encode(self, rows: pa.Table) -> Encoded:
+        """Return the content of a file with these rows."""
+        return self.encoding.encode(rows, omitted=self.partition_by)
+
+    def create(self) -> DeltaTable:
+        """Make the table, and return it as it was made, even if others have written to it since.
+
+        So a commit on top of it meets theirs, and is told of a unit that has landed in one.
+        """
+        delta = DeltaTable.create(
+            self.folder.uri,
+            schema=self.schema,
+            mode="ignore",
+            partition_by=list(self.partition_by),
+            name=self.folder.name,
+            description=self.description,
+            storage_options=self.folder.delta_options,
+            commit_properties=CommitProperties(custom_metadata={NOTE: sealed({}, [], {})}),
+        )
+        return (self.open_delta(version=0) if delta.version() else delta) or delta
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """One version of a table. Reading it is not disturbed by later commits."""
+
+    table: Table
+    delta: DeltaTable | None
+
+    @property
+    def version(self) -> int | None:
+        """Version of the Delta table; None before the first commit."""
+        return None if self.delta is None else self.delta.version()
+
+    @cached_property
+    def files(self) -> tuple[TableFile, ...]:
+        """Active files, sorted by path."""
+        if self.delta is None:
+            return ()
+        with storage_errors(self.table.folder):
+            return active_files(self._actions, self.table.folder)
+
+    @property
+    def has_same_columns(self) -> bool:
+        """Whether all active files have the same ones of the table's columns."""
+        with storage_errors(self.table.folder):
+            return have_same_columns(self._actions, self.table.schema.names)
+
+    @cached_property
+    def _actions(self) -> pa.Table:
+        return read_actions(self.delta)
+
+    @property
+    def paths(self) -> list[str]:
+        """Where the active files are, as DuckDB knows it, sorted."""
+        return [self.table.uri(file.path) for file in self.files]
+
+    @property
+    def rows(self) -> int:
+        """Number of rows of all active files."""
+        return sum(file.rows for file in self.files)
+
+    @property
+    def size_bytes(self) -> int:
+        """Size of all active files."""
+        return sum(file.size_bytes for file in self.files)
+
+    def renewed(self) -> "Snapshot":
+        """Return the newest version: this very snapshot, if nobody has committed since.
+
+        If somebody has, this snapshot is not to be used any more.
+        """
+        if self.delta is None:
+            return self.table.snapshot()
+        version = self.version
+        with storage_errors(self.table.folder):
+            self.delta.update_incremental()
+        return self if self.version == version else self.table.snapshot()
+
+    def landed(self, unit_name: str) -> int | None:
+        """Return the version of a unit of work that has landed, or None."""
+        if self.delta is None:
+            return None
+        return self.delta.transaction_version(unit_name)
+
+    def commit(self, change: Change) -> None:
+        """Apply a change in one atomic commit on top of this snapshot.
+
+        Raises `ConflictError` if another process landed one of the same units meanwhile, or removed
+        a file; and `StorageError` if the log cannot be written.
+        """
+        table, actions = self.table, change.actions()
+        note = sealed(change.note, actions, {u.name: u.version for u in change.units})
+        with storage_errors(table.folder):
+            try:
+                delta = self.delta or table.create()
+                require_writable(table.folder, table.schema, delta)
+                delta.create_write_transaction(
+                    actions,
+                    mode="append",
+                    schema=table.schema,
+                    partition_by=list(table.partition_by),
+                    commit_properties=CommitProperties(
+                        custom_metadata={NOTE: note},
+                        app_transactions=[Transaction(u.name, u.version) for u in change.units],
+                    ),
+                )
+            except CommitFailedError as error:
+                if not is_conflict(error):
+                    raise
+                raise ConflictError(
+                    f"{table.folder}: another process changed the table at the same moment "
+                    f"({first_line(error)}). Run the same command again."
+                ) from None
+            table.folder.settle_commits(self.version)
+            seal_new_checkpoint(table.folder, self.version)
+
+
+def _file_path(name: str, encoded: Encoded, day: date | None) -> str:
+    folder = f"day={day.isoformat()}/" if day else ""
+    return f"{folder}{name}-{encoded.checksum}.parquet"

@@ -1,0 +1,139 @@
+"""A folder of files below a data root: the few operations that the rest of the program needs.
+
+Data files, documents and signatures are written once and are immutable, so that a folder needs
+neither locks nor directories: whole files appear, are read, are listed and are deleted. Nothing
+else knows what a data root is made of. `fleet_slip.files.local_folder` is a folder of a file
+system, `fleet_slip.files.object_folder` one of an object store.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol, Self, TypeAlias
+
+if TYPE_CHECKING:
+    import duckdb
+    import pyarrow as pa
+
+TEMPORARY_PREFIX = ".tmp-"
+"""Beginning of the name of a file that is not whole yet."""
+
+Content: TypeAlias = "bytes | pa.Buffer"
+
+
+@dataclass(frozen=True)
+class StoredFile:
+    """A file, in the state in which a listing found it.
+
+    Attributes:
+        folder: the folder that was listed.
+        path: the file's path below that folder.
+        identity: changes when another file takes the place of this one.
+    """
+
+    folder: "Folder"
+    path: str
+    size_bytes: int
+    modified_ns: int
+    identity: str
+
+    def __str__(self) -> str:
+        """Return the full path."""
+        return f"{self.folder}/{self.path}"
+
+    @property
+    def name(self) -> str:
+        """The last part of the path."""
+        return self.path.rpartition("/")[2]
+
+    @property
+    def age_hours(self) -> float:
+        """Hours since it was written."""
+        return (time.time_ns() - self.modified_ns) / 3.6e12
+
+
+class Folder(Protocol):
+    """A folder below a data root; it need not exist. As text it is its path.
+
+    A folder is a value: comparing, hashing and pickling it touch nothing. All methods raise
+    `StorageError` for what cannot be read or written. `path` is always that of a file below the
+    folder, with slashes.
+    """
+
+    @property
+    def name(self) -> str:
+        """The last part of the folder's path."""
+
+    @property
+    def uri(self) -> str:
+        """The folder as DuckDB and the Delta library know it."""
+
+    @property
+    def delta_options(self) -> dict[str, str] | None:
+        """Options of the Delta library for tables below this folder."""
+
+    @property
+    def spill(self) -> Path:
+        """A folder of this machine for what a query cannot hold in memory."""
+
+    @property
+    def reuses_names(self) -> bool:
+        """Whether a data file's name may be written again after it was deleted, or meanwhile.
+
+        Not where `remove` could delete what was written a moment ago under the same name.
+        """
+
+    def __truediv__(self, name: str) -> Self:
+        """Return a folder below this one."""
+
+    def exists(self) -> bool:
+        """Whether there is such a folder."""
+
+    def names(self) -> list[str]:
+        """Return the names of files and folders directly below, sorted."""
+
+    def files(self) -> list[StoredFile]:
+        """Return all files below, at any depth, sorted by path."""
+
+    def read(self, path: str, longest: int | None = None) -> bytes:
+        """Return the content of a file, or only its first bytes."""
+
+    def read_many(self, paths: Sequence[str]) -> list[bytes | None]:
+        """Return the content of files, None for one that is gone."""
+
+    def open(self, path: str) -> "pa.NativeFile":
+        """Open a file for reading anywhere in it."""
+
+    def put(self, path: str, content: Content) -> None:
+        """Write a file as a whole, durably. A file of that name is replaced."""
+
+    def create(self, path: str, content: Content) -> bool:
+        """Write a file as a whole, durably; False, and no change, if there is one of that name."""
+
+    def append(self, path: str, content: bytes) -> None:
+        """Add to a history in one write, durably. Its parts are files whose names begin so."""
+
+    def remove(self, file: StoredFile) -> bool:
+        """Delete the very file that a listing found; False if it is gone or was replaced."""
+
+    def settle_commits(self, before: int | None) -> None:
+        """Make the commits after a version durable, if the folder is a Delta table."""
+
+    def free_bytes(self) -> tuple[int, int] | None:
+        """Return how much is free and how much there is in all; None where that has no meaning."""
+
+    def exclusive(self, name: str, waiting: Callable[[], None]) -> AbstractContextManager[None]:
+        """Hold a lock among the processes of this machine, where the folder can have one."""
+
+    def let_read(self, database: "duckdb.DuckDBPyConnection") -> None:
+        """Enable a connection to read files below this folder."""
+
+    def lend(
+        self, database: "duckdb.DuckDBPyConnection", wanted: Callable[[str], bool]
+    ) -> list[str]:
+        """Enable a connection to read the files whose paths are wanted; return their URIs, sorted.
+
+        For files that may be many and small, and may be replaced by others at any moment.
+        """

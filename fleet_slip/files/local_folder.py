@@ -1,0 +1,242 @@
+"""Folders of a file system.
+
+A file is written under a temporary name, flushed to disk and renamed; a new number is taken by a
+hard link, which fails if another process took it first. So no reader ever sees half a file, and
+what was written survives a power cut.
+"""
+
+import contextlib
+import errno
+import fcntl
+import os
+import shutil
+import uuid
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import count
+from pathlib import Path
+from typing import TYPE_CHECKING, Self
+
+import pyarrow as pa
+
+from fleet_slip.files.folder import TEMPORARY_PREFIX, Content, StoredFile
+from fleet_slip.files.storage_errors import storage_errors
+
+if TYPE_CHECKING:
+    import duckdb
+
+
+@dataclass(frozen=True)
+class LocalFolder:
+    """A folder of a file system; see `fleet_slip.files.folder.Folder`."""
+
+    path: Path
+
+    def __str__(self) -> str:
+        """Return the path."""
+        return str(self.path)
+
+    @property
+    def name(self) -> str:
+        """The last part of the folder's path."""
+        return self.path.name
+
+    @property
+    def uri(self) -> str:
+        """The folder as DuckDB and the Delta library know it."""
+        return str(self.path)
+
+    @property
+    def delta_options(self) -> dict[str, str] | None:
+        """Options of the Delta library: none are needed."""
+        return None
+
+    @property
+    def spill(self) -> Path:
+        """A folder of this machine for what a query cannot hold in memory."""
+        return self.path
+
+    @property
+    def reuses_names(self) -> bool:
+        """Return True: `remove` deletes the very file that was found."""
+        return True
+
+    def __truediv__(self, name: str) -> Self:
+        """Return a folder below this one."""
+        return type(self)(self.path / name)
+
+    def exists(self) -> bool:
+        """Whether there is such a folder."""
+        with storage_errors(self):
+            return self.path.is_dir()
+
+    def names(self) -> list[str]:
+        """Return the names of files and folders directly below, sorted."""
+        with storage_errors(self):
+            return sorted(e.name for e in self.path.iterdir()) if self.path.is_dir() else []
+
+    def files(self) -> list[StoredFile]:
+        """Return all files below, at any depth, sorted by path."""
+        with storage_errors(self):
+            walked = os.walk(self.path, onerror=_pass_over)
+            paths = sorted(Path(folder) / name for folder, _, names in walked for name in names)
+            return [file for file in map(self._judge, filter(Path.is_file, paths)) if file]
+
+    def read(self, path: str, longest: int | None = None) -> bytes:
+        """Return the content of a file, or only its first bytes."""
+        with storage_errors(self.path / path), (self.path / path).open("rb") as file:
+            return file.read(-1 if longest is None else longest)
+
+    def read_many(self, paths: Sequence[str]) -> list[bytes | None]:
+        """Return the content of files, None for one that is gone."""
+        return [self.read(path) if (self.path / path).is_file() else None for path in paths]
+
+    def open(self, path: str) -> pa.NativeFile:
+        """Open a file for reading anywhere in it."""
+        with storage_errors(self.path / path):
+            return pa.OSFile(str(self.path / path), "rb")
+
+    def put(self, path: str, content: Content) -> None:
+        """Write a file as a whole, durably. A file of that name is replaced."""
+        target = self.path / path
+        with _written_aside(target, content) as temporary:
+            temporary.replace(target)
+
+    def create(self, path: str, content: Content) -> bool:
+        """Write a file as a whole, durably; False, and no change, if there is one of that name."""
+        target = self.path / path
+        with _written_aside(target, content) as temporary:
+            try:
+                target.hardlink_to(temporary)
+            except FileExistsError:
+                return False
+        return True
+
+    def append(self, path: str, content: bytes) -> None:
+        """Add to a file in one write, durably."""
+        file = self.path / path
+        with storage_errors(file):
+            file.parent.mkdir(exist_ok=True)
+            descriptor = os.open(file, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+            try:
+                os.write(descriptor, content)
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
+
+    def remove(self, file: StoredFile) -> bool:
+        """Delete the very file that a listing found; False if it is gone or was replaced.
+
+        A job may be writing a file of the same name and bytes at this moment. So the file is moved
+        aside first; if it is not the one that was found it is put back.
+        """
+        path = self.path / file.path
+        aside = path.with_name(f"{TEMPORARY_PREFIX}{uuid.uuid4().hex}")
+        with storage_errors(path):
+            try:
+                path.rename(aside)
+            except FileNotFoundError:
+                return False
+            found = self._judge(aside)
+            same = found is not None and replace(found, path=file.path) == file
+            if not same:
+                with contextlib.suppress(FileExistsError):
+                    path.hardlink_to(aside)
+            aside.unlink()
+        return same
+
+    def settle_commits(self, before: int | None) -> None:
+        """Make the commits to this table after a version durable: the Delta library does not."""
+        folder = self.path / "_delta_log"
+        with contextlib.suppress(FileNotFoundError):
+            for version in count(0 if before is None else before + 1):
+                with (folder / f"{version:020}.json").open("rb") as file:
+                    os.fsync(file.fileno())
+        _flush(folder)
+
+    def free_bytes(self) -> tuple[int, int] | None:
+        """Return how much of the disk is free, and its size."""
+        with storage_errors(self):
+            disk = shutil.disk_usage(self.path)
+        return disk.free, disk.total
+
+    @contextlib.contextmanager
+    def exclusive(self, name: str, waiting: Callable[[], None]) -> Iterator[None]:
+        """Hold a lock among the processes of this machine; a killed process releases it.
+
+        Calls `waiting` once if another process holds it. Where the file system is read-only there
+        is nothing to protect, and no lock is taken.
+        """
+        lock = self.path / name
+        with contextlib.ExitStack() as stack:
+            with storage_errors(lock):
+                try:
+                    lock.parent.mkdir(parents=True, exist_ok=True)
+                    file = stack.enter_context(lock.open("w"))
+                except OSError as error:
+                    if error.errno != errno.EROFS:
+                        raise
+                    file = None
+                if file is not None:
+                    try:
+                        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    except BlockingIOError:
+                        waiting()
+                        fcntl.flock(file, fcntl.LOCK_EX)
+            yield
+
+    def let_read(self, database: "duckdb.DuckDBPyConnection") -> None:
+        """Enable a connection to read files below this folder, as every one is."""
+
+    def lend(
+        self,
+        database: "duckdb.DuckDBPyConnection",  # noqa: ARG002
+        wanted: Callable[[str], bool],
+    ) -> list[str]:
+        """Return the URIs of the files whose paths are wanted: a connection can read them."""
+        return [f"{self.uri}/{file.path}" for file in self.files() if wanted(file.path)]
+
+    def _judge(self, path: Path) -> StoredFile | None:
+        try:
+            stat = path.stat(follow_symlinks=False)
+        except FileNotFoundError:
+            return None
+        return StoredFile(
+            self,
+            path.relative_to(self.path).as_posix(),
+            stat.st_size,
+            stat.st_mtime_ns,
+            str(stat.st_ino),
+        )
+
+
+@contextlib.contextmanager
+def _written_aside(target: Path, content: Content) -> Iterator[Path]:
+    """Write a temporary sibling of a file, and make durable what is done with it."""
+    temporary = target.with_name(f"{TEMPORARY_PREFIX}{uuid.uuid4().hex}")
+    with storage_errors(target):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with temporary.open("xb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            yield temporary
+        finally:
+            temporary.unlink(missing_ok=True)
+        _flush(target.parent)
+
+
+def _pass_over(error: OSError) -> None:
+    """Go on where a folder is gone, or not ours to see, or none; raise any other error."""
+    if not isinstance(error, FileNotFoundError | NotADirectoryError | PermissionError):
+        raise error
+
+
+def _flush(folder: Path) -> None:
+    """Make renames inside a folder durable."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,142 @@
+"""Objects as files that can be read anywhere in them: for DuckDB and for pyarrow.
+
+Objects of a data root that are read in this way never change, so that a size is asked for once.
+DuckDB's Parquet reader merges what it needs into reads of about a megabyte.
+"""
+
+import io
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+import fsspec
+import obstore
+
+from fleet_slip.files.object_errors import object_errors
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from obstore.store import ObjectStore
+
+
+class ObjectReader(io.RawIOBase):
+    """An object as a file. It is read in as many requests as there are calls."""
+
+    def __init__(self, store: "ObjectStore", key: str, where: str, size: int | None = None) -> None:
+        """Open an object; `where` names it in errors."""
+        self._store, self._key, self._where, self._position = store, key, where, 0
+        if size is None:
+            with object_errors(where):
+                size = obstore.head(store, key)["size"]
+        self._size = size
+
+    def readable(self) -> bool:
+        """Return True."""
+        return True
+
+    def seekable(self) -> bool:
+        """Return True."""
+        return True
+
+    def tell(self) -> int:
+        """Return where the next read begins."""
+        return self._position
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        """Move to where the next read begins."""
+        begin = {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self._size}[whence]
+        self._position = begin + offset
+        return self._position
+
+    def read(self, size: int = -1) -> bytes:
+        """Read so many bytes, or all that are left."""
+        left = max(self._size - self._position, 0)
+        length = left if size is None or size < 0 else min(size, left)
+        if not length:
+            return b""
+        with object_errors(self._where):
+            part = obstore.get_range(self._store, self._key, start=self._position, length=length)
+        self._position += length
+        return bytes(part)
+
+
+class ObjectFilesystem(fsspec.AbstractFileSystem):  # type: ignore[misc]
+    """The objects of one bucket, for `duckdb.DuckDBPyConnection.register_filesystem`; read only."""
+
+    cachable = False
+
+    def __init__(self, bucket: str, store: "Callable[[], ObjectStore]") -> None:
+        """Serve a bucket, such as s3://BUCKET, of the store that is returned when asked for.
+
+        fsspec makes text of all that it is given, which not every store survives.
+        """
+        super().__init__()
+        self.protocol, _, self._name = bucket.partition("://")
+        self._store = store()
+        self._sizes: dict[str, int] = {}
+
+    def _key(self, path: str) -> str:
+        return path.removeprefix(f"{self.protocol}://").removeprefix(f"{self._name}/")
+
+    def info(self, path: str, **_options: Any) -> dict[str, Any]:
+        """Return the name, type and size of an object."""
+        key = self._key(path)
+        if key not in self._sizes:
+            with object_errors(f"{self.protocol}://{self._name}/{key}"):
+                self._sizes[key] = obstore.head(self._store, key)["size"]
+        return {"name": path, "type": "file", "size": self._sizes[key]}
+
+    def modified(self, path: str) -> datetime:  # noqa: ARG002 - they never change
+        """Return one moment for all objects."""
+        return datetime.fromtimestamp(0, UTC)
+
+    def glob(self, path: str, **_options: Any) -> list[str]:
+        """Return the path: names of data files are no patterns."""
+        return [path]
+
+    def exists(self, path: str, **_options: Any) -> bool:
+        """Return True; that it is not there shows when it is read."""
+        return bool(path)
+
+    def open(self, path: str, mode: str = "rb", **_options: Any) -> ObjectReader:
+        """Open an object for reading. Raises `PermissionError` for any other mode."""
+        if mode != "rb":
+            raise PermissionError(f"{path}: a warehouse is only read through SQL")
+        key = self._key(path)
+        where = f"{self.protocol}://{self._name}/{key}"
+        return ObjectReader(self._store, key, where, self.info(path)["size"])
+
+
+class LentFile(fsspec.AbstractFileSystem):  # type: ignore[misc]
+    """A file in memory, for a connection that it is registered with; read only."""
+
+    cachable = False
+    protocol = "lent"
+    uri = "lent://file"
+
+    def __init__(self, content: memoryview) -> None:
+        """Serve a content; a view of it, since fsspec makes text of all that it is given."""
+        super().__init__()
+        self._content = content
+
+    def info(self, path: str, **_options: Any) -> dict[str, Any]:
+        """Return the name, type and size."""
+        return {"name": path, "type": "file", "size": len(self._content)}
+
+    def modified(self, path: str) -> datetime:  # noqa: ARG002 - it never changes
+        """Return some moment."""
+        return datetime.fromtimestamp(0, UTC)
+
+    def glob(self, path: str, **_options: Any) -> list[str]:
+        """Return the path."""
+        return [path]
+
+    def exists(self, path: str, **_options: Any) -> bool:
+        """Return whether it is this file."""
+        return path.removeprefix("lent://") == "file"
+
+    def open(self, path: str, mode: str = "rb", **_options: Any) -> io.BytesIO:
+        """Open the file for reading. Raises `PermissionError` for any other mode."""
+        if mode != "rb":
+            raise PermissionError(f"{path}: it is only lent")
+        return io.BytesIO(self._content)

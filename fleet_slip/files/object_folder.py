@@ -1,0 +1,271 @@
+"""Folders of an object store: S3 and what speaks like it, Google Cloud Storage, Azure.
+
+A put of an object is whole or nothing, and `If-None-Match: *` makes it fail where there is one of
+that name; so temporary names, renames, flushes and links are not needed. Nothing is ever changed
+in place, so that several machines can write.
+"""
+
+import contextlib
+import functools
+import os
+import tempfile
+import time
+import uuid
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from datetime import timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import duckdb
+import obstore
+import pyarrow as pa
+from obstore.exceptions import AlreadyExistsError
+from obstore.store import from_url
+
+from fleet_slip.errors import StorageError
+from fleet_slip.files.folder import Content, StoredFile
+from fleet_slip.files.object_credentials import AwsProfile, aws_profile
+from fleet_slip.files.object_errors import object_errors
+from fleet_slip.files.object_files import LentFile, ObjectFilesystem, ObjectReader
+
+if TYPE_CHECKING:
+    from obstore.store import ObjectStore
+
+HTTP_VARIABLE = "AWS_ALLOW_HTTP"
+"""Environment variable, which the Delta library reads too: true lets an endpoint be http."""
+
+TIMEOUT_S = 60
+"""Longest that one request may take: a log file has up to 40 MB."""
+
+CONNECT_TIMEOUT_S = 5
+RETRIES = 5
+RETRY_S = 60
+"""No attempt begins later than so long after the first."""
+
+READS_AT_ONCE = 32
+LISTINGS = 20
+"""So often files are listed again that were replaced before they were read."""
+
+
+@dataclass(frozen=True)
+class ObjectFolder:
+    """A folder of an object store; see `fleet_slip.files.folder.Folder`.
+
+    Attributes:
+        bucket: `s3://BUCKET`, `gs://BUCKET` or `az://CONTAINER`.
+        prefix: what the names of the folder's objects begin with, without a slash at the end.
+    """
+
+    bucket: str
+    prefix: str
+
+    def __str__(self) -> str:
+        """Return the URL."""
+        return f"{self.bucket}/{self.prefix}".rstrip("/")
+
+    @property
+    def name(self) -> str:
+        """The last part of the folder's path."""
+        return self.prefix.rpartition("/")[2]
+
+    @property
+    def uri(self) -> str:
+        """The folder as DuckDB and the Delta library know it."""
+        return str(self)
+
+    @property
+    def reuses_names(self) -> bool:
+        """Whether a name may be written again: `remove` may delete what is written meanwhile."""
+        return False
+
+    @property
+    def delta_options(self) -> dict[str, str] | None:
+        """Options of the Delta library; credentials it finds where we do."""
+        profile = _profile(self.bucket)
+        return {
+            "timeout": f"{TIMEOUT_S}s",
+            "connect_timeout": f"{CONNECT_TIMEOUT_S}s",
+            "max_retries": f"{RETRIES}",
+            "retry_timeout": f"{RETRY_S}s",
+            "conditional_put": "etag",
+            **(profile.delta_options if profile else {}),
+        }
+
+    @property
+    def spill(self) -> Path:
+        """A folder of this machine for what a query cannot hold in memory."""
+        return Path(tempfile.gettempdir())
+
+    def __truediv__(self, name: str) -> Self:
+        """Return a folder below this one."""
+        return replace(self, prefix=self._key(name))
+
+    def exists(self) -> bool:
+        """Whether there is anything below this folder."""
+        with object_errors(str(self)):
+            pages = obstore.list(self._store, self.prefix or None, chunk_size=1)
+            return any(len(page) for page in pages)
+
+    def names(self) -> list[str]:
+        """Return the names of files and folders directly below, sorted."""
+        with object_errors(str(self)):
+            found = obstore.list_with_delimiter(self._store, self.prefix or None)
+        paths = [*found["common_prefixes"], *(meta["path"] for meta in found["objects"])]
+        return sorted(path.rpartition("/")[2] for path in paths)
+
+    def files(self) -> list[StoredFile]:
+        """Return all files below, at any depth, sorted by path."""
+        with object_errors(str(self)):
+            pages = list(obstore.list(self._store, self.prefix or None))
+        found = [self._found(meta) for page in pages for meta in page]
+        return sorted(found, key=lambda file: file.path)
+
+    def read(self, path: str, longest: int | None = None) -> bytes:
+        """Return the content of a file, or only its first bytes."""
+        with object_errors(f"{self}/{path}"):
+            answer = obstore.get(self._store, self._key(path))
+            if longest is not None and answer.meta["size"] > longest:
+                return bytes(
+                    obstore.get_range(self._store, self._key(path), start=0, length=longest)
+                )
+            return bytes(answer.bytes())
+
+    def read_many(self, paths: Sequence[str]) -> list[bytes | None]:
+        """Return the content of files, None for one that is gone. Many are asked for at once."""
+        with ThreadPoolExecutor(READS_AT_ONCE) as executor:
+            return list(executor.map(self._read_or_none, paths))
+
+    def open(self, path: str) -> pa.NativeFile:
+        """Open a file for reading anywhere in it."""
+        return pa.PythonFile(ObjectReader(self._store, self._key(path), f"{self}/{path}"), "r")
+
+    def put(self, path: str, content: Content) -> None:
+        """Write a file as a whole, durably. A file of that name is replaced."""
+        self._put(path, content, "overwrite")
+
+    def create(self, path: str, content: Content) -> bool:
+        """Write a file as a whole, durably; False, and no change, if there is one of that name.
+
+        Where an answer was lost on the way, the attempt is made again, and is False for the file
+        that it has made itself.
+        """
+        return self._put(path, content, "create")
+
+    def append(self, path: str, content: bytes) -> None:
+        """Add to a history in one write: objects cannot grow, so that it is an object of its own.
+
+        Its name begins with the path and goes on with the time.
+        """
+        self.put(f"{path}/{time.time_ns():020d}-{uuid.uuid4().hex[:8]}.jsonl", content)
+
+    def remove(self, file: StoredFile) -> bool:
+        """Delete the very file that a listing found; False if it is gone or was replaced.
+
+        It is looked at first. What is written between looking and deleting would be deleted, so
+        that no name of a data file is used twice (`reuses_names`).
+        """
+        with object_errors(str(file)):
+            try:
+                meta = obstore.head(self._store, self._key(file.path))
+            except FileNotFoundError:
+                return False
+            if self._found(meta) != file:
+                return False
+            obstore.delete(self._store, self._key(file.path))
+        return True
+
+    def settle_commits(self, before: int | None) -> None:
+        """Make commits durable, as they are."""
+
+    def free_bytes(self) -> tuple[int, int] | None:
+        """Return None: a bucket is never full."""
+        return None
+
+    @contextlib.contextmanager
+    def exclusive(self, name: str, waiting: Callable[[], None]) -> Iterator[None]:  # noqa: ARG002
+        """Hold no lock: there is none that a killed process surely releases.
+
+        What is done twice at once lands once, by the commits.
+        """
+        yield
+
+    def let_read(self, database: duckdb.DuckDBPyConnection) -> None:
+        """Enable a connection to read the objects of this bucket."""
+        database.register_filesystem(ObjectFilesystem(self.bucket, lambda: self._store))
+
+    def lend(self, database: duckdb.DuckDBPyConnection, wanted: Callable[[str], bool]) -> list[str]:
+        """Read the files whose paths are wanted into memory, as one; return its URI.
+
+        DuckDB would ask for them one after the other. Raises `StorageError` if they are replaced as
+        fast as they are listed.
+        """
+        for _ in range(LISTINGS):
+            paths = [file.path for file in self.files() if wanted(file.path)]
+            contents = self.read_many(paths)
+            if None not in contents:
+                break
+        else:
+            raise StorageError(f"{self}: other processes keep changing it. Run the command again.")
+        if not paths:
+            return []
+        lent = LentFile(memoryview(b"".join(content for content in contents if content)))
+        database.register_filesystem(lent)
+        return [lent.uri]
+
+    @property
+    def _store(self) -> "ObjectStore":
+        return _store(self.bucket)
+
+    def _read_or_none(self, path: str) -> bytes | None:
+        with object_errors(f"{self}/{path}"):
+            try:
+                return bytes(obstore.get(self._store, self._key(path)).bytes())
+            except FileNotFoundError:
+                return None
+
+    def _key(self, path: str) -> str:
+        return f"{self.prefix}/{path}" if self.prefix else path
+
+    def _put(self, path: str, content: Content, mode: Any) -> bool:
+        data = memoryview(content).cast("B")
+        with object_errors(f"{self}/{path}"):
+            try:
+                obstore.put(self._store, self._key(path), data, mode=mode, use_multipart=False)
+            except AlreadyExistsError:
+                return False
+        return True
+
+    def _found(self, meta: Any) -> StoredFile:
+        # Of one object some stores list milliseconds, or a tag without quotes, and tell seconds
+        # and quotes when they are asked for it alone.
+        return StoredFile(
+            self,
+            meta["path"][len(self.prefix) :].lstrip("/"),
+            meta["size"],
+            int(meta["last_modified"].timestamp()) * 10**9,
+            (meta["e_tag"] or "").strip('"'),
+        )
+
+
+def _profile(bucket: str) -> AwsProfile | None:
+    """Return where credentials are, if it is a bucket of S3 and they are not in the environment."""
+    return aws_profile() if bucket.startswith("s3://") else None
+
+
+@functools.cache
+def _store(bucket: str) -> "ObjectStore":
+    """Return the client for a bucket, which a process makes when it first needs it."""
+    profile = _profile(bucket)
+    with object_errors(bucket):
+        return from_url(
+            bucket,
+            client_options={
+                "allow_http": os.environ.get(HTTP_VARIABLE, "").lower() in ("1", "true"),
+                "timeout": timedelta(seconds=TIMEOUT_S),
+                "connect_timeout": timedelta(seconds=CONNECT_TIMEOUT_S),
+            },
+            retry_config={"max_retries": RETRIES, "retry_timeout": timedelta(seconds=RETRY_S)},
+            **(profile.store_options if profile else {}),
+        )

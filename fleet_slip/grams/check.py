@@ -1,0 +1,174 @@
+"""Checks the Gram rows against two other ways to compute them, bit for bit."""
+
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.delta import TableFile
+from fleet_slip.errors import SelectionError, StorageError
+from fleet_slip.grams.job import aggregate
+from fleet_slip.regression.gram import Gram
+from fleet_slip.warehouse.tables import Warehouse
+
+INTEGER_ROWS = 5_000
+"""Rows of a drive that are also summed by Python integers, which take 50 us a row."""
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """What was compared. All of it was equal, or `StorageError` would have been raised."""
+
+    files: int
+    rows: int
+    drives: int
+    drives_by_integers: int
+
+
+def check_grams(
+    warehouse: Warehouse,
+    count: int,
+    progress: Callable[[int, int], None] = lambda _more, _all: None,
+) -> CheckReport:
+    """Check the Gram rows of evenly chosen log files.
+
+    Raises `StorageError` naming the first drive whose Grams differ, and `SelectionError` if there
+    is nothing to check.
+    """
+    logs = warehouse.logs.snapshot()
+    if not logs.files:
+        raise SelectionError(f"{warehouse.root}: no logs yet. Run: fleet-slip simulate CAMPAIGN")
+    step = max(1, len(logs.files) // count)
+    chosen = logs.files[::step][:count]
+    stored = stored_grams(warehouse)
+    drives = by_integers = rows = 0
+    for file in chosen:
+        from_sql = grams_of(aggregate(warehouse, [file]))
+        _compare(file, "the stored Gram rows", from_sql, stored.get(file.path, {}))
+        counts = read_counts(warehouse, file)
+        _compare(file, "float64 blocks", from_sql, grams_by_blocks(warehouse, counts))
+        by_integers += _check_by_integers(warehouse, file, counts)
+        drives += len(from_sql)
+        rows += file.rows
+        progress(1, len(chosen))
+    return CheckReport(len(chosen), rows, drives, by_integers)
+
+
+DriveGrams = dict[tuple[str, tuple[str, ...]], Gram]
+"""Gram of each drive and set of signals."""
+
+
+def grams_of(rows: pa.Table) -> DriveGrams:
+    """Return rows of the table `grams` as Grams."""
+    found = {}
+    for row in rows.select(["drive_id", "signals", "n", "sums", "products"]).to_pylist():
+        signals = tuple(row["signals"].split(",")) if row["signals"] else ()
+        found[row["drive_id"], signals] = Gram(
+            signals, row["n"], tuple(row["sums"]), tuple(row["products"])
+        )
+    return found
+
+
+def stored_grams(
+    warehouse: Warehouse, files: Sequence[TableFile] | None = None
+) -> dict[str, DriveGrams]:
+    """Return the stored Gram rows of the logged signals, by log file; of some files, or all."""
+    by_file: dict[str, DriveGrams] = defaultdict(dict)
+    for gram_file in warehouse.grams.snapshot().files if files is None else files:
+        every = warehouse.grams.read(gram_file.path)
+        rows = every.filter(pc.equal(every["feature_set"], PLAIN))
+        for file in rows["file"].unique().to_pylist():
+            by_file[file] |= grams_of(rows.filter(pc.equal(rows["file"], file)))
+    return by_file
+
+
+def read_counts(warehouse: Warehouse, file: TableFile) -> pa.Table:
+    """Return the columns of a log file that its Gram rows are made of, null where it has none."""
+    names = ["drive_id", *warehouse.catalogue.gram_signals]
+    present = warehouse.logs.read_metadata(file.path).schema.to_arrow_schema().names
+    rows = warehouse.logs.read(file.path, [name for name in names if name in present])
+    for name in names:
+        if name not in present:
+            rows = rows.append_column(name, pa.nulls(len(rows), pa.int16()))
+    return rows.select(names)
+
+
+def _drives(rows: pa.Table) -> list[tuple[str, pa.Table]]:
+    ids = pc.dictionary_encode(rows["drive_id"].cast(pa.string()).combine_chunks())
+    drive_of_row = ids.indices.to_numpy()
+    order = np.argsort(drive_of_row, kind="stable")
+    if (order[1:] < order[:-1]).any():
+        rows, drive_of_row = rows.take(order), drive_of_row[order]
+    starts = np.flatnonzero(np.diff(drive_of_row, prepend=-1))
+    return [
+        (ids.dictionary[int(drive_of_row[start])].as_py(), rows.slice(start, end - start))
+        for start, end in pairwise([*starts.tolist(), rows.num_rows])
+    ]
+
+
+def grams_by_blocks(warehouse: Warehouse, counts: pa.Table) -> DriveGrams:
+    """Compute Gram rows by matrix products in float64, exact because blocks are small."""
+    found: DriveGrams = {}
+    for drive, rows in _drives(counts):
+        for signals, matrix in _complete_parts(warehouse, rows):
+            found[drive, signals] = Gram.from_counts(signals, matrix)
+    return found
+
+
+def _complete_parts(
+    warehouse: Warehouse, rows: pa.Table
+) -> list[tuple[tuple[str, ...], np.ndarray[Any, np.dtype[np.int64]]]]:
+    """Divide rows by the signals that they have; return each part's signals and counts."""
+    names = warehouse.catalogue.gram_signals
+    columns = [rows[name].combine_chunks() for name in names]
+    present = np.column_stack(
+        [column.is_valid().to_numpy(zero_copy_only=False) for column in columns]
+    )
+    values = np.column_stack(
+        [column.fill_null(0).to_numpy(zero_copy_only=False).astype(np.int64) for column in columns]
+    )
+    parts = []
+    number_of_row = present @ (1 << np.arange(len(names)))
+    for number in np.unique(number_of_row).tolist():
+        pattern = [bool(number >> i & 1) for i in range(len(names))]
+        signals = tuple(name for name, there in zip(names, pattern, strict=True) if there)
+        parts.append((signals, values[number_of_row == number][:, pattern]))
+    return parts
+
+
+def _check_by_integers(warehouse: Warehouse, file: TableFile, counts: pa.Table) -> int:
+    """Compare the float64 blocks with plain Python sums on the first drive's first rows."""
+    drive, rows = _drives(counts)[0]
+    for signals, matrix in _complete_parts(warehouse, rows.slice(0, INTEGER_ROWS)):
+        columns = [[int(count) for count in column] for column in matrix.T]
+        by_integers = Gram(
+            signals,
+            len(matrix),
+            tuple(map(sum, columns)),
+            tuple(
+                sum(a * b for a, b in zip(columns[i], columns[j], strict=True))
+                for i in range(len(columns))
+                for j in range(i + 1)
+            ),
+        )
+        by_blocks = Gram.from_counts(signals, matrix)
+        _compare(
+            file, "Python integers", {(drive, signals): by_blocks}, {(drive, signals): by_integers}
+        )
+    return 1
+
+
+def _compare(file: TableFile, other: str, one: DriveGrams, two: DriveGrams) -> None:
+    for key in sorted(one.keys() | two.keys()):
+        if one.get(key) != two.get(key):
+            raise StorageError(
+                f"{file.path}: the Gram of drive {key[0]} by SQL and by {other} differ. If the "
+                "Gram job has not run since the logs changed, run: fleet-slip gram. Otherwise the "
+                "file or a library is damaged: keep both and report it."
+            )

@@ -1,0 +1,261 @@
+"""Cohorts: the Gram rows of the drives that satisfy an SQL condition."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import duckdb
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.errors import RefusedError, SelectionError
+from fleet_slip.grams.reader import GramReader, open_grams
+from fleet_slip.regression.drives import serving_drives
+from fleet_slip.regression.folds import Assignment, CohortFolds, by_hash, by_value
+from fleet_slip.regression.gram import GramTable, IntArray, packed_size
+from fleet_slip.warehouse.database import database_errors
+from fleet_slip.warehouse.tables import Warehouse
+
+FOLD_KEYS = {
+    "drive": "drive_id",
+    "vehicle": "vehicle_id",
+    "track": "track",
+    "day": "day",
+    "mass": "mass_kg",
+    "adhesion": "adhesion",
+    "row": "part",
+}
+"""What a fold may be made of, and the column that tells."""
+
+ROW_FOLDS = "row"
+"""Folds of single rows, as WEKA makes them. They leak: a test row's neighbours train the model."""
+
+SCENARIO = "scenario"
+"""Source of the drives that models are evaluated on, and must never be trained on."""
+
+ALL_DRIVES = "true"
+TRAINING_DRIVES = f"source <> '{SCENARIO}'"
+
+
+@dataclass(frozen=True)
+class Served:
+    """The drives of a cohort that have all of some signals, one Gram row each.
+
+    Attributes:
+        table: their Gram rows, restricted to the signals.
+        drives: metadata of each, in the same order.
+    """
+
+    table: GramTable
+    drives: pa.Table
+
+
+@dataclass(frozen=True)
+class Cohort:
+    """Gram rows, grouped by the signals that they have.
+
+    A drive has several Gram rows if it has a signal in some of its rows only, or if the feature set
+    divides its rows.
+
+    Attributes:
+        condition: SQL condition on the columns of the view `drives`.
+        tables: one `GramTable` for each set of signals.
+        drives: metadata of each Gram row, in the order of the tables.
+        logs_version, grams_version: versions of the Delta tables that were read.
+        feature_set: which Gram rows these are.
+    """
+
+    condition: str
+    tables: tuple[GramTable, ...]
+    drives: pa.Table
+    logs_version: int
+    grams_version: int
+    feature_set: str = PLAIN
+
+    @property
+    def rows(self) -> int:
+        """Number of rows of the logs behind the cohort."""
+        return int(sum(table.n.sum() for table in self.tables))
+
+    @cached_property
+    def drive_numbers(self) -> IntArray:
+        """The drive of each Gram row, numbered from 0."""
+        indices = pc.dictionary_encode(self.drives["drive_id"].combine_chunks()).indices
+        return np.asarray(indices.to_numpy(), dtype=np.int64)
+
+    @property
+    def drive_count(self) -> int:
+        """Number of drives."""
+        return int(self.drive_numbers.max()) + 1
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Signals and features that any of the drives has, in the order of the feature set."""
+        found = {name for table in self.tables for name in table.signals}
+        return tuple(name for name in features().set(self.feature_set).inputs if name in found)
+
+    def folds(self, by: str, count: int) -> CohortFolds:
+        """Divide the cohort into folds, of whole drives unless by `row`.
+
+        By `drive`: hashed into `count` folds. By another key of `FOLD_KEYS`: one fold for each
+        value, or hashed into `count` folds if there are more values than that. By `row`: the folds
+        that the feature set made of single rows, `count` of them. Raises `SelectionError` if it
+        made none.
+        """
+        if by == ROW_FOLDS:
+            require_row_folds(self.feature_set, count)
+        values = self.drives[FOLD_KEYS[by]].to_pylist()
+        return CohortFolds.of(self.tables, assign(values, by, count), self.drive_numbers)
+
+    def serving(self, inputs: Sequence[str]) -> Served:
+        """Return the drives that have the label and all the inputs, one Gram row each.
+
+        Raises `SelectionError` if there is none.
+        """
+        table, mask = serving_drives(self.tables, [*inputs, catalogue().label])
+        rows = np.flatnonzero(mask)
+        numbers = self.drive_numbers[rows]
+        order = np.argsort(numbers, kind="stable")
+        _, first = np.unique(numbers[order], return_index=True)
+        if len(first) == len(rows):
+            return Served(table, self.drives.take(rows))
+        merged = GramTable(
+            table.signals,
+            *(
+                np.add.reduceat(part[order], first)
+                for part in (table.n, table.sums, table.products)
+            ),
+        )
+        return Served(merged, self.drives.take(rows[order[first]]))
+
+    def part(self, wanted: NDArray[np.bool_]) -> "Cohort":
+        """Return the cohort with some of its Gram rows only; the mask lists them all."""
+        stops = np.cumsum([len(table) for table in self.tables])[:-1]
+        masks = np.split(wanted, stops)
+        kept = [table.take(m) for table, m in zip(self.tables, masks, strict=True) if m.any()]
+        return Cohort(
+            self.condition,
+            tuple(kept),
+            self.drives.filter(pa.array(wanted)),
+            self.logs_version,
+            self.grams_version,
+            self.feature_set,
+        )
+
+    def gram_condition(self, inputs: Sequence[str]) -> str:
+        """Return the SQL condition on the view `grams` of the rows that a model is made of."""
+        return gram_condition(self.condition, self.feature_set, inputs)
+
+
+def gram_condition(condition: str, feature_set: str, inputs: Sequence[str]) -> str:
+    """Return the SQL condition on the view `grams` of a cohort's rows that have some inputs."""
+    wanted = ", ".join(f"'{name}'" for name in [*inputs, catalogue().label])
+    return (
+        f"feature_set = '{features().identity(feature_set)}' AND ({condition}) AND "
+        f"list_has_all(string_split(signals, ','), [{wanted}])"
+    )
+
+
+def require_row_folds(feature_set: str, count: int) -> None:
+    """Raise `SelectionError` if a feature set has not made so many folds of rows."""
+    made = features().set(feature_set).row_folds
+    if made is None:
+        known = ", ".join(name for name, one in features().sets.items() if one.row_folds)
+        raise SelectionError(
+            f"the Gram rows of the feature set {feature_set} are of whole drives: folds of rows "
+            f"are made when the logs are read. Feature sets that make them: {known}."
+        )
+    if count > made:
+        raise SelectionError(
+            f"the feature set {feature_set} made {made} folds of rows; choose no more."
+        )
+
+
+def assign(values: Sequence[Any], by: str, count: int) -> Assignment:
+    """Assign Gram rows to folds by the values of a fold key."""
+    if by == ROW_FOLDS:
+        return by_value([(int(value) - 1) % count + 1 for value in values])
+    if by == "drive" or len(set(values)) > count:
+        return by_hash([str(value) for value in values], count)
+    return by_value(values)
+
+
+def load_cohort(
+    warehouse: Warehouse | GramReader,
+    condition: str = TRAINING_DRIVES,
+    feature_set: str = PLAIN,
+) -> Cohort:
+    """Read the Gram rows of the drives that satisfy a condition.
+
+    Raises `SelectionError` if the condition is not valid SQL, no drive satisfies it, or the
+    feature set has not been computed for all logs; `RefusedError` if a drive of an evaluation
+    scenario satisfies it.
+    """
+    with open_grams(warehouse, condition, feature_set) as opened:
+        statement = opened.statement("cohort.sql", condition)
+        with database_errors(f"the cohort {condition!r}"):
+            rows = opened.database.sql(statement).to_arrow_table()
+        if not rows.num_rows:
+            raise nothing(opened.database, condition)
+    require_training(rows["source"].unique().to_pylist(), condition)
+    sets = rows["signals"].unique().to_pylist()
+    tables = tuple(
+        gram_table(
+            signals, rows.filter(pc.equal(rows["signals"], signals)) if len(sets) > 1 else rows
+        )
+        for signals in sets
+    )
+    return Cohort(
+        condition=condition,
+        tables=tables,
+        drives=rows.drop_columns(["sums", "products"]),
+        logs_version=opened.logs_version,
+        grams_version=opened.grams_version,
+        feature_set=feature_set,
+    )
+
+
+def require_training(sources: Iterable[str], condition: str) -> None:
+    """Raise `RefusedError` if drives of a scenario are among those of a condition."""
+    if SCENARIO in sources:
+        raise RefusedError(
+            f"the cohort {condition!r} has drives of evaluation scenarios, which no model may be "
+            f"trained on. Add to the condition: AND {TRAINING_DRIVES}"
+        )
+
+
+def gram_table(signals: str, rows: pa.Table | pa.RecordBatch) -> GramTable:
+    """Return Gram rows, all of the same signals, as arrays."""
+    names = tuple(signals.split(","))
+    k = len(names)
+    return GramTable(
+        names,
+        rows["n"].to_numpy(),
+        _matrix(rows["sums"], k),
+        _matrix(rows["products"], packed_size(k)),
+    )
+
+
+def _matrix(lists: pa.ChunkedArray | pa.ListArray, width: int) -> NDArray[np.int64]:
+    chunks = lists.chunks if isinstance(lists, pa.ChunkedArray) else [lists]
+    parts = [chunk.flatten().to_numpy() for chunk in chunks]
+    values: NDArray[np.int64] = parts[0] if len(parts) == 1 else np.concatenate(parts)
+    return values.reshape(-1, width)
+
+
+def nothing(database: duckdb.DuckDBPyConnection, condition: str) -> SelectionError:
+    """Return the error that no drive satisfies a condition."""
+    examples = database.execute(
+        "SELECT string_agg(DISTINCT source, ', '), string_agg(DISTINCT campaign, ', ') FROM grams"
+    ).fetchone()
+    sources, campaigns = examples or ("", "")
+    return SelectionError(
+        f"no drive satisfies the cohort condition {condition!r}. The warehouse has sources "
+        f"{sources} and campaigns {campaigns}. See the columns with: "
+        'fleet-slip sql "DESCRIBE drives"'
+    )

@@ -1,0 +1,68 @@
+"""The sums of a cohort over each day, from Gram rows that are read batch by batch."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import date
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.grams.cohort import TRAINING_DRIVES, gram_table, nothing, require_training
+from fleet_slip.grams.fold_sums import by_signals, hash_numbers
+from fleet_slip.grams.reader import GramReader, open_grams
+from fleet_slip.regression.drives import no_drive_has
+from fleet_slip.regression.gram import Gram
+from fleet_slip.warehouse.tables import Warehouse
+
+
+@dataclass(frozen=True)
+class DailySums:
+    """The Gram of each day, and the number of drives in it."""
+
+    days: tuple[date, ...]
+    grams: tuple[Gram, ...]
+    drives: tuple[int, ...]
+
+
+def sum_days(
+    source: Warehouse | GramReader,
+    inputs: Sequence[str],
+    condition: str = TRAINING_DRIVES,
+    feature_set: str = PLAIN,
+) -> DailySums:
+    """Add up, day by day, the Gram rows of the drives that have the label and all the inputs.
+
+    Raises like `fleet_slip.grams.cohort.load_cohort`, and `SelectionError`
+    if no drive has them all.
+    """
+    signals = (*inputs, catalogue().label)
+    grams: dict[date, Gram] = {}
+    drives: dict[date, list[NDArray[np.uint64]]] = {}
+    found = False
+    with open_grams(source, condition, feature_set) as opened:
+        for batch in opened.batches(condition):
+            found = True
+            require_training(batch["source"].unique().to_pylist(), condition)
+            for names, rows, _ in by_signals(batch):
+                if not set(signals) <= set(names.split(",")):
+                    continue
+                here = rows["day"].dictionary_encode()
+                number = here.indices.to_numpy()
+                days = here.dictionary.to_pylist()
+                totals = gram_table(names, rows).restrict(signals).totals(number, len(days))
+                ids = hash_numbers(rows["drive_id"])
+                for i, (day, total) in enumerate(zip(days, totals, strict=True)):
+                    grams[day] = grams[day] + total if day in grams else total
+                    drives.setdefault(day, []).append(ids[number == i])
+        if not found:
+            raise nothing(opened.database, condition)
+    if not grams:
+        raise no_drive_has(signals)
+    days = sorted(grams)
+    return DailySums(
+        tuple(days),
+        tuple(grams[day] for day in days),
+        tuple(len(np.unique(np.concatenate(drives[day]))) for day in days),
+    )

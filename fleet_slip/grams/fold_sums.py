@@ -1,0 +1,206 @@
+"""The sums of a cohort over its folds, from Gram rows that are read batch by batch.
+
+Comparing given models needs no single drive, only the Gram of each fold. So any number of Gram
+rows is added up in the memory of one batch.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.errors import SelectionError
+from fleet_slip.grams.cohort import (
+    FOLD_KEYS,
+    ROW_FOLDS,
+    TRAINING_DRIVES,
+    assign,
+    gram_condition,
+    gram_table,
+    nothing,
+    require_row_folds,
+    require_training,
+)
+from fleet_slip.grams.reader import GramReader, OpenedGrams, open_grams
+from fleet_slip.regression.folds import CohortFolds, hash_number
+from fleet_slip.regression.gram import Gram, IntArray
+from fleet_slip.selection.model_list import FoldPlan
+from fleet_slip.warehouse.database import database_errors
+from fleet_slip.warehouse.tables import Warehouse
+
+FoldOf = Callable[[pa.RecordBatch, NDArray[np.uint64]], IntArray]
+"""Tells the fold of each Gram row, from its metadata and its drive's hash."""
+
+
+@dataclass(frozen=True)
+class SummedCohort:
+    """What a selection from given models needs of a cohort; see `fleet_slip.grams.cohort.Cohort`.
+
+    Attributes:
+        condition: SQL condition on the columns of the view `drives`.
+        plan: how the cohort was divided.
+        sums: the Gram of each fold.
+        rows, drive_count: number of rows of the logs, and of drives, behind the cohort.
+        logs_version, grams_version: versions of the Delta tables that were read.
+        feature_set: which Gram rows were read.
+    """
+
+    condition: str
+    plan: FoldPlan
+    sums: CohortFolds
+    rows: int
+    drive_count: int
+    logs_version: int
+    grams_version: int
+    feature_set: str = PLAIN
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Signals and features that any of the drives has, in the order of the feature set."""
+        found = {name for grams in self.sums.tables for name in grams[0].signals}
+        return tuple(name for name in features().set(self.feature_set).inputs if name in found)
+
+    def folds(self, by: str, count: int) -> CohortFolds:
+        """Return the folds, which must be those that were asked for when the cohort was read."""
+        if (by, count) != (self.plan.by, self.plan.count):
+            raise ValueError(f"the sums are over {self.plan}, not over {count} folds by {by}")
+        return self.sums
+
+    def gram_condition(self, inputs: Sequence[str]) -> str:
+        """Return the SQL condition on the view `grams` of the rows that a model is made of."""
+        return gram_condition(self.condition, self.feature_set, inputs)
+
+
+def sum_cohort(
+    warehouse: Warehouse | GramReader,
+    plan: FoldPlan,
+    condition: str = TRAINING_DRIVES,
+    feature_set: str = PLAIN,
+) -> SummedCohort:
+    """Add up the Gram rows of the drives that satisfy a condition, over each fold.
+
+    Raises like `fleet_slip.grams.cohort.load_cohort`, and `SelectionError`
+    if there are not two folds.
+    """
+    if plan.by == ROW_FOLDS:
+        require_row_folds(feature_set, plan.count)
+    with open_grams(warehouse, condition, feature_set) as opened:
+        names, fold_of = _folding(opened, plan, condition)
+        sums = _Sums(len(names), fold_of)
+        for batch in opened.batches(condition):
+            require_training(batch["source"].unique().to_pylist(), condition)
+            sums.add(batch)
+        if not sums.tables:
+            raise nothing(opened.database, condition)
+    return SummedCohort(
+        condition=condition,
+        plan=plan,
+        sums=sums.folds(names),
+        rows=sum(gram.n for grams in sums.tables.values() for gram in grams),
+        drive_count=sums.drive_count,
+        logs_version=opened.logs_version,
+        grams_version=opened.grams_version,
+        feature_set=feature_set,
+    )
+
+
+def _folding(opened: OpenedGrams, plan: FoldPlan, condition: str) -> tuple[list[str], FoldOf]:
+    """Return the names of all folds that there may be, and what tells the fold of a Gram row."""
+    if plan.by == "drive":
+        names = [str(fold + 1) for fold in range(plan.count)]
+        return names, lambda _, drives: (drives % plan.count).astype(np.int64)
+    key = FOLD_KEYS[plan.by]
+    text = opened.statement("cohort_sums.sql", condition)
+    with database_errors(f"the cohort {condition!r}"):
+        found = opened.database.sql(f"SELECT DISTINCT {key} FROM ({text})").to_arrow_table()
+    values = found[key].combine_chunks()
+    if not len(values):
+        raise nothing(opened.database, condition)
+    assignment = assign(values.to_pylist(), plan.by, plan.count)
+
+    def fold_of(batch: pa.RecordBatch, _: NDArray[np.uint64]) -> IntArray:
+        at: IntArray = pc.index_in(batch[key], value_set=values).to_numpy()
+        return assignment.fold[at]
+
+    return list(assignment.names), fold_of
+
+
+def hash_numbers(ids: pa.Array) -> NDArray[np.uint64]:
+    """Return the hash of each drive's id: what tells it from others, in 8 bytes."""
+    return np.fromiter(map(hash_number, ids.to_pylist()), dtype=np.uint64, count=len(ids))
+
+
+def by_signals(batch: pa.RecordBatch) -> Iterator[tuple[str, pa.RecordBatch, NDArray[np.bool_]]]:
+    """Yield each set of signals in a batch of Gram rows, its rows, and which those are."""
+    names = batch["signals"].unique().to_pylist()
+    if len(names) == 1:
+        yield names[0], batch, np.ones(len(batch), dtype=np.bool_)
+        return
+    for signals in names:
+        mask = pc.equal(batch["signals"], signals)
+        yield signals, batch.filter(mask), mask.to_numpy(zero_copy_only=False)
+
+
+@dataclass
+class _Sums:
+    """Adds up Gram rows by set of signals and fold, and remembers which drives they are of."""
+
+    count: int
+    fold_of: FoldOf
+    tables: dict[str, list[Gram]] = field(default_factory=dict)
+    drives: dict[str, list[NDArray[np.uint64]]] = field(default_factory=dict)
+    used: set[int] = field(default_factory=set)
+    divided: bool = False
+    """Whether a drive may have several Gram rows of the same signals."""
+
+    def add(self, batch: pa.RecordBatch) -> None:
+        """Add a batch of Gram rows."""
+        drives = hash_numbers(batch["drive_id"])
+        folds = self.fold_of(batch, drives)
+        self.used.update(np.unique(folds).tolist())
+        self.divided |= batch["part"].null_count < len(batch)
+        for signals, rows, here in by_signals(batch):
+            totals = gram_table(signals, rows).totals(folds[here], self.count)
+            known = self.tables.get(signals)
+            self.tables[signals] = (
+                [a + b for a, b in zip(known, totals, strict=True)] if known else totals
+            )
+            self.drives.setdefault(signals, []).append(drives[here])
+
+    @property
+    def _one_each(self) -> bool:
+        """Whether every Gram row is of a drive of its own: then nothing must be sorted to tell."""
+        return len(self.tables) == 1 and not self.divided
+
+    @property
+    def drive_count(self) -> int:
+        """Number of drives."""
+        every = [part for parts in self.drives.values() for part in parts]
+        return sum(map(len, every)) if self._one_each else len(np.unique(np.concatenate(every)))
+
+    def folds(self, names: Sequence[str]) -> CohortFolds:
+        """Return the folds that a drive fell into. Raises `SelectionError` if it is one only."""
+        used = sorted(self.used)
+        if len(used) < 2:
+            raise SelectionError(
+                "cross-validation needs at least two folds, and the cohort has one: "
+                f"{names[used[0]]}. Widen the cohort, or fold by another key."
+            )
+        order = sorted(self.tables)
+        return CohortFolds(
+            tuple(names[fold] for fold in used),
+            tuple(tuple(self.tables[signals][fold] for fold in used) for signals in order),
+            self._numbers(order),
+        )
+
+    def _numbers(self, order: Sequence[str]) -> tuple[IntArray, ...]:
+        """Return the number of each Gram row's drive, table by table."""
+        if self._one_each:
+            return (np.arange(self.drive_count),)
+        each = [np.concatenate(self.drives[signals]) for signals in order]
+        _, numbers = np.unique(np.concatenate(each), return_inverse=True)
+        return tuple(np.split(numbers, np.cumsum([len(part) for part in each])[:-1]))

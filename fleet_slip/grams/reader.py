@@ -1,0 +1,139 @@
+"""Opens the Gram rows of a warehouse, once for cohort after cohort."""
+
+import contextlib
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Self
+
+import duckdb
+import pyarrow as pa
+
+from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.delta.table import Snapshot, Table
+from fleet_slip.errors import SelectionError
+from fleet_slip.grams.job import find_backlog
+from fleet_slip.resources import read_sql
+from fleet_slip.views import connect, open_views, tables_in
+from fleet_slip.warehouse.database import database_errors
+from fleet_slip.warehouse.read_only_sql import one_query
+from fleet_slip.warehouse.tables import Warehouse
+
+GRAMS_ALONE = frozenset({"grams"})
+"""What most conditions ask for: columns of the Gram rows themselves."""
+
+BATCH_ROWS = 2**13
+"""Gram rows of one batch: some 700 bytes each."""
+
+
+@dataclass(frozen=True)
+class OpenedGrams:
+    """A connection to the Gram rows of a feature set, and what stood in the warehouse then."""
+
+    database: duckdb.DuckDBPyConnection
+    identity: str
+    logs_version: int
+    grams_version: int
+
+    def statement(self, name: str, condition: str) -> str:
+        """Return a statement of `jobs/` for a condition. Raises `SelectionError`."""
+        text = read_sql("jobs", name).format(condition=condition, feature_set=self.identity)
+        with database_errors(f"the cohort {condition!r}"):
+            return one_query(self.database, text)
+
+    def batches(self, condition: str) -> Iterator[pa.RecordBatch]:
+        """Yield the Gram rows of a cohort in any order, with what their fold is told from."""
+        statement = self.statement("cohort_sums.sql", condition)
+        with database_errors(f"the cohort {condition!r}"):
+            yield from self.database.sql(statement).to_arrow_reader(BATCH_ROWS)
+
+
+class GramReader:
+    """The Gram rows of a warehouse, for one cohort after another.
+
+    Each is read from the newest version. What was opened for the one before is used again if nobody
+    has committed since: then a cohort costs its query and no more. Not for several threads at once.
+    """
+
+    def __init__(self, warehouse: Warehouse) -> None:
+        """Open nothing yet."""
+        self._warehouse = warehouse
+        self._logs: Snapshot | None = None
+        self._grams: Snapshot | None = None
+        self._database: duckdb.DuckDBPyConnection | None = None
+        self._alone = False
+
+    def __enter__(self) -> Self:
+        """Return the reader."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the connection."""
+        self._close()
+
+    def opened(self, condition: str, feature_set: str) -> OpenedGrams:
+        """Return what a cohort's condition may ask for, until the next call.
+
+        Raises `SelectionError` if there are no Gram rows, or if those of the feature set are not
+        complete.
+        """
+        # The Delta library reads the log of many files on one core while DuckDB starts on another.
+        with ThreadPoolExecutor(1) as other:
+            renewing = other.submit(_newest, self._logs, self._warehouse.logs)
+            grams = _newest(self._grams, self._warehouse.grams)
+            if grams is not self._grams:
+                self._close()
+            database = self._connected(grams, f"FROM grams WHERE {condition}")
+            logs = renewing.result()
+        self._logs, self._grams = logs, grams
+        if not grams.rows:
+            raise SelectionError(
+                f"{self._warehouse.root}: there are no Gram rows yet. Run: fleet-slip simulate "
+                "CAMPAIGN (or fleet-slip ingest FILE --mapping M), then fleet-slip gram."
+            )
+        identity = features().identity(feature_set)
+        if feature_set != PLAIN:
+            _require_complete(logs, grams, feature_set, identity)
+        return OpenedGrams(database, identity, logs.version or 0, grams.version or 0)
+
+    def _connected(self, grams: Snapshot, query: str) -> duckdb.DuckDBPyConnection:
+        alone = tables_in(query) == GRAMS_ALONE
+        if self._database is None or not (alone and self._alone):
+            self._close()
+            if alone:
+                self._database = open_views(self._warehouse, GRAMS_ALONE, [grams])
+            else:
+                self._database = connect(self._warehouse.root, query=query)
+            self._alone = alone
+        return self._database
+
+    def _close(self) -> None:
+        if self._database is not None:
+            self._database.close()
+            self._database = None
+
+
+@contextlib.contextmanager
+def open_grams(
+    source: Warehouse | GramReader, condition: str, feature_set: str
+) -> Iterator[OpenedGrams]:
+    """Open what a cohort's condition may ask for, anew unless by a reader. Raises like `opened`."""
+    if isinstance(source, GramReader):
+        yield source.opened(condition, feature_set)
+    else:
+        with GramReader(source) as reader:
+            yield reader.opened(condition, feature_set)
+
+
+def _newest(before: Snapshot | None, table: Table) -> Snapshot:
+    return before.renewed() if before else table.snapshot()
+
+
+def _require_complete(logs: Snapshot, grams: Snapshot, feature_set: str, identity: str) -> None:
+    backlog = find_backlog(logs, grams, identity)
+    if backlog.missing or backlog.stale:
+        raise SelectionError(
+            f"the feature set {feature_set}, as it is defined now, has not been computed for "
+            f"{len(backlog.missing)} of {len(logs.files)} log files. Run: fleet-slip gram "
+            f"--features {feature_set}"
+        )

@@ -1,0 +1,60 @@
+"""A cohort made ready for one set of inputs: folds, and moments of each drive."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from fleet_slip.catalogue.features import input_scales
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.errors import SelectionError
+from fleet_slip.grams.cohort import FOLD_KEYS, ROW_FOLDS, Cohort, Served, assign
+from fleet_slip.regression.drives import DriveMoments
+from fleet_slip.regression.folds import CohortFolds, Folds
+from fleet_slip.regression.gram import IntArray
+from fleet_slip.regression.nested_choice import Training
+from fleet_slip.selection.model_list import FoldPlan
+
+
+@dataclass(frozen=True)
+class DriveFolds:
+    """The drives that have all of some inputs, and the fold of each.
+
+    Attributes:
+        served: the drives.
+        fold: fold of each drive, shape (drives,).
+        training: what the regression modules work on.
+    """
+
+    served: Served
+    fold: IntArray
+    training: Training
+
+    @property
+    def moments(self) -> DriveMoments:
+        """Moments of each drive, for cluster-robust errors and resampling."""
+        if self.training.drives is None:
+            return DriveMoments.of(self.served.table)
+        return self.training.drives
+
+
+def drive_folds(
+    cohort: Cohort, inputs: Sequence[str], plan: FoldPlan, *, naive: bool = False
+) -> DriveFolds:
+    """Divide the drives that have all the inputs into folds. `naive` takes rows for independent.
+
+    Raises `SelectionError` if no drive has them all, or for folds of rows.
+    """
+    if plan.by == ROW_FOLDS:
+        raise SelectionError(
+            "with folds of rows there are no drives to hold out. Fold by drive for this."
+        )
+    served = cohort.serving(inputs)
+    assignment = assign(served.drives[FOLD_KEYS[plan.by]].to_pylist(), plan.by, plan.count)
+    folds = CohortFolds.of([served.table], assignment).serving(inputs, catalogue().label)
+    moments = None if naive else DriveMoments.of(served.table)
+    return DriveFolds(served, assignment.fold, Training(folds, moments, input_scales()))
+
+
+def row_training(cohort: Cohort, inputs: Sequence[str], plan: FoldPlan) -> Training:
+    """Return folds of rows; rows then count as independent. Raises `SelectionError`."""
+    folds: Folds = cohort.folds(plan.by, plan.count).serving(inputs, catalogue().label)
+    return Training(folds, None, input_scales())

@@ -1,0 +1,1 @@
+"""Keeping a warehouse whole: verify, repair, compact, vacuum, forget, retain, migrate."""

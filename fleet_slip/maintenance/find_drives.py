@@ -1,0 +1,73 @@
+"""Finds the drives of a car, or of a time, in the log files."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import pyarrow.compute as pc
+
+from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.delta import Snapshot
+from fleet_slip.maintenance.audit import Subject
+from fleet_slip.maintenance.old_files import rows_of
+from fleet_slip.resources import read_sql
+from fleet_slip.warehouse.database import database_errors, open_database
+
+FILES_PER_QUERY = 256
+"""DuckDB keeps what it read of each file of a query: some 70 KB."""
+
+
+@dataclass(frozen=True)
+class Located:
+    """Which drives of a subject are in which log files, as Gram rows tell.
+
+    A log file never changes, and the Gram rows of the catalogue's signals have all of its drives.
+
+    Attributes:
+        known: paths of the log files that have such Gram rows, the subject's drives or not.
+        drives: the subject's drives in each log file that has some, by path.
+    """
+
+    known: frozenset[str]
+    drives: Mapping[str, frozenset[str]]
+
+
+def locate(grams: Snapshot, subject: Subject) -> Located:
+    """Look for a subject's drives in the Gram rows."""
+    known: set[str] = set()
+    drives: dict[str, set[str]] = {}
+    columns = ["feature_set", "file", "drive_id", "vehicle_id", "day"]
+    for file in grams.files:
+        rows = grams.table.read(file.path, columns)
+        whole = pc.equal(rows["feature_set"], features().identity(PLAIN))
+        known.update(rows["file"].filter(whole).unique().to_pylist())
+        found = rows.filter(rows_of(rows, subject))
+        for path, drive in zip(
+            found["file"].to_pylist(), found["drive_id"].to_pylist(), strict=True
+        ):
+            drives.setdefault(path, set()).add(drive)
+    return Located(frozenset(known), {path: frozenset(names) for path, names in drives.items()})
+
+
+def drives_by_file(logs: Snapshot, subject: Subject, located: Located) -> dict[str, frozenset[str]]:
+    """Return the drives concerned of each log file that has some, by the file's path.
+
+    Only files without Gram rows are opened.
+    """
+    active = [file.path for file in logs.files]
+    found = {path: located.drives[path] for path in active if path in located.drives}
+    unknown = [path for path in active if path not in located.known]
+    statement = read_sql("jobs", "find_drives.sql").format(condition=subject.condition)
+    with (
+        open_database(reading=logs.table.folder) as database,
+        database_errors(f"looking for drives in {logs.table.folder}"),
+    ):
+        for first in range(0, len(unknown), FILES_PER_QUERY):
+            paths = {
+                logs.table.uri(path): path for path in unknown[first : first + FILES_PER_QUERY]
+            }
+            database.execute("SET VARIABLE log_files = $files", {"files": list(paths)})
+            rows = database.execute(statement, {"value": subject.value}).fetchall()
+            for uri in {uri for _, uri in rows}:
+                names = frozenset(drive for drive, other in rows if other == uri)
+                found[paths[uri]] = names
+    return found

@@ -1,0 +1,233 @@
+"""Forgets drives: one car's, a single one, or all before a day.
+
+Their rows leave `quarantine`, `logs` and `grams`, in this order, so that an interrupted job finds
+by what is left what it still has to do. The log files concerned are written again without them,
+in one commit; the Gram rows follow by reconciliation. `fleet_slip/maintenance/audit.py` is the
+record of it.
+"""
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from fleet_slip.delta import Change, retried
+from fleet_slip.errors import FleetSlipError, SelectionError
+from fleet_slip.grams.job import reconcile
+from fleet_slip.maintenance.audit import Audit, Subject
+from fleet_slip.maintenance.find_drives import Located, drives_by_file, locate
+from fleet_slip.maintenance.old_files import quarantined_of, remove_old_files
+from fleet_slip.maintenance.rewriting import read_drives
+from fleet_slip.models.manifest import TrainedOn
+from fleet_slip.models.versions import Registry
+from fleet_slip.views import connect
+from fleet_slip.warehouse.database import database_errors
+from fleet_slip.warehouse.read_only_sql import one_query
+from fleet_slip.warehouse.tables import Warehouse
+
+Progress = Callable[[int, int], None]
+"""Called with files rewritten since the last call, and files to rewrite in all."""
+
+
+@dataclass(frozen=True)
+class ForgetReport:
+    """What was done."""
+
+    drives: int
+    rows: int
+    files_rewritten: int
+    files_removed: int
+    """Log files all of whose drives were forgotten."""
+    models: tuple[str, ...]
+    """Model versions, NAME@VERSION, that were trained on the drives."""
+    old_files_deleted: int
+    old_files_left: int
+    """Files with the drives that no version refers to, kept for readers of the last week."""
+
+    @property
+    def changed(self) -> bool:
+        """Whether there was anything to do."""
+        return bool(self.drives or self.old_files_deleted)
+
+
+def forget(
+    warehouse: Warehouse,
+    subject: Subject,
+    *,
+    now: bool = False,
+    progress: Progress = lambda _more, _all: None,
+) -> ForgetReport:
+    """Forget drives; with `now`, delete the replaced files at once instead of by `vacuum`.
+
+    It can be repeated after any interruption. Raises `SelectionError` if there never was such a
+    drive, `StorageError`, or `ConflictError`.
+    """
+    audit = Audit(warehouse.root)
+    located = locate(warehouse.grams.snapshot(), subject)
+    drives = _drives_of(warehouse, subject, located)
+    state = audit.state(subject)
+    if not drives and state is None and subject.kind != "before":
+        raise SelectionError(
+            f"no drive has {subject.column} {subject.value!r}. See: "
+            'fleet-slip sql "SELECT drive_id, vehicle_id, day FROM drives"'
+        )
+    models = audit.models_of(subject)
+    if drives and state != "begun":
+        models = models_trained_on(warehouse, drives)
+        audit.begin(subject, len(drives), models)
+    _forget_quarantined(warehouse, subject, drives)
+    rows, rewritten, removed = _rewrite_logs(warehouse, subject, located, progress)
+    reconcile(warehouse)
+    deleted, left = remove_old_files(warehouse, subject, delete=now)
+    if drives or state == "begun":
+        audit.end(subject)
+    return ForgetReport(
+        drives=len(drives),
+        rows=rows,
+        files_rewritten=rewritten,
+        files_removed=removed,
+        models=tuple(models),
+        old_files_deleted=deleted,
+        old_files_left=left,
+    )
+
+
+def _drives_of(warehouse: Warehouse, subject: Subject, located: Located) -> frozenset[str]:
+    """Return the drives in the logs and the quarantine, and what interrupted jobs left in grams."""
+    in_logs = drives_by_file(warehouse.logs.snapshot(), subject, located)
+    found: set[str] = set().union(*in_logs.values(), *located.drives.values())
+    for file in warehouse.quarantine.snapshot().files:
+        rows = warehouse.quarantine.read(file.path)
+        names = rows.filter(quarantined_of(rows, subject, ()))["drive_id"].drop_null()
+        found.update(names.to_pylist())
+    return frozenset(found)
+
+
+def _rewrite_logs(
+    warehouse: Warehouse, subject: Subject, located: Located, progress: Progress
+) -> tuple[int, int, int]:
+    """Commit the logs without the drives; return rows forgotten, files rewritten, removed."""
+
+    def attempt() -> tuple[int, int, int]:
+        logs = warehouse.logs.snapshot()
+        drives = drives_by_file(logs, subject, located)
+        concerned = [file for file in logs.files if file.path in drives]
+        if not concerned:
+            return 0, 0, 0
+        actions = []
+        rows = sum(file.rows for file in concerned)
+        for file in concerned:
+            kept = read_drives(warehouse.logs, [file], without=drives[file.path])
+            if kept.num_rows:
+                actions.append(warehouse.logs.write_file("kept", kept, file.day))
+                rows -= kept.num_rows
+            progress(1, len(concerned))
+        logs.commit(Change(add=actions, remove=concerned, note={"job": "forget"}))
+        return rows, len(actions), len(concerned) - len(actions)
+
+    return retried(attempt)
+
+
+def _forget_quarantined(warehouse: Warehouse, subject: Subject, drives: Collection[str]) -> None:
+    def attempt() -> None:
+        snapshot = warehouse.quarantine.snapshot()
+        add, remove = [], []
+        for file in snapshot.files:
+            rows = warehouse.quarantine.read(file.path)
+            kept = rows.filter(pc.invert(quarantined_of(rows, subject, drives)))
+            if kept.num_rows < rows.num_rows:
+                remove.append(file)
+                if kept.num_rows:
+                    add.append(warehouse.quarantine.write_file("kept", kept))
+        if remove:
+            snapshot.commit(Change(add=add, remove=remove, note={"job": "forget"}))
+
+    if drives:
+        retried(attempt)
+
+
+def models_trained_on(warehouse: Warehouse, drives: Collection[str]) -> list[str]:
+    """Return the model versions whose cohort has one of the drives, among those that it could see.
+
+    Where that can no longer be told, because the Gram rows of that time are gone or the manifest
+    is damaged, the version counts as trained on them.
+    """
+    registry = Registry(warehouse.root / "models")
+    versions = {
+        f"{name}@{number}": _trained_on(registry, name, number)
+        for name in registry.names()
+        for number in registry.versions(name)
+    }
+    cohorts = {trained.cohort for trained in versions.values() if trained}
+    chosen = _in_cohorts(warehouse, cohorts, drives)
+    seen = _Seen(warehouse, drives)
+    return [
+        reference
+        for reference, trained in versions.items()
+        if trained is None or seen.any(chosen[trained.cohort], trained.grams_version)
+    ]
+
+
+def _trained_on(registry: Registry, name: str, number: int) -> TrainedOn | None:
+    try:
+        return registry.load(name, number).manifest.trained_on
+    except FleetSlipError:
+        return None
+
+
+def _in_cohorts(
+    warehouse: Warehouse, cohorts: Collection[str], drives: Collection[str]
+) -> dict[str, frozenset[str]]:
+    """Return which of some drives each cohort has; all, of a cohort that cannot be asked for."""
+    found = {}
+    with connect(warehouse.root, query=" ".join(["grams", *cohorts])) as database:
+        database.register(
+            "forgotten", pa.table({"drive_id": pa.array(sorted(drives), pa.string())})
+        )
+        for cohort in cohorts:
+            statement = (
+                "SELECT DISTINCT drive_id FROM grams WHERE drive_id IN (FROM forgotten) AND "
+                f"({cohort}\n)"
+            )
+            try:
+                with database_errors(f"the cohort {cohort!r}"):
+                    rows = database.execute(one_query(database, statement)).fetchall()
+                found[cohort] = frozenset(row[0] for row in rows)
+            except FleetSlipError:
+                found[cohort] = frozenset(drives)
+    return found
+
+
+class _Seen:
+    """Which of some drives the Gram rows of each version of their table have.
+
+    A file of Gram rows is read once, however many versions it is part of.
+    """
+
+    def __init__(self, warehouse: Warehouse, drives: Collection[str]) -> None:
+        self._grams = warehouse.grams
+        self._drives = frozenset(drives)
+        self._of_file: dict[str, frozenset[str]] = {}
+        self._of_version: dict[int, frozenset[str]] = {}
+
+    def any(self, drives: frozenset[str], version: int) -> bool:
+        """Whether a version has one of the drives; true where the version is gone."""
+        if not drives:
+            return False
+        try:
+            return not drives.isdisjoint(self._at(version))
+        except FleetSlipError:
+            return True
+
+    def _at(self, version: int) -> frozenset[str]:
+        if version not in self._of_version:
+            files = self._grams.snapshot(version).files
+            self._of_version[version] = frozenset().union(*(self._in(f.path) for f in files))
+        return self._of_version[version]
+
+    def _in(self, path: str) -> frozenset[str]:
+        if path not in self._of_file:
+            ids = self._grams.read(path, ["drive_id"])["drive_id"].cast(pa.string())
+            self._of_file[path] = self._drives.intersection(ids.unique().to_pylist())
+        return self._of_file[path]

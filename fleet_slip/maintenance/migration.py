@@ -1,0 +1,190 @@
+"""Brings the table `logs` to the signal catalogue: new columns, other scales.
+
+The quarantine, whose columns do not depend on the catalogue, gets those that came later.
+
+New columns need no file to be touched: where a file lacks a column, its values are null. Another
+scale needs every count of the signal rewritten, and no reader may ever mix the two:
+
+1. The new scale is announced in the table's schema. From then on no writer can commit, since Delta
+   refuses commits that began before a change of schema, and later ones are refused here. Readers
+   with the old catalogue go on reading the old files.
+2. The files are rewritten, with counts rounded to the nearest (halves to even) count.
+3. One commit exchanges all files and the schema's scales.
+
+A migration that was killed is run again; until step 3 nothing of the old data is gone.
+"""
+
+import contextlib
+import re
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from decimal import Decimal
+from fractions import Fraction
+
+import numpy as np
+import pyarrow as pa
+from deltalake import CommitProperties, DeltaTable, Field
+from deltalake.exceptions import CommitFailedError
+from deltalake.schema import Schema
+from deltalake.transaction import AddAction, RemoveAction
+from numpy.typing import NDArray
+
+from fleet_slip.catalogue.signals import COUNT_MAX
+from fleet_slip.delta import Snapshot, Table, TableFile
+from fleet_slip.delta.schema import SCALE, TARGET, Evolution, evolution, scales_of
+from fleet_slip.delta.sealing import NOTE, sealed
+from fleet_slip.errors import ConflictError, RefusedError, StorageError
+from fleet_slip.files.storage_errors import storage_errors
+from fleet_slip.maintenance.rewriting import read_drives
+from fleet_slip.warehouse.tables import Warehouse
+
+Progress = Callable[[int, int], None]
+"""Called with rows rewritten since the last call, and rows in all."""
+
+
+@dataclass(frozen=True)
+class MigrationReport:
+    """What a migration did."""
+
+    added: tuple[str, ...]
+    retired: tuple[str, ...]
+    rescaled: Mapping[str, tuple[Decimal, Decimal]]
+    files_rewritten: int
+    rows_rewritten: int
+    logs_version: int | None
+
+    @property
+    def changed(self) -> bool:
+        """Whether there was anything to do but to record scales."""
+        return bool(self.added or self.rescaled)
+
+
+def migrate(warehouse: Warehouse, progress: Progress = lambda _more, _all: None) -> MigrationReport:
+    """Make the logs agree with the catalogue. Running it again does nothing.
+
+    Raises `RefusedError` if counts would not fit int16 in a new scale: then nothing is changed but
+    the announcement, which a migration back to the old catalogue takes away. Raises
+    `ConflictError` if another process changed the table at the same moment.
+    """
+    warehouse.require()
+    _add_columns_that_came_later(warehouse.quarantine)
+    table = warehouse.logs
+    delta = table.open_delta()
+    if delta is None:
+        return MigrationReport((), (), {}, 0, 0, None)
+    found = evolution(table.schema, delta)
+    files = 0
+    rows = 0
+    if found.pending:
+        _add_columns(table, delta, found)
+    if found.rescaled:
+        _announce(table, found)
+        files, rows = _rescale(table, found, progress)
+    elif found.migrating:
+        _settle(table)
+    version = _now(table).version()
+    return MigrationReport(found.added, found.retired, found.rescaled, files, rows, version)
+
+
+def _add_columns_that_came_later(table: Table) -> None:
+    delta = table.open_delta()
+    if delta is not None and (found := evolution(table.schema, delta)).added:
+        _add_columns(table, delta, found)
+
+
+def rescaled(counts: NDArray[np.int16], ratio: Fraction) -> NDArray[np.int64]:
+    """Return counts times a ratio, rounded to the nearest integer, halves to even."""
+    scaled = 2 * counts.astype(np.int64) * ratio.numerator + ratio.denominator
+    nearest = scaled // (2 * ratio.denominator)
+    tie = scaled % (2 * ratio.denominator) == 0
+    return np.asarray(nearest - (tie & (nearest % 2 == 1)), dtype=np.int64)
+
+
+def _add_columns(table: Table, delta: DeltaTable, found: Evolution) -> None:
+    fields = {field.name: field for field in Schema.from_arrow(table.schema).fields}
+    scales = scales_of(table.schema)
+    with storage_errors(table.folder), _conflicts(table):
+        if found.added:
+            delta.alter.add_columns([_with_scale(fields[n], scales) for n in found.added])
+        for name in found.unrecorded:
+            delta.alter.set_column_metadata(name, {SCALE: str(scales[name])})
+
+
+def _with_scale(field: Field, scales: Mapping[str, Decimal]) -> Field:
+    metadata = {SCALE: str(scales[field.name])} if field.name in scales else {}
+    return Field(field.name, field.type, nullable=True, metadata=metadata)
+
+
+def _announce(table: Table, found: Evolution) -> None:
+    with storage_errors(table.folder), _conflicts(table):
+        delta = _now(table)
+        for name, (old, new) in found.rescaled.items():
+            delta.alter.set_column_metadata(name, {SCALE: str(old), TARGET: str(new)})
+
+
+def _settle(table: Table) -> None:
+    """Take back the announcement of a migration: the scales are those of the catalogue again."""
+    with storage_errors(table.folder), _conflicts(table):
+        delta = _now(table)
+        for field in delta.schema().fields:
+            if field.metadata.get(TARGET):
+                # Keys can be set, not removed.
+                delta.alter.set_column_metadata(field.name, {TARGET: ""})
+
+
+def _rescale(table: Table, found: Evolution, progress: Progress) -> tuple[int, int]:
+    delta = _now(table)
+    before = Snapshot(table, delta)
+    ratios = {n: Fraction(old) / Fraction(new) for n, (old, new) in found.rescaled.items()}
+    actions: list[AddAction | RemoveAction] = []
+    for file in before.files:
+        actions.append(_rewrite(table, file, ratios))
+        progress(file.rows, before.rows)
+    with storage_errors(table.folder), _conflicts(table):
+        delta.create_write_transaction(
+            actions,
+            mode="overwrite",
+            schema=table.schema,
+            partition_by=list(table.partition_by),
+            commit_properties=CommitProperties(
+                custom_metadata={NOTE: sealed({"job": "migrate"}, actions, {})}
+            ),
+        )
+    return len(actions), before.rows
+
+
+def _rewrite(table: Table, file: TableFile, ratios: Mapping[str, Fraction]) -> AddAction:
+    rows = read_drives(table, [file])
+    for name, ratio in ratios.items():
+        column = rows[name].combine_chunks()
+        absent = column.is_null().to_numpy(zero_copy_only=False)
+        counts = rescaled(column.fill_null(0).to_numpy(), ratio)
+        if len(counts) and np.abs(counts).max() > COUNT_MAX:
+            raise RefusedError(
+                f"{file.path}: counts of {name} up to {np.abs(counts).max():,} in the new scale "
+                f"do not fit 16 bits. Choose a wider scale."
+            )
+        stored = pa.array(counts.astype(np.int16), mask=absent)
+        rows = rows.set_column(rows.schema.get_field_index(name), name, stored)
+    stem = re.sub(r"(-[0-9a-f]+)?\.parquet$", "", file.path.rpartition("/")[2])
+    return table.write_file(stem, rows, file.day)
+
+
+def _now(table: Table) -> DeltaTable:
+    """Return a table that exists, as it is now."""
+    delta = table.open_delta()
+    if delta is None:
+        raise StorageError(f"{table.folder}: the table is gone. Restore it from a backup.")
+    return delta
+
+
+@contextlib.contextmanager
+def _conflicts(table: Table) -> Iterator[None]:
+    """Turn a lost race into `ConflictError`."""
+    try:
+        yield
+    except CommitFailedError:
+        raise ConflictError(
+            f"{table.folder}: another process changed the table at the same moment. Run the same "
+            "command again."
+        ) from None

@@ -1,0 +1,152 @@
+"""Rebuilds what can be rebuilt: Gram rows from the logs, simulated logs from their campaign.
+
+Nothing is deleted that was not rebuilt. A log file is simulated again under the name that the
+Delta log knows; since the name has the file's checksum, it is the same file or it is refused.
+"""
+
+import contextlib
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from datetime import date
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from fleet_slip.delta import Change, TableFile, retried
+from fleet_slip.delta.checkpoints import (
+    checkpoint_faults,
+    dispensable,
+    remove_checkpoint,
+    seal_checkpoints,
+)
+from fleet_slip.errors import FleetSlipError
+from fleet_slip.files.storage_errors import storage_errors
+from fleet_slip.grams.job import reconcile
+from fleet_slip.maintenance.verify import Verification, problem_of
+from fleet_slip.resources import config_names
+from fleet_slip.simulation.campaign import Batch, Campaign, DriveSpec, load_campaign
+from fleet_slip.simulation.drives import simulate_batch
+from fleet_slip.simulation.job import file_name
+from fleet_slip.warehouse.tables import Warehouse
+
+
+def repair(
+    warehouse: Warehouse, verification: Verification, campaigns: Sequence[str] = ()
+) -> list[str]:
+    """Rebuild what a verification found damaged; return what was rebuilt, below the root.
+
+    `campaigns` names campaign files besides those that ship. Verify again to see what is left.
+    """
+    rebuilt = _sum_up_again(warehouse)
+    damaged = {finding.path for finding in verification.damage if finding.kind == "file"}
+    wrong = {f.path.removeprefix("logs/") for f in verification.damage if f.kind == "gram"}
+    rebuilt += _simulate_again(warehouse, damaged, campaigns)
+    rebuilt += _aggregate_again(warehouse, damaged, wrong)
+    return rebuilt
+
+
+def _sum_up_again(warehouse: Warehouse) -> list[str]:
+    """Write damaged checkpoints again that can be spared: from what is before them in the log."""
+    rebuilt = []
+    for table in warehouse.tables:
+        for fault in list(checkpoint_faults(table.folder)):
+            if not dispensable(table.folder, fault.name):
+                continue
+            remove_checkpoint(table.folder, fault.name)
+            delta = table.open_delta()
+            if delta is not None:
+                with storage_errors(table.folder):
+                    delta.create_checkpoint()
+                seal_checkpoints(table.folder, again=f"{delta.version():020}.checkpoint.parquet")
+            rebuilt.append(f"{table.folder.name}/_delta_log/{fault.name}")
+    return rebuilt
+
+
+def _simulate_again(
+    warehouse: Warehouse, damaged: Collection[str], campaigns: Sequence[str]
+) -> list[str]:
+    files = [file for file in warehouse.logs.snapshot().files if f"logs/{file.path}" in damaged]
+    if not files:
+        return []
+    known = _campaigns(campaigns)
+    drives = _drives_of(warehouse, {file.path for file in files})
+    rebuilt = []
+    for file in files:
+        for batch in _candidates(file, drives.get(file.path, frozenset()), known):
+            if warehouse.logs.restore_file(file, simulate_batch(batch)):
+                rebuilt.append(f"logs/{file.path}")
+                break
+    return rebuilt
+
+
+def _campaigns(named: Sequence[str]) -> list[Campaign]:
+    return [load_campaign(name) for name in (*named, *config_names("campaigns"))]
+
+
+def _drives_of(warehouse: Warehouse, paths: Collection[str]) -> dict[str, frozenset[str]]:
+    """Return the drives that log files have, which their Gram rows tell."""
+    found: dict[str, set[str]] = {}
+    for rows in _readable_grams(warehouse).values():
+        concerned = rows.filter(pc.is_in(rows["file"], pa.array(sorted(paths), pa.string())))
+        for row in concerned.select(["file", "drive_id"]).to_pylist():
+            found.setdefault(row["file"], set()).add(row["drive_id"])
+    return {path: frozenset(drives) for path, drives in found.items()}
+
+
+def _candidates(
+    file: TableFile, drives: Collection[str], campaigns: Iterable[Campaign]
+) -> Iterable[Batch]:
+    """Yield what the file may have been simulated from: its drives, or a batch of its name."""
+    if file.day is None:
+        return
+    for campaign in campaigns:
+        if file.day not in campaign.days():
+            continue
+        specs: Mapping[str, DriveSpec] = {spec.drive_id: spec for spec in campaign.drives(file.day)}
+        if drives and specs.keys() >= set(drives):
+            yield _batch(campaign, file.day, [specs[drive] for drive in sorted(drives)])
+        for batch in campaign.batches(file.day):
+            if f"/{file_name(batch)}-" in file.path:
+                yield batch
+
+
+def _batch(campaign: Campaign, day: date, drives: Sequence[DriveSpec]) -> Batch:
+    return Batch(campaign.name, day, 0, tuple(drives))
+
+
+def _aggregate_again(
+    warehouse: Warehouse, damaged: Collection[str], wrong: Collection[str]
+) -> list[str]:
+    """Drop the Gram files that are damaged or have wrong rows, and compute what is missing."""
+    removed: list[str] = []
+
+    def attempt() -> None:
+        removed.clear()
+        snapshot = warehouse.grams.snapshot()
+        readable = _readable_grams(warehouse)
+        bad = [
+            file
+            for file in snapshot.files
+            if f"grams/{file.path}" in damaged
+            or (file.path in readable and _names_any(readable[file.path], wrong))
+        ]
+        if bad:
+            snapshot.commit(Change(remove=bad, note={"job": "repair"}))
+            removed.extend(f"grams/{file.path}" for file in bad)
+
+    retried(attempt)
+    reconcile(warehouse)  # also what an interrupted repair has dropped
+    return removed
+
+
+def _names_any(rows: pa.Table, files: Collection[str]) -> bool:
+    return not set(files).isdisjoint(rows["file"].unique().to_pylist())
+
+
+def _readable_grams(warehouse: Warehouse) -> dict[str, pa.Table]:
+    """Return which drives and log files the Gram files name, of those that are whole."""
+    found = {}
+    for file in warehouse.grams.snapshot().files:
+        if problem_of(warehouse.grams, file) is None:
+            with contextlib.suppress(FleetSlipError):
+                found[file.path] = warehouse.grams.read(file.path, ["file", "drive_id"])
+    return found

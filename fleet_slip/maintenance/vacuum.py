@@ -1,0 +1,110 @@
+"""Removes files that nothing refers to any more: replaced ones, and leftovers of killed jobs.
+
+A file stays while a version of the last `retention_hours` refers to it, so that a query that began
+then goes on undisturbed; and while it is younger than that, because a job may be about to commit
+it. A clock that was set back keeps files longer. Files of a table without a Delta log all stay.
+"""
+
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from fleet_slip.delta import Snapshot, Table
+from fleet_slip.files.folder import TEMPORARY_PREFIX, StoredFile
+from fleet_slip.files.storage_errors import storage_errors
+from fleet_slip.runs.history import gather_runs
+from fleet_slip.warehouse.tables import Warehouse
+
+RETENTION_HOURS = 168
+"""Also the longest that can be kept: Delta checkpoints forget removed files after a week."""
+
+
+@dataclass(frozen=True)
+class VacuumReport:
+    """What was removed, or would be."""
+
+    files: tuple[str, ...]
+    size_bytes: int
+    dry_run: bool
+
+
+def vacuum(
+    warehouse: Warehouse, retention_hours: float = RETENTION_HOURS, *, dry_run: bool = False
+) -> VacuumReport:
+    """Remove what nothing has referred to for some hours, and gather the records of runs.
+
+    Raises `StorageError`.
+    """
+    warehouse.require()
+    removed = []
+    for file in expired(warehouse, retention_hours):
+        if dry_run or file.folder.remove(file):
+            removed.append(file)
+    if not dry_run:
+        gather_runs(warehouse.root)
+    return VacuumReport(
+        files=tuple(str(file).removeprefix(f"{warehouse.root}/") for file in removed),
+        size_bytes=sum(file.size_bytes for file in removed),
+        dry_run=dry_run,
+    )
+
+
+def expired(warehouse: Warehouse, retention_hours: float) -> list[StoredFile]:
+    """Return the files that `vacuum` removes."""
+    found = []
+    for table in warehouse.tables:
+        files = unreferenced(table)
+        snapshot = table.snapshot()
+        if snapshot.version is None:  # its Delta log may have been lost, and these be its data
+            continue
+        kept = removed_since(snapshot, retention_hours)
+        found += [file for file in files if file.path not in kept]
+    found += temporary_files(warehouse)
+    return [file for file in found if file.age_hours >= retention_hours]
+
+
+def unreferenced(table: Table) -> list[StoredFile]:
+    """Return the data files below a table that its current version does not refer to."""
+    # Listed before the log is read: a file that is committed meanwhile is not taken for a leftover.
+    files = [
+        file
+        for file in table.folder.files()
+        if file.path.endswith(".parquet")
+        and not file.path.startswith("_delta_log/")
+        and not file.name.startswith(TEMPORARY_PREFIX)
+    ]
+    active = {file.path for file in table.snapshot().files}
+    return [file for file in files if file.path not in active]
+
+
+def temporary_files(warehouse: Warehouse) -> list[StoredFile]:
+    """Return what killed writers left under temporary names: ours, and the Delta library's."""
+    return [
+        file
+        for file in warehouse.root.files()
+        if file.name.startswith(TEMPORARY_PREFIX) or _OF_DELTA.fullmatch(file.path)
+    ]
+
+
+_OF_DELTA = re.compile(r"[^/]+/_delta_log/[^/]*#[^/]*")
+"""Temporary names of the Delta library, in a file system."""
+
+
+def replaced(snapshot: Snapshot) -> set[str]:
+    """Return the paths of files that a commit removed from a table, ever."""
+    return set(_removed_before(snapshot, 0))
+
+
+def removed_since(snapshot: Snapshot, hours: float) -> set[str]:
+    """Return the paths of files that a commit of the last hours removed from a table."""
+    return replaced(snapshot) - set(_removed_before(snapshot, hours))
+
+
+def _removed_before(snapshot: Snapshot, hours: float) -> Iterator[str]:
+    if snapshot.delta is None:
+        return
+    with storage_errors(snapshot.table.folder):
+        yield from snapshot.delta.vacuum(
+            math.ceil(hours), dry_run=True, enforce_retention_duration=False, full=False
+        )

@@ -1,0 +1,1 @@
+"""Model versions: manifests, aliases, signatures, publishing and scoring."""

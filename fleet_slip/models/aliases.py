@@ -1,0 +1,101 @@
+"""Where the aliases of a model point, and every move that brought them there.
+
+A move is decided by the moves before it, and added only while it comes right after these: of two
+processes that decide at once, one looks again.
+"""
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Annotated, Literal, TypeVar
+
+from pydantic import Field, ValidationError
+
+from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN, Identifier
+from fleet_slip.config import Config, faults_of
+from fleet_slip.errors import SelectionError, StorageError
+from fleet_slip.files.documents import MAX_DIGITS, DocumentFolder
+
+CHAMPION = "champion"
+"""The alias of the version in use."""
+
+Command = Literal["publish", "promote", "rollback"]
+
+T = TypeVar("T")
+
+
+class AliasMove(Config):
+    """One entry of the history: an alias points at a version from this moment on."""
+
+    alias: Identifier
+    version: Annotated[int, Field(ge=1, lt=10**MAX_DIGITS)]
+    command: Command
+    at: datetime
+
+
+@dataclass(frozen=True)
+class AliasHistory:
+    """All moves of one model's aliases."""
+
+    documents: DocumentFolder
+
+    def moves(self) -> list[AliasMove]:
+        """Return all moves, oldest first."""
+        return list(self.latest_moves())[::-1]
+
+    def latest_moves(self) -> Iterator[AliasMove]:
+        """Yield the moves, newest first, each read when it is asked for."""
+        for number in reversed(self.documents.numbers()):
+            document = self.documents.read(number)
+            try:
+                move = AliasMove.model_validate(document.content)
+            except ValidationError as error:
+                raise StorageError(
+                    f"{self.documents.file(number)}: this program does not understand this move of "
+                    f"an alias: {faults_of(error)}. Update fleet-slip, or publish again."
+                ) from None
+            yield move
+
+    def pointed_at(self, alias: str) -> int | None:
+        """Return the version that an alias points at, or None."""
+        return next((move.version for move in self.latest_moves() if move.alias == alias), None)
+
+    def before(self, alias: str) -> int | None:
+        """Return the version that an alias pointed at before the one of now, or None.
+
+        What was rolled back does not count: going back twice goes back two versions.
+        """
+        trail: list[int] = []
+        for move in self.moves():
+            if move.alias == alias:
+                trail = trail[:-1] if move.command == "rollback" else [*trail, move.version]
+        return trail[-2] if len(trail) > 1 else None
+
+    def published_at(self, version: int) -> datetime | None:
+        """Return when a version was published last; None if no move tells."""
+        moves = self.latest_moves()
+        published = (m.at for m in moves if m.version == version and m.command == "publish")
+        return next(published, None)
+
+    def aliases(self) -> dict[str, int]:
+        """Return each alias and the version that it points at."""
+        return {move.alias: move.version for move in self.moves()}
+
+    def decide(self, decision: Callable[[int], T | None]) -> T:
+        """Return what a decision comes to, which is taken again while it comes to None.
+
+        The decision gets the number of the newest move, which it passes to `move`; it must read
+        nothing of the history before it is called. Raises `ConflictError` after many attempts.
+        """
+        return self.documents.after_newest(decision)
+
+    def move(self, alias: str, version: int, command: Command, *, after: int) -> bool:
+        """Point an alias at a version; return False if there were moves after the one given."""
+        if not re.fullmatch(IDENTIFIER_PATTERN, alias):
+            raise SelectionError(
+                f"{alias!r} cannot be an alias: use small letters, digits and _, beginning with a "
+                "letter, at most 41."
+            )
+        move = AliasMove(alias=alias, version=version, command=command, at=datetime.now(UTC))
+        return self.documents.create(after + 1, move.model_dump(mode="json")) is not None

@@ -1,0 +1,163 @@
+"""What a model version says of itself: its terms, figures, data and why it was chosen, checked.
+
+A manifest is a function of data, configuration and program alone. It may come from anywhere, so
+that every text and number in it is bounded, and the one text that becomes SQL is arithmetic.
+"""
+
+import re
+from decimal import Decimal
+from fractions import Fraction
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, Field, FiniteFloat, PlainSerializer, PlainValidator
+
+from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN, Identifier, catalogue
+from fleet_slip.config import Config
+from fleet_slip.errors import ConfigError
+
+_FRACTION = re.compile(r"-?[0-9]{1,4000}/[0-9]{1,4000}")
+
+
+def _exact_fraction(value: Any) -> Fraction:
+    """Return a fraction, also from its text "3/4". Raises `ValueError` for anything else."""
+    if isinstance(value, Fraction):
+        return value
+    if not isinstance(value, str) or not _FRACTION.fullmatch(value):
+        raise ValueError("is not a fraction such as 3/4")
+    numerator, denominator = map(int, value.split("/"))
+    if not denominator:
+        raise ValueError("is divided by zero")
+    return Fraction(numerator, denominator)
+
+
+ExactFraction = Annotated[
+    Fraction,
+    PlainValidator(_exact_fraction),
+    PlainSerializer(lambda value: f"{value.numerator}/{value.denominator}"),
+]
+
+Scale = Annotated[Decimal, Field(ge=Decimal("1e-12"), le=Decimal("1e12"), allow_inf_nan=False)]
+
+Count = Annotated[int, Field(ge=0, lt=2**63)]
+
+_SQL_WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_SQL_CHARACTERS = re.compile(r"[A-Za-z0-9_+*/()<>=: -]{0,5000}")
+_SQL_WORDS = frozenset({"CASE", "WHEN", "THEN", "ELSE", "END", "BIGINT", "abs", "sign"})
+
+
+def _integer_arithmetic(sql: str) -> str:
+    """Return the SQL of a feature. Raises `ValueError` if it is more than integer arithmetic.
+
+    A manifest may come from anywhere, and this is the one text of it that becomes SQL.
+    """
+    words = set(_SQL_WORD.findall(sql)) - _SQL_WORDS - set(catalogue().signals)
+    if words or not _SQL_CHARACTERS.fullmatch(sql) or "--" in sql or "/*" in sql:
+        raise ValueError("is not integer arithmetic on the counts of signals")
+    return sql
+
+
+class ModelTerm(Config):
+    """One signal of a model: `label = intercept + sum(coefficient * signal)`, in SI units.
+
+    `sql` is empty for a logged signal. For a feature it computes the count from the counts of
+    signals; the count is clipped to +-32767, and times `scale` it is the physical value.
+    """
+
+    signal: Identifier
+    column: Identifier
+    unit: str
+    scale: Scale
+    sql: Annotated[str, AfterValidator(_integer_arithmetic)] = ""
+    coefficient: FiniteFloat
+    coefficient_exact: ExactFraction
+
+    @property
+    def scale_exact(self) -> Fraction:
+        """Physical value of one count, exactly."""
+        return Fraction(self.scale)
+
+
+class ModelLabel(Config):
+    """What a model estimates."""
+
+    signal: Identifier
+    column: Identifier
+    unit: str
+    scale: Scale
+
+
+class CrossValidated(Config):
+    """Pooled cross-validated figures of a model, and how the folds were made."""
+
+    folds_by: str
+    folds: Count
+    correlation: FiniteFloat
+    correlation_standard_error: FiniteFloat
+    rmse_deg: FiniteFloat
+    error_mean_deg: FiniteFloat
+    error_std_deg: FiniteFloat
+    condition_number: FiniteFloat
+
+
+class TrainedOn(Config):
+    """The data that made a model."""
+
+    cohort: str
+    feature_set: str = "signals"
+    drives: Count
+    rows: Count
+    logs_version: Count
+    grams_version: Count
+
+
+class SelectedBy(Config):
+    """Why this model: the list it came from, its name there, and the rule that chose it."""
+
+    model_list: str
+    model: str
+    reason: str
+    config_sha256: str
+
+
+class Manifest(Config):
+    """One model version, complete."""
+
+    format: Literal[1] = 1
+    name: Identifier
+    label: ModelLabel
+    intercept: FiniteFloat
+    intercept_exact: ExactFraction
+    terms: tuple[ModelTerm, ...] = Field(min_length=1)
+    cross_validation: CrossValidated
+    trained_on: TrainedOn
+    selected_by: SelectedBy
+    package_version: str
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """Names of the model's inputs."""
+        return tuple(term.signal for term in self.terms)
+
+    @property
+    def features(self) -> dict[str, str]:
+        """SQL of each input that is a feature."""
+        return {term.signal: term.sql for term in self.terms if term.sql}
+
+    def same_estimator(self, other: "Manifest") -> bool:
+        """Whether both are the same numbers from the same rows."""
+        return (
+            self.intercept_exact == other.intercept_exact
+            and self.terms == other.terms
+            and self.trained_on.rows == other.trained_on.rows
+            and self.trained_on.drives == other.trained_on.drives
+        )
+
+
+def check_model_name(name: str) -> str:
+    """Return a name that a model or an alias may have. Raises `ConfigError` otherwise."""
+    if not re.fullmatch(IDENTIFIER_PATTERN, name):
+        raise ConfigError(
+            f"{name!r} cannot be the name of a model: use small letters, digits and _, beginning "
+            "with a letter, at most 41."
+        )
+    return name

@@ -1,0 +1,87 @@
+"""Evaluates a published model on the rows of a cohort, in SQL."""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from fleet_slip.catalogue.features import with_features
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.errors import SelectionError
+from fleet_slip.models.manifest import Manifest
+from fleet_slip.resources import read_sql
+from fleet_slip.views import connect
+from fleet_slip.warehouse.database import database_errors
+from fleet_slip.warehouse.read_only_sql import one_query
+from fleet_slip.warehouse.tables import Warehouse
+
+
+@dataclass(frozen=True)
+class Score:
+    """Figures of the error, estimate minus truth, over the rows of a cohort with the signals."""
+
+    rows: int
+    correlation: float | None
+    rmse_deg: float
+    error_mean_deg: float
+    error_std_deg: float
+    error_mean_absolute_deg: float
+    error_median_deg: float
+    error_p95_deg: float
+    error_p99_deg: float
+    error_max_deg: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `score --json` prints."""
+        return asdict(self)
+
+
+def score_statement(manifest: Manifest, condition: str) -> str:
+    """Return `jobs/score.sql` for a model: its dot product over the logs in SI units.
+
+    Features are computed as the manifest defines them, whatever they are called today.
+    """
+    terms = [f"{term.coefficient!r} * {term.column}" for term in manifest.terms]
+    columns = [term.column for term in manifest.terms] + [manifest.label.column]
+    return read_sql("jobs", "score.sql").format(
+        estimate="\n        + ".join([repr(manifest.intercept), *terms]),
+        label=manifest.label.column,
+        rows=_rows(manifest),
+        complete=" AND ".join(f"{column} IS NOT NULL" for column in columns),
+        condition=condition,
+    )
+
+
+def _rows(manifest: Manifest) -> str:
+    """Return the view `log`, or for a model with features a subquery with their columns too."""
+    if not manifest.features:
+        return "log"
+    columns = [
+        *(f"{name} * {s.scale}::DOUBLE AS {s.column}" for name, s in catalogue().signals.items()),
+        *(f"{t.signal} * {t.scale}::DOUBLE AS {t.column}" for t in manifest.terms if t.sql),
+    ]
+    separator = ",\n            "
+    return f"""(
+        SELECT
+            *,
+            {separator.join(columns)}
+        FROM {with_features("log_counts", manifest.features)}
+    )"""
+
+
+def score(warehouse: Warehouse, manifest: Manifest, condition: str) -> Score:
+    """Score a model. Raises `SelectionError` if the cohort has no row with its signals."""
+    text = score_statement(manifest, condition)
+    with connect(warehouse.root, query=text) as database:
+        statement = one_query(database, text)
+        with database_errors(f"scoring on the cohort {condition!r}"):
+            result = database.execute(statement)
+            names = [column[0] for column in result.description or ()]
+            row = result.fetchone()
+    if row is None or not row[0]:
+        raise SelectionError(
+            f"no row of the cohort {condition!r} has {', '.join(manifest.signals)} and "
+            f"{manifest.label.signal}. Choose another cohort, or a model with fewer signals."
+        )
+    figures = dict(zip(names, row, strict=True))
+    percentiles = figures.pop("error_percentiles_deg")
+    median, p95, p99 = percentiles
+    return Score(**figures, error_median_deg=median, error_p95_deg=p95, error_p99_deg=p99)

@@ -1,0 +1,139 @@
+"""Optional signatures of model versions: Ed25519, over what a version is called and contains.
+
+    models/<name>/versions/1.json    the version
+    models/<name>/versions/1.sig     its signature, in base64
+
+A checksum finds damage; whoever can write the data root can compute it anew. A signature can only
+be made with the private key, which need not be where versions are read. The number and the name of
+the version are signed too, so that a signed version cannot take the place of another.
+"""
+
+import base64
+import os
+import stat
+from pathlib import Path
+from types import ModuleType
+
+from fleet_slip.errors import ConfigError, RefusedError, StorageError
+from fleet_slip.files.folder import Folder
+
+SIGNING_VARIABLE = "FLEET_SLIP_SIGNING_KEY"
+"""Environment variable: path of the private key that new versions are signed with."""
+
+VERIFY_VARIABLE = "FLEET_SLIP_VERIFY_KEY"
+"""Environment variable: path of the public key. If it is set, versions must have its signature."""
+
+PRIVATE_MODE = 0o600
+PUBLIC_MODE = 0o644
+LONGEST_FILE_BYTES = 10_000
+
+
+def make_keys(private: Path) -> Path:
+    """Write a new private key, and its public key beside it with `.pub`; return the latter's path.
+
+    Raises `ConfigError` if one of them exists: a key is never replaced.
+    """
+    public = private.with_name(private.name + ".pub")
+    for path in (private, public):
+        if os.path.lexists(path):
+            raise ConfigError(f"{path}: exists, and keys are never replaced. Choose another name.")
+    secret, known = _ed25519().generate()
+    _write_new(private, secret, PRIVATE_MODE)
+    _write_new(public, known, PUBLIC_MODE)
+    return public
+
+
+def require_signing_key(key: Path) -> None:
+    """Raise `ConfigError` for a private key that cannot be used."""
+    _signed(key, b"")
+
+
+def sign(folder: Folder, number: int, name: str, sha256: str, key: Path) -> None:
+    """Write the signature of a version beside its document, durably.
+
+    Raises `ConfigError` for a key that cannot be used.
+    """
+    signature = _signed(key, _message(number, name, sha256))
+    folder.put(f"{number}.sig", base64.b64encode(signature) + b"\n")
+
+
+def require_signature(folder: Folder, number: int, name: str, sha256: str) -> None:
+    """Raise `RefusedError` if a public key is configured and did not sign this version.
+
+    The environment is read here, not by the callers, so that none of them can forget to ask.
+    """
+    if not (configured := os.environ.get(VERIFY_VARIABLE)):
+        return
+    public = _read_key(Path(configured), private=False)
+    shown, file = f"{name}@{number}", f"{number}.sig"
+    if file not in folder.names():
+        raise RefusedError(
+            f"{shown} is not signed, and ${VERIFY_VARIABLE} asks for a signature. If the version "
+            f"is yours: fleet-slip sign {shown} --sign-key FILE"
+        )
+    try:
+        signature = base64.b64decode(folder.read(file, longest=LONGEST_FILE_BYTES))
+    except (StorageError, ValueError) as error:
+        raise RefusedError(f"{folder}/{file}: not a signature: {error}") from None
+    try:
+        signed = _ed25519().is_signed(public, signature, _message(number, name, sha256))
+    except ValueError:
+        raise ConfigError(
+            f"{configured}: not an Ed25519 public key in PEM. ${VERIFY_VARIABLE} must name the "
+            ".pub file that fleet-slip keygen wrote."
+        ) from None
+    if not signed:
+        raise RefusedError(
+            f"{shown} is not what the key {configured} signed: it was changed, or signed with "
+            "another key. Do not use it."
+        )
+
+
+def _message(number: int, name: str, sha256: str) -> bytes:
+    return f"fleet-slip model version\n{name}\n{number}\n{sha256}\n".encode()
+
+
+def _signed(key: Path, message: bytes) -> bytes:
+    secret = _read_key(key, private=True)
+    try:
+        signature = _ed25519().sign(secret, message)
+    except ValueError:
+        raise ConfigError(
+            f"{key}: not an unencrypted Ed25519 private key in PEM. Make one with: fleet-slip "
+            "keygen FILE"
+        ) from None
+    return bytes(signature)
+
+
+def _read_key(path: Path, *, private: bool) -> bytes:
+    try:
+        with path.open("rb") as stream:
+            mode = os.fstat(stream.fileno()).st_mode
+            content = stream.read(LONGEST_FILE_BYTES)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path}: the key cannot be read: {error}") from None
+    if private and mode & (stat.S_IRWXG | stat.S_IRWXO):
+        raise ConfigError(f"{path}: others may read this private key. Run: chmod 600 {path}")
+    return content
+
+
+def _write_new(path: Path, content: bytes, mode: int) -> None:
+    """Create a file that at no time had a wider mode than this."""
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path}: the key cannot be written: {error}") from None
+
+
+def _ed25519() -> ModuleType:
+    try:
+        from fleet_slip.models import ed25519  # noqa: PLC0415 - the library is optional
+    except ImportError:
+        raise ConfigError(
+            "signatures need the library cryptography. Run: pip install 'fleet-slip[signing]'"
+        ) from None
+    return ed25519

@@ -1,0 +1,270 @@
+"""Model versions: immutable, numbered, each explaining itself; and aliases with their history.
+
+    models/<name>/versions/1.json, 2.json, ...   what was published
+    models/<name>/history/1.json, 2.json, ...    every move of an alias, in order
+
+A manifest is a function of data, configuration and program alone; the time stands in the history.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+from pydantic import ValidationError
+
+from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN
+from fleet_slip.config import faults_of
+from fleet_slip.errors import RefusedError, SelectionError, StorageError
+from fleet_slip.files.documents import MAX_DIGITS, DocumentFolder
+from fleet_slip.files.folder import Folder
+from fleet_slip.models.aliases import CHAMPION, AliasHistory
+from fleet_slip.models.manifest import Manifest
+from fleet_slip.models.signing import require_signature, require_signing_key, sign
+
+_IDENTIFIER = re.compile(IDENTIFIER_PATTERN)
+
+
+@dataclass(frozen=True)
+class ModelVersion:
+    """A manifest with its number and verified checksum."""
+
+    version: int
+    manifest: Manifest
+    sha256: str
+
+    @property
+    def reference(self) -> str:
+        """The version as it is named on the command line: `NAME@VERSION`."""
+        return f"{self.manifest.name}@{self.version}"
+
+
+@dataclass(frozen=True)
+class Registry:
+    """All models below a folder. New versions are signed with a private key, if there is one."""
+
+    folder: Folder
+    signing_key: Path | None = None
+
+    def names(self) -> list[str]:
+        """Return the names of all models, sorted."""
+        return [
+            name
+            for name in self.folder.names()
+            if _IDENTIFIER.fullmatch(name) and (self.folder / name / "versions").exists()
+        ]
+
+    def versions(self, name: str) -> list[int]:
+        """Return the version numbers of a model, ascending."""
+        return self._versions(name).numbers()
+
+    def load(self, name: str, version: int) -> ModelVersion:
+        """Return one version.
+
+        Raises `StorageError` if it was changed after it was published, and `RefusedError` if it
+        lacks the signature that is asked for (`fleet_slip.models.signing`).
+        """
+        loaded = self._read(name, version)
+        require_signature(self._versions(name).folder, version, name, loaded.sha256)
+        return loaded
+
+    def sign(self, name: str, version: int) -> None:
+        """Sign a version, if there is a key to sign with."""
+        if self.signing_key is not None:
+            loaded = self._read(name, version)
+            folder = self._versions(name).folder
+            sign(folder, version, name, loaded.sha256, self.signing_key)
+
+    def _read(self, name: str, version: int) -> ModelVersion:
+        if not _IDENTIFIER.fullmatch(name):
+            raise SelectionError(_unknown(name, str(version), self.names(), []))
+        try:
+            document = self._versions(name).read(version)
+        except StorageError:
+            # Looked up only now: a model may have very many versions.
+            numbers = self.versions(name) if name in self.names() else []
+            if version in numbers:
+                raise
+            raise SelectionError(_unknown(name, str(version), self.names(), numbers)) from None
+        try:
+            manifest = Manifest.model_validate(document.content)
+        except ValidationError as error:
+            raise StorageError(
+                f"{name}@{version}: this program does not understand its manifest: "
+                f"{faults_of(error)}. Update fleet-slip, or publish again."
+            ) from None
+        if manifest.name != name:
+            raise StorageError(
+                f"{name}@{version}: its manifest is of the model {manifest.name}. Restore the file "
+                "from a backup, or publish again."
+            )
+        return ModelVersion(version, manifest, document.sha256)
+
+    def resolve(self, reference: str) -> ModelVersion:
+        """Return the version that `NAME`, `NAME@VERSION` or `NAME@ALIAS` names.
+
+        `NAME` alone is its champion. Raises `SelectionError` for an unknown one.
+        """
+        name, _, which = reference.partition("@")
+        if name not in self.names():
+            known = ", ".join(self.names()) or "none yet; publish one with: fleet-slip publish"
+            raise SelectionError(f"no model is called {name!r}. Models: {known}.")
+        which = which or CHAMPION
+        if which.isascii() and which.isdigit() and len(which) <= MAX_DIGITS:
+            return self.load(name, int(which))
+        history = self.history(name)
+        version = history.pointed_at(which)
+        if version is None:
+            known_aliases = history.aliases()
+            raise SelectionError(
+                _unknown(name, which, self.names(), self.versions(name), known_aliases)
+            )
+        return self.load(name, version)
+
+    def champion(self, name: str) -> ModelVersion | None:
+        """Return the version in use, or None before the first."""
+        version = self.history(name).pointed_at(CHAMPION)
+        return None if version is None else self.load(name, version)
+
+    def history(self, name: str) -> AliasHistory:
+        """Return the moves of a model's aliases."""
+        return AliasHistory(DocumentFolder(self.folder / name / "history"))
+
+    def publish(self, manifest: Manifest) -> ModelVersion:
+        """Make a manifest the next version of its model, and its champion."""
+        version = self.add(manifest)
+        history = self.history(manifest.name)
+        history.decide(lambda newest: self.make_champion(version, after=newest) or None)
+        return version
+
+    def add(self, manifest: Manifest) -> ModelVersion:
+        """Make a manifest the next version of its model, to which nothing points yet.
+
+        If the latest version is the same estimator from the same rows, that one is used: another
+        process added it just now, or was interrupted.
+        """
+        if self.signing_key is not None:
+            require_signing_key(self.signing_key)  # before anything is written
+        name, versions = manifest.name, self._versions(manifest.name)
+
+        def next_version(latest: int) -> int | None:
+            if latest and self._read(name, latest).manifest.same_estimator(manifest):
+                return latest
+            document = versions.create(latest + 1, manifest.model_dump(mode="json"))
+            return document.number if document else None
+
+        version = versions.after_newest(next_version)
+        self.sign(name, version)
+        return self._read(name, version)
+
+    def make_champion(self, version: ModelVersion, *, after: int) -> bool:
+        """Point the champion at a version; return False if an alias moved after the move given."""
+        history = self.history(version.manifest.name)
+        there = history.pointed_at(CHAMPION) == version.version
+        return there or history.move(CHAMPION, version.version, "publish", after=after)
+
+    def promote(self, name: str, version: int, alias: str) -> None:
+        """Point an alias at a version. Raises `SelectionError` for an unknown version.
+
+        Where it points there already nothing is added, so that a repeated command can be undone by
+        one `rollback`.
+        """
+        self.load(name, version)
+        history = self.history(name)
+
+        def move(newest: int) -> int | None:
+            there = history.pointed_at(alias) == version
+            moved = there or history.move(alias, version, "promote", after=newest)
+            return version if moved else None
+
+        history.decide(move)
+
+    def rollback(self, name: str, alias: str) -> int:
+        """Point an alias back at the version it had before; return that version.
+
+        Raises `RefusedError` if it never had another, and what `load` raises if that is not sound.
+        """
+        history = self.history(name)
+
+        def move(newest: int) -> int | None:
+            version = history.before(alias)
+            if version is None:
+                raise RefusedError(
+                    f"{name}@{alias} never pointed at another version, so there is nothing to go "
+                    f"back to. See: fleet-slip models {name}"
+                )
+            self.load(name, version)
+            return version if history.move(alias, version, "rollback", after=newest) else None
+
+        return history.decide(move)
+
+    def as_table(self) -> pa.Table:
+        """Return all versions of all models as rows."""
+        rows = [row for name in self.names() for row in self._rows(name)]
+        return pa.Table.from_pylist(rows, schema=_TABLE_SCHEMA)
+
+    def _rows(self, name: str) -> list[Mapping[str, Any]]:
+        moves = self.history(name).moves()
+        aliases: dict[int, list[str]] = {}
+        for alias, number in sorted({move.alias: move.version for move in moves}.items()):
+            aliases.setdefault(number, []).append(alias)
+        published = {move.version: move.at for move in reversed(moves)}
+        rows: list[Mapping[str, Any]] = []
+        for number in self.versions(name):
+            version = self._read(name, number)
+            manifest = version.manifest
+            rows.append(
+                {
+                    "name": name,
+                    "version": number,
+                    "aliases": ",".join(aliases.get(number, [])),
+                    "signals": ",".join(manifest.signals),
+                    "correlation": manifest.cross_validation.correlation,
+                    "rmse_deg": manifest.cross_validation.rmse_deg,
+                    "error_mean_deg": manifest.cross_validation.error_mean_deg,
+                    "error_std_deg": manifest.cross_validation.error_std_deg,
+                    "cohort": manifest.trained_on.cohort,
+                    "drives": manifest.trained_on.drives,
+                    "rows": manifest.trained_on.rows,
+                    "published_at": published.get(number),
+                    "sha256": version.sha256,
+                }
+            )
+        return rows
+
+    def _versions(self, name: str) -> DocumentFolder:
+        return DocumentFolder(self.folder / name / "versions")
+
+
+_TABLE_SCHEMA = pa.schema(
+    [
+        ("name", pa.string()),
+        ("version", pa.int64()),
+        ("aliases", pa.string()),
+        ("signals", pa.string()),
+        ("correlation", pa.float64()),
+        ("rmse_deg", pa.float64()),
+        ("error_mean_deg", pa.float64()),
+        ("error_std_deg", pa.float64()),
+        ("cohort", pa.string()),
+        ("drives", pa.int64()),
+        ("rows", pa.int64()),
+        ("published_at", pa.timestamp("us", tz="UTC")),
+        ("sha256", pa.string()),
+    ]
+)
+
+
+def _unknown(
+    name: str,
+    which: str,
+    names: list[str],
+    versions: list[int],
+    aliases: Mapping[str, int] | None = None,
+) -> str:
+    if name not in names:
+        return f"no model is called {name!r}. Models: {', '.join(names) or 'none yet'}."
+    known = [str(number) for number in versions] + sorted(aliases or {})
+    return f"{name} has no version or alias {which!r}. It has: {', '.join(known)}."

@@ -1,0 +1,173 @@
+"""Drift: a published model's error on each day since it was trained, on a control chart.
+
+Errors are exact, from Gram rows: with v = (coefficients, -1) the sum of squared errors of a day is
+v'Gv. The chart is one of individuals, a day being an individual, since days differ by more than
+their rows would make them (Montgomery, Introduction to Statistical Quality Control, ch. 6). What
+is usual is learned from the training days, each predicted by the model's signals fitted on the
+other training days; so that no day is judged by a model that it made. A new day is within the
+limits mean +- t s sqrt(1 + 1/m), the prediction interval of a normal individual after m others,
+with Student's t for m - 1 degrees of freedom: with few days the limits are as wide as they must be.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from datetime import date
+from statistics import fmean, stdev
+from typing import Any
+
+from fleet_slip.catalogue.features import input_scales
+from fleet_slip.errors import SelectionError, StorageError
+from fleet_slip.grams.day_sums import sum_days
+from fleet_slip.models.versions import ModelVersion
+from fleet_slip.monitoring.thresholds import MonitorThresholds, thresholds
+from fleet_slip.regression.exact import LinearModel, fit
+from fleet_slip.regression.figures import error_sums
+from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.special import student_t_quantile
+from fleet_slip.selection.what_if import counts_model
+from fleet_slip.warehouse.tables import Warehouse
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Centre line and control limits of one figure, in degrees; the lower may be missing."""
+
+    centre: float
+    lower: float | None
+    upper: float
+
+    @classmethod
+    def of(cls, usual: Sequence[float], false_alarms: float) -> "Limits":
+        """Return the two-sided prediction interval of one more individual."""
+        m = len(usual)
+        t = student_t_quantile(1 - false_alarms / 2, m - 1)
+        half = t * stdev(usual) * math.sqrt(1 + 1 / m)
+        return cls(fmean(usual), fmean(usual) - half, fmean(usual) + half)
+
+    @classmethod
+    def above(cls, usual: Sequence[float], false_alarms: float) -> "Limits":
+        """Return the upper limit of a positive figure, made on its logarithm.
+
+        A day that is better than usual is no alarm.
+        """
+        logarithms = cls.of([math.log(value) for value in usual], 2 * false_alarms)
+        return cls(math.exp(logarithms.centre), None, math.exp(logarithms.upper))
+
+    def beyond(self, value: float) -> bool:
+        """Whether a value is outside."""
+        return value > self.upper or (self.lower is not None and value < self.lower)
+
+
+@dataclass(frozen=True)
+class Day:
+    """Errors of one day.
+
+    Attributes:
+        training: the day made the model; its errors are those of the model without it.
+        alarms: figures beyond their limits, of a new day.
+    """
+
+    day: date
+    drives: int
+    rows: int
+    error_mean_deg: float
+    error_std_deg: float
+    training: bool
+    alarms: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A control chart of a model version."""
+
+    model: str
+    cohort: str
+    days: tuple[Day, ...]
+    mean_limits: Limits
+    std_limits: Limits
+
+    @property
+    def alarms(self) -> tuple[Day, ...]:
+        """The days that are beyond a limit."""
+        return tuple(day for day in self.days if day.alarms)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the chart for a JSON document."""
+        return asdict(self)
+
+
+def monitor(
+    warehouse: Warehouse,
+    version: ModelVersion,
+    condition: str | None = None,
+    since: date | None = None,
+    limits: MonitorThresholds | None = None,
+) -> Chart:
+    """Chart a model's error day by day. Reads Gram rows only.
+
+    `condition` chooses the drives; by default those that satisfy the condition of its training.
+    Days from `since` are new; by default those after the last day of the logs it was trained on.
+    Raises `SelectionError` if fewer than `min_training_days` are left to learn from.
+    """
+    limits = limits or thresholds().monitor
+    manifest = version.manifest
+    condition = condition or manifest.trained_on.cohort
+    sums = sum_days(warehouse, manifest.signals, condition, manifest.trained_on.feature_set)
+    days, grams = sums.days, sums.grams
+    last = _last_training_day(warehouse, version) if since is None else None
+    training = [day < since if since else last is not None and day <= last for day in days]
+    if sum(training) < limits.min_training_days:
+        raise SelectionError(
+            f"{version.reference} was trained on {sum(training)} days of the cohort "
+            f"{condition!r}, too few to tell what is usual. Choose another --since or --cohort; "
+            f"{limits.min_training_days} days are needed."
+        )
+    models = _models(counts_model(manifest), grams, training)
+    found = [
+        _day(day, gram, count, model, known)
+        for day, gram, count, model, known in zip(
+            days, grams, sums.drives, models, training, strict=True
+        )
+    ]
+    usual = [day for day in found if day.training]
+    mean = Limits.of([day.error_mean_deg for day in usual], limits.false_alarms_per_day)
+    std = Limits.above([day.error_std_deg for day in usual], limits.false_alarms_per_day)
+    judged = tuple(day if day.training else _judged(day, mean, std) for day in found)
+    return Chart(version.reference, condition, judged, mean, std)
+
+
+def _models(
+    champion: LinearModel, grams: Sequence[Gram], training: Sequence[bool]
+) -> list[LinearModel]:
+    """Return the model that predicts each day: of a training day, the one made without it."""
+    own = [gram for gram, known in zip(grams, training, strict=True) if known]
+    total = sum(own[1:], own[0])
+    return [
+        fit(total - gram, champion.signals, champion.label).model if known else champion
+        for gram, known in zip(grams, training, strict=True)
+    ]
+
+
+def _day(day: date, gram: Gram, drives: int, model: LinearModel, training: bool) -> Day:
+    figures = error_sums(model, gram).figures(input_scales()[model.label])
+    return Day(day, drives, gram.n, figures.error_mean_deg, figures.error_std_deg, training)
+
+
+def _judged(day: Day, mean: Limits, std: Limits) -> Day:
+    beyond = {"mean": mean.beyond(day.error_mean_deg), "std": std.beyond(day.error_std_deg)}
+    return Day(**{**asdict(day), "alarms": tuple(name for name, yes in beyond.items() if yes)})
+
+
+def _last_training_day(warehouse: Warehouse, version: ModelVersion) -> date | None:
+    """Return the newest day of the logs as they were when the model was trained."""
+    logs = warehouse.logs
+    number = version.manifest.trained_on.logs_version
+    try:
+        then = logs.snapshot(number)
+    except StorageError:
+        raise StorageError(
+            f"{logs.folder}: version {number}, which {version.reference} was trained on, is no "
+            "longer in the Delta log. Say where new days begin with --since."
+        ) from None
+    return max((file.day for file in then.files if file.day), default=None)

@@ -1,0 +1,143 @@
+"""What every car does, whatever the cohort: its sensors move, and agree on which way it turns.
+
+In a left turn (ISO 8855) ay, yaw rate and every steering angle are positive, and the right wheels
+run faster than the left. Each of these is a witness; one that contradicts the others is reversed,
+and a reversed difference of two wheels means that the two are swapped.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import count
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.monitoring.moments import AT_ONCE, DriveBatches, MeanMoments
+from fleet_slip.regression.gram import GramTable
+from fleet_slip.regression.special import FloatArray
+
+WITNESSES: Mapping[str, Mapping[str, int]] = {
+    "ay": {"ay": 1},
+    "yaw_rate": {"yaw_rate": 1},
+    "steering_wheel": {"steering_wheel": 1},
+    "steer_fl": {"steer_fl": 1},
+    "steer_fr": {"steer_fr": 1},
+    "front wheels": {"wheel_fl": -1, "wheel_fr": 1},
+    "rear wheels": {"wheel_rl": -1, "wheel_rr": 1},
+}
+"""What is positive in a left turn, as a combination of signals."""
+
+FEWEST_WITNESSES = 3
+
+STEERING_RATIO = (0.25, 1.0)
+"""Track over wheelbase is about 0.5 to 0.65 in a car; less if steering is nearer to parallel."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What is wrong with the sensors of a drive.
+
+    Attributes:
+        kind: stuck, reversed, swapped, saturated, scaled, biased, noisy or unexplained.
+        signals: those concerned; of an unexplained fault, the one that is furthest off.
+        figure: the figure that shows it.
+    """
+
+    kind: str
+    signals: tuple[str, ...]
+    figure: str
+
+
+def implausible(table: GramTable, min_correlation: float) -> dict[int, Fault]:
+    """Return the drives whose sensors contradict one another or stand still, with the fault."""
+    faults: dict[int, Fault] = {}
+    for first, moments in zip(count(0, AT_ONCE), DriveBatches.of(table)):
+        turning = reversed_or_swapped(moments, min_correlation)
+        found = steering_swapped(moments) | turning
+        faults |= {first + drive: fault for drive, fault in found.items()}
+    return faults | stuck(table)
+
+
+def stuck(table: GramTable) -> dict[int, Fault]:
+    """Return the drives in which a signal never changed while most others did.
+
+    Exact: the sum of squares about the mean is the integer zero.
+    """
+    at = [row * (row + 3) // 2 for row in range(len(table.signals))]
+    squares = table.products[:, at]
+    # n sum(x^2) may not fit 64 bits, the difference from sum(x)^2 is right modulo 2^64.
+    constant = table.n[:, None] * squares - table.sums * table.sums == 0
+    moving = constant.mean(axis=1) < 0.5
+    faults = {}
+    for drive in np.flatnonzero(constant.any(axis=1) & moving).tolist():
+        names = tuple(np.array(table.signals)[constant[drive]].tolist())
+        faults[drive] = Fault("stuck", names, "variance 0")
+    return faults
+
+
+def reversed_or_swapped(moments: MeanMoments, min_correlation: float) -> dict[int, Fault]:
+    """Return the drives in which witnesses of the turning direction contradict the majority.
+
+    A witness is reversed if the median of its correlations with the others is below
+    -`min_correlation`. A drive with a majority reversed has the others reversed.
+    """
+    names = [name for name, parts in WITNESSES.items() if set(parts) <= set(moments.signals)]
+    if len(names) < FEWEST_WITNESSES:
+        return {}
+    correlations = _correlations(moments, names)
+    others = ~np.eye(len(names), dtype=bool)
+    medians = np.stack(
+        [np.median(correlations[:, i, others[i]], axis=1) for i in range(len(names))], axis=1
+    )
+    against = medians < -min_correlation
+    return {
+        int(drive): _fault(names, against[drive], medians[drive])
+        for drive in np.flatnonzero(against.any(axis=1))
+    }
+
+
+def steering_swapped(moments: MeanMoments) -> dict[int, Fault]:
+    """Return the drives in which the outer front wheel steers more than the inner one.
+
+    With Ackermann's geometry cot(right) - cot(left) = track / wheelbase in a left turn, so that
+    the mean of left - right is about that ratio times the mean of left * right, in radians.
+    `STEERING_RATIO` bounds the ratio with the sign turned: beyond it a sensor is biased instead.
+    """
+    left, right = "steer_fl", "steer_fr"
+    if not {left, right} <= set(moments.signals):
+        return {}
+    i, j = moments.position(left), moments.position(right)
+    m, scale = moments.matrices, float(catalogue()[left].scale)
+    product = m[:, i, j] * scale**2
+    difference = (m[:, 0, i] - m[:, 0, j]) * scale
+    ratio = np.divide(difference, product, out=np.zeros_like(product), where=product > 0)
+    low, high = STEERING_RATIO
+    return {
+        int(drive): Fault(
+            "swapped", (left, right), f"inner wheel over outer {ratio[drive]:+.2f}, not +0.5"
+        )
+        for drive in np.flatnonzero((-ratio > low) & (-ratio < high))
+    }
+
+
+def _correlations(moments: MeanMoments, names: Sequence[str]) -> FloatArray:
+    weights = np.zeros((len(names), len(moments.signals)))
+    for row, name in enumerate(names):
+        for signal, weight in WITNESSES[name].items():
+            weights[row, moments.signals.index(signal)] = weight
+    covariances = weights @ moments.covariances() @ weights.T
+    spread = np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0))
+    product = spread[:, :, None] * spread[:, None, :]
+    return np.asarray(
+        np.divide(covariances, product, out=np.zeros_like(covariances), where=product > 0)
+    )
+
+
+def _fault(names: Sequence[str], against: NDArray[np.bool_], medians: FloatArray) -> Fault:
+    contrary = [name for name, yes in zip(names, against, strict=True) if yes]
+    figure = f"correlation {medians[against].min():+.2f} with the other signs of turning"
+    swapped = [name for name in contrary if len(WITNESSES[name]) == 2]
+    if swapped and len(contrary) == len(swapped):
+        return Fault("swapped", tuple(s for name in swapped for s in WITNESSES[name]), figure)
+    return Fault("reversed", tuple(s for name in contrary for s in WITNESSES[name]), figure)

@@ -1,0 +1,166 @@
+"""Faulty sensors, drive by drive, from Gram rows alone."""
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from datetime import date
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.grams.cohort import TRAINING_DRIVES, Cohort, load_cohort, nothing, require_training
+from fleet_slip.grams.reader import GramReader
+from fleet_slip.monitoring.moments import DriveBatches
+from fleet_slip.monitoring.peers import settle
+from fleet_slip.monitoring.plausibility import Fault, implausible
+from fleet_slip.monitoring.thresholds import QualityThresholds, thresholds
+from fleet_slip.regression.gram import GramTable
+from fleet_slip.warehouse.database import database_errors
+from fleet_slip.warehouse.tables import Warehouse
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A drive whose sensors are not in order."""
+
+    drive_id: str
+    vehicle_id: str
+    day: date
+    fault: Fault
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the finding for a JSON document."""
+        named = {"drive_id": self.drive_id, "vehicle_id": self.vehicle_id, "day": self.day}
+        return named | asdict(self.fault)
+
+
+@dataclass(frozen=True)
+class QualityReport:
+    """What was examined and found.
+
+    Attributes:
+        drives: Gram rows long enough to be examined.
+        compared: those among them that had enough peers to be compared with.
+        findings: one for each that is not in order, by day and drive.
+    """
+
+    drives: int
+    compared: int
+    findings: tuple[Finding, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the report for a JSON document."""
+        return {
+            "drives": self.drives,
+            "compared": self.compared,
+            "findings": [finding.as_dict() for finding in self.findings],
+        }
+
+
+def examine_drives(
+    warehouse: Warehouse,
+    condition: str = TRAINING_DRIVES,
+    limits: QualityThresholds | None = None,
+) -> QualityReport:
+    """Examine the drives that satisfy a condition, with one vehicle model's at a time in memory.
+
+    Raises like `fleet_slip.grams.cohort.load_cohort`.
+    """
+    with GramReader(warehouse) as reader:
+        reports = [
+            examine(load_cohort(reader, f"({condition}\n) AND {of_model}"), limits)
+            for of_model in _vehicle_models(reader, condition)
+        ]
+    findings = [finding for report in reports for finding in report.findings]
+    return QualityReport(
+        sum(report.drives for report in reports),
+        sum(report.compared for report in reports),
+        tuple(sorted(findings, key=_day_and_drive)),
+    )
+
+
+def _vehicle_models(reader: GramReader, condition: str) -> list[str]:
+    """Return, for each vehicle model of a cohort, the condition that a drive is of it."""
+    opened = reader.opened(condition, PLAIN)
+    cohort = opened.statement("cohort.sql", condition)
+    with database_errors(f"the cohort {condition!r}"):
+        statement = f"SELECT DISTINCT vehicle_model, source FROM ({cohort}\n)"
+        found = opened.database.sql(statement).fetchall()
+    if not found:
+        raise nothing(opened.database, condition)
+    require_training({source for _, source in found}, condition)
+    models = sorted({model for model, _ in found}, key=str)
+    return [f"vehicle_model IS NOT DISTINCT FROM {_literal(model)}" for model in models]
+
+
+def _literal(text: str | None) -> str:
+    return "NULL" if text is None else "'" + text.replace("'", "''") + "'"
+
+
+def _day_and_drive(finding: Finding) -> tuple[date, str]:
+    return finding.day, finding.drive_id
+
+
+def examine(cohort: Cohort, limits: QualityThresholds | None = None) -> QualityReport:
+    """Examine each drive of a cohort, beside the drives of its vehicle model.
+
+    First for what no car does (`implausible`), then by comparison with its peers, if it has
+    `min_drives` of them.
+    """
+    limits = limits or thresholds().quality
+    drives = compared = 0
+    findings = []
+    for table, metadata in _groups(cohort, limits.min_rows):
+        faults = implausible(table, limits.min_correlation)
+        faults |= _saturated(table, metadata, limits)
+        in_order = np.array([drive not in faults for drive in range(len(table))])
+        if in_order.sum() >= limits.min_drives:
+            compared += len(table)
+            faults |= _unlike_peers(table, in_order, limits)
+        drives += len(table)
+        findings += _findings(metadata, faults)
+    findings.sort(key=_day_and_drive)
+    return QualityReport(drives, compared, tuple(findings))
+
+
+def _groups(cohort: Cohort, min_rows: int) -> Iterator[tuple[GramTable, pa.Table]]:
+    """Yield the drives of each vehicle model and set of signals that are long enough."""
+    start = 0
+    for table in cohort.tables:
+        metadata = cohort.drives.slice(start, len(table))
+        start += len(table)
+        models = np.array(metadata["vehicle_model"].to_pylist(), dtype=object)
+        long = table.n >= min_rows
+        for model in sorted({str(name) for name in models[long]}):
+            mask = long & (models.astype(str) == model)
+            yield table.take(mask), metadata.filter(pa.array(mask))
+
+
+def _saturated(table: GramTable, metadata: pa.Table, limits: QualityThresholds) -> dict[int, Fault]:
+    clipped = np.array([count or 0 for count in metadata["saturated"].to_pylist()])
+    fraction = clipped / table.n
+    return {
+        int(drive): Fault("saturated", (), f"{clipped[drive]:,} values at the end of their range")
+        for drive in np.flatnonzero(fraction > limits.max_saturated_per_row)
+    }
+
+
+def _unlike_peers(
+    table: GramTable, in_order: "np.ndarray[Any, np.dtype[np.bool_]]", limits: QualityThresholds
+) -> dict[int, Fault]:
+    peers, suspects = settle(table, in_order, catalogue().label, limits)
+    at = np.flatnonzero(suspects)
+    if not len(at):
+        return {}
+    faults = peers.explain(DriveBatches.of(table, suspects))
+    return dict(zip(at.tolist(), faults, strict=True))
+
+
+def _findings(metadata: pa.Table, faults: dict[int, Fault]) -> list[Finding]:
+    return [
+        Finding(row["drive_id"], row["vehicle_id"], row["day"], faults[drive])
+        for drive, row in enumerate(metadata.select(["drive_id", "vehicle_id", "day"]).to_pylist())
+        if drive in faults
+    ]

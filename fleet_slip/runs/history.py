@@ -1,0 +1,62 @@
+"""Reading the history of runs, and keeping it short where every record is an object of its own.
+
+    runs/2026-11.jsonl                          in a folder: the records of a month
+    runs/2026-11.jsonl/TIME-RANDOM.jsonl        on an object store: a record
+    runs/2026-11.jsonl/CHECKSUM.jsonl           records of that month, gathered
+
+Gathering takes no lock. A record is deleted by who has written, durably, an object that has it; so
+whatever gatherers do at once, or are killed at, every record is there once or more, and the view
+`runs` counts a run by its name. A reader whose files are gathered meanwhile lists them again.
+"""
+
+import hashlib
+from collections import defaultdict
+from concurrent.futures import ThreadPoolExecutor
+
+import duckdb
+
+from fleet_slip.files.folder import Folder, StoredFile
+from fleet_slip.runs.log import FOLDER
+
+REMOVALS_AT_ONCE = 16
+
+
+def lend_runs(root: Folder, database: duckdb.DuckDBPyConnection, since: str = "") -> list[str]:
+    """Let a connection read the history's files; return their URIs, none if there is no history.
+
+    `since` is the first month that is wanted, as YYYY-MM.
+    """
+    return (root / FOLDER).lend(database, lambda path: _is_record(path) and path >= since)
+
+
+def gather_runs(root: Folder) -> int:
+    """Make one object of the records of each month; return how many objects there were of them.
+
+    Does nothing in a folder, where a month is one file.
+    """
+    folder = root / FOLDER
+    months: dict[str, list[StoredFile]] = defaultdict(list)
+    for file in folder.files():
+        month, _, name = file.path.partition("/")
+        if name and _is_record(name):
+            months[month].append(file)
+    scattered = {month: files for month, files in months.items() if len(files) > 1}
+    for month, files in scattered.items():
+        _gather(folder, month, files)
+    return sum(len(files) for files in scattered.values())
+
+
+def _gather(folder: Folder, month: str, files: list[StoredFile]) -> None:
+    contents = folder.read_many([file.path for file in files])
+    read = {file: content for file, content in zip(files, contents, strict=True) if content}
+    # Sorted and each once: the same records are the same object, whoever gathers them.
+    lines = sorted({line for content in read.values() for line in content.splitlines() if line})
+    whole = b"".join(line + b"\n" for line in lines)
+    target = f"{month}/{hashlib.sha256(whole).hexdigest()[:32]}.jsonl"
+    folder.create(target, whole)
+    with ThreadPoolExecutor(REMOVALS_AT_ONCE) as executor:
+        list(executor.map(folder.remove, (file for file in read if file.path != target)))
+
+
+def _is_record(path: str) -> bool:
+    return path.endswith(".jsonl")

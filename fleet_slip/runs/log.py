@@ -1,0 +1,252 @@
+"""The history of runs: which commands changed a warehouse, when, and what came of it.
+
+    runs/2026-11.jsonl    one line when a command starts, one when it ends
+
+A line is appended by a single write to the month's file and never changed, so that processes need
+no lock, and a run that was killed is known by its missing second line. A line that a full disk or
+a power cut tore is skipped by readers; it cannot damage its successor, since every record begins
+on a new line. Nothing here may fail or delay the command: what cannot be written is not written.
+"""
+
+import contextlib
+import json
+import logging
+import os
+import re
+import socket
+import time
+import uuid
+from collections.abc import Iterator, Mapping, Sequence
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import version
+from typing import Any
+
+from fleet_slip.errors import StorageError
+from fleet_slip.files.folder import Folder
+
+RECORD_COLUMNS = {
+    "run_id": "VARCHAR",
+    "command": "VARCHAR",
+    "arguments": "VARCHAR[]",
+    "started_at": "VARCHAR",
+    "ended_at": "VARCHAR",
+    "outcome": "VARCHAR",
+    "exit_code": "INTEGER",
+    "error": "VARCHAR",
+    "seconds": "DOUBLE",
+    "steps": "STRUCT(name VARCHAR, seconds DOUBLE, rows BIGINT, size_bytes BIGINT)[]",
+    "host": "VARCHAR",
+    "process": "INTEGER",
+    "package_version": "VARCHAR",
+}
+"""What a line of the history may say, with DuckDB's types."""
+
+LOGGER = logging.getLogger("fleet_slip")
+FOLDER = "runs"
+INTERRUPTED = 130
+ARGUMENTS_MAX = 50
+"""So many arguments are kept; a glob may have given a hundred thousand."""
+ERROR_MAX = 2000
+"""So many characters of a message are kept."""
+
+_PRIVATE_OPTION = re.compile(r"(?i)--?(?:[\w-]*(?:key|token|secret|passw)[\w-]*|vehicle|drive)")
+_DATA_FILE = re.compile(r"(?is).*(\.(?:csv|parquet|mf4)(?:\.\w+)?)")
+_URL_CREDENTIALS = re.compile(r"(?<=://)[^/@\s]+(?=@)")
+HIDDEN = "***"
+
+_current: ContextVar["Run | None"] = ContextVar("run", default=None)
+
+
+@dataclass
+class Step:
+    """One step of a run. Whoever does it fills in the figures while it lasts."""
+
+    name: str
+    seconds: float = 0.0
+    rows: int | None = None
+    size_bytes: int | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the step for the record."""
+        return {
+            "name": self.name,
+            "seconds": round(self.seconds, 6),
+            "rows": self.rows,
+            "size_bytes": self.size_bytes,
+        }
+
+
+@dataclass
+class Run:
+    """A command under way."""
+
+    command: str
+    arguments: tuple[str, ...]
+    started_at: datetime
+    run_id: str
+    steps: list[Step] = field(default_factory=list)
+
+    @classmethod
+    def start(cls, command: str, arguments: Sequence[str]) -> "Run":
+        """Begin a run now. Its name sorts by time."""
+        now = datetime.now(UTC)
+        run_id = f"{now:%Y%m%dT%H%M%S.%fZ}-{uuid.uuid4().hex[:8]}"
+        return cls(command, tuple(arguments), now, run_id)
+
+    @property
+    def shown_arguments(self) -> list[str]:
+        """The command line without what the history must not keep."""
+        return _shortened(publishable(self.arguments))
+
+    def beginning(self) -> dict[str, Any]:
+        """Return the line that is written when the run starts."""
+        return {
+            "run_id": self.run_id,
+            "command": self.command,
+            "arguments": self.shown_arguments,
+            "started_at": _timestamp(self.started_at),
+            "host": socket.gethostname(),
+            "process": os.getpid(),
+            "package_version": version("fleet-slip"),
+        }
+
+    def end(self, error: BaseException | None, seconds: float) -> dict[str, Any]:
+        """Return the line that is written when the run ends."""
+        exit_code = _exit_code(error)
+        outcome = {0: "done", INTERRUPTED: "interrupted"}.get(exit_code, "failed")
+        return {
+            "run_id": self.run_id,
+            "ended_at": _timestamp(datetime.now(UTC)),
+            "seconds": round(seconds, 6),
+            "outcome": outcome,
+            "exit_code": exit_code,
+            "error": self._told(error) if error is not None and exit_code else None,
+            "steps": [one.as_dict() for one in self.steps],
+        }
+
+    def _told(self, error: BaseException) -> str:
+        return _without(str(error), self.arguments, publishable(self.arguments))[:ERROR_MAX]
+
+
+def current_run_id() -> str | None:
+    """Return the name of the run under way."""
+    run = _current.get()
+    return run.run_id if run else None
+
+
+@contextlib.contextmanager
+def recording(root: Folder, command: str, arguments: Sequence[str]) -> Iterator[Run]:
+    """Record a command that may change the warehouse at `root`, whatever comes of it.
+
+    A data root that does not exist is not made: then both lines are written at the end, if the
+    command has made it.
+    """
+    run = Run.start(command, arguments)
+    file = f"{FOLDER}/{run.started_at:%Y-%m}.jsonl"
+    begun = time.monotonic()
+    token = _current.set(run)
+    told = _exists(root) and _append(root, file, run.beginning())
+    log_event("run started", command=command, arguments=run.shown_arguments)
+    error: BaseException | None = None
+    try:
+        yield run
+    except BaseException as caught:
+        error = caught
+        raise
+    finally:
+        end = run.end(error, time.monotonic() - begun)
+        log_event("run ended", **{key: end[key] for key in ("outcome", "exit_code", "seconds")})
+        if _exists(root):
+            _append(root, file, *([] if told else [run.beginning()]), end)
+        _current.reset(token)
+
+
+@contextlib.contextmanager
+def step(name: str) -> Iterator[Step]:
+    """Time a step of the run under way, and log it. Without a run it is logged only."""
+    run = _current.get()
+    one = Step(name)
+    begun = time.monotonic()
+    try:
+        yield one
+    finally:
+        one.seconds = time.monotonic() - begun
+        if run:
+            run.steps.append(one)
+        log_event(
+            "step ended", step=name, **{k: v for k, v in one.as_dict().items() if k != "name"}
+        )
+
+
+def publishable(arguments: Sequence[str]) -> list[str]:
+    """Return command line arguments without what the history must not keep.
+
+    That is the value of an option whose name speaks of a key, token, secret or password, the user
+    part of a URL, and what may name a person's car, since the history outlives what is forgotten:
+    the values of --vehicle and --drive, and the names of data files.
+    """
+    kept: list[str] = []
+    hide_next = False
+    for argument in arguments:
+        text = _URL_CREDENTIALS.sub(HIDDEN, argument.encode(errors="replace").decode())
+        option, equals, _ = text.partition("=")
+        private = bool(_PRIVATE_OPTION.fullmatch(option))
+        if hide_next:
+            text = HIDDEN
+        elif private and equals:
+            text = f"{option}={HIDDEN}"
+        elif data_file := _DATA_FILE.fullmatch(text):
+            text = f"{HIDDEN}{data_file[1]}"
+        hide_next = private and not equals and not hide_next
+        kept.append(text)
+    return kept
+
+
+def _without(text: str, arguments: Sequence[str], shown: Sequence[str]) -> str:
+    """Return a message with the arguments that are not shown replaced, wherever it quotes them."""
+    for argument, instead in zip(arguments, shown, strict=True):
+        if argument != instead:
+            secret = argument.partition("=")[2] if instead.endswith(f"={HIDDEN}") else argument
+            text = text.replace(secret, HIDDEN) if secret else text
+    return text
+
+
+def _shortened(arguments: list[str]) -> list[str]:
+    more = len(arguments) - ARGUMENTS_MAX
+    return [*arguments[:ARGUMENTS_MAX], f"... and {more} more"] if more > 0 else arguments
+
+
+def _exists(root: Folder) -> bool:
+    with contextlib.suppress(StorageError):
+        return root.exists()
+    return False
+
+
+def _append(root: Folder, file: str, *records: Mapping[str, Any]) -> bool:
+    """Append records in one write; False where that is not possible."""
+    text = "".join(f"\n{json.dumps(record, separators=(',', ':'))}\n" for record in records)
+    try:
+        root.append(file, text.encode())
+    except StorageError as error:
+        log_event("run not recorded", logging.WARNING, file=f"{root}/{file}", reason=str(error))
+        return False
+    return True
+
+
+def log_event(event: str, level: int = logging.INFO, **fields: Any) -> None:
+    """Log what happened, with figures: a line for machines, nothing for people."""
+    LOGGER.log(level, event, extra={"event": event, "fields": fields})
+
+
+def _exit_code(error: BaseException | None) -> int:
+    if error is None:
+        return 0
+    if isinstance(error, KeyboardInterrupt):
+        return INTERRUPTED
+    return int(getattr(error, "exit_code", 1))
+
+
+def _timestamp(moment: datetime) -> str:
+    return moment.isoformat(timespec="microseconds")

@@ -1,0 +1,1 @@
+"""Which model: comparison, search, uncertainty and diagnosis, all from Gram matrices."""

@@ -1,0 +1,99 @@
+"""Compares candidate models on a cohort by cross-validation and chooses one; no log row is read."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Generic
+
+from typing_extensions import TypeVar
+
+from fleet_slip.catalogue.features import features, input_scales
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.errors import SelectionError
+from fleet_slip.grams.cohort import ROW_FOLDS, Cohort
+from fleet_slip.grams.fold_sums import SummedCohort
+from fleet_slip.regression.crossval import CrossValidation, cross_validate_inputs
+from fleet_slip.regression.folds import CohortFolds
+from fleet_slip.regression.winner import Winner, choose
+from fleet_slip.selection.model_list import CandidateModel, FoldPlan
+from fleet_slip.selection.search import OrderedChoice
+from fleet_slip.selection.uncertainty import Uncertainty
+
+AnyCohort = TypeVar("AnyCohort", bound=Cohort | SummedCohort, default=Cohort)
+
+
+@dataclass(frozen=True)
+class Selection(Generic[AnyCohort]):
+    """All candidates with their figures, in the order of the list, and the winner.
+
+    Attributes:
+        cohort: the Gram rows, or their sums.
+        folds: how they were divided.
+        models: the candidates that the cohort can serve, cross-validated.
+        winner: the chosen one and why.
+        skipped: candidates that the cohort cannot serve, with the reason.
+        choice: how an order or a subset was chosen; None for a list of models.
+        uncertainty: how sure the winner's figures are, if that was asked for.
+    """
+
+    cohort: AnyCohort
+    folds: FoldPlan
+    models: tuple[CrossValidation, ...]
+    winner: Winner
+    skipped: dict[str, str]
+    choice: OrderedChoice | None = None
+    uncertainty: Uncertainty | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `select --json` prints."""
+        document: dict[str, Any] = {
+            "models": [
+                {**model.as_dict(), "gram_rows": self.cohort.gram_condition(model.signals)}
+                for model in self.models
+            ],
+            "winner": self.winner.model.name,
+            "reason": self.winner.reason,
+            "cohort": self.cohort.condition,
+            "feature_set": features().identity(self.cohort.feature_set),
+            "drives": self.cohort.drive_count,
+            "rows": self.cohort.rows,
+            "folds": {
+                "by": self.folds.by,
+                "count": self.folds.count,
+                "leaking": self.folds.by == ROW_FOLDS,
+            },
+            "skipped": self.skipped,
+        }
+        if self.choice is not None:
+            document["choice"] = self.choice.as_dict()
+        if self.uncertainty is not None:
+            document["uncertainty"] = self.uncertainty.as_dict()
+        return document
+
+
+def select(
+    cohort: AnyCohort, candidates: Sequence[CandidateModel], folds: FoldPlan
+) -> Selection[AnyCohort]:
+    """Cross-validate each candidate and choose the winner.
+
+    A candidate that needs signals which no drive of the cohort has, or whose signals are linearly
+    dependent, is skipped with the reason. Raises `SelectionError` if none is left.
+    """
+    divided = cohort.folds(folds.by, folds.count)
+    models: list[CrossValidation] = []
+    skipped: dict[str, str] = {}
+    for candidate in candidates:
+        try:
+            models.append(validate(candidate, divided))
+        except SelectionError as error:
+            skipped[candidate.name] = str(error)
+    if not models:
+        reasons = "; ".join(f"model {name}: {reason}" for name, reason in skipped.items())
+        raise SelectionError(f"no candidate can be fitted on the cohort. {reasons}")
+    return Selection(cohort, folds, tuple(models), choose(models), skipped)
+
+
+def validate(candidate: CandidateModel, folds: CohortFolds) -> CrossValidation:
+    """Cross-validate one candidate by exact least squares in each fold."""
+    return cross_validate_inputs(
+        candidate.name, folds, candidate.signals, catalogue().label, input_scales()
+    )

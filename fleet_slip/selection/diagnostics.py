@@ -1,0 +1,194 @@
+"""What there is to know about a model's fit to a cohort: errors, collinearity, stability."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from fleet_slip.catalogue.features import input_scales
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.errors import SelectionError
+from fleet_slip.grams.cohort import Cohort, Served
+from fleet_slip.regression.drives import DriveMoments, serving_drives
+from fleet_slip.regression.evidence import Evidence
+from fleet_slip.regression.exact import Fit, LinearModel, condition_number, fit
+from fleet_slip.regression.inference import (
+    ChowTest,
+    Inference,
+    WaldTest,
+    chow,
+    classical,
+    cluster,
+    variance_inflation,
+    wald,
+)
+from fleet_slip.regression.nested import nested_fits
+from fleet_slip.regression.ridge import errors_in_variables
+from fleet_slip.regression.serial import (
+    AutoregressiveFit,
+    SerialCorrelation,
+    autoregressive_fit,
+    lag_signals,
+    serial_correlation,
+)
+
+
+@dataclass(frozen=True)
+class SerialDiagnosis:
+    """How much the residual of a row says of the next one.
+
+    Attributes:
+        correlation: of the least-squares residuals.
+        autoregressive: feasible generalised least squares, whose residuals are independent.
+        inference: standard errors of its slopes.
+    """
+
+    correlation: SerialCorrelation
+    autoregressive: AutoregressiveFit
+    inference: Inference
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Whether another cohort has the same coefficients.
+
+    Attributes:
+        condition: the other cohort.
+        other: the coefficients there.
+        rows: Chow's test, which takes rows for independent.
+        drives: Wald's test, which takes drives for independent.
+    """
+
+    condition: str
+    other: Inference
+    rows: ChowTest
+    drives: WaldTest
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """One model on one cohort.
+
+    Attributes:
+        fitted: exact fit, in counts.
+        drives: number of drives that serve it.
+        naive, robust: coefficients in SI units, rows or drives counting as independent.
+        inflation: variance inflation of each input.
+        condition_number: of the inputs' correlation matrix.
+        evidence: effective rows and design effect.
+        serial: from lagged Gram rows; None if they were not given.
+        comparison: with another cohort; None without one.
+        noise_free: the model, in SI units, for signals without the noise they were logged with.
+    """
+
+    fitted: Fit
+    drives: int
+    naive: Inference
+    robust: Inference
+    inflation: Mapping[str, float]
+    condition_number: float
+    evidence: Evidence
+    serial: SerialDiagnosis | None = None
+    comparison: Comparison | None = None
+    noise_free: LinearModel | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `diagnose --json` prints."""
+        document: dict[str, Any] = {
+            "signals": list(self.fitted.model.signals),
+            "drives": self.drives,
+            "rows": self.fitted.gram.n,
+            "effective_rows": self.evidence.rows,
+            "design_effect": self.evidence.design_effect,
+            "r_squared": self.fitted.r_squared,
+            "residual_std": self.naive.residual_std,
+            "condition_number": self.condition_number,
+            "variance_inflation": dict(self.inflation),
+            "by_rows": [asdict(estimate) for estimate in self.naive.estimates],
+            "by_drives": [asdict(estimate) for estimate in self.robust.estimates],
+        }
+        if self.serial is not None:
+            document["serial"] = {
+                **asdict(self.serial.correlation),
+                "autoregressive_rho": self.serial.autoregressive.rho,
+                "autoregressive": [asdict(e) for e in self.serial.inference.estimates[1:]],
+            }
+        if self.comparison is not None:
+            document["against"] = {
+                "cohort": self.comparison.condition,
+                "by_drives": [asdict(estimate) for estimate in self.comparison.other.estimates],
+                "chow_rows_independent": asdict(self.comparison.rows),
+                "wald_drives_independent": asdict(self.comparison.drives),
+            }
+        if self.noise_free is not None:
+            document["noise_free"] = {
+                "intercept": self.noise_free.offset,
+                **self.noise_free.weights,
+            }
+        return document
+
+
+def diagnose(
+    cohort: Cohort,
+    inputs: Sequence[str],
+    *,
+    lagged: Cohort | None = None,
+    against: Cohort | None = None,
+    sensor_noise: Mapping[str, float] | None = None,
+) -> Diagnosis:
+    """Fit the inputs to the drives of a cohort that have them all, and examine the fit.
+
+    `lagged` is the same cohort with lagged Gram rows; `sensor_noise` the standard deviation of
+    sensors in SI units. Raises `SelectionError` for dependent or absent signals.
+    """
+    label, scales = catalogue().label, input_scales()
+    served = cohort.serving(inputs)
+    moments = DriveMoments.of(served.table)
+    total = served.table.total()
+    fits = nested_fits(total, inputs, label)
+    fitted = fits[-1]
+    free = None
+    if sensor_noise:
+        free = errors_in_variables(total, inputs, label, sensor_noise, scales).physical(scales)
+    return Diagnosis(
+        fitted=fitted,
+        drives=len(served.table),
+        naive=classical(fitted, scales),
+        robust=cluster(fitted, moments, scales),
+        inflation=variance_inflation(total, inputs),
+        condition_number=condition_number(total, inputs),
+        evidence=Evidence.clustered(fits, moments),
+        serial=_serial(fitted, lagged) if lagged else None,
+        comparison=_compare(served, fitted, moments, against) if against else None,
+        noise_free=free,
+    )
+
+
+def _serial(fitted: Fit, lagged: Cohort) -> SerialDiagnosis:
+    inputs, label = fitted.model.signals, fitted.model.label
+    table, _ = serving_drives(lagged.tables, lag_signals([*inputs, label]))
+    gram = table.total()
+    autoregressive = autoregressive_fit(gram, inputs, label)
+    return SerialDiagnosis(
+        serial_correlation(fitted.model, fitted.gram, gram),
+        autoregressive,
+        classical(autoregressive.differenced, input_scales()),
+    )
+
+
+def _compare(here: Served, fitted: Fit, moments: DriveMoments, against: Cohort) -> Comparison:
+    inputs, label = fitted.model.signals, fitted.model.label
+    there = against.serving(inputs)
+    shared = {*here.drives["drive_id"].to_pylist()} & {*there.drives["drive_id"].to_pylist()}
+    if shared:
+        raise SelectionError(
+            f"the two cohorts share {len(shared)} drives, such as {min(shared)}: a comparison "
+            f"needs different drives. Add to --cohort: AND NOT ({against.condition})"
+        )
+    other_moments = DriveMoments.of(there.table)
+    other = fit(there.table.total(), inputs, label)
+    return Comparison(
+        against.condition,
+        cluster(other, other_moments, input_scales()),
+        chow([fitted.gram, other.gram], inputs, label),
+        wald(fitted, moments, other, other_moments),
+    )

@@ -1,0 +1,94 @@
+"""Model lists: the candidates that a selection compares, read from `configs/models/*.toml`."""
+
+import hashlib
+from collections.abc import Sequence
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.catalogue.signals import Identifier, catalogue
+from fleet_slip.config import Config, load_config
+from fleet_slip.files.documents import canonical_json
+from fleet_slip.resources import find_config
+
+FoldKey = Literal["drive", "vehicle", "track", "day", "mass", "adhesion", "row"]
+
+
+class CandidateModel(Config):
+    """A named set of inputs: signals, or features of a feature set."""
+
+    name: str = Field(min_length=1, max_length=60)
+    signals: tuple[Identifier, ...] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _signals_are_inputs(self) -> "CandidateModel":
+        inputs = (*catalogue().inputs, *features().features)
+        for name in self.signals:
+            if name not in inputs:
+                raise ValueError(
+                    f"model {self.name!r}: {name!r} is not an input. Inputs: {', '.join(inputs)}"
+                )
+        if len(set(self.signals)) < len(self.signals):
+            raise ValueError(f"model {self.name!r} names a signal twice")
+        return self
+
+
+class FoldPlan(Config):
+    """How a cohort is divided for cross-validation."""
+
+    by: FoldKey = "drive"
+    count: int = Field(default=5, ge=2, le=1000)
+
+
+class ModelList(Config):
+    """Candidates in their declared order, the feature set and the folds to compare them on."""
+
+    description: str = Field(min_length=1)
+    features: Identifier = PLAIN
+    folds: FoldPlan = FoldPlan()
+    model: tuple[CandidateModel, ...] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _names_differ(self) -> "ModelList":
+        names = [candidate.name for candidate in self.model]
+        if len(set(names)) < len(names):
+            raise ValueError("two models have the same name")
+        return self
+
+    @model_validator(mode="after")
+    def _feature_set_has_the_inputs(self) -> "ModelList":
+        known = features()
+        if self.features not in {PLAIN, *known.sets}:
+            raise ValueError(f"features: no feature set is called {self.features!r}")
+        inputs = known.set(self.features).inputs
+        for candidate in self.model:
+            absent = [name for name in candidate.signals if name not in inputs]
+            if absent:
+                raise ValueError(
+                    f"model {candidate.name!r}: {', '.join(absent)} is not in the feature set "
+                    f"{self.features!r}. Its inputs: {', '.join(inputs)}"
+                )
+        return self
+
+    @property
+    def sha256(self) -> str:
+        """Checksum of what the list says, whatever its layout."""
+        content = self.model_dump(mode="json", exclude_defaults=True)
+        return hashlib.sha256(canonical_json(content).encode()).hexdigest()
+
+
+def load_model_list(name_or_path: str) -> ModelList:
+    """Return a shipped model list by name, or one from a TOML file. Raises `ConfigError`."""
+    return load_config(find_config("models", name_or_path), ModelList)
+
+
+def nested_models(order: Sequence[str]) -> tuple[CandidateModel, ...]:
+    """Return the nested models of a predefined order (paper, section II.B): its first 1..k inputs.
+
+    The null model, without any input, predicts the mean and has no correlation to compare.
+    """
+    return tuple(
+        CandidateModel(name=f"first {size}", signals=tuple(order[:size]))
+        for size in range(1, len(order) + 1)
+    )

@@ -1,0 +1,246 @@
+"""Error by regime, and whether each regime should have a model of its own."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fleet_slip.catalogue.features import features, input_scales
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.errors import SelectionError
+from fleet_slip.grams.cohort import FOLD_KEYS, ROW_FOLDS, Cohort, assign
+from fleet_slip.grams.statement import UNKNOWN_PART
+from fleet_slip.regression.crossval import held_out
+from fleet_slip.regression.exact import LinearModel, fit
+from fleet_slip.regression.figures import ErrorSums, Figures
+from fleet_slip.regression.gram import Gram, IntArray
+from fleet_slip.selection.model_list import FoldPlan
+
+ROWS_PER_COEFFICIENT = 100
+"""A regime with fewer training rows, one second of driving a coefficient, uses the pooled model."""
+
+
+@dataclass(frozen=True)
+class RegimeFigures:
+    """Held-out figures of one regime's rows, by the model of all regimes and by its own.
+
+    `share` is the part of the cohort's rows; `own` says whether it had enough rows for one.
+    """
+
+    name: str
+    rows: int
+    share: float
+    pooled: Figures
+    split: Figures
+    own: bool
+
+
+@dataclass(frozen=True)
+class RegimeComparison:
+    """One model for all regimes against one for each, cross-validated on the same folds.
+
+    Attributes:
+        signals: the inputs.
+        drives: number of drives that have them.
+        folds: number of folds.
+        regimes: figures by regime.
+        pooled, split: figures over all rows.
+        gain: mean over the folds of what splitting adds to the correlation.
+        gain_standard_error: of the gain, over the same folds.
+    """
+
+    signals: tuple[str, ...]
+    drives: int
+    folds: int
+    regimes: tuple[RegimeFigures, ...]
+    pooled: Figures
+    split: Figures
+    gain: float
+    gain_standard_error: float
+
+    @property
+    def split_wins(self) -> bool:
+        """Whether splitting gains more than one standard error: it costs many coefficients."""
+        return self.gain > self.gain_standard_error
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `regimes --json` prints."""
+        return {
+            "signals": list(self.signals),
+            "drives": self.drives,
+            "folds": self.folds,
+            "pooled": self.pooled.as_dict(),
+            "split": self.split.as_dict(),
+            "gain": self.gain,
+            "gain_standard_error": self.gain_standard_error,
+            "winner": "split" if self.split_wins else "pooled",
+            "regimes": [
+                {
+                    "regime": one.name,
+                    "rows": one.rows,
+                    "share": one.share,
+                    "own_model": one.own,
+                    "pooled": one.pooled.as_dict(),
+                    "split": one.split.as_dict(),
+                }
+                for one in self.regimes
+            ],
+        }
+
+
+def regime_names(cohort: Cohort, over: Sequence[str]) -> list[str]:
+    """Return the regime of each Gram row, by some of the regimes that its set divides by.
+
+    Raises `SelectionError` if the set does not divide by one of them.
+    """
+    divided = features().set(cohort.feature_set).regimes
+    unknown = [name for name in over if name not in divided]
+    if unknown or not divided:
+        having = ", ".join(name for name, one in features().sets.items() if one.regimes)
+        raise SelectionError(
+            f"the feature set {cohort.feature_set} is not divided by {', '.join(unknown) or 'any'} "
+            f"regime; it has {', '.join(divided) or 'none'}. Sets with regimes: {having}."
+        )
+    at = [divided.index(name) for name in (over or divided)]
+    return [
+        part if part == UNKNOWN_PART else ", ".join(part.split(", ")[i] for i in at)
+        for part in cohort.drives["part"].to_pylist()
+    ]
+
+
+def band_order(cohort: Cohort, names: Sequence[str]) -> list[str]:
+    """Return the distinct regime names in the order of their bands, unknown ones last."""
+    known = features()
+    rank = {
+        band: i
+        for regime in known.set(cohort.feature_set).regimes
+        for i, band in enumerate(known.regimes[regime].bands)
+    }
+    return sorted(set(names), key=lambda name: [rank.get(b, len(rank)) for b in name.split(", ")])
+
+
+def compare_regimes(
+    cohort: Cohort, inputs: Sequence[str], plan: FoldPlan, over: Sequence[str] = ()
+) -> RegimeComparison:
+    """Cross-validate one model for all regimes and one for each, on drives that have the inputs.
+
+    Raises `SelectionError` for a feature set without regimes, absent signals, or empty folds.
+    """
+    if plan.by == ROW_FOLDS:
+        raise SelectionError("rows are divided by regime already: fold by drive, or by vehicle.")
+    names = regime_names(cohort, over)
+    order = band_order(cohort, names)
+    regime = np.array([order.index(name) for name in names], dtype=np.int64)
+    assignment = assign(cohort.drives[FOLD_KEYS[plan.by]].to_pylist(), plan.by, plan.count)
+    grid = _Grid.of(cohort, inputs, regime, len(order), assignment.fold, len(assignment.names))
+    pooled = [grid.pooled(f) for f in range(grid.folds)]
+    sums = {
+        (r, f): grid.tested(r, f, pooled[f])
+        for r in range(len(order))
+        for f in range(grid.folds)
+        if grid.grams[r][f].n
+    }
+    unit = input_scales()[catalogue().label]
+    found = []
+    for r, name in enumerate(order):
+        mine = [sums[r, f] for f in range(grid.folds) if (r, f) in sums]
+        if not mine:
+            continue
+        one, own = _total([s[0] for s in mine]), _total([s[1] for s in mine])
+        found.append(
+            RegimeFigures(
+                name,
+                one.n,
+                one.n / grid.total.n,
+                one.figures(unit),
+                own.figures(unit),
+                all(s[2] for s in mine),
+            )
+        )
+    by_fold = [[s for (_, f), s in sums.items() if f == fold] for fold in range(grid.folds)]
+    pooled_folds = [_total([s[0] for s in fold]) for fold in by_fold]
+    split_folds = [_total([s[1] for s in fold]) for fold in by_fold]
+    gains = [
+        after.figures(unit).correlation - before.figures(unit).correlation
+        for before, after in zip(pooled_folds, split_folds, strict=True)
+    ]
+    return RegimeComparison(
+        signals=tuple(inputs),
+        drives=len(cohort.serving(inputs).table),
+        folds=grid.folds,
+        regimes=tuple(found),
+        pooled=_total(pooled_folds).figures(unit),
+        split=_total(split_folds).figures(unit),
+        gain=math.fsum(gains) / len(gains),
+        gain_standard_error=_standard_error(gains),
+    )
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """The Gram of each regime and fold."""
+
+    inputs: tuple[str, ...]
+    grams: tuple[tuple[Gram, ...], ...]
+    total: Gram
+
+    @property
+    def folds(self) -> int:
+        return len(self.grams[0])
+
+    @classmethod
+    def of(
+        cls,
+        cohort: Cohort,
+        inputs: Sequence[str],
+        regime: IntArray,
+        regimes: int,
+        fold: IntArray,
+        folds: int,
+    ) -> "_Grid":
+        signals = [*inputs, catalogue().label]
+        cell = regime * folds + fold
+        cells = [Gram.zero(signals)] * (regimes * folds)
+        stops = np.cumsum([len(table) for table in cohort.tables])[:-1]
+        for table, mine in zip(cohort.tables, np.split(cell, stops), strict=True):
+            if set(signals) <= set(table.signals):
+                found = table.restrict(signals).totals(mine, regimes * folds)
+                cells = [a + b for a, b in zip(cells, found, strict=True)]
+        cohort.serving(inputs)
+        grams = tuple(tuple(cells[r * folds : (r + 1) * folds]) for r in range(regimes))
+        return cls(tuple(inputs), grams, sum(cells[1:], cells[0]))
+
+    def pooled(self, fold: int) -> tuple[LinearModel, Gram]:
+        """Return the model of all regimes without a fold, and the rows it was fitted on."""
+        mine = [row[fold] for row in self.grams]
+        training = self.total - sum(mine[1:], mine[0])
+        return fit(training, self.inputs, catalogue().label).model, training
+
+    def tested(
+        self, regime: int, fold: int, pooled: tuple[LinearModel, Gram]
+    ) -> tuple[ErrorSums, ErrorSums, bool]:
+        """Return the errors on one regime and fold by the pooled model and the regime's own."""
+        test = self.grams[regime][fold]
+        model, everything = pooled
+        by_pooled = held_out(model, everything, test)
+        others = [gram for f, gram in enumerate(self.grams[regime]) if f != fold]
+        training = sum(others[1:], others[0])
+        if training.n < ROWS_PER_COEFFICIENT * (len(self.inputs) + 1):
+            return by_pooled, by_pooled, False
+        try:
+            own = fit(training, self.inputs, catalogue().label).model
+        except SelectionError:
+            return by_pooled, by_pooled, False
+        return by_pooled, held_out(own, everything, test), True
+
+
+def _total(sums: Sequence[ErrorSums]) -> ErrorSums:
+    return sum(sums[1:], sums[0])
+
+
+def _standard_error(values: Sequence[float]) -> float:
+    mean = math.fsum(values) / len(values)
+    square = math.fsum((value - mean) ** 2 for value in values)
+    return math.sqrt(square / (len(values) - 1) / len(values))

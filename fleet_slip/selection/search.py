@@ -1,0 +1,179 @@
+"""Which signals of a set: the nested models of a ranking, or the best subset of every size."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fleet_slip.catalogue.features import input_scales
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.errors import SelectionError
+from fleet_slip.grams.cohort import ROW_FOLDS, Cohort
+from fleet_slip.grams.training import drive_folds, row_training
+from fleet_slip.regression.criteria import CRITERIA
+from fleet_slip.regression.crossval import CrossValidation, cross_validate, least_squares
+from fleet_slip.regression.evidence import Evidence
+from fleet_slip.regression.nested import nested_fits
+from fleet_slip.regression.nested_choice import (
+    CROSS_VALIDATION,
+    Rule,
+    Training,
+    cross_validate_nested,
+    cross_validate_selection,
+    select_nested,
+)
+from fleet_slip.regression.nested_choice import Selection as NestedSelection
+from fleet_slip.regression.subsets import SizeResult, best_subsets, choices
+from fleet_slip.regression.winner import Winner, choose
+from fleet_slip.selection.model_list import FoldPlan
+
+ALL_SUBSETS = "all-subsets"
+"""Instead of a ranking: the best subset of every size."""
+
+FEWEST_FOLDS = 3
+"""To make a choice again inside the training folds, two of them must be left."""
+
+
+@dataclass(frozen=True)
+class OrderedChoice:
+    """How a number of signals was chosen.
+
+    Attributes:
+        rule: ranking (or `ALL_SUBSETS`) and criterion.
+        evidence: what the criterion looked at.
+        nested: the ranked signals with the criterion's values; None for all subsets.
+        subsets: the best subsets of size 0, 1, ...; None for a ranking.
+        picks: the size that each criterion picks among the best subsets.
+        honest: figures of the whole choice, made again inside every training fold; None with
+            fewer than three folds, and for all subsets.
+    """
+
+    rule: Rule
+    evidence: Evidence
+    nested: NestedSelection | None = None
+    subsets: tuple[SizeResult, ...] | None = None
+    picks: dict[str, int] | None = None
+    honest: CrossValidation | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what a JSON document needs."""
+        document: dict[str, Any] = {
+            "ranking": self.rule.ranking,
+            "criterion": self.rule.criterion,
+            "evidence": self.evidence.kind,
+            "effective_rows": self.evidence.rows,
+        }
+        if self.nested is not None:
+            document |= self.nested.as_dict()
+        if self.subsets is not None:
+            document["subsets"] = [result.as_dict() for result in self.subsets]
+            document["picks"] = self.picks
+        if self.honest is not None:
+            document["honest"] = self.honest.as_dict()
+        return document
+
+
+@dataclass(frozen=True)
+class OrderedSelection:
+    """The candidates of a ranking or of all subsets, the winner, and how it was chosen."""
+
+    models: tuple[CrossValidation, ...]
+    winner: Winner
+    choice: OrderedChoice
+
+
+def check_criterion(name: str) -> str:
+    """Return the criterion that a name means, `cv` being cross-validation.
+
+    Raises `SelectionError` for an unknown one.
+    """
+    if name == "cv":
+        return CROSS_VALIDATION
+    if name not in (*CRITERIA, CROSS_VALIDATION):
+        known = ", ".join(("cv", *CRITERIA))
+        raise SelectionError(f"unknown criterion {name!r}. Known criteria: {known}.")
+    return name
+
+
+def select_ranked(
+    cohort: Cohort, inputs: Sequence[str], plan: FoldPlan, rule: Rule, *, naive: bool = False
+) -> OrderedSelection:
+    """Rank the inputs and choose one of the nested models, on the drives that have them all.
+
+    Raises `SelectionError` if no drive has them all, if they are linearly dependent, for an unknown
+    rule, or if the criterion keeps none of them.
+    """
+    label = catalogue().label
+    if plan.by == ROW_FOLDS:
+        training, fold = row_training(cohort, inputs, plan), np.empty(0, dtype=np.int64)
+    else:
+        ready = drive_folds(cohort, inputs, plan, naive=naive)
+        training, fold = ready.training, ready.fold
+    chosen = select_nested(training, inputs, label, rule)
+    models = cross_validate_nested(training.folds, chosen.order, label, training.scales)[1:]
+    honest = None
+    if len(training.folds.grams) >= FEWEST_FOLDS:
+        honest = cross_validate_selection("the choice itself", training, fold, inputs, label, rule)
+    if rule.criterion == CROSS_VALIDATION:
+        winner = choose(models)
+    else:
+        winner = _winner(models, chosen.size, rule, chosen.evidence)
+    choice = OrderedChoice(rule, chosen.evidence, nested=chosen, honest=honest)
+    return OrderedSelection(tuple(models), winner, choice)
+
+
+def select_subsets(
+    cohort: Cohort, inputs: Sequence[str], plan: FoldPlan, criterion: str, *, naive: bool = False
+) -> OrderedSelection:
+    """Find the best subset of every size and choose one of them.
+
+    Raises `SelectionError` as `select_ranked` does.
+    """
+    label = catalogue().label
+    if plan.by == ROW_FOLDS:
+        training = row_training(cohort, inputs, plan)
+    else:
+        training = drive_folds(cohort, inputs, plan, naive=naive).training
+    total = training.folds.total
+    results = best_subsets(total, inputs, label)
+    evidence = _evidence(training, inputs)
+    picks = choices(results, evidence)
+    models = [
+        cross_validate(
+            f"best {result.best.size}",
+            training.folds,
+            least_squares(result.best.model.signals, label),
+            input_scales(),
+        )
+        for result in results[1:]
+    ]
+    rule = Rule(ALL_SUBSETS, criterion)
+    if criterion == CROSS_VALIDATION:
+        winner = choose(models)
+    else:
+        winner = _winner(models, picks[criterion], rule, evidence)
+    choice = OrderedChoice(rule, evidence, subsets=tuple(results), picks=picks)
+    return OrderedSelection(tuple(models), winner, choice)
+
+
+def _evidence(training: Training, inputs: Sequence[str]) -> Evidence:
+    fits = nested_fits(training.folds.total, inputs, catalogue().label)
+    if training.drives is None:
+        return Evidence.naive(fits)
+    return Evidence.clustered(fits, training.drives)
+
+
+def _winner(models: Sequence[CrossValidation], size: int, rule: Rule, evidence: Evidence) -> Winner:
+    if size == 0:
+        raise SelectionError(
+            f"the criterion {rule.criterion} keeps no signal: none says more than chance. Choose "
+            "more drives, other signals, or --criterion cv."
+        )
+    best = max(models, key=lambda model: model.sums.signed_r_squared)
+    among = "the best subsets" if rule.ranking == ALL_SUBSETS else f"the order by {rule.ranking}"
+    reason = (
+        f"{rule.criterion} keeps {size} of {len(models)} signals of {among}, taking "
+        f"{evidence.kind} for independent."
+    )
+    return Winner(models[size - 1], best, reason)

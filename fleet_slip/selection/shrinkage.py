@@ -1,0 +1,118 @@
+"""Ridge, lasso and Pace regression beside least squares, cross-validated on the same folds."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.errors import SelectionError
+from fleet_slip.grams.cohort import Cohort
+from fleet_slip.grams.training import drive_folds
+from fleet_slip.regression.crossval import (
+    CrossValidation,
+    Procedure,
+    assemble,
+    cross_validate,
+    held_out,
+    least_squares,
+)
+from fleet_slip.regression.evidence import Evidence
+from fleet_slip.regression.exact import Scales
+from fleet_slip.regression.folds import Folds
+from fleet_slip.regression.lars import lasso_model
+from fleet_slip.regression.nested import nested_fits
+from fleet_slip.regression.pace import ESTIMATORS, Estimator, shrink
+from fleet_slip.regression.ridge import ridge_model
+from fleet_slip.selection.model_list import FoldPlan
+from fleet_slip.selection.search import FEWEST_FOLDS
+
+PENALTIES = tuple(float(10.0**exponent) for exponent in np.arange(-6, 0.01, 0.5))
+"""Penalties on the correlation matrix that ridge and lasso choose from."""
+
+PACE = ("james-stein", "pace2", "pace4", "pace6", "eb")
+
+
+@dataclass(frozen=True)
+class Shrunk:
+    """One method: its figures, and the penalty chosen on all rows, if it has one."""
+
+    cross_validation: CrossValidation
+    penalty: float | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what a JSON document needs."""
+        return {**self.cross_validation.as_dict(), "penalty": self.penalty}
+
+
+def compare_shrinkage(
+    cohort: Cohort, inputs: Sequence[str], plan: FoldPlan, *, naive: bool = False
+) -> tuple[Shrunk, ...]:
+    """Cross-validate every method on the drives that have all the inputs.
+
+    Ridge and lasso choose their penalty by cross-validation inside each training fold. Pace
+    weighs effects by the noise; drives count as independent, so its noise is larger by the design
+    effect, unless `naive`. Raises `SelectionError` for fewer than three folds, or dependent
+    signals.
+    """
+    label = catalogue().label
+    ready = drive_folds(cohort, inputs, plan)
+    folds, scales = ready.training.folds, ready.training.scales
+    if len(folds.grams) < FEWEST_FOLDS:
+        raise SelectionError("choosing a penalty inside the training folds needs three folds.")
+    effect = 1.0
+    if not naive:
+        fits = nested_fits(folds.total, inputs, label)
+        effect = Evidence.clustered(fits, ready.moments).design_effect
+    found = [Shrunk(cross_validate("least squares", folds, least_squares(inputs, label), scales))]
+    penalised: dict[str, Callable[[float], Procedure]] = {
+        "ridge": lambda penalty: lambda gram: ridge_model(gram, inputs, label, penalty),
+        "lasso": lambda penalty: lambda gram: lasso_model(gram, inputs, label, penalty),
+    }
+    found += [_penalised(name, folds, make, scales) for name, make in penalised.items()]
+    for name in PACE:
+        estimator = _by_effect(ESTIMATORS[name], effect)
+        procedure = _shrinking(inputs, label, estimator)
+        found.append(Shrunk(cross_validate(name, folds, procedure, scales)))
+    return tuple(found)
+
+
+def _shrinking(inputs: Sequence[str], label: str, estimator: Estimator) -> Procedure:
+    return lambda gram: shrink(gram, inputs, label, estimator, constant=False)
+
+
+def _by_effect(estimator: Estimator, effect: float) -> Estimator:
+    """Measure the effects in units of a noise that is larger by the design effect."""
+    unit = effect**0.5
+    return lambda a: estimator(a / unit) * unit
+
+
+def _penalised(
+    name: str, folds: Folds, make: Callable[[float], Procedure], scales: Scales
+) -> Shrunk:
+    tests = []
+    for i, test in enumerate(folds.grams):
+        rest = Folds(
+            tuple(gram for j, gram in enumerate(folds.grams) if j != i),
+            tuple(fold for j, fold in enumerate(folds.names) if j != i),
+            folds.drives,
+        )
+        training = rest.total
+        tests.append(held_out(make(_best_penalty(rest, make))(training), training, test))
+    penalty = _best_penalty(folds, make)
+    return Shrunk(assemble(name, folds, tests, make(penalty)(folds.total), scales), penalty)
+
+
+def _best_penalty(folds: Folds, make: Callable[[float], Procedure]) -> float:
+    """Return the penalty with the least squared error on held-out folds."""
+
+    def error(penalty: float) -> float:
+        procedure = make(penalty)
+        total = 0.0
+        for test in folds.grams:
+            training = folds.total - test
+            total += float(held_out(procedure(training), training, test).squared_error)
+        return total
+
+    return min(PENALTIES, key=error)

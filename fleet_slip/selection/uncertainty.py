@@ -1,0 +1,72 @@
+"""How far to trust a winner's figures: drawing the drives again, and dealing the folds again."""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.grams.cohort import Cohort
+from fleet_slip.grams.training import drive_folds
+from fleet_slip.regression.crossval import CrossValidation
+from fleet_slip.regression.exact import fit
+from fleet_slip.regression.resampling import (
+    Interval,
+    bootstrap_correlations,
+    held_out_products,
+    percentile_interval,
+    repeated_cross_validation,
+)
+from fleet_slip.selection.model_list import FoldPlan
+
+SEED = 1
+"""Resampling is reproducible: the same command prints the same figures."""
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """What resampling says of a model's cross-validated correlation.
+
+    Attributes:
+        interval: percentile interval by cluster bootstrap over drives.
+        repeats: number of deals of drives into folds.
+        repeated_mean, repeated_spread: mean and standard deviation of the correlation over them.
+    """
+
+    interval: Interval | None
+    repeats: int
+    repeated_mean: float | None
+    repeated_spread: float | None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what a JSON document needs."""
+        return asdict(self)
+
+
+def uncertainty(
+    cohort: Cohort,
+    model: CrossValidation,
+    plan: FoldPlan,
+    *,
+    bootstrap: int | None,
+    repeat: int | None,
+) -> Uncertainty:
+    """Draw the drives with replacement `bootstrap` times, deal the folds anew `repeat` times.
+
+    Raises `SelectionError` for folds of rows, or too few drives.
+    """
+    label = catalogue().label
+    ready = drive_folds(cohort, model.signals, plan)
+    interval = None
+    if bootstrap:
+        folds = ready.training.folds
+        models = [fit(folds.total - test, model.signals, label).model for test in folds.grams]
+        products = held_out_products(ready.moments, ready.fold, models)
+        interval = percentile_interval(bootstrap_correlations(products, bootstrap, SEED))
+    repeated = None
+    if repeat:
+        repeated = repeated_cross_validation(ready.moments, plan.count, repeat, SEED)
+    return Uncertainty(
+        interval,
+        repeat or 0,
+        repeated.mean if repeated else None,
+        repeated.spread if repeated else None,
+    )

@@ -1,0 +1,102 @@
+"""What worse sensors would do to a model's error, in closed form: no drive is simulated again."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from fleet_slip.catalogue.features import features, input_scales
+from fleet_slip.errors import SelectionError
+from fleet_slip.grams.cohort import Cohort
+from fleet_slip.models.manifest import Manifest
+from fleet_slip.regression.disturbance import disturbed
+from fleet_slip.regression.exact import LinearModel
+from fleet_slip.regression.figures import Figures, error_sums
+from fleet_slip.regression.ridge import noise_matched
+
+
+@dataclass(frozen=True)
+class WhatIf:
+    """Figures of a model on a cohort, as it is and with bias and noise added to its signals.
+
+    Attributes:
+        drives: number of drives that serve the model.
+        before, after: figures of the model.
+        refitted: the model, in SI units, that is best under the added noise.
+        refitted_after: its figures with the bias and the noise.
+    """
+
+    drives: int
+    before: Figures
+    after: Figures
+    refitted: LinearModel
+    refitted_after: Figures
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `what-if --json` prints."""
+        return {
+            "drives": self.drives,
+            "before": self.before.as_dict(),
+            "after": self.after.as_dict(),
+            "refitted_after": self.refitted_after.as_dict(),
+            "refitted": {"intercept": self.refitted.offset, **self.refitted.weights},
+        }
+
+
+def counts_model(manifest: Manifest) -> LinearModel:
+    """Return a published model as one of counts, exactly."""
+    # Of the counts as they are now: a signal's scale may have changed since it was published.
+    scales = input_scales()
+    unit = scales[manifest.label.signal]
+    return LinearModel(
+        manifest.signals,
+        manifest.label.signal,
+        tuple(
+            term.coefficient_exact * (term.scale_exact if term.sql else scales[term.signal]) / unit
+            for term in manifest.terms
+        ),
+        manifest.intercept_exact / unit,
+    )
+
+
+def what_if(
+    cohort: Cohort,
+    model: LinearModel,
+    *,
+    bias: Mapping[str, float],
+    noise: Mapping[str, float],
+) -> WhatIf:
+    """Return the figures to expect once bias and white noise come on top of what is logged.
+
+    `model` is one of counts; `bias` and `noise` (standard deviations) are in SI units. Raises
+    `SelectionError` for a signal that the model does not use, or uses inside a feature: there
+    the effect is not linear.
+    """
+    for name in {*bias, *noise}:
+        _require_linear(name, model)
+    scales = input_scales()
+    served = cohort.serving(model.signals)
+    total = served.table.total()
+    unit = scales[model.label]
+
+    def after(one: LinearModel) -> Figures:
+        return disturbed(error_sums(one, total), one, scales, bias=bias, noise=noise).figures(unit)
+
+    refitted = noise_matched(total, model.signals, model.label, noise, scales)
+    return WhatIf(
+        len(served.table),
+        error_sums(model, total).figures(unit),
+        after(model),
+        refitted.physical(scales),
+        after(refitted),
+    )
+
+
+def _require_linear(name: str, model: LinearModel) -> None:
+    known = features().features
+    inside = [f for f in model.signals if f in known and name in known[f].inputs]
+    if inside:
+        raise SelectionError(
+            f"{name} also enters the model through {', '.join(inside)}, where its error has no "
+            "closed form. Use a model without that feature, or simulate the campaign with other "
+            "sensors."
+        )

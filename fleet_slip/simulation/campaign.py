@@ -1,0 +1,185 @@
+"""Campaigns: which cars drive where, how fast and how often, read from `configs/campaigns/*.toml`.
+
+A campaign is a function of its file alone. A drive depends on the campaign's seed and on its own
+name, never on the number of days, on other drives or on the order in which they are simulated.
+"""
+
+import hashlib
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import date, timedelta
+from functools import cached_property
+from itertools import groupby
+from operator import itemgetter
+from typing import Annotated, Self
+
+import numpy as np
+from pydantic import Field, TypeAdapter, model_validator
+
+from fleet_slip.catalogue.signals import Identifier
+from fleet_slip.config import Config, load_config
+from fleet_slip.errors import ConfigError
+from fleet_slip.resources import find_config
+from fleet_slip.simulation.drive_plan import Fleet, Grid, random_generator
+from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ, Sensors
+from fleet_slip.simulation.speed_profile import SpeedLimits, SpeedProfile, speed_profile
+from fleet_slip.simulation.track import Track
+from fleet_slip.vehicle.parameters import VehicleParameters
+
+ROAD_SPACING_M = 1.0
+"""Spacing of the points at which curvature and target speed are tabulated, in m."""
+
+
+@dataclass(frozen=True)
+class DriveSpec:
+    """Everything that determines one drive's bytes."""
+
+    drive_id: str
+    vehicle_id: str
+    campaign: str
+    day: date
+    vehicle: VehicleParameters
+    sensors: Sensors
+    track: Track
+    adhesion: float
+    limits: SpeedLimits
+    speed_factor: float
+    laps: float
+    seed: int
+    source: str = "simulated"
+
+    @property
+    def profile(self) -> SpeedProfile:
+        """The speed profile of the track within the limits, before the speed factor."""
+        return speed_profile(self.track, self.limits, ROAD_SPACING_M)
+
+    @cached_property
+    def expected_rows(self) -> int:
+        """Rows of the drive if the car holds its target speed."""
+        time_s = self.profile.time_s(self.laps) / self.speed_factor
+        return math.ceil(time_s * SAMPLE_RATE_HZ)
+
+    def generator(self) -> np.random.Generator:
+        """Return the generator of the drive's sensor noise, at its start."""
+        return random_generator(self.seed, "sensors", self.drive_id)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Whole drives of one day that become one Parquet file."""
+
+    campaign: str
+    day: date
+    index: int
+    drives: tuple[DriveSpec, ...]
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 over all that determines the batch's bytes, as canonical JSON."""
+        content = _BATCH.dump_python(self, mode="json")
+        canonical = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
+        return hashlib.sha256(canonical.encode()).hexdigest()
+
+
+_BATCH = TypeAdapter(Batch)
+
+
+class Campaign(Config):
+    """A plan of drives over days. A day's drives stay the same when days are added."""
+
+    name: Identifier
+    description: str = Field(min_length=1)
+    seed: int = Field(ge=0)
+    first_day: date = Field(ge=date(1970, 1, 1), le=date(2099, 12, 31))
+    number_of_days: int = Field(gt=0, le=10_000)
+    drives_per_day: int = Field(gt=0, le=9999)
+    laps: float = Field(gt=0, le=1000)
+    rows_per_file: int = Field(gt=0, le=2_000_000)
+    plan: Annotated[Grid | Fleet, Field(discriminator="kind")]
+    sensors: Sensors
+
+    @model_validator(mode="after")
+    def _open_tracks_have_no_laps(self) -> Self:
+        for track in self.plan.tracks:
+            if self.laps > 1 and not track.closed:
+                raise ValueError(f"laps is {self.laps}, but the track {track.name!r} is open")
+        return self
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 over all that determines a day's bytes: all but how many days there are."""
+        content = self.model_dump(mode="json", exclude={"number_of_days", "description"})
+        canonical = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
+        return hashlib.sha256(canonical.encode()).hexdigest()
+
+    def days(self) -> tuple[date, ...]:
+        """Return all days, in order."""
+        return tuple(self.first_day + timedelta(days=day) for day in range(self.number_of_days))
+
+    def drives(self, day: date) -> tuple[DriveSpec, ...]:
+        """Return the drives of one day, in the order of their names.
+
+        Raises `ConfigError` if the campaign has no such day.
+        """
+        days = self.days()
+        if day not in days:
+            raise ConfigError(
+                f"{day} is not a day of the campaign {self.name!r}, which goes from {days[0]} to"
+                f" {days[-1]}. Choose one of these, or raise number_of_days."
+            )
+        first = (day - self.first_day).days * self.drives_per_day
+        return tuple(self._drive(day, first, i) for i in range(self.drives_per_day))
+
+    def batches(self, day: date) -> tuple[Batch, ...]:
+        """Return the files of one day: whole drives, in each about `rows_per_file` rows or fewer.
+
+        Raises `ConfigError` like `drives`.
+        """
+        packs = pack(self.drives(day), self.rows_per_file)
+        return tuple(Batch(self.name, day, i, drives) for i, drives in enumerate(packs))
+
+    def _drive(self, day: date, first: int, index: int) -> DriveSpec:
+        plan, number = self.plan, first + index
+        drive_id = f"{self.name}-{day.isoformat()}-{index:04d}"
+        vehicle_id = f"{self.name}-{plan.car(number):04d}"
+        if isinstance(plan, Grid):
+            assignment = plan.assignment(number, self.sensors)
+        else:
+            assignment = plan.assignment(
+                self.sensors,
+                random_generator(self.seed, "car", vehicle_id),
+                random_generator(self.seed, "drive", drive_id),
+            )
+        return DriveSpec(
+            drive_id=drive_id,
+            vehicle_id=vehicle_id,
+            campaign=self.name,
+            day=day,
+            vehicle=assignment.vehicle,
+            sensors=assignment.sensors,
+            track=assignment.track,
+            adhesion=assignment.adhesion,
+            limits=assignment.limits,
+            speed_factor=assignment.speed_factor,
+            laps=self.laps,
+            seed=self.seed,
+        )
+
+
+def pack(drives: Sequence[DriveSpec], rows_per_file: int) -> list[tuple[DriveSpec, ...]]:
+    """Split drives, in their order, evenly into as few runs as have about so many rows or fewer."""
+    ends = np.cumsum([drive.expected_rows for drive in drives])
+    middles = (ends + np.append(0, ends[:-1])) / 2
+    files = math.ceil(ends[-1] / rows_per_file)
+    file_of_drive = (middles * files / ends[-1]).astype(int)
+    return [
+        tuple(drive for _, drive in run)
+        for _, run in groupby(zip(file_of_drive, drives, strict=True), key=itemgetter(0))
+    ]
+
+
+def load_campaign(name_or_path: str) -> Campaign:
+    """Read a campaign by the name of a shipped one or by path. Raises `ConfigError`."""
+    return load_config(find_config("campaigns", name_or_path), Campaign)

@@ -1,0 +1,214 @@
+"""How a campaign chooses car, road and speed for each of its drives: from a grid, or at random."""
+
+import hashlib
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import BeforeValidator, Field, FiniteFloat, model_validator
+
+from fleet_slip.config import Config
+from fleet_slip.errors import ConfigError
+from fleet_slip.simulation.sensors import Sensors
+from fleet_slip.simulation.speed_profile import SpeedLimits
+from fleet_slip.simulation.track import Track, load_track
+from fleet_slip.vehicle.parameters import GRAVITY_MPS2, VehicleParameters, load_vehicle
+
+GOLDEN_RATIO = (1 + math.sqrt(5)) / 2
+
+
+def named(load: Callable[[str], object]) -> BeforeValidator:
+    """Let a config name another one, and report where the name stands if there is none."""
+
+    def resolve(value: Any) -> Any:
+        if not isinstance(value, str):
+            return value
+        try:
+            return load(value)
+        except ConfigError as error:
+            raise ValueError(str(error)) from None
+
+    return BeforeValidator(resolve)
+
+
+NamedTrack = Annotated[Track, named(load_track)]
+NamedVehicle = Annotated[VehicleParameters, named(load_vehicle)]
+Positive = Annotated[FiniteFloat, Field(gt=0)]
+NotNegative = Annotated[FiniteFloat, Field(ge=0)]
+NotEmpty = Field(min_length=1)
+
+
+def random_generator(seed: int, *identity: str) -> np.random.Generator:
+    """Return a generator that depends on the seed and on what it is for, and on nothing else."""
+    digest = hashlib.sha256("\n".join(identity).encode()).digest()
+    words = np.frombuffer(digest, dtype="<u4").tolist()
+    return np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, *words])))
+
+
+class Uniform(Config):
+    """A uniform distribution over positive numbers."""
+
+    min: Positive
+    max: Positive
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.min > self.max:
+            raise ValueError(f"min {self.min} is above max {self.max}")
+        return self
+
+    def draw(self, generator: np.random.Generator) -> float:
+        """Draw one number."""
+        return float(generator.uniform(self.min, self.max))
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """One car on one road at one speed."""
+
+    vehicle: VehicleParameters
+    sensors: Sensors
+    track: Track
+    adhesion: float
+    limits: SpeedLimits
+    speed_factor: float
+
+
+class Plan(Config):
+    """What every kind of plan states. The limits of speed are those on a road with μ = 1."""
+
+    vehicles: tuple[NamedVehicle, ...] = NotEmpty
+    tracks: tuple[NamedTrack, ...] = NotEmpty
+    acceleration_mps2: Positive
+    braking_mps2: Positive
+    top_speed_mps: Positive
+
+    def limits(self, lateral_mps2: float, adhesion: float = 1.0) -> SpeedLimits:
+        """Return the limits at a planned lateral acceleration, all for the same adhesion."""
+        return SpeedLimits(
+            lateral_mps2=lateral_mps2,
+            acceleration_mps2=self.acceleration_mps2 * adhesion,
+            braking_mps2=self.braking_mps2 * adhesion,
+            top_speed_mps=self.top_speed_mps,
+        )
+
+
+class Grid(Plan):
+    """Every combination of the lists once, then again from the beginning.
+
+    The order strides through the combinations by about 1/φ of their number (φ the golden
+    ratio), so that any run of drives, such as one day's, is spread evenly over all of them.
+    Speeds are planned for μ = 1 whatever the road is: the driver does not see it.
+    """
+
+    kind: Literal["grid"]
+    mass_kg: tuple[Positive, ...] = NotEmpty
+    adhesion: tuple[Positive, ...] = NotEmpty
+    lateral_mps2: tuple[Positive, ...] = NotEmpty
+    speed_factor: tuple[Positive, ...] = NotEmpty
+
+    @property
+    def _axes(self) -> tuple[tuple[Any, ...], ...]:
+        return (
+            self.vehicles,
+            self.mass_kg,
+            self.tracks,
+            self.adhesion,
+            self.lateral_mps2,
+            self.speed_factor,
+        )
+
+    def _combination(self, number: int) -> int:
+        """Return which combination the drive of this number takes, as an index in C order."""
+        count = math.prod(map(len, self._axes))
+        stride = round(count / GOLDEN_RATIO)
+        while math.gcd(stride, count) > 1:
+            stride += 1
+        return number * stride % count
+
+    def car(self, number: int) -> int:
+        """Return the car that drives the drive of this number: one for each vehicle and mass."""
+        return self._combination(number) // math.prod(map(len, self._axes[2:]))
+
+    def assignment(self, number: int, sensors: Sensors) -> Assignment:
+        """Return what the drive of this number is to be."""
+        index = np.unravel_index(self._combination(number), [len(axis) for axis in self._axes])
+        vehicle, mass_kg, track, adhesion, lateral_mps2, speed_factor = (
+            axis[i] for axis, i in zip(self._axes, index, strict=True)
+        )
+        return Assignment(
+            vehicle=vehicle.with_sprung_mass(mass_kg),
+            sensors=sensors,
+            track=track,
+            adhesion=adhesion,
+            limits=self.limits(lateral_mps2),
+            speed_factor=speed_factor,
+        )
+
+
+class SensorBiases(Config):
+    """Standard deviations of the biases from car to car."""
+
+    acceleration_mps2: NotNegative
+    yaw_rate_rad_s: NotNegative
+
+    def draw(self, sensors: Sensors, generator: np.random.Generator) -> Sensors:
+        """Return the sensors of one car, its biases drawn around the given ones."""
+        ax, ay, yaw_rate = generator.standard_normal(3).tolist()
+        return sensors.model_copy(
+            update={
+                "ax_bias_mps2": sensors.ax_bias_mps2 + self.acceleration_mps2 * ax,
+                "ay_bias_mps2": sensors.ay_bias_mps2 + self.acceleration_mps2 * ay,
+                "yaw_rate_bias_rad_s": sensors.yaw_rate_bias_rad_s + self.yaw_rate_rad_s * yaw_rate,
+            }
+        )
+
+
+class Fleet(Plan):
+    """Many different cars that take turns, each on roads and at speeds drawn for every drive.
+
+    Model, load, tyres and sensor biases are a car's own and stay. The driver sees the road: he uses
+    a share of the friction that it offers, `friction_use`, planned lateral acceleration over μ g.
+    """
+
+    kind: Literal["fleet"]
+    cars: int = Field(gt=0)
+    load: Uniform
+    """Sprung mass over that of the vehicle's file."""
+    tyre_stiffness: Uniform
+    """Cornering stiffness over that of the vehicle's file."""
+    tyre_radius: Uniform
+    """Rolling radius over that of the vehicle's file."""
+    sensor_bias_std: SensorBiases
+    adhesion: Uniform
+    friction_use: Uniform
+    speed_factor: Uniform
+
+    def car(self, number: int) -> int:
+        """Return the car that drives the drive of this number."""
+        return number % self.cars
+
+    def assignment(
+        self, sensors: Sensors, of_car: np.random.Generator, of_drive: np.random.Generator
+    ) -> Assignment:
+        """Draw a car from one generator and its drive from another, in a fixed order."""
+        vehicle = self.vehicles[of_car.integers(len(self.vehicles))]
+        vehicle = vehicle.with_sprung_mass(vehicle.body.sprung_mass_kg * self.load.draw(of_car))
+        vehicle = vehicle.with_tyres(
+            stiffness_factor=self.tyre_stiffness.draw(of_car),
+            rolling_radius_factor=self.tyre_radius.draw(of_car),
+        )
+        sensors = self.sensor_bias_std.draw(sensors, of_car)
+        track = self.tracks[of_drive.integers(len(self.tracks))]
+        adhesion = self.adhesion.draw(of_drive)
+        lateral_mps2 = self.friction_use.draw(of_drive) * adhesion * GRAVITY_MPS2
+        return Assignment(
+            vehicle=vehicle,
+            sensors=sensors,
+            track=track,
+            adhesion=adhesion,
+            limits=self.limits(lateral_mps2, adhesion),
+            speed_factor=self.speed_factor.draw(of_drive),
+        )

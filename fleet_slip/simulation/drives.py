@@ -1,0 +1,131 @@
+"""From drives to the rows of a log: plan the speed, drive the car, measure, tabulate counts."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.simulation.campaign import Batch, DriveSpec
+from fleet_slip.simulation.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ, Measurement, Recorder
+from fleet_slip.vehicle.lanes import LaneDrive, Road, simulate_blocks
+
+DRIVES_AT_ONCE = 128
+"""Drives of a batch that are simulated together, which bounds the memory for their roads."""
+
+CHUNK_ROWS = 2**16
+"""Rows of a chunk of a column that is the same in all rows of a drive."""
+
+
+@dataclass(frozen=True)
+class DriveLog:
+    """One drive as its car logged it."""
+
+    spec: DriveSpec
+    measurement: Measurement
+    lost_control_s: float | None
+
+    @property
+    def rows(self) -> int:
+        """Number of ticks."""
+        return len(self.measurement.gps_fix)
+
+    @property
+    def metadata(self) -> dict[str, object]:
+        """The columns of `SignalCatalogue.drive_schema`."""
+        spec = self.spec
+        return {
+            "drive_id": spec.drive_id,
+            "vehicle_id": spec.vehicle_id,
+            "vehicle_model": spec.vehicle.name,
+            "source": spec.source,
+            "campaign": spec.campaign,
+            "track": spec.track.name,
+            "mass_kg": spec.vehicle.body.sprung_mass_kg,
+            "adhesion": spec.adhesion,
+            "speed_factor": spec.speed_factor,
+            "lost_control_s": self.lost_control_s,
+            "saturated": self.measurement.saturated,
+        }
+
+
+def lane_drive(spec: DriveSpec) -> LaneDrive:
+    """Return the drive as the simulator takes it."""
+    profile = spec.profile
+    road = Road(
+        spacing_m=profile.spacing_m,
+        curvature_1pm=spec.track.curvature(profile.station_m),
+        speed_mps=spec.speed_factor * profile.speed_mps,
+        length_m=spec.track.length_m,
+        closed=spec.track.closed,
+    )
+    return LaneDrive(vehicle=spec.vehicle, road=road, adhesion=spec.adhesion, laps=spec.laps)
+
+
+def simulate_batch(batch: Batch) -> pa.Table:
+    """Simulate and measure the drives of a batch.
+
+    Returns a table in the order of `SignalCatalogue.log_schema`, with strings as dictionaries,
+    sorted by drive, then tick. It depends on the batch alone: any number of threads may simulate
+    any batches in any order.
+    """
+    logs: list[DriveLog] = []
+    for first in range(0, len(batch.drives), DRIVES_AT_ONCE):
+        logs += simulate_logs(batch.drives[first : first + DRIVES_AT_ONCE])
+    return tabulate(batch, logs)
+
+
+def simulate_logs(specs: Sequence[DriveSpec]) -> list[DriveLog]:
+    """Simulate drives together, each measured with its own sensors and random generator.
+
+    A block of a drive is measured as soon as it is there: of true signals nothing is kept.
+    """
+    recorders = [Recorder(spec.sensors, spec.generator()) for spec in specs]
+    logs: dict[int, DriveLog] = {}
+    for block in simulate_blocks([lane_drive(spec) for spec in specs]):
+        recorder = recorders[block.drive]
+        recorder.record(block.channels)
+        if block.last:
+            lost = block.lost_control_tick
+            logs[block.drive] = DriveLog(
+                specs[block.drive],
+                recorder.measurement(),
+                None if lost is None else lost / SAMPLE_RATE_HZ,
+            )
+    return [logs[drive] for drive in range(len(specs))]
+
+
+def tabulate(batch: Batch, logs: Sequence[DriveLog]) -> pa.Table:
+    """Return the rows of the logs as one table."""
+    rows = [log.rows for log in logs]
+    columns = {"day": pa.repeat(pa.scalar(batch.day), sum(rows))}
+    for field in catalogue().drive_schema:
+        values = pa.array([log.metadata[field.name] for log in logs], type=field.type)
+        columns[field.name] = _repeated(values, rows)
+    ticks = pa.array(np.arange(max(rows), dtype=np.int32))
+    columns["tick"] = pa.chunked_array([ticks[:n] for n in rows])
+    for name in catalogue().signals:
+        columns[name] = pa.chunked_array([_counts(log, name) for log in logs])
+    return pa.table({name: columns[name] for name in catalogue().log_schema.names})
+
+
+def _counts(log: DriveLog, name: str) -> pa.Array:
+    """Return the counts of a signal without a copy; all null if the car lacks the sensor."""
+    if name not in log.measurement.counts:
+        return pa.nulls(log.rows, pa.int16())
+    no_fix = ~log.measurement.gps_fix if name in GPS_SIGNALS else None
+    return pa.array(log.measurement.counts[name], mask=no_fix)
+
+
+def _repeated(values: pa.Array, times: Sequence[int]) -> pa.ChunkedArray:
+    """Return each value so many times; strings as a dictionary.
+
+    Chunks of one drive share their memory, which does not grow with the length of the drive.
+    """
+    encoded = values.dictionary_encode() if pa.types.is_string(values.type) else values
+    chunks = []
+    for drive, count in enumerate(times):
+        same = encoded.take(pa.array(np.full(min(count, CHUNK_ROWS), drive)))
+        chunks += [same[: count - first] for first in range(0, count, CHUNK_ROWS)]
+    return pa.chunked_array(chunks, type=encoded.type)

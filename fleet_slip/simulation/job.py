@@ -1,0 +1,279 @@
+"""Writes what is missing of a campaign into the warehouse.
+
+Each batch of drives is one file and one unit of work that lands exactly once: a repeated or
+interrupted job goes on with the batches that have not landed.
+"""
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, field
+from datetime import date
+from functools import partial
+from itertools import pairwise
+
+from deltalake.transaction import AddAction
+
+from fleet_slip.compute.tasks import completed
+from fleet_slip.delta import Change, Snapshot, Unit, retried
+from fleet_slip.errors import RefusedError
+from fleet_slip.simulation.campaign import Batch, Campaign
+from fleet_slip.simulation.drives import simulate_batch
+from fleet_slip.warehouse.tables import Warehouse
+
+Progress = Callable[[int, int], None]
+"""Called with rows landed since the last call, and rows expected in all."""
+
+
+@dataclass
+class Seconds:
+    """Where the time went. Tasks run side by side, so that their seconds add up to more than
+    `elapsed`."""
+
+    elapsed: float = 0.0
+    simulate: float = 0.0
+    """Driving, measuring and tabulating, summed over tasks."""
+    encode: float = 0.0
+    """Parquet and its checksum, summed over tasks."""
+    write: float = 0.0
+    """Writing and flushing files, summed over tasks."""
+    commit: float = 0.0
+    """Committing to the Delta log, which the coordinator does."""
+
+    @property
+    def tasks(self) -> float:
+        """Time of all tasks."""
+        return self.simulate + self.encode + self.write
+
+
+@dataclass
+class SimulationReport:
+    """What a run of the job did."""
+
+    batches_written: int = 0
+    batches_present: int = 0
+    """Batches of the days that were planned that had landed before."""
+    days_present: int = 0
+    """Days that were complete, and so not planned."""
+    drives: int = 0
+    rows: int = 0
+    size_bytes: int = 0
+    logs_version: int | None = None
+    seconds: Seconds = field(default_factory=Seconds)
+
+    @property
+    def changed(self) -> bool:
+        """Whether there was anything to do."""
+        return bool(self.batches_written)
+
+
+@dataclass(frozen=True)
+class _Written:
+    batch: Batch
+    action: AddAction
+    rows: int
+    simulate_s: float
+    encode_s: float
+    write_s: float
+
+
+def simulate_campaign(
+    warehouse: Warehouse,
+    campaign: Campaign,
+    days: Iterable[date],
+    executor: Executor,
+    progress: Progress = lambda _rows, _all: None,
+) -> SimulationReport:
+    """Simulate what has not landed of the given days of a campaign, and land each batch.
+
+    A day is planned when its turn comes: a plan of years takes no time before the first row and no
+    memory. A day that is complete is recorded as such and never planned again, so that a night
+    takes as long after years as after a week. Raises like `simulate_batches`.
+    """
+    snapshot = warehouse.logs.snapshot()
+    every = tuple(days)
+    open_days = _open_days(snapshot, campaign, every)
+    begun = [d for d in open_days if snapshot.landed(unit_name(campaign.name, d, 0)) is not None]
+    for day in begun:  # before anything is written, so that a changed campaign is refused
+        for batch in campaign.batches(day):
+            has_landed(snapshot, batch)
+    plan = (campaign.batches(day) for day in open_days)
+    report = _simulate(warehouse, plan, len(open_days), executor, progress)
+    report.days_present = len(every) - len(open_days)
+    retried(lambda: _complete(warehouse, campaign, open_days))
+    report.logs_version = warehouse.logs.snapshot().version
+    return report
+
+
+def _open_days(snapshot: Snapshot, campaign: Campaign, days: Iterable[date]) -> tuple[date, ...]:
+    """Return the days that are not recorded as complete.
+
+    Raises `RefusedError` if a day was completed by the campaign as it was before a change.
+    """
+    found = []
+    for unit, day in _day_units(campaign, days):
+        landed = snapshot.landed(unit.name)
+        if landed is None:
+            found.append(day)
+        elif landed != unit.version:
+            raise _changed(campaign.name, day)
+    return tuple(found)
+
+
+def _complete(warehouse: Warehouse, campaign: Campaign, days: Iterable[date]) -> None:
+    """Record that all batches of some days have landed."""
+    snapshot = warehouse.logs.snapshot()
+    units = [unit for unit, _ in _day_units(campaign, _open_days(snapshot, campaign, days))]
+    if units:
+        snapshot.commit(Change(units=units, note={"job": "simulate", "campaign": campaign.name}))
+
+
+def _day_units(campaign: Campaign, days: Iterable[date]) -> Iterator[tuple[Unit, date]]:
+    version = int(campaign.digest[:15], base=16)
+    return ((Unit(f"simulate/{campaign.name}/{day}", version), day) for day in days)
+
+
+def simulate_batches(
+    warehouse: Warehouse,
+    batches: Sequence[Batch],
+    executor: Executor,
+    progress: Progress = lambda _rows, _all: None,
+) -> SimulationReport:
+    """Simulate the batches that have not landed, and land each.
+
+    Raises `RefusedError` if a batch's place was taken by a different version of it, `StorageError`
+    if the warehouse cannot be written, and `ClusterError` at the end for batches that the workers
+    of a cluster died of.
+    """
+    snapshot = warehouse.logs.snapshot()
+    for batch in batches:
+        has_landed(snapshot, batch)
+    return _simulate(warehouse, [batches], 1, executor, progress)
+
+
+def _simulate(
+    warehouse: Warehouse,
+    plan: Iterable[Sequence[Batch]],
+    days: int,
+    executor: Executor,
+    progress: Progress,
+) -> SimulationReport:
+    start = time.perf_counter()
+    backlog = _Backlog(warehouse.logs.snapshot(), plan, days)
+    report = SimulationReport()
+    for _, result in completed(executor, partial(_write, warehouse), backlog, _name):
+        before_s = time.perf_counter()
+        if _land(warehouse, result):
+            _count(report, result)
+        report.seconds.commit += time.perf_counter() - before_s
+        progress(result.rows, backlog.expected_rows)
+    report.batches_present = backlog.present
+    report.logs_version = warehouse.logs.snapshot().version
+    report.seconds.elapsed = time.perf_counter() - start
+    return report
+
+
+def _count(report: SimulationReport, result: _Written) -> None:
+    report.batches_written += 1
+    report.drives += len(result.batch.drives)
+    report.rows += result.rows
+    report.size_bytes += result.action.size
+    report.seconds.simulate += result.simulate_s
+    report.seconds.encode += result.encode_s
+    report.seconds.write += result.write_s
+
+
+class _Backlog:
+    """Batches that have not landed, planned day by day as they are asked for."""
+
+    def __init__(self, snapshot: Snapshot, plan: Iterable[Sequence[Batch]], days: int) -> None:
+        """Take what has landed, the batches of each day, and how many days there are."""
+        self._snapshot = snapshot
+        self._plan = plan
+        self._days = days
+        self._days_planned = 0
+        self._rows = 0
+        self.present = 0
+
+    @property
+    def expected_rows(self) -> int:
+        """Rows to simulate; those of days not planned yet are taken to be like the others'."""
+        return self._rows * self._days // max(self._days_planned, 1)
+
+    def __iter__(self) -> Iterator[Batch]:
+        """Yield the batches in order."""
+        for batches in self._plan:
+            missing = [batch for batch in batches if not has_landed(self._snapshot, batch)]
+            self.present += len(batches) - len(missing)
+            self._days_planned += 1
+            self._rows += sum(drive.expected_rows for batch in missing for drive in batch.drives)
+            yield from missing
+
+
+def has_landed(snapshot: Snapshot, batch: Batch) -> bool:
+    """Whether a batch is in the logs. Raises `RefusedError` if another batch has its place."""
+    landed = snapshot.landed(unit_name(batch.campaign, batch.day, batch.index))
+    if landed is not None and landed != unit_of(batch).version:
+        raise _changed(batch.campaign, batch.day)
+    return landed is not None
+
+
+def _changed(campaign: str, day: date) -> RefusedError:
+    return RefusedError(
+        f"{day}: the campaign {campaign!r} was changed since this day was simulated, and logs are "
+        "never replaced. Give the changed campaign another name, or use another --root."
+    )
+
+
+def unit_of(batch: Batch) -> Unit:
+    """Return the unit of work that lands a batch; its version is from the batch's content."""
+    name = unit_name(batch.campaign, batch.day, batch.index)
+    return Unit(name, int(batch.digest[:15], base=16))
+
+
+def unit_name(campaign: str, day: date, index: int) -> str:
+    """Return the name of the unit of work that lands a day's batch of an index."""
+    return f"simulate/{campaign}/{day}/{index}"
+
+
+def _name(batch: Batch) -> str:
+    return f"{batch.campaign}, {batch.day}, file {batch.index}"
+
+
+def _write(warehouse: Warehouse, batch: Batch) -> _Written:
+    times = [time.perf_counter()]
+    rows = simulate_batch(batch)
+    times.append(time.perf_counter())
+    content = warehouse.logs.encode(rows)
+    times.append(time.perf_counter())
+    action = warehouse.logs.put(file_name(batch), content, batch.day)
+    times.append(time.perf_counter())
+    simulate_s, encode_s, write_s = (b - a for a, b in pairwise(times))
+    return _Written(batch, action, rows.num_rows, simulate_s, encode_s, write_s)
+
+
+def file_name(batch: Batch) -> str:
+    """Return the name of a batch's file, before the checksum of its bytes."""
+    return f"{batch.campaign}-{batch.index:04d}-{batch.digest[:12]}"
+
+
+def _land(warehouse: Warehouse, written: _Written) -> bool:
+    """Commit a batch; False if another process landed it first."""
+    change = Change(
+        add=[written.action],
+        units=[unit_of(written.batch)],
+        note={
+            "job": "simulate",
+            "campaign": written.batch.campaign,
+            "digest": written.batch.digest,
+        },
+    )
+
+    def attempt() -> bool:
+        snapshot = warehouse.logs.snapshot()
+        if has_landed(snapshot, written.batch):
+            return False
+        snapshot.commit(change)
+        return True
+
+    return retried(attempt)

@@ -1,0 +1,233 @@
+"""Scenarios: test drives that models are evaluated on, read from `configs/scenarios/*.toml`.
+
+A scenario says only in what it differs from its base. Its drive is simulated once and kept in the
+logs under a source of its own, so that it can never be part of a training cohort.
+"""
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from datetime import date
+from typing import Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from fleet_slip.catalogue.signals import Identifier, catalogue
+from fleet_slip.config import Config, load_config, load_toml
+from fleet_slip.errors import ConfigError
+from fleet_slip.grams.cohort import SCENARIO
+from fleet_slip.resources import config_names, find_config
+from fleet_slip.simulation.campaign import Batch, DriveSpec
+from fleet_slip.simulation.drive_plan import NamedTrack, NamedVehicle, NotNegative, Positive
+from fleet_slip.simulation.sensors import GPS_SIGNALS, Sensors
+from fleet_slip.simulation.speed_profile import SpeedLimits, SpeedProfile
+from fleet_slip.vehicle.parameters import VehicleParameters
+
+DAY = date(2024, 4, 1)
+"""The date that all scenario drives carry."""
+
+NOT_INHERITED = frozenset({"name", "description", "paper", "base", "drive", "failures"})
+"""What a scenario says of itself alone."""
+
+
+class PacePoint(Config):
+    """Speed over that of the planned profile at one station; linear in between."""
+
+    station_m: NotNegative
+    factor: Positive
+
+
+class Failure(Config):
+    """Sensors that fail for a while. The stored log stays as it was; the failure is applied to
+    what is read of it.
+
+    `stuck`: the signals keep the count that they had at `from_s`. `missing`: they are null.
+    """
+
+    kind: Literal["stuck", "missing"]
+    signals: tuple[Identifier, ...] = Field(min_length=1)
+    from_s: NotNegative
+    until_s: Positive | None = None
+    """None: to the end of the drive."""
+
+    @model_validator(mode="after")
+    def _signals_are_measured(self) -> Self:
+        measured = (*catalogue().inputs, *GPS_SIGNALS)
+        for name in self.signals:
+            if name not in measured:
+                raise ValueError(f"{name!r} cannot fail. Signals: {', '.join(measured)}")
+        if self.until_s is not None and self.until_s <= self.from_s:
+            raise ValueError(f"until_s {self.until_s} is not after from_s {self.from_s}")
+        return self
+
+
+@dataclass(frozen=True)
+class ScenarioDrive(DriveSpec):
+    """A drive whose speed varies along the track beside what the track asks for."""
+
+    pace: tuple[PacePoint, ...] = ()
+
+    @property
+    def profile(self) -> SpeedProfile:
+        """The speed profile of the track within the limits, times the pace."""
+        planned = super().profile
+        return replace(planned, speed_mps=planned.speed_mps * self._factor(planned.station_m))
+
+    def _factor(self, station_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        if not self.pace:
+            return np.ones(len(station_m))
+        stations = [point.station_m for point in self.pace]
+        factors = [point.factor for point in self.pace]
+        period = self.track.length_m if self.track.closed else None
+        return np.interp(station_m, stations, factors, period=period)
+
+
+@dataclass(frozen=True)
+class ScenarioBatch(Batch):
+    """The one drive of a scenario, as one Parquet file."""
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 over all that determines the batch's bytes, the pace included."""
+        paces = [
+            [point.model_dump() for point in drive.pace]
+            for drive in self.drives
+            if isinstance(drive, ScenarioDrive)
+        ]
+        return hashlib.sha256(f"{super().digest} {json.dumps(paces)}".encode()).hexdigest()
+
+
+class Scenario(Config):
+    """One test drive, and what fails in it."""
+
+    name: Identifier
+    description: str = Field(min_length=1)
+    paper: str | None = None
+    """The figures and tables of the paper that show this situation; None goes beyond the paper."""
+    base: Identifier | None = None
+    drive: Identifier
+    """Whose drive this is: its own, or that of the base if nothing but failures is added."""
+    vehicle: NamedVehicle
+    sprung_mass_kg: Positive | None = None
+    """None: that of the vehicle's file."""
+    tyre_stiffness: Positive = 1.0
+    """Cornering stiffness over that of the vehicle's file."""
+    tyre_radius: Positive = 1.0
+    """Rolling radius over that of the vehicle's file."""
+    track: NamedTrack
+    adhesion: Positive
+    limits: SpeedLimits
+    """Planned for a dry road whatever the road is: the driver does not see it."""
+    pace: tuple[PacePoint, ...] = ()
+    laps: Positive
+    seed: int = Field(ge=0)
+    sensors: Sensors
+    failures: tuple[Failure, ...] = ()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _inherit(cls, content: Any) -> Any:
+        return _complete(content, ()) if isinstance(content, dict) else content
+
+    @model_validator(mode="after")
+    def _pace_is_on_the_track(self) -> Self:
+        stations = [point.station_m for point in self.pace]
+        if stations != sorted(set(stations)):
+            raise ValueError("the stations of pace must increase")
+        if stations and stations[-1] >= self.track.length_m:
+            raise ValueError(
+                f"pace: {stations[-1]} m is beyond {self.track.name}, {self.track.length_m:.0f} m"
+            )
+        return self
+
+    @property
+    def drive_id(self) -> str:
+        """Name of the drive in the logs. No campaign's drive can have it."""
+        return f"{SCENARIO}-{self.drive}"
+
+    @property
+    def car(self) -> VehicleParameters:
+        """The car with the scenario's load and tyres."""
+        tyred = self.vehicle.with_tyres(
+            stiffness_factor=self.tyre_stiffness, rolling_radius_factor=self.tyre_radius
+        )
+        return tyred if self.sprung_mass_kg is None else tyred.with_sprung_mass(self.sprung_mass_kg)
+
+    def batch(self) -> ScenarioBatch:
+        """Return the drive as the simulation job takes it."""
+        drive = ScenarioDrive(
+            drive_id=self.drive_id,
+            vehicle_id=self.drive_id,
+            campaign=self.drive_id,
+            day=DAY,
+            vehicle=self.car,
+            sensors=self.sensors,
+            track=self.track,
+            adhesion=self.adhesion,
+            limits=self.limits,
+            speed_factor=1.0,
+            laps=self.laps,
+            seed=self.seed,
+            source=SCENARIO,
+            pace=self.pace,
+        )
+        return ScenarioBatch(self.drive_id, DAY, 0, (drive,))
+
+
+def _complete(content: Mapping[str, Any], derived: tuple[str, ...]) -> dict[str, Any]:
+    """Fill in what a scenario takes over from its base, and whose drive it is.
+
+    `derived` names the scenarios that are made from this one. Raises `ValueError`.
+    """
+    name, base = content.get("name"), content.get("base")
+    if "drive" in content:
+        raise ValueError("drive follows from the base and cannot be given")
+    if base is None:
+        return {**content, "drive": name}
+    if base == name or base in derived:
+        raise ValueError(f"the base {base!r} leads back to this scenario")
+    inherited = _complete(_settings(str(base)), (*derived, str(name)))
+    changes = sorted(set(content) - NOT_INHERITED)
+    if "failures" in content and changes:
+        raise ValueError(
+            f"a scenario with failures takes the drive of its base as it is, without "
+            f"{', '.join(changes)}"
+        )
+    drive = inherited["drive"] if "failures" in content else name
+    kept = {key: value for key, value in inherited.items() if key not in NOT_INHERITED}
+    return {**_merged(kept, content), "drive": drive}
+
+
+def _settings(name: str) -> dict[str, Any]:
+    try:
+        return load_toml(find_config("scenarios", name))
+    except ConfigError as error:
+        raise ValueError(str(error)) from None
+
+
+def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the base with changes; tables are merged key by key, all else is replaced."""
+    merged = dict(base)
+    for key, value in changes.items():
+        both = isinstance(value, dict) and isinstance(merged.get(key), dict)
+        merged[key] = _merged(merged[key], value) if both else value
+    return merged
+
+
+def load_scenario(name_or_path: str) -> Scenario:
+    """Read a scenario by the name of a shipped one or by path. Raises `ConfigError`."""
+    return load_config(find_config("scenarios", name_or_path), Scenario)
+
+
+def shipped_scenarios() -> tuple[Scenario, ...]:
+    """Return all shipped scenarios: the paper's first, in the order of its figures."""
+    return tuple(sorted(map(load_scenario, config_names("scenarios")), key=_place_in_paper))
+
+
+def _place_in_paper(scenario: Scenario) -> tuple[bool, list[int], str]:
+    numbers = [int(number) for number in re.findall(r"\d+", scenario.paper or "")]
+    return scenario.paper is None, numbers, scenario.name

@@ -1,0 +1,247 @@
+"""What a car's sensors report: bias, white noise and lost GPS fixes, then integer counts."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, FiniteFloat, field_validator
+
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S, Signal, catalogue
+from fleet_slip.config import Config
+
+SAMPLE_RATE_HZ = int(1 / SAMPLE_TIME_S)
+GPS_SIGNALS = {"gps_vx": "vx_mps", "gps_vy": "vy_mps"}
+"""The signals that are null between fixes, each with the true column that it measures."""
+
+Scalar = TypeVar("Scalar", bound=np.generic)
+
+EXACT = (0.0, 0.0)
+"""Bias and standard deviation of a signal that is not measured but known."""
+
+
+class Gps(Config):
+    """Satellite navigation: velocity at its own rate, and stretches without a fix.
+
+    Outages begin at random with a mean time from the end of one to the beginning of the next,
+    and last for exponentially distributed times.
+    """
+
+    rate_hz: int = Field(gt=0)
+    velocity_std_mps: FiniteFloat = Field(ge=0)
+    time_between_outages_s: FiniteFloat = Field(ge=1)
+    outage_duration_s: FiniteFloat = Field(gt=0)
+
+    @field_validator("rate_hz")
+    @classmethod
+    def _rate_divides_sample_rate(cls, rate_hz: int) -> int:
+        if SAMPLE_RATE_HZ % rate_hz:
+            raise ValueError(f"{rate_hz} Hz does not divide {SAMPLE_RATE_HZ} Hz")
+        return rate_hz
+
+
+class Sensors(Config):
+    """Bias and standard deviation of white noise of one car's sensors."""
+
+    ax_bias_mps2: FiniteFloat
+    ay_bias_mps2: FiniteFloat
+    acceleration_std_mps2: FiniteFloat = Field(ge=0)
+    yaw_rate_bias_rad_s: FiniteFloat
+    yaw_rate_std_rad_s: FiniteFloat = Field(ge=0)
+    wheel_speed_std_rad_s: FiniteFloat = Field(ge=0)
+    steering_wheel_std_rad: FiniteFloat = Field(ge=0)
+    steer_std_rad: FiniteFloat = Field(ge=0)
+    sideslip_std_rad: FiniteFloat = Field(ge=0)
+    gps: Gps
+
+    @property
+    def bias_and_std(self) -> dict[str, tuple[float, float]]:
+        """Bias and standard deviation of the signals at the full rate, in their SI units."""
+        wheel, steer = (0.0, self.wheel_speed_std_rad_s), (0.0, self.steer_std_rad)
+        return {
+            "ax": (self.ax_bias_mps2, self.acceleration_std_mps2),
+            "ay": (self.ay_bias_mps2, self.acceleration_std_mps2),
+            "yaw_rate": (self.yaw_rate_bias_rad_s, self.yaw_rate_std_rad_s),
+            "steering_wheel": (0.0, self.steering_wheel_std_rad),
+            "wheel_fl": wheel,
+            "wheel_fr": wheel,
+            "wheel_rl": wheel,
+            "wheel_rr": wheel,
+            "steer_fl": steer,
+            "steer_fr": steer,
+            "sideslip": (0.0, self.sideslip_std_rad),
+        }
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """One drive in counts: an int16 array per signal in catalogue order, one value a tick.
+
+    `gps_fix` is true where the GPS signals are valid. `saturated` counts the values that were
+    clipped to their signal's valid range.
+    """
+
+    counts: dict[str, NDArray[np.int16]]
+    gps_fix: NDArray[np.bool_]
+    saturated: int
+
+
+class Recorder:
+    """What the sensors of one car report of one drive, recorded block by block.
+
+    The draws come in a fixed order: for every block white noise signal by signal in catalogue
+    order, then the GPS outages, then the GPS noise. Signals without an entry in
+    `Sensors.bias_and_std` are exact. So the counts depend on where a drive is cut into blocks.
+    """
+
+    def __init__(self, sensors: Sensors, generator: np.random.Generator) -> None:
+        """Begin a drive."""
+        self._sensors = sensors
+        self._generator = generator
+        self._outages = _Outages(sensors.gps, generator)
+        self._ticks = 0
+        self._counts: dict[str, list[NDArray[np.int16]]] = {}
+        self._gps_fix: list[NDArray[np.bool_]] = []
+        self._saturated = 0
+
+    def record(self, truth: Mapping[str, NDArray[np.float64]]) -> None:
+        """Measure the next block.
+
+        `truth` holds a float64 array of one length for the SI column of every signal but GPS; a
+        signal without one is not measured, as by a car that lacks the sensor.
+        """
+        ticks = len(next(iter(truth.values())))
+        noise = np.zeros(ticks, dtype=np.float32)
+        errors = self._sensors.bias_and_std
+        for name, signal in catalogue().signals.items():
+            if name in GPS_SIGNALS or signal.column not in truth:
+                continue
+            if name in errors:
+                self._generator.standard_normal(out=noise, dtype=np.float32)
+            self._add(name, truth[signal.column], noise, errors.get(name, EXACT))
+        self._record_gps(truth, ticks)
+        self._ticks += ticks
+
+    def _record_gps(self, truth: Mapping[str, NDArray[np.float64]], ticks: int) -> None:
+        fix = self._outages.fixes(self._ticks, ticks)
+        self._gps_fix.append(fix)
+        for name, column in GPS_SIGNALS.items():
+            if name not in catalogue().signals:
+                continue
+            fixed = truth[column][fix]
+            noise = self._generator.standard_normal(len(fixed), dtype=np.float32)
+            self._add(name, fixed, noise, (0.0, self._sensors.gps.velocity_std_mps))
+            counts = np.zeros(ticks, dtype=np.int16)
+            counts[fix] = self._counts[name].pop()
+            self._counts[name].append(counts)
+
+    def _add(
+        self,
+        name: str,
+        physical: NDArray[np.float64],
+        noise: NDArray[np.float32],
+        bias_and_std: tuple[float, float],
+    ) -> None:
+        counts, clipped = _noisy_counts(physical, noise, bias_and_std, catalogue()[name])
+        self._counts.setdefault(name, []).append(counts)
+        self._saturated += clipped
+
+    def measurement(self) -> Measurement:
+        """Return all blocks as one measurement, once, at the end: their memory is given back."""
+        return Measurement(
+            {
+                name: _joined(self._counts.pop(name))
+                for name in catalogue().signals
+                if name in self._counts
+            },
+            _joined(self._gps_fix),
+            self._saturated,
+        )
+
+
+def _joined(parts: list[NDArray[Scalar]]) -> NDArray[Scalar]:
+    """Return the parts as one array, without a copy if there is only one."""
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+
+def measure(
+    truth: Mapping[str, NDArray[np.float64]], sensors: Sensors, generator: np.random.Generator
+) -> Measurement:
+    """Measure one drive in one block; see `Recorder`."""
+    recorder = Recorder(sensors, generator)
+    recorder.record(truth)
+    return recorder.measurement()
+
+
+def quantise(physical: NDArray[np.float64], signal: Signal) -> tuple[NDArray[np.int16], int]:
+    """Return `physical / scale` as counts, and how many values were clipped to the valid range.
+
+    Halves round to even. NaN is clipped as well, to the lower end.
+    """
+    return _noisy_counts(physical, np.zeros(len(physical), dtype=np.float32), EXACT, signal)
+
+
+def _noisy_counts(
+    physical: NDArray[np.float64],
+    noise: NDArray[np.float32],
+    bias_and_std: tuple[float, float],
+    signal: Signal,
+) -> tuple[NDArray[np.int16], int]:
+    counts = np.empty(len(physical), dtype=np.int16)
+    valid = (float(signal.min_count), float(signal.max_count))
+    clipped = _quantise(physical, noise, bias_and_std, float(signal.scale), valid, counts)
+    return counts, int(clipped)
+
+
+@numba.njit(cache=True, nogil=True)
+def _quantise(
+    physical: NDArray[np.float64],
+    noise: NDArray[np.float32],
+    bias_and_std: tuple[float, float],
+    scale: float,
+    valid: tuple[float, float],
+    counts: NDArray[np.int16],
+) -> int:
+    """Fill `counts` in one pass over memory and return how many were clipped."""
+    bias, std = bias_and_std
+    lowest, highest = valid
+    clipped = 0
+    for i in range(len(physical)):
+        count = np.rint((physical[i] + (bias + std * noise[i])) / scale)
+        within = lowest <= count <= highest
+        # A comparison with NaN is false: NaN takes the lower end and never reaches the cast.
+        inside = min(count, highest) if count >= lowest else lowest
+        counts[i] = np.int16(inside)
+        clipped += 0 if within else 1
+    return clipped
+
+
+class _Outages:
+    """When a drive has a GPS fix: once a period, and never in an outage."""
+
+    def __init__(self, gps: Gps, generator: np.random.Generator) -> None:
+        """Begin a drive, with a fix."""
+        self._gps = gps
+        self._generator = generator
+        self._begin_s = 0.0
+        self._end_s = 0.0
+
+    def fixes(self, first: int, ticks: int) -> NDArray[np.bool_]:
+        """Return for so many ticks from a first one, the next ones, whether there is a fix."""
+        period = SAMPLE_RATE_HZ // self._gps.rate_hz
+        fix = np.zeros(ticks, dtype=np.bool_)
+        fix[-first % period :: period] = True
+        self._clear(fix, first)
+        while self._end_s * SAMPLE_RATE_HZ < first + ticks:
+            self._begin_s = self._end_s + self._generator.exponential(
+                self._gps.time_between_outages_s
+            )
+            self._end_s = self._begin_s + self._generator.exponential(self._gps.outage_duration_s)
+            self._clear(fix, first)
+        return fix
+
+    def _clear(self, fix: NDArray[np.bool_], first: int) -> None:
+        begin, end = (int(s * SAMPLE_RATE_HZ) - first for s in (self._begin_s, self._end_s))
+        fix[max(begin, 0) : max(end, 0)] = False

@@ -1,0 +1,172 @@
+"""Tracks as sequences of curvature segments, read from `configs/tracks/*.toml`."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Annotated, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field, FiniteFloat, model_validator
+
+from fleet_slip.catalogue.signals import Identifier
+from fleet_slip.config import Config, load_config
+from fleet_slip.resources import find_config
+
+CLOSURE_TOLERANCE_M = 0.05
+"""Largest gap between the ends of a closed track, in m."""
+
+CLOSURE_TOLERANCE_RAD = 1e-3
+"""Largest difference of heading between the ends of a closed track, in rad."""
+
+CONTINUITY_TOLERANCE_1PM = 1e-6
+"""Largest jump of curvature between two segments, in 1/m: a car cannot follow a jump."""
+
+LONGEST_M = 1e6
+"""Longest track, in m. Its points are tabulated, which takes memory."""
+
+SHARPEST_1PM = 1.0
+"""Largest curvature of a track, in 1/m. No car turns so sharply; sums of much more overflow."""
+
+INTEGRATION_STEP_M = 5.0
+QUADRATURE_POINTS = 6
+
+
+Curvature = Annotated[FiniteFloat, Field(ge=-SHARPEST_1PM, le=SHARPEST_1PM)]
+
+
+class Segment(Config):
+    """A straight, an arc or a clothoid: curvature is linear in arc length between two values."""
+
+    length_m: FiniteFloat = Field(gt=0, le=LONGEST_M)
+    curvature_1pm: tuple[Curvature, Curvature]
+
+
+@dataclass(frozen=True)
+class CentreLine:
+    """Points on a track's centre line, from a start at the origin that heads along x.
+
+    All arrays have the same shape. `heading_rad` is continuous, not wrapped to one turn.
+    """
+
+    station_m: NDArray[np.float64]
+    x_m: NDArray[np.float64]
+    y_m: NDArray[np.float64]
+    heading_rad: NDArray[np.float64]
+
+
+class Track(Config):
+    """A centre line given by its curvature, positive when bending left."""
+
+    name: Identifier
+    description: str = Field(min_length=1)
+    closed: bool
+    segments: tuple[Segment, ...] = Field(min_length=1, max_length=10_000)
+
+    @model_validator(mode="after")
+    def _is_not_too_long(self) -> Self:
+        if self.length_m > LONGEST_M:
+            raise ValueError(f"is {self.length_m:g} m long, at most {LONGEST_M:g} m are possible")
+        return self
+
+    @model_validator(mode="after")
+    def _curvature_is_continuous(self) -> Self:
+        following = [*self.segments[1:], *(self.segments[:1] if self.closed else ())]
+        for index, (segment, successor) in enumerate(zip(self.segments, following, strict=False)):
+            end, start = segment.curvature_1pm[1], successor.curvature_1pm[0]
+            if abs(end - start) > CONTINUITY_TOLERANCE_1PM:
+                raise ValueError(
+                    f"curvature jumps from {end} to {start} 1/m after segment {index}"
+                    f" (counted from 0)"
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _closed_track_closes(self) -> Self:
+        if not self.closed:
+            return self
+        gap_m, gap_rad = self.closure()
+        if gap_m > CLOSURE_TOLERANCE_M or gap_rad > CLOSURE_TOLERANCE_RAD:
+            raise ValueError(
+                f"the lap does not close: its ends are {gap_m:.3f} m and {gap_rad:.5f} rad apart"
+            )
+        return self
+
+    @cached_property
+    def _knots_m(self) -> NDArray[np.float64]:
+        """Stations of the segments' ends, from 0 to the length of the track."""
+        return np.concatenate([[0.0], np.cumsum([s.length_m for s in self.segments])])
+
+    @cached_property
+    def _curvature_at_knots_1pm(self) -> NDArray[np.float64]:
+        first = [segment.curvature_1pm[0] for segment in self.segments]
+        return np.array([*first, self.segments[-1].curvature_1pm[1]])
+
+    @property
+    def length_m(self) -> float:
+        """Length of the centre line, in m."""
+        return float(self._knots_m[-1])
+
+    def curvature(self, station_m: ArrayLike) -> NDArray[np.float64]:
+        """Return the curvature in 1/m at stations in m.
+
+        Stations outside the track wrap around a closed one and stay at the ends of an open one.
+        """
+        station = np.asarray(station_m, dtype=np.float64)
+        if self.closed:
+            station = np.mod(station, self.length_m)
+        return np.interp(station, self._knots_m, self._curvature_at_knots_1pm)
+
+    def grid(self, spacing_m: float) -> tuple[NDArray[np.float64], float]:
+        """Return evenly spaced stations in m and their spacing, as near `spacing_m` as fits.
+
+        The stations begin at 0. On an open track they end at its end; on a closed one they end
+        one spacing before the start comes again.
+        """
+        intervals = max(1, round(self.length_m / spacing_m))
+        stations = np.linspace(0.0, self.length_m, intervals + 1)
+        return (stations[:-1] if self.closed else stations), self.length_m / intervals
+
+    def centre_line(self, spacing_m: float) -> CentreLine:
+        """Integrate the curvature to points about `spacing_m` apart, both ends included.
+
+        The heading is the exact integral; the position is integrated by Gauss-Legendre
+        quadrature within each segment, to rounding.
+        """
+        intervals = max(1, round(self.length_m / spacing_m))
+        station = np.linspace(0.0, self.length_m, intervals + 1)
+        steps = np.arange(0.0, self.length_m, INTEGRATION_STEP_M)
+        nodes = np.union1d(station, np.concatenate([self._knots_m, steps]))
+        x, y, heading = self._integrate(nodes)
+        at = np.searchsorted(nodes, station)
+        return CentreLine(station, x[at], y[at], heading[at])
+
+    def closure(self) -> tuple[float, float]:
+        """Return how far apart the ends are: in m, and in rad beside whole turns."""
+        line = self.centre_line(self.length_m)
+        turns = line.heading_rad[-1] / (2 * np.pi)
+        gap_rad = 2 * np.pi * abs(turns - round(turns))
+        return float(np.hypot(line.x_m[-1], line.y_m[-1])), float(gap_rad)
+
+    def _integrate(self, nodes: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+        """Return x, y and heading at sorted stations between which curvature is linear."""
+        step = np.diff(nodes)
+        curvature = self.curvature(nodes)
+        if self.closed:
+            curvature[-1] = self.segments[-1].curvature_1pm[1]
+        change = np.diff(curvature)
+        heading = _cumulative(step * (curvature[:-1] + change / 2))
+        points, weights = np.polynomial.legendre.leggauss(QUADRATURE_POINTS)
+        u = (points[:, None] + 1) / 2
+        inside = heading[:-1] + step * u * (curvature[:-1] + change * u / 2)
+        x = _cumulative(step * (weights / 2 @ np.cos(inside)))
+        y = _cumulative(step * (weights / 2 @ np.sin(inside)))
+        return x, y, heading
+
+
+def _cumulative(increments: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.concatenate([[0.0], np.cumsum(increments)])
+
+
+def load_track(name_or_path: str) -> Track:
+    """Read a track by the name of a shipped one or by path. Raises `ConfigError`."""
+    return load_config(find_config("tracks", name_or_path), Track)

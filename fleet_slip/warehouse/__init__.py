@@ -1,0 +1,1 @@
+"""The tables of a data root, and DuckDB over them."""

@@ -1,0 +1,134 @@
+"""DuckDB connections: how they are opened, what they may use, and how their errors are told."""
+
+import contextlib
+import os
+import resource
+import uuid
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
+from pathlib import Path
+from typing import TypeVar
+
+import duckdb
+
+from fleet_slip.errors import FleetSlipError, SelectionError, StorageError
+from fleet_slip.files.folder import Folder
+
+SPILL_LIMIT = "20GB"
+"""Largest size of what one connection may write to disk for a query beyond its memory."""
+
+LOOK_S = 0.1
+"""How often a waiting query looks whether Ctrl-C was pressed."""
+
+Result = TypeVar("Result")
+
+CGROUP_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
+
+
+def open_database(
+    *, reading: Folder | None = None, spill: bool = False, threads: int | None = None
+) -> duckdb.DuckDBPyConnection:
+    """Open an in-memory database. Data stays in Parquet, so that no lock can block a reader.
+
+    It can read the files below the folder `reading`. It takes at most half of the memory that the
+    process may have. What a large query cannot hold in memory goes to disk if it may `spill`;
+    otherwise such a query fails.
+    """
+    aside = reading.spill / f".spill-{uuid.uuid4().hex}" if reading and spill else ""
+    config: dict[str, str | bool | int | float | list[str]] = {
+        "autoinstall_known_extensions": False,
+        "autoload_known_extensions": False,
+        "memory_limit": f"{memory_bytes() // 2 // 2**20}MiB",
+        "temp_directory": str(aside),
+        "max_temp_directory_size": SPILL_LIMIT,
+    }
+    if threads is not None:
+        config["threads"] = threads
+    database = duckdb.connect(":memory:", config=config)
+    if reading:
+        reading.let_read(database)
+    return database
+
+
+def memory_bytes() -> int:
+    """Return the memory that this process may have: the machine's, or less in a container."""
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    for file in CGROUP_LIMITS:
+        with contextlib.suppress(OSError, ValueError):
+            memory = min(memory, int(Path(file).read_text(encoding="ascii")))
+    return memory
+
+
+def limit_memory() -> None:
+    """Have the system refuse this process more than three quarters of the memory.
+
+    DuckDB keeps to its own limit for what it buffers, not for one value: a list of 2e9 numbers.
+    """
+    limit = memory_bytes() // 4 * 3
+    _, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    if hard == resource.RLIM_INFINITY or limit < hard:
+        resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))
+
+
+def interruptible(database: duckdb.DuckDBPyConnection, work: Callable[[], Result]) -> Result:
+    """Do work with a connection so that Ctrl-C ends it, in the middle of an operator, too.
+
+    DuckDB asks whether to stop between tasks only, and a recursive query is one task.
+    """
+    with ThreadPoolExecutor(1) as pool:
+        answer = pool.submit(work)
+        try:
+            # Where a library has set a handler that restarts system calls, a signal ends no wait.
+            while not wait([answer], LOOK_S).done:
+                pass
+        except KeyboardInterrupt:
+            database.interrupt()
+            raise
+        return answer.result()
+
+
+_INTERRUPTED = "Query interrupted"
+"""What DuckDB's Python client says when it stopped at a Ctrl-C."""
+
+_OF_FILES = (
+    duckdb.IOException,
+    duckdb.InvalidInputException,
+    duckdb.InternalException,
+)
+
+
+@contextlib.contextmanager
+def database_errors(doing: str) -> Iterator[None]:
+    """Turn DuckDB's errors into ours, saying what was being done."""
+    try:
+        yield
+    except FleetSlipError:
+        raise
+    except duckdb.InterruptException:
+        raise KeyboardInterrupt from None
+    except RuntimeError as error:
+        if str(error) == _INTERRUPTED:
+            raise KeyboardInterrupt from None
+        raise
+    except (duckdb.OutOfMemoryException, MemoryError) as error:
+        reason = first_line(error) or "out of memory"
+        raise StorageError(f"{doing} failed: {reason}. Ask for less at once.") from None
+    except _OF_FILES as error:
+        raise StorageError(f"{doing} failed: {first_line(error)}. {_RESTORE}") from None
+    except duckdb.Error as error:
+        if type(error) is duckdb.Error:  # what its Parquet reader raises at damaged metadata
+            raise StorageError(f"{doing} failed: {first_line(error)}. {_RESTORE}") from None
+        raise SelectionError(f"{doing} failed: {first_line(error)}") from None
+    except UnicodeDecodeError:  # the message quotes bytes of a damaged file
+        raise StorageError(f"{doing} failed: a file is damaged. {_RESTORE}") from None
+
+
+def first_line(error: BaseException) -> str:
+    """Return DuckDB's message on one line, without the excerpt of the statement or its advice."""
+    text = str(error).partition("\n\nLINE ")[0].partition("\n\nPossible solutions:")[0]
+    if "Traceback (most recent call last)" in text:  # of Python that DuckDB called to read a file
+        text = text.strip().rpartition("\n")[2].partition(": ")[2]
+    return " ".join(text.split()).rstrip(".")
+
+
+_RESTORE = "If a file is missing or damaged, restore it from a backup."

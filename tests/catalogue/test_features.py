@@ -1,0 +1,282 @@
+"""Features against their physical definitions, and kinds of Gram rows against plain integers."""
+
+import hashlib
+from collections.abc import Callable
+from fractions import Fraction
+from math import ceil, floor
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from fleet_slip.catalogue import features as features_module
+from fleet_slip.catalogue.features import features, load_features, with_features
+from fleet_slip.catalogue.signals import COUNT_MAX, catalogue
+from fleet_slip.delta import Change, Unit
+from fleet_slip.errors import ConfigError, SelectionError
+from fleet_slip.grams import job as gram_job
+from fleet_slip.grams import statement as gram_statement
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.job import update_grams
+from fleet_slip.regression.gram import Gram, GramTable
+from fleet_slip.regression.serial import lag_signals
+from fleet_slip.resources import folder
+from fleet_slip.warehouse.tables import Warehouse
+from tests.conftest import land, log_rows, random_counts
+
+RADIUS_M = Fraction(31, 100)
+INPUTS = catalogue().inputs
+LABEL = catalogue().label
+
+Row = dict[str, Fraction]
+
+
+def speed(row: Row) -> Fraction:
+    wheels = [row[f"wheel_{corner}"] for corner in ("fl", "fr", "rl", "rr")]
+    return RADIUS_M * sum(wheels, Fraction(0)) / 4
+
+
+def over_speed(name: str) -> Callable[[Row], Fraction | None]:
+    # The shipped guard is 120,000 / (31 * 4 * 40 ...) counts: 3 m/s, to within one count.
+    return lambda row: row[name] / speed(row) if speed(row) >= 3 else None
+
+
+PHYSICS: dict[str, Callable[[Row], Fraction | None]] = {
+    "speed": speed,
+    "speed_squared": lambda row: speed(row) ** 2,
+    "yaw_rate_speed": lambda row: row["yaw_rate"] * speed(row),
+    "curvature": over_speed("yaw_rate"),
+    "course_rate": over_speed("ay"),
+    "ay_signed_square": lambda row: row["ay"] * abs(row["ay"]),
+    "steer_mean": lambda row: (row["steer_fl"] + row["steer_fr"]) / 2,
+    "steer_speed_squared": lambda row: (row["steer_fl"] + row["steer_fr"]) / 2 * speed(row) ** 2,
+    "wheel_difference_front": lambda row: row["wheel_fr"] - row["wheel_fl"],
+    "wheel_difference_rear": lambda row: row["wheel_rr"] - row["wheel_rl"],
+    "wheel_difference_axles": lambda row: (
+        (row["wheel_rl"] + row["wheel_rr"] - row["wheel_fl"] - row["wheel_fr"]) / 2
+    ),
+}
+
+
+def nearest(value: Fraction) -> int:
+    """Round to the nearest integer, halves away from zero."""
+    return floor(value + Fraction(1, 2)) if value >= 0 else ceil(value - Fraction(1, 2))
+
+
+def counts(rows: int, seed: int) -> dict[str, Any]:
+    return random_counts(np.random.default_rng(seed), rows)
+
+
+def test_every_feature_is_its_physical_definition_rounded_and_clipped() -> None:
+    logged = counts(400, 7)
+    # Ordinary driving too, where the guarded quotients exist and nothing is clipped.
+    for name in INPUTS:
+        logged[name][200:] = (logged[name][200:] // 40) + (1500 if "wheel" in name else 0)
+    definitions = {name: one.sql for name, one in features().features.items()}
+    assert set(definitions) == set(PHYSICS)
+    with duckdb.connect() as database:
+        database.register("log_counts", pa.table(logged))
+        query = f"SELECT * FROM {with_features('log_counts', definitions)}"
+        found: pa.Table = database.sql(query).to_arrow_table()
+    exact = {name: catalogue()[name].exact_scale for name in INPUTS}
+    clipped = 0
+    for i, row in enumerate(found.to_pylist()):
+        physical = {name: int(logged[name][i]) * exact[name] for name in INPUTS}
+        out_of_range = 0
+        for name, formula in PHYSICS.items():
+            value = formula(physical)
+            if value is None:
+                assert row[name] is None
+                continue
+            count = nearest(value / features().features[name].exact_scale)
+            out_of_range += abs(count) > COUNT_MAX
+            assert row[name] == max(-COUNT_MAX, min(COUNT_MAX, count)), (name, i)
+        assert row["clipped"] == out_of_range
+        clipped += out_of_range
+    assert clipped > 100
+    assert found["curvature"].null_count > 50
+    assert len(found) - found["curvature"].null_count > 50
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('counts = "ay * abs(ay)"', 'counts = "ay * sideslip"', "sideslip: not an input signal"),
+        ('counts = "ay * abs(ay)"', 'counts = "ay * vx"', "vx: not an input signal"),
+        ('counts = "ay * abs(ay)"', 'counts = "ay / 2.5"', "not integer arithmetic"),
+        ('counts = "ay * abs(ay)"', 'counts = "ay) FROM x; DROP TABLE y; --"', "not an input"),
+        ("at_least = 120000\n", "", "at_least is for a divisor that varies"),
+        ('column = "speed_mps"', 'column = "ay_mps2"', "names must differ"),
+        ('divided_by = "50000"', 'divided_by = "0"', "divided_by is zero"),
+        ('regimes = ["speed", "ay"]', 'regimes = ["mood"]', "unknown mood"),
+        ("row_folds = 10", "row_folds = 10\nlagged = true", "not several of them"),
+    ],
+)
+def test_a_feature_that_is_not_integer_arithmetic_on_inputs_is_refused(
+    tmp_path: Path, old: str, new: str, message: str
+) -> None:
+    text = (folder("configs") / "features.toml").read_text(encoding="utf-8")
+    assert old in text
+    (tmp_path / "features.toml").write_text(text.replace(old, new), encoding="utf-8")
+    with pytest.raises(ConfigError, match=message):
+        load_features(tmp_path / "features.toml")
+
+
+def cohort_gram(warehouse: Warehouse, feature_set: str, signals: list[str]) -> Gram:
+    table: GramTable = load_cohort(warehouse, "true", feature_set).serving(signals[:-1]).table
+    assert table.signals == tuple(signals)
+    return table.total()
+
+
+def drive(name: str, rows: int, seed: int, **changed: Any) -> pa.Table:
+    """A drive at speeds up to 30 m/s, so that most rows have every feature."""
+    logged = counts(rows, seed)
+    rng = np.random.default_rng(seed)
+    for wheel in ("fl", "fr", "rl", "rr"):
+        logged[f"wheel_{wheel}"] = rng.integers(0, 10_000, rows).astype(np.int16)
+    logged["ay"] = rng.integers(-6000, 6000, rows).astype(np.int16)
+    return log_rows(name, logged | changed)
+
+
+def test_a_set_costs_one_pass_and_stands_beside_the_others(warehouse: Warehouse) -> None:
+    land(warehouse, "one", drive("a", 300, 1), drive("b", 200, 2))
+    plain = update_grams(warehouse)
+    motion = update_grams(warehouse, feature_set="motion")
+    assert (plain.rows_read, motion.rows_read) == (500, 500)
+    assert not update_grams(warehouse).changed
+    assert not update_grams(warehouse, feature_set="motion").changed
+    signals = [*INPUTS, LABEL]
+    assert cohort_gram(warehouse, "motion", signals) == cohort_gram(warehouse, "signals", signals)
+    with_curvature = load_cohort(warehouse, "true", "motion").serving(["ay", "curvature"])
+    assert 0 < with_curvature.table.total().n < 500
+    assert with_curvature.drives.num_rows == 2
+    land(warehouse, "two", drive("c", 100, 3))
+    update_grams(warehouse)
+    with pytest.raises(SelectionError, match="1 of 2 log files"):
+        load_cohort(warehouse, "true", "motion")
+    assert update_grams(warehouse, feature_set="motion").rows_read == 100
+    logs = warehouse.logs.snapshot()
+    gone = next(file for file in logs.files if "one" in file.path)
+    logs.commit(Change(remove=[gone], units=[Unit("test/remove", 1)]))
+    assert update_grams(warehouse).files_dropped == 1
+    left = load_cohort(warehouse, "true", "motion")
+    assert set(left.drives["drive_id"].to_pylist()) == {"c"}
+
+
+def test_a_changed_definition_never_mixes_with_the_old_rows(
+    warehouse: Warehouse, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    land(warehouse, "one", drive("a", 300, 1))
+    update_grams(warehouse, feature_set="motion")
+    before = features()
+    text = (folder("configs") / "features.toml").read_text(encoding="utf-8")
+    changed_text = text.replace("at_least = 120000", "at_least = 400000")
+    (tmp_path / "features.toml").write_text(changed_text, encoding="utf-8")
+    changed = load_features(tmp_path / "features.toml")
+    assert changed.identity("motion") != before.identity("motion")
+    assert changed.identity("lags") == before.identity("lags")
+    for module in (features_module, gram_job, gram_statement):
+        monkeypatch.setattr(module, "features", lambda: changed)
+    assert update_grams(warehouse, feature_set="motion").rows_read == 300
+    rows = pa.concat_tables(
+        [pa.parquet.read_table(path) for path in warehouse.grams.snapshot().paths]
+    ).to_pylist()
+    with_curvature = {
+        identity: sum(
+            row["n"]
+            for row in rows
+            if row["feature_set"] == identity and "curvature" in row["signals"]
+        )
+        for identity in (before.identity("motion"), changed.identity("motion"))
+    }
+    old, new = with_curvature.values()
+    assert 0 < new < old < 300
+
+
+def test_rows_fall_into_folds_by_a_hash_that_never_changes(warehouse: Warehouse) -> None:
+    rows = drive("drive-x", 500, 4)
+    land(warehouse, "one", rows)
+    update_grams(warehouse, feature_set="rows")
+    seed = int.from_bytes(hashlib.md5(b"drive-x").digest()[8:], "little")  # noqa: S324
+    cohort = load_cohort(warehouse, "true", "rows")
+    found = dict(
+        zip(cohort.drives["part"].to_pylist(), cohort.drives["n"].to_pylist(), strict=True)
+    )
+    assert found == _fold_sizes(seed % 2**32, 500)
+    assert all(30 < n < 70 for n in found.values())
+    update_grams(warehouse)
+    signals = [*INPUTS, LABEL]
+    assert cohort_gram(warehouse, "rows", signals) == cohort_gram(warehouse, "signals", signals)
+    assert len(cohort.folds("row", 5).serving(["ax", "ay"], LABEL).grams) == 5
+    assert cohort.folds("row", 5).serving(["ax", "ay"], LABEL).drives == 1
+    with pytest.raises(SelectionError, match="Feature sets that make them: rows"):
+        load_cohort(warehouse, "true").folds("row", 5)
+
+
+def _fold_sizes(seed: int, rows: int) -> dict[str, int]:
+    sizes: dict[str, int] = {}
+    for tick in range(rows):
+        value = (seed + tick) % 2**32
+        for _ in range(2):
+            value = ((value >> 16) ^ value) * 73244475 % 2**32
+        fold = str(value % 10 + 1)
+        sizes[fold] = sizes.get(fold, 0) + 1
+    return sizes
+
+
+def test_rows_are_divided_by_regime(warehouse: Warehouse) -> None:
+    rows = drive("a", 600, 5)
+    land(warehouse, "one", rows)
+    update_grams(warehouse, feature_set="regimes")
+    cohort = load_cohort(warehouse, "true", "regimes")
+    found: dict[str, int] = {}
+    for part, n in zip(
+        cohort.drives["part"].to_pylist(), cohort.drives["n"].to_pylist(), strict=True
+    ):
+        found[part] = found.get(part, 0) + n
+    wheels = sum(rows[f"wheel_{w}"].to_numpy().astype(int) for w in ("fl", "fr", "rl", "rr"))
+    kmps = np.floor(wheels / 4 + 0.5) * 0.0031
+    ay = np.abs(rows["ay"].to_numpy().astype(int)) * 0.001
+    fast = (kmps >= 20) & (kmps < 25) & (ay >= 1) & (ay < 2)
+    assert found["speed 20-25, |ay| 1-2"] == int(fast.sum()) > 0
+    assert found["speed < 10, |ay| < 1"] == int(((kmps < 10) & (ay < 1)).sum()) > 0
+    assert sum(found.values()) == 600
+
+
+def test_lagged_rows_have_a_predecessor_in_their_drive(warehouse: Warehouse) -> None:
+    one, two = drive("a", 50, 6), drive("b", 40, 7)
+    gap = one.filter(pa.compute.not_equal(one["tick"], 20))
+    shuffled = gap.take(np.random.default_rng(0).permutation(len(gap)))
+    land(warehouse, "one", shuffled, two)
+    update_grams(warehouse, feature_set="lags")
+    signals = lag_signals(["ay", LABEL])
+    wanted = Gram.zero(signals)
+    for table in (gap, two):
+        tick = table["tick"].to_numpy()
+        now = np.column_stack([table[name].to_numpy() for name in ("ay", LABEL)]).astype(np.int64)
+        after = np.flatnonzero(np.diff(tick) == 1) + 1
+        wanted += Gram.from_counts(signals, np.hstack([now[after], now[after - 1]]))
+    total = sum(
+        (t.restrict(signals).total() for t in load_cohort(warehouse, "true", "lags").tables),
+        Gram.zero(signals),
+    )
+    assert total == wanted
+    assert total.n == 47 + 39
+
+
+def test_a_drive_with_several_gram_rows_is_one_drive(warehouse: Warehouse) -> None:
+    standing = np.zeros(300, dtype=np.int16)
+    wheels = {f"wheel_{w}": np.r_[standing[:100], [8000] * 200] for w in ("fl", "fr", "rl", "rr")}
+    land(warehouse, "one", drive("a", 300, 8, **wheels), drive("b", 300, 9))
+    update_grams(warehouse, feature_set="motion")
+    cohort = load_cohort(warehouse, "true", "motion")
+    assert len(cohort.drives) > 2
+    assert cohort.drive_count == 2
+    served = cohort.serving(["ay", "yaw_rate"])
+    assert served.drives["drive_id"].to_pylist() == ["a", "b"]
+    assert served.table.n.tolist() == [300, 300]
+    moving = cohort.serving(["ay", "curvature"])
+    assert int(moving.table.n[moving.drives["drive_id"].to_pylist().index("a")]) == 200

@@ -1,0 +1,84 @@
+from decimal import Decimal
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fleet_slip.catalogue.signals import Signal, catalogue, load_catalogue
+from fleet_slip.errors import ConfigError, SelectionError
+from fleet_slip.resources import folder
+
+SHIPPED = (folder("configs") / "signals.toml").read_text()
+
+
+def edited(tmp_path: Path, old: str, new: str) -> Path:
+    assert SHIPPED.count(old) >= 1
+    file = tmp_path / "signals.toml"
+    file.write_text(SHIPPED.replace(old, new, 1))
+    return file
+
+
+def test_the_paper_s_signals_are_inputs_and_side_slip_is_the_label() -> None:
+    signals = catalogue()
+    assert signals.inputs == (
+        "ax", "ay", "yaw_rate", "steering_wheel",
+        "wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr", "steer_fl", "steer_fr",
+    )  # fmt: skip
+    assert signals.label == "sideslip"
+    assert {name for name, s in signals.signals.items() if s.role == "truth"} >= {"vx", "vy"}
+
+
+def test_counts_are_int16_and_metadata_has_its_types() -> None:
+    schema = catalogue().log_schema
+    assert all(schema.field(name).type == pa.int16() for name in catalogue().signals)
+    assert schema.field("mass_kg").type == pa.float64()
+    assert schema.names[0] == "day"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "fault"),
+    [
+        ('unit = "m/s^2"', 'unit = "km/h"', "signals.ax.unit"),
+        ("scale = 0.001", "scale = 0.0001", "signals.ax: the range needs counts up to 300000"),
+        ("scale = 0.001", "scale = 0", "signals.ax.scale"),
+        ("min = -30.0", "min = 31.0", "signals.ax: min 31.0 is not below max 30.0"),
+        ('role = "input"', 'role = "label"', "exactly one signal must have the role 'label'"),
+        ('column = "ay_mps2"', 'column = "ax_mps2"', "names must differ: ax_mps2"),
+        ("[signals.ax]", '[signals."ax; DROP"]', "signals.ax; DROP"),
+        ("description", "descripton", "signals.ax.descripton: unknown key"),
+        ("[signals.ax]", "[signals.ax", "not valid TOML"),
+    ],
+)
+def test_a_mistake_is_told_with_file_key_and_reason(
+    tmp_path: Path, old: str, new: str, fault: str
+) -> None:
+    file = edited(tmp_path, old, new)
+    with pytest.raises(ConfigError) as caught:
+        load_catalogue(file)
+    assert str(file) in str(caught.value)
+    assert fault in str(caught.value)
+
+
+def test_a_missing_catalogue_and_an_unknown_signal_are_told(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no such file"):
+        load_catalogue(tmp_path / "none.toml")
+    with pytest.raises(SelectionError, match=r"unknown signal 'beta'. Known signals: ax, ay"):
+        catalogue()["beta"]
+
+
+@given(
+    scale=st.decimals("0.00001", "0.01", places=5),
+    low=st.integers(-30000, -1),
+    high=st.integers(1, 30000),
+)
+def test_valid_counts_are_those_whose_physical_value_is_in_range(
+    scale: Decimal, low: int, high: int
+) -> None:
+    signal = Signal(
+        unit="m", column="x_m", scale=scale, min=low * scale, max=high * scale, role="input",
+        description="x",
+    )  # fmt: skip
+    assert (signal.min_count, signal.max_count) == (low, high)
+    assert signal.exact_scale * high <= signal.max

@@ -1,0 +1,294 @@
+"""The whole system through the command line, as a user runs it."""
+
+import csv
+import io
+import json
+import subprocess
+from hashlib import sha256
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+
+import fleet_slip
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.models.versions import Registry
+from fleet_slip.warehouse.tables import Warehouse
+from tests.conftest import COMMAND, RunCommand
+
+
+@pytest.fixture(scope="module")
+def smoke_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data root after `fleet-slip run --campaign smoke`."""
+    root = tmp_path_factory.mktemp("smoke") / "data"
+    subprocess.run([COMMAND, "--root", str(root), "run", "--campaign", "smoke"], check=True)
+    return root
+
+
+def test_run_makes_a_model_and_a_second_run_does_nothing(run_command: RunCommand) -> None:
+    first = run_command("run", "--campaign", "smoke", "--json").json
+    assert first["changed"]
+    assert first["publish"] == {**first["publish"], "model": "smoke", "version": 1, "new": True}
+    assert first["simulate"]["rows"] == first["gram"]["rows_read"] > 10_000
+    second = run_command("run", "--campaign", "smoke", "--json").json
+    assert not second["changed"]
+    assert second["publish"]["sha256"] == first["publish"]["sha256"]
+    assert "nothing to do" in run_command("run", "--campaign", "smoke").stderr
+
+
+def test_the_bits_are_those_of_other_machines(smoke_root: Path) -> None:
+    """They came out on x86-64 with two kinds of vector registers, and on AArch64 (emulated)."""
+    warehouse = Warehouse(LocalFolder(smoke_root))
+    digests = {}
+    for table in (warehouse.logs, warehouse.grams):
+        files = [table.read(file.path) for file in table.snapshot().files]
+        rows = pa.concat_tables(files)
+        rows = rows.drop_columns([name for name in rows.column_names if name == "file"])
+        lines = sorted(rows.to_pylist(), key=lambda row: (row["drive_id"], row.get("tick", 0)))
+        digests[table.folder.name] = sha256(str(lines).encode()).hexdigest()
+    manifest = Registry(LocalFolder(smoke_root / "models")).resolve("smoke").manifest
+    content = manifest.model_dump(mode="json", exclude={"package_version"})
+    digests["models"] = sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    assert digests == {
+        "logs": "b875580a1d17083def2771a1c408763eb3a55e5ba122d59e699d2cce7b2f7c40",
+        "grams": "d81339d42929335003f976666893a4ac71b7a9f530338fac71c9c606d61b46d2",
+        "models": "992db5a79a91cfbe260bce0067fff3cc72b833ecb9a6e2cd1cd8366c78f3c053",
+    }
+
+
+def test_a_nightly_run_reads_the_new_day_only_and_ends_where_one_run_ends(
+    run_command: RunCommand, tmp_path: Path, smoke_root: Path
+) -> None:
+    first = run_command("run", "--campaign", "smoke", "--days", "1", "--json").json
+    second = run_command("run", "--campaign", "smoke", "--through", "2024-05-02", "--json").json
+    assert second["gram"]["rows_read"] == second["simulate"]["rows"] > 0
+    assert first["publish"]["version"], second["publish"]["version"] == (1, 2)
+    at_once = run_command("select", "--cohort", "campaign = 'smoke'", "--json", root=smoke_root)
+    by_night = run_command("select", "--cohort", "campaign = 'smoke'", "--json")
+    assert by_night.json == at_once.json
+
+
+def test_select_reports_the_models_in_the_list_s_order(
+    run_command: RunCommand, smoke_root: Path
+) -> None:
+    report = run_command("select", "--json", root=smoke_root).json
+    assert [model["name"] for model in report["models"]] == ["1", "2", "3", "4", "5"]
+    for model in report["models"]:
+        assert model["correlation"] > 0.85
+        assert model["rmse_deg"] >= model["error_std_deg"] * 0.99 > 0
+        assert set(model["coefficients"]) == set(model["signals"])
+    assert report["winner"] in "12345"
+    table = run_command("select", "--nested", "ay,yaw_rate,steering_wheel", root=smoke_root).stdout
+    assert "first 3" in table
+    assert "winner: " in table
+
+
+def test_sql_answers_as_table_json_and_csv(run_command: RunCommand, smoke_root: Path) -> None:
+    query = "SELECT drive_id, count(*) AS n, max(time_s) AS t FROM log GROUP BY ALL ORDER BY ALL"
+    rows = run_command("sql", query, "--json", root=smoke_root).json
+    assert rows[0]["drive_id"] == "smoke-2024-05-01-0000"
+    assert rows[0]["t"] == (rows[0]["n"] - 1) / 100
+    table = list(
+        csv.DictReader(io.StringIO(run_command("sql", query, "--csv", root=smoke_root).stdout))
+    )
+    assert [row["n"] for row in table] == [str(row["n"]) for row in rows]
+    assert "smoke-2024-05-01-0000" in run_command("sql", query, root=smoke_root).stdout
+    counted = run_command("sql", "SELECT sum(rows) AS n FROM drives", "--json", root=smoke_root)
+    assert counted.json == [{"n": sum(row["n"] for row in rows)}]
+
+
+def test_every_column_is_documented(run_command: RunCommand, smoke_root: Path) -> None:
+    query = "FROM dictionary WHERE description = ''"
+    assert run_command("sql", query, "--json", root=smoke_root).json == []
+    comments = "SELECT comment FROM duckdb_columns() WHERE column_name = 'ax_mps2'"
+    assert (
+        run_command("sql", comments, "--json", root=smoke_root)
+        .json[0]["comment"]
+        .endswith("[m/s^2]")
+    )
+
+
+def test_python_sees_the_same_views_in_si_units(smoke_root: Path) -> None:
+    with fleet_slip.connect(smoke_root) as database:
+        worst = database.execute(
+            "SELECT max(abs(c.ax * 0.001 - l.ax_mps2)), "
+            "max(abs(l.sideslip_rad - atan2(vy_mps, vx_mps))) "
+            "FROM log l JOIN log_counts c ON c.drive_id = l.drive_id AND c.tick = l.tick"
+        ).fetchone()
+    assert worst is not None
+    assert worst[0] < 1e-12
+    assert worst[1] < 0.01
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        "COPY (SELECT 1) TO 'stolen.csv'",
+        "EXPLAIN ANALYZE COPY (SELECT 1) TO 'stolen.csv'",
+        "SELECT * FROM read_csv('/etc/passwd')",
+        "ATTACH 'other.db'",
+        "SET enable_external_access = true",
+        "SELECT 1; SELECT 2",
+        "INSTALL httpfs",
+        "SELEC 1",
+        "SELECT nothing FROM drives",
+    ],
+)
+def test_sql_only_reads_the_warehouse(
+    run_command: RunCommand, smoke_root: Path, tmp_path: Path, query: str
+) -> None:
+    done = run_command("sql", query, root=smoke_root)
+    assert done.exit_code == 5 or (done.exit_code == 6 and "passwd" in query)
+    assert done.stderr.startswith("error: ")
+    assert not list(tmp_path.glob("stolen*"))
+
+
+def test_publish_show_score_promote_and_roll_back(run_command: RunCommand, tmp_path: Path) -> None:
+    run_command("run", "--campaign", "smoke")
+    again = run_command("publish", "smoke", "--cohort", "campaign = 'smoke'", "--json").json
+    assert (again["version"], again["new"]) == (1, False)
+    worse = run_command("publish", "smoke", "--nested", "ax")
+    assert worse.exit_code == 7
+    assert "worse than the champion" in worse.stderr
+    forced = run_command("publish", "smoke", "--nested", "ax", "--force", "--json").json
+    assert (forced["version"], forced["new"]) == (2, True)
+    assert run_command("show", "smoke", "--json").json["version"] == 2
+    assert run_command("rollback", "smoke").exit_code == 0
+    shown = run_command("show", "smoke@champion", "--json").json
+    assert shown["version"] == 1
+    score = run_command("score", "smoke", "--json").json
+    assert score["rows"] == shown["trained_on"]["rows"]
+    assert 0 < score["error_median_deg"] < score["error_p95_deg"] < score["error_max_deg"]
+    assert abs(score["error_mean_deg"]) < 1e-9  # an OLS fit has no mean error on its own rows
+    assert run_command("promote", "smoke@2", "--alias", "shadow").exit_code == 0
+    listed = run_command("models", "--json").json
+    assert [(m["version"], m["aliases"]) for m in listed] == [(1, "champion"), (2, "shadow")]
+    assert "rollback" in run_command("models", "smoke").stdout
+    assert "ax_mps2" in run_command("show", "smoke@2").stdout
+
+
+def test_the_grams_agree_however_computed(run_command: RunCommand, smoke_root: Path) -> None:
+    report = run_command("check", "--json", root=smoke_root).json
+    assert report["drives"] >= report["files"] == report["drives_by_integers"] > 0
+    assert "sum(ax::INTEGER * ax::INTEGER)" in run_command("gram", "--sql").stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "exit_code", "message"),
+    [
+        (["run", "--campaign", "nowhere"], 3, "Known: fleet, smoke, waterford"),
+        (["run", "--campaign", "missing.toml"], 3, "no such file"),
+        (["run", "--campaign", "smoke", "--through", "yesterday"], 3, "write it as 2024-05-01"),
+        (["run", "--campaign", "smoke", "--through", "1999-01-01"], 3, "lasts from"),
+        (["select", "--cohort", "campaign = 'none'"], 5, "no drive satisfies"),
+        (["select", "--cohort", "campain = 'x'"], 5, "campain"),
+        (["select", "--cohort", "true) OR (true"], 5, ""),
+        (["select", "--cohort", "1; DROP VIEW grams"], 5, "not valid SQL"),
+        (["select", "--nested", "ax,beta"], 3, "beta is not an input"),
+        (["select", "--models", "table9"], 3, "Known: table1"),
+        (["select", "--by", "vehicle"], 5, "at least two folds"),
+        (["show", "nothing"], 5, "no model is called"),
+        (["score", "smoke@9"], 5, "has no version"),
+        (["score", "smoke", "--cohort", "mass_kg > 9000"], 5, "no row of the cohort"),
+        (["ingest", "none.csv", "--mapping", "race_car_250lm"], 4, "none.csv"),
+        (["ingest", "none.csv", "--mapping", "unknown"], 3, "Known: race_car_250lm"),
+        (["select", "--folds", "1"], 2, ""),
+        (["publish", "Bad Name!"], 3, "cannot be the name of a model"),
+    ],
+)
+def test_a_mistake_is_one_line_and_its_exit_code(
+    run_command: RunCommand, smoke_root: Path, arguments: list[str], exit_code: int, message: str
+) -> None:
+    done = run_command(*arguments, root=smoke_root)
+    assert done.exit_code == exit_code or message == "", done
+    assert message in done.stderr
+    assert done.stdout == "" or message == ""
+
+
+def test_commands_on_an_empty_warehouse_say_how_to_begin(
+    run_command: RunCommand, tmp_path: Path
+) -> None:
+    (tmp_path / "data").mkdir()
+    assert run_command("select").exit_code == 5
+    assert "fleet-slip simulate" in run_command("select").stderr
+    assert run_command("check").exit_code == 5
+    assert run_command("sql", "FROM log", "--json").json == []
+    assert run_command("sql", "FROM drives", "--json").json == []
+    assert run_command("models", "--json").json == []
+    assert run_command("gram", "--json").json["files_read"] == 0
+
+
+def test_a_changed_campaign_is_refused_and_changes_nothing(
+    run_command: RunCommand, tmp_path: Path
+) -> None:
+    from fleet_slip.resources import find_config  # noqa: PLC0415
+
+    text = find_config("campaigns", "smoke").read_text()
+    (tmp_path / "mine.toml").write_text(text)
+    assert run_command("simulate", "./mine.toml").exit_code == 0
+    before = run_command("sql", "SELECT count(*) AS n FROM log", "--json").json
+    seed = next(line for line in text.splitlines() if line.startswith("seed"))
+    (tmp_path / "mine.toml").write_text(text.replace(seed, "seed = 999"))
+    changed = run_command("simulate", "./mine.toml")
+    assert changed.exit_code == 7
+    assert "was changed since this day was simulated" in changed.stderr
+    assert run_command("sql", "SELECT count(*) AS n FROM log", "--json").json == before
+
+
+def test_two_runs_at_once_do_the_job_once(tmp_path: Path, smoke_root: Path) -> None:
+    command = [COMMAND, "--root", str(tmp_path / "data"), "run", "--campaign", "smoke", "--json"]
+    runs = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(3)]
+    reports = [json.loads(run.communicate()[0]) for run in runs]
+    assert sorted(report["changed"] for report in reports) == [False, False, True]
+    alone = Warehouse(LocalFolder(smoke_root)).logs.snapshot()
+    together = Warehouse(LocalFolder(tmp_path / "data")).logs.snapshot()
+    assert [file.path for file in together.files] == [file.path for file in alone.files]
+    assert len(list((tmp_path / "data" / "models" / "smoke" / "versions").iterdir())) == 1
+
+
+def test_simulations_and_gram_jobs_at_once_lose_and_double_nothing(
+    tmp_path: Path, smoke_root: Path
+) -> None:
+    root = str(tmp_path / "data")
+    jobs = [["simulate", "smoke"], ["simulate", "smoke"], ["gram"], ["simulate", "smoke"], ["gram"]]
+    running = [subprocess.Popen([COMMAND, "--root", root, *job]) for job in jobs]
+    assert [process.wait() for process in running] == [0] * len(jobs)
+    subprocess.run([COMMAND, "--root", root, "gram"], check=True)
+    query = "SELECT drive_id, n, sums, products FROM grams ORDER BY ALL"
+    with fleet_slip.connect(root) as mine, fleet_slip.connect(smoke_root) as other:
+        assert mine.execute(query).fetchall() == other.execute(query).fetchall()
+
+
+def test_help_teaches_and_version_is_told(run_command: RunCommand) -> None:
+    text = run_command("--help").stdout
+    for command in (
+        "run",
+        "simulate",
+        "ingest",
+        "gram",
+        "select",
+        "publish",
+        "sql",
+        "shell",
+        "score",
+    ):
+        assert command in text
+    assert "Exit codes" in text
+    assert run_command("--version").stdout.startswith("fleet-slip ")
+    assert run_command().exit_code in (0, 2)
+
+
+def test_the_shell_answers_statements_and_survives_mistakes(
+    run_command: RunCommand, smoke_root: Path
+) -> None:
+    typed = "SELECT count(*) AS drives\nFROM drives;\nSELEC;\nSELECT 41 + 1 AS answer;\n.quit\n"
+    done = run_command("shell", root=smoke_root, input=typed)
+    assert done.exit_code == 0
+    assert "answer" in done.stdout
+    assert "42" in done.stdout
+    assert "error: not valid SQL" in done.stderr
+
+
+def test_json_is_alone_on_stdout(run_command: RunCommand, smoke_root: Path) -> None:
+    for command in (["models"], ["select"], ["run", "--campaign", "smoke"], ["show", "smoke"]):
+        json.loads(run_command(*command, "--json", root=smoke_root).stdout)

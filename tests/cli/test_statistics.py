@@ -1,0 +1,304 @@
+"""Selection, diagnostics and what-if by command, and against a campaign with worse sensors."""
+
+import math
+import re
+import subprocess
+from pathlib import Path
+
+import duckdb
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import fleet_slip
+from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.cli.main import app
+from fleet_slip.errors import FleetSlipError
+from fleet_slip.resources import find_config
+from tests.conftest import COMMAND, Finished, RunCommand
+
+NOISE = {
+    "ax": 0.1,
+    "ay": 0.1,
+    "yaw_rate": 0.01,
+    "steering_wheel": 0.002,
+    "wheel_fl": 0.02,
+    "wheel_fr": 0.02,
+}
+"""The smoke campaign's sensors, in SI units."""
+
+
+def run(root: Path, *arguments: str) -> None:
+    subprocess.run([COMMAND, "--root", str(root), *arguments], check=True, cwd=root.parent)
+
+
+@pytest.fixture
+def run_command(tmp_path: Path) -> RunCommand:
+    """Run a command in this process, which saves the second that a process takes to start."""
+
+    def invoke(*arguments: str, root: Path | None = None) -> Finished:
+        data = str(root or tmp_path / "data")
+        done = CliRunner().invoke(app, ["--root", data, *arguments])
+        if isinstance(done.exception, FleetSlipError):
+            return Finished(done.exception.exit_code, done.stdout, f"error: {done.exception}")
+        assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+        return Finished(done.exit_code, done.stdout, done.stderr)
+
+    return invoke
+
+
+@pytest.fixture(scope="module")
+def smoke_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data root with the smoke campaign, its model and all feature sets."""
+    root = tmp_path_factory.mktemp("statistics") / "data"
+    run(root, "run", "--campaign", "smoke")
+    run(root, "gram", "--features", "all")
+    return root
+
+
+def test_all_sets_are_up_to_date(run_command: RunCommand, smoke_root: Path) -> None:
+    reports = run_command("gram", "--features", "all", "--json", root=smoke_root).json
+    assert [report["files_read"] for report in reports] == [0] * len(reports)
+    assert [report["feature_set"] for report in reports] == [
+        features().identity(name) for name in (PLAIN, *features().sets)
+    ]
+
+
+def test_a_criterion_chooses_from_a_ranking_and_says_how_sure(
+    run_command: RunCommand, smoke_root: Path
+) -> None:
+    nested = ("--nested", "ax,ay,yaw_rate,steering_wheel,steer_fl")
+    arguments = ("select", *nested, "--rank", "backward", "--criterion", "bic")
+    report = run_command(
+        *arguments, "--bootstrap", "200", "--repeat", "5", "--json", root=smoke_root
+    ).json
+    choice = report["choice"]
+    assert sorted(choice["order"]) == ["ax", "ay", "steer_fl", "steering_wheel", "yaw_rate"]
+    best = min(range(6), key=lambda j: choice["criterion_values"][j])
+    assert report["winner"] == f"first {best}"
+    assert choice["evidence"] == "drives"
+    assert choice["effective_rows"] < report["rows"] / 10
+    winner = report["models"][best - 1]
+    interval = report["uncertainty"]["interval"]
+    assert interval["low"] < winner["correlation"] < interval["high"]
+    assert abs(choice["honest"]["correlation"] - winner["correlation"]) < 0.01
+    naive = run_command(*arguments, "--naive", "--json", root=smoke_root).json
+    assert naive["choice"]["effective_rows"] == naive["rows"]
+    table = run_command(*arguments, root=smoke_root).stdout
+    assert "order by backward" in table
+    assert "made again inside every training fold" in table
+
+
+def test_all_subsets_report_the_best_of_every_size(
+    run_command: RunCommand, smoke_root: Path
+) -> None:
+    report = run_command(
+        "select", "--all-subsets", "--nested", "ax,ay,yaw_rate,steer_fl", "--json", root=smoke_root
+    ).json
+    subsets = report["choice"]["subsets"]
+    assert [one["size"] for one in subsets] == [0, 1, 2, 3, 4]
+    gains = [one["r_squared"] for one in subsets]
+    assert gains == sorted(gains)
+    assert set(report["choice"]["picks"]) >= {"cp", "bic", "ric", "cic"}
+    assert [len(model["signals"]) for model in report["models"]] == [1, 2, 3, 4]
+
+
+def test_a_model_names_the_rows_that_it_was_made_of(
+    run_command: RunCommand, smoke_root: Path
+) -> None:
+    report = run_command("select", "--json", root=smoke_root).json
+    model = report["models"][1]
+    assert model["drives"] == report["drives"] == 8
+    with fleet_slip.connect(smoke_root) as database:
+        row = database.execute(
+            f"SELECT count(DISTINCT drive_id), sum(n) FROM grams WHERE {model['gram_rows']}"
+        ).fetchone()
+    assert row == (model["drives"], model["rows"])
+
+
+def test_folds_of_rows_are_labelled_as_leaking(run_command: RunCommand, smoke_root: Path) -> None:
+    leaking = run_command("select", "--by", "row", root=smoke_root)
+    assert "leak" in leaking.stderr
+    by_row = run_command("select", "--by", "row", "--json", root=smoke_root).json
+    by_drive = run_command("select", "--json", root=smoke_root).json
+    assert by_row["folds"] == {"by": "row", "count": 5, "leaking": True}
+    for leaky, honest in zip(by_row["models"], by_drive["models"], strict=True):
+        assert leaky["rows"] == honest["rows"]
+        assert leaky["rmse_deg"] < honest["rmse_deg"]
+
+
+def test_a_published_model_with_features_explains_and_evaluates_them(
+    run_command: RunCommand, smoke_root: Path
+) -> None:
+    nested = ("--nested", "ay,steer_fl,curvature,speed_squared")
+    arguments = ("--features", "motion", *nested, "--rank", "declared", "--criterion", "cp")
+    done = run_command("publish", "curved", *arguments, "--json", root=smoke_root)
+    assert done.exit_code == 0, done.stderr
+    shown = run_command("show", "curved", "--json", root=smoke_root).json
+    terms = {term["signal"]: term for term in shown["terms"]}
+    assert terms["curvature"]["sql"] == features().features["curvature"].sql
+    assert (terms["curvature"]["unit"], terms["ay"]["sql"]) == ("rad/m", "")
+    assert shown["trained_on"]["feature_set"] == features().identity("motion")
+    assert "CASE WHEN" in run_command("show", "curved", root=smoke_root).stdout
+    score = run_command("score", "curved", "--json", root=smoke_root).json
+    assert score["rows"] == shown["trained_on"]["rows"]
+    assert abs(score["error_mean_deg"]) < 1e-9  # an OLS fit has no mean error on its own rows
+    with fleet_slip.connect(smoke_root) as database:
+        rows = database.sql("FROM log_counts").to_arrow_table()
+    computed = duckdb.connect()
+    computed.register("log_counts", rows)
+    columns = [terms[name]["sql"] or name for name in terms]
+    counts = computed.execute(f"SELECT {', '.join(columns)}, sideslip FROM log_counts")
+    matrix = np.array(counts.fetchall(), dtype=np.float64)
+    scales = np.array([term["scale"] for term in terms.values()], dtype=np.float64)
+    weights = np.array([term["coefficient"] for term in terms.values()])
+    error = matrix[:, :-1] @ (scales * weights) + shown["intercept"] - matrix[:, -1] * 1e-4
+    assert score["rmse_deg"] == pytest.approx(math.degrees(math.sqrt(np.mean(error**2))), rel=1e-9)
+    again = run_command("publish", "curved", *arguments, "--json", root=smoke_root).json
+    assert not again["new"]
+
+
+def test_diagnose_shows_both_kinds_of_errors_and_the_serial_correlation(
+    run_command: RunCommand, smoke_root: Path
+) -> None:
+    arguments = ("diagnose", "--signals", "ay,steer_fl", "--serial", "--sensor-noise", "ay=0.1")
+    report = run_command(*arguments, "--json", root=smoke_root).json
+    for naive, robust in zip(report["by_rows"], report["by_drives"], strict=True):
+        assert naive["value"] == robust["value"]
+        assert robust["standard_error"] > naive["standard_error"]
+    assert report["effective_rows"] < report["rows"]
+    # e_t - e_{t-1} has the variance 2 (1 - rho), but for the ends of the drives.
+    serial = report["serial"]
+    assert serial["durbin_watson"] == pytest.approx(2 * (1 - serial["rho"]), rel=0.01)
+    weights = {estimate["name"]: estimate["value"] for estimate in report["by_rows"]}
+    assert abs(report["noise_free"]["ay"]) > abs(weights["ay"])  # noise attenuates
+    fast, slow = "speed_factor > 0.85", "speed_factor <= 0.85"
+    compared = ("diagnose", "--signals", "ay", "--cohort", fast, "--against", slow)
+    against = run_command(*compared, "--json", root=smoke_root).json["against"]
+    assert against["chow_rows_independent"]["f"] > against["wald_drives_independent"]["f"] > 0
+    assert "Wald, by drives" in run_command(*compared, root=smoke_root).stdout
+
+
+def test_what_if_agrees_with_a_campaign_of_doubled_noise(
+    run_command: RunCommand, smoke_root: Path, tmp_path: Path
+) -> None:
+    text = find_config("campaigns", "smoke").read_text()
+    stds = ("acceleration_std_mps2", "yaw_rate_std_rad_s", "wheel_speed_std_rad_s")
+    for name in (*stds, "steering_wheel_std_rad"):
+        std = re.search(rf"{name} = (.+)", text)
+        assert std is not None
+        text = text.replace(std[0], f"{name} = {2 * float(std[1])}")
+    (tmp_path / "noisy.toml").write_text(text)
+    noisy = tmp_path / "noisy"
+    run(noisy, "simulate", str(tmp_path / "noisy.toml"))
+    nested = ("--nested", ",".join(NOISE), "--rank", "declared", "--criterion", "aic", "--naive")
+    run_command("publish", "doubled", *nested, root=smoke_root)
+    shown = run_command("show", "doubled", "--json", root=smoke_root).json
+    used = [term["signal"] for term in shown["terms"]]
+    # Noise of twice the standard deviation is what there is, plus noise of sqrt(3) times it.
+    options = [
+        word for name in used for word in ("--noise", f"{name}={NOISE[name] * math.sqrt(3)}")
+    ]
+    predicted = run_command("what-if", "doubled", *options, "--json", root=smoke_root).json
+    (noisy / "models").symlink_to(smoke_root / "models")
+    simulated = run_command("score", "doubled", "--json", root=noisy).json
+    assert predicted["after"]["rmse_deg"] > 1.2 * predicted["before"]["rmse_deg"]
+    assert predicted["after"]["rmse_deg"] == pytest.approx(simulated["rmse_deg"], rel=0.01)
+    assert predicted["after"]["correlation"] == pytest.approx(simulated["correlation"], abs=1e-3)
+    assert predicted["refitted_after"]["rmse_deg"] < predicted["after"]["rmse_deg"]
+    # A bias of d in one signal moves the mean error by its coefficient times d.
+    weight = next(term["coefficient"] for term in shown["terms"] if term["signal"] == "ay")
+    biased = run_command("what-if", "doubled", "--bias", "ay=0.5", "--json", root=smoke_root).json
+    moved = biased["after"]["error_mean_deg"] - biased["before"]["error_mean_deg"]
+    assert moved == pytest.approx(math.degrees(weight * 0.5), rel=1e-9)
+
+
+def test_regimes_compare_one_model_with_one_for_each(
+    run_command: RunCommand, smoke_root: Path
+) -> None:
+    arguments = ("regimes", "--over", "speed", "--signals", "ay,steer_fl,yaw_rate")
+    report = run_command(*arguments, "--json", root=smoke_root).json
+    rows = [one["rows"] for one in report["regimes"]]
+    assert sum(rows) == report["pooled"]["rows"] == report["split"]["rows"]
+    squares = sum(
+        n * one["pooled"]["rmse_deg"] ** 2 for n, one in zip(rows, report["regimes"], strict=True)
+    )
+    assert math.sqrt(squares / sum(rows)) == pytest.approx(report["pooled"]["rmse_deg"], rel=1e-9)
+    whole = run_command(
+        "select", "--nested", "ay,steer_fl,yaw_rate", "--json", root=smoke_root
+    ).json["models"][-1]
+    assert report["pooled"]["correlation"] == pytest.approx(whole["correlation"], rel=1e-12)
+    assert report["winner"] == (
+        "split" if report["gain"] > report["gain_standard_error"] else "pooled"
+    )
+    assert "Choose" in run_command(*arguments, root=smoke_root).stdout
+
+
+def test_shrinkage_is_compared_with_least_squares(
+    run_command: RunCommand, smoke_root: Path
+) -> None:
+    report = run_command("shrink", "--signals", "ay,ax,steer_fl", "--json", root=smoke_root).json
+    by_name = {method["name"]: method for method in report["methods"]}
+    assert set(by_name) >= {"least squares", "ridge", "lasso", "pace2", "pace6", "eb"}
+    plain = by_name["least squares"]["correlation"]
+    for method in by_name.values():
+        assert method["correlation"] == pytest.approx(plain, abs=0.05)
+    assert by_name["ridge"]["penalty"] > 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "exit_code", "message"),
+    [
+        (["gram", "--features", "mood"], 5, "Feature sets: signals, motion"),
+        (["select", "--features", "mood"], 5, "Feature sets: signals, motion"),
+        (["select", "--nested", "curvature"], 3, "not an input"),
+        (["select", "--rank", "luck"], 5, "Known rankings: declared"),
+        (["select", "--criterion", "luck"], 5, "Known criteria: cv, cp"),
+        (["select", "--models", "table1", "--rank", "t"], 3, "leave out --models"),
+        (["select", "--all-subsets", "--rank", "t"], 3, "needs no order"),
+        (["select", "--by", "row", "--features", "motion"], 5, "sets that make them: rows"),
+        (["select", "--by", "row", "--bootstrap", "100"], 5, "Fold by drive"),
+        (["what-if", "smoke"], 3, "--noise ay=0.2"),
+        (["what-if", "smoke", "--noise", "ay"], 3, "write SIGNAL=NUMBER"),
+        (["what-if", "smoke", "--noise", "vx=1"], 5, "noise is given for vx"),
+        (["what-if", "nothing", "--noise", "ay=1"], 5, "no model is called"),
+        (["what-if", "smoke", "--signals", "ay", "--noise", "ay=1"], 3, "not both"),
+        (["regimes", "--over", "mood"], 5, "it has speed, ay"),
+        (["regimes", "--by", "row"], 5, "fold by drive"),
+        (["shrink", "--by", "row"], 5, "Fold by drive"),
+        (["regimes", "--features", "motion"], 5, "Sets with regimes: regimes"),
+        (["diagnose", "--signals", "ay,ay"], 3, "stands twice"),
+        (["diagnose", "smoke", "--against", "speed_factor > 0.85"], 5, "AND NOT (speed_factor"),
+    ],
+)
+def test_a_mistake_is_one_line_and_its_exit_code(
+    run_command: RunCommand, smoke_root: Path, arguments: list[str], exit_code: int, message: str
+) -> None:
+    done = run_command(*arguments, root=smoke_root)
+    assert done.exit_code == exit_code, done
+    assert message in done.stderr.replace("\n", " ")
+    assert done.stdout == ""
+
+
+def test_noise_inside_a_feature_has_no_closed_form(
+    run_command: RunCommand, smoke_root: Path
+) -> None:
+    arguments = ("what-if", "--features", "motion", "--signals", "ay,ay_signed_square")
+    done = run_command(*arguments, "--noise", "ay=0.1", root=smoke_root)
+    assert done.exit_code == 5
+    assert "ay_signed_square" in done.stderr
+
+
+def test_a_set_that_was_not_computed_says_how(run_command: RunCommand, tmp_path: Path) -> None:
+    run_command("simulate", "smoke", "--days", "1")
+    run_command("gram")
+    done = run_command("select", "--features", "motion")
+    assert done.exit_code == 5
+    assert "fleet-slip gram --features motion" in done.stderr
+
+
+def test_features_are_listed(run_command: RunCommand) -> None:
+    assert "curvature" in run_command("features").stdout
+    assert "10 folds of rows" in run_command("features", "--sets").stdout
+    listed = run_command("features", "--json").json
+    assert listed["sets"]["motion"]["identity"] == features().identity("motion")

@@ -1,0 +1,212 @@
+"""The sums of a cohort are those of its Gram rows, whatever the batches and the folds."""
+
+from datetime import timedelta
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from benchmarks.growth_history import write_fleet, write_grams
+from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.errors import FleetSlipError, SelectionError
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.grams import reader as gram_reader
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.day_sums import sum_days
+from fleet_slip.grams.fold_sums import sum_cohort
+from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.reader import GramReader
+from fleet_slip.selection.compare import select
+from fleet_slip.selection.model_list import FoldKey, FoldPlan, load_model_list
+from fleet_slip.selection.request import SelectionPlan, run_plan
+from fleet_slip.views import TABLES, connect, tables_in
+from fleet_slip.warehouse.tables import Warehouse
+from tests.conftest import DAY, land, log_rows, random_counts
+
+MODELS = load_model_list("table1")
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Warehouse:
+    """Return a warehouse of 60 drives, each of its own car, over three days."""
+    warehouse = Warehouse(LocalFolder(tmp_path_factory.mktemp("fleet")))
+    write_fleet(warehouse, 60)
+    return warehouse
+
+
+@pytest.mark.parametrize("by", ["drive", "vehicle", "track", "day", "mass", "adhesion"])
+@pytest.mark.parametrize("batch", [7, 1000])
+def test_sums_equal_those_of_the_cohort(
+    fleet: Warehouse, monkeypatch: pytest.MonkeyPatch, by: FoldKey, batch: int
+) -> None:
+    monkeypatch.setattr(gram_reader, "BATCH_ROWS", batch)
+    plan = FoldPlan(by=by, count=4)
+    cohort = load_cohort(fleet, "adhesion > 0.65")
+    summed = sum_cohort(fleet, plan, "adhesion > 0.65")
+    one, two = (each.folds(plan.by, plan.count) for each in (cohort, summed))
+    assert one.names == two.names
+    assert one.tables == two.tables
+    assert (summed.rows, summed.drive_count) == (cohort.rows, cohort.drive_count)
+    assert summed.inputs == cohort.inputs
+    assert summed.gram_condition(["ax"]) == cohort.gram_condition(["ax"])
+
+
+def test_drives_with_fewer_signals_serve_the_models_that_they_can(warehouse: Warehouse) -> None:
+    rng = np.random.default_rng(1)
+    rows = []
+    for i in range(36):
+        counts = random_counts(rng, 40)
+        if i % 3 == 0:  # no wheel speeds in any row, or in some: then two Gram rows
+            for name in [name for name in counts if name.startswith("wheel")]:
+                counts[name] = pa.array(counts[name], mask=np.arange(40) >= 20 * (i % 2))
+        rows.append(log_rows(f"drive-{i}", counts))
+    land(warehouse, "one", *rows)
+    update_grams(warehouse)
+    plan = FoldPlan(count=3)
+    whole = select(load_cohort(warehouse), MODELS.model, plan)
+    summed = select(sum_cohort(warehouse, plan), MODELS.model, plan)
+    assert summed.as_dict() == whole.as_dict()
+    assert {model.drives for model in summed.models} == {30, 36}, summed.skipped
+
+
+@pytest.mark.parametrize("batch", [7, 1000])
+def test_days_add_up_to_those_of_the_drives(
+    warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch, batch: int
+) -> None:
+    monkeypatch.setattr(gram_reader, "BATCH_ROWS", batch)
+    rng = np.random.default_rng(1)
+    for number in range(3):
+        rows = []
+        for i in range(12):
+            counts = random_counts(rng, 40)
+            if i % 3 == 0:  # the steering wheel in no row, or in some: then two Gram rows
+                mask = np.arange(40) >= 20 * (i % 2)
+                counts["steering_wheel"] = pa.array(counts["steering_wheel"], mask=mask)
+            rows.append(log_rows(f"drive-{number}-{i}", counts))
+        land(warehouse, str(number), *rows, day=DAY + timedelta(days=number))
+    update_grams(warehouse)
+    for inputs in (["ax"], ["ax", "steering_wheel"]):
+        served = load_cohort(warehouse).serving(inputs)
+        sums = sum_days(warehouse, inputs)
+        days = served.drives["day"].to_pylist()
+        assert sums.days == tuple(sorted(set(days)))
+        assert sums.drives == tuple(days.count(day) for day in sums.days)
+        for day, gram in zip(sums.days, sums.grams, strict=True):
+            assert gram == served.table.total(np.array([one == day for one in days]))
+    with pytest.raises(SelectionError, match="no drive satisfies"):
+        sum_days(warehouse, ["ax"], "mass_kg > 1e9")
+    with pytest.raises(SelectionError, match="no drive of the cohort has all of"):
+        sum_days(warehouse, ["steering_wheel"], "drive_id IN ('drive-0-0', 'drive-0-6')")
+
+
+def test_a_listed_selection_is_the_same_either_way(fleet: Warehouse) -> None:
+    whole = select(load_cohort(fleet), MODELS.model, MODELS.folds)
+    planned = run_plan(fleet, SelectionPlan()).selection
+    assert planned.as_dict() == whole.as_dict()
+
+
+@pytest.mark.parametrize(
+    "condition",
+    ["mass_kg > 1e9", "no_such_column = 1", "mass_kg >", "drive_id = 'drive-000000001'"],
+)
+def test_errors_are_those_of_the_cohort(fleet: Warehouse, condition: str) -> None:
+    with pytest.raises(FleetSlipError) as whole:
+        load_cohort(fleet, condition).folds("drive", 5)
+    with pytest.raises(type(whole.value)) as summed:
+        sum_cohort(fleet, FoldPlan(), condition)
+    assert str(summed.value) == str(whole.value)
+
+
+def test_sums_of_other_folds_are_refused(fleet: Warehouse) -> None:
+    with pytest.raises(ValueError, match="sums are over"):
+        sum_cohort(fleet, FoldPlan()).folds("drive", 7)
+
+
+def test_folds_of_rows_need_a_set_that_made_them(fleet: Warehouse) -> None:
+    with pytest.raises(SelectionError, match="of whole drives"):
+        sum_cohort(fleet, FoldPlan(by="row"))
+
+
+def test_gram_job_takes_the_made_history_for_its_own(fleet: Warehouse) -> None:
+    assert not update_grams(fleet).changed
+
+
+@pytest.mark.parametrize(
+    ("query", "expected"),
+    [
+        ("SELECT count(*) FROM Grams", {"grams"}),
+        ('FROM "log" LIMIT 1', {"log", "log_counts"}),
+        ("FROM drives", {"drives", "grams", "log_counts"}),
+        ("FROM models -- and runs", {"models", "runs"}),
+        ("SHOW TABLES", TABLES),
+        ("SELECT 1", TABLES),
+        ("FROM duckdb_columns() WHERE table_name = 'log'", TABLES),
+        ("SELECT * FROM dictionary", TABLES),
+    ],
+)
+def test_a_query_opens_what_it_names(query: str, expected: set[str]) -> None:
+    assert tables_in(query) == expected
+
+
+def test_a_query_of_gram_rows_needs_no_log_file(tmp_path: Path) -> None:
+    warehouse = Warehouse(LocalFolder(tmp_path))
+    write_fleet(warehouse, 20)
+    for path in warehouse.logs.snapshot().paths:
+        Path(path).unlink()
+    query = "SELECT count(*) FROM grams"
+    with connect(tmp_path, query=query) as database:
+        assert database.execute(query).fetchone() == (20,)
+    assert run_plan(warehouse, SelectionPlan()).selection.cohort.drive_count == 20
+
+
+def test_a_query_of_a_day_needs_the_files_of_that_day(tmp_path: Path) -> None:
+    warehouse = Warehouse(LocalFolder(tmp_path))
+    write_fleet(warehouse, 60)
+    first, *_, last = sorted({str(file.day) for file in warehouse.logs.snapshot().files})
+    for path in warehouse.logs.snapshot().paths:
+        if f"day={last}" in path:
+            Path(path).write_bytes(b"no Parquet file")
+    query = f"SELECT count(DISTINCT drive_id) FROM log WHERE day = DATE '{first}'"
+    with connect(tmp_path, query=query) as database:
+        assert database.execute(query).fetchone() == (20,)
+
+
+def test_files_with_other_columns_are_read_by_name(tmp_path: Path) -> None:
+    warehouse = Warehouse(LocalFolder(tmp_path))
+    counts = random_counts(np.random.default_rng(1), 10)
+    for number, dropped in enumerate(["gps_vx", "steer_fl", ""]):
+        rows = log_rows(f"drive-{number}", counts)
+        kept = rows.drop_columns([dropped]) if dropped else rows
+        land(warehouse, str(number), kept)
+        assert warehouse.logs.snapshot().has_same_columns is (number == 0)
+    query = "SELECT count(gps_vx), count(steer_fl), count(ax) FROM log_counts"
+    with connect(tmp_path, query=query) as database:
+        assert database.execute(query).fetchone() == (20, 20, 30)
+
+
+def test_a_reader_opens_anew_only_what_changed(tmp_path: Path) -> None:
+    warehouse = Warehouse(LocalFolder(tmp_path))
+    write_fleet(warehouse, 20)
+    plan = FoldPlan(count=3)
+    elsewhere = "drive_id IN (SELECT drive_id FROM drives WHERE adhesion > 0.7)"
+    with GramReader(warehouse) as reader:
+        before = sum_cohort(reader, plan)
+        opened = reader.opened("true", PLAIN).database
+        assert reader.opened("adhesion > 0.7", PLAIN).database is opened
+        assert sum_cohort(reader, plan, elsewhere).drive_count == 14
+        assert sum_cohort(reader, plan).sums.tables == before.sums.tables
+        write_grams(warehouse, warehouse.logs.snapshot().paths[:1], 10)
+        after = sum_cohort(reader, plan)
+        assert after.sums.tables == sum_cohort(warehouse, plan).sums.tables
+        assert after.grams_version == before.grams_version + 1
+        assert after.rows > before.rows
+
+
+def test_a_reader_reads_again_what_came_after_the_table(tmp_path: Path) -> None:
+    warehouse = Warehouse(LocalFolder(tmp_path))
+    with GramReader(warehouse) as reader:
+        with pytest.raises(SelectionError, match="no Gram rows yet"):
+            sum_cohort(reader, FoldPlan())
+        write_fleet(warehouse, 20)
+        assert sum_cohort(reader, FoldPlan()).drive_count == 20

@@ -1,0 +1,201 @@
+"""The Gram job against plain Python integers, and its reconciliation with the logs."""
+
+from itertools import permutations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.delta import Change, Unit
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.grams import job as gram_job
+from fleet_slip.grams.check import check_grams, grams_of
+from fleet_slip.grams.job import (
+    aggregate,
+    find_backlog,
+    update_grams,
+)
+from fleet_slip.grams.statement import gram_statement
+from fleet_slip.warehouse.tables import Warehouse
+from tests.conftest import DAY, land, log_rows, random_counts
+
+NAMES = catalogue().gram_signals
+
+
+def integer_gram(columns: list[list[int]]) -> tuple[list[int], list[int]]:
+    """Sums and packed products by Python integers."""
+    products = [
+        sum(x * y for x, y in zip(columns[i], columns[j], strict=True))
+        for i in range(len(columns))
+        for j in range(i + 1)
+    ]
+    return [sum(column) for column in columns], products
+
+
+def stored(warehouse: Warehouse) -> dict[tuple[str, tuple[str, ...]], Any]:
+    paths = warehouse.grams.snapshot().paths
+    return grams_of(pa.concat_tables([pa.parquet.read_table(path) for path in paths]))
+
+
+def test_gram_rows_equal_sums_of_python_integers_at_the_ends_of_int16(warehouse: Warehouse) -> None:
+    counts = {name: random_counts(np.random.default_rng(i), 3000) for i, name in enumerate("ab")}
+    land(warehouse, "one", *(log_rows(drive, c) for drive, c in counts.items()))
+    update_grams(warehouse)
+    for drive, gram in ((key[0], gram) for key, gram in stored(warehouse).items()):
+        columns = [counts[drive][name].tolist() for name in NAMES]
+        assert (list(gram.sums), list(gram.products)) == integer_gram(columns)
+        assert (gram.n, gram.signals) == (3000, NAMES)
+
+
+def test_rows_that_lack_signals_have_gram_rows_of_their_own(warehouse: Warehouse) -> None:
+    counts = random_counts(np.random.default_rng(1), 100)
+    whole = {name: counts[name].tolist() for name in NAMES}
+    holes = dict(whole, ay=[None if i % 3 == 0 else v for i, v in enumerate(whole["ay"])])
+    absent = {name: values for name, values in whole.items() if not name.startswith("wheel")}
+    land(warehouse, "one", log_rows("holes", holes), log_rows("absent", absent))
+    update_grams(warehouse)
+    grams = stored(warehouse)
+    assert {(drive, gram.n) for (drive, _), gram in grams.items()} == {
+        ("holes", 34), ("holes", 66), ("absent", 100),
+    }  # fmt: skip
+    without_ay = tuple(name for name in NAMES if name != "ay")
+    with_hole = [whole[name][::3] for name in without_ay]
+    assert list(grams["holes", without_ay].products) == integer_gram(with_hole)[1]
+    few = tuple(name for name in NAMES if not name.startswith("wheel"))
+    assert list(grams["absent", few].products) == integer_gram([whole[name] for name in few])[1]
+    assert check_grams(warehouse, 1).drives == 3
+
+
+@settings(
+    max_examples=8,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+@given(seed=st.integers(0, 2**32), pieces=st.integers(1, 4), threads=st.integers(1, 3))
+def test_rows_do_not_depend_on_files_order_or_threads(
+    tmp_path_factory: pytest.TempPathFactory, seed: int, pieces: int, threads: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    drives = [log_rows(f"d{i}", random_counts(rng, int(rng.integers(2, 400)))) for i in range(4)]
+    expected = None
+    for split in (1, pieces):
+        warehouse = Warehouse(LocalFolder(tmp_path_factory.mktemp("root")))
+        shuffled = [drives[i] for i in rng.permutation(4)]
+        for number, part in enumerate(np.array_split(np.arange(4), split)):
+            rows = [shuffled[i].take(rng.permutation(len(shuffled[i]))) for i in part]
+            land(warehouse, f"f{number}", *rows)
+        grams = grams_of(aggregate(warehouse, warehouse.logs.snapshot().files, threads=threads))
+        expected = expected or grams
+        assert grams == expected
+
+
+def test_a_second_run_does_nothing_and_a_new_file_reads_only_itself(warehouse: Warehouse) -> None:
+    rng = np.random.default_rng(2)
+    land(warehouse, "one", log_rows("a", random_counts(rng, 50)))
+    first = update_grams(warehouse)
+    again = update_grams(warehouse)
+    assert (first.files_read, first.rows_read, again.changed) == (1, 50, False)
+    assert again.grams_version == first.grams_version
+    land(warehouse, "two", log_rows("b", random_counts(rng, 70)))
+    second = update_grams(warehouse)
+    assert (second.files_read, second.rows_read, second.gram_rows) == (1, 70, 2)
+
+
+def test_gram_rows_of_a_file_that_is_gone_are_dropped(warehouse: Warehouse) -> None:
+    rng = np.random.default_rng(3)
+    for name in "abc":
+        land(warehouse, name, log_rows(name, random_counts(rng, 20)))
+    update_grams(warehouse)
+    logs = warehouse.logs.snapshot()
+    gone = next(file for file in logs.files if "/b-" in file.path)
+    logs.commit(Change(remove=[gone], units=[Unit("test/remove", 1)]))
+    assert find_backlog(warehouse.logs.snapshot(), warehouse.grams.snapshot()).stale == {gone.path}
+    assert update_grams(warehouse).files_dropped == 1
+    assert {drive for drive, _ in stored(warehouse)} == {"a", "c"}
+    assert not update_grams(warehouse).changed
+
+
+def test_many_small_gram_files_are_merged_without_changing_a_row(
+    warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    most = 8
+    monkeypatch.setattr(gram_job, "SMALL_FILES_MAX", most)
+    rng = np.random.default_rng(4)
+    for number in range(most + 2):
+        land(warehouse, f"f{number}", log_rows(f"d{number}", random_counts(rng, 3)))
+        update_grams(warehouse)
+    assert len(warehouse.grams.snapshot().files) < most
+    assert len(stored(warehouse)) == most + 2
+    assert check_grams(warehouse, 100).drives == most + 2
+
+
+def test_merging_and_rewriting_take_few_rows_at_a_time(
+    warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(gram_job, "FILE_ROWS", 5)
+    monkeypatch.setattr(gram_job, "SMALL_FILES_MAX", 4)
+    rng = np.random.default_rng(6)
+    for number in range(9):
+        drives = [log_rows(f"d{number}-{i}", random_counts(rng, 3)) for i in range(3)]
+        land(warehouse, f"f{number}", *drives)
+        before = {file.path: file.rows for file in warehouse.grams.snapshot().files}
+        update_grams(warehouse)
+        files = {file.path: file.rows for file in warehouse.grams.snapshot().files}
+        assert sum(rows for path, rows in before.items() if path not in files) <= 10
+        assert max(files.values()) < 10
+    assert sum(rows < 5 for rows in files.values()) <= 5
+    first, *others = warehouse.logs.snapshot().files
+    warehouse.logs.snapshot().commit(Change(remove=[first, *others[:5]]))
+    update_grams(warehouse)
+    assert {drive for drive, _ in stored(warehouse)} == {
+        f"d{number}-{i}" for number in range(6, 9) for i in range(3)
+    }
+    assert check_grams(warehouse, 100).drives == 9
+
+
+def test_the_statement_names_each_product_once() -> None:
+    statement = gram_statement(catalogue())
+    pairs = [(a, b) for i, a in enumerate(NAMES) for b in NAMES[: i + 1]]
+    for a, b in pairs:
+        assert statement.count(f"sum({a}::INTEGER * {b}::INTEGER)") == 1
+    assert len(pairs) == 66
+    assert not [
+        p
+        for p in permutations(NAMES, 2)
+        if p not in pairs and f"({p[0]}::INTEGER * {p[1]}:" in statement
+    ]
+
+
+def test_the_check_finds_a_gram_row_that_is_not_of_its_file(
+    warehouse: Warehouse, tmp_path: Path
+) -> None:
+    land(warehouse, "one", log_rows("a", random_counts(np.random.default_rng(5), 30)))
+    rows = aggregate(warehouse, warehouse.logs.snapshot().files)
+    wrong = rows.set_column(rows.schema.get_field_index("n"), "n", pa.array([31]))
+    action = warehouse.grams.write_file("wrong", wrong)
+    warehouse.grams.snapshot().commit(Change(add=[action]))
+    with pytest.raises(
+        Exception, match="the Gram of drive a by SQL and by the stored Gram rows differ"
+    ):
+        check_grams(warehouse, 1)
+    assert DAY in rows["day"].to_pylist()
+
+
+def test_a_car_can_compute_its_gram_row_tick_by_tick(warehouse: Warehouse) -> None:
+    """78 64-bit integers, and as many multiplications a tick: what an ECU would do on board."""
+    counts = random_counts(np.random.default_rng(5), 200)
+    land(warehouse, "one", log_rows("car", counts))
+    update_grams(warehouse)
+    [gram] = stored(warehouse).values()
+    on_board = np.zeros(78, dtype=np.int64)
+    row, column = np.tril_indices(12)
+    for tick in range(200):
+        values = np.array([1, *(counts[name][tick] for name in NAMES)], dtype=np.int64)
+        on_board += values[row] * values[column]
+    n, products = on_board[0], on_board[(row > 0) & (column > 0)]
+    sums = on_board[(row > 0) & (column == 0)]
+    assert [n, *sums, *products] == [gram.n, *gram.sums, *gram.products]

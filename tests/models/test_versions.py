@@ -1,0 +1,242 @@
+"""Model versions and aliases: numbered, immutable, verified, and safe with many writers."""
+
+import json
+import multiprocessing
+from decimal import Decimal
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fleet_slip.errors import RefusedError, SelectionError, StorageError
+from fleet_slip.files.documents import Document, DocumentFolder
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.models.aliases import CHAMPION, AliasHistory
+from fleet_slip.models.manifest import (
+    CrossValidated,
+    Manifest,
+    ModelLabel,
+    ModelTerm,
+    SelectedBy,
+    TrainedOn,
+)
+from fleet_slip.models.versions import Registry
+
+
+def manifest(coefficient: Fraction = Fraction(1, 3), name: str = "sideslip") -> Manifest:
+    return Manifest(
+        name=name,
+        label=ModelLabel(
+            signal="sideslip", column="sideslip_rad", unit="rad", scale=Decimal("0.0001")
+        ),
+        intercept=0.0,
+        intercept_exact=Fraction(0),
+        terms=(
+            ModelTerm(
+                signal="ay",
+                column="ay_mps2",
+                unit="m/s^2",
+                scale=Decimal("0.001"),
+                coefficient=float(coefficient),
+                coefficient_exact=coefficient,
+            ),
+        ),
+        cross_validation=CrossValidated(
+            folds_by="drive", folds=5, correlation=0.99, correlation_standard_error=0.001,
+            rmse_deg=0.1, error_mean_deg=0.0, error_std_deg=0.1, condition_number=1.0,
+        ),
+        trained_on=TrainedOn(cohort="true", drives=3, rows=300, logs_version=1, grams_version=1),
+        selected_by=SelectedBy(model_list="table1", model="1", reason="best", config_sha256="0"),
+        package_version="0",
+    )  # fmt: skip
+
+
+def test_versions_are_consecutive_and_the_latest_published_is_champion(tmp_path: Path) -> None:
+    registry = Registry(LocalFolder(tmp_path))
+    for number in (1, 2, 3):
+        assert registry.publish(manifest(Fraction(number))).version == number
+    assert registry.versions("sideslip") == [1, 2, 3]
+    assert registry.resolve("sideslip").version == 3
+    assert registry.resolve("sideslip@2").manifest.terms[0].coefficient == 2.0
+    assert registry.resolve(f"sideslip@{CHAMPION}").reference == "sideslip@3"
+
+
+def test_a_manifest_keeps_every_digit(tmp_path: Path) -> None:
+    exact = Fraction(123456789012345678901, 98765432109876543210987)
+    Registry(LocalFolder(tmp_path)).publish(manifest(exact))
+    loaded = Registry(LocalFolder(tmp_path)).load("sideslip", 1).manifest
+    assert loaded == manifest(exact)
+    assert loaded.terms[0].coefficient_exact == exact
+    assert loaded.terms[0].coefficient == float(exact)
+
+
+def test_publishing_what_an_interrupted_run_left_uses_it(tmp_path: Path) -> None:
+    registry = Registry(LocalFolder(tmp_path))
+    DocumentFolder(LocalFolder(tmp_path / "sideslip" / "versions")).append(
+        manifest().model_dump(mode="json")
+    )
+    assert registry.champion("sideslip") is None
+    assert registry.publish(manifest()).version == 1
+    assert registry.versions("sideslip") == [1]
+
+
+@pytest.mark.parametrize("change", ["coefficient", "sha256", "truncated"])
+def test_a_changed_version_is_refused(tmp_path: Path, change: str) -> None:
+    Registry(LocalFolder(tmp_path)).publish(manifest())
+    file = tmp_path / "sideslip" / "versions" / "1.json"
+    envelope = json.loads(file.read_text())
+    if change == "coefficient":
+        envelope["content"]["terms"][0]["coefficient"] = 0.5
+    elif change == "sha256":
+        envelope["sha256"] = "0" * 64
+    file.write_text(json.dumps(envelope)[: 40 if change == "truncated" else None])
+    with pytest.raises(StorageError, match=r"1\.json"):
+        Registry(LocalFolder(tmp_path)).load("sideslip", 1)
+
+
+def test_aliases_move_and_go_back(tmp_path: Path) -> None:
+    registry = Registry(LocalFolder(tmp_path))
+    for number in (1, 2, 3):
+        registry.publish(manifest(Fraction(number)))
+    registry.promote("sideslip", 1, CHAMPION)
+    registry.promote("sideslip", 2, "shadow")
+    assert registry.history("sideslip").aliases() == {CHAMPION: 1, "shadow": 2}
+    assert [registry.rollback("sideslip", CHAMPION) for _ in range(3)] == [3, 2, 1]
+    with pytest.raises(RefusedError, match="never pointed at another version"):
+        registry.rollback("sideslip", CHAMPION)
+    commands = [move.command for move in registry.history("sideslip").moves()]
+    assert commands == ["publish"] * 3 + ["promote"] * 2 + ["rollback"] * 3
+
+
+def test_unknown_names_versions_and_aliases_say_what_there_is(tmp_path: Path) -> None:
+    registry = Registry(LocalFolder(tmp_path))
+    with pytest.raises(SelectionError, match=r"no model is called 'x'.*publish one with"):
+        registry.resolve("x")
+    registry.publish(manifest())
+    with pytest.raises(SelectionError, match=r"It has: 1\."):
+        registry.resolve("sideslip@7")
+    with pytest.raises(SelectionError, match=r"It has: 1, champion\."):
+        registry.resolve("sideslip@best")
+    with pytest.raises(SelectionError, match="no model is called"):
+        registry.resolve("../../etc@1")
+
+
+def _publish_ten(path: Path, writer: int) -> None:
+    for number in range(10):
+        Registry(LocalFolder(path)).publish(manifest(Fraction(writer * 100 + number, 7)))
+
+
+def test_writers_at_once_never_share_a_number_or_lose_a_version(tmp_path: Path) -> None:
+    context = multiprocessing.get_context("spawn")
+    writers = [context.Process(target=_publish_ten, args=(tmp_path, n)) for n in range(4)]
+    for process in writers:
+        process.start()
+    for process in writers:
+        process.join()
+    registry = Registry(LocalFolder(tmp_path))
+    numbers = registry.versions("sideslip")
+    assert numbers == list(range(1, 41))
+    published = {registry.load("sideslip", n).manifest.terms[0].coefficient_exact for n in numbers}
+    assert len(published) == 40
+    assert len(registry.history("sideslip").moves()) == 40
+
+
+def _publish_the_same(path: Path, logs_version: int, barrier: Any) -> None:
+    trained_on = manifest().trained_on.model_copy(update={"logs_version": logs_version})
+    for model in range(20):
+        barrier.wait()
+        same = manifest(name=f"m{model}").model_copy(update={"trained_on": trained_on})
+        Registry(LocalFolder(path)).publish(same)
+
+
+def test_writers_at_once_publish_the_same_estimator_once(tmp_path: Path) -> None:
+    context = multiprocessing.get_context("spawn")
+    barrier = context.Barrier(3)
+    writers = [
+        context.Process(target=_publish_the_same, args=(tmp_path, n, barrier)) for n in range(3)
+    ]
+    for process in writers:
+        process.start()
+    for process in writers:
+        process.join()
+    registry = Registry(LocalFolder(tmp_path))
+    for model in range(20):
+        assert registry.versions(f"m{model}") == [1]
+        moves = registry.history(f"m{model}").moves()
+        assert [(move.alias, move.version) for move in moves] == [(CHAMPION, 1)]
+
+
+def test_what_was_decided_on_another_champion_is_decided_again(tmp_path: Path) -> None:
+    registry = Registry(LocalFolder(tmp_path))
+    history = registry.history("sideslip")
+    challenger = registry.add(manifest(Fraction(2)))
+    seen: list[int | None] = []
+
+    def decision(newest_move: int) -> bool | None:
+        seen.append(history.pointed_at(CHAMPION))
+        if len(seen) == 1:
+            registry.publish(manifest(Fraction(1)))  # another process, in between
+        return registry.make_champion(challenger, after=newest_move) or None
+
+    history.decide(decision)
+    assert seen == [None, 2]
+    assert [move.version for move in history.moves()] == [2, 1]
+
+
+def test_two_who_go_back_at_once_go_back_two_versions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    registry = Registry(LocalFolder(tmp_path))
+    for number in (1, 2, 3):
+        registry.publish(manifest(Fraction(number)))
+
+    def slow_move(history: AliasHistory, *arguments: Any, after: int) -> bool:
+        monkeypatch.setattr(AliasHistory, "move", move)
+        assert registry.rollback("sideslip", CHAMPION) == 2  # another process, in between
+        return move(history, *arguments, after=after)
+
+    move = AliasHistory.move
+    monkeypatch.setattr(AliasHistory, "move", slow_move)
+    assert registry.rollback("sideslip", CHAMPION) == 1
+    assert registry.history("sideslip").pointed_at(CHAMPION) == 1
+    with pytest.raises(RefusedError, match="never pointed at another version"):
+        registry.rollback("sideslip", CHAMPION)
+
+
+def test_a_version_and_the_champion_are_found_without_reading_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    registry = Registry(LocalFolder(tmp_path))
+    for number in range(1, 21):
+        registry.publish(manifest(Fraction(number)))
+    read: list[int] = []
+
+    def counted(folder: DocumentFolder, number: int) -> Document:
+        read.append(number)
+        return original(folder, number)
+
+    original = DocumentFolder.read
+    monkeypatch.setattr(DocumentFolder, "read", counted)
+    champion = registry.champion("sideslip")
+    assert champion is not None
+    assert registry.history("sideslip").published_at(champion.version) is not None
+    assert registry.load("sideslip", 7).version == 7
+    assert read == [20, 20, 20, 7]
+    read.clear()
+    assert registry.as_table().num_rows == 20
+    assert len(read) <= 3 * 20
+
+
+def test_an_alias_points_where_its_last_move_left_it(tmp_path: Path) -> None:
+    registry = Registry(LocalFolder(tmp_path))
+    for number in (1, 2, 3):
+        registry.publish(manifest(Fraction(number)))
+    registry.promote("sideslip", 1, "tested")
+    registry.rollback("sideslip", CHAMPION)
+    history = registry.history("sideslip")
+    for alias in (CHAMPION, "tested", "unknown"):
+        assert history.pointed_at(alias) == history.aliases().get(alias)
+    rows = registry.as_table().to_pylist()
+    assert [row["aliases"] for row in rows] == ["tested", "champion", ""]
+    assert [row["published_at"] for row in rows] == sorted(row["published_at"] for row in rows)

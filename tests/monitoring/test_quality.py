@@ -1,0 +1,152 @@
+"""Faulty sensors found from Gram rows: what was broken is what is named."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fleet_slip.errors import SelectionError
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.job import update_grams
+from fleet_slip.monitoring.plausibility import Fault
+from fleet_slip.monitoring.quality import QualityReport, examine, examine_drives
+from fleet_slip.monitoring.thresholds import QualityThresholds, thresholds
+from fleet_slip.warehouse.tables import Warehouse
+from tests.conftest import RunCommand, land, log_rows, random_counts
+from tests.monitoring.cars import TICKS, Signals, broken, counts, drive
+
+DRIVES = 30
+
+
+def fleet(warehouse: Warehouse, change: Callable[[Signals], None], saturated: int = 0) -> None:
+    """Land drives of which the last has a fault."""
+    rng = np.random.default_rng(5)
+    signals = [drive(rng) for _ in range(DRIVES)]
+    signals[-1] = broken(signals[-1], change)
+    rows = [
+        log_rows(f"d{i:02d}", counts(one), saturated=saturated if i == DRIVES - 1 else 0)
+        for i, one in enumerate(signals)
+    ]
+    land(warehouse, "all", *rows)
+    update_grams(warehouse)
+
+
+def only_finding(report: QualityReport) -> Fault:
+    assert [finding.drive_id for finding in report.findings] == ["d29"]
+    return report.findings[0].fault
+
+
+def swap(a: str, b: str) -> Callable[[Signals], None]:
+    def change(signals: Signals) -> None:
+        signals[a], signals[b] = signals[b], signals[a]
+
+    return change
+
+
+def add(name: str, offset: float) -> Callable[[Signals], None]:
+    return lambda signals: signals.__setitem__(name, signals[name] + offset)
+
+
+def multiply(name: str, factor: float) -> Callable[[Signals], None]:
+    return lambda signals: signals.__setitem__(name, signals[name] * factor)
+
+
+def shake(name: str, std: float) -> Callable[[Signals], None]:
+    noise = std * np.random.default_rng(9).standard_normal(TICKS)
+    return lambda signals: signals.__setitem__(name, signals[name] + noise)
+
+
+FAULTS = [
+    (multiply("ay", -1), "reversed", ("ay",)),
+    (multiply("yaw_rate", -1), "reversed", ("yaw_rate",)),
+    (multiply("steering_wheel", -1), "reversed", ("steering_wheel",)),
+    (swap("wheel_fl", "wheel_fr"), "swapped", ("wheel_fl", "wheel_fr")),
+    (swap("wheel_rl", "wheel_rr"), "swapped", ("wheel_rl", "wheel_rr")),
+    (swap("steer_fl", "steer_fr"), "swapped", ("steer_fl", "steer_fr")),
+    (multiply("wheel_rl", 0), "stuck", ("wheel_rl",)),
+    (add("yaw_rate", 0.1), "biased", ("yaw_rate",)),
+    (add("steering_wheel", 0.1), "biased", ("steering_wheel",)),
+    (multiply("wheel_fr", 1.05), "scaled", ("wheel_fr",)),
+    (shake("steering_wheel", 0.1), "noisy", ("steering_wheel",)),
+    (shake("sideslip", 0.1), "noisy", ("sideslip",)),
+]
+
+
+@pytest.mark.parametrize(("change", "kind", "signals"), FAULTS)
+def test_what_is_broken_is_named(
+    warehouse: Warehouse,
+    change: Callable[[Signals], None],
+    kind: str,
+    signals: tuple[str, ...],
+) -> None:
+    fleet(warehouse, change)
+    fault = only_finding(examine(load_cohort(warehouse)))
+    assert (fault.kind, fault.signals) == (kind, signals)
+
+
+def test_drives_in_order_raise_no_alarm(warehouse: Warehouse) -> None:
+    fleet(warehouse, lambda _: None)
+    report = examine(load_cohort(warehouse))
+    assert (report.drives, report.compared, report.findings) == (DRIVES, DRIVES, ())
+
+
+def test_vehicle_models_are_examined_one_after_the_other(warehouse: Warehouse) -> None:
+    rng = np.random.default_rng(3)
+    for file, model in enumerate(("beetle", "driver's", None)):
+        rows = [
+            log_rows(f"{model}-{i}", random_counts(rng, 200), vehicle_model=model)
+            for i in range(12)
+        ]
+        land(warehouse, str(file), *rows)
+    update_grams(warehouse)
+    for condition in ("true", "drive_id LIKE '%-1' -- and '%-11'", "vehicle_model IS NULL"):
+        together = examine(load_cohort(warehouse, f"{condition}\n"), few())
+        assert examine_drives(warehouse, condition, few()) == together
+        assert together.drives > 0
+    with pytest.raises(SelectionError, match="no drive satisfies"):
+        examine_drives(warehouse, "mass_kg > 1e9")
+
+
+def few() -> QualityThresholds:
+    return thresholds().quality.model_copy(update={"min_rows": 100, "min_drives": 8})
+
+
+def test_values_at_the_end_of_their_range_are_told(warehouse: Warehouse) -> None:
+    fleet(warehouse, lambda _: None, saturated=TICKS // 10)
+    assert only_finding(examine(load_cohort(warehouse))).kind == "saturated"
+
+
+def test_signs_need_no_peers_and_offsets_do(warehouse: Warehouse) -> None:
+    fleet(warehouse, multiply("yaw_rate", -1))
+    alone = load_cohort(warehouse, "drive_id IN ('d28', 'd29')")
+    report = examine(alone)
+    assert report.compared == 0
+    assert only_finding(report).kind == "reversed"
+    limits = replace_min_rows(TICKS + 1)
+    assert examine(load_cohort(warehouse), limits).drives == 0
+
+
+def replace_min_rows(rows: int) -> QualityThresholds:
+    return thresholds().quality.model_copy(update={"min_rows": rows})
+
+
+def test_the_order_and_number_of_drives_do_not_matter_to_a_verdict(warehouse: Warehouse) -> None:
+    fleet(warehouse, multiply("wheel_fr", 1.05))
+    cohort = load_cohort(warehouse)
+    (table,) = cohort.tables
+    back = np.arange(len(table))[::-1]
+    turned = replace(cohort, tables=(table.take(back),), drives=cohort.drives.take(back))
+    assert examine(turned).findings == examine(cohort).findings
+
+
+def test_the_command_tells_by_its_exit_code(run_command: RunCommand, warehouse: Warehouse) -> None:
+    fleet(warehouse, multiply("ay", -1))
+    bad = run_command("quality", "--json")
+    assert bad.exit_code == 10
+    (finding,) = bad.json["findings"]
+    assert (finding["drive_id"], finding["kind"], finding["signals"]) == ("d29", "reversed", ["ay"])
+    assert "the sensors of 1 of 30 drives are not in order" in bad.stderr
+    good = run_command("quality", "--cohort", "drive_id <> 'd29'")
+    assert good.exit_code == 0
+    assert "29 drives examined" in good.stdout

@@ -1,0 +1,89 @@
+"""The health of a warehouse, as a monitor asks for it."""
+
+import subprocess
+import sys
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fleet_slip.errors import StorageError
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.grams.job import update_grams
+from fleet_slip.monitoring.status import status_of
+from fleet_slip.runs.log import recording
+from fleet_slip.warehouse.tables import Warehouse
+from tests.conftest import DAY, RunCommand, land, log_rows, path_of, random_counts
+
+
+def test_freshness_backlog_and_age(warehouse: Warehouse) -> None:
+    land(warehouse, "a", log_rows("a", random_counts(np.random.default_rng(1), 50)))
+    update_grams(warehouse)
+    land(warehouse, "b", log_rows("b", random_counts(np.random.default_rng(2), 70)))
+    found = status_of(warehouse, max_age_hours=1)
+    assert (found.newest_day, found.tables["logs"].rows, found.tables["grams"].rows) == (
+        DAY,
+        120,
+        1,
+    )
+    assert (found.backlog_files, found.backlog_rows) == (1, 70)
+    assert found.problems == ()
+    later = status_of(warehouse, 1, now=datetime.now(UTC) + timedelta(hours=3))
+    assert [text.partition(" for ")[0] for text in later.problems] == [
+        "no data has been committed",
+        "a log file has been waiting",
+    ]
+    assert later.data_age_hours == pytest.approx(3, abs=0.1)
+    assert status_of(warehouse, None, now=datetime.now(UTC) + timedelta(hours=3)).problems == ()
+
+
+def test_the_last_run_of_each_command_counts(warehouse: Warehouse) -> None:
+    path_of(warehouse.root).mkdir()
+    with pytest.raises(StorageError), recording(warehouse.root, "gram", []):
+        raise StorageError("the disk is full")
+    assert "gram" in status_of(warehouse).problems[0]
+    assert "exit code 6: the disk is full" in status_of(warehouse).problems[0]
+    with recording(warehouse.root, "gram", []):
+        (running,) = (r for r in status_of(warehouse).last_runs if r["state"] == "running")
+        assert running["command"] == "gram"
+        assert status_of(warehouse).problems == ()
+    assert status_of(warehouse).problems == ()
+
+
+def test_a_killed_run_is_known(warehouse: Warehouse) -> None:
+    path_of(warehouse.root).mkdir()
+    code = (
+        "import os, signal, sys\nfrom pathlib import Path\n"
+        "from fleet_slip.files.local_folder import LocalFolder\n"
+        "from fleet_slip.runs.log import recording\n"
+        "with recording(LocalFolder(Path(sys.argv[1])), 'run', []):\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(warehouse.root)], check=False)
+    assert done.returncode == -9
+    (problem,) = status_of(warehouse).problems
+    assert problem.startswith("run of ")
+    assert problem.endswith(" was killed")
+
+
+def test_a_missing_data_root_is_a_storage_error(tmp_path: Path) -> None:
+    with pytest.raises(StorageError, match="no data root"):
+        status_of(Warehouse(LocalFolder(tmp_path / "nothing")))
+
+
+def test_the_command_tells_a_monitor(run_command: RunCommand, tmp_path: Path) -> None:
+    run_command("run", "--campaign", "smoke", "--days", "1")
+    fine = run_command("status", "--max-age-hours", "1", "--json")
+    assert fine.exit_code == 0
+    (champion,) = fine.json["champions"]
+    assert (champion["model"], champion["version"], champion["logs_behind"]) == ("smoke", 1, 0)
+    assert champion["age_hours"] < 1
+    run_command("simulate", "smoke")
+    assert run_command("status", "--json").json["champions"][0]["logs_behind"] > 0
+    manifest = tmp_path / "data" / "models" / "smoke" / "versions" / "1.json"
+    manifest.write_text(manifest.read_text().replace('"name": "smoke"', '"name": "smoky"'))
+    bad = run_command("status")
+    assert bad.exit_code == 10
+    assert "does not match its SHA-256" in bad.stderr
+    assert "last runs" in bad.stdout

@@ -1,0 +1,119 @@
+"""Choosing among nested models, and the honest figures of the choice."""
+
+import numpy as np
+import pytest
+
+from fleet_slip.errors import SelectionError
+from fleet_slip.regression.crossval import cross_validate, least_squares
+from fleet_slip.regression.drives import DriveMoments
+from fleet_slip.regression.exact import fit
+from fleet_slip.regression.figures import error_sums
+from fleet_slip.regression.folds import CohortFolds, by_value
+from fleet_slip.regression.gram import GramTable
+from fleet_slip.regression.nested_choice import (
+    CROSS_VALIDATION,
+    Rule,
+    Training,
+    cross_validate_nested,
+    cross_validate_selection,
+    select_nested,
+)
+from fleet_slip.regression.subsets import best_subsets, choices
+
+from .data import gram_of, names, unit_scales
+
+INPUTS = names(5)[:-1]
+
+
+def sparse_drives(seed: int, drives: int = 40) -> list[np.ndarray]:
+    """Two signals matter; drives have an offset of their own."""
+    rng = np.random.default_rng(seed)
+    result = []
+    for _ in range(drives):
+        x = rng.normal(size=(50, 5)) * 400 + rng.normal(size=5) * 200
+        y = 0.8 * x[:, 1] - 0.5 * x[:, 3] + rng.normal() * 120 + rng.normal(size=50) * 40
+        result.append(np.rint(np.column_stack([x, y])).astype(np.int64))
+    return result
+
+
+def training_of(drives: list[np.ndarray], *, clustered: bool) -> tuple[Training, np.ndarray]:
+    table = GramTable.from_grams([gram_of(counts) for counts in drives])
+    assignment = by_value([i % 5 for i in range(len(drives))])
+    folds = CohortFolds.of([table], assignment).serving(INPUTS, "y")
+    moments = DriveMoments.of(table) if clustered else None
+    return Training(folds, moments, unit_scales(5)), assignment.fold
+
+
+@pytest.mark.parametrize("ranking", ["forward", "backward", "t", "lars"])
+@pytest.mark.parametrize("criterion", ["bic", CROSS_VALIDATION])
+def test_the_signals_that_matter_are_found(ranking: str, criterion: str) -> None:
+    training, _ = training_of(sparse_drives(1), clustered=True)
+    selection = select_nested(training, INPUTS, "y", Rule(ranking, criterion))
+    assert set(selection.order[: selection.size]) == {"x2", "x4"}
+    assert selection.fit == fit(training.folds.total, selection.order[:2], "y")
+    assert len(selection.values) == 6
+    document = selection.as_dict()
+    assert document["signals"] == [*selection.signals]
+    assert document["evidence"] == "drives"
+    assert np.argmin(selection.values) >= 2
+
+
+def test_rows_taken_for_independent_keep_signals_that_drives_do_not_support() -> None:
+    kept = {True: 0, False: 0}
+    for seed in range(8):
+        for clustered in kept:
+            training, _ = training_of(sparse_drives(seed), clustered=clustered)
+            rule = Rule("backward", "bic")
+            kept[clustered] += select_nested(training, INPUTS, "y", rule).size
+    assert kept[True] < 8 * 2.5
+    assert kept[False] > 8 * 3.5
+
+
+def test_the_choice_is_made_again_inside_every_training_fold() -> None:
+    drives = sparse_drives(3, drives=20)
+    training, fold = training_of(drives, clustered=True)
+    rule = Rule("forward", "aic")
+    result = cross_validate_selection("rule", training, fold, INPUTS, "y", rule)
+    tests = []
+    for number in range(5):
+        rest = [drive for drive, f in zip(drives, fold, strict=True) if f != number]
+        table = GramTable.from_grams([gram_of(counts) for counts in rest])
+        folds = CohortFolds.of([table], by_value([i % 4 for i in range(16)]))
+        inner = Training(folds.serving(INPUTS, "y"), DriveMoments.of(table), unit_scales(5))
+        model = select_nested(inner, INPUTS, "y", rule).fit.model
+        tests.append(error_sums(model, training.folds.grams[number]))
+    pooled = sum(tests[1:], tests[0])
+    assert result.pooled.rmse == pooled.figures(unit_scales(5)["y"]).rmse
+    assert result.pooled.correlation == pooled.figures(unit_scales(5)["y"]).correlation
+    assert result.signals == select_nested(training, INPUTS, "y", rule).fit.model.signals
+
+
+def test_nested_models_are_cross_validated_in_order() -> None:
+    training, _ = training_of(sparse_drives(2), clustered=False)
+    order = ("x4", "x2", "x1", "x3", "x5")
+    models = cross_validate_nested(training.folds, order, "y", training.scales)
+    assert [model.signals for model in models] == [order[:j] for j in range(6)]
+    alone = cross_validate("x", training.folds, least_squares(order[:2], "y"), training.scales)
+    assert models[2].pooled == alone.pooled
+
+
+def test_inner_cross_validation_needs_folds() -> None:
+    drives = sparse_drives(4, drives=6)
+    table = GramTable.from_grams([gram_of(counts) for counts in drives])
+    assignment = by_value([0, 0, 0, 1, 1, 1])
+    folds = CohortFolds.of([table], assignment).serving(INPUTS, "y")
+    training = Training(folds, None, unit_scales(5))
+    with pytest.raises(SelectionError, match="at least three folds"):
+        cross_validate_selection(
+            "x", training, assignment.fold, INPUTS, "y", Rule("t", CROSS_VALIDATION)
+        )
+
+
+def test_criteria_choose_among_the_best_subsets() -> None:
+    training, _ = training_of(sparse_drives(5), clustered=True)
+    selection = select_nested(training, INPUTS, "y", Rule("t", "cp"))
+    results = best_subsets(training.folds.total, INPUTS, "y")
+    picked = choices(results, selection.evidence)
+    assert picked["bic"] == 2
+    assert set(results[2].best.model.signals) == {"x2", "x4"}
+    assert results[2].as_dict()["signals"] == ["x2", "x4"]

@@ -1,0 +1,116 @@
+"""Learned rivals: what they learn, what they weigh, and that folds are made of whole drives."""
+
+import numpy as np
+import pytest
+
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.regression.folds import by_hash
+from fleet_slip.rivals.compare import TWO_SIGNALS, Rival, all_signals, cross_validate, train
+from fleet_slip.rivals.learners import (
+    CENTRES,
+    LEARNERS,
+    Learner,
+    fit_general_regression,
+    fit_perceptron,
+    fit_regression,
+    kernel_mean,
+    one_thread,
+)
+from fleet_slip.rivals.sample import Sample
+
+COLUMNS = tuple(catalogue()[name].column for name in all_signals())
+
+
+def sample(rows: int = 3000, drives: int = 12) -> Sample:
+    generator = np.random.default_rng(3)
+    inputs = generator.standard_normal((rows, len(COLUMNS)))
+    label = 0.02 * np.tanh(inputs[:, 1]) - 0.01 * inputs[:, 2]
+    names = np.array([f"drive-{i % drives}" for i in range(rows)])
+    return Sample(COLUMNS, inputs, label, names)
+
+
+def test_the_two_sets_of_signals_are_those_of_the_papers() -> None:
+    assert TWO_SIGNALS == ("ay", "yaw_rate")
+    assert len(all_signals()) == 8
+    assert "steer_fl" not in all_signals()
+
+
+def test_regression_on_a_sample_is_least_squares() -> None:
+    generator = np.random.default_rng(5)
+    inputs = generator.standard_normal((500, 3)) * [1, 100, 0.01] + [5, -300, 2]
+    label = inputs @ [0.3, -0.002, 4.0] + 0.7 + 0.1 * generator.standard_normal(500)
+    design = np.column_stack([np.ones(500), inputs])
+    expected = design @ np.linalg.solve(design.T @ design, design.T @ label)
+    fitted = fit_regression(inputs, label)
+    np.testing.assert_allclose(fitted.predict(inputs), expected, atol=1e-9)
+    assert fitted.size_bytes == 4 * 8
+
+
+def test_a_kernel_mean_is_the_definition() -> None:
+    generator = np.random.default_rng(8)
+    rows, centres = generator.standard_normal((7, 2)), generator.standard_normal((5, 2))
+    labels = generator.standard_normal(5)
+    distance2 = ((rows[:, None] - centres[None]) ** 2).sum(axis=2)
+    weights = np.exp(-distance2 / (2 * 0.6**2))
+    expected = (weights * labels).sum(axis=1) / weights.sum(axis=1)
+    np.testing.assert_allclose(kernel_mean(rows, centres, labels, 0.6), expected, rtol=1e-12)
+
+
+def test_a_kernel_mean_far_from_everything_is_the_nearest_label() -> None:
+    centres = np.array([[0.0], [1.0]])
+    far = np.array([[1e4]])
+    assert kernel_mean(far, centres, np.array([3.0, 7.0]), 0.1) == pytest.approx(7.0)
+
+
+def test_a_general_regression_network_follows_a_curve() -> None:
+    x = np.linspace(-3, 3, 2 * CENTRES + 500)[:, None]
+    fitted = fit_general_regression(x, np.sin(x[:, 0]))
+    inside = np.abs(x[:, 0]) < 2.5
+    np.testing.assert_allclose(fitted.predict(x)[inside], np.sin(x[inside, 0]), atol=0.03)
+
+
+def test_a_perceptron_carries_the_parameters_of_its_layers() -> None:
+    data = sample()
+    fitted = fit_perceptron(data.inputs, data.sideslip_rad)
+    weights = (8 * 16 + 16) + (16 * 16 + 16) + (16 + 1)
+    scaling = 2 * 8 + 2
+    assert fitted.size_bytes == 8 * (weights + scaling)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("learner", LEARNERS, ids=lambda learner: learner.name)
+def test_every_learner_learns(learner: Learner) -> None:
+    with one_thread():
+        rival = train(learner, sample(), all_signals())
+    spread_deg = float(np.degrees(sample().sideslip_rad.std()))
+    figures = rival.cross_validated
+    assert figures.coverage == 1
+    assert figures.error_std_deg is not None
+    assert figures.error_std_deg < 0.75 * spread_deg
+    assert rival.training_s > 0
+    assert rival.fitted.size_bytes > 0
+
+
+def test_no_fold_is_tested_on_drives_that_it_was_fitted_on() -> None:
+    """A learner that remembers labels by drive must fail on drives that it has not seen."""
+    data = sample()
+    number = np.array([int(name.removeprefix("drive-")) for name in data.drive_id])
+    seen: list[set[int]] = []
+
+    def remember(inputs: np.ndarray, label: np.ndarray) -> object:
+        seen.append(set(inputs[:, 0].astype(int)))
+        return fit_regression(inputs, label)
+
+    learner = Learner("memory", "", remember)  # type: ignore[arg-type]
+    cross_validate(learner, number[:, None].astype(float), data)
+    folds = by_hash(data.drive_id.tolist(), 5)
+    assert len(seen) == len(folds.names)
+    for fold, fitted_on in enumerate(seen):
+        assert not fitted_on & set(number[folds.fold == fold])
+
+
+def test_a_null_input_leaves_no_estimate() -> None:
+    rival: Rival = train(LEARNERS[0], sample(), TWO_SIGNALS)
+    signals = {column: np.array([0.5, np.nan, 0.5]) for column in COLUMNS}
+    estimate = rival.estimate(signals)
+    assert np.isfinite(estimate).tolist() == [True, False, True]

@@ -1,0 +1,247 @@
+"""Campaigns: what is driven is a function of the file alone, and faults in it are named."""
+
+from collections import Counter
+from datetime import date
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from fleet_slip.errors import ConfigError
+from fleet_slip.resources import config_names, find_config
+from fleet_slip.simulation.campaign import Campaign, load_campaign
+from fleet_slip.simulation.drive_plan import Grid, random_generator
+
+SMOKE = find_config("campaigns", "smoke").read_text(encoding="utf-8")
+FLEET = find_config("campaigns", "fleet").read_text(encoding="utf-8")
+
+
+def load_text(folder: Path, text: str) -> Campaign:
+    file = folder / "campaign.toml"
+    file.write_text(text)
+    return load_campaign(str(file))
+
+
+def digests(campaign: Campaign, day: date) -> list[str]:
+    return [batch.digest for batch in campaign.batches(day)]
+
+
+def total_rows(campaign: Campaign) -> int:
+    return sum(d.expected_rows for day in campaign.days() for d in campaign.drives(day))
+
+
+@pytest.mark.parametrize("name", config_names("campaigns"))
+def test_shipped_campaigns_are_named_after_their_file(name: str) -> None:
+    assert load_campaign(name).name == name
+
+
+@pytest.mark.parametrize("name", ["smoke", "fleet"])
+def test_batches_hold_each_drive_once_in_order_and_about_as_many_rows(name: str) -> None:
+    campaign = load_campaign(name)
+    for day in campaign.days()[:3]:
+        batches = campaign.batches(day)
+        assert [batch.index for batch in batches] == list(range(len(batches)))
+        assert tuple(d for b in batches for d in b.drives) == campaign.drives(day)
+        names = [drive.drive_id for batch in batches for drive in batch.drives]
+        assert len(names) == campaign.drives_per_day
+        assert all(a < b for a, b in pairwise(names))
+        rows = [sum(drive.expected_rows for drive in batch.drives) for batch in batches]
+        longest = max(drive.expected_rows for batch in batches for drive in batch.drives)
+        assert max(rows) <= campaign.rows_per_file + longest
+        assert max(rows) - min(rows) <= 2 * longest
+
+
+def test_drives_longer_than_a_file_stand_alone(tmp_path: Path) -> None:
+    campaign = load_text(tmp_path, SMOKE.replace("rows_per_file = 15_000", "rows_per_file = 100"))
+    assert [len(batch.drives) for batch in campaign.batches(date(2024, 5, 1))] == [1, 1, 1, 1]
+
+
+def test_drive_names_can_be_read() -> None:
+    drive = load_campaign("smoke").drives(date(2024, 5, 2))[3]
+    assert (drive.drive_id, drive.vehicle_id) == ("smoke-2024-05-02-0003", "smoke-0000")
+    assert drive.source == "simulated"
+
+
+def test_drive_names_are_unique() -> None:
+    campaign = load_campaign("fleet")
+    names = [d.drive_id for day in campaign.days() for d in campaign.drives(day)]
+    assert len(set(names)) == len(names) == campaign.number_of_days * campaign.drives_per_day
+
+
+@pytest.mark.parametrize("name", ["smoke", "fleet"])
+def test_adding_days_changes_no_earlier_day(name: str) -> None:
+    campaign = load_campaign(name)
+    longer = campaign.model_copy(update={"number_of_days": campaign.number_of_days + 5})
+    assert longer.days()[: campaign.number_of_days] == campaign.days()
+    for day in campaign.days()[:3]:
+        assert digests(longer, day) == digests(campaign, day)
+
+
+@pytest.mark.parametrize("name", ["smoke", "fleet"])
+def test_loading_again_gives_the_same_digests(name: str) -> None:
+    first, again = load_campaign(name), load_campaign(name)
+    assert digests(first, first.days()[0]) == digests(again, again.days()[0])
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("seed = 1", "seed = 2"),
+        ("laps = 0.5", "laps = 0.4"),
+        ("mass_kg = [1320.0]", "mass_kg = [1320.5]"),
+        ("adhesion = [1.0]", "adhesion = [0.9]"),
+        ("braking_mps2 = 4.0", "braking_mps2 = 4.1"),
+        ("[0.7, 0.8, 0.9, 1.0]", "[0.71, 0.81, 0.91, 1.01]"),
+        ("ax_bias_mps2 = 0.15", "ax_bias_mps2 = 0.16"),
+        ("outage_duration_s = 5.0", "outage_duration_s = 5.5"),
+    ],
+)
+def test_every_key_changes_the_digest(tmp_path: Path, old: str, new: str) -> None:
+    assert SMOKE.count(old) == 1
+    original = load_text(tmp_path, SMOKE)
+    changed = load_text(tmp_path, SMOKE.replace(old, new))
+    day = original.days()[0]
+    assert set(digests(original, day)).isdisjoint(digests(changed, day))
+
+
+@pytest.mark.parametrize(
+    ("kind", "key", "name"),
+    [("tracks", "tracks", "waterford_hills"), ("vehicles", "vehicles", "d_class_sedan")],
+)
+def test_track_and_vehicle_are_part_of_the_digest(
+    tmp_path: Path, kind: str, key: str, name: str
+) -> None:
+    text = find_config(kind, name).read_text(encoding="utf-8")
+    old = {"tracks": "length_m = 89.145", "vehicles": "height_m = 0.54"}[kind]
+    assert text.count(old) == 1
+    results = []
+    for file, content in (("same", text), ("other", text.replace(old, old + "1"))):
+        (tmp_path / f"{file}.toml").write_text(content)
+        path = f'{key} = ["{tmp_path}/{file}.toml"]'
+        campaign = load_text(tmp_path, SMOKE.replace(f'{key} = ["{name}"]', path))
+        results.append(digests(campaign, campaign.days()[0]))
+    original = load_campaign("smoke")
+    assert results[0] == digests(original, original.days()[0])
+    assert set(results[0]).isdisjoint(results[1])
+
+
+def test_grid_takes_every_combination_once_before_any_twice() -> None:
+    plan = load_campaign("waterford").plan
+    assert isinstance(plan, Grid)
+    sensors = load_campaign("waterford").sensors
+    count = len(plan.lateral_mps2) * len(plan.speed_factor)
+    taken = [plan.assignment(number, sensors) for number in range(2 * count)]
+    times = Counter((a.limits.lateral_mps2, a.speed_factor) for a in taken[:count])
+    assert len(times) == count
+    assert set(times.values()) == {1}
+    assert taken[count:] == taken[:count]
+
+
+def test_each_day_of_a_grid_covers_the_range_of_speeds() -> None:
+    campaign = load_campaign("waterford")
+    assert isinstance(campaign.plan, Grid)
+    lowest, highest = min(campaign.plan.speed_factor), max(campaign.plan.speed_factor)
+    for day in campaign.days():
+        factors = sorted(drive.speed_factor for drive in campaign.drives(day))
+        ends = [lowest, *factors, highest]
+        assert max(b - a for a, b in pairwise(ends)) < (highest - lowest) / 4
+
+
+def test_cars_of_a_grid_are_its_vehicles_and_masses(tmp_path: Path) -> None:
+    text = SMOKE.replace("[1320.0]", "[1000.0, 1320.0, 1740.0]")
+    campaign = load_text(tmp_path, text.replace("number_of_days = 2", "number_of_days = 6"))
+    drives = [d for day in campaign.days() for d in campaign.drives(day)]
+    masses = {(d.vehicle_id, d.vehicle.body.sprung_mass_kg) for d in drives}
+    assert masses == {("smoke-0000", 1000.0), ("smoke-0001", 1320.0), ("smoke-0002", 1740.0)}
+
+
+def test_cars_of_a_fleet_differ_and_keep_their_properties() -> None:
+    campaign = load_campaign("fleet")
+    drives = [d for day in campaign.days() for d in campaign.drives(day)]
+    cars = {(d.vehicle_id, d.vehicle, d.sensors) for d in drives}
+    assert len(cars) == len({d.vehicle_id for d in drives}) == 300
+    assert len({d.vehicle for d in drives}) == 300
+    assert len({d.sensors for d in drives}) == 300
+    assert len({d.vehicle.name for d in drives}) > 1
+    assert len({d.track.name for d in drives}) > 1
+    assert len({d.adhesion for d in drives}) == len(drives)
+    for drive in drives:
+        assert drive.limits.lateral_mps2 <= 0.61 * drive.adhesion * 9.81
+
+
+def test_shipped_campaigns_are_as_large_as_they_say() -> None:
+    assert 20_000 < total_rows(load_campaign("smoke")) < 80_000
+    assert total_rows(load_campaign("waterford")) >= 2_000_000
+    assert 10_000_000 < total_rows(load_campaign("fleet")) < 30_000_000
+
+
+def test_random_generators_differ_by_seed_and_by_every_part_of_their_name() -> None:
+    names = [("a", "b"), ("ab",), ("b", "a"), ("a", "b", "c")]
+    drawn = [random_generator(seed, *name).random() for seed in (1, 2) for name in names]
+    assert len(set(drawn)) == 2 * len(names)
+    assert random_generator(1, "a", "b").random() == drawn[0]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        (
+            '["waterford_hills"]',
+            '["imola"]',
+            "plan.grid.tracks.0: tracks: nothing is called 'imola'",
+        ),
+        ('["d_class_sedan"]', '["tank"]', "plan.grid.vehicles.0: vehicles: nothing is called"),
+        ("[0.7, 0.8, 0.9, 1.0]", "[]", "plan.grid.speed_factor"),
+        ("[0.7, 0.8, 0.9, 1.0]", "[0.7, -0.8]", "plan.grid.speed_factor.1"),
+        ("adhesion = [1.0]", "adhesion = [nan]", "plan.grid.adhesion.0"),
+        ("adhesion", "adhesoin", "plan.grid.adhesoin: unknown key"),
+        ('kind = "grid"', 'kind = "list"', "plan"),
+        ("first_day = 2024-05-01", 'first_day = "tomorrow"', "first_day"),
+        ("first_day = 2024-05-01", "first_day = 9999-12-31", "first_day"),
+        ("first_day = 2024-05-01", "first_day = 2024-05-32", "not valid TOML"),
+        ("number_of_days = 2", "number_of_days = 0", "number_of_days"),
+        ("drives_per_day = 4", "drives_per_day = 10000", "drives_per_day"),
+        ("laps = 0.5", "laps = 0", "laps"),
+        ("rows_per_file = 15_000", "rows_per_file = 9_000_000", "rows_per_file"),
+        ("steer_std_rad = 0.0002", "steer_std_rad = -1", "sensors.steer_std_rad"),
+        ('name = "smoke"', 'name = "smoke test"', "name"),
+        ("seed = 1", "seed = -1", "seed"),
+        ("seed = 1", "", "seed"),
+    ],
+)
+def test_faults_are_named_by_file_key_and_reason(
+    tmp_path: Path, old: str, new: str, complaint: str
+) -> None:
+    assert old in SMOKE
+    with pytest.raises(ConfigError) as error:
+        load_text(tmp_path, SMOKE.replace(old, new, 1))
+    assert str(tmp_path / "campaign.toml") in str(error.value)
+    assert complaint in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        ("min = 0.85", "min = 1.85", "plan.fleet.tyre_stiffness: min 1.85 is above max 1.15"),
+        ("cars = 300", "cars = 0", "plan.fleet.cars"),
+        ("min = 0.85", "", "plan.fleet.tyre_stiffness.min"),
+    ],
+)
+def test_faults_of_a_fleet_are_named(tmp_path: Path, old: str, new: str, complaint: str) -> None:
+    assert old in FLEET
+    with pytest.raises(ConfigError) as error:
+        load_text(tmp_path, FLEET.replace(old, new, 1))
+    assert complaint in str(error.value)
+
+
+@pytest.mark.parametrize("day", [date(2024, 4, 30), date(2024, 5, 3)])
+def test_a_day_outside_the_campaign_is_refused(day: date) -> None:
+    with pytest.raises(ConfigError, match="goes from 2024-05-01 to 2024-05-02"):
+        load_campaign("smoke").batches(day)
+
+
+def test_open_tracks_have_no_laps(tmp_path: Path) -> None:
+    text = SMOKE.replace('["waterford_hills"]', '["straight"]')
+    assert load_text(tmp_path, text).drives_per_day == 4
+    with pytest.raises(ConfigError, match=r"laps is 2\.0, but the track 'straight' is open"):
+        load_text(tmp_path, text.replace("laps = 0.5", "laps = 2"))

@@ -1,0 +1,99 @@
+"""The job that fills the logs: plans as it goes, refuses early, and says where the time went."""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from datetime import date
+from pathlib import Path
+
+import pytest
+
+from fleet_slip.errors import RefusedError
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.simulation.campaign import Batch, Campaign, load_campaign
+from fleet_slip.simulation.job import SimulationReport, simulate_batches, simulate_campaign
+from fleet_slip.warehouse.tables import Warehouse
+
+DAYS = 12
+
+
+def campaign(**changes: object) -> Campaign:
+    """Return a dozen days of one drive of a few seconds."""
+    plan = {"number_of_days": DAYS, "drives_per_day": 1, "laps": 0.03, **changes}
+    return load_campaign("smoke").model_copy(update=plan)
+
+
+def run(root: Path, plan: Campaign, progress: Callable[[int, int], None]) -> SimulationReport:
+    with ThreadPoolExecutor(2) as executor:
+        return simulate_campaign(
+            Warehouse(LocalFolder(root)), plan, plan.days(), executor, progress
+        )
+
+
+def test_days_are_planned_while_others_are_simulated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    planned: list[date] = []
+    batches = Campaign.batches
+
+    def counted(self: Campaign, day: date) -> tuple[Batch, ...]:
+        planned.append(day)
+        return batches(self, day)
+
+    monkeypatch.setattr(Campaign, "batches", counted)
+    at_landing: list[tuple[int, int, int]] = []
+    report = run(
+        tmp_path,
+        campaign(),
+        lambda rows, expected: at_landing.append((len(planned), rows, expected)),
+    )
+    assert at_landing[0][0] < DAYS
+    assert planned == list(campaign().days())
+    assert report.batches_written == DAYS
+    for _, _, expected in at_landing:
+        assert expected == pytest.approx(report.rows, rel=0.3)
+    assert sum(rows for _, rows, _ in at_landing) == report.rows
+
+
+def test_a_changed_campaign_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    late = campaign().days()[8:9]
+    with ThreadPoolExecutor(2) as executor:
+        simulate_campaign(Warehouse(LocalFolder(tmp_path)), campaign(), late, executor)
+    before = Warehouse(LocalFolder(tmp_path)).logs.snapshot()
+    with pytest.raises(RefusedError, match="was changed"):
+        run(tmp_path, campaign(seed=77), lambda _rows, _all: None)
+    after = Warehouse(LocalFolder(tmp_path)).logs.snapshot()
+    assert (after.version, after.rows) == (before.version, before.rows)
+
+
+def test_the_report_says_where_the_time_went(tmp_path: Path) -> None:
+    report = run(tmp_path, campaign(), lambda _rows, _all: None)
+    seconds = report.seconds
+    assert min(seconds.simulate, seconds.encode, seconds.write, seconds.commit) > 0
+    assert seconds.tasks == seconds.simulate + seconds.encode + seconds.write
+    assert seconds.commit < seconds.elapsed
+    assert seconds.tasks < 2 * seconds.elapsed
+    again = run(tmp_path, campaign(), lambda _rows, _all: None)
+    assert (again.rows, again.days_present, again.seconds.tasks) == (0, DAYS, 0)
+
+
+def test_a_complete_day_is_never_planned_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run(tmp_path, campaign(), lambda _rows, _all: None)
+    before = Warehouse(LocalFolder(tmp_path)).logs.snapshot()
+    monkeypatch.setattr(type(campaign()), "batches", None)
+    again = run(tmp_path, campaign(), lambda _rows, _all: None)
+    assert (again.days_present, again.logs_version) == (DAYS, before.version)
+    with pytest.raises(RefusedError, match="was changed"):
+        run(tmp_path, campaign(seed=77), lambda _rows, _all: None)
+
+
+def test_days_that_landed_before_they_were_recorded_are_recorded(tmp_path: Path) -> None:
+    warehouse = Warehouse(LocalFolder(tmp_path))
+    batches = [batch for day in campaign().days() for batch in campaign().batches(day)]
+    with ThreadPoolExecutor(2) as executor:
+        simulate_batches(warehouse, batches, executor)
+    found = [run(tmp_path, campaign(), lambda _rows, _all: None) for _ in range(2)]
+    assert [report.rows for report in found] == [0, 0]
+    assert [report.days_present for report in found] == [0, DAYS]
+    assert found[0].logs_version == found[1].logs_version

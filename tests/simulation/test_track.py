@@ -1,0 +1,151 @@
+"""Tracks: curvature, centre line, closure, and what is refused."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.special import fresnel
+
+from fleet_slip.errors import ConfigError
+from fleet_slip.resources import config_names
+from fleet_slip.simulation.track import Segment, Track, load_track
+
+SHARED = Path(__file__).parents[2].parent / "shared" / "tracks"
+
+
+def make_track(*segments: tuple[float, float, float], closed: bool = False) -> Track:
+    return Track(
+        name="test",
+        description="a test",
+        closed=closed,
+        segments=tuple(Segment(length_m=s[0], curvature_1pm=s[1:]) for s in segments),
+    )
+
+
+@pytest.mark.parametrize("name", config_names("tracks"))
+def test_shipped_tracks_are_named_after_their_file(name: str) -> None:
+    assert load_track(name).name == name
+
+
+@pytest.mark.parametrize(
+    ("name", "length_m", "gap_m"),
+    [("waterford_hills", 2230.9, 0.0055), ("melbourne", 5240.9, 0.0155)],
+)
+def test_circuits_have_the_stated_length_and_close(
+    name: str, length_m: float, gap_m: float
+) -> None:
+    track = load_track(name)
+    assert track.length_m == pytest.approx(length_m, abs=0.06)
+    gap, turn = track.closure()
+    assert gap <= gap_m
+    assert turn < 1e-4
+    line = track.centre_line(1.0)
+    assert line.heading_rad[-1] == pytest.approx(-2 * np.pi, abs=1e-4), "both run clockwise"
+
+
+@pytest.mark.parametrize(
+    ("name", "file"),
+    [
+        ("waterford_hills", "waterford_hills_segments.csv"),
+        ("melbourne", "melbourne_raceline_segments.csv"),
+    ],
+)
+def test_segments_are_those_of_the_source(name: str, file: str) -> None:
+    if not (SHARED / file).is_file():
+        pytest.skip("the source of the segments is not here")
+    with (SHARED / file).open() as lines:
+        rows = [
+            (float(r["length_m"]), float(r["kappa_start_1pm"]), float(r["kappa_end_1pm"]))
+            for r in csv.DictReader(lines)
+        ]
+    assert rows == [(s.length_m, *s.curvature_1pm) for s in load_track(name).segments]
+
+
+def test_circle_is_a_circle() -> None:
+    line = load_track("skid_pad").centre_line(0.7)
+    assert np.allclose(np.hypot(line.x_m, line.y_m - 50.0), 50.0, rtol=0, atol=1e-11)
+    assert line.y_m.max() > 99.9, "positive curvature bends left"
+
+
+def test_clothoid_is_the_fresnel_integral() -> None:
+    length, end = 300.0, 0.02
+    line = make_track((length, 0.0, end)).centre_line(10.0)
+    scale = np.sqrt(np.pi * length / end)
+    sine, cosine = fresnel(line.station_m / scale)
+    assert np.allclose(line.x_m, scale * cosine, rtol=0, atol=1e-10)
+    assert np.allclose(line.y_m, scale * sine, rtol=0, atol=1e-10)
+
+
+def test_heading_integrates_curvature() -> None:
+    track = load_track("waterford_hills")
+    line = track.centre_line(50.0)
+    ends = np.cumsum([segment.length_m for segment in track.segments])
+    for a, b, change in zip(
+        line.station_m[:-1], line.station_m[1:], np.diff(line.heading_rad), strict=True
+    ):
+        kinks = ends[(ends > a) & (ends < b)]
+        integral = quad(track.curvature, a, b, points=kinks if len(kinks) else None)[0]
+        assert integral == pytest.approx(change, abs=1e-12)
+
+
+def test_centre_line_does_not_depend_on_spacing() -> None:
+    track = load_track("melbourne")
+    coarse, fine = track.centre_line(track.length_m / 4), track.centre_line(track.length_m / 4000)
+    assert np.allclose(coarse.x_m, fine.x_m[::1000], rtol=0, atol=1e-9)
+    assert np.allclose(coarse.y_m, fine.y_m[::1000], rtol=0, atol=1e-9)
+
+
+def test_curvature_wraps_on_a_closed_track_and_stays_on_an_open_one() -> None:
+    circuit = load_track("waterford_hills")
+    station = np.array([0.0, 100.0, 2000.0])
+    assert np.allclose(circuit.curvature(station), circuit.curvature(station + circuit.length_m))
+    assert np.allclose(circuit.curvature(-10.0), circuit.curvature(circuit.length_m - 10.0))
+    clothoid = make_track((100.0, 0.0, 0.01))
+    assert clothoid.curvature([-5.0, 50.0, 200.0]).tolist() == pytest.approx([0.0, 0.005, 0.01])
+
+
+def test_grid_of_a_closed_track_leaves_out_its_end() -> None:
+    station, spacing = load_track("skid_pad").grid(1.0)
+    assert len(station) == 314
+    assert station[-1] + spacing == pytest.approx(314.159265)
+    station, spacing = load_track("straight").grid(1.0)
+    assert (len(station), spacing, station[-1]) == (1001, 1.0, 1000.0)
+
+
+def toml(segments: str, closed: str = "false") -> str:
+    return f'name = "t"\ndescription = "a test"\nclosed = {closed}\nsegments = [{segments}]\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        (toml(""), "segments"),
+        (toml("{ length_m = 0.0, curvature_1pm = [0, 0] }"), "segments.0.length_m"),
+        (toml("{ length_m = 1.0, curvature_1pm = [0, nan] }"), "segments.0.curvature_1pm.1"),
+        (toml("{ length_m = 1.0, curvature_1pm = [0] }"), "segments.0.curvature_1pm"),
+        (toml("{ length_m = 1.0, curvature_1pm = [0, 0], radius = 1 }"), "unknown key"),
+        (
+            toml(
+                "{ length_m = 9, curvature_1pm = [0, 0] }, "
+                "{ length_m = 9, curvature_1pm = [0.1, 0.1] }"
+            ),
+            "curvature jumps from 0.0 to 0.1 1/m after segment 0",
+        ),
+        (toml("{ length_m = 9.0, curvature_1pm = [0.0, 0.0] }", "true"), "does not close"),
+        ("name = 3", "description"),
+    ],
+)
+def test_faults_are_named_by_file_and_key(tmp_path: Path, text: str, complaint: str) -> None:
+    file = tmp_path / "bad.toml"
+    file.write_text(text)
+    with pytest.raises(ConfigError) as error:
+        load_track(str(file))
+    assert str(file) in str(error.value)
+    assert complaint in str(error.value)
+
+
+def test_unknown_track_names_the_known_ones() -> None:
+    with pytest.raises(ConfigError, match="waterford_hills"):
+        load_track("nurburgring")

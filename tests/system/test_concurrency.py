@@ -1,0 +1,106 @@
+"""Writers, a job that rearranges, and readers at once; and commands at once on one root."""
+
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks.reliability import concurrency
+from fleet_slip.files.local_folder import LocalFolder
+from tests.conftest import COMMAND, RunCommand
+from tests.ingest.samples import csv_text, good_columns
+from tests.system.test_crash import state
+
+MAPPING = """
+name = "test"
+time = { column = "t", unit = "s" }
+drive = { day = 2024-05-31, vehicle_id = "car", vehicle_model = "sedan" }
+signals.ax = { column = "ax", unit = "m/s^2" }
+signals.sideslip = { column = "beta", unit = "deg" }
+"""
+
+
+@pytest.mark.slow
+def test_writers_lose_nothing_and_readers_see_whole_commits_in_order(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    concurrency(writers=3, commits=5)
+    assert "nothing lost or doubled" in capsys.readouterr().out
+
+
+def started(root: Path, command: list[str]) -> subprocess.Popen[str]:
+    """Start a command in a process of its own."""
+    return subprocess.Popen(
+        [COMMAND, "--root", str(root), *command],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def at_once(root: Path, *commands: list[str]) -> list[tuple[int, str]]:
+    """Run commands in processes of their own at the same time; return exit codes and stderr."""
+    running = [started(root, command) for command in commands]
+    answers = [process.communicate()[1] for process in running]
+    return [(p.returncode, text) for p, text in zip(running, answers, strict=True)]
+
+
+def contents(run_command: RunCommand, root: Path) -> list[Any]:
+    """Every row of logs, Gram rows and quarantine, whatever files they lie in."""
+    queries = (
+        "SELECT count(*) AS n, sum(hash(l)) AS h FROM log_counts AS l",
+        "SELECT * EXCLUDE (file) FROM grams ORDER BY ALL",
+        "SELECT * FROM quarantine ORDER BY ALL",
+    )
+    return [run_command("sql", query, "--json", root=root).json for query in queries]
+
+
+@pytest.mark.slow
+def test_commands_at_once_leave_what_they_leave_one_after_the_other(
+    run_command: RunCommand, tmp_path: Path
+) -> None:
+    mapping = tmp_path / "mapping.toml"
+    mapping.write_text(MAPPING)
+    files = []
+    for number in range(2):
+        columns = good_columns(60)
+        columns["ax"][number] = "soft"
+        files.append(tmp_path / f"{number}.csv")
+        files[-1].write_text(csv_text(columns))
+    jobs = [["ingest", str(file), "--mapping", str(mapping)] for file in files]
+    jobs.append(["simulate", "smoke", "--threads", "1"])
+    serial, parallel = tmp_path / "serial", tmp_path / "parallel"
+    for job in [*jobs, ["gram"]]:
+        assert run_command(*job, root=serial).exit_code == 0
+    assert [code for code, _ in at_once(parallel, *jobs, *jobs, ["gram"], ["gram"])] == [0] * 8
+    run_command("gram", root=parallel)
+    assert contents(run_command, parallel) == contents(run_command, serial)
+    publishing = ["publish", "m", "--nested", "ay", "--cohort", "campaign = 'smoke'"]
+    for code, text in at_once(parallel, publishing, publishing, publishing):
+        assert code == 0, text
+    versions = run_command("models", "m", "--json", root=parallel).json
+    assert len({row["sha256"] for row in versions}) == 1
+    assert "champion" in versions[-1]["aliases"]
+    assert run_command("verify", "--full", root=parallel).exit_code == 0
+
+
+@pytest.mark.slow
+def test_the_second_run_of_a_campaign_waits_and_has_nothing_to_do(
+    run_command: RunCommand, tmp_path: Path
+) -> None:
+    job = ["run", "--campaign", "smoke", "--threads", "1"]
+    root = tmp_path / "data"
+    with LocalFolder(root).exclusive(".run-smoke.lock", lambda: None):
+        running = [started(root, job) for _ in range(2)]
+        for process in running:
+            assert process.stderr
+            assert process.stderr.readline() == "smoke: waiting for another run\n"
+    answers = [process.communicate()[1] for process in running]
+    assert [process.returncode for process in running] == [0, 0]
+    assert sum("nothing to do, smoke@1 is up to date" in text for text in answers) == 1
+    alone = tmp_path / "alone"
+    run_command(*job, root=alone)
+    both, one = state(tmp_path / "data"), state(alone)
+    assert (both["versions"], both["moves"]) == (one["versions"], one["moves"])
+    assert both["files"].keys() == one["files"].keys()

@@ -1,0 +1,174 @@
+"""Commands that are killed in mid-work, a full disk, a read-only one, and files that go bad."""
+
+import hashlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import fleet_slip
+from fleet_slip.files.folder import TEMPORARY_PREFIX
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.models.versions import Registry
+from fleet_slip.warehouse.tables import Warehouse
+from tests.conftest import COMMAND, RunCommand
+
+JOB = ["run", "--campaign", "smoke", "--threads", "1"]
+KILLS = 30
+
+
+def state(root: Path) -> dict[str, Any]:
+    """All that a data root holds, apart from the moments at which it was written."""
+    warehouse = Warehouse(LocalFolder(root))
+    files = {
+        path: hashlib.sha256(Path(path).read_bytes()).hexdigest()
+        for table in (warehouse.logs, warehouse.grams)
+        for path in table.snapshot().paths
+    }
+    registry = Registry(LocalFolder(root / "models"))
+    return {
+        "files": {Path(path).relative_to(root): digest for path, digest in files.items()},
+        "versions": [registry.load("smoke", n).sha256 for n in registry.versions("smoke")],
+        "aliases": registry.history("smoke").aliases(),
+        "moves": [(move.command, move.version) for move in registry.history("smoke").moves()],
+    }
+
+
+@pytest.mark.slow
+def test_commands_that_are_killed_and_repeated_end_in_the_same_bits() -> None:
+    """A tenth of what `python -m benchmarks.crash` does; a new process, because it forks."""
+    command = [sys.executable, "-m", "benchmarks.crash", "--kills", str(KILLS)]
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False, cwd=Path(__file__).parents[2]
+    )
+    assert done.returncode == 0, done.stderr
+    assert f"{KILLS} kills survived" in done.stdout
+
+
+def test_leftovers_of_a_kill_are_not_part_of_any_table(
+    run_command: RunCommand, tmp_path: Path
+) -> None:
+    run_command("simulate", "smoke")
+    rows = run_command("sql", "SELECT count(*) AS n FROM log", "--json").json
+    day = tmp_path / "data" / "logs" / "day=2024-05-01"
+    (day / f"{TEMPORARY_PREFIX}0.parquet").write_bytes(b"half a file")
+    (day / "smoke-9999-uncommitted.parquet").write_bytes(b"written, not committed")
+    assert run_command("sql", "SELECT count(*) AS n FROM log", "--json").json == rows
+    assert run_command("gram", "--json").json["rows_read"] == rows[0]["n"]
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Any:
+    """Return a function that mounts a small disk; skip where that is not allowed."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+
+    def mount(options: str) -> Path:
+        command = ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(folder)]
+        if subprocess.run(command, capture_output=True, check=False).returncode:
+            pytest.skip("this machine does not allow to mount a file system")
+        return folder / "data"
+
+    yield mount
+    subprocess.run(["umount", str(folder)], capture_output=True, check=False)
+
+
+def test_a_full_disk_is_told_and_the_same_command_goes_on_after_it(
+    run_command: RunCommand, small_disk: Any, tmp_path: Path
+) -> None:
+    root = small_disk("size=300k")
+    full = run_command(*JOB, root=root)
+    assert full.exit_code == 6
+    assert "the disk is full. Free some space" in full.stderr
+    assert not list(root.rglob(f"{TEMPORARY_PREFIX}*"))
+    subprocess.run(["mount", "-o", "remount,size=20m", str(root.parent)], check=True)
+    assert run_command(*JOB, root=root).exit_code == 0
+    assert run_command(*JOB, root=tmp_path / "fresh").exit_code == 0
+    assert state(root) == state(tmp_path / "fresh")
+
+
+def test_a_read_only_root_is_told_and_can_be_queried(
+    run_command: RunCommand, small_disk: Any
+) -> None:
+    root = small_disk("size=20m")
+    assert run_command(*JOB, root=root).exit_code == 0
+    subprocess.run(["mount", "-o", "remount,ro", str(root.parent)], check=True)
+    for command in (["simulate", "waterford", "--days", "1"], ["publish", "other"]):
+        refused = run_command(*command, root=root)
+        assert refused.exit_code == 6
+        assert "read-only. Choose a writable data root" in refused.stderr
+    assert run_command("select", "--json", root=root).exit_code == 0
+    assert run_command(*JOB, "--json", root=root).json["changed"] is False
+
+
+def test_a_damaged_log_file_is_named(run_command: RunCommand, tmp_path: Path) -> None:
+    run_command("simulate", "smoke")
+    file = next((tmp_path / "data" / "logs").rglob("smoke-0000*.parquet"))
+    whole = file.read_bytes()
+    for damaged in (whole[:1000], b"", b"x" * len(whole)):
+        file.write_bytes(damaged)
+        told = run_command("gram")
+        assert told.exit_code == 6
+        assert file.name in told.stderr
+    file.unlink()
+    for command in (["gram"], ["sql", "SELECT max(ax_mps2) FROM log"]):
+        told = run_command(*command)
+        assert told.exit_code == 6
+        assert file.name in told.stderr
+    file.write_bytes(whole)
+    assert json.loads(run_command("gram", "--json").stdout)["files_read"] == 4
+
+
+@pytest.fixture
+def failing_disk(tmp_path: Path) -> dict[str, str]:
+    """The environment in which reads of files with `FAILING_PATH` in their path fail with EIO."""
+    library = tmp_path / "eio.so"
+    source = Path(__file__).with_name("eio.c")
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("this machine has no C compiler to make a disk fail with")
+    subprocess.run([compiler, "-shared", "-fPIC", "-o", library, source, "-ldl"], check=True)
+    return {**os.environ, "LD_PRELOAD": str(library)}
+
+
+@pytest.fixture(scope="module")
+def done_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data root after the job."""
+    root = tmp_path_factory.mktemp("done") / "data"
+    subprocess.run([COMMAND, "--root", str(root), *JOB], check=True, capture_output=True)
+    return root
+
+
+def digest(root: Path) -> Any:
+    """Number and hash of the rows of the logs."""
+    with fleet_slip.connect(root) as database:
+        query = "SELECT count(*), bit_xor(hash(l)) FROM log_counts l"
+        return database.execute(query).fetchone()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("failing", ["smoke-0000", "signals-", "00000000000000000001.json"])
+def test_a_read_error_is_told_and_loses_nothing(
+    run_command: RunCommand,
+    tmp_path: Path,
+    done_once: Path,
+    failing_disk: dict[str, str],
+    failing: str,
+) -> None:
+    shutil.copytree(done_once, tmp_path / "data")
+    before = digest(tmp_path / "data")
+    environment = {**failing_disk, "FAILING_PATH": failing}
+    compacted = run_command("compact", env=environment)
+    assert compacted.exit_code == 6
+    assert "nput/output error" in compacted.stderr or failing in compacted.stderr
+    verified = run_command("verify", "--json", env=environment)
+    assert verified.exit_code == 9
+    assert verified.json["damage"]
+    assert run_command("compact").exit_code == 0
+    assert digest(tmp_path / "data") == before
+    assert run_command("verify", "--full").exit_code == 0
