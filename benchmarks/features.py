@@ -15,8 +15,9 @@ import numpy as np
 
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohort import TRAINING_DRIVES, Cohort, load_cohort
+from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.grams.job import update_grams
 from fleet_slip.regression.crossval import held_out
 from fleet_slip.regression.exact import fit

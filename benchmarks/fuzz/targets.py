@@ -30,6 +30,7 @@ from fleet_slip.files.data_root import data_root
 from fleet_slip.files.documents import checksum
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.folding import FoldKey
 from fleet_slip.grams.job import update_grams
 from fleet_slip.ingest.job import ingest_file
 from fleet_slip.ingest.mapping import Mapping, load_mapping
@@ -38,7 +39,7 @@ from fleet_slip.models.manifest import check_model_name
 from fleet_slip.models.score import score
 from fleet_slip.models.versions import Registry
 from fleet_slip.resources import find_config, folder
-from fleet_slip.selection.model_list import FoldKey, load_model_list
+from fleet_slip.selection.model_list import load_model_list
 from fleet_slip.selection.request import SelectionPlan, run_plan
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.scenario import load_scenario

@@ -6,7 +6,7 @@ of Gram row, and how a drive's rows are divided into several Gram rows, if they 
 
 import hashlib
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from decimal import Decimal
 from fractions import Fraction
 from functools import cache, cached_property
@@ -19,11 +19,13 @@ from fleet_slip.catalogue.signals import COUNT_MAX, Identifier, Signal, SIUnit, 
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import SelectionError
 from fleet_slip.files.documents import canonical_json
-from fleet_slip.regression.serial import lag_signals
 from fleet_slip.resources import folder
 
 PLAIN = "signals"
 """The feature set whose columns are the catalogue's inputs and label themselves."""
+
+LAG = "_lag"
+"""What the column of a signal's previous value ends in."""
 
 _FUNCTIONS = frozenset({"abs", "sign"})
 _WORD = re.compile(r"[a-z_][a-z0-9_]*")
@@ -42,6 +44,11 @@ def integer_sql(text: str) -> str:
     if not _INTEGER_SQL.fullmatch(text):
         raise ValueError(f"{text!r} is not integer arithmetic of + - * ( )")
     return _WORD.sub(lambda m: f"{m[0]}::BIGINT" if m[0] in inputs else m[0], text)
+
+
+def lag_signals(signals: Sequence[str]) -> tuple[str, ...]:
+    """Return the columns of a lagged set: all signals now, then all one sample before."""
+    return (*signals, *(name + LAG for name in signals))
 
 
 class Feature(Config):
@@ -244,6 +251,14 @@ def input_scales() -> Mapping[str, Fraction]:
     signals = catalogue()
     scales = {name: signals[name].exact_scale for name in signals.gram_signals}
     return scales | {name: one.exact_scale for name, one in features().features.items()}
+
+
+def with_absent(rows: str, absent: Sequence[str]) -> str:
+    """Return a table expression with signals that none of its files has, as nulls."""
+    if not absent:
+        return rows
+    nulls = ", ".join(f"NULL::SMALLINT AS {name}" for name in absent)
+    return f"(SELECT *, {nulls} FROM {rows})"
 
 
 def with_features(rows: str, definitions: Mapping[str, str]) -> str:

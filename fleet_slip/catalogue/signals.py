@@ -12,7 +12,6 @@ import pyarrow as pa
 from pydantic import Field, StringConstraints, model_validator
 
 from fleet_slip.config import Config, load_config
-from fleet_slip.delta.schema import SCALE
 from fleet_slip.errors import SelectionError
 from fleet_slip.resources import folder
 
@@ -141,18 +140,6 @@ class SignalCatalogue(Config):
                 *self.drive_schema,
                 ("tick", pa.int32()),
                 *((name, pa.int16()) for name in self.signals),
-            ]
-        )
-
-    @cached_property
-    def stored_schema(self) -> pa.Schema:
-        """The log schema with the scale of each signal in its field's metadata."""
-        return pa.schema(
-            [
-                field.with_metadata({SCALE: str(self.signals[field.name].scale)})
-                if field.name in self.signals
-                else field
-                for field in self.log_schema
             ]
         )
 

@@ -6,10 +6,11 @@ import typer
 
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli.output import Json, print_json, print_table, say, stdout
 from fleet_slip.cli.selecting import Cohort
 from fleet_slip.cli.subject import FeatureSetOption, Model, Signals, quantities, subject_of
-from fleet_slip.grams.cohort import TRAINING_DRIVES, load_cohort
+from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.regression.inference import INTERCEPT, Estimate
 from fleet_slip.selection.diagnostics import Comparison, Diagnosis
 from fleet_slip.selection.diagnostics import diagnose as diagnose_fit

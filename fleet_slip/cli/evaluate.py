@@ -3,19 +3,22 @@
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from fleet_slip.catalogue.sources import ALL_DRIVES
 from fleet_slip.cli.models import Reference, registry_of
 from fleet_slip.cli.output import Json, print_json, print_table, progress, say, stdout
 from fleet_slip.cli.recorded import recorded
 from fleet_slip.cli.run import DEFAULT_CAMPAIGN
 from fleet_slip.cli.selecting import Cohort
 from fleet_slip.cli.workers import Threads
-from fleet_slip.grams.cohort import ALL_DRIVES
 from fleet_slip.models.score import score as score_rows
 from fleet_slip.models.score import score_statement
+
+if TYPE_CHECKING:
+    from fleet_slip.evaluation.evaluate import TrainRivals
 
 OneCar = Annotated[
     str,
@@ -93,6 +96,11 @@ def evaluate(
     from fleet_slip.evaluation.runs import simulate_scenarios  # noqa: PLC0415
     from fleet_slip.simulation.scenario import load_scenario, shipped_scenarios  # noqa: PLC0415
 
+    train_rivals: TrainRivals | None = None
+    if rivals:
+        from fleet_slip.rivals import compare  # noqa: PLC0415 - an optional extra
+
+        train_rivals = compare.train_rivals
     scenarios = tuple(map(load_scenario, scenario)) if scenario else shipped_scenarios()
     versions = [registry_of(context.obj).resolve(name) for name in (one_car, *(fleet or ()))]
     with (
@@ -101,7 +109,7 @@ def evaluate(
     ):
         simulate_scenarios(context.obj, scenarios, executor, advance)
         found = evaluate_models(
-            context.obj, scenarios, versions[0], versions[1:], executor, rivals=rivals
+            context.obj, scenarios, versions[0], versions[1:], executor, train_rivals
         )
     content = found.as_dict()
     kept = keep(context.obj, content)

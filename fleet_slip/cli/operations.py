@@ -7,12 +7,12 @@ from typing import Annotated
 
 import typer
 
+from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli.models import Reference, registry_of
 from fleet_slip.cli.output import Json, print_json, print_table, progress, say
 from fleet_slip.cli.recorded import recorded
 from fleet_slip.cli.run import DEFAULT_CAMPAIGN
 from fleet_slip.errors import AlarmError, ConfigError
-from fleet_slip.grams.cohort import TRAINING_DRIVES
 from fleet_slip.maintenance.migration import migrate as migrate_logs
 from fleet_slip.monitoring.monitor import Chart
 from fleet_slip.monitoring.monitor import monitor as chart_errors

@@ -4,6 +4,7 @@ from typing import Annotated, Any
 
 import typer
 
+from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli.models import registry_of
 from fleet_slip.cli.output import Json, print_json, say
 from fleet_slip.cli.recorded import recorded
@@ -21,7 +22,6 @@ from fleet_slip.cli.selecting import (
     print_selection,
 )
 from fleet_slip.cli.signing import SignKey
-from fleet_slip.grams.cohort import TRAINING_DRIVES
 from fleet_slip.models.manifest import check_model_name
 from fleet_slip.models.publish import Publication, manifest_of
 from fleet_slip.models.publish import publish as publish_selection

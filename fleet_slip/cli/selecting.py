@@ -5,14 +5,14 @@ from typing import Annotated, Any
 
 import typer
 
+from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli.output import Json, print_json, print_table, say, stdout
-from fleet_slip.grams.cohort import ROW_FOLDS, TRAINING_DRIVES
+from fleet_slip.grams.folding import ROW_FOLDS, FoldKey
 from fleet_slip.regression.criteria import CRITERIA
 from fleet_slip.regression.crossval import CrossValidation
 from fleet_slip.regression.nested_choice import CROSS_VALIDATION
 from fleet_slip.regression.ranking import RANKINGS
 from fleet_slip.selection.compare import Selection
-from fleet_slip.selection.model_list import FoldKey
 from fleet_slip.selection.request import DEFAULT_MODELS, SelectionPlan, run_plan
 from fleet_slip.selection.search import OrderedChoice
 from fleet_slip.selection.uncertainty import Uncertainty

@@ -6,19 +6,21 @@ import typer
 
 from fleet_slip.catalogue.features import PLAIN, FeatureSet, features
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli.output import Json, print_json, print_table, stdout
 from fleet_slip.cli.selecting import Cohort, FoldCount, Naive
 from fleet_slip.cli.subject import FeatureSetOption, Model, Signals, quantities, subject_of
 from fleet_slip.errors import ConfigError
-from fleet_slip.grams.cohort import TRAINING_DRIVES, load_cohort
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.folding import Folding, FoldKey
+from fleet_slip.models.counts_model import counts_model
 from fleet_slip.regression.exact import fit
 from fleet_slip.regression.figures import Figures
 from fleet_slip.regression.inference import INTERCEPT
-from fleet_slip.selection.model_list import FoldKey, FoldPlan
 from fleet_slip.selection.regimes import RegimeComparison, compare_regimes
 from fleet_slip.selection.request import WHOLE_SET, inputs_of
 from fleet_slip.selection.shrinkage import compare_shrinkage
-from fleet_slip.selection.what_if import WhatIf, counts_model, what_if
+from fleet_slip.selection.what_if import WhatIf, what_if
 
 By = Annotated[FoldKey, typer.Option(help="What a fold is made of.")]
 
@@ -181,7 +183,7 @@ def regimes(
     """
     drives = load_cohort(context.obj, cohort, feature_set)
     inputs = inputs_of(drives, signals or WHOLE_SET)
-    plan = FoldPlan(by=by, count=folds or FoldPlan().count)
+    plan = Folding(by=by, count=folds or Folding().count)
     divided_by = [name.strip() for name in over.split(",")] if over else []
     result = compare_regimes(drives, inputs, plan, divided_by)
     if json:
@@ -235,7 +237,7 @@ def shrink(
     """
     drives = load_cohort(context.obj, cohort, feature_set or PLAIN)
     inputs = inputs_of(drives, signals or WHOLE_SET)
-    plan = FoldPlan(by=by, count=folds or FoldPlan().count)
+    plan = Folding(by=by, count=folds or Folding().count)
     found = compare_shrinkage(drives, inputs, plan, naive=naive)
     if json:
         print_json({"cohort": cohort, "methods": [one.as_dict() for one in found]})

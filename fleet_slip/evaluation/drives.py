@@ -10,8 +10,8 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalogue.sources import SCENARIO
 from fleet_slip.errors import SelectionError
-from fleet_slip.grams.cohort import SCENARIO
 from fleet_slip.resources import read_sql
 from fleet_slip.simulation.scenario import Failure, Scenario
 from fleet_slip.simulation.sensors import GPS_SIGNALS

@@ -1,22 +1,42 @@
 """An evaluation from end to end: estimators, scenarios, figures, checks and comparisons."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from fleet_slip.evaluation.comparison import Comparison, compare
-from fleet_slip.evaluation.estimators import Estimate, Training, training
+from fleet_slip.evaluation.drives import FloatArray
+from fleet_slip.evaluation.estimators import Estimate, Signals, Training, training
 from fleet_slip.evaluation.filters import filter_bank
 from fleet_slip.evaluation.results import document
 from fleet_slip.evaluation.runs import Run, run_all
 from fleet_slip.evaluation.targets import Check, checks, filter_checks
+from fleet_slip.grams.cohort import Cohort
 from fleet_slip.models.versions import ModelVersion
 from fleet_slip.simulation.scenario import Scenario, load_scenario
 from fleet_slip.warehouse.tables import Warehouse
 
-if TYPE_CHECKING:
-    from fleet_slip.rivals.compare import Rival
+
+class Rival(Protocol):
+    """What an evaluation asks of a learned rival; `fleet_slip.rivals` has them."""
+
+    @property
+    def name(self) -> str:
+        """Name among the estimators."""
+
+    def estimate(self, signals: Signals) -> FloatArray:
+        """Estimate side-slip in rad of a drive; NaN where an input is null."""
+
+    def description(self) -> Mapping[str, Any]:
+        """Return what a document says of it as an estimator."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what a document says of its accuracy and cost."""
+
+
+TrainRivals = Callable[[Warehouse, Cohort], Sequence[Rival]]
+"""Trains the rivals on the rows of a cohort."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +45,7 @@ class Competitors:
 
     one_car: Training
     fleets: tuple[Training, ...]
-    rivals: "tuple[Rival, ...]"
+    rivals: tuple[Rival, ...]
     estimators: Mapping[str, Estimate]
     descriptions: Mapping[str, Mapping[str, Any]]
 
@@ -58,8 +78,7 @@ def gather(
     one_car: ModelVersion,
     fleets: Sequence[ModelVersion],
     executor: Executor,
-    *,
-    rivals: bool,
+    train_rivals: TrainRivals | None,
 ) -> Competitors:
     """Fit, tune and train all that compete, on cohorts without any drive of a scenario.
 
@@ -67,7 +86,7 @@ def gather(
     """
     first = training(warehouse, one_car)
     others = tuple(training(warehouse, version) for version in fleets)
-    learned = _train_rivals(warehouse, first) if rivals else ()
+    learned = tuple(train_rivals(warehouse, first.selection.cohort)) if train_rivals else ()
     estimators: dict[str, Estimate] = {}
     descriptions: dict[str, Mapping[str, Any]] = {}
     for trained in (first, *others):
@@ -91,11 +110,10 @@ def evaluate(
     one_car: ModelVersion,
     fleets: Sequence[ModelVersion],
     executor: Executor,
-    *,
-    rivals: bool = False,
+    train_rivals: TrainRivals | None = None,
 ) -> Evaluation:
     """Evaluate a model and all that competes with it on scenarios that are in the logs."""
-    competitors = gather(warehouse, one_car, fleets, executor, rivals=rivals)
+    competitors = gather(warehouse, one_car, fleets, executor, train_rivals)
     runs = run_all(warehouse, scenarios, competitors.estimators)
     first = competitors.one_car
     return Evaluation(
@@ -109,9 +127,3 @@ def evaluate(
             row for fleet in competitors.fleets for row in compare(runs, first, fleet)
         ),
     )
-
-
-def _train_rivals(warehouse: Warehouse, trained: Training) -> "tuple[Rival, ...]":
-    from fleet_slip.rivals.compare import train_rivals  # noqa: PLC0415 - an optional extra
-
-    return train_rivals(warehouse, trained.selection.cohort)

@@ -13,33 +13,15 @@ from numpy.typing import NDArray
 
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalogue.sources import SCENARIO, TRAINING_DRIVES
 from fleet_slip.errors import RefusedError, SelectionError
+from fleet_slip.grams.folding import FOLD_KEYS, ROW_FOLDS
 from fleet_slip.grams.reader import GramReader, open_grams
 from fleet_slip.regression.drives import serving_drives
 from fleet_slip.regression.folds import Assignment, CohortFolds, by_hash, by_value
 from fleet_slip.regression.gram import GramTable, IntArray, packed_size
 from fleet_slip.warehouse.database import database_errors
 from fleet_slip.warehouse.tables import Warehouse
-
-FOLD_KEYS = {
-    "drive": "drive_id",
-    "vehicle": "vehicle_id",
-    "track": "track",
-    "day": "day",
-    "mass": "mass_kg",
-    "adhesion": "adhesion",
-    "row": "part",
-}
-"""What a fold may be made of, and the column that tells."""
-
-ROW_FOLDS = "row"
-"""Folds of single rows, as WEKA makes them. They leak: a test row's neighbours train the model."""
-
-SCENARIO = "scenario"
-"""Source of the drives that models are evaluated on, and must never be trained on."""
-
-ALL_DRIVES = "true"
-TRAINING_DRIVES = f"source <> '{SCENARIO}'"
 
 
 @dataclass(frozen=True)

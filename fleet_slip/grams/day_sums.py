@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.cohort import TRAINING_DRIVES, gram_table, nothing, require_training
+from fleet_slip.catalogue.sources import TRAINING_DRIVES
+from fleet_slip.grams.cohort import gram_table, nothing, require_training
 from fleet_slip.grams.fold_sums import by_signals, hash_numbers
 from fleet_slip.grams.reader import GramReader, open_grams
 from fleet_slip.regression.drives import no_drive_has

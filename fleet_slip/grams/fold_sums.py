@@ -13,11 +13,9 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.errors import SelectionError
 from fleet_slip.grams.cohort import (
-    FOLD_KEYS,
-    ROW_FOLDS,
-    TRAINING_DRIVES,
     assign,
     gram_condition,
     gram_table,
@@ -25,10 +23,10 @@ from fleet_slip.grams.cohort import (
     require_row_folds,
     require_training,
 )
+from fleet_slip.grams.folding import FOLD_KEYS, ROW_FOLDS, Folding
 from fleet_slip.grams.reader import GramReader, OpenedGrams, open_grams
 from fleet_slip.regression.folds import CohortFolds, hash_number
 from fleet_slip.regression.gram import Gram, IntArray
-from fleet_slip.selection.model_list import FoldPlan
 from fleet_slip.warehouse.database import database_errors
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -50,7 +48,7 @@ class SummedCohort:
     """
 
     condition: str
-    plan: FoldPlan
+    plan: Folding
     sums: CohortFolds
     rows: int
     drive_count: int
@@ -77,7 +75,7 @@ class SummedCohort:
 
 def sum_cohort(
     warehouse: Warehouse | GramReader,
-    plan: FoldPlan,
+    plan: Folding,
     condition: str = TRAINING_DRIVES,
     feature_set: str = PLAIN,
 ) -> SummedCohort:
@@ -108,7 +106,7 @@ def sum_cohort(
     )
 
 
-def _folding(opened: OpenedGrams, plan: FoldPlan, condition: str) -> tuple[list[str], FoldOf]:
+def _folding(opened: OpenedGrams, plan: Folding, condition: str) -> tuple[list[str], FoldOf]:
     """Return the names of all folds that there may be, and what tells the fold of a Gram row."""
     if plan.by == "drive":
         names = [str(fold + 1) for fold in range(plan.count)]

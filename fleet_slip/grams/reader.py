@@ -14,9 +14,9 @@ from fleet_slip.delta.table import Snapshot, Table
 from fleet_slip.errors import SelectionError
 from fleet_slip.grams.job import find_backlog
 from fleet_slip.resources import read_sql
-from fleet_slip.views import connect, open_views, tables_in
 from fleet_slip.warehouse.database import database_errors
 from fleet_slip.warehouse.read_only_sql import one_query
+from fleet_slip.warehouse.table_views import connect_tables, lock, open_tables, views_in
 from fleet_slip.warehouse.tables import Warehouse
 
 GRAMS_ALONE = frozenset({"grams"})
@@ -97,13 +97,14 @@ class GramReader:
         return OpenedGrams(database, identity, logs.version or 0, grams.version or 0)
 
     def _connected(self, grams: Snapshot, query: str) -> duckdb.DuckDBPyConnection:
-        alone = tables_in(query) == GRAMS_ALONE
+        alone = views_in(query) == GRAMS_ALONE
         if self._database is None or not (alone and self._alone):
             self._close()
             if alone:
-                self._database = open_views(self._warehouse, GRAMS_ALONE, [grams])
+                self._database = open_tables(self._warehouse, GRAMS_ALONE, [grams])
+                lock(self._database, grams.paths)
             else:
-                self._database = connect(self._warehouse.root, query=query)
+                self._database = connect_tables(self._warehouse, query)
             self._alone = alone
         return self._database
 

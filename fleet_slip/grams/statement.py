@@ -5,9 +5,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
-from fleet_slip.catalogue.features import PLAIN, FeatureCatalogue, Regime, features, with_features
+from fleet_slip.catalogue.features import (
+    LAG,
+    PLAIN,
+    FeatureCatalogue,
+    Regime,
+    features,
+    with_absent,
+    with_features,
+)
 from fleet_slip.catalogue.signals import SignalCatalogue
-from fleet_slip.regression.serial import LAG
 from fleet_slip.resources import read_sql
 
 LOGS = "read_parquet(getvariable('log_files'), union_by_name => true, hive_partitioning => false)"
@@ -24,14 +31,6 @@ class Parts:
 
     number: str
     names: tuple[str, ...]
-
-
-def with_absent(rows: str, absent: Sequence[str]) -> str:
-    """Return a table expression with signals that none of its files has, as nulls."""
-    if not absent:
-        return rows
-    nulls = ", ".join(f"NULL::SMALLINT AS {name}" for name in absent)
-    return f"(SELECT *, {nulls} FROM {rows})"
 
 
 def gram_statement(

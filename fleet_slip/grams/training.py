@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import SelectionError
-from fleet_slip.grams.cohort import FOLD_KEYS, ROW_FOLDS, Cohort, Served, assign
+from fleet_slip.grams.cohort import Cohort, Served, assign
+from fleet_slip.grams.folding import FOLD_KEYS, ROW_FOLDS, Folding
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.folds import CohortFolds, Folds
 from fleet_slip.regression.gram import IntArray
 from fleet_slip.regression.nested_choice import Training
-from fleet_slip.selection.model_list import FoldPlan
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class DriveFolds:
 
 
 def drive_folds(
-    cohort: Cohort, inputs: Sequence[str], plan: FoldPlan, *, naive: bool = False
+    cohort: Cohort, inputs: Sequence[str], plan: Folding, *, naive: bool = False
 ) -> DriveFolds:
     """Divide the drives that have all the inputs into folds. `naive` takes rows for independent.
 
@@ -54,7 +54,7 @@ def drive_folds(
     return DriveFolds(served, assignment.fold, Training(folds, moments, input_scales()))
 
 
-def row_training(cohort: Cohort, inputs: Sequence[str], plan: FoldPlan) -> Training:
+def row_training(cohort: Cohort, inputs: Sequence[str], plan: Folding) -> Training:
     """Return folds of rows; rows then count as independent. Raises `SelectionError`."""
     folds: Folds = cohort.folds(plan.by, plan.count).serving(inputs, catalogue().label)
     return Training(folds, None, input_scales())

@@ -8,9 +8,9 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import SelectionError
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.resources import read_sql
-from fleet_slip.views import connect
 from fleet_slip.warehouse.database import database_errors
 from fleet_slip.warehouse.read_only_sql import one_query
+from fleet_slip.warehouse.table_views import connect_tables
 from fleet_slip.warehouse.tables import Warehouse
 
 
@@ -70,7 +70,7 @@ def _rows(manifest: Manifest) -> str:
 def score(warehouse: Warehouse, manifest: Manifest, condition: str) -> Score:
     """Score a model. Raises `SelectionError` if the cohort has no row with its signals."""
     text = score_statement(manifest, condition)
-    with connect(warehouse.root, query=text) as database:
+    with connect_tables(warehouse, text) as database:
         statement = one_query(database, text)
         with database_errors(f"scoring on the cohort {condition!r}"):
             result = database.execute(statement)

@@ -19,13 +19,13 @@ from typing import Any
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.errors import SelectionError, StorageError
 from fleet_slip.grams.day_sums import sum_days
+from fleet_slip.models.counts_model import counts_model
 from fleet_slip.models.versions import ModelVersion
 from fleet_slip.monitoring.thresholds import MonitorThresholds, thresholds
 from fleet_slip.regression.exact import LinearModel, fit
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.special import student_t_quantile
-from fleet_slip.selection.what_if import counts_model
 from fleet_slip.warehouse.tables import Warehouse
 
 

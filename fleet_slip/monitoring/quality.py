@@ -10,7 +10,8 @@ import pyarrow as pa
 
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.cohort import TRAINING_DRIVES, Cohort, load_cohort, nothing, require_training
+from fleet_slip.catalogue.sources import TRAINING_DRIVES
+from fleet_slip.grams.cohort import Cohort, load_cohort, nothing, require_training
 from fleet_slip.grams.reader import GramReader
 from fleet_slip.monitoring.moments import DriveBatches
 from fleet_slip.monitoring.peers import settle

@@ -17,8 +17,7 @@ from fleet_slip.grams.job import find_backlog
 from fleet_slip.models.versions import Registry
 from fleet_slip.monitoring.thresholds import StatusThresholds, thresholds
 from fleet_slip.resources import read_sql
-from fleet_slip.runs.history import lend_runs
-from fleet_slip.views import run_source
+from fleet_slip.runs.history import lend_runs, run_source
 from fleet_slip.warehouse.database import database_errors, open_database
 from fleet_slip.warehouse.tables import Warehouse
 

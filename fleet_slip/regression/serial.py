@@ -1,7 +1,7 @@
 """Serial correlation of the residuals, from a Gram of signals and their previous values.
 
-A lag Gram has each signal twice, now and one sample before (`ax` and `ax_lag`), over all rows that
-have a predecessor in their drive. It holds S0 = sum u_t u_t', S1 = sum u_t u_{t-1}' and
+A lag Gram has each signal twice, now and one sample before, over all rows that have a predecessor
+in their drive. It holds S0 = sum u_t u_t', S1 = sum u_t u_{t-1}' and
 Sm = sum u_{t-1} u_{t-1}'.
 """
 
@@ -14,15 +14,25 @@ from fleet_slip.regression.exact import Fit, LinearModel, fit
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.gram import Gram
 
-LAG = "_lag"
-
 _GRID = 2**20
 _ROUNDS = 50
 
 
-def lag_signals(signals: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of the signals of a lag Gram: all now, then all one sample before."""
-    return (*signals, *(name + LAG for name in signals))
+@dataclass(frozen=True)
+class LagGram:
+    """A Gram of signals and their previous values.
+
+    Attributes:
+        gram: its signals are `x` and `x + suffix` for each signal `x`.
+        suffix: what the name of a previous value ends in.
+    """
+
+    gram: Gram
+    suffix: str
+
+    def before(self, name: str) -> str:
+        """Return the name of a signal's previous value."""
+        return name + self.suffix
 
 
 @dataclass(frozen=True)
@@ -38,7 +48,7 @@ class SerialCorrelation:
     durbin_watson: float
 
 
-def serial_correlation(model: LinearModel, gram: Gram, lagged: Gram) -> SerialCorrelation:
+def serial_correlation(model: LinearModel, gram: Gram, lagged: LagGram) -> SerialCorrelation:
     """Return the serial correlation of a model of counts.
 
     `gram` has all rows; `lagged` those with a predecessor. The residual is that of the model, its
@@ -52,14 +62,14 @@ def serial_correlation(model: LinearModel, gram: Gram, lagged: Gram) -> SerialCo
     return SerialCorrelation(float(now_before / before), float(steps / total))
 
 
-def quasi_differenced(lagged: Gram, signals: Sequence[str], rho: Fraction) -> Gram:
+def quasi_differenced(lagged: LagGram, signals: Sequence[str], rho: Fraction) -> Gram:
     """Return the Gram of q u_t - p u_{t-1} for rho = p / q, exactly.
 
     Its counts are worth 1/q of the signals'; coefficients are unaffected, the intercept becomes
     q - p times that of the levels.
     """
     p, q = rho.numerator, rho.denominator
-    return lagged.combine({name: {name: q, name + LAG: -p} for name in signals})
+    return lagged.gram.combine({name: {name: q, lagged.before(name): -p} for name in signals})
 
 
 @dataclass(frozen=True)
@@ -77,7 +87,7 @@ class AutoregressiveFit:
     differenced: Fit
 
 
-def autoregressive_fit(lagged: Gram, inputs: Sequence[str], label: str) -> AutoregressiveFit:
+def autoregressive_fit(lagged: LagGram, inputs: Sequence[str], label: str) -> AutoregressiveFit:
     """Return the AR(1) fit by iterated Cochrane-Orcutt (1949) from a lag Gram.
 
     rho is kept on a grid of 2^-20, so that each step is exact; it stops when rho does not change.
@@ -102,16 +112,16 @@ def autoregressive_fit(lagged: Gram, inputs: Sequence[str], label: str) -> Autor
     return AutoregressiveFit(model, float(rho), differenced)
 
 
-def _residual_products(model: LinearModel, lagged: Gram) -> tuple[Fraction, Fraction]:
+def _residual_products(model: LinearModel, lagged: LagGram) -> tuple[Fraction, Fraction]:
     """Return sum e_t e_{t-1} and sum e_{t-1}^2."""
     before = LinearModel(
-        tuple(name + LAG for name in model.signals),
-        model.label + LAG,
+        tuple(map(lagged.before, model.signals)),
+        lagged.before(model.label),
         model.coefficients,
         model.intercept,
     )
-    square = error_sums(before, lagged).squared_error
-    now = error_sums(model, lagged).squared_error
+    square = error_sums(before, lagged.gram).squared_error
+    now = error_sums(model, lagged.gram).squared_error
     step = error_sums(_difference(model), _with_differences(model, lagged)).squared_error
     # (e_t - e_{t-1})^2 = e_t^2 - 2 e_t e_{t-1} + e_{t-1}^2
     return (now + square - step) / 2, square
@@ -121,5 +131,5 @@ def _difference(model: LinearModel) -> LinearModel:
     return LinearModel(model.signals, model.label, model.coefficients, Fraction(0))
 
 
-def _with_differences(model: LinearModel, lagged: Gram) -> Gram:
+def _with_differences(model: LinearModel, lagged: LagGram) -> Gram:
     return quasi_differenced(lagged, [*model.signals, model.label], Fraction(1))

@@ -5,13 +5,13 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from fleet_slip.catalogue.sources import SCENARIO
 from fleet_slip.errors import SelectionError
 from fleet_slip.evaluation.estimators import TABLE_ONE, Estimate, LinearEstimate, Training, training
 from fleet_slip.evaluation.filters import FILTERS, bound
 from fleet_slip.evaluation.runs import Run, run_all
 from fleet_slip.evaluation.targets import THE_PAPERS_CHOICE
 from fleet_slip.files.documents import canonical_json
-from fleet_slip.grams.cohort import SCENARIO
 from fleet_slip.models.versions import ModelVersion
 from fleet_slip.report.coefficients import Coefficients, coefficient_table
 from fleet_slip.report.evaluated import Evaluated, latest_of

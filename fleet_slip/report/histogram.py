@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.evaluation.drives import FloatArray
-from fleet_slip.grams.cohort import FOLD_KEYS, assign
+from fleet_slip.grams.cohort import assign
+from fleet_slip.grams.folding import FOLD_KEYS
 from fleet_slip.regression.crossval import CrossValidation, least_squares
 from fleet_slip.regression.exact import LinearModel
 from fleet_slip.resources import read_sql

@@ -16,7 +16,8 @@ from concurrent.futures import ThreadPoolExecutor
 import duckdb
 
 from fleet_slip.files.folder import Folder, StoredFile
-from fleet_slip.runs.log import FOLDER
+from fleet_slip.resources import read_sql
+from fleet_slip.runs.log import FOLDER, RECORD_COLUMNS
 
 REMOVALS_AT_ONCE = 16
 
@@ -60,3 +61,13 @@ def _gather(folder: Folder, month: str, files: list[StoredFile]) -> None:
 
 def _is_record(path: str) -> bool:
     return path.endswith(".jsonl")
+
+
+def run_source(database: duckdb.DuckDBPyConnection, files: list[str]) -> str:
+    """Return what stands after FROM for the history of runs, or some of its files."""
+    columns = ", ".join(f"{name} {kind}" for name, kind in RECORD_COLUMNS.items())
+    database.execute("SET VARIABLE run_files = $paths", {"paths": files})
+    if files:
+        return read_sql("warehouse", "stored_runs.sql").format(run_columns=RECORD_COLUMNS)
+    database.execute(f"CREATE TABLE empty_runs ({columns})")
+    return "empty_runs"

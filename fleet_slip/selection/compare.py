@@ -9,12 +9,13 @@ from typing_extensions import TypeVar
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import SelectionError
-from fleet_slip.grams.cohort import ROW_FOLDS, Cohort
+from fleet_slip.grams.cohort import Cohort
 from fleet_slip.grams.fold_sums import SummedCohort
+from fleet_slip.grams.folding import ROW_FOLDS, Folding
 from fleet_slip.regression.crossval import CrossValidation, cross_validate_inputs
 from fleet_slip.regression.folds import CohortFolds
 from fleet_slip.regression.winner import Winner, choose
-from fleet_slip.selection.model_list import CandidateModel, FoldPlan
+from fleet_slip.selection.model_list import CandidateModel
 from fleet_slip.selection.search import OrderedChoice
 from fleet_slip.selection.uncertainty import Uncertainty
 
@@ -36,7 +37,7 @@ class Selection(Generic[AnyCohort]):
     """
 
     cohort: AnyCohort
-    folds: FoldPlan
+    folds: Folding
     models: tuple[CrossValidation, ...]
     winner: Winner
     skipped: dict[str, str]
@@ -71,7 +72,7 @@ class Selection(Generic[AnyCohort]):
 
 
 def select(
-    cohort: AnyCohort, candidates: Sequence[CandidateModel], folds: FoldPlan
+    cohort: AnyCohort, candidates: Sequence[CandidateModel], folds: Folding
 ) -> Selection[AnyCohort]:
     """Cross-validate each candidate and choose the winner.
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from fleet_slip.catalogue.features import input_scales
+from fleet_slip.catalogue.features import LAG, input_scales, lag_signals
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import SelectionError
 from fleet_slip.grams.cohort import Cohort, Served
@@ -25,9 +25,9 @@ from fleet_slip.regression.nested import nested_fits
 from fleet_slip.regression.ridge import errors_in_variables
 from fleet_slip.regression.serial import (
     AutoregressiveFit,
+    LagGram,
     SerialCorrelation,
     autoregressive_fit,
-    lag_signals,
     serial_correlation,
 )
 
@@ -166,7 +166,7 @@ def diagnose(
 def _serial(fitted: Fit, lagged: Cohort) -> SerialDiagnosis:
     inputs, label = fitted.model.signals, fitted.model.label
     table, _ = serving_drives(lagged.tables, lag_signals([*inputs, label]))
-    gram = table.total()
+    gram = LagGram(table.total(), LAG)
     autoregressive = autoregressive_fit(gram, inputs, label)
     return SerialDiagnosis(
         serial_correlation(fitted.model, fitted.gram, gram),

@@ -2,7 +2,6 @@
 
 import hashlib
 from collections.abc import Sequence
-from typing import Literal
 
 from pydantic import Field, model_validator
 
@@ -10,9 +9,8 @@ from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.signals import Identifier, catalogue
 from fleet_slip.config import Config, load_config
 from fleet_slip.files.documents import canonical_json
+from fleet_slip.grams.folding import Folding
 from fleet_slip.resources import find_config
-
-FoldKey = Literal["drive", "vehicle", "track", "day", "mass", "adhesion", "row"]
 
 
 class CandidateModel(Config):
@@ -34,19 +32,12 @@ class CandidateModel(Config):
         return self
 
 
-class FoldPlan(Config):
-    """How a cohort is divided for cross-validation."""
-
-    by: FoldKey = "drive"
-    count: int = Field(default=5, ge=2, le=1000)
-
-
 class ModelList(Config):
     """Candidates in their declared order, the feature set and the folds to compare them on."""
 
     description: str = Field(min_length=1)
     features: Identifier = PLAIN
-    folds: FoldPlan = FoldPlan()
+    folds: Folding = Folding()
     model: tuple[CandidateModel, ...] = Field(min_length=1)
 
     @model_validator(mode="after")

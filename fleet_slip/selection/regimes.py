@@ -10,13 +10,13 @@ import numpy as np
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import SelectionError
-from fleet_slip.grams.cohort import FOLD_KEYS, ROW_FOLDS, Cohort, assign
+from fleet_slip.grams.cohort import Cohort, assign
+from fleet_slip.grams.folding import FOLD_KEYS, ROW_FOLDS, Folding
 from fleet_slip.grams.statement import UNKNOWN_PART
 from fleet_slip.regression.crossval import held_out
 from fleet_slip.regression.exact import LinearModel, fit
 from fleet_slip.regression.figures import ErrorSums, Figures
 from fleet_slip.regression.gram import Gram, IntArray
-from fleet_slip.selection.model_list import FoldPlan
 
 ROWS_PER_COEFFICIENT = 100
 """A regime with fewer training rows, one second of driving a coefficient, uses the pooled model."""
@@ -122,7 +122,7 @@ def band_order(cohort: Cohort, names: Sequence[str]) -> list[str]:
 
 
 def compare_regimes(
-    cohort: Cohort, inputs: Sequence[str], plan: FoldPlan, over: Sequence[str] = ()
+    cohort: Cohort, inputs: Sequence[str], plan: Folding, over: Sequence[str] = ()
 ) -> RegimeComparison:
     """Cross-validate one model for all regimes and one for each, on drives that have the inputs.
 

@@ -6,16 +6,16 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.errors import ConfigError
 from fleet_slip.files.documents import canonical_json
-from fleet_slip.grams.cohort import ROW_FOLDS, TRAINING_DRIVES, Cohort, load_cohort
+from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.grams.fold_sums import SummedCohort, sum_cohort
+from fleet_slip.grams.folding import ROW_FOLDS, Folding, FoldKey
 from fleet_slip.regression.nested_choice import Rule
 from fleet_slip.selection.compare import Selection, select
 from fleet_slip.selection.model_list import (
     CandidateModel,
-    FoldKey,
-    FoldPlan,
     ModelList,
     load_model_list,
     nested_models,
@@ -109,9 +109,9 @@ def run_plan(warehouse: Warehouse, plan: SelectionPlan) -> PlannedSelection:
     return replace(planned, selection=replace(planned.selection, uncertainty=figures))
 
 
-def _fold_plan(plan: SelectionPlan, model_list: ModelList | None) -> FoldPlan:
-    listed = model_list.folds if model_list else FoldPlan()
-    return FoldPlan(by=plan.by or listed.by, count=plan.folds or listed.count)
+def _fold_plan(plan: SelectionPlan, model_list: ModelList | None) -> Folding:
+    listed = model_list.folds if model_list else Folding()
+    return Folding(by=plan.by or listed.by, count=plan.folds or listed.count)
 
 
 def _feature_set(plan: SelectionPlan, model_list: ModelList | None) -> str:
@@ -125,7 +125,7 @@ def _listed(
     cohort: Cohort | SummedCohort,
     plan: SelectionPlan,
     model_list: ModelList | None,
-    folds: FoldPlan,
+    folds: Folding,
 ) -> PlannedSelection:
     listed = model_list.model if model_list else ()
     nested = nested_models(inputs_of(cohort, plan.nested)) if plan.nested else ()
@@ -140,7 +140,7 @@ def _listed(
     return PlannedSelection(select(cohort, described.model, folds), label, described.sha256)
 
 
-def _ordered(cohort: Cohort, plan: SelectionPlan, folds: FoldPlan) -> PlannedSelection:
+def _ordered(cohort: Cohort, plan: SelectionPlan, folds: Folding) -> PlannedSelection:
     nested = plan.nested or WHOLE_SET
     inputs = inputs_of(cohort, nested)
     rule = Rule(plan.rank or "declared", check_criterion(plan.criterion or "cv"))

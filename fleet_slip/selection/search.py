@@ -9,7 +9,8 @@ import numpy as np
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import SelectionError
-from fleet_slip.grams.cohort import ROW_FOLDS, Cohort
+from fleet_slip.grams.cohort import Cohort
+from fleet_slip.grams.folding import ROW_FOLDS, Folding
 from fleet_slip.grams.training import drive_folds, row_training
 from fleet_slip.regression.criteria import CRITERIA
 from fleet_slip.regression.crossval import CrossValidation, cross_validate, least_squares
@@ -26,7 +27,6 @@ from fleet_slip.regression.nested_choice import (
 from fleet_slip.regression.nested_choice import Selection as NestedSelection
 from fleet_slip.regression.subsets import SizeResult, best_subsets, choices
 from fleet_slip.regression.winner import Winner, choose
-from fleet_slip.selection.model_list import FoldPlan
 
 ALL_SUBSETS = "all-subsets"
 """Instead of a ranking: the best subset of every size."""
@@ -97,7 +97,7 @@ def check_criterion(name: str) -> str:
 
 
 def select_ranked(
-    cohort: Cohort, inputs: Sequence[str], plan: FoldPlan, rule: Rule, *, naive: bool = False
+    cohort: Cohort, inputs: Sequence[str], plan: Folding, rule: Rule, *, naive: bool = False
 ) -> OrderedSelection:
     """Rank the inputs and choose one of the nested models, on the drives that have them all.
 
@@ -124,7 +124,7 @@ def select_ranked(
 
 
 def select_subsets(
-    cohort: Cohort, inputs: Sequence[str], plan: FoldPlan, criterion: str, *, naive: bool = False
+    cohort: Cohort, inputs: Sequence[str], plan: Folding, criterion: str, *, naive: bool = False
 ) -> OrderedSelection:
     """Find the best subset of every size and choose one of them.
 

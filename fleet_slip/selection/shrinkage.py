@@ -9,6 +9,7 @@ import numpy as np
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import SelectionError
 from fleet_slip.grams.cohort import Cohort
+from fleet_slip.grams.folding import Folding
 from fleet_slip.grams.training import drive_folds
 from fleet_slip.regression.crossval import (
     CrossValidation,
@@ -25,7 +26,6 @@ from fleet_slip.regression.lars import lasso_model
 from fleet_slip.regression.nested import nested_fits
 from fleet_slip.regression.pace import ESTIMATORS, Estimator, shrink
 from fleet_slip.regression.ridge import ridge_model
-from fleet_slip.selection.model_list import FoldPlan
 from fleet_slip.selection.search import FEWEST_FOLDS
 
 PENALTIES = tuple(float(10.0**exponent) for exponent in np.arange(-6, 0.01, 0.5))
@@ -47,7 +47,7 @@ class Shrunk:
 
 
 def compare_shrinkage(
-    cohort: Cohort, inputs: Sequence[str], plan: FoldPlan, *, naive: bool = False
+    cohort: Cohort, inputs: Sequence[str], plan: Folding, *, naive: bool = False
 ) -> tuple[Shrunk, ...]:
     """Cross-validate every method on the drives that have all the inputs.
 

@@ -5,6 +5,7 @@ from typing import Any
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.grams.cohort import Cohort
+from fleet_slip.grams.folding import Folding
 from fleet_slip.grams.training import drive_folds
 from fleet_slip.regression.crossval import CrossValidation
 from fleet_slip.regression.exact import fit
@@ -15,7 +16,6 @@ from fleet_slip.regression.resampling import (
     percentile_interval,
     repeated_cross_validation,
 )
-from fleet_slip.selection.model_list import FoldPlan
 
 SEED = 1
 """Resampling is reproducible: the same command prints the same figures."""
@@ -44,7 +44,7 @@ class Uncertainty:
 def uncertainty(
     cohort: Cohort,
     model: CrossValidation,
-    plan: FoldPlan,
+    plan: Folding,
     *,
     bootstrap: int | None,
     repeat: int | None,

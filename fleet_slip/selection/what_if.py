@@ -7,7 +7,6 @@ from typing import Any
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.errors import SelectionError
 from fleet_slip.grams.cohort import Cohort
-from fleet_slip.models.manifest import Manifest
 from fleet_slip.regression.disturbance import disturbed
 from fleet_slip.regression.exact import LinearModel
 from fleet_slip.regression.figures import Figures, error_sums
@@ -40,22 +39,6 @@ class WhatIf:
             "refitted_after": self.refitted_after.as_dict(),
             "refitted": {"intercept": self.refitted.offset, **self.refitted.weights},
         }
-
-
-def counts_model(manifest: Manifest) -> LinearModel:
-    """Return a published model as one of counts, exactly."""
-    # Of the counts as they are now: a signal's scale may have changed since it was published.
-    scales = input_scales()
-    unit = scales[manifest.label.signal]
-    return LinearModel(
-        manifest.signals,
-        manifest.label.signal,
-        tuple(
-            term.coefficient_exact * (term.scale_exact if term.sql else scales[term.signal]) / unit
-            for term in manifest.terms
-        ),
-        manifest.intercept_exact / unit,
-    )
 
 
 def what_if(

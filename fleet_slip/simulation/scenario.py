@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from fleet_slip.catalogue.signals import Identifier, catalogue
+from fleet_slip.catalogue.sources import SCENARIO
 from fleet_slip.config import Config, load_config, load_toml
 from fleet_slip.errors import ConfigError
-from fleet_slip.grams.cohort import SCENARIO
 from fleet_slip.resources import config_names, find_config
 from fleet_slip.simulation.campaign import Batch, DriveSpec
 from fleet_slip.simulation.drive_plan import NamedTrack, NamedVehicle, NotNegative, Positive

@@ -7,6 +7,7 @@ import pyarrow as pa
 
 from fleet_slip.catalogue.signals import SignalCatalogue, catalogue
 from fleet_slip.delta import Encoding, Table
+from fleet_slip.delta.schema import SCALE
 from fleet_slip.errors import StorageError
 from fleet_slip.files.folder import Folder
 
@@ -48,7 +49,7 @@ class Warehouse:
         signals = self.catalogue
         return Table(
             folder=self.root / "logs",
-            schema=signals.stored_schema,
+            schema=stored_schema(signals),
             encoding=Encoding(
                 dictionary=tuple(signals.drive),
                 delta_packed=("tick", *signals.signals),
@@ -86,6 +87,18 @@ class Warehouse:
     def tables(self) -> tuple[Table, ...]:
         """All tables."""
         return (self.logs, self.grams, self.quarantine)
+
+
+def stored_schema(signals: SignalCatalogue) -> pa.Schema:
+    """Return the schema of the table `logs`, with each signal's scale in its field's metadata."""
+    return pa.schema(
+        [
+            field.with_metadata({SCALE: str(signals[field.name].scale)})
+            if field.name in signals.signals
+            else field
+            for field in signals.log_schema
+        ]
+    )
 
 
 def gram_schema(signals: SignalCatalogue) -> pa.Schema:

@@ -13,7 +13,7 @@ import pyarrow as pa
 import pytest
 
 from fleet_slip.catalogue import features as features_module
-from fleet_slip.catalogue.features import features, load_features, with_features
+from fleet_slip.catalogue.features import features, lag_signals, load_features, with_features
 from fleet_slip.catalogue.signals import COUNT_MAX, catalogue
 from fleet_slip.delta import Change, Unit
 from fleet_slip.errors import ConfigError, SelectionError
@@ -22,7 +22,6 @@ from fleet_slip.grams import statement as gram_statement
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.job import update_grams
 from fleet_slip.regression.gram import Gram, GramTable
-from fleet_slip.regression.serial import lag_signals
 from fleet_slip.resources import folder
 from fleet_slip.warehouse.tables import Warehouse
 from tests.conftest import land, log_rows, random_counts

@@ -15,12 +15,13 @@ from fleet_slip.grams import reader as gram_reader
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.day_sums import sum_days
 from fleet_slip.grams.fold_sums import sum_cohort
+from fleet_slip.grams.folding import Folding, FoldKey
 from fleet_slip.grams.job import update_grams
 from fleet_slip.grams.reader import GramReader
 from fleet_slip.selection.compare import select
-from fleet_slip.selection.model_list import FoldKey, FoldPlan, load_model_list
+from fleet_slip.selection.model_list import load_model_list
 from fleet_slip.selection.request import SelectionPlan, run_plan
-from fleet_slip.views import TABLES, connect, tables_in
+from fleet_slip.views import VIEWS, connect, needed_views
 from fleet_slip.warehouse.tables import Warehouse
 from tests.conftest import DAY, land, log_rows, random_counts
 
@@ -41,7 +42,7 @@ def test_sums_equal_those_of_the_cohort(
     fleet: Warehouse, monkeypatch: pytest.MonkeyPatch, by: FoldKey, batch: int
 ) -> None:
     monkeypatch.setattr(gram_reader, "BATCH_ROWS", batch)
-    plan = FoldPlan(by=by, count=4)
+    plan = Folding(by=by, count=4)
     cohort = load_cohort(fleet, "adhesion > 0.65")
     summed = sum_cohort(fleet, plan, "adhesion > 0.65")
     one, two = (each.folds(plan.by, plan.count) for each in (cohort, summed))
@@ -63,7 +64,7 @@ def test_drives_with_fewer_signals_serve_the_models_that_they_can(warehouse: War
         rows.append(log_rows(f"drive-{i}", counts))
     land(warehouse, "one", *rows)
     update_grams(warehouse)
-    plan = FoldPlan(count=3)
+    plan = Folding(count=3)
     whole = select(load_cohort(warehouse), MODELS.model, plan)
     summed = select(sum_cohort(warehouse, plan), MODELS.model, plan)
     assert summed.as_dict() == whole.as_dict()
@@ -114,18 +115,18 @@ def test_errors_are_those_of_the_cohort(fleet: Warehouse, condition: str) -> Non
     with pytest.raises(FleetSlipError) as whole:
         load_cohort(fleet, condition).folds("drive", 5)
     with pytest.raises(type(whole.value)) as summed:
-        sum_cohort(fleet, FoldPlan(), condition)
+        sum_cohort(fleet, Folding(), condition)
     assert str(summed.value) == str(whole.value)
 
 
 def test_sums_of_other_folds_are_refused(fleet: Warehouse) -> None:
     with pytest.raises(ValueError, match="sums are over"):
-        sum_cohort(fleet, FoldPlan()).folds("drive", 7)
+        sum_cohort(fleet, Folding()).folds("drive", 7)
 
 
 def test_folds_of_rows_need_a_set_that_made_them(fleet: Warehouse) -> None:
     with pytest.raises(SelectionError, match="of whole drives"):
-        sum_cohort(fleet, FoldPlan(by="row"))
+        sum_cohort(fleet, Folding(by="row"))
 
 
 def test_gram_job_takes_the_made_history_for_its_own(fleet: Warehouse) -> None:
@@ -139,14 +140,14 @@ def test_gram_job_takes_the_made_history_for_its_own(fleet: Warehouse) -> None:
         ('FROM "log" LIMIT 1', {"log", "log_counts"}),
         ("FROM drives", {"drives", "grams", "log_counts"}),
         ("FROM models -- and runs", {"models", "runs"}),
-        ("SHOW TABLES", TABLES),
-        ("SELECT 1", TABLES),
-        ("FROM duckdb_columns() WHERE table_name = 'log'", TABLES),
-        ("SELECT * FROM dictionary", TABLES),
+        ("SHOW TABLES", VIEWS),
+        ("SELECT 1", VIEWS),
+        ("FROM duckdb_columns() WHERE table_name = 'log'", VIEWS),
+        ("SELECT * FROM dictionary", VIEWS),
     ],
 )
 def test_a_query_opens_what_it_names(query: str, expected: set[str]) -> None:
-    assert tables_in(query) == expected
+    assert needed_views(query) == expected
 
 
 def test_a_query_of_gram_rows_needs_no_log_file(tmp_path: Path) -> None:
@@ -188,7 +189,7 @@ def test_files_with_other_columns_are_read_by_name(tmp_path: Path) -> None:
 def test_a_reader_opens_anew_only_what_changed(tmp_path: Path) -> None:
     warehouse = Warehouse(LocalFolder(tmp_path))
     write_fleet(warehouse, 20)
-    plan = FoldPlan(count=3)
+    plan = Folding(count=3)
     elsewhere = "drive_id IN (SELECT drive_id FROM drives WHERE adhesion > 0.7)"
     with GramReader(warehouse) as reader:
         before = sum_cohort(reader, plan)
@@ -207,6 +208,6 @@ def test_a_reader_reads_again_what_came_after_the_table(tmp_path: Path) -> None:
     warehouse = Warehouse(LocalFolder(tmp_path))
     with GramReader(warehouse) as reader:
         with pytest.raises(SelectionError, match="no Gram rows yet"):
-            sum_cohort(reader, FoldPlan())
+            sum_cohort(reader, Folding())
         write_fleet(warehouse, 20)
-        assert sum_cohort(reader, FoldPlan()).drive_count == 20
+        assert sum_cohort(reader, Folding()).drive_count == 20

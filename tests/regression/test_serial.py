@@ -13,8 +13,8 @@ from fleet_slip.regression.exact import fit
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.serial import (
+    LagGram,
     autoregressive_fit,
-    lag_signals,
     quasi_differenced,
     serial_correlation,
 )
@@ -38,10 +38,11 @@ def autoregressive_drives(
     return result
 
 
-def lag_gram(drives: list[np.ndarray]) -> Gram:
-    signals = lag_signals(names(drives[0].shape[1] - 1))
+def lag_gram(drives: list[np.ndarray]) -> LagGram:
+    now = names(drives[0].shape[1] - 1)
+    signals = (*now, *(f"{name}_before" for name in now))
     pairs = [np.column_stack([drive[1:], drive[:-1]]) for drive in drives]
-    return Gram.from_counts(signals, np.concatenate(pairs))
+    return LagGram(Gram.from_counts(signals, np.concatenate(pairs)), "_before")
 
 
 @settings(max_examples=20)

@@ -1,0 +1,21 @@
+"""A published model as one of counts, so that Gram rows can tell its error."""
+
+from fleet_slip.catalogue.features import input_scales
+from fleet_slip.models.manifest import Manifest
+from fleet_slip.regression.exact import LinearModel
+
+
+def counts_model(manifest: Manifest) -> LinearModel:
+    """Return a published model as one of counts, exactly."""
+    # Of the counts as they are now: a signal's scale may have changed since it was published.
+    scales = input_scales()
+    unit = scales[manifest.label.signal]
+    return LinearModel(
+        manifest.signals,
+        manifest.label.signal,
+        tuple(
+            term.coefficient_exact * (term.scale_exact if term.sql else scales[term.signal]) / unit
+            for term in manifest.terms
+        ),
+        manifest.intercept_exact / unit,
+    )
