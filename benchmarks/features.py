@@ -33,14 +33,14 @@ LABEL = catalogue().label
 MODELS = {
     "raw: 3 signals": ("ax", "ay", "yaw_rate"),
     "raw: 4 signals": ("ax", "ay", "yaw_rate", "steering_wheel"),
-    "raw: all signals": features().set("regimes").signals,
+    "raw: all signals": features().feature_set("regimes").signals,
     "curvature and ay": ("ay", "curvature"),
     "curvature, ay, ay|ay|": ("ay", "curvature", "ay_signed_square"),
     "the same and steering": (
         *("ay", "curvature", "ay_signed_square", "steer_fl", "steer_fr"),
         "steer_speed_squared",
     ),
-    "signals and features": features().set("regimes").inputs,
+    "signals and features": features().feature_set("regimes").inputs,
 }
 
 

@@ -25,10 +25,10 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.delta import Change, Table, Unit, retried
+from fleet_slip.delta import Change, Table, Unit, retry_conflicts
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.job import update_grams
-from fleet_slip.maintenance.audit import Subject
+from fleet_slip.maintenance.audit import Forgettable
 from fleet_slip.maintenance.compaction import compact
 from fleet_slip.maintenance.forget import forget
 from fleet_slip.maintenance.vacuum import vacuum
@@ -77,7 +77,7 @@ def write(root: Path, writer: int, commits: int) -> None:
             logs.write_file(name, rows_of(f"{name}-{part}"), DAY)
             for part in range(FILES_OF_A_COMMIT)
         ]
-        retried(partial(_land, logs, Change(add=actions, units=[Unit(f"write/{name}", 1)])))
+        retry_conflicts(partial(_land, logs, Change(add=actions, units=[Unit(f"write/{name}", 1)])))
 
 
 def _land(logs: Table, change: Change) -> None:
@@ -211,7 +211,10 @@ def costs(warehouse: Warehouse, root: Path) -> None:
         warehouse.grams.snapshot().paths[0], columns=["drive_id", "vehicle_id", "campaign"]
     )
     one, other, *_ = rows.filter(pc.equal(rows["campaign"], "fleet")).to_pylist()
-    for subject in (Subject("drive", one["drive_id"]), Subject("vehicle", other["vehicle_id"])):
+    for subject in (
+        Forgettable("drive", one["drive_id"]),
+        Forgettable("vehicle", other["vehicle_id"]),
+    ):
         started = time.perf_counter()
         done = forget(warehouse, subject, now=True)
         seconds = time.perf_counter() - started

@@ -15,7 +15,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.regression.criteria import CRITERIA, criterion_values
-from fleet_slip.regression.disturbance import disturbed
+from fleet_slip.regression.disturbance import disturb
 from fleet_slip.regression.drives import DriveMoments, serving_drives
 from fleet_slip.regression.evidence import Evidence
 from fleet_slip.regression.exact import correlation_matrix, fit
@@ -143,7 +143,7 @@ def uncertainty(training: Training, fold: IntArray) -> None:
     final = cross_validate_nested(folds, NINE, LABEL, SCALES)[-1]
     for factor in (0, 1, 2):
         noise = {"ax": 0.1 * factor, "ay": 0.1 * factor, "yaw_rate": 0.01 * factor}
-        after = disturbed(final.sums, final.counts, SCALES, noise=noise).figures(SCALES[LABEL])
+        after = disturb(final.sums, final.counts, SCALES, noise=noise).figures(SCALES[LABEL])
         print(f"  noise {noise}: r {after.correlation:.4f}, rmse {after.rmse_deg:.4f} deg")
 
 

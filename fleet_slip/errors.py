@@ -34,8 +34,14 @@ class InputError(FleetSlipError):
     exit_code = 4
 
 
-class SelectionError(FleetSlipError):
+class DataError(FleetSlipError):
     """The data cannot answer: an empty cohort, an absent signal, a rank-deficient model."""
+
+    exit_code = 5
+
+
+class QuestionError(FleetSlipError):
+    """The question has no answer: bad SQL, an unknown model, signal, feature set or ranking."""
 
     exit_code = 5
 

@@ -7,10 +7,10 @@ from typing import Literal
 
 from fleet_slip.errors import ConfigError
 
-Folder = Literal["configs", "jobs", "warehouse"]
+ShippedFolder = Literal["configs", "jobs", "warehouse"]
 
 
-def folder(name: Folder) -> Traversable:
+def folder(name: ShippedFolder) -> Traversable:
     """Return the folder `configs`, `jobs` or `warehouse` of this installation."""
     packaged = files("fleet_slip") / "_data" / name
     if packaged.is_dir():
@@ -18,7 +18,7 @@ def folder(name: Folder) -> Traversable:
     return Path(str(files("fleet_slip"))).parent / name
 
 
-def read_sql(name: Folder, file: str) -> str:
+def read_sql(name: ShippedFolder, file: str) -> str:
     """Return the text of one SQL file, such as `read_sql("jobs", "gram.sql")`."""
     return (folder(name) / file).read_text(encoding="utf-8")
 

@@ -17,7 +17,7 @@ from pydantic import Field, model_validator
 
 from fleet_slip.catalogue.signals import COUNT_MAX, Identifier, Signal, SIUnit, catalogue
 from fleet_slip.config import Config, load_config
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import QuestionError
 from fleet_slip.files.documents import canonical_json
 from fleet_slip.resources import folder
 
@@ -183,13 +183,13 @@ class FeatureCatalogue(Config):
                 raise ValueError(f"sets.{name}: unknown {', '.join(unknown)}")
         return self
 
-    def set(self, name: str) -> FeatureSet:
-        """Return a feature set by name. Raises `SelectionError` for an unknown one."""
+    def feature_set(self, name: str) -> FeatureSet:
+        """Return a feature set by name. Raises `DataError` for an unknown one."""
         if name == PLAIN:
             return FeatureSet(description="The logged signals", signals=catalogue().inputs)
         if name not in self.sets:
             known = ", ".join((PLAIN, *self.sets))
-            raise SelectionError(f"no feature set is called {name!r}. Feature sets: {known}.")
+            raise QuestionError(f"no feature set is called {name!r}. Feature sets: {known}.")
         return self.sets[name]
 
     def identity(self, name: str) -> str:
@@ -199,7 +199,7 @@ class FeatureCatalogue(Config):
         """
         if name == PLAIN:
             return PLAIN
-        one = self.set(name)
+        one = self.feature_set(name)
         used = [*one.features, *(self.regimes[r].of for r in one.regimes)]
         content = {
             "columns": list(one.columns),
@@ -215,12 +215,12 @@ class FeatureCatalogue(Config):
     def name_of(self, identity: str) -> str:
         """Return the name of the set that Gram rows are of, if it is still defined like that.
 
-        Raises `SelectionError` otherwise.
+        Raises `DataError` otherwise.
         """
         name = identity.rpartition("-")[0] or identity
         if name in {PLAIN, *self.sets} and self.identity(name) == identity:
             return name
-        raise SelectionError(
+        raise QuestionError(
             f"the feature set {identity} is not defined as it was then: configs/features.toml has "
             "changed. Publish the model again."
         )

@@ -12,7 +12,7 @@ import pyarrow as pa
 from pydantic import Field, StringConstraints, model_validator
 
 from fleet_slip.config import Config, load_config
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import QuestionError
 from fleet_slip.resources import folder
 
 CATALOGUE_VARIABLE = "FLEET_SLIP_SIGNALS"
@@ -104,12 +104,12 @@ class SignalCatalogue(Config):
         return self
 
     def __getitem__(self, name: str) -> Signal:
-        """Return a signal by name. Raises `SelectionError` for an unknown one."""
+        """Return a signal by name. Raises `QuestionError` for an unknown one."""
         try:
             return self.signals[name]
         except KeyError:
             known = ", ".join(self.signals)
-            raise SelectionError(f"unknown signal {name!r}. Known signals: {known}.") from None
+            raise QuestionError(f"unknown signal {name!r}. Known signals: {known}.") from None
 
     @cached_property
     def label(self) -> str:

@@ -157,11 +157,11 @@ class CommandGroup(TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Put the command that is called in the place of its summary."""
         if args[0] in COMMANDS:
-            self.commands.update(loaded(COMMANDS[args[0]].module))
+            self.commands.update(load_commands(COMMANDS[args[0]].module))
         return super().resolve_command(ctx, args)
 
 
-def loaded(module: str) -> dict[str, Any]:
+def load_commands(module: str) -> dict[str, Any]:
     """Return the commands of one of the modules of `fleet_slip.cli`, by name."""
     app = typer.Typer(rich_markup_mode=MARKUP)
     import_module(f"fleet_slip.cli.{module}").register(app)

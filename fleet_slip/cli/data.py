@@ -11,8 +11,8 @@ import typer
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.cli.output import Json, print_json, print_table, progress, say
-from fleet_slip.cli.recorded import recorded
-from fleet_slip.cli.workers import Cluster, Threads, elsewhere, workers
+from fleet_slip.cli.recorded import record_run
+from fleet_slip.cli.workers import Cluster, Threads, unless_local, workers
 from fleet_slip.errors import ConfigError
 from fleet_slip.grams.check import check_grams
 from fleet_slip.grams.job import GramReport, update_grams
@@ -84,12 +84,12 @@ def run_simulation(
 def run_gram(warehouse: Warehouse, executor: Executor, feature_set: str = PLAIN) -> GramReport:
     """Run the Gram job for a feature set with a progress bar."""
     with step("gram") as figures, progress(f"gram {feature_set}", "rows", executor) as advance:
-        report = update_grams(warehouse, advance, feature_set, elsewhere(executor))
+        report = update_grams(warehouse, advance, feature_set, unless_local(executor))
         figures.rows = report.rows_read
     return report
 
 
-@recorded
+@record_run
 def simulate(
     context: typer.Context,
     campaign: CampaignName,
@@ -135,7 +135,7 @@ def _where_the_time_went(report: "SimulationReport") -> str:
     )
 
 
-@recorded
+@record_run
 def ingest(
     context: typer.Context,
     files: Annotated[list[Path], typer.Argument(help="CSV or Parquet files.", show_default=False)],
@@ -161,7 +161,7 @@ def ingest(
         step("ingest") as figures,
     ):
         figures.rows = 0
-        for done in ingest_files(warehouse, files, plan, elsewhere(executor)):
+        for done in ingest_files(warehouse, files, plan, unless_local(executor)):
             report = reports[done.file] = done.as_dict()
             figures.rows += report["ticks"] if report["new"] else 0
             if not json:
@@ -179,7 +179,7 @@ def _ingested(report: dict[str, Any]) -> str:
     )
 
 
-@recorded
+@record_run
 def gram(
     context: typer.Context,
     feature_set: Annotated[

@@ -12,7 +12,7 @@ from fleet_slip.cli.selecting import Cohort
 from fleet_slip.cli.subject import FeatureSetOption, Model, Signals, quantities, subject_of
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.regression.inference import INTERCEPT, Estimate
-from fleet_slip.selection.diagnostics import Comparison, Diagnosis
+from fleet_slip.selection.diagnostics import CohortComparison, Diagnosis
 from fleet_slip.selection.diagnostics import diagnose as diagnose_fit
 
 
@@ -128,7 +128,7 @@ def _coefficient_rows(result: Diagnosis) -> list[list[str]]:
     return rows
 
 
-def _print_comparison(result: Diagnosis, found: Comparison) -> None:
+def _print_comparison(result: Diagnosis, found: CohortComparison) -> None:
     print_table(
         f"\nthe same signals where {found.condition}",
         ["signal", "coefficient here", "there", "s.e. there", "difference / s.e."],

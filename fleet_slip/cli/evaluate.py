@@ -10,7 +10,7 @@ import typer
 from fleet_slip.catalogue.sources import ALL_DRIVES
 from fleet_slip.cli.models import Reference, registry_of
 from fleet_slip.cli.output import Json, print_json, print_table, progress, say, stdout
-from fleet_slip.cli.recorded import recorded
+from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.run import DEFAULT_CAMPAIGN
 from fleet_slip.cli.selecting import Cohort
 from fleet_slip.cli.workers import Threads
@@ -74,7 +74,7 @@ def score(
     )
 
 
-@recorded
+@record_run
 def evaluate(
     context: typer.Context,
     one_car: OneCar = DEFAULT_CAMPAIGN,

@@ -8,10 +8,10 @@ from typing import Annotated, Any
 import typer
 
 from fleet_slip.cli.output import Json, print_json, print_table, progress, say
-from fleet_slip.cli.recorded import recorded
-from fleet_slip.cli.workers import Cluster, elsewhere, workers
+from fleet_slip.cli.recorded import record_run
+from fleet_slip.cli.workers import Cluster, unless_local, workers
 from fleet_slip.errors import DamageError
-from fleet_slip.maintenance.audit import Subject
+from fleet_slip.maintenance.audit import Forgettable
 from fleet_slip.maintenance.compaction import TARGET_ROWS
 from fleet_slip.maintenance.compaction import compact as compact_logs
 from fleet_slip.maintenance.forget import ForgetReport
@@ -20,7 +20,7 @@ from fleet_slip.maintenance.retention import load_retention
 from fleet_slip.maintenance.retention import retain as apply_retention
 from fleet_slip.maintenance.vacuum import RETENTION_HOURS, VacuumReport
 from fleet_slip.maintenance.vacuum import vacuum as remove_expired
-from fleet_slip.maintenance.verify import Finding, Verification
+from fleet_slip.maintenance.verify import Damage, Verification
 from fleet_slip.maintenance.verify import verify as verify_root
 from fleet_slip.runs.log import step
 from fleet_slip.warehouse.tables import Warehouse
@@ -77,7 +77,7 @@ def verify(
 
 def _verify(warehouse: Warehouse, executor: Executor, *, full: bool) -> Verification:
     with progress("verify", "bytes", executor) as advance:
-        return verify_root(warehouse, full=full, progress=advance, executor=elsewhere(executor))
+        return verify_root(warehouse, full=full, progress=advance, executor=unless_local(executor))
 
 
 def _verified(report: Verification, rebuilt: list[str]) -> dict[str, Any]:
@@ -105,11 +105,11 @@ def _print_verification(report: Verification, rebuilt: list[str]) -> None:
     )
 
 
-def _row(finding: Finding) -> list[str]:
+def _row(finding: Damage) -> list[str]:
     return [finding.path, finding.problem]
 
 
-@recorded
+@record_run
 def compact(
     context: typer.Context,
     target_rows: Annotated[
@@ -133,7 +133,7 @@ def compact(
         say(f"nothing to do, all {report.files_after} files are large or alone in their day")
 
 
-@recorded
+@record_run
 def vacuum(
     context: typer.Context,
     retention_hours: Annotated[
@@ -164,7 +164,7 @@ def _vacuumed(report: VacuumReport) -> str:
     return f"{len(report.files)} files with {report.size_bytes:,} bytes {done}"
 
 
-@recorded
+@record_run
 def forget(
     context: typer.Context,
     vehicle: Annotated[str | None, typer.Option(help="The vehicle_id to forget.")] = None,
@@ -181,7 +181,7 @@ def forget(
     """
     if (vehicle is None) == (drive is None):
         raise typer.BadParameter("give one of --vehicle and --drive.")
-    subject = Subject("drive", drive) if drive else Subject("vehicle", vehicle or "")
+    subject = Forgettable("drive", drive) if drive else Forgettable("vehicle", vehicle or "")
     with step("forget") as figures, progress("forget", "files") as advance:
         report = forget_drives(context.obj, subject, now=now, progress=advance)
         figures.rows = report.rows
@@ -210,7 +210,7 @@ def _say_forgotten(report: ForgetReport) -> None:
         say(f"trained on them: {', '.join(report.models)}. Train again with: fleet-slip run")
 
 
-@recorded
+@record_run
 def retain(
     context: typer.Context,
     config: Annotated[

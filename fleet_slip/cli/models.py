@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from fleet_slip.cli.output import Json, print_json, print_table, say
-from fleet_slip.cli.recorded import recorded
+from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.signing import signing_key
 from fleet_slip.maintenance.audit import Audit
 from fleet_slip.models.aliases import CHAMPION
@@ -150,7 +150,7 @@ def _print_version(version: ModelVersion) -> None:
     )
 
 
-@recorded
+@record_run
 def promote(
     context: typer.Context,
     reference: Annotated[str, typer.Argument(help="NAME@VERSION to point the alias at.")],
@@ -164,7 +164,7 @@ def promote(
     say(f"{version.manifest.name}@{alias} is now version {version.version}")
 
 
-@recorded
+@record_run
 def rollback(
     context: typer.Context,
     name: Annotated[str, typer.Argument(help="Name of the model.")],

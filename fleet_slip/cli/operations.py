@@ -10,7 +10,7 @@ import typer
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli.models import Reference, registry_of
 from fleet_slip.cli.output import Json, print_json, print_table, progress, say
-from fleet_slip.cli.recorded import recorded
+from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.run import DEFAULT_CAMPAIGN
 from fleet_slip.errors import AlarmError, ConfigError
 from fleet_slip.maintenance.migration import migrate as migrate_logs
@@ -135,7 +135,7 @@ def _print_chart(chart: Chart) -> None:
     )
 
 
-@recorded
+@record_run
 def migrate(context: typer.Context, json: Json = False) -> None:
     """Bring the logs to the signal catalogue: add columns, convert counts to other scales.
 

@@ -7,7 +7,7 @@ import typer
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli.models import registry_of
 from fleet_slip.cli.output import Json, print_json, say
-from fleet_slip.cli.recorded import recorded
+from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.selecting import (
     AllSubsets,
     Cohort,
@@ -34,7 +34,7 @@ def register(app: typer.Typer) -> None:
     app.command()(publish)
 
 
-@recorded
+@record_run
 def publish(
     context: typer.Context,
     name: Annotated[str, typer.Argument(help="Name of the model, such as sideslip.")],

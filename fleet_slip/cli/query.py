@@ -13,7 +13,7 @@ import typer
 from pyarrow.csv import write_csv
 
 from fleet_slip.cli.output import Json, print_json, say
-from fleet_slip.errors import FleetSlipError, SelectionError
+from fleet_slip.errors import FleetSlipError, QuestionError
 from fleet_slip.views import connect
 from fleet_slip.warehouse.database import database_errors, interruptible, limit_memory
 from fleet_slip.warehouse.read_only_sql import one_query
@@ -60,7 +60,7 @@ def _read_stdin() -> str:
     try:
         return sys.stdin.read()
     except UnicodeDecodeError:
-        raise SelectionError("the query on stdin is not UTF-8 text.") from None
+        raise QuestionError("the query on stdin is not UTF-8 text.") from None
 
 
 def _answer(
@@ -84,7 +84,7 @@ def _representation_errors() -> Iterator[None]:
     try:
         yield
     except (pa.ArrowException, ValueError, OverflowError) as error:
-        raise SelectionError(
+        raise QuestionError(
             f"the result cannot be printed: {error}. Cast the column, such as: CAST(sums AS TEXT)"
         ) from None
 

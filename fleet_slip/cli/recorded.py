@@ -13,7 +13,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-def recorded(command: Callable[P, R]) -> Callable[P, R]:
+def record_run(command: Callable[P, R]) -> Callable[P, R]:
     """Return the command, recorded. Its `context` parameter carries the warehouse."""
 
     @functools.wraps(command)

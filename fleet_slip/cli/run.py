@@ -10,7 +10,7 @@ from fleet_slip.cli.data import Days, Through, chosen_days, run_gram, run_simula
 from fleet_slip.cli.models import registry_of
 from fleet_slip.cli.output import Json, print_json, say
 from fleet_slip.cli.publishing import print_publication, published
-from fleet_slip.cli.recorded import recorded
+from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.selecting import print_selection
 from fleet_slip.cli.workers import Cluster, Threads, workers
 from fleet_slip.errors import RefusedError
@@ -29,7 +29,7 @@ def register(app: typer.Typer) -> None:
     app.command()(run)
 
 
-@recorded
+@record_run
 def run(
     context: typer.Context,
     campaign: Annotated[

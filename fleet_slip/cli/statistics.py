@@ -54,7 +54,7 @@ def list_features(
                     for name, one in known.features.items()
                 },
                 "sets": {
-                    name: {"identity": known.identity(name), **known.set(name).model_dump()}
+                    name: {"identity": known.identity(name), **known.feature_set(name).model_dump()}
                     for name in (PLAIN, *known.sets)
                 },
             }
@@ -64,8 +64,13 @@ def list_features(
             "",
             ["set", "columns", "rows of a drive", "description"],
             [
-                [name, " ".join(known.set(name).inputs), _parts(known.set(name)), one.description]
-                for name, one in ((n, known.set(n)) for n in (PLAIN, *known.sets))
+                [
+                    name,
+                    " ".join(known.feature_set(name).inputs),
+                    _parts(known.feature_set(name)),
+                    one.description,
+                ]
+                for name, one in ((n, known.feature_set(n)) for n in (PLAIN, *known.sets))
             ],
             left=4,
         )

@@ -8,7 +8,7 @@ import typer
 
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.cli.models import registry_of
-from fleet_slip.errors import ConfigError, SelectionError
+from fleet_slip.errors import ConfigError, QuestionError
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.models.versions import ModelVersion, Registry
 from fleet_slip.selection.request import WHOLE_SET, inputs_of
@@ -38,7 +38,7 @@ FeatureSetOption = Annotated[
 
 
 @dataclass(frozen=True)
-class Subject:
+class Examined:
     """What a command examines: the inputs of a published model, or named ones."""
 
     feature_set: str
@@ -55,16 +55,16 @@ class Subject:
 
 def subject_of(
     warehouse: Warehouse, reference: str | None, signals: str | None, feature_set: str | None
-) -> Subject:
+) -> Examined:
     """Return what is to be examined. Raises `ConfigError` if a model and signals are named."""
     if signals is not None or feature_set is not None:
         if reference is not None:
             raise ConfigError("name a published model or --signals (of --features), not both.")
-        return Subject(feature_set or PLAIN, signals, None)
+        return Examined(feature_set or PLAIN, signals, None)
     registry = registry_of(warehouse)
     version = registry.resolve(reference or _only_model(registry))
     identity = version.manifest.trained_on.feature_set
-    return Subject(features().name_of(identity), None, version)
+    return Examined(features().name_of(identity), None, version)
 
 
 def _only_model(registry: Registry) -> str:
@@ -72,7 +72,7 @@ def _only_model(registry: Registry) -> str:
     if len(names) == 1:
         return names[0]
     known = ", ".join(names) or "none"
-    raise SelectionError(f"name a published model, or --signals. Published: {known}.")
+    raise QuestionError(f"name a published model, or --signals. Published: {known}.")
 
 
 def quantities(values: Sequence[str] | None, option: str) -> dict[str, float]:

@@ -60,6 +60,6 @@ def workers(
         yield Warehouse(root), executor
 
 
-def elsewhere(executor: Executor) -> Executor | None:
+def unless_local(executor: Executor) -> Executor | None:
     """Return the executor if it is of other processes, for what uses all cores of its own."""
     return None if isinstance(executor, LocalThreads) else executor

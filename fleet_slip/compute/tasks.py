@@ -49,7 +49,7 @@ def in_flight(executor: Executor) -> int:
     return int(getattr(executor, "in_flight", IN_FLIGHT))
 
 
-def completed(
+def run_tasks(
     executor: Executor | None,
     function: Callable[[Item], Result],
     items: Iterable[Item],

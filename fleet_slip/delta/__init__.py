@@ -10,7 +10,7 @@ source takes its place without a commit.
 """
 
 from fleet_slip.delta.change import Change, Unit
-from fleet_slip.delta.conflicts import retried
+from fleet_slip.delta.conflicts import retry_conflicts
 from fleet_slip.delta.encoding import Encoded, Encoding, checksum_in, checksum_of
 from fleet_slip.delta.files import TableFile, absent_columns
 from fleet_slip.delta.table import Snapshot, Table
@@ -26,5 +26,5 @@ __all__ = [
     "absent_columns",
     "checksum_in",
     "checksum_of",
-    "retried",
+    "retry_conflicts",
 ]

@@ -29,7 +29,7 @@ def is_conflict(error: CommitFailedError) -> bool:
     return _CONFLICT.search(str(error)) is not None
 
 
-def retried(attempt: Callable[[], Result]) -> Result:
+def retry_conflicts(attempt: Callable[[], Result]) -> Result:
     """Call until it raises no `ConflictError`, waiting ever longer between, at random.
 
     The last conflict is raised. "Full jitter": processes that met once do not meet again.

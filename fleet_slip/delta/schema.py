@@ -48,7 +48,7 @@ class Evolution:
         return bool(self.added or self.rescaled or self.unrecorded or self.migrating)
 
 
-def evolution(schema: pa.Schema, delta: DeltaTable) -> Evolution:
+def compare_schemas(schema: pa.Schema, delta: DeltaTable) -> Evolution:
     """Compare the schema of the catalogue with that of a stored table."""
     try:
         stored = {field.name: field.metadata for field in delta.schema().fields}
@@ -80,7 +80,7 @@ def scales_of(schema: pa.Schema) -> dict[str, Decimal]:
 
 def require_readable(folder: Folder, schema: pa.Schema, delta: DeltaTable) -> None:
     """Raise `RefusedError` if a table's counts are in other scales than the catalogue's."""
-    found = evolution(schema, delta)
+    found = compare_schemas(schema, delta)
     if found.rescaled:
         changes = ", ".join(f"{n} {old} -> {new}" for n, (old, new) in found.rescaled.items())
         raise RefusedError(
@@ -92,7 +92,7 @@ def require_readable(folder: Folder, schema: pa.Schema, delta: DeltaTable) -> No
 
 def require_writable(folder: Folder, schema: pa.Schema, delta: DeltaTable) -> None:
     """Raise `RefusedError` if a table lacks columns of the catalogue or is being migrated."""
-    found = evolution(schema, delta)
+    found = compare_schemas(schema, delta)
     if found.migrating:
         raise RefusedError(
             f"{folder}: a migration to other scales is under way, or was interrupted. Wait for it, "

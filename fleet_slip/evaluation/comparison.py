@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from fleet_slip.evaluation.estimators import Training
-from fleet_slip.evaluation.runs import Run
+from fleet_slip.evaluation.estimators import TrainedModels
+from fleet_slip.evaluation.runs import EvaluatedScenario
 
 
 @dataclass(frozen=True)
-class Comparison:
+class FleetComparison:
     """Errors of the same set of signals, trained on one car and on a fleet, on one scenario.
 
     Root mean square errors, because a bias is an error too.
@@ -32,7 +32,9 @@ class Comparison:
         return {**asdict(self), "better": self.better}
 
 
-def compare(runs: Sequence[Run], one_car: Training, fleet: Training) -> tuple[Comparison, ...]:
+def compare(
+    runs: Sequence[EvaluatedScenario], one_car: TrainedModels, fleet: TrainedModels
+) -> tuple[FleetComparison, ...]:
     """Compare the models of Table I that both cohorts can serve, wherever both have estimates."""
     found = []
     for run in runs:
@@ -43,6 +45,6 @@ def compare(runs: Sequence[Run], one_car: Training, fleet: Training) -> tuple[Co
             errors = [run.results[name].whole.rmse_deg for name in (one, other)]
             if errors[0] is not None and errors[1] is not None:
                 found.append(
-                    Comparison(run.scenario.name, number, one, other, errors[0], errors[1])
+                    FleetComparison(run.scenario.name, number, one, other, errors[0], errors[1])
                 )
     return tuple(found)

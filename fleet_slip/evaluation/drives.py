@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import SCENARIO
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.resources import read_sql
 from fleet_slip.simulation.scenario import Failure, Scenario
 from fleet_slip.simulation.sensors import GPS_SIGNALS
@@ -27,7 +27,7 @@ SLOWEST_MPS = 2.0
 
 
 @dataclass(frozen=True)
-class Drive:
+class EvaluatedDrive:
     """One drive. Arrays have shape (ticks,).
 
     Attributes:
@@ -71,10 +71,10 @@ def visible_signals() -> tuple[str, ...]:
     return (*catalogue().inputs, *GPS_SIGNALS)
 
 
-def load_drives(warehouse: Warehouse, scenarios: Sequence[Scenario]) -> tuple[Drive, ...]:
+def load_drives(warehouse: Warehouse, scenarios: Sequence[Scenario]) -> tuple[EvaluatedDrive, ...]:
     """Read the drives of scenarios and apply their failures.
 
-    Raises `SelectionError` if a drive is not in the logs.
+    Raises `DataError` if a drive is not in the logs.
     """
     signals = catalogue().signals
     names = [name for name in signals if name != catalogue().label]
@@ -90,17 +90,17 @@ def load_drives(warehouse: Warehouse, scenarios: Sequence[Scenario]) -> tuple[Dr
     return tuple(_drive(scenario, rows) for scenario in scenarios)
 
 
-def _drive(scenario: Scenario, all_rows: pa.Table) -> Drive:
+def _drive(scenario: Scenario, all_rows: pa.Table) -> EvaluatedDrive:
     rows = all_rows.filter(pc.equal(all_rows["drive_id"], scenario.drive_id))
     if not rows.num_rows:
-        raise SelectionError(
+        raise DataError(
             f"the drive {scenario.drive_id} is not in the logs. Run: fleet-slip evaluate"
         )
     time_s = _column(rows, "time_s")
     measured = {name: _column(rows, catalogue()[name].column) for name in visible_signals()}
     for failure in scenario.failures:
         measured = apply_failure(measured, time_s, failure)
-    return Drive(
+    return EvaluatedDrive(
         scenario=scenario,
         time_s=time_s,
         signals={catalogue()[name].column: values for name, values in measured.items()},
@@ -122,12 +122,12 @@ def apply_failure(
 ) -> dict[str, FloatArray]:
     """Return signals, by name, as a car with the failure logs them; the given ones stay.
 
-    Raises `SelectionError` if the drive ends before the failure begins.
+    Raises `DataError` if the drive ends before the failure begins.
     """
     until_s = np.inf if failure.until_s is None else failure.until_s
     failed = (time_s >= failure.from_s) & (time_s < until_s)
     if not failed.any():
-        raise SelectionError(
+        raise QuestionError(
             f"the drive lasts {time_s[-1]:.1f} s, and its failure begins at {failure.from_s} s. "
             "Choose an earlier from_s."
         )

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError
 from fleet_slip.evaluation.drives import FloatArray
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.models.manifest import Manifest
@@ -47,11 +47,11 @@ class LinearEstimate:
     def published(cls, manifest: Manifest) -> "LinearEstimate":
         """Return the estimator that a manifest publishes.
 
-        Raises `SelectionError` for a model with features, which are SQL and not signals.
+        Raises `DataError` for a model with features, which are SQL and not signals.
         """
         features = [term.signal for term in manifest.terms if term.sql]
         if features:
-            raise SelectionError(
+            raise DataError(
                 f"{manifest.name} uses the features {', '.join(features)}, and test drives are "
                 "evaluated on signals alone. Use: fleet-slip score"
             )
@@ -69,7 +69,7 @@ class LinearEstimate:
 
 
 @dataclass(frozen=True)
-class Training:
+class TrainedModels:
     """A published model, and the five models of Table I on the cohort that it was trained on."""
 
     version: ModelVersion
@@ -125,11 +125,11 @@ class Training:
         return {**fitted, reference: published}
 
 
-def training(warehouse: Warehouse, version: ModelVersion) -> Training:
+def train_models(warehouse: Warehouse, version: ModelVersion) -> TrainedModels:
     """Fit the models of Table I on a published model's cohort, as it is now, from its Gram rows.
 
-    Raises `SelectionError` if the cohort is empty now.
+    Raises `DataError` if the cohort is empty now.
     """
     cohort = load_cohort(warehouse, version.manifest.trained_on.cohort)
     models = load_model_list(TABLE_ONE)
-    return Training(version, select(cohort, models.model, models.folds))
+    return TrainedModels(version, select(cohort, models.model, models.folds))

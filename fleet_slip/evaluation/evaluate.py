@@ -5,12 +5,12 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from fleet_slip.evaluation.comparison import Comparison, compare
+from fleet_slip.evaluation.comparison import FleetComparison, compare
 from fleet_slip.evaluation.drives import FloatArray
-from fleet_slip.evaluation.estimators import Estimate, Signals, Training, training
+from fleet_slip.evaluation.estimators import Estimate, Signals, TrainedModels, train_models
 from fleet_slip.evaluation.filters import filter_bank
 from fleet_slip.evaluation.results import document
-from fleet_slip.evaluation.runs import Run, run_all
+from fleet_slip.evaluation.runs import EvaluatedScenario, run_all
 from fleet_slip.evaluation.targets import Check, checks, filter_checks
 from fleet_slip.grams.cohort import Cohort
 from fleet_slip.models.versions import ModelVersion
@@ -43,8 +43,8 @@ TrainRivals = Callable[[Warehouse, Cohort], Sequence[Rival]]
 class Competitors:
     """All estimators that compete, by name, and what a document says of each."""
 
-    one_car: Training
-    fleets: tuple[Training, ...]
+    one_car: TrainedModels
+    fleets: tuple[TrainedModels, ...]
     rivals: tuple[Rival, ...]
     estimators: Mapping[str, Estimate]
     descriptions: Mapping[str, Mapping[str, Any]]
@@ -55,9 +55,9 @@ class Evaluation:
     """Everything that an evaluation found, with the drives and estimates behind it."""
 
     competitors: Competitors
-    runs: tuple[Run, ...]
+    runs: tuple[EvaluatedScenario, ...]
     checks: tuple[Check, ...]
-    comparisons: tuple[Comparison, ...]
+    comparisons: tuple[FleetComparison, ...]
 
     def as_dict(self) -> dict[str, Any]:
         """Return the evaluation's document."""
@@ -84,8 +84,8 @@ def gather(
 
     Filters and learned rivals get the training drives of the one-car model.
     """
-    first = training(warehouse, one_car)
-    others = tuple(training(warehouse, version) for version in fleets)
+    first = train_models(warehouse, one_car)
+    others = tuple(train_models(warehouse, version) for version in fleets)
     learned = tuple(train_rivals(warehouse, first.selection.cohort)) if train_rivals else ()
     estimators: dict[str, Estimate] = {}
     descriptions: dict[str, Mapping[str, Any]] = {}

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from fleet_slip.evaluation.drives import Drive
-from fleet_slip.evaluation.runs import Result, Run, Section
+from fleet_slip.evaluation.drives import EvaluatedDrive
+from fleet_slip.evaluation.runs import EvaluatedScenario, Result, Section
 from fleet_slip.evaluation.stability import rear_compliance, stretches
 from fleet_slip.files.documents import Document, DocumentFolder, checksum
 from fleet_slip.warehouse.tables import Warehouse
@@ -17,7 +17,7 @@ FORMAT = 1
 
 
 def document(
-    runs: Sequence[Run], estimators: Mapping[str, Mapping[str, Any]], **further: Any
+    runs: Sequence[EvaluatedScenario], estimators: Mapping[str, Mapping[str, Any]], **further: Any
 ) -> dict[str, Any]:
     """Return the document of an evaluation.
 
@@ -33,7 +33,7 @@ def document(
     }
 
 
-def _run(one: Run) -> dict[str, Any]:
+def _run(one: EvaluatedScenario) -> dict[str, Any]:
     scenario, drive = one.scenario, one.drive
     return {
         "name": scenario.name,
@@ -51,7 +51,7 @@ def _run(one: Run) -> dict[str, Any]:
     }
 
 
-def _truth(drive: Drive) -> dict[str, Any]:
+def _truth(drive: EvaluatedDrive) -> dict[str, Any]:
     sideslip_deg = np.degrees(drive.sideslip_rad[drive.evaluated])
     ay = drive.signals["ay_mps2"] - drive.scenario.sensors.ay_bias_mps2
     return {
@@ -68,7 +68,7 @@ def _truth(drive: Drive) -> dict[str, Any]:
     }
 
 
-def _section(drive: Drive, section: Section) -> dict[str, Any]:
+def _section(drive: EvaluatedDrive, section: Section) -> dict[str, Any]:
     return {
         "name": section.name,
         "criterion": section.criterion,

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fleet_slip.errors import SelectionError
-from fleet_slip.evaluation.drives import BoolArray, Drive, FloatArray, load_drives
+from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.evaluation.drives import BoolArray, EvaluatedDrive, FloatArray, load_drives
 from fleet_slip.evaluation.errors import ErrorFigures, error_figures
 from fleet_slip.evaluation.estimators import Estimate
 from fleet_slip.evaluation.stability import CRITERION, unstable
@@ -40,10 +40,10 @@ class Result:
 
 
 @dataclass(frozen=True)
-class Run:
+class EvaluatedScenario:
     """One scenario: the drive, its sections, and estimates and results by estimator."""
 
-    drive: Drive
+    drive: EvaluatedDrive
     sections: tuple[Section, ...]
     estimates: Mapping[str, FloatArray]
     results: Mapping[str, Result]
@@ -73,28 +73,28 @@ def simulate_scenarios(
 
 def run_all(
     warehouse: Warehouse, scenarios: Sequence[Scenario], estimators: Mapping[str, Estimate]
-) -> tuple[Run, ...]:
+) -> tuple[EvaluatedScenario, ...]:
     """Evaluate estimators on scenarios whose drives are in the logs."""
     return tuple(run(drive, estimators) for drive in load_drives(warehouse, scenarios))
 
 
-def run(drive: Drive, estimators: Mapping[str, Estimate]) -> Run:
+def run(drive: EvaluatedDrive, estimators: Mapping[str, Estimate]) -> EvaluatedScenario:
     """Evaluate estimators on one drive. An estimator sees its signals and nothing else."""
     parts = sections(drive)
     estimates = {name: _estimates(drive, estimate) for name, estimate in estimators.items()}
     results = {name: _result(drive, parts, rad) for name, rad in estimates.items()}
-    return Run(drive, parts, estimates, results)
+    return EvaluatedScenario(drive, parts, estimates, results)
 
 
-def _estimates(drive: Drive, estimate: Estimate) -> FloatArray:
+def _estimates(drive: EvaluatedDrive, estimate: Estimate) -> FloatArray:
     """Return the estimates; none where the drive lacks what the estimator needs to begin."""
     try:
         return estimate(drive.signals)
-    except SelectionError:
+    except (DataError, QuestionError):
         return np.full(len(drive.time_s), np.nan)
 
 
-def _result(drive: Drive, parts: Sequence[Section], estimate_rad: FloatArray) -> Result:
+def _result(drive: EvaluatedDrive, parts: Sequence[Section], estimate_rad: FloatArray) -> Result:
     def figures(among: BoolArray) -> ErrorFigures:
         return error_figures(estimate_rad, drive.sideslip_rad, among & drive.evaluated)
 
@@ -105,7 +105,7 @@ def _result(drive: Drive, parts: Sequence[Section], estimate_rad: FloatArray) ->
     )
 
 
-def sections(drive: Drive) -> tuple[Section, ...]:
+def sections(drive: EvaluatedDrive) -> tuple[Section, ...]:
     """Return the sections of a drive that have any rows."""
     found = (
         Section("unstable", CRITERION, unstable(drive)),
@@ -118,7 +118,7 @@ def sections(drive: Drive) -> tuple[Section, ...]:
     return tuple(section for section in found if section.rows.any())
 
 
-def _without_gps(drive: Drive) -> BoolArray:
+def _without_gps(drive: EvaluatedDrive) -> BoolArray:
     fixes = np.isfinite(drive.signals["gps_vx_mps"])
     ticks = np.arange(len(fixes))
     latest = np.maximum.accumulate(np.where(fixes, ticks, 0))

@@ -15,7 +15,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from fleet_slip.evaluation.drives import BoolArray, Drive, FloatArray
+from fleet_slip.evaluation.drives import BoolArray, EvaluatedDrive, FloatArray
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.vehicle.parameters import VehicleParameters, constants
 from fleet_slip.vehicle.tyre import brush_force
@@ -65,7 +65,7 @@ def peak_slip(vehicle: VehicleParameters, adhesion: float) -> PeakSlip:
     return PeakSlip(peak(c.static_front, c.stiffness_front), peak(c.static_rear, c.stiffness_rear))
 
 
-def slip_angles(drive: Drive) -> tuple[FloatArray, FloatArray]:
+def slip_angles(drive: EvaluatedDrive) -> tuple[FloatArray, FloatArray]:
     """Return the slip angles of front and rear axle in rad, positive when sliding to the left.
 
     The yaw rate is the gyroscope's, less the bias that the scenario states; where it is null there
@@ -79,7 +79,7 @@ def slip_angles(drive: Drive) -> tuple[FloatArray, FloatArray]:
     return front, rear
 
 
-def unstable(drive: Drive) -> BoolArray:
+def unstable(drive: EvaluatedDrive) -> BoolArray:
     """Return for each tick whether the car is within an unstable stretch."""
     peak = peak_slip(drive.scenario.car, drive.scenario.adhesion)
     front, rear = slip_angles(drive)
@@ -97,7 +97,7 @@ def join(mask: BoolArray, gap: int) -> BoolArray:
     return joined
 
 
-def stretches(drive: Drive, mask: BoolArray) -> tuple[Stretch, ...]:
+def stretches(drive: EvaluatedDrive, mask: BoolArray) -> tuple[Stretch, ...]:
     """Return where a mask over the ticks of a drive is true."""
     return tuple(
         Stretch(
@@ -116,7 +116,7 @@ def _runs(mask: BoolArray) -> Iterator[tuple[int, int]]:
     yield from zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
 
 
-def rear_compliance(drive: Drive) -> float:
+def rear_compliance(drive: EvaluatedDrive) -> float:
     """Return the slip angle of the rear axle per lateral acceleration, in rad s²/m.
 
     By least squares through the origin over the rows of the drive that have both.

@@ -11,7 +11,7 @@ from typing import Any
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.evaluation.errors import ErrorFigures
 from fleet_slip.evaluation.estimators import LinearEstimate
-from fleet_slip.evaluation.runs import GPS_OUTAGE_S, Run
+from fleet_slip.evaluation.runs import GPS_OUTAGE_S, EvaluatedScenario
 from fleet_slip.evaluation.stability import rear_compliance, stretches
 from fleet_slip.simulation.sensors import Sensors
 
@@ -116,7 +116,9 @@ class Check:
 
 
 def checks(
-    runs: Sequence[Run], models: Mapping[str, str], estimators: Mapping[str, LinearEstimate]
+    runs: Sequence[EvaluatedScenario],
+    models: Mapping[str, str],
+    estimators: Mapping[str, LinearEstimate],
 ) -> tuple[Check, ...]:
     """Check the models of Table I, given the name of each one's estimator.
 
@@ -137,8 +139,8 @@ def checks(
 
 def _check(
     requirement: Requirement,
-    nominal: Run,
-    run: Run,
+    nominal: EvaluatedScenario,
+    run: EvaluatedScenario,
     name: str,
     estimators: Mapping[str, LinearEstimate],
 ) -> Check:
@@ -157,7 +159,9 @@ THE_PAPERS_CHOICE = "4"
 """The model of Table I that the paper compares with the Kalman filter."""
 
 
-def filter_checks(runs: Sequence[Run], models: Mapping[str, str]) -> tuple[Check, ...]:
+def filter_checks(
+    runs: Sequence[EvaluatedScenario], models: Mapping[str, str]
+) -> tuple[Check, ...]:
     """Check that the regression has a smaller error than the paper's Kalman filter has.
 
     As it is and tuned; over the drive, and while satellite navigation is out in the tunnel.
@@ -175,7 +179,7 @@ def filter_checks(runs: Sequence[Run], models: Mapping[str, str]) -> tuple[Check
     )
 
 
-def _filter_checks(run: Run, name: str, rival: str) -> Iterator[Check]:
+def _filter_checks(run: EvaluatedScenario, name: str, rival: str) -> Iterator[Check]:
     ours, theirs = run.results[name], run.results[rival]
     parts = [("error std", ours.whole, theirs.whole, _CORRECTED)]
     if "gps_outage" in ours.inside:
@@ -201,7 +205,7 @@ _CORRECTED = (
 )
 
 
-def _drift(run: Run) -> str:
+def _drift(run: EvaluatedScenario) -> str:
     (section,) = (part for part in run.sections if part.name == "gps_outage")
     longest_s = max(s.until_s - s.from_s for s in stretches(run.drive, section.rows))
     return (
@@ -211,7 +215,7 @@ def _drift(run: Run) -> str:
     )
 
 
-def stable(run: Run, estimator: str) -> ErrorFigures:
+def stable(run: EvaluatedScenario, estimator: str) -> ErrorFigures:
     """Return the figures outside of the unstable section, or of all where there is none."""
     result = run.results[estimator]
     return result.outside.get("unstable", result.whole)
@@ -232,7 +236,7 @@ def passed_noise_deg(model: LinearEstimate, sensors: Sensors) -> float:
     return math.degrees(math.sqrt(math.fsum(squares)))
 
 
-def _noise(model: LinearEstimate, nominal: Run, noisy: Run) -> str:
+def _noise(model: LinearEstimate, nominal: EvaluatedScenario, noisy: EvaluatedScenario) -> str:
     before = passed_noise_deg(model, nominal.scenario.sensors)
     after = passed_noise_deg(model, noisy.scenario.sensors)
     return (
@@ -243,7 +247,7 @@ def _noise(model: LinearEstimate, nominal: Run, noisy: Run) -> str:
     )
 
 
-def _compliance(run: Run, nominal: Run) -> str:
+def _compliance(run: EvaluatedScenario, nominal: EvaluatedScenario) -> str:
     here = math.degrees(rear_compliance(run.drive))
     there = math.degrees(rear_compliance(nominal.drive))
     return (

@@ -12,7 +12,7 @@ import pyarrow.compute as pc
 
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.delta import TableFile
-from fleet_slip.errors import SelectionError, StorageError
+from fleet_slip.errors import DataError, StorageError
 from fleet_slip.grams.job import aggregate
 from fleet_slip.regression.gram import Gram
 from fleet_slip.warehouse.tables import Warehouse
@@ -38,12 +38,12 @@ def check_grams(
 ) -> CheckReport:
     """Check the Gram rows of evenly chosen log files.
 
-    Raises `StorageError` naming the first drive whose Grams differ, and `SelectionError` if there
+    Raises `StorageError` naming the first drive whose Grams differ, and `DataError` if there
     is nothing to check.
     """
     logs = warehouse.logs.snapshot()
     if not logs.files:
-        raise SelectionError(f"{warehouse.root}: no logs yet. Run: fleet-slip simulate CAMPAIGN")
+        raise DataError(f"{warehouse.root}: no logs yet. Run: fleet-slip simulate CAMPAIGN")
     step = max(1, len(logs.files) // count)
     chosen = logs.files[::step][:count]
     stored = stored_grams(warehouse)

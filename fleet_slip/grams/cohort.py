@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import SCENARIO, TRAINING_DRIVES
-from fleet_slip.errors import RefusedError, SelectionError
+from fleet_slip.errors import DataError, QuestionError, RefusedError
 from fleet_slip.grams.folding import FOLD_KEYS, ROW_FOLDS
 from fleet_slip.grams.reader import GramReader, open_grams
 from fleet_slip.regression.drives import serving_drives
-from fleet_slip.regression.folds import Assignment, CohortFolds, by_hash, by_value
+from fleet_slip.regression.folds import CohortFolds, FoldAssignment, by_hash, by_value
 from fleet_slip.regression.gram import GramTable, IntArray, packed_size
 from fleet_slip.warehouse.database import database_errors
 from fleet_slip.warehouse.tables import Warehouse
@@ -79,14 +79,16 @@ class Cohort:
     def inputs(self) -> tuple[str, ...]:
         """Signals and features that any of the drives has, in the order of the feature set."""
         found = {name for table in self.tables for name in table.signals}
-        return tuple(name for name in features().set(self.feature_set).inputs if name in found)
+        return tuple(
+            name for name in features().feature_set(self.feature_set).inputs if name in found
+        )
 
     def folds(self, by: str, count: int) -> CohortFolds:
         """Divide the cohort into folds, of whole drives unless by `row`.
 
         By `drive`: hashed into `count` folds. By another key of `FOLD_KEYS`: one fold for each
         value, or hashed into `count` folds if there are more values than that. By `row`: the folds
-        that the feature set made of single rows, `count` of them. Raises `SelectionError` if it
+        that the feature set made of single rows, `count` of them. Raises `DataError` if it
         made none.
         """
         if by == ROW_FOLDS:
@@ -97,7 +99,7 @@ class Cohort:
     def serving(self, inputs: Sequence[str]) -> Served:
         """Return the drives that have the label and all the inputs, one Gram row each.
 
-        Raises `SelectionError` if there is none.
+        Raises `DataError` if there is none.
         """
         table, mask = serving_drives(self.tables, [*inputs, catalogue().label])
         rows = np.flatnonzero(mask)
@@ -144,21 +146,21 @@ def gram_condition(condition: str, feature_set: str, inputs: Sequence[str]) -> s
 
 
 def require_row_folds(feature_set: str, count: int) -> None:
-    """Raise `SelectionError` if a feature set has not made so many folds of rows."""
-    made = features().set(feature_set).row_folds
+    """Raise `DataError` if a feature set has not made so many folds of rows."""
+    made = features().feature_set(feature_set).row_folds
     if made is None:
         known = ", ".join(name for name, one in features().sets.items() if one.row_folds)
-        raise SelectionError(
+        raise QuestionError(
             f"the Gram rows of the feature set {feature_set} are of whole drives: folds of rows "
             f"are made when the logs are read. Feature sets that make them: {known}."
         )
     if count > made:
-        raise SelectionError(
+        raise QuestionError(
             f"the feature set {feature_set} made {made} folds of rows; choose no more."
         )
 
 
-def assign(values: Sequence[Any], by: str, count: int) -> Assignment:
+def assign(values: Sequence[Any], by: str, count: int) -> FoldAssignment:
     """Assign Gram rows to folds by the values of a fold key."""
     if by == ROW_FOLDS:
         return by_value([(int(value) - 1) % count + 1 for value in values])
@@ -174,7 +176,7 @@ def load_cohort(
 ) -> Cohort:
     """Read the Gram rows of the drives that satisfy a condition.
 
-    Raises `SelectionError` if the condition is not valid SQL, no drive satisfies it, or the
+    Raises `DataError` if the condition is not valid SQL, no drive satisfies it, or the
     feature set has not been computed for all logs; `RefusedError` if a drive of an evaluation
     scenario satisfies it.
     """
@@ -183,7 +185,7 @@ def load_cohort(
         with database_errors(f"the cohort {condition!r}"):
             rows = opened.database.sql(statement).to_arrow_table()
         if not rows.num_rows:
-            raise nothing(opened.database, condition)
+            raise empty_cohort_error(opened.database, condition)
     require_training(rows["source"].unique().to_pylist(), condition)
     sets = rows["signals"].unique().to_pylist()
     tables = tuple(
@@ -230,13 +232,13 @@ def _matrix(lists: pa.ChunkedArray | pa.ListArray, width: int) -> NDArray[np.int
     return values.reshape(-1, width)
 
 
-def nothing(database: duckdb.DuckDBPyConnection, condition: str) -> SelectionError:
+def empty_cohort_error(database: duckdb.DuckDBPyConnection, condition: str) -> DataError:
     """Return the error that no drive satisfies a condition."""
     examples = database.execute(
         "SELECT string_agg(DISTINCT source, ', '), string_agg(DISTINCT campaign, ', ') FROM grams"
     ).fetchone()
     sources, campaigns = examples or ("", "")
-    return SelectionError(
+    return DataError(
         f"no drive satisfies the cohort condition {condition!r}. The warehouse has sources "
         f"{sources} and campaigns {campaigns}. See the columns with: "
         'fleet-slip sql "DESCRIBE drives"'

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.grams.cohort import gram_table, nothing, require_training
+from fleet_slip.grams.cohort import empty_cohort_error, gram_table, require_training
 from fleet_slip.grams.fold_sums import by_signals, hash_numbers
 from fleet_slip.grams.reader import GramReader, open_grams
-from fleet_slip.regression.drives import no_drive_has
+from fleet_slip.regression.drives import missing_signals_error
 from fleet_slip.regression.gram import Gram
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -35,7 +35,7 @@ def sum_days(
 ) -> DailySums:
     """Add up, day by day, the Gram rows of the drives that have the label and all the inputs.
 
-    Raises like `fleet_slip.grams.cohort.load_cohort`, and `SelectionError`
+    Raises like `fleet_slip.grams.cohort.load_cohort`, and `DataError`
     if no drive has them all.
     """
     signals = (*inputs, catalogue().label)
@@ -58,9 +58,9 @@ def sum_days(
                     grams[day] = grams[day] + total if day in grams else total
                     drives.setdefault(day, []).append(ids[number == i])
         if not found:
-            raise nothing(opened.database, condition)
+            raise empty_cohort_error(opened.database, condition)
     if not grams:
-        raise no_drive_has(signals)
+        raise missing_signals_error(signals)
     days = sorted(grams)
     return DailySums(
         tuple(days),

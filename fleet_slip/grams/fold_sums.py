@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError
 from fleet_slip.grams.cohort import (
     assign,
+    empty_cohort_error,
     gram_condition,
     gram_table,
-    nothing,
     require_row_folds,
     require_training,
 )
@@ -60,7 +60,9 @@ class SummedCohort:
     def inputs(self) -> tuple[str, ...]:
         """Signals and features that any of the drives has, in the order of the feature set."""
         found = {name for grams in self.sums.tables for name in grams[0].signals}
-        return tuple(name for name in features().set(self.feature_set).inputs if name in found)
+        return tuple(
+            name for name in features().feature_set(self.feature_set).inputs if name in found
+        )
 
     def folds(self, by: str, count: int) -> CohortFolds:
         """Return the folds, which must be those that were asked for when the cohort was read."""
@@ -81,7 +83,7 @@ def sum_cohort(
 ) -> SummedCohort:
     """Add up the Gram rows of the drives that satisfy a condition, over each fold.
 
-    Raises like `fleet_slip.grams.cohort.load_cohort`, and `SelectionError`
+    Raises like `fleet_slip.grams.cohort.load_cohort`, and `DataError`
     if there are not two folds.
     """
     if plan.by == ROW_FOLDS:
@@ -93,7 +95,7 @@ def sum_cohort(
             require_training(batch["source"].unique().to_pylist(), condition)
             sums.add(batch)
         if not sums.tables:
-            raise nothing(opened.database, condition)
+            raise empty_cohort_error(opened.database, condition)
     return SummedCohort(
         condition=condition,
         plan=plan,
@@ -117,7 +119,7 @@ def _folding(opened: OpenedGrams, plan: Folding, condition: str) -> tuple[list[s
         found = opened.database.sql(f"SELECT DISTINCT {key} FROM ({text})").to_arrow_table()
     values = found[key].combine_chunks()
     if not len(values):
-        raise nothing(opened.database, condition)
+        raise empty_cohort_error(opened.database, condition)
     assignment = assign(values.to_pylist(), plan.by, plan.count)
 
     def fold_of(batch: pa.RecordBatch, _: NDArray[np.uint64]) -> IntArray:
@@ -181,10 +183,10 @@ class _Sums:
         return sum(map(len, every)) if self._one_each else len(np.unique(np.concatenate(every)))
 
     def folds(self, names: Sequence[str]) -> CohortFolds:
-        """Return the folds that a drive fell into. Raises `SelectionError` if it is one only."""
+        """Return the folds that a drive fell into. Raises `DataError` if it is one only."""
         used = sorted(self.used)
         if len(used) < 2:
-            raise SelectionError(
+            raise DataError(
                 "cross-validation needs at least two folds, and the cohort has one: "
                 f"{names[used[0]]}. Widen the cohort, or fold by another key."
             )

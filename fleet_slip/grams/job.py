@@ -19,14 +19,14 @@ import pyarrow.compute as pc
 from deltalake.transaction import AddAction
 
 from fleet_slip.catalogue.features import PLAIN, features
-from fleet_slip.compute.tasks import completed, in_flight
+from fleet_slip.compute.tasks import in_flight, run_tasks
 from fleet_slip.delta import (
     Change,
     Snapshot,
     TableFile,
     Unit,
     absent_columns,
-    retried,
+    retry_conflicts,
 )
 from fleet_slip.errors import ConflictError, StorageError
 from fleet_slip.grams.statement import gram_statement
@@ -86,11 +86,11 @@ def update_grams(
 ) -> GramReport:
     """Bring the Gram rows of a feature set up to date. Running it again does nothing.
 
-    An executor runs the queries elsewhere; see `aggregate`. Raises `SelectionError` for an unknown
+    An executor runs the queries elsewhere; see `aggregate`. Raises `DataError` for an unknown
     set, `StorageError`, `ConflictError` if other processes keep changing the table, or
     `ClusterError`.
     """
-    return retried(lambda: _update_once(warehouse, progress, feature_set, executor))
+    return retry_conflicts(lambda: _update_once(warehouse, progress, feature_set, executor))
 
 
 def reconcile(
@@ -202,7 +202,7 @@ def aggregate(
     The query runs in this process, on all of its cores unless `threads` says how many; or, with an
     executor of other processes, as tasks of some files and one thread each.
     """
-    lagged = features().set(feature_set).lagged
+    lagged = features().feature_set(feature_set).lagged
     step = LAGGED_FILES_PER_QUERY if lagged else FILES_PER_QUERY
     total = sum(file.rows for file in files)
     parts = [warehouse.grams.schema.empty_table()]
@@ -215,7 +215,7 @@ def aggregate(
     groups = _groups(files, min(step, max(1, ceil(len(files) / in_flight(executor)))))
     task = partial(_aggregate_group, warehouse, feature_set)
     done: dict[str, pa.Table] = {}
-    for group, rows in completed(executor, task, groups, _group_name):
+    for group, rows in run_tasks(executor, task, groups, _group_name):
         done[group[0].path] = rows
         progress(sum(file.rows for file in group), total)
     return pa.concat_tables([*parts, *(done[group[0].path] for group in groups)])

@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.delta.table import Snapshot, Table
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError
 from fleet_slip.grams.job import find_backlog
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.database import database_errors
@@ -36,7 +36,7 @@ class OpenedGrams:
     grams_version: int
 
     def statement(self, name: str, condition: str) -> str:
-        """Return a statement of `jobs/` for a condition. Raises `SelectionError`."""
+        """Return a statement of `jobs/` for a condition. Raises `DataError`."""
         text = read_sql("jobs", name).format(condition=condition, feature_set=self.identity)
         with database_errors(f"the cohort {condition!r}"):
             return one_query(self.database, text)
@@ -74,7 +74,7 @@ class GramReader:
     def opened(self, condition: str, feature_set: str) -> OpenedGrams:
         """Return what a cohort's condition may ask for, until the next call.
 
-        Raises `SelectionError` if there are no Gram rows, or if those of the feature set are not
+        Raises `DataError` if there are no Gram rows, or if those of the feature set are not
         complete.
         """
         # The Delta library reads the log of many files on one core while DuckDB starts on another.
@@ -87,7 +87,7 @@ class GramReader:
             logs = renewing.result()
         self._logs, self._grams = logs, grams
         if not grams.rows:
-            raise SelectionError(
+            raise DataError(
                 f"{self._warehouse.root}: there are no Gram rows yet. Run: fleet-slip simulate "
                 "CAMPAIGN (or fleet-slip ingest FILE --mapping M), then fleet-slip gram."
             )
@@ -133,7 +133,7 @@ def _newest(before: Snapshot | None, table: Table) -> Snapshot:
 def _require_complete(logs: Snapshot, grams: Snapshot, feature_set: str, identity: str) -> None:
     backlog = find_backlog(logs, grams, identity)
     if backlog.missing or backlog.stale:
-        raise SelectionError(
+        raise DataError(
             f"the feature set {feature_set}, as it is defined now, has not been computed for "
             f"{len(backlog.missing)} of {len(logs.files)} log files. Run: fleet-slip gram "
             f"--features {feature_set}"

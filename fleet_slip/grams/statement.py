@@ -44,10 +44,10 @@ def gram_statement(
 
     `whole` states that no file has a column of the set in only some of its rows; `absent` are the
     signals that no file has, since they came to the catalogue later. Raises
-    `SelectionError` for an unknown set.
+    `DataError` for an unknown set.
     """
     known = features()
-    one = known.set(feature_set)
+    one = known.feature_set(feature_set)
     names = one.columns
     regimes = [known.regimes[name] for name in one.regimes]
     definitions = {

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import Cohort, Served, assign
 from fleet_slip.grams.folding import FOLD_KEYS, ROW_FOLDS, Folding
 from fleet_slip.regression.drives import DriveMoments
@@ -41,10 +41,10 @@ def drive_folds(
 ) -> DriveFolds:
     """Divide the drives that have all the inputs into folds. `naive` takes rows for independent.
 
-    Raises `SelectionError` if no drive has them all, or for folds of rows.
+    Raises `DataError` if no drive has them all, or for folds of rows.
     """
     if plan.by == ROW_FOLDS:
-        raise SelectionError(
+        raise QuestionError(
             "with folds of rows there are no drives to hold out. Fold by drive for this."
         )
     served = cohort.serving(inputs)
@@ -55,6 +55,6 @@ def drive_folds(
 
 
 def row_training(cohort: Cohort, inputs: Sequence[str], plan: Folding) -> Training:
-    """Return folds of rows; rows then count as independent. Raises `SelectionError`."""
+    """Return folds of rows; rows then count as independent. Raises `DataError`."""
     folds: Folds = cohort.folds(plan.by, plan.count).serving(inputs, catalogue().label)
     return Training(folds, None, input_scales())

@@ -20,7 +20,7 @@ _FROM_MAPPING = ("vehicle_id", "vehicle_model", "track", "mass_kg", "adhesion", 
 
 
 @dataclass(frozen=True)
-class Drive:
+class MeasuredDrive:
     """One uninterrupted stretch of a file: where its rows are and what is known of it."""
 
     drive_id: str
@@ -43,7 +43,7 @@ def drive_id(prefix: str, group: int, stretch: int = 1) -> str:
     return f"{prefix}-{group + 1}" + (f"-{stretch}" if stretch > 1 else "")
 
 
-def cut(rows: pl.DataFrame, prefix: str, metadata: Sequence[dict[str, Any]]) -> list[Drive]:
+def cut(rows: pl.DataFrame, prefix: str, metadata: Sequence[dict[str, Any]]) -> list[MeasuredDrive]:
     """Return the drives in rows that are sorted by `group` and `part`, sorted by their names."""
     parts = rows["part"].to_numpy()
     starts = np.flatnonzero(np.diff(parts, prepend=parts[0] - 1))
@@ -54,7 +54,7 @@ def cut(rows: pl.DataFrame, prefix: str, metadata: Sequence[dict[str, Any]]) -> 
         stretch = stretch + 1 if group == previous else 1
         previous = group
         name = drive_id(prefix, group, stretch)
-        drives.append(Drive(name, slice(start, end), metadata[group]))
+        drives.append(MeasuredDrive(name, slice(start, end), metadata[group]))
     return sorted(drives, key=lambda drive: drive.drive_id)
 
 
@@ -95,7 +95,9 @@ def _on_the_circle(resample: Callable[[FloatArray], FloatArray], angle: FloatArr
     return np.asarray(resampled - 2 * np.pi * np.rint(resampled / (2 * np.pi)), dtype=np.float64)
 
 
-def log_table(drives: Sequence[Drive], ticked: Sequence[Ticked], mapping: Mapping) -> pa.Table:
+def log_table(
+    drives: Sequence[MeasuredDrive], ticked: Sequence[Ticked], mapping: Mapping
+) -> pa.Table:
     """Return the rows of `logs` for these drives; strings are dictionary-encoded."""
     sizes = [drive.ticks.size for drive in ticked]
     of_drive = pa.array(np.repeat(np.arange(len(drives), dtype=np.int32), sizes))
@@ -116,7 +118,7 @@ def log_table(drives: Sequence[Drive], ticked: Sequence[Ticked], mapping: Mappin
     return pa.table(columns)
 
 
-def _metadata(drive: Drive, ticked: Ticked, mapping: Mapping) -> dict[str, Any]:
+def _metadata(drive: MeasuredDrive, ticked: Ticked, mapping: Mapping) -> dict[str, Any]:
     """Return what is known of a drive, by column of `logs`."""
     given = {name: getattr(mapping.drive, name) for name in _FROM_MAPPING}
     known = {name: value for name, value in given.items() if not isinstance(value, FromColumn)}

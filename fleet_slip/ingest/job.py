@@ -11,8 +11,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from deltalake.transaction import AddAction
 
-from fleet_slip.compute.tasks import completed
-from fleet_slip.delta import Change, Table, Unit, retried
+from fleet_slip.compute.tasks import run_tasks
+from fleet_slip.delta import Change, Table, Unit, retry_conflicts
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.measured import IngestCounts, MeasuredLog, read_measured
 from fleet_slip.warehouse.tables import Warehouse
@@ -72,7 +72,7 @@ def ingest_files(
     With an executor they are read and written by its workers, in any order. Raises like
     `ingest_file`, and `ClusterError` at the end for files that workers died of.
     """
-    for file, written in completed(executor, partial(_write, warehouse, mapping), files, str):
+    for file, written in run_tasks(executor, partial(_write, warehouse, mapping), files, str):
         # Not the file's name: it may name a car, and the Delta log outlives what is forgotten.
         note = {"job": "ingest", "mapping": mapping.name, "digest": written.digest}
         _commit(warehouse.quarantine, written.quarantine, written.unit, note)
@@ -116,4 +116,4 @@ def _commit(table: Table, actions: Sequence[AddAction], unit: Unit, note: dict[s
         snapshot.commit(change)
         return True
 
-    return retried(attempt)
+    return retry_conflicts(attempt)

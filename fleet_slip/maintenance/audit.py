@@ -20,7 +20,7 @@ FOLDER = "forgotten"
 
 
 @dataclass(frozen=True)
-class Subject:
+class Forgettable:
     """What is to be forgotten: a vehicle, a drive, or every drive before a day."""
 
     kind: Literal["vehicle", "drive", "before"]
@@ -58,12 +58,12 @@ class Audit:
         """Return all entries, oldest first."""
         return [self._folder.read(number).content for number in self._folder.numbers()]
 
-    def state(self, subject: Subject) -> Literal["begun", "done"] | None:
+    def state(self, subject: Forgettable) -> Literal["begun", "done"] | None:
         """Return how far forgetting a subject got; None if it was never begun."""
         mine = self._of(subject)
         return mine[-1]["event"] if mine else None
 
-    def models_of(self, subject: Subject) -> list[str]:
+    def models_of(self, subject: Forgettable) -> list[str]:
         """Return the model versions that the last forgetting of a subject marked."""
         begun = [entry for entry in self._of(subject) if entry["event"] == "begun"]
         return list(begun[-1]["models"]) if begun else []
@@ -72,21 +72,21 @@ class Audit:
         """Return all model versions, NAME@VERSION, that were trained on forgotten drives."""
         return frozenset(name for entry in self.entries() for name in entry.get("models", ()))
 
-    def begin(self, subject: Subject, drives: int, models: Collection[str]) -> None:
+    def begin(self, subject: Forgettable, drives: int, models: Collection[str]) -> None:
         """Record what is about to be forgotten."""
         self._append(subject, {"event": "begun", "drives": drives, "models": sorted(models)})
 
-    def end(self, subject: Subject) -> None:
+    def end(self, subject: Forgettable) -> None:
         """Record that it is forgotten."""
         self._append(subject, {"event": "done"})
 
-    def _of(self, subject: Subject) -> list[Mapping[str, Any]]:
+    def _of(self, subject: Forgettable) -> list[Mapping[str, Any]]:
         entries = self.entries()
         # One salt, or more if several processes made the first entries at once.
         digests = {salt: subject.digest(salt) for salt in {entry["salt"] for entry in entries}}
         return [entry for entry in entries if entry["subject"] == digests[entry["salt"]]]
 
-    def _append(self, subject: Subject, content: Mapping[str, Any]) -> None:
+    def _append(self, subject: Forgettable, content: Mapping[str, Any]) -> None:
         entries = self.entries()
         salt = entries[0]["salt"] if entries else secrets.token_hex(16)
         at = datetime.now(UTC).isoformat(timespec="seconds")

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from datetime import date
 
-from fleet_slip.delta import Change, Snapshot, TableFile, retried
+from fleet_slip.delta import Change, Snapshot, TableFile, retry_conflicts
 from fleet_slip.grams.job import reconcile
 from fleet_slip.maintenance.rewriting import read_drives
 from fleet_slip.warehouse.tables import Warehouse
@@ -87,7 +87,7 @@ def _compact_day(warehouse: Warehouse, day: date, target_rows: int) -> int:
             )
         return sum(file.rows for pack in packs for file in pack)
 
-    return retried(attempt)
+    return retry_conflicts(attempt)
 
 
 def _small_files(snapshot: Snapshot, day: date, target_rows: int) -> list[TableFile]:

@@ -7,7 +7,7 @@ import pyarrow.compute as pc
 
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.delta import Snapshot
-from fleet_slip.maintenance.audit import Subject
+from fleet_slip.maintenance.audit import Forgettable
 from fleet_slip.maintenance.old_files import rows_of
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.database import database_errors, open_database
@@ -31,7 +31,7 @@ class Located:
     drives: Mapping[str, frozenset[str]]
 
 
-def locate(grams: Snapshot, subject: Subject) -> Located:
+def locate(grams: Snapshot, subject: Forgettable) -> Located:
     """Look for a subject's drives in the Gram rows."""
     known: set[str] = set()
     drives: dict[str, set[str]] = {}
@@ -48,7 +48,9 @@ def locate(grams: Snapshot, subject: Subject) -> Located:
     return Located(frozenset(known), {path: frozenset(names) for path, names in drives.items()})
 
 
-def drives_by_file(logs: Snapshot, subject: Subject, located: Located) -> dict[str, frozenset[str]]:
+def drives_by_file(
+    logs: Snapshot, subject: Forgettable, located: Located
+) -> dict[str, frozenset[str]]:
     """Return the drives concerned of each log file that has some, by the file's path.
 
     Only files without Gram rows are opened.

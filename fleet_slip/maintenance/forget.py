@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from fleet_slip.delta import Change, retried
-from fleet_slip.errors import FleetSlipError, SelectionError
+from fleet_slip.delta import Change, retry_conflicts
+from fleet_slip.errors import FleetSlipError, QuestionError
 from fleet_slip.grams.job import reconcile
-from fleet_slip.maintenance.audit import Audit, Subject
+from fleet_slip.maintenance.audit import Audit, Forgettable
 from fleet_slip.maintenance.find_drives import Located, drives_by_file, locate
 from fleet_slip.maintenance.old_files import quarantined_of, remove_old_files
 from fleet_slip.maintenance.rewriting import read_drives
@@ -53,14 +53,14 @@ class ForgetReport:
 
 def forget(
     warehouse: Warehouse,
-    subject: Subject,
+    subject: Forgettable,
     *,
     now: bool = False,
     progress: Progress = lambda _more, _all: None,
 ) -> ForgetReport:
     """Forget drives; with `now`, delete the replaced files at once instead of by `vacuum`.
 
-    It can be repeated after any interruption. Raises `SelectionError` if there never was such a
+    It can be repeated after any interruption. Raises `DataError` if there never was such a
     drive, `StorageError`, or `ConflictError`.
     """
     audit = Audit(warehouse.root)
@@ -68,7 +68,7 @@ def forget(
     drives = _drives_of(warehouse, subject, located)
     state = audit.state(subject)
     if not drives and state is None and subject.kind != "before":
-        raise SelectionError(
+        raise QuestionError(
             f"no drive has {subject.column} {subject.value!r}. See: "
             'fleet-slip sql "SELECT drive_id, vehicle_id, day FROM drives"'
         )
@@ -93,7 +93,7 @@ def forget(
     )
 
 
-def _drives_of(warehouse: Warehouse, subject: Subject, located: Located) -> frozenset[str]:
+def _drives_of(warehouse: Warehouse, subject: Forgettable, located: Located) -> frozenset[str]:
     """Return the drives in the logs and the quarantine, and what interrupted jobs left in grams."""
     in_logs = drives_by_file(warehouse.logs.snapshot(), subject, located)
     found: set[str] = set().union(*in_logs.values(), *located.drives.values())
@@ -105,7 +105,7 @@ def _drives_of(warehouse: Warehouse, subject: Subject, located: Located) -> froz
 
 
 def _rewrite_logs(
-    warehouse: Warehouse, subject: Subject, located: Located, progress: Progress
+    warehouse: Warehouse, subject: Forgettable, located: Located, progress: Progress
 ) -> tuple[int, int, int]:
     """Commit the logs without the drives; return rows forgotten, files rewritten, removed."""
 
@@ -126,10 +126,12 @@ def _rewrite_logs(
         logs.commit(Change(add=actions, remove=concerned, note={"job": "forget"}))
         return rows, len(actions), len(concerned) - len(actions)
 
-    return retried(attempt)
+    return retry_conflicts(attempt)
 
 
-def _forget_quarantined(warehouse: Warehouse, subject: Subject, drives: Collection[str]) -> None:
+def _forget_quarantined(
+    warehouse: Warehouse, subject: Forgettable, drives: Collection[str]
+) -> None:
     def attempt() -> None:
         snapshot = warehouse.quarantine.snapshot()
         add, remove = [], []
@@ -144,7 +146,7 @@ def _forget_quarantined(warehouse: Warehouse, subject: Subject, drives: Collecti
             snapshot.commit(Change(add=add, remove=remove, note={"job": "forget"}))
 
     if drives:
-        retried(attempt)
+        retry_conflicts(attempt)
 
 
 def models_trained_on(warehouse: Warehouse, drives: Collection[str]) -> list[str]:

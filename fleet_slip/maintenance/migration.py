@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from fleet_slip.catalogue.signals import COUNT_MAX
 from fleet_slip.delta import Snapshot, Table, TableFile
-from fleet_slip.delta.schema import SCALE, TARGET, Evolution, evolution, scales_of
+from fleet_slip.delta.schema import SCALE, TARGET, Evolution, compare_schemas, scales_of
 from fleet_slip.delta.sealing import NOTE, sealed
 from fleet_slip.errors import ConflictError, RefusedError, StorageError
 from fleet_slip.files.storage_errors import storage_errors
@@ -72,7 +72,7 @@ def migrate(warehouse: Warehouse, progress: Progress = lambda _more, _all: None)
     delta = table.open_delta()
     if delta is None:
         return MigrationReport((), (), {}, 0, 0, None)
-    found = evolution(table.schema, delta)
+    found = compare_schemas(table.schema, delta)
     files = 0
     rows = 0
     if found.pending:
@@ -88,11 +88,11 @@ def migrate(warehouse: Warehouse, progress: Progress = lambda _more, _all: None)
 
 def _add_columns_that_came_later(table: Table) -> None:
     delta = table.open_delta()
-    if delta is not None and (found := evolution(table.schema, delta)).added:
+    if delta is not None and (found := compare_schemas(table.schema, delta)).added:
         _add_columns(table, delta, found)
 
 
-def rescaled(counts: NDArray[np.int16], ratio: Fraction) -> NDArray[np.int64]:
+def rescale_counts(counts: NDArray[np.int16], ratio: Fraction) -> NDArray[np.int64]:
     """Return counts times a ratio, rounded to the nearest integer, halves to even."""
     scaled = 2 * counts.astype(np.int64) * ratio.numerator + ratio.denominator
     nearest = scaled // (2 * ratio.denominator)
@@ -158,7 +158,7 @@ def _rewrite(table: Table, file: TableFile, ratios: Mapping[str, Fraction]) -> A
     for name, ratio in ratios.items():
         column = rows[name].combine_chunks()
         absent = column.is_null().to_numpy(zero_copy_only=False)
-        counts = rescaled(column.fill_null(0).to_numpy(), ratio)
+        counts = rescale_counts(column.fill_null(0).to_numpy(), ratio)
         if len(counts) and np.abs(counts).max() > COUNT_MAX:
             raise RefusedError(
                 f"{file.path}: counts of {name} up to {np.abs(counts).max():,} in the new scale "

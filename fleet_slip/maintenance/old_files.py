@@ -9,7 +9,7 @@ import pyarrow.compute as pc
 from fleet_slip.delta import Snapshot
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.files.folder import StoredFile
-from fleet_slip.maintenance.audit import Subject
+from fleet_slip.maintenance.audit import Forgettable
 from fleet_slip.maintenance.vacuum import replaced, unreferenced
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -17,7 +17,9 @@ BEING_WRITTEN_HOURS = 1.0
 """A file that no commit ever knew and that is younger may belong to a job that is running."""
 
 
-def remove_old_files(warehouse: Warehouse, subject: Subject, *, delete: bool) -> tuple[int, int]:
+def remove_old_files(
+    warehouse: Warehouse, subject: Forgettable, *, delete: bool
+) -> tuple[int, int]:
     """Delete the files with the drives that no version refers to, or count them.
 
     The logs come last: their old files may be all that tells the drives of a car in the quarantine.
@@ -55,7 +57,7 @@ def _with_day(file: StoredFile, rows: pa.Table) -> pa.Table:
 
 
 def _with_subject(
-    snapshot: Snapshot, subject: Subject
+    snapshot: Snapshot, subject: Forgettable
 ) -> Iterator[tuple[StoredFile, frozenset[str]]]:
     for file, rows in _readable(snapshot):
         names = rows.filter(rows_of(rows, subject))["drive_id"].unique().to_pylist()
@@ -64,21 +66,23 @@ def _with_subject(
 
 
 def _of_quarantine(
-    snapshot: Snapshot, subject: Subject, drives: Collection[str]
+    snapshot: Snapshot, subject: Forgettable, drives: Collection[str]
 ) -> Iterator[StoredFile]:
     for file, rows in _readable(snapshot):
         if pc.any(quarantined_of(rows, subject, drives)).as_py():
             yield file
 
 
-def rows_of(rows: pa.Table, subject: Subject) -> pa.ChunkedArray:
+def rows_of(rows: pa.Table, subject: Forgettable) -> pa.ChunkedArray:
     """Return which rows of `logs` or `grams` are of a subject."""
     if subject.kind == "before":
         return pc.less(rows["day"], pa.scalar(date.fromisoformat(subject.value)))
     return pc.equal(rows[subject.column].cast(pa.string()), subject.value)
 
 
-def quarantined_of(rows: pa.Table, subject: Subject, drives: Collection[str]) -> pa.ChunkedArray:
+def quarantined_of(
+    rows: pa.Table, subject: Forgettable, drives: Collection[str]
+) -> pa.ChunkedArray:
     """Return which rows of the quarantine are of a subject, or of drives that are known to be.
 
     A row that was refused before its drive was cut at a gap in time names the drive as a whole.

@@ -11,7 +11,7 @@ from datetime import date
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from fleet_slip.delta import Change, TableFile, retried
+from fleet_slip.delta import Change, TableFile, retry_conflicts
 from fleet_slip.delta.checkpoints import (
     checkpoint_faults,
     dispensable,
@@ -133,7 +133,7 @@ def _aggregate_again(
             snapshot.commit(Change(remove=bad, note={"job": "repair"}))
             removed.extend(f"grams/{file.path}" for file in bad)
 
-    retried(attempt)
+    retry_conflicts(attempt)
     reconcile(warehouse)  # also what an interrupted repair has dropped
     return removed
 

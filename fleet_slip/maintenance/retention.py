@@ -8,7 +8,7 @@ from pydantic import Field
 
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import ConfigError, RefusedError
-from fleet_slip.maintenance.audit import Subject
+from fleet_slip.maintenance.audit import Forgettable
 from fleet_slip.maintenance.forget import ForgetReport, forget
 from fleet_slip.maintenance.vacuum import RETENTION_HOURS, VacuumReport, vacuum
 from fleet_slip.resources import find_config, folder
@@ -60,6 +60,6 @@ def retain(
             f"{warehouse.root}: its latest drive is of {max(days)} and all before {before} would "
             "be forgotten, which leaves none. Check the clock, or drives_days of the retention."
         )
-    forgotten = forget(warehouse, Subject("before", before.isoformat()), progress=progress)
+    forgotten = forget(warehouse, Forgettable("before", before.isoformat()), progress=progress)
     vacuumed = vacuum(warehouse, retention.replaced_files_hours)
     return RetentionReport(before, forgotten, vacuumed)

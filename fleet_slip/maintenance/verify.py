@@ -15,12 +15,12 @@ from typing import Literal
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from fleet_slip.compute.tasks import LocalThreads, completed
+from fleet_slip.compute.tasks import LocalThreads, run_tasks
 from fleet_slip.delta import Snapshot, Table, TableFile, checksum_in, checksum_of
 from fleet_slip.delta.checkpoints import FOLDER as CHECKSUMS
 from fleet_slip.delta.checkpoints import checkpoint_faults, unsealed_checkpoints
 from fleet_slip.delta.commit_check import log_problems
-from fleet_slip.errors import FleetSlipError, RefusedError, SelectionError, StorageError
+from fleet_slip.errors import DataError, FleetSlipError, QuestionError, RefusedError, StorageError
 from fleet_slip.files.documents import DocumentFolder
 from fleet_slip.files.folder import Folder, StoredFile
 from fleet_slip.files.storage_errors import storage_errors
@@ -43,7 +43,7 @@ Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
-class Finding:
+class Damage:
     """One thing that is not as it must be, or that is worth knowing.
 
     Attributes:
@@ -72,10 +72,10 @@ class Verification:
     rows: int = 0
     log_files_recomputed: int = 0
     documents: int = 0
-    findings: list[Finding] = field(default_factory=list)
+    findings: list[Damage] = field(default_factory=list)
 
     @property
-    def damage(self) -> list[Finding]:
+    def damage(self) -> list[Damage]:
         """The findings that are damage."""
         return [finding for finding in self.findings if finding.damage]
 
@@ -121,12 +121,12 @@ def _snapshots(warehouse: Warehouse, report: Verification) -> dict[str, Snapshot
             snapshot = table.snapshot()
             _ = snapshot.files
         except FleetSlipError as error:
-            report.findings.append(Finding("log", table.folder.name, str(error)))
+            report.findings.append(Damage("log", table.folder.name, str(error)))
         else:
             found[table.folder.name] = snapshot
             for file, problem in log_problems(snapshot):
                 path = f"{table.folder.name}/_delta_log/{file}"
-                report.findings.append(Finding("log", path, problem))
+                report.findings.append(Damage("log", path, problem))
     return found
 
 
@@ -137,14 +137,14 @@ def _verify_checkpoints(table: Table, report: Verification) -> None:
     if faults := documents.faults():
         for file, problem in faults.items():
             where = f"{name}/{CHECKSUMS}/{file.rpartition('/')[2]}"
-            report.findings.append(Finding("document", where, problem))
+            report.findings.append(Damage("document", where, problem))
         return
     for fault in checkpoint_faults(table.folder):
         where = f"{name}/_delta_log/{fault.name}"
-        report.findings.append(Finding("log", where, fault.problem))
+        report.findings.append(Damage("log", where, fault.problem))
     for checkpoint in unsealed_checkpoints(table.folder):
         problem = "no checksum was kept of this checkpoint; the next one comes with both"
-        report.findings.append(Finding("backlog", f"{name}/_delta_log/{checkpoint}", problem))
+        report.findings.append(Damage("backlog", f"{name}/_delta_log/{checkpoint}", problem))
 
 
 def _any_table(snapshots: Mapping[str, Snapshot]) -> bool:
@@ -156,7 +156,7 @@ def _require_logs(snapshots: Mapping[str, Snapshot], report: Verification) -> No
     logs, grams = snapshots.get("logs"), snapshots.get("grams")
     if logs and grams and logs.version is None and grams.rows:
         problem = f"the table is gone that {grams.rows:,} Gram rows were computed from"
-        report.findings.append(Finding("log", "logs", problem))
+        report.findings.append(Damage("log", "logs", problem))
 
 
 def _verify_files(
@@ -168,12 +168,12 @@ def _verify_files(
     with LocalThreads(os.cpu_count() or 1) as threads:
         groups = _groups(snapshot.files)
         task = partial(_problems_of, table)
-        for group, found in completed(executor or threads, task, groups, _group_name):
+        for group, found in run_tasks(executor or threads, task, groups, _group_name):
             problems |= found
             progress(sum(file.size_bytes for file in group), snapshot.size_bytes)
     for path, problem in sorted(problems.items()):
         if problem:
-            report.findings.append(Finding("file", f"{table.folder.name}/{path}", problem))
+            report.findings.append(Damage("file", f"{table.folder.name}/{path}", problem))
     report.files += len(snapshot.files)
     report.size_bytes += snapshot.size_bytes
     report.rows += snapshot.rows if table.folder.name == "logs" else 0
@@ -250,7 +250,7 @@ def _verify_drives(warehouse: Warehouse, files: Sequence[TableFile], report: Ver
         rows = database.execute(read_sql("jobs", "verify_drives.sql")).fetchall()
     for drive, in_files, beginnings, n, file in rows:
         problem = f"{n:,} rows in {in_files} files with {beginnings} rows of tick 0; one is {file}"
-        report.findings.append(Finding("drive", drive, problem))
+        report.findings.append(Damage("drive", drive, problem))
 
 
 def _verify_grams(
@@ -269,21 +269,21 @@ def _verify_grams(
         twice = database.execute(read_sql("jobs", "verify_grams.sql")).fetchall()
     for identity, file, drive, n in twice:
         problem = f"the Gram row {identity} of drive {drive} stands {n} times"
-        report.findings.append(Finding("gram", f"logs/{file}", problem))
+        report.findings.append(Damage("gram", f"logs/{file}", problem))
     stored = stored_grams(warehouse, grams)
     covered = [file for file in logs if file.path in stored]
     step = 1 if full else max(1, len(covered) // SAMPLE)
     task = partial(_computed, warehouse)
-    for file, computed in completed(executor, task, covered[::step], _recomputing):
+    for file, computed in run_tasks(executor, task, covered[::step], _recomputing):
         for drive in _different(stored[file.path], computed):
             problem = f"the stored Gram row of drive {drive} is not that of its rows"
-            report.findings.append(Finding("gram", f"logs/{file.path}", problem))
+            report.findings.append(Damage("gram", f"logs/{file.path}", problem))
         report.log_files_recomputed += 1
     missing = len(logs) - len(covered)
     stale = stored.keys() - set(active)
     if missing or stale:
         problem = f"{missing} log files have no Gram rows, {len(stale)} with Gram rows are gone"
-        report.findings.append(Finding("backlog", "grams", f"{problem}; run: fleet-slip gram"))
+        report.findings.append(Damage("backlog", "grams", f"{problem}; run: fleet-slip gram"))
 
 
 def _computed(warehouse: Warehouse, file: TableFile) -> DriveGrams:
@@ -302,7 +302,7 @@ def _verify_documents(root: Folder, report: Verification) -> None:
     for folder in _document_folders(root):
         report.documents += len(folder.numbers())
         for file, problem in folder.faults().items():
-            report.findings.append(Finding("document", file.removeprefix(f"{root}/"), problem))
+            report.findings.append(Damage("document", file.removeprefix(f"{root}/"), problem))
 
 
 def _document_folders(root: Folder) -> list[DocumentFolder]:
@@ -328,16 +328,16 @@ def _verify_models(
             try:
                 trained = registry.load(name, number).manifest.trained_on
             except RefusedError as error:  # its signature
-                report.findings.append(Finding("model", f"{name}@{number}", str(error)))
+                report.findings.append(Damage("model", f"{name}@{number}", str(error)))
                 continue
-            except (StorageError, SelectionError):
+            except (StorageError, DataError, QuestionError):
                 continue  # told as a document
             made_of = {"logs": trained.logs_version, "grams": trained.grams_version}
             for table, version in made_of.items():
                 latest = snapshots[table].version if table in snapshots else None
                 if latest is None or version > latest:
                     problem = f"was made of version {version} of {table}, which does not exist"
-                    report.findings.append(Finding("model", f"{name}@{number}", problem))
+                    report.findings.append(Damage("model", f"{name}@{number}", problem))
         try:
             aliases = registry.history(name).aliases()
         except (FleetSlipError, ValueError):
@@ -345,7 +345,7 @@ def _verify_models(
         for alias, version in aliases.items():
             if version not in numbers:
                 problem = f"points at version {version}, which does not exist"
-                report.findings.append(Finding("model", f"{name}@{alias}", problem))
+                report.findings.append(Damage("model", f"{name}@{alias}", problem))
 
 
 def _list_unreferenced(
@@ -365,4 +365,4 @@ def _list_unreferenced(
 
 def _remark(warehouse: Warehouse, file: StoredFile, problem: str, report: Verification) -> None:
     where = str(file).removeprefix(f"{warehouse.root}/")
-    report.findings.append(Finding("unreferenced", where, problem))
+    report.findings.append(Damage("unreferenced", where, problem))

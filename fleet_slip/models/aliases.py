@@ -14,7 +14,7 @@ from pydantic import Field, ValidationError
 
 from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN, Identifier
 from fleet_slip.config import Config, faults_of
-from fleet_slip.errors import SelectionError, StorageError
+from fleet_slip.errors import QuestionError, StorageError
 from fleet_slip.files.documents import MAX_DIGITS, DocumentFolder
 
 CHAMPION = "champion"
@@ -93,7 +93,7 @@ class AliasHistory:
     def move(self, alias: str, version: int, command: Command, *, after: int) -> bool:
         """Point an alias at a version; return False if there were moves after the one given."""
         if not re.fullmatch(IDENTIFIER_PATTERN, alias):
-            raise SelectionError(
+            raise QuestionError(
                 f"{alias!r} cannot be an alias: use small letters, digits and _, beginning with a "
                 "letter, at most 41."
             )

@@ -8,7 +8,7 @@ from typing import Any
 
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.errors import RefusedError, SelectionError
+from fleet_slip.errors import DataError, QuestionError, RefusedError
 from fleet_slip.models.manifest import (
     CrossValidated,
     Manifest,
@@ -135,7 +135,7 @@ def _revalidate(champion: ModelVersion, selection: Selection[Any]) -> CrossValid
         _require_same_features(champion)
         candidate = CandidateModel(name=champion.reference, signals=champion.manifest.signals)
         return validate(candidate, folds)
-    except SelectionError as error:
+    except (DataError, QuestionError) as error:
         raise RefusedError(
             f"{champion.manifest.name} was not published: the champion {champion.reference} cannot "
             f"be compared on this cohort ({error}) Use --force to publish all the same."
@@ -146,7 +146,7 @@ def _require_same_features(champion: ModelVersion) -> None:
     known = features().features
     for name, sql in champion.manifest.features.items():
         if name not in known or known[name].sql != sql:
-            raise SelectionError(f"its feature {name} is not defined as it was then.")
+            raise DataError(f"its feature {name} is not defined as it was then.")
 
 
 def _cross_validated(winner: CrossValidation, selection: Selection[Any]) -> CrossValidated:

@@ -5,7 +5,7 @@ from typing import Any
 
 from fleet_slip.catalogue.features import with_features
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.database import database_errors
@@ -68,7 +68,7 @@ def _rows(manifest: Manifest) -> str:
 
 
 def score(warehouse: Warehouse, manifest: Manifest, condition: str) -> Score:
-    """Score a model. Raises `SelectionError` if the cohort has no row with its signals."""
+    """Score a model. Raises `DataError` if the cohort has no row with its signals."""
     text = score_statement(manifest, condition)
     with connect_tables(warehouse, text) as database:
         statement = one_query(database, text)
@@ -77,7 +77,7 @@ def score(warehouse: Warehouse, manifest: Manifest, condition: str) -> Score:
             names = [column[0] for column in result.description or ()]
             row = result.fetchone()
     if row is None or not row[0]:
-        raise SelectionError(
+        raise DataError(
             f"no row of the cohort {condition!r} has {', '.join(manifest.signals)} and "
             f"{manifest.label.signal}. Choose another cohort, or a model with fewer signals."
         )

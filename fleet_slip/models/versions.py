@@ -17,7 +17,7 @@ from pydantic import ValidationError
 
 from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN
 from fleet_slip.config import faults_of
-from fleet_slip.errors import RefusedError, SelectionError, StorageError
+from fleet_slip.errors import QuestionError, RefusedError, StorageError
 from fleet_slip.files.documents import MAX_DIGITS, DocumentFolder
 from fleet_slip.files.folder import Folder
 from fleet_slip.models.aliases import CHAMPION, AliasHistory
@@ -79,7 +79,7 @@ class Registry:
 
     def _read(self, name: str, version: int) -> ModelVersion:
         if not _IDENTIFIER.fullmatch(name):
-            raise SelectionError(_unknown(name, str(version), self.names(), []))
+            raise QuestionError(_unknown(name, str(version), self.names(), []))
         try:
             document = self._versions(name).read(version)
         except StorageError:
@@ -87,7 +87,7 @@ class Registry:
             numbers = self.versions(name) if name in self.names() else []
             if version in numbers:
                 raise
-            raise SelectionError(_unknown(name, str(version), self.names(), numbers)) from None
+            raise QuestionError(_unknown(name, str(version), self.names(), numbers)) from None
         try:
             manifest = Manifest.model_validate(document.content)
         except ValidationError as error:
@@ -105,12 +105,12 @@ class Registry:
     def resolve(self, reference: str) -> ModelVersion:
         """Return the version that `NAME`, `NAME@VERSION` or `NAME@ALIAS` names.
 
-        `NAME` alone is its champion. Raises `SelectionError` for an unknown one.
+        `NAME` alone is its champion. Raises `QuestionError` for an unknown one.
         """
         name, _, which = reference.partition("@")
         if name not in self.names():
             known = ", ".join(self.names()) or "none yet; publish one with: fleet-slip publish"
-            raise SelectionError(f"no model is called {name!r}. Models: {known}.")
+            raise QuestionError(f"no model is called {name!r}. Models: {known}.")
         which = which or CHAMPION
         if which.isascii() and which.isdigit() and len(which) <= MAX_DIGITS:
             return self.load(name, int(which))
@@ -118,7 +118,7 @@ class Registry:
         version = history.pointed_at(which)
         if version is None:
             known_aliases = history.aliases()
-            raise SelectionError(
+            raise QuestionError(
                 _unknown(name, which, self.names(), self.versions(name), known_aliases)
             )
         return self.load(name, version)
@@ -166,7 +166,7 @@ class Registry:
         return there or history.move(CHAMPION, version.version, "publish", after=after)
 
     def promote(self, name: str, version: int, alias: str) -> None:
-        """Point an alias at a version. Raises `SelectionError` for an unknown version.
+        """Point an alias at a version. Raises `QuestionError` for an unknown version.
 
         Where it points there already nothing is added, so that a repeated command can be undone by
         one `rollback`.

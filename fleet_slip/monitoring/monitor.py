@@ -17,7 +17,7 @@ from statistics import fmean, stdev
 from typing import Any
 
 from fleet_slip.catalogue.features import input_scales
-from fleet_slip.errors import SelectionError, StorageError
+from fleet_slip.errors import DataError, StorageError
 from fleet_slip.grams.day_sums import sum_days
 from fleet_slip.models.counts_model import counts_model
 from fleet_slip.models.versions import ModelVersion
@@ -108,7 +108,7 @@ def monitor(
 
     `condition` chooses the drives; by default those that satisfy the condition of its training.
     Days from `since` are new; by default those after the last day of the logs it was trained on.
-    Raises `SelectionError` if fewer than `min_training_days` are left to learn from.
+    Raises `DataError` if fewer than `min_training_days` are left to learn from.
     """
     limits = limits or thresholds().monitor
     manifest = version.manifest
@@ -118,7 +118,7 @@ def monitor(
     last = _last_training_day(warehouse, version) if since is None else None
     training = [day < since if since else last is not None and day <= last for day in days]
     if sum(training) < limits.min_training_days:
-        raise SelectionError(
+        raise DataError(
             f"{version.reference} was trained on {sum(training)} days of the cohort "
             f"{condition!r}, too few to tell what is usual. Choose another --since or --cohort; "
             f"{limits.min_training_days} days are needed."

@@ -11,7 +11,7 @@ import pyarrow as pa
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.grams.cohort import Cohort, load_cohort, nothing, require_training
+from fleet_slip.grams.cohort import Cohort, empty_cohort_error, load_cohort, require_training
 from fleet_slip.grams.reader import GramReader
 from fleet_slip.monitoring.moments import DriveBatches
 from fleet_slip.monitoring.peers import settle
@@ -23,7 +23,7 @@ from fleet_slip.warehouse.tables import Warehouse
 
 
 @dataclass(frozen=True)
-class Finding:
+class SensorFault:
     """A drive whose sensors are not in order."""
 
     drive_id: str
@@ -49,7 +49,7 @@ class QualityReport:
 
     drives: int
     compared: int
-    findings: tuple[Finding, ...]
+    findings: tuple[SensorFault, ...]
 
     def as_dict(self) -> dict[str, Any]:
         """Return the report for a JSON document."""
@@ -90,7 +90,7 @@ def _vehicle_models(reader: GramReader, condition: str) -> list[str]:
         statement = f"SELECT DISTINCT vehicle_model, source FROM ({cohort}\n)"
         found = opened.database.sql(statement).fetchall()
     if not found:
-        raise nothing(opened.database, condition)
+        raise empty_cohort_error(opened.database, condition)
     require_training({source for _, source in found}, condition)
     models = sorted({model for model, _ in found}, key=str)
     return [f"vehicle_model IS NOT DISTINCT FROM {_literal(model)}" for model in models]
@@ -100,7 +100,7 @@ def _literal(text: str | None) -> str:
     return "NULL" if text is None else "'" + text.replace("'", "''") + "'"
 
 
-def _day_and_drive(finding: Finding) -> tuple[date, str]:
+def _day_and_drive(finding: SensorFault) -> tuple[date, str]:
     return finding.day, finding.drive_id
 
 
@@ -159,9 +159,9 @@ def _unlike_peers(
     return dict(zip(at.tolist(), faults, strict=True))
 
 
-def _findings(metadata: pa.Table, faults: dict[int, Fault]) -> list[Finding]:
+def _findings(metadata: pa.Table, faults: dict[int, Fault]) -> list[SensorFault]:
     return [
-        Finding(row["drive_id"], row["vehicle_id"], row["day"], faults[drive])
+        SensorFault(row["drive_id"], row["vehicle_id"], row["day"], faults[drive])
         for drive, row in enumerate(metadata.select(["drive_id", "vehicle_id", "day"]).to_pylist())
         if drive in faults
     ]

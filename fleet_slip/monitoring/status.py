@@ -10,7 +10,7 @@ from typing import Any
 import pyarrow as pa
 
 from fleet_slip.delta import Snapshot
-from fleet_slip.errors import RefusedError, SelectionError, StorageError
+from fleet_slip.errors import DataError, QuestionError, RefusedError, StorageError
 from fleet_slip.files.folder import Folder
 from fleet_slip.files.storage_errors import storage_errors
 from fleet_slip.grams.job import find_backlog
@@ -197,7 +197,7 @@ def _champions(
             champion = registry.champion(name)
             history = registry.history(name)
             published_at = history.published_at(champion.version) if champion else None
-        except (StorageError, RefusedError, SelectionError) as error:
+        except (StorageError, RefusedError, DataError, QuestionError) as error:
             damaged.append(str(error))
             continue
         if champion is None:

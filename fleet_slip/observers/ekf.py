@@ -274,7 +274,7 @@ def build_model(track: SingleTrack, noise: EkfNoise) -> Model:
 def estimate(drive: DriveSignals, car: VehicleParameters, noise: EkfNoise) -> Floats:
     """Estimate side-slip in rad at every row. Gaps of a sensor are bridged by the value before.
 
-    Raises `SelectionError` if a sensor is absent.
+    Raises `DataError` if a sensor is absent.
     """
     turning = yaw_rate.estimate(drive, car, noise.yaw_rate).yaw_rate_rad_s
     vx_mps = measured_speed_mps(drive, car)

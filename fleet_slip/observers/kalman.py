@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field, FiniteFloat
 
 from fleet_slip.config import Config
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError
 from fleet_slip.observers import yaw_rate
 from fleet_slip.observers.angle import sideslip_angle
 from fleet_slip.observers.signals import STEP_S, DriveSignals, Floats, held
@@ -266,11 +266,11 @@ def run(drive: DriveSignals, yaw_rate_rad_s: Floats, noise: FilterNoise) -> Kalm
     """Run the filter over a drive with a yaw rate that is known.
 
     It begins at the first GPS fix, predicts at every row and updates at every fix. Gaps of the
-    accelerometers are bridged by the value before. Raises `SelectionError` if the drive has no fix.
+    accelerometers are bridged by the value before. Raises `DataError` if the drive has no fix.
     """
     fixes = np.flatnonzero(np.isfinite(drive.gps_vx_mps) & np.isfinite(drive.gps_vy_mps))
     if not len(fixes):
-        raise SelectionError(
+        raise DataError(
             "the drive has no GPS fix, which the Kalman filter begins with. Choose drives with GPS."
         )
     means = _filter(

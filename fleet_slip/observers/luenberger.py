@@ -76,7 +76,7 @@ def _observe(
 def estimate(drive: DriveSignals, car: VehicleParameters, poles: ObserverPoles) -> Floats:
     """Estimate side-slip in rad at every row. Gaps of a sensor are bridged by the value before.
 
-    Raises `SelectionError` if a sensor is absent.
+    Raises `DataError` if a sensor is absent.
     """
     vx_mps = measured_speed_mps(drive, car)
     space = state_space(SingleTrack.of(car, poles.stiffness_factor), vx_mps)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.warehouse.database import database_errors
 
 STEP_S = float(SAMPLE_TIME_S)
@@ -52,7 +52,7 @@ class LabelledDrive:
 def read_drive(database: duckdb.DuckDBPyConnection, drive_id: str) -> LabelledDrive:
     """Read a drive from the view `log` of a warehouse (`fleet_slip.views.connect`).
 
-    Raises `SelectionError` if there is no such drive.
+    Raises `DataError` if there is no such drive.
     """
     label = catalogue()[catalogue().label].column
     columns = [*(field.name for field in fields(DriveSignals)), label]
@@ -62,7 +62,7 @@ def read_drive(database: duckdb.DuckDBPyConnection, drive_id: str) -> LabelledDr
             {"drive_id": drive_id},
         ).fetchnumpy()
     if not len(found[label]):
-        raise SelectionError(f"no drive is called {drive_id!r}. The view drives lists them.")
+        raise QuestionError(f"no drive is called {drive_id!r}. The view drives lists them.")
     arrays = {name: np.ma.filled(found[name].astype(np.float64), np.nan) for name in columns}
     sideslip_rad = arrays.pop(label)
     return LabelledDrive(drive_id, DriveSignals(**arrays), sideslip_rad)
@@ -71,13 +71,13 @@ def read_drive(database: duckdb.DuckDBPyConnection, drive_id: str) -> LabelledDr
 def held(values: Floats, name: str) -> Floats:
     """Return a signal with every gap filled by the value before it, a leading one by the first.
 
-    Raises `SelectionError` if there is no value at all.
+    Raises `DataError` if there is no value at all.
     """
     valid = np.isfinite(values)
     if valid.all():
         return values
     if not valid.any():
-        raise SelectionError(
+        raise DataError(
             f"the drive has no {name}, which this estimator needs. Choose drives that have it, or "
             "another estimator."
         )

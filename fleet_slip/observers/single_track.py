@@ -107,10 +107,10 @@ def state_space(model: SingleTrack, vx_mps: Floats) -> StateSpace:
 
 
 def measured_speed_mps(drive: DriveSignals, car: VehicleParameters) -> Floats:
-    """Return the longitudinal velocity from wheel speeds. Raises `SelectionError` without them."""
+    """Return the longitudinal velocity from wheel speeds. Raises `DataError` without them."""
     return held(undriven_axle(drive, car).vx_mps, "wheel speeds")
 
 
 def measured_steer_rad(drive: DriveSignals) -> Floats:
-    """Return the mean angle of the front wheels. Raises `SelectionError` without them."""
+    """Return the mean angle of the front wheels. Raises `DataError` without them."""
     return held((drive.steer_fl_rad + drive.steer_fr_rad) / 2, "steer_fl and steer_fr")

@@ -9,7 +9,7 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from fleet_slip.config import Config
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError
 from fleet_slip.observers.signals import DriveSignals, Floats, LabelledDrive
 from fleet_slip.vehicle.parameters import VehicleParameters
 
@@ -39,14 +39,14 @@ def error_std_rad(
 ) -> float:
     """Return the standard deviation of estimate − truth over all rows that have both.
 
-    Raises `SelectionError` if no row has.
+    Raises `DataError` if no row has.
     """
     estimates = executor.map(estimate, (drive.signals for drive in drives))
     errors = [found - drive.sideslip_rad for found, drive in zip(estimates, drives, strict=True)]
     error = np.concatenate(errors) if errors else np.empty(0)
     error = error[np.isfinite(error)]
     if not len(error):
-        raise SelectionError("no row has both an estimate and a label. Choose other drives.")
+        raise DataError("no row has both an estimate and a label. Choose other drives.")
     return float(error.std())
 
 

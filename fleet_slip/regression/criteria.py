@@ -12,7 +12,7 @@ from functools import cache
 
 import numpy as np
 
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import QuestionError
 from fleet_slip.regression.evidence import Evidence
 from fleet_slip.regression.special import FloatArray, normal_cdf, normal_density
 
@@ -106,7 +106,7 @@ CRITERIA: dict[str, Callable[[Problem], FloatArray]] = {
 
 
 def criterion_values(name: str, evidence: Evidence) -> FloatArray:
-    """Return a criterion for the k+1 nested models. Raises `SelectionError` for an unknown name."""
+    """Return a criterion for the k+1 nested models. Raises `QuestionError` for an unknown name."""
     size = np.arange(evidence.inputs + 1, dtype=np.float64)
     return _criterion(name)(Problem(evidence.excess(), size, evidence.rows, evidence.inputs))
 
@@ -146,7 +146,7 @@ def _criterion(name: str) -> Callable[[Problem], FloatArray]:
         return CRITERIA[name]
     except KeyError:
         known = ", ".join(CRITERIA)
-        raise SelectionError(f"unknown criterion {name!r}. Known criteria: {known}.") from None
+        raise QuestionError(f"unknown criterion {name!r}. Known criteria: {known}.") from None
 
 
 def _cumulative(values: tuple[float, ...]) -> FloatArray:

@@ -88,7 +88,7 @@ def cross_validate(
 ) -> CrossValidation:
     """Cross-validate a procedure, which sees nothing but the training Gram of each fold.
 
-    Raises `SelectionError` if a training fold cannot be fitted.
+    Raises `DataError` if a training fold cannot be fitted.
     """
     tests = []
     for fold in folds.grams:
@@ -122,7 +122,7 @@ def cross_validate_inputs(
 ) -> CrossValidation:
     """Cross-validate ordinary least squares on given inputs, over every drive that has them.
 
-    Raises `SelectionError` if no drive has all the inputs, or if they are linearly dependent.
+    Raises `DataError` if no drive has all the inputs, or if they are linearly dependent.
     """
     folds = cohort.serving(inputs, label)
     return cross_validate(name, folds, least_squares(inputs, label), scales)

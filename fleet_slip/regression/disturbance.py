@@ -9,12 +9,12 @@ from collections.abc import Mapping
 from dataclasses import replace
 from fractions import Fraction
 
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import QuestionError
 from fleet_slip.regression.exact import LinearModel, Scales
 from fleet_slip.regression.figures import ErrorSums
 
 
-def disturbed(
+def disturb(
     sums: ErrorSums,
     model: LinearModel,
     scales: Scales,
@@ -27,7 +27,7 @@ def disturbed(
     MSE' = MSE + 2 e (b'd) + (b'd)^2 + sum b_j^2 s_j^2, with e the mean error. `model` is one of
     counts, as are the sums; `bias` and `noise` (standard deviations) are in physical units and
     come on top of what the logged signals already have.
-    Raises `SelectionError` for a signal that the model does not use.
+    Raises `QuestionError` for a signal that the model does not use.
     """
     shift = sum(
         (model.coefficients[i] * value for i, value in _counts(model, scales, bias or {})),
@@ -50,7 +50,7 @@ def _counts(
 ) -> list[tuple[int, Fraction]]:
     unused = [name for name in values if name not in model.signals]
     if unused:
-        raise SelectionError(
+        raise QuestionError(
             f"the model does not use {', '.join(unused)}: it uses {', '.join(model.signals)}."
         )
     return [

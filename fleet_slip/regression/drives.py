@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError
 from fleet_slip.regression.exact import LinearModel
 from fleet_slip.regression.gram import GramTable, packed_position, packed_size
 from fleet_slip.regression.special import FloatArray
 
 
-def no_drive_has(signals: Sequence[str]) -> SelectionError:
+def missing_signals_error(signals: Sequence[str]) -> DataError:
     """Return the error that no drive of a cohort has all of some signals."""
-    return SelectionError(
+    return DataError(
         f"no drive of the cohort has all of {', '.join(signals)}. Use fewer signals, or another "
         "cohort."
     )
@@ -30,12 +30,12 @@ def serving_drives(
 ) -> tuple[GramTable, NDArray[np.bool_]]:
     """Return one table of the drives that have all the signals, and which drives those are.
 
-    The mask lists the drives of all tables one after another. Raises `SelectionError` if no
+    The mask lists the drives of all tables one after another. Raises `DataError` if no
     drive has all the signals.
     """
     served = [set(signals) <= set(table.signals) for table in tables]
     if not any(served):
-        raise no_drive_has(signals)
+        raise missing_signals_error(signals)
     parts = [table.restrict(signals) for table, yes in zip(tables, served, strict=True) if yes]
     mask = np.repeat(served, [len(table) for table in tables])
     if len(parts) == 1:
@@ -67,10 +67,10 @@ class DriveMoments:
 
     @classmethod
     def of(cls, table: GramTable) -> "DriveMoments":
-        """Centre and scale a table of drives. Raises `SelectionError` if it has no rows."""
+        """Centre and scale a table of drives. Raises `DataError` if it has no rows."""
         total = table.total()
         if total.n == 0:
-            raise SelectionError(f"no rows have all of {', '.join(table.signals)}.")
+            raise DataError(f"no rows have all of {', '.join(table.signals)}.")
         k = len(table.signals)
         centre = tuple(round(s / total.n) for s in total.sums)
         squares = np.array([total.centred()[i][i] for i in range(k)], dtype=np.float64)

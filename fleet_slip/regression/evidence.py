@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.exact import Fit
 from fleet_slip.regression.inference import drive_scores, noise_variance, small_sample_factor
@@ -45,7 +45,7 @@ class Evidence:
     def naive(cls, fits: Sequence[Fit]) -> "Evidence":
         """Take rows for independent: A_j = (RSS_{j-1} - RSS_j) / sigma^2.
 
-        `fits` are the k+1 nested ones. Raises `SelectionError` if sigma^2 is zero or unknown.
+        `fits` are the k+1 nested ones. Raises `DataError` if sigma^2 is zero or unknown.
         """
         full, variance = fits[-1], _variance(fits[-1])
         return cls(
@@ -64,7 +64,7 @@ class Evidence:
         With q_j the orthogonal direction of signal j and e the full model's residuals,
         A_j = (q_j'y)^2 / (c sum_p (q_j'e)_p^2), p running over drives. The ratio to the naive
         A_j is the design effect of that direction (Kish 1965); rows divided by the mean design
-        effect are the effective rows, at least k + 2. Raises `SelectionError` as `naive` does.
+        effect are the effective rows, at least k + 2. Raises `DataError` as `naive` does.
         """
         full, variance = fits[-1], _variance(fits[-1])
         at = [0, *(drives.signals.index(name) + 1 for name in full.model.signals)]
@@ -117,7 +117,7 @@ def _gains(fits: Sequence[Fit]) -> list[Fraction]:
 def _variance(full: Fit) -> Fraction:
     variance = noise_variance(full)
     if variance == 0:
-        raise SelectionError(
+        raise DataError(
             f"{full.model.label} is an exact linear combination of "
             f"{', '.join(full.model.signals)}: there is no noise to compare models by. "
             "Leave out the signal that contains the label."

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError
 from fleet_slip.regression import rounding
 from fleet_slip.regression.eigenvalues import symmetric_eigenvalues
 from fleet_slip.regression.elimination import Elimination, eliminate
@@ -98,13 +98,13 @@ class Fit:
 def fit(gram: Gram, inputs: Sequence[str], label: str, *, intercept: bool = True) -> Fit:
     """Fit the label on the inputs by exact least squares.
 
-    Raises `SelectionError` if there are no rows, or if the inputs are linearly dependent: the
+    Raises `DataError` if there are no rows, or if the inputs are linearly dependent: the
     message then names the dependent signals and the exact relation.
     """
     part = gram.restrict([*inputs, label])
     triangle = eliminate(moments(part, intercept=intercept))
     if triangle.singular is not None:
-        raise SelectionError(dependence(part, inputs, intercept=intercept))
+        raise DataError(dependence(part, inputs, intercept=intercept))
     return fit_leading(part, triangle, len(inputs), intercept=intercept)
 
 
@@ -130,10 +130,10 @@ def fit_leading(gram: Gram, triangle: Elimination, size: int, *, intercept: bool
 def moments(gram: Gram, *, intercept: bool = True) -> list[list[int]]:
     """Return n S (about the means), or the raw products without an intercept.
 
-    Raises `SelectionError` if there are no rows.
+    Raises `DataError` if there are no rows.
     """
     if gram.n == 0:
-        raise SelectionError("no rows to fit: choose a cohort with drives that have all signals.")
+        raise DataError("no rows to fit: choose a cohort with drives that have all signals.")
     return gram.centred() if intercept else gram.raw()
 
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError
 from fleet_slip.regression.gram import Gram, GramTable, IntArray, positions
 
 
@@ -30,7 +30,7 @@ def hash_fold(key: str, count: int) -> int:
 
 
 @dataclass(frozen=True)
-class Assignment:
+class FoldAssignment:
     """The fold of each drive of a cohort.
 
     Attributes:
@@ -42,50 +42,50 @@ class Assignment:
     names: tuple[str, ...]
 
     def __post_init__(self) -> None:
-        """Check that no fold is empty and that there are two. Raises `SelectionError`."""
+        """Check that no fold is empty and that there are two. Raises `DataError`."""
         used = set(self.fold.tolist())
         if len(self.names) < 2:
-            raise SelectionError(
+            raise DataError(
                 "cross-validation needs at least two folds, and the cohort has one: "
                 f"{', '.join(self.names) or 'no drives'}. Widen the cohort, or fold by another key."
             )
         empty = [name for number, name in enumerate(self.names) if number not in used]
         if empty:
-            raise SelectionError(
+            raise DataError(
                 f"no drive falls into fold {', '.join(empty)} of {len(self.names)}: the cohort has "
                 f"{len(self.fold)} drives. Choose fewer folds, or more drives."
             )
 
 
-def by_hash(keys: Sequence[str], count: int) -> Assignment:
+def by_hash(keys: Sequence[str], count: int) -> FoldAssignment:
     """Deal drives into `count` folds by the hash of a key: the drive id, or a vehicle or track.
 
     Drives with the same key share a fold. A fold that no drive falls into, as happens in small
     cohorts, is left out: a drive's fold must not depend on which other drives there are. Raises
-    `SelectionError` if fewer than two folds are left.
+    `DataError` if fewer than two folds are left.
     """
     if count < 2:
-        raise SelectionError(f"cross-validation needs at least two folds, not {count}.")
+        raise DataError(f"cross-validation needs at least two folds, not {count}.")
     numbers = [hash_fold(key, count) for key in keys]
     used = sorted(set(numbers))
     fold = np.searchsorted(used, numbers).astype(np.int64)
-    return Assignment(fold, tuple(str(number + 1) for number in used))
+    return FoldAssignment(fold, tuple(str(number + 1) for number in used))
 
 
-def by_value(values: Sequence[Any]) -> Assignment:
+def by_value(values: Sequence[Any]) -> FoldAssignment:
     """Make one fold of each distinct value: leave one vehicle, track, day or mass out.
 
-    Raises `SelectionError` if a drive has no value, or all have the same.
+    Raises `DataError` if a drive has no value, or all have the same.
     """
     if any(value is None for value in values):
-        raise SelectionError(
+        raise DataError(
             "a drive has no value of the column to fold by: fold by another, or leave such drives "
             "out of the cohort."
         )
     distinct = sorted(set(values))
     number = {value: i for i, value in enumerate(distinct)}
     fold = np.array([number[value] for value in values], dtype=np.int64)
-    return Assignment(fold, tuple(str(value) for value in distinct))
+    return FoldAssignment(fold, tuple(str(value) for value in distinct))
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ class CohortFolds:
     def of(
         cls,
         tables: Sequence[GramTable],
-        assignment: Assignment,
+        assignment: FoldAssignment,
         drives: IntArray | None = None,
     ) -> "CohortFolds":
         """Add up the Gram rows of each fold. The assignment lists the rows table after table.
@@ -148,14 +148,14 @@ class CohortFolds:
     def serving(self, inputs: Sequence[str], label: str) -> Folds:
         """Return the folds of the drives that have the label and all the inputs.
 
-        Raises `SelectionError` if no drive has them all, or a fold has no such row.
+        Raises `DataError` if no drive has them all, or a fold has no such row.
         """
         signals = (*inputs, label)
         served = [i for i, grams in enumerate(self.tables) if set(signals) <= set(grams[0].signals)]
         if not served:
             known = sorted({name for grams in self.tables for name in grams[0].signals})
             positions(known, signals)
-            raise SelectionError(
+            raise DataError(
                 f"no drive of the cohort has all of {', '.join(signals)}. Use fewer signals, or "
                 "another cohort."
             )
@@ -165,7 +165,7 @@ class CohortFolds:
         )
         empty = [name for name, gram in zip(self.names, folds, strict=True) if gram.n == 0]
         if empty:
-            raise SelectionError(
+            raise DataError(
                 f"fold {', '.join(empty)} has no rows with all of {', '.join(signals)}. Choose "
                 "fewer folds, another key to fold by, or fewer signals."
             )

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError
 
 IntArray = NDArray[np.int64]
 ObjectArray = NDArray[np.object_]
@@ -90,7 +90,7 @@ class Gram:
         return total
 
     def __add__(self, other: "Gram") -> "Gram":
-        """Return the Gram of both sets of rows. Raises `SelectionError` if the signals differ."""
+        """Return the Gram of both sets of rows. Raises `DataError` if the signals differ."""
         self._require_same_signals(other)
         return Gram(
             self.signals,
@@ -102,7 +102,7 @@ class Gram:
     def __sub__(self, other: "Gram") -> "Gram":
         """Return the Gram of the rows that are not in `other`.
 
-        Raises `SelectionError` if the signals differ, or if a row count or a sum of squares would
+        Raises `DataError` if the signals differ, or if a row count or a sum of squares would
         go negative: then `other` was not a part of this Gram.
         """
         self._require_same_signals(other)
@@ -114,7 +114,7 @@ class Gram:
         )
         squares = [rest.products[packed_position(i, i)] for i in range(len(self.signals))]
         if rest.n < 0 or min(squares, default=0) < 0:
-            raise SelectionError(
+            raise DataError(
                 "cannot subtract a Gram that is not part of the total: a sum of squares would be "
                 "negative. Rebuild the Gram rows from the logs."
             )
@@ -123,7 +123,7 @@ class Gram:
     def restrict(self, signals: Sequence[str]) -> "Gram":
         """Return the Gram of some of the signals, in the given order.
 
-        Raises `SelectionError` for a signal that the Gram lacks.
+        Raises `DataError` for a signal that the Gram lacks.
         """
         at = positions(self.signals, signals)
         return Gram(
@@ -137,7 +137,7 @@ class Gram:
         """Return the Gram of integer linear combinations of the signals, T'GT.
 
         Each new signal maps old signals to integer weights: {"difference": {"a": 1, "b": -1}}.
-        Raises `SelectionError` for a signal that the Gram lacks.
+        Raises `DataError` for a signal that the Gram lacks.
         """
         weights = [
             dict(zip(positions(self.signals, [*old]), old.values(), strict=True))
@@ -182,7 +182,7 @@ class Gram:
 
     def _require_same_signals(self, other: "Gram") -> None:
         if self.signals != other.signals:
-            raise SelectionError(
+            raise DataError(
                 f"Grams of different signals cannot be combined: {', '.join(self.signals)} and "
                 f"{', '.join(other.signals)}. Restrict both to the signals that they share."
             )
@@ -261,7 +261,7 @@ class GramTable:
     def restrict(self, signals: Sequence[str]) -> "GramTable":
         """Return the same drives with some of the signals, in the given order.
 
-        Raises `SelectionError` for a signal that the table lacks.
+        Raises `DataError` for a signal that the table lacks.
         """
         at = positions(self.signals, signals)
         packed = list(_packed_positions(tuple(at)))
@@ -308,10 +308,10 @@ def exact_sum(values: IntArray) -> list[int]:
 
 
 def positions(signals: Sequence[str], wanted: Sequence[str]) -> list[int]:
-    """Return the index of each wanted signal. Raises `SelectionError` for an absent one."""
+    """Return the index of each wanted signal. Raises `DataError` for an absent one."""
     missing = [name for name in wanted if name not in signals]
     if missing:
-        raise SelectionError(
+        raise DataError(
             f"no Gram of {', '.join(missing)}: the drives have {', '.join(signals)}. "
             "Leave the signal out, or choose a cohort that has it."
         )

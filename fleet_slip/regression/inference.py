@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError
 from fleet_slip.regression import rounding, special
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.elimination import inverse_matrix
@@ -62,10 +62,10 @@ class Inference:
 def noise_variance(fitted: Fit) -> Fraction:
     """Return sigma^2 = RSS / (n - k - 1), in counts^2, exactly.
 
-    Raises `SelectionError` if there are no more rows than coefficients.
+    Raises `DataError` if there are no more rows than coefficients.
     """
     if fitted.degrees_of_freedom <= 0:
-        raise SelectionError(
+        raise DataError(
             f"{fitted.gram.n} rows cannot tell the noise of a model with {fitted.size} signals."
         )
     return fitted.rss / fitted.degrees_of_freedom
@@ -93,7 +93,7 @@ def classical(fitted: Fit, scales: Scales, variance: Fraction | None = None) -> 
     """Return standard errors for independent rows, rounded once from exact rationals.
 
     `variance` is that of the noise in counts^2 if it is from another model (the full one, for
-    nested models). Raises `SelectionError` if it is to be estimated and there are too few rows.
+    nested models). Raises `DataError` if it is to be estimated and there are too few rows.
     """
     sigma2 = noise_variance(fitted) if variance is None else variance
     units = _units(fitted, scales)
@@ -111,7 +111,7 @@ def cluster(fitted: Fit, drives: DriveMoments, scales: Scales) -> Inference:
 
     V = c B (sum_p s_p s_p') B with B = (X'X)^-1, s_p the drive's sum of x times residual, and
     c = P/(P-1) (n-1)/(n-k-1). The t distribution has P - 1 degrees of freedom.
-    Raises `SelectionError` if there is only one drive.
+    Raises `DataError` if there is only one drive.
     """
     covariance = cluster_covariance(fitted, drives)
     units = [float(unit) for unit in _units(fitted, scales)]
@@ -142,9 +142,9 @@ def drive_scores(fitted: Fit, drives: DriveMoments) -> FloatArray:
 
 
 def small_sample_factor(fitted: Fit, clusters: int) -> float:
-    """Return P/(P-1) (n-1)/(n-k-1). Raises `SelectionError` for a single drive."""
+    """Return P/(P-1) (n-1)/(n-k-1). Raises `DataError` for a single drive."""
     if clusters < 2:
-        raise SelectionError("cluster-robust errors need at least two drives.")
+        raise DataError("cluster-robust errors need at least two drives.")
     noise_variance(fitted)
     return clusters / (clusters - 1) * (fitted.gram.n - 1) / fitted.degrees_of_freedom
 
@@ -152,11 +152,11 @@ def small_sample_factor(fitted: Fit, clusters: int) -> float:
 def variance_inflation(gram: Gram, inputs: Sequence[str]) -> dict[str, float]:
     """Return 1 / (1 - R^2) of each input on the others: how much collinearity costs it.
 
-    Raises `SelectionError` for dependent inputs.
+    Raises `DataError` for dependent inputs.
     """
     relations = dependence(gram, inputs)
     if relations:
-        raise SelectionError(relations)
+        raise DataError(relations)
     matrix = moments(gram.restrict(inputs))
     inverse = inverse_matrix(matrix)
     return {name: float(matrix[i][i] * inverse[i][i]) for i, name in enumerate(inputs)}
@@ -182,17 +182,17 @@ def chow(groups: Sequence[Gram], inputs: Sequence[str], label: str) -> ChowTest:
     """Compare one model for all groups with one for each.
 
     F = ((RSS_pool - sum RSS_p) / ((P-1)(k+1))) / (sum RSS_p / (n - P(k+1))).
-    Raises `SelectionError` if there is one group only, or too few rows.
+    Raises `DataError` if there is one group only, or too few rows.
     """
     count, size = len(groups), len(inputs) + 1
     if count < 2:
-        raise SelectionError("a Chow test compares at least two groups of drives.")
+        raise DataError("a Chow test compares at least two groups of drives.")
     total = sum(groups[1:], groups[0])
     apart = sum((fit(group, inputs, label).rss for group in groups), Fraction(0))
     together = fit(total, inputs, label).rss
     numerator, denominator = (count - 1) * size, total.n - count * size
     if denominator <= 0 or apart == 0:
-        raise SelectionError("a Chow test needs noise and more rows than coefficients.")
+        raise DataError("a Chow test needs noise and more rows than coefficients.")
     f = float((together - apart) / numerator / (apart / denominator))
     return ChowTest(f, numerator, denominator, special.f_upper(f, numerator, denominator))
 
@@ -218,12 +218,12 @@ def wald(one: Fit, one_drives: DriveMoments, other: Fit, other_drives: DriveMome
 
     F = d'(V_1 + V_2)^-1 d / (k + 1), d the difference and V the cluster-robust covariances; its
     denominator is the number of drives minus two (Cameron and Miller 2015). Unlike `chow`, it does
-    not take neighbouring rows for independent. Raises `SelectionError` with fewer drives than
+    not take neighbouring rows for independent. Raises `DataError` with fewer drives than
     coefficients.
     """
     size, drives = one.size + 1, len(one_drives) + len(other_drives)
     if min(len(one_drives), len(other_drives)) <= size:
-        raise SelectionError(
+        raise DataError(
             f"comparing {size} coefficients by drives needs more than {size} drives in each cohort."
         )
     gap = [a - b for a, b in zip(_numbers(one), _numbers(other), strict=True)]

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError
 from fleet_slip.regression.exact import LinearModel, correlation_matrix
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.special import FloatArray
@@ -49,12 +49,12 @@ def lars_path(
 
     The lasso minimises |y - Xb|^2 / 2 + penalty |b|_1; `ridge` adds ridge |b|^2 / 2 (the elastic
     net of Zou and Hastie 2005, without their rescaling). Ties to within rounding enter in the
-    declared order. Raises `SelectionError` for a constant signal.
+    declared order. Raises `DataError` for a constant signal.
     """
     matrix = correlation_matrix(gram.restrict([*inputs, label]))
     constant = [name for i, name in enumerate([*inputs, label]) if matrix[i, i] == 0]
     if constant:
-        raise SelectionError(f"{', '.join(constant)} is constant: leave it out.")
+        raise DataError(f"{', '.join(constant)} is constant: leave it out.")
     k = len(inputs)
     penalised = matrix[:k, :k] + ridge * np.eye(k)
     return path_of_moments(penalised, matrix[:k, k], inputs, lasso=lasso)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError
 from fleet_slip.regression.elimination import eliminate
 from fleet_slip.regression.evidence import Evidence
 from fleet_slip.regression.exact import (
@@ -23,12 +23,12 @@ def nested_fits(gram: Gram, order: Sequence[str], label: str) -> list[Fit]:
     """Return the exact fits of the first 0, 1, ..., k signals of an order.
 
     One Bareiss pass yields every residual sum of squares (bordered over principal minors) and
-    every leading triangular system. Raises `SelectionError` for dependent signals.
+    every leading triangular system. Raises `DataError` for dependent signals.
     """
     part = gram.restrict([*order, label])
     triangle = eliminate(moments(part))
     if triangle.singular is not None:
-        raise SelectionError(dependence(part, order))
+        raise DataError(dependence(part, order))
     return [fit_leading(part, triangle, size) for size in range(len(order) + 1)]
 
 
@@ -74,7 +74,7 @@ def nested_models(
     """Return all nested models of an order with their statistics.
 
     The evidence gives contributions and distances; without one, rows count as independent.
-    Raises `SelectionError` for dependent signals, too few rows, or a label without noise.
+    Raises `DataError` for dependent signals, too few rows, or a label without noise.
     """
     fits = nested_fits(gram, order, label)
     known = evidence or Evidence.naive(fits)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import QuestionError
 from fleet_slip.regression.criteria import best_size, criterion_values
 from fleet_slip.regression.crossval import (
     CrossValidation,
@@ -95,7 +95,7 @@ class Training:
 def select_nested(training: Training, inputs: Sequence[str], label: str, rule: Rule) -> Selection:
     """Rank the inputs, and choose one of the nested models.
 
-    Raises `SelectionError` for dependent signals, an unknown rule, or a label without noise.
+    Raises `DataError` for dependent signals, an unknown rule, or a label without noise.
     """
     total = training.folds.total
     order = rank(rule.ranking, total, inputs, label)
@@ -134,7 +134,7 @@ def cross_validate_selection(
 ) -> CrossValidation:
     """Cross-validate the choice itself: nothing of a fold is seen in choosing for it.
 
-    `fold` says the fold of each of the drives. Raises `SelectionError` as `select_nested` does.
+    `fold` says the fold of each of the drives. Raises `DataError` as `select_nested` does.
     """
     folds = training.folds
     tests = []
@@ -150,7 +150,7 @@ def _without(training: Training, fold: IntArray, number: int) -> Training:
     folds = training.folds
     kept = [i for i in range(len(folds.grams)) if i != number]
     if len(kept) < 2:
-        raise SelectionError("choosing inside the training folds needs at least three folds.")
+        raise QuestionError("choosing inside the training folds needs at least three folds.")
     drives = training.drives
     rest = Folds(
         tuple(folds.grams[i] for i in kept),

@@ -6,7 +6,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError
 from fleet_slip.regression import rounding
 from fleet_slip.regression.elimination import Elimination, eliminate
 from fleet_slip.regression.exact import LinearModel, dependence, fit_leading, moments
@@ -33,16 +33,14 @@ class OrthogonalResponses:
 
     @classmethod
     def of(cls, gram: Gram, order: Sequence[str], label: str) -> "OrthogonalResponses":
-        """Rotate a Gram into an order. Raises `SelectionError` if dependent or without noise."""
+        """Rotate a Gram into an order. Raises `DataError` if dependent or without noise."""
         part = gram.restrict([*order, label])
         triangle = eliminate(moments(part))
         if triangle.singular is not None:
-            raise SelectionError(dependence(part, order))
+            raise DataError(dependence(part, order))
         variance = noise_variance(fit_leading(part, triangle, len(order)))
         if variance == 0:
-            raise SelectionError(
-                f"{label} has no noise around {', '.join(order)}: nothing to shrink."
-            )
+            raise DataError(f"{label} has no noise around {', '.join(order)}: nothing to shrink.")
         n = part.n
         a = [rounding.signed_ratio(Fraction(part.sums[-1]), n * variance)]
         for t, row in enumerate(triangle.rows):

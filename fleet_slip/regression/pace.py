@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError
 from fleet_slip.regression.exact import LinearModel
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.mixture import (
@@ -48,12 +48,12 @@ def pace(
     By the theory, the constant is estimated as it is. With `weka_compatible` it takes part in the
     mixture and may be shrunk, and the estimators have the deviations of WEKA 3.9's
     PaceRegression: subset does what nested does, and the expected contributions of pace2 and
-    pace4 are WEKA's. Raises `SelectionError` for an unknown estimator, dependent signals, or a
+    pace4 are WEKA's. Raises `DataError` for an unknown estimator, dependent signals, or a
     label without noise.
     """
     known = WEKA_ESTIMATORS if weka_compatible else ESTIMATORS
     if estimator not in known:
-        raise SelectionError(f"unknown estimator {estimator!r}. Known: {', '.join(known)}.")
+        raise DataError(f"unknown estimator {estimator!r}. Known: {', '.join(known)}.")
     return shrink(gram, inputs, label, known[estimator], constant=weka_compatible)
 
 
@@ -63,7 +63,7 @@ def shrink(
     """Return the model of counts whose orthogonal responses an estimator has changed.
 
     The order is that of backward elimination; `constant` says whether the response of the
-    constant is among those to change. Raises `SelectionError` as `pace` does.
+    constant is among those to change. Raises `DataError` as `pace` does.
     """
     basis = OrthogonalResponses.of(gram, backward(gram, inputs, label), label)
     a = basis.responses

@@ -7,7 +7,7 @@ The exception is LARS, whose steps need square roots.
 from collections.abc import Callable, Sequence
 from fractions import Fraction
 
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression.elimination import adjugate, eliminate
 from fleet_slip.regression.exact import dependence, moments
 from fleet_slip.regression.gram import Gram
@@ -16,7 +16,7 @@ from fleet_slip.regression.lars import lars_path
 Matrix = list[list[int]]
 Score = Callable[[list[int], int], Fraction]
 Ranking = Callable[[Gram, Sequence[str], str], tuple[str, ...]]
-"""Orders inputs, given a Gram with them and the label. Raises `SelectionError` if dependent."""
+"""Orders inputs, given a Gram with them and the label. Raises `DataError` if dependent."""
 
 
 def declared(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:  # noqa: ARG001
@@ -115,16 +115,16 @@ RANKINGS: dict[str, Ranking] = {
 
 
 def rank(name: str, gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
-    """Order the inputs by a ranking. Raises `SelectionError` for an unknown or dependent one."""
+    """Order the inputs by a ranking. Raises `DataError` for an unknown or dependent one."""
     if name not in RANKINGS:
-        raise SelectionError(f"unknown ranking {name!r}. Known rankings: {', '.join(RANKINGS)}.")
+        raise QuestionError(f"unknown ranking {name!r}. Known rankings: {', '.join(RANKINGS)}.")
     return RANKINGS[name](gram, inputs, label)
 
 
 def _moments(gram: Gram, inputs: Sequence[str], label: str) -> Matrix:
     matrix = moments(gram.restrict([*inputs, label]))
     if eliminate(matrix).singular is not None:
-        raise SelectionError(dependence(gram, inputs))
+        raise DataError(dependence(gram, inputs))
     return matrix
 
 

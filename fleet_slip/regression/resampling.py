@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.exact import LinearModel
 from fleet_slip.regression.special import FloatArray
@@ -67,7 +67,7 @@ def bootstrap_correlations(products: FloatArray, replicates: int, seed: int) -> 
     """Return pooled correlations of cohorts drawn from the drives with replacement.
 
     `products` is from `held_out_products`; the models stay as they were cross-validated. Raises
-    `SelectionError` for fewer than two drives.
+    `DataError` for fewer than two drives.
     """
     totals = _resampled_totals(products, replicates, seed)
     n, e, ee, y, ye, yy = totals.T
@@ -81,7 +81,7 @@ def bootstrap_correlations(products: FloatArray, replicates: int, seed: int) -> 
 def bootstrap_coefficients(drives: DriveMoments, replicates: int, seed: int) -> FloatArray:
     """Return refitted coefficients of resampled drives, in counts, shape (replicates, k+1).
 
-    The columns are the intercept and the inputs of the moments. Raises `SelectionError` for fewer
+    The columns are the intercept and the inputs of the moments. Raises `DataError` for fewer
     than two drives, and where a draw leaves signals dependent.
     """
     totals = drives.matrix(_resampled_totals(drives.packed, replicates, seed))
@@ -93,7 +93,7 @@ def solve(totals: FloatArray) -> FloatArray:
     try:
         return np.asarray(np.linalg.solve(totals[..., :-1, :-1], totals[..., :-1, -1:])[..., 0])
     except np.linalg.LinAlgError:
-        raise SelectionError(
+        raise DataError(
             "a resampled cohort cannot be fitted: too few drives have these signals."
         ) from None
 
@@ -135,10 +135,10 @@ def repeated_cross_validation(
 ) -> RepeatedCrossValidation:
     """Cross-validate least squares on all inputs with `repeats` random deals into folds.
 
-    Raises `SelectionError` if there are fewer drives than folds.
+    Raises `DataError` if there are fewer drives than folds.
     """
     if len(drives) < folds:
-        raise SelectionError(f"{len(drives)} drives cannot fill {folds} folds.")
+        raise DataError(f"{len(drives)} drives cannot fill {folds} folds.")
     rng = np.random.default_rng(seed)
     batch = max(1, _BATCH_BYTES // (8 * folds * len(drives)))
     figures = []
@@ -181,7 +181,7 @@ def _resampled_totals(values: FloatArray, replicates: int, seed: int) -> FloatAr
     """Return sums over as many drives drawn with replacement, shape (replicates, columns)."""
     drives = len(values)
     if drives < 2:
-        raise SelectionError("a bootstrap over drives needs at least two drives.")
+        raise DataError("a bootstrap over drives needs at least two drives.")
     # SFC64 and 64-bit draws are the fastest that bincount takes without a copy.
     rng = np.random.Generator(np.random.SFC64(seed))
     batch = max(1, _BATCH_BYTES // (8 * drives))

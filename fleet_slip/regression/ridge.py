@@ -13,7 +13,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression import rounding
 from fleet_slip.regression.elimination import eliminate
 from fleet_slip.regression.exact import LinearModel, Scales, correlation_matrix, moments
@@ -27,7 +27,7 @@ def penalised(
 ) -> LinearModel:
     """Solve (S + diag(penalties)) b = S_xy exactly; penalties in counts^2 of each input.
 
-    Raises `SelectionError` if the matrix is not positive definite.
+    Raises `DataError` if the matrix is not positive definite.
     """
     part = gram.restrict([*inputs, label])
     common = math.lcm(*(penalty.denominator for penalty in penalties))
@@ -39,7 +39,7 @@ def penalised(
         at = triangle.singular
         if at is None:
             at = next(i for i, minor in enumerate(triangle.minors) if minor <= 0) - 1
-        raise SelectionError(
+        raise DataError(
             f"the moments stop being positive definite at {inputs[at]}: the assumed noise is more "
             "than the signal holds, or signals are linearly dependent."
         )
@@ -63,7 +63,7 @@ def errors_in_variables(
 ) -> LinearModel:
     """Return the model of counts for signals without the noise that they were logged with.
 
-    `noise` is the standard deviation of the sensors, in physical units. Raises `SelectionError`
+    `noise` is the standard deviation of the sensors, in physical units. Raises `DataError`
     if there is less variance in the signals than that.
     """
     variances = _variances(gram, inputs, noise, scales)
@@ -121,7 +121,7 @@ def _variances(
 ) -> list[Fraction]:
     unknown = [name for name in noise if name not in inputs]
     if unknown:
-        raise SelectionError(
+        raise QuestionError(
             f"noise is given for {', '.join(unknown)}, which the model does not use. "
             f"It uses {', '.join(inputs)}."
         )

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError
 from fleet_slip.regression.exact import Fit, LinearModel, fit
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.gram import Gram
@@ -52,13 +52,13 @@ def serial_correlation(model: LinearModel, gram: Gram, lagged: LagGram) -> Seria
     """Return the serial correlation of a model of counts.
 
     `gram` has all rows; `lagged` those with a predecessor. The residual is that of the model, its
-    intercept included. Raises `SelectionError` if there is no residual, or a lag is missing.
+    intercept included. Raises `DataError` if there is no residual, or a lag is missing.
     """
     now_before, before = _residual_products(model, lagged)
     steps = error_sums(_difference(model), _with_differences(model, lagged)).squared_error
     total = error_sums(model, gram).squared_error
     if total == 0 or before == 0:
-        raise SelectionError("the model has no residual: serial correlation is undefined.")
+        raise DataError("the model has no residual: serial correlation is undefined.")
     return SerialCorrelation(float(now_before / before), float(steps / total))
 
 
@@ -91,7 +91,7 @@ def autoregressive_fit(lagged: LagGram, inputs: Sequence[str], label: str) -> Au
     """Return the AR(1) fit by iterated Cochrane-Orcutt (1949) from a lag Gram.
 
     rho is kept on a grid of 2^-20, so that each step is exact; it stops when rho does not change.
-    Raises `SelectionError` for dependent signals, or residuals that a random walk explains.
+    Raises `DataError` for dependent signals, or residuals that a random walk explains.
     """
     signals = [*inputs, label]
     rho = Fraction(0)
@@ -102,10 +102,10 @@ def autoregressive_fit(lagged: LagGram, inputs: Sequence[str], label: str) -> Au
         model = LinearModel(tuple(inputs), label, coefficients, level)
         now_before, before = _residual_products(model, lagged)
         if before == 0:
-            raise SelectionError("the model has no residual: serial correlation is undefined.")
+            raise DataError("the model has no residual: serial correlation is undefined.")
         new = Fraction(round(now_before / before * _GRID), _GRID)
         if abs(new) >= 1:
-            raise SelectionError(f"the residuals are a random walk (rho = {float(new):.4f}).")
+            raise DataError(f"the residuals are a random walk (rho = {float(new):.4f}).")
         if new == rho:
             break
         rho = new

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression.criteria import CRITERIA, subset_values
 from fleet_slip.regression.evidence import Evidence
 from fleet_slip.regression.exact import Fit, correlation_matrix, dependence, fit
@@ -68,20 +68,20 @@ class SizeResult:
 def best_subsets(gram: Gram, inputs: Sequence[str], label: str, count: int = 2) -> list[SizeResult]:
     """Return the `count` best models of each size 0..k, re-checked and ordered exactly.
 
-    Ties go to the signals declared first. Raises `SelectionError` for dependent signals or a
+    Ties go to the signals declared first. Raises `DataError` for dependent signals or a
     constant label.
     """
     relations = dependence(gram, inputs)
     if relations:
-        raise SelectionError(relations)
+        raise DataError(relations)
     if len(inputs) > MOST_INPUTS:
-        raise SelectionError(
+        raise QuestionError(
             f"all subsets of {len(inputs)} signals are too many: give at most {MOST_INPUTS}."
         )
     part = gram.restrict([*inputs, label])
     matrix = correlation_matrix(part)
     if matrix[-1, -1] == 0:
-        raise SelectionError(f"{label} is constant: there is nothing to explain.")
+        raise DataError(f"{label} is constant: there is nothing to explain.")
     found = candidates(matrix, count + _SPARE)
     return [_exact_best(part, inputs, label, masks, count) for masks in found]
 

@@ -32,7 +32,7 @@ def weka_linear_regression(
     """Return the model of counts that WEKA's LinearRegression finds.
 
     `selection` is its option -S (1 none, 0 m5, 2 greedy), `drop_collinear` is off with -C, and
-    `ridge` is -R. Raises `SelectionError` if the moments are singular.
+    `ridge` is -R. Raises `DataError` if the moments are singular.
     """
     search = _Search(gram, label, ridge)
     model = search.fit(list(inputs))

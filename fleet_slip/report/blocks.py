@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet_slip.evaluation.drives import FloatArray
-from fleet_slip.evaluation.runs import Run
+from fleet_slip.evaluation.runs import EvaluatedScenario
 from fleet_slip.regression.special import student_t_two_sided
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 
@@ -30,7 +30,7 @@ class Difference:
     p: float
 
 
-def mean_squares(run: Run, estimator: str) -> FloatArray:
+def mean_squares(run: EvaluatedScenario, estimator: str) -> FloatArray:
     """Return the mean squared error in deg² of each block of a drive, shape (blocks,)."""
     error = np.degrees(run.estimates[estimator] - run.drive.sideslip_rad)[run.drive.evaluated]
     size = int(BLOCK_S * SAMPLE_RATE_HZ)
@@ -39,14 +39,14 @@ def mean_squares(run: Run, estimator: str) -> FloatArray:
     return squares
 
 
-def difference(run: Run, first: str, second: str) -> Difference:
+def difference(run: EvaluatedScenario, first: str, second: str) -> Difference:
     """Compare the squared errors of two estimators by a paired t test over blocks."""
     gain = mean_squares(run, second) - mean_squares(run, first)
     t = float(gain.mean() / (gain.std(ddof=1) / math.sqrt(len(gain))))
     return Difference(t, len(gain), student_t_two_sided(t, len(gain) - 1))
 
 
-def blocks_won(run: Run, estimators: Sequence[str]) -> dict[str, int]:
+def blocks_won(run: EvaluatedScenario, estimators: Sequence[str]) -> dict[str, int]:
     """Return in how many blocks of a drive each estimator has the smallest squared error."""
     squares = np.stack([mean_squares(run, name) for name in estimators])
     best = np.bincount(squares.argmin(axis=0), minlength=len(estimators))

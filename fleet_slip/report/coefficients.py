@@ -51,7 +51,7 @@ class Coefficients:
 def coefficient_table(cohort: Cohort, model: str, inputs: Sequence[str]) -> Coefficients:
     """Fit the label on the inputs over all drives of a cohort that have them.
 
-    Raises `SelectionError` if no drive has them, or there is one only.
+    Raises `DataError` if no drive has them, or there is one only.
     """
     signals = catalogue()
     label = signals.label

@@ -6,10 +6,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from fleet_slip.catalogue.sources import SCENARIO
-from fleet_slip.errors import SelectionError
-from fleet_slip.evaluation.estimators import TABLE_ONE, Estimate, LinearEstimate, Training, training
+from fleet_slip.errors import DataError
+from fleet_slip.evaluation.estimators import (
+    TABLE_ONE,
+    Estimate,
+    LinearEstimate,
+    TrainedModels,
+    train_models,
+)
 from fleet_slip.evaluation.filters import FILTERS, bound
-from fleet_slip.evaluation.runs import Run, run_all
+from fleet_slip.evaluation.runs import EvaluatedScenario, run_all
 from fleet_slip.evaluation.targets import THE_PAPERS_CHOICE
 from fleet_slip.files.documents import canonical_json
 from fleet_slip.models.versions import ModelVersion
@@ -82,8 +88,8 @@ class ReportData:
 
     version: ModelVersion
     evaluated: Evaluated
-    trained: Training
-    runs: Mapping[str, Run]
+    trained: TrainedModels
+    runs: Mapping[str, EvaluatedScenario]
     coefficients: tuple[Coefficients, ...]
     histogram: Histogram
     ordering: Ordering
@@ -101,11 +107,11 @@ class ReportData:
 def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
     """Gather a report about a model version.
 
-    Raises `SelectionError` if the version has not been evaluated, or if its cohort or a drive of a
+    Raises `DataError` if the version has not been evaluated, or if its cohort or a drive of a
     scenario has changed since: all numbers of a report must be of the same data.
     """
     evaluated = latest_of(warehouse, version)
-    trained = training(warehouse, version)
+    trained = train_models(warehouse, version)
     _same_models(evaluated, trained)
     shipped = shipped_scenarios()
     scenarios = [one for one in shipped if one.name in evaluated.scenarios]
@@ -149,21 +155,21 @@ def drawn_estimators(evaluated: Evaluated) -> dict[str, Estimate]:
     return estimators
 
 
-def _same_models(evaluated: Evaluated, trained: Training) -> None:
+def _same_models(evaluated: Evaluated, trained: TrainedModels) -> None:
     now = {name: model.as_dict() for name, model in trained.estimators().items()}
     for name in evaluated.models.values():
         kept = evaluated.estimators[name]
         if now.get(name) != {key: kept[key] for key in ("intercept", "coefficients")}:
-            raise SelectionError(_changed(evaluated, f"the cohort of {evaluated.group}"))
+            raise DataError(_changed(evaluated, f"the cohort of {evaluated.group}"))
 
 
-def _same_figures(evaluated: Evaluated, runs: Mapping[str, Run]) -> None:
+def _same_figures(evaluated: Evaluated, runs: Mapping[str, EvaluatedScenario]) -> None:
     for scenario, run in runs.items():
         for name, result in run.results.items():
             kept = evaluated.figures(scenario, name)
             found = result.whole.rmse_deg
             if kept is None or not _same(kept.rmse_deg, found):
-                raise SelectionError(_changed(evaluated, f"the drive of {scenario}, or {name},"))
+                raise DataError(_changed(evaluated, f"the drive of {scenario}, or {name},"))
 
 
 def _same(first: float | None, second: float | None) -> bool:
@@ -179,7 +185,7 @@ def _changed(evaluated: Evaluated, what: str) -> str:
     )
 
 
-def _coefficients(trained: Training) -> tuple[Coefficients, ...]:
+def _coefficients(trained: TrainedModels) -> tuple[Coefficients, ...]:
     cohort, published = trained.selection.cohort, trained.version
     choice = next(m for m in trained.selection.models if m.name == THE_PAPERS_CHOICE)
     tables = [coefficient_table(cohort, f"model {choice.name}", choice.signals)]

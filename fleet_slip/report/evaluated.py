@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
 
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError
 from fleet_slip.evaluation.errors import ErrorFigures
 from fleet_slip.evaluation.results import folder
 from fleet_slip.files.documents import Document
@@ -95,7 +95,7 @@ def _figures(found: Mapping[str, Any]) -> ErrorFigures:
 def latest_of(warehouse: Warehouse, version: ModelVersion) -> Evaluated:
     """Return the latest evaluation that is about a model version.
 
-    Raises `SelectionError` if there is none.
+    Raises `DataError` if there is none.
     """
     kept = folder(warehouse)
     for number in reversed(kept.numbers()):
@@ -103,7 +103,7 @@ def latest_of(warehouse: Warehouse, version: ModelVersion) -> Evaluated:
         first = next(iter(document.content["estimators"].values()))
         if first["group"] == version.reference:
             return Evaluated(document, version.reference)
-    raise SelectionError(
+    raise DataError(
         f"{version.reference} has not been evaluated. Run: fleet-slip evaluate --one-car "
         f"{version.reference}"
     )

@@ -37,7 +37,7 @@ class Ordering:
 def compare_orders(cohort: Cohort, signals: Sequence[str]) -> Ordering:
     """Rank the signals in every way, and compare with all subsets.
 
-    Raises `SelectionError` if no drive of the cohort has them all.
+    Raises `DataError` if no drive of the cohort has them all.
     """
     label = catalogue().label
     total = cohort.serving(signals).table.total()

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from matplotlib.figure import Figure
 
-from fleet_slip.evaluation.runs import Run
+from fleet_slip.evaluation.runs import EvaluatedScenario
 from fleet_slip.report.data import DRAWN_FILTERS, ReportData
 from fleet_slip.report.figures.density import density
 from fleet_slip.report.figures.lateral import error_by_acceleration
@@ -179,7 +179,7 @@ def _stability(block: Block) -> Iterator[str]:
     )
 
 
-def _speed(key: str, title: str, run: Run) -> Picture:
+def _speed(key: str, title: str, run: EvaluatedScenario) -> Picture:
     kmh = run.drive.speed_mps * KMH_PER_MPS
     caption = (
         f"From {kmh.min():.0f} to {kmh.max():.0f} km/h in {run.drive.time_s[-1]:.0f} s, over "
@@ -200,7 +200,7 @@ def _beyond_the_paper(data: ReportData) -> Iterator[Picture]:
     yield from _lateral(data, data.runs)
 
 
-def _map(data: ReportData, shown: Sequence[tuple[str, Run]]) -> Picture:
+def _map(data: ReportData, shown: Sequence[tuple[str, EvaluatedScenario]]) -> Picture:
     label = choice_line(data).label
     title = f"Where on the track {label} is off"
     caption = (
@@ -232,7 +232,7 @@ def _density(data: ReportData, histogram: Histogram) -> Picture:
     )  # fmt: skip
 
 
-def _lateral(data: ReportData, runs: Mapping[str, Run]) -> Iterator[Picture]:
+def _lateral(data: ReportData, runs: Mapping[str, EvaluatedScenario]) -> Iterator[Picture]:
     driven = [runs[name] for name in STYLES if name in runs]
     if "style_limit" not in runs:
         return

@@ -26,7 +26,7 @@ class Written:
 def write_report(warehouse: Warehouse, version: ModelVersion, output: Folder) -> Written:
     """Write the report about a model version into a folder.
 
-    A file is replaced as a whole or not at all; the page comes last. Raises `SelectionError` if the
+    A file is replaced as a whole or not at all; the page comes last. Raises `DataError` if the
     version has not been evaluated, or not on today's data.
     """
     data = gather(warehouse, version)

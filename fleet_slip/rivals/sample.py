@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError
 from fleet_slip.grams.cohort import Cohort, assign
-from fleet_slip.regression.folds import Assignment
+from fleet_slip.regression.folds import FoldAssignment
 from fleet_slip.resources import read_sql
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.views import connect
@@ -39,7 +39,7 @@ class Sample:
         """Return some of the inputs, shape (rows, columns)."""
         return self.inputs[:, [self.columns.index(column) for column in columns]]
 
-    def folds(self, count: int) -> Assignment:
+    def folds(self, count: int) -> FoldAssignment:
         """Divide the rows as the regression's cross-validation divides the drives."""
         return assign(self.drive_id.tolist(), "drive", count)
 
@@ -49,7 +49,7 @@ def draw_sample(
 ) -> Sample:
     """Draw about so many rows of a cohort that have the signals and the label.
 
-    Raises `SelectionError` if there is none.
+    Raises `DataError` if there is none.
     """
     names = (*signals, catalogue().label)
     columns = [catalogue()[name].column for name in names]
@@ -65,7 +65,7 @@ def draw_sample(
     with connect(warehouse.root) as database, database_errors("drawing a sample"):
         found = database.sql(statement, params=parameters).to_arrow_table()
     if not found.num_rows:
-        raise SelectionError(f"no row of {cohort.condition!r} has all of {', '.join(names)}.")
+        raise DataError(f"no row of {cohort.condition!r} has all of {', '.join(names)}.")
     values = np.stack([found[column].to_numpy() for column in columns], axis=1)
     return Sample(
         columns=tuple(columns[:-1]),

@@ -8,7 +8,7 @@ from typing_extensions import TypeVar
 
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.cohort import Cohort
 from fleet_slip.grams.fold_sums import SummedCohort
 from fleet_slip.grams.folding import ROW_FOLDS, Folding
@@ -77,7 +77,7 @@ def select(
     """Cross-validate each candidate and choose the winner.
 
     A candidate that needs signals which no drive of the cohort has, or whose signals are linearly
-    dependent, is skipped with the reason. Raises `SelectionError` if none is left.
+    dependent, is skipped with the reason. Raises `DataError` if none is left.
     """
     divided = cohort.folds(folds.by, folds.count)
     models: list[CrossValidation] = []
@@ -85,11 +85,11 @@ def select(
     for candidate in candidates:
         try:
             models.append(validate(candidate, divided))
-        except SelectionError as error:
+        except (DataError, QuestionError) as error:
             skipped[candidate.name] = str(error)
     if not models:
         reasons = "; ".join(f"model {name}: {reason}" for name, reason in skipped.items())
-        raise SelectionError(f"no candidate can be fitted on the cohort. {reasons}")
+        raise DataError(f"no candidate can be fitted on the cohort. {reasons}")
     return Selection(cohort, folds, tuple(models), choose(models), skipped)
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from fleet_slip.catalogue.features import LAG, input_scales, lag_signals
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import Cohort, Served
 from fleet_slip.regression.drives import DriveMoments, serving_drives
 from fleet_slip.regression.evidence import Evidence
@@ -48,7 +48,7 @@ class SerialDiagnosis:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class CohortComparison:
     """Whether another cohort has the same coefficients.
 
     Attributes:
@@ -88,7 +88,7 @@ class Diagnosis:
     condition_number: float
     evidence: Evidence
     serial: SerialDiagnosis | None = None
-    comparison: Comparison | None = None
+    comparison: CohortComparison | None = None
     noise_free: LinearModel | None = None
 
     def as_dict(self) -> dict[str, Any]:
@@ -138,7 +138,7 @@ def diagnose(
     """Fit the inputs to the drives of a cohort that have them all, and examine the fit.
 
     `lagged` is the same cohort with lagged Gram rows; `sensor_noise` the standard deviation of
-    sensors in SI units. Raises `SelectionError` for dependent or absent signals.
+    sensors in SI units. Raises `DataError` for dependent or absent signals.
     """
     label, scales = catalogue().label, input_scales()
     served = cohort.serving(inputs)
@@ -175,18 +175,18 @@ def _serial(fitted: Fit, lagged: Cohort) -> SerialDiagnosis:
     )
 
 
-def _compare(here: Served, fitted: Fit, moments: DriveMoments, against: Cohort) -> Comparison:
+def _compare(here: Served, fitted: Fit, moments: DriveMoments, against: Cohort) -> CohortComparison:
     inputs, label = fitted.model.signals, fitted.model.label
     there = against.serving(inputs)
     shared = {*here.drives["drive_id"].to_pylist()} & {*there.drives["drive_id"].to_pylist()}
     if shared:
-        raise SelectionError(
+        raise QuestionError(
             f"the two cohorts share {len(shared)} drives, such as {min(shared)}: a comparison "
             f"needs different drives. Add to --cohort: AND NOT ({against.condition})"
         )
     other_moments = DriveMoments.of(there.table)
     other = fit(there.table.total(), inputs, label)
-    return Comparison(
+    return CohortComparison(
         against.condition,
         cluster(other, other_moments, input_scales()),
         chow([fitted.gram, other.gram], inputs, label),

@@ -52,7 +52,7 @@ class ModelList(Config):
         known = features()
         if self.features not in {PLAIN, *known.sets}:
             raise ValueError(f"features: no feature set is called {self.features!r}")
-        inputs = known.set(self.features).inputs
+        inputs = known.feature_set(self.features).inputs
         for candidate in self.model:
             absent = [name for name in candidate.signals if name not in inputs]
             if absent:

@@ -9,7 +9,7 @@ import numpy as np
 
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.cohort import Cohort, assign
 from fleet_slip.grams.folding import FOLD_KEYS, ROW_FOLDS, Folding
 from fleet_slip.grams.statement import UNKNOWN_PART
@@ -93,13 +93,13 @@ class RegimeComparison:
 def regime_names(cohort: Cohort, over: Sequence[str]) -> list[str]:
     """Return the regime of each Gram row, by some of the regimes that its set divides by.
 
-    Raises `SelectionError` if the set does not divide by one of them.
+    Raises `DataError` if the set does not divide by one of them.
     """
-    divided = features().set(cohort.feature_set).regimes
+    divided = features().feature_set(cohort.feature_set).regimes
     unknown = [name for name in over if name not in divided]
     if unknown or not divided:
         having = ", ".join(name for name, one in features().sets.items() if one.regimes)
-        raise SelectionError(
+        raise QuestionError(
             f"the feature set {cohort.feature_set} is not divided by {', '.join(unknown) or 'any'} "
             f"regime; it has {', '.join(divided) or 'none'}. Sets with regimes: {having}."
         )
@@ -115,7 +115,7 @@ def band_order(cohort: Cohort, names: Sequence[str]) -> list[str]:
     known = features()
     rank = {
         band: i
-        for regime in known.set(cohort.feature_set).regimes
+        for regime in known.feature_set(cohort.feature_set).regimes
         for i, band in enumerate(known.regimes[regime].bands)
     }
     return sorted(set(names), key=lambda name: [rank.get(b, len(rank)) for b in name.split(", ")])
@@ -126,10 +126,10 @@ def compare_regimes(
 ) -> RegimeComparison:
     """Cross-validate one model for all regimes and one for each, on drives that have the inputs.
 
-    Raises `SelectionError` for a feature set without regimes, absent signals, or empty folds.
+    Raises `DataError` for a feature set without regimes, absent signals, or empty folds.
     """
     if plan.by == ROW_FOLDS:
-        raise SelectionError("rows are divided by regime already: fold by drive, or by vehicle.")
+        raise QuestionError("rows are divided by regime already: fold by drive, or by vehicle.")
     names = regime_names(cohort, over)
     order = band_order(cohort, names)
     regime = np.array([order.index(name) for name in names], dtype=np.int64)
@@ -231,7 +231,7 @@ class _Grid:
             return by_pooled, by_pooled, False
         try:
             own = fit(training, self.inputs, catalogue().label).model
-        except SelectionError:
+        except (DataError, QuestionError):
             return by_pooled, by_pooled, False
         return by_pooled, held_out(own, everything, test), True
 

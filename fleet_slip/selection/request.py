@@ -176,7 +176,7 @@ def inputs_of(cohort: Cohort | SummedCohort, order: str) -> tuple[str, ...]:
 
 def check_inputs(names: Sequence[str], feature_set: str) -> tuple[str, ...]:
     """Return the names of inputs of a feature set. Raises `ConfigError` for what is none."""
-    known = features().set(feature_set).inputs
+    known = features().feature_set(feature_set).inputs
     order = tuple(name.strip() for name in names)
     unknown = [name for name in order if name not in known]
     if unknown or len(set(order)) < len(order):

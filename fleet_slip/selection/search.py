@@ -8,7 +8,7 @@ import numpy as np
 
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.cohort import Cohort
 from fleet_slip.grams.folding import ROW_FOLDS, Folding
 from fleet_slip.grams.training import drive_folds, row_training
@@ -86,13 +86,13 @@ class OrderedSelection:
 def check_criterion(name: str) -> str:
     """Return the criterion that a name means, `cv` being cross-validation.
 
-    Raises `SelectionError` for an unknown one.
+    Raises `DataError` for an unknown one.
     """
     if name == "cv":
         return CROSS_VALIDATION
     if name not in (*CRITERIA, CROSS_VALIDATION):
         known = ", ".join(("cv", *CRITERIA))
-        raise SelectionError(f"unknown criterion {name!r}. Known criteria: {known}.")
+        raise QuestionError(f"unknown criterion {name!r}. Known criteria: {known}.")
     return name
 
 
@@ -101,7 +101,7 @@ def select_ranked(
 ) -> OrderedSelection:
     """Rank the inputs and choose one of the nested models, on the drives that have them all.
 
-    Raises `SelectionError` if no drive has them all, if they are linearly dependent, for an unknown
+    Raises `DataError` if no drive has them all, if they are linearly dependent, for an unknown
     rule, or if the criterion keeps none of them.
     """
     label = catalogue().label
@@ -128,7 +128,7 @@ def select_subsets(
 ) -> OrderedSelection:
     """Find the best subset of every size and choose one of them.
 
-    Raises `SelectionError` as `select_ranked` does.
+    Raises `DataError` as `select_ranked` does.
     """
     label = catalogue().label
     if plan.by == ROW_FOLDS:
@@ -166,7 +166,7 @@ def _evidence(training: Training, inputs: Sequence[str]) -> Evidence:
 
 def _winner(models: Sequence[CrossValidation], size: int, rule: Rule, evidence: Evidence) -> Winner:
     if size == 0:
-        raise SelectionError(
+        raise DataError(
             f"the criterion {rule.criterion} keeps no signal: none says more than chance. Choose "
             "more drives, other signals, or --criterion cv."
         )

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import Cohort
 from fleet_slip.grams.folding import Folding
 from fleet_slip.grams.training import drive_folds
@@ -53,14 +53,14 @@ def compare_shrinkage(
 
     Ridge and lasso choose their penalty by cross-validation inside each training fold. Pace
     weighs effects by the noise; drives count as independent, so its noise is larger by the design
-    effect, unless `naive`. Raises `SelectionError` for fewer than three folds, or dependent
+    effect, unless `naive`. Raises `DataError` for fewer than three folds, or dependent
     signals.
     """
     label = catalogue().label
     ready = drive_folds(cohort, inputs, plan)
     folds, scales = ready.training.folds, ready.training.scales
     if len(folds.grams) < FEWEST_FOLDS:
-        raise SelectionError("choosing a penalty inside the training folds needs three folds.")
+        raise QuestionError("choosing a penalty inside the training folds needs three folds.")
     effect = 1.0
     if not naive:
         fits = nested_fits(folds.total, inputs, label)

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from fleet_slip.catalogue.features import features, input_scales
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import Cohort
-from fleet_slip.regression.disturbance import disturbed
+from fleet_slip.regression.disturbance import disturb
 from fleet_slip.regression.exact import LinearModel
 from fleet_slip.regression.figures import Figures, error_sums
 from fleet_slip.regression.ridge import noise_matched
@@ -51,7 +51,7 @@ def what_if(
     """Return the figures to expect once bias and white noise come on top of what is logged.
 
     `model` is one of counts; `bias` and `noise` (standard deviations) are in SI units. Raises
-    `SelectionError` for a signal that the model does not use, or uses inside a feature: there
+    `DataError` for a signal that the model does not use, or uses inside a feature: there
     the effect is not linear.
     """
     for name in {*bias, *noise}:
@@ -62,7 +62,7 @@ def what_if(
     unit = scales[model.label]
 
     def after(one: LinearModel) -> Figures:
-        return disturbed(error_sums(one, total), one, scales, bias=bias, noise=noise).figures(unit)
+        return disturb(error_sums(one, total), one, scales, bias=bias, noise=noise).figures(unit)
 
     refitted = noise_matched(total, model.signals, model.label, noise, scales)
     return WhatIf(
@@ -78,7 +78,7 @@ def _require_linear(name: str, model: LinearModel) -> None:
     known = features().features
     inside = [f for f in model.signals if f in known and name in known[f].inputs]
     if inside:
-        raise SelectionError(
+        raise QuestionError(
             f"{name} also enters the model through {', '.join(inside)}, where its error has no "
             "closed form. Use a model without that feature, or simulate the campaign with other "
             "sensors."

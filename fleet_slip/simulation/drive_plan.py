@@ -19,7 +19,7 @@ from fleet_slip.vehicle.parameters import GRAVITY_MPS2, VehicleParameters, load_
 GOLDEN_RATIO = (1 + math.sqrt(5)) / 2
 
 
-def named(load: Callable[[str], object]) -> BeforeValidator:
+def load_by_name(load: Callable[[str], object]) -> BeforeValidator:
     """Let a config name another one, and report where the name stands if there is none."""
 
     def resolve(value: Any) -> Any:
@@ -33,8 +33,8 @@ def named(load: Callable[[str], object]) -> BeforeValidator:
     return BeforeValidator(resolve)
 
 
-NamedTrack = Annotated[Track, named(load_track)]
-NamedVehicle = Annotated[VehicleParameters, named(load_vehicle)]
+NamedTrack = Annotated[Track, load_by_name(load_track)]
+NamedVehicle = Annotated[VehicleParameters, load_by_name(load_vehicle)]
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 NotNegative = Annotated[FiniteFloat, Field(ge=0)]
 NotEmpty = Field(min_length=1)
@@ -65,7 +65,7 @@ class Uniform(Config):
 
 
 @dataclass(frozen=True)
-class Assignment:
+class CarOnRoad:
     """One car on one road at one speed."""
 
     vehicle: VehicleParameters
@@ -132,13 +132,13 @@ class Grid(Plan):
         """Return the car that drives the drive of this number: one for each vehicle and mass."""
         return self._combination(number) // math.prod(map(len, self._axes[2:]))
 
-    def assignment(self, number: int, sensors: Sensors) -> Assignment:
+    def assignment(self, number: int, sensors: Sensors) -> CarOnRoad:
         """Return what the drive of this number is to be."""
         index = np.unravel_index(self._combination(number), [len(axis) for axis in self._axes])
         vehicle, mass_kg, track, adhesion, lateral_mps2, speed_factor = (
             axis[i] for axis, i in zip(self._axes, index, strict=True)
         )
-        return Assignment(
+        return CarOnRoad(
             vehicle=vehicle.with_sprung_mass(mass_kg),
             sensors=sensors,
             track=track,
@@ -192,7 +192,7 @@ class Fleet(Plan):
 
     def assignment(
         self, sensors: Sensors, of_car: np.random.Generator, of_drive: np.random.Generator
-    ) -> Assignment:
+    ) -> CarOnRoad:
         """Draw a car from one generator and its drive from another, in a fixed order."""
         vehicle = self.vehicles[of_car.integers(len(self.vehicles))]
         vehicle = vehicle.with_sprung_mass(vehicle.body.sprung_mass_kg * self.load.draw(of_car))
@@ -204,7 +204,7 @@ class Fleet(Plan):
         track = self.tracks[of_drive.integers(len(self.tracks))]
         adhesion = self.adhesion.draw(of_drive)
         lateral_mps2 = self.friction_use.draw(of_drive) * adhesion * GRAVITY_MPS2
-        return Assignment(
+        return CarOnRoad(
             vehicle=vehicle,
             sensors=sensors,
             track=track,

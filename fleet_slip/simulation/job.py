@@ -14,8 +14,8 @@ from itertools import pairwise
 
 from deltalake.transaction import AddAction
 
-from fleet_slip.compute.tasks import completed
-from fleet_slip.delta import Change, Snapshot, Unit, retried
+from fleet_slip.compute.tasks import run_tasks
+from fleet_slip.delta import Change, Snapshot, Unit, retry_conflicts
 from fleet_slip.errors import RefusedError
 from fleet_slip.simulation.campaign import Batch, Campaign
 from fleet_slip.simulation.drives import simulate_batch
@@ -100,7 +100,7 @@ def simulate_campaign(
     plan = (campaign.batches(day) for day in open_days)
     report = _simulate(warehouse, plan, len(open_days), executor, progress)
     report.days_present = len(every) - len(open_days)
-    retried(lambda: _complete(warehouse, campaign, open_days))
+    retry_conflicts(lambda: _complete(warehouse, campaign, open_days))
     report.logs_version = warehouse.logs.snapshot().version
     return report
 
@@ -161,7 +161,7 @@ def _simulate(
     start = time.perf_counter()
     backlog = _Backlog(warehouse.logs.snapshot(), plan, days)
     report = SimulationReport()
-    for _, result in completed(executor, partial(_write, warehouse), backlog, _name):
+    for _, result in run_tasks(executor, partial(_write, warehouse), backlog, _name):
         before_s = time.perf_counter()
         if _land(warehouse, result):
             _count(report, result)
@@ -276,4 +276,4 @@ def _land(warehouse: Warehouse, written: _Written) -> bool:
         snapshot.commit(change)
         return True
 
-    return retried(attempt)
+    return retry_conflicts(attempt)

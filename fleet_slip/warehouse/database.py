@@ -11,7 +11,7 @@ from typing import TypeVar
 
 import duckdb
 
-from fleet_slip.errors import FleetSlipError, SelectionError, StorageError
+from fleet_slip.errors import FleetSlipError, QuestionError, StorageError
 from fleet_slip.files.folder import Folder
 
 SPILL_LIMIT = "20GB"
@@ -118,7 +118,7 @@ def database_errors(doing: str) -> Iterator[None]:
     except duckdb.Error as error:
         if type(error) is duckdb.Error:  # what its Parquet reader raises at damaged metadata
             raise StorageError(f"{doing} failed: {first_line(error)}. {_RESTORE}") from None
-        raise SelectionError(f"{doing} failed: {first_line(error)}") from None
+        raise QuestionError(f"{doing} failed: {first_line(error)}") from None
     except UnicodeDecodeError:  # the message quotes bytes of a damaged file
         raise StorageError(f"{doing} failed: a file is damaged. {_RESTORE}") from None
 

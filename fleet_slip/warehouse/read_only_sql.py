@@ -11,7 +11,7 @@ from typing import Any
 
 import duckdb
 
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import QuestionError
 from fleet_slip.warehouse.database import first_line
 
 LONGEST_QUERY = 100_000
@@ -48,21 +48,21 @@ CATALOGUE_PREFIX = "duckdb_"
 def one_query(database: duckdb.DuckDBPyConnection, text: str) -> str:
     """Return the text if it is one statement that only reads.
 
-    Raises `SelectionError` otherwise: a query must not write files, change settings or run text.
+    Raises `QuestionError` otherwise: a query must not write files, change settings or run text.
     """
     if len(text) > LONGEST_QUERY:
-        raise SelectionError(
+        raise QuestionError(
             f"the query has {len(text):,} characters, at most {LONGEST_QUERY:,} are read."
         )
     try:
         text.encode()
         statements = database.extract_statements(text)
     except UnicodeEncodeError:
-        raise SelectionError("not valid SQL: it is not Unicode text.") from None
+        raise QuestionError("not valid SQL: it is not Unicode text.") from None
     except duckdb.Error as error:
-        raise SelectionError(f"not valid SQL: {first_line(error)}") from None
+        raise QuestionError(f"not valid SQL: {first_line(error)}") from None
     if len(statements) != 1:
-        raise SelectionError(f"one SQL statement is expected, not {len(statements)}.")
+        raise QuestionError(f"one SQL statement is expected, not {len(statements)}.")
     explained = statements[0].type == duckdb.StatementType.EXPLAIN
     _require_reading(database, _explained(text) if explained else text)
     return text
@@ -88,30 +88,30 @@ def _require_reading(database: duckdb.DuckDBPyConnection, text: str) -> None:
     try:
         tree = json.loads(serialised, object_hook=_checked)
     except RecursionError:
-        raise SelectionError("the query is nested too deeply. Divide it into parts.") from None
+        raise QuestionError("the query is nested too deeply. Divide it into parts.") from None
     if tree["error"]:
-        raise SelectionError(
+        raise QuestionError(
             "only queries are allowed here (SELECT, WITH, DESCRIBE, SUMMARIZE, EXPLAIN; a PIVOT "
             "with IN): the warehouse is written by the jobs alone."
         )
 
 
 def _checked(node: dict[str, Any]) -> dict[str, Any]:
-    """Return a node of the parsed statement. Raises `SelectionError` if it may do harm."""
+    """Return a node of the parsed statement. Raises `QuestionError` if it may do harm."""
     kind = node.get("type")
     if not isinstance(kind, str):
         return node
     if kind.endswith("_NODE") and kind not in QUERY_NODES:
-        raise SelectionError(
+        raise QuestionError(
             "the query would write: only reading is allowed here. The warehouse is written by the "
             "jobs alone."
         )
     if kind == "VALUE_PARAMETER":
-        raise SelectionError("the query has a parameter, and nothing gives it a value.")
+        raise QuestionError("the query has a parameter, and nothing gives it a value.")
     if kind == "TABLE_FUNCTION":
         name = str(node["function"]["function_name"]).lower()
         if name not in TABLE_FUNCTIONS and not name.startswith(CATALOGUE_PREFIX):
-            raise SelectionError(
+            raise QuestionError(
                 f"the function {name!r} cannot be called after FROM here. Functions: "
                 f"{', '.join(sorted(TABLE_FUNCTIONS))}, and those that begin with duckdb_."
             )

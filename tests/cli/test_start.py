@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from fleet_slip.cli.commands import COMMANDS, Command, loaded
+from fleet_slip.cli.commands import COMMANDS, Command, load_commands
 
 TABLES = {"deltalake", "numpy", "pyarrow"}
 ENGINES = {"duckdb", "highway_env", "jinja2", "matplotlib", "numba", "pint", "polars"}
@@ -47,7 +47,9 @@ def test_a_command_does_not_wait_for_what_it_does_not_need(
 
 
 def test_every_command_is_listed_in_its_own_words() -> None:
-    modules = {module: loaded(module) for module in {one.module for one in COMMANDS.values()}}
+    modules = {
+        module: load_commands(module) for module in {one.module for one in COMMANDS.values()}
+    }
     found = {
         name: Command(module, " ".join(command.help.partition("\n\n")[0].split()))
         for module, commands in modules.items()

@@ -15,7 +15,7 @@ from distributed import Client
 from benchmarks.dask_processes import DaskProcesses, dask_processes
 from fleet_slip.compute.cluster import cluster_executor
 from fleet_slip.compute.cluster_worker import Marker, environment, pickled, work
-from fleet_slip.compute.tasks import LocalThreads, completed
+from fleet_slip.compute.tasks import LocalThreads, run_tasks
 from fleet_slip.errors import RefusedError, StorageError
 from fleet_slip.files.local_folder import LocalFolder
 from tests.cluster.work import Order, obey
@@ -49,7 +49,7 @@ def stored(root: Path) -> dict[str, bytes]:
 
 def run_orders(dask: DaskProcesses, folder: Path, number: int, seconds: float) -> int:
     with cluster_executor(dask.address, LocalFolder(folder)) as executor:
-        return len(list(completed(executor, obey, orders(folder, number, seconds), str)))
+        return len(list(run_tasks(executor, obey, orders(folder, number, seconds), str)))
 
 
 def orders(folder: Path, number: int, seconds: float) -> Iterator[Order]:
@@ -119,7 +119,7 @@ def test_a_worker_of_other_versions_is_refused_early_and_late(
         try:
             dask.wait_for_workers(3)
             with pytest.raises(RefusedError, match=r"^worker .* has numba 0\.1 instead of "):
-                list(completed(executor, obey, orders(tmp_path, UNTIL_ALL_HAD_ONE, 0.2), str))
+                list(run_tasks(executor, obey, orders(tmp_path, UNTIL_ALL_HAD_ONE, 0.2), str))
             with pytest.raises(RefusedError, match=r"^tcp://.* has numba 0\.1 instead of "):
                 run_orders(dask, tmp_path, 1, 0)
         finally:
@@ -202,7 +202,7 @@ def test_a_bounded_number_of_tasks_is_under_way() -> None:
 
     with LocalThreads(2) as threads:
         done = []
-        for item, result in completed(threads, lambda i: i * i, items(), str):
+        for item, result in run_tasks(threads, lambda i: i * i, items(), str):
             done.append((item, result))
             assert len(taken) - len(done) < threads.in_flight
     assert sorted(done) == [(i, i * i) for i in range(50)]

@@ -13,7 +13,7 @@ from dask.config import set as dask_config
 from benchmarks.dask_processes import DaskProcesses, dask_processes
 from fleet_slip.compute import cluster as cluster_module
 from fleet_slip.compute.cluster import ClusterExecutor, cluster_executor
-from fleet_slip.compute.tasks import completed
+from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import ClusterError
 from fleet_slip.files.local_folder import LocalFolder
 from tests.cluster.work import Order, obey
@@ -37,7 +37,7 @@ def orders(folder: Path, number: int, seconds: float = 0.0, deadly: str = "") ->
 def results(executor: ClusterExecutor, items: Sequence[Order]) -> dict[str, str]:
     return {
         order.name: result
-        for order, result in completed(executor, obey, items, lambda order: order.name)
+        for order, result in run_tasks(executor, obey, items, lambda order: order.name)
     }
 
 
@@ -61,7 +61,7 @@ def test_workers_that_stop_or_die_delay_but_lose_nothing(
     dask.wait_for_workers(3)
     items = orders(tmp_path, 10, seconds=0.5)
     with cluster_executor(dask.address, LocalFolder(tmp_path)) as executor:
-        running = completed(executor, obey, items, lambda order: order.name)
+        running = run_tasks(executor, obey, items, lambda order: order.name)
         first, result = next(running)
         until(lambda: len(begun_by(items)) > 1)
         stopped, killed, *_ = begun_by(items)
@@ -83,7 +83,7 @@ def test_a_task_that_kills_every_worker_is_named_and_the_rest_is_done(
         cluster_executor(dask.address, LocalFolder(tmp_path)) as executor,
         pytest.raises(ClusterError, match=r"^task-1: every worker that tried it died") as caught,
     ):
-        for order, result in completed(executor, obey, items, lambda order: order.name):
+        for order, result in run_tasks(executor, obey, items, lambda order: order.name):
             done[order.name] = result
     assert caught.value.exit_code == 11
     assert done == {order.name: order.name.upper() for order in items if not order.deadly}
@@ -95,7 +95,7 @@ def test_a_scheduler_that_comes_back_gets_the_tasks_again(
 ) -> None:
     items = orders(tmp_path, 6, seconds=0.4)
     with cluster_executor(dask.address, LocalFolder(tmp_path)) as executor:
-        running = completed(executor, obey, items, lambda order: order.name)
+        running = run_tasks(executor, obey, items, lambda order: order.name)
         first, result = next(running)
         done = {first.name: result}
         dask.close()

@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from fleet_slip.delta import Change, Unit, checksum_in, checksum_of, retried
+from fleet_slip.delta import Change, Unit, checksum_in, checksum_of, retry_conflicts
 from fleet_slip.errors import ConflictError, StorageError
 from fleet_slip.files.folder import TEMPORARY_PREFIX
 from fleet_slip.files.local_folder import LocalFolder
@@ -138,10 +138,10 @@ def test_a_conflict_is_retried_and_the_last_one_is_told(monkeypatch: pytest.Monk
             raise outcome
         return outcome
 
-    assert retried(attempt) == "done"
+    assert retry_conflicts(attempt) == "done"
     assert len(waits) == 2
     with pytest.raises(ConflictError, match="always"):
-        retried(attempt)
+        retry_conflicts(attempt)
     assert max(waits) <= 5
 
 

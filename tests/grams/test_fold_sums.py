@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.growth_history import write_fleet, write_grams
 from fleet_slip.catalogue.features import PLAIN
-from fleet_slip.errors import FleetSlipError, SelectionError
+from fleet_slip.errors import DataError, FleetSlipError
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams import reader as gram_reader
 from fleet_slip.grams.cohort import load_cohort
@@ -95,9 +95,9 @@ def test_days_add_up_to_those_of_the_drives(
         assert sums.drives == tuple(days.count(day) for day in sums.days)
         for day, gram in zip(sums.days, sums.grams, strict=True):
             assert gram == served.table.total(np.array([one == day for one in days]))
-    with pytest.raises(SelectionError, match="no drive satisfies"):
+    with pytest.raises(DataError, match="no drive satisfies"):
         sum_days(warehouse, ["ax"], "mass_kg > 1e9")
-    with pytest.raises(SelectionError, match="no drive of the cohort has all of"):
+    with pytest.raises(DataError, match="no drive of the cohort has all of"):
         sum_days(warehouse, ["steering_wheel"], "drive_id IN ('drive-0-0', 'drive-0-6')")
 
 
@@ -125,7 +125,7 @@ def test_sums_of_other_folds_are_refused(fleet: Warehouse) -> None:
 
 
 def test_folds_of_rows_need_a_set_that_made_them(fleet: Warehouse) -> None:
-    with pytest.raises(SelectionError, match="of whole drives"):
+    with pytest.raises(DataError, match="of whole drives"):
         sum_cohort(fleet, Folding(by="row"))
 
 
@@ -207,7 +207,7 @@ def test_a_reader_opens_anew_only_what_changed(tmp_path: Path) -> None:
 def test_a_reader_reads_again_what_came_after_the_table(tmp_path: Path) -> None:
     warehouse = Warehouse(LocalFolder(tmp_path))
     with GramReader(warehouse) as reader:
-        with pytest.raises(SelectionError, match="no Gram rows yet"):
+        with pytest.raises(DataError, match="no Gram rows yet"):
             sum_cohort(reader, Folding())
         write_fleet(warehouse, 20)
         assert sum_cohort(reader, Folding()).drive_count == 20

@@ -14,13 +14,13 @@ import pytest
 import fleet_slip
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.delta import Change
-from fleet_slip.errors import RefusedError, SelectionError, StorageError
+from fleet_slip.errors import DataError, RefusedError, StorageError
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams import job as gram_job
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.job import aggregate, update_grams
 from fleet_slip.ingest.job import ingest_file
-from fleet_slip.maintenance.audit import Audit, Subject
+from fleet_slip.maintenance.audit import Audit, Forgettable
 from fleet_slip.maintenance.compaction import compact
 from fleet_slip.maintenance.find_drives import Located, drives_by_file, locate
 from fleet_slip.maintenance.forget import forget
@@ -71,7 +71,7 @@ def test_afterwards_every_coefficient_is_that_of_a_world_where_the_car_never_dro
     warehouse = fill(tmp_path / "with", *CARS)
     without = fill(tmp_path / "without", "alfa", "gamma")
     with_all = coefficients(warehouse)
-    report = forget(warehouse, Subject("vehicle", "beta"))
+    report = forget(warehouse, Forgettable("vehicle", "beta"))
     assert (report.drives, report.rows, report.files_rewritten) == (3, 600, 3)
     assert coefficients(warehouse) == coefficients(without)
     assert with_all != coefficients(without)
@@ -91,7 +91,7 @@ def test_a_car_is_found_in_files_with_and_without_gram_rows_and_no_other_is_open
     land(warehouse, "later", drive("gamma", 8), drive("beta", 8))  # without Gram rows
     (other,) = (path for path in warehouse.logs.snapshot().paths if "other" in path)
     Path(other).write_bytes(b"no Parquet file")
-    subject = Subject("vehicle", "beta")
+    subject = Forgettable("vehicle", "beta")
     logs = warehouse.logs.snapshot()
     found = drives_by_file(logs, subject, locate(warehouse.grams.snapshot(), subject))
     assert sorted(found.values(), key=min) == [{f"beta-{number}"} for number in (0, 1, 2, 8)]
@@ -104,10 +104,10 @@ def test_with_now_no_byte_below_the_root_names_the_car_not_even_in_older_version
 ) -> None:
     warehouse = fill(tmp_path, *CARS)
     compact(warehouse)  # older versions now have the car in other files
-    report = forget(warehouse, Subject("vehicle", "beta"))
+    report = forget(warehouse, Forgettable("vehicle", "beta"))
     assert report.old_files_left > 0
     assert mentions(tmp_path, "beta")
-    again = forget(warehouse, Subject("vehicle", "beta"), now=True)
+    again = forget(warehouse, Forgettable("vehicle", "beta"), now=True)
     assert (again.drives, again.old_files_left) == (0, 0)
     assert again.old_files_deleted == report.old_files_left
     assert not mentions(tmp_path, "beta")
@@ -117,21 +117,21 @@ def test_with_now_no_byte_below_the_root_names_the_car_not_even_in_older_version
 def test_the_record_names_nobody_and_can_be_asked(tmp_path: Path) -> None:
     warehouse = fill(tmp_path, *CARS)
     audit = Audit(LocalFolder(tmp_path))
-    forget(warehouse, Subject("drive", "beta-1"))
+    forget(warehouse, Forgettable("drive", "beta-1"))
     assert [entry["event"] for entry in audit.entries()] == ["begun", "done"]
     assert "beta" not in json.dumps(audit.entries())
-    assert audit.state(Subject("drive", "beta-1")) == "done"
-    assert audit.state(Subject("vehicle", "beta-1")) is None
-    assert not forget(warehouse, Subject("drive", "beta-1"), now=True).drives
-    with pytest.raises(SelectionError, match="no drive has vehicle_id 'delta'"):
-        forget(warehouse, Subject("vehicle", "delta"))
+    assert audit.state(Forgettable("drive", "beta-1")) == "done"
+    assert audit.state(Forgettable("vehicle", "beta-1")) is None
+    assert not forget(warehouse, Forgettable("drive", "beta-1"), now=True).drives
+    with pytest.raises(DataError, match="no drive has vehicle_id 'delta'"):
+        forget(warehouse, Forgettable("vehicle", "delta"))
 
 
 def test_whoever_forgets_first_at_the_same_moment_is_found_in_the_record(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     audit = Audit(LocalFolder(tmp_path))
-    one, other = (Subject("vehicle", name) for name in ("alfa", "beta"))
+    one, other = (Forgettable("vehicle", name) for name in ("alfa", "beta"))
     audit.begin(one, 1, [])
     with monkeypatch.context() as patch:
         patch.setattr(Audit, "entries", lambda _: [])  # as they were a moment ago
@@ -152,7 +152,7 @@ def test_a_gram_job_under_way_does_not_bring_a_forgotten_drive_back(
     def overtaken(*arguments: Any) -> pa.Table:
         rows = aggregate(*arguments)
         monkeypatch.undo()
-        forget(warehouse, Subject("vehicle", "beta"))
+        forget(warehouse, Forgettable("vehicle", "beta"))
         return rows
 
     monkeypatch.setattr(gram_job, "aggregate", overtaken)
@@ -164,7 +164,7 @@ def test_a_gram_job_under_way_does_not_bring_a_forgotten_drive_back(
 
 def test_a_file_of_forgotten_drives_only_is_removed(tmp_path: Path) -> None:
     warehouse = fill(tmp_path, "alfa")
-    report = forget(warehouse, Subject("drive", "alfa-1"))
+    report = forget(warehouse, Forgettable("drive", "alfa-1"))
     assert (report.files_removed, report.files_rewritten) == (1, 0)
     assert warehouse.logs.snapshot().rows == 400
 
@@ -178,7 +178,7 @@ def test_quarantined_rows_of_the_car_go_too(tmp_path: Path) -> None:
     rows = pa.Table.from_pylist(values, schema=warehouse.quarantine.schema)
     action = warehouse.quarantine.write_file("q", rows)
     warehouse.quarantine.snapshot().commit(Change(add=[action]))
-    forget(warehouse, Subject("vehicle", "beta"), now=True)
+    forget(warehouse, Forgettable("vehicle", "beta"), now=True)
     (path,) = warehouse.quarantine.snapshot().paths
     assert pq.read_table(path)["drive_id"].to_pylist() == ["alfa-1", None, "beta-10"]
     assert not unreferenced(warehouse.quarantine)
@@ -197,7 +197,7 @@ def test_a_car_all_of_whose_rows_were_refused_goes_too(tmp_path: Path, subject: 
     update_grams(warehouse)
     (path,) = warehouse.quarantine.snapshot().paths
     (name,) = pq.read_table(path)["drive_id"].unique().to_pylist()
-    chosen = Subject(subject, name if subject == "drive" else "secretive")
+    chosen = Forgettable(subject, name if subject == "drive" else "secretive")
     before = warehouse.logs.snapshot()
     report = forget(warehouse, chosen, now=True)
     assert (report.drives, report.rows) == (1, 0)

@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 
 from fleet_slip.catalogue.signals import CATALOGUE_VARIABLE, catalogue
 from fleet_slip.delta import Change, Table
-from fleet_slip.delta.schema import evolution
+from fleet_slip.delta.schema import compare_schemas
 from fleet_slip.errors import ConflictError, RefusedError
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.check import check_grams
 from fleet_slip.grams.job import update_grams
-from fleet_slip.maintenance.migration import migrate, rescaled
+from fleet_slip.maintenance.migration import migrate, rescale_counts
 from fleet_slip.resources import folder
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
@@ -216,13 +216,13 @@ def test_a_table_records_the_scales_from_the_start(warehouse: Warehouse) -> None
     land(warehouse, "a", log_rows("a", small_counts(1)))
     delta = warehouse.logs.snapshot().delta
     assert delta is not None
-    assert not evolution(warehouse.logs.schema, delta).pending
+    assert not compare_schemas(warehouse.logs.schema, delta).pending
 
 
 @given(st.lists(st.integers(-32767, 32767), min_size=1), st.integers(1, 99), st.integers(1, 99))
 def test_rescaling_rounds_as_python_does(counts: list[int], old: int, new: int) -> None:
     ratio = Fraction(old, new)
-    found = rescaled(np.array(counts, dtype=np.int16), ratio).tolist()
+    found = rescale_counts(np.array(counts, dtype=np.int16), ratio).tolist()
     assert found == [round(count * ratio) for count in counts]
 
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError
 from fleet_slip.grams.job import update_grams
 from fleet_slip.models.publish import manifest_of, publish
 from fleet_slip.models.versions import ModelVersion, Registry
@@ -108,7 +108,7 @@ def test_days_to_learn_from_may_be_chosen_and_must_be_enough(
     warehouse, version = trained
     chart = monitor(warehouse, version, since=DAY + timedelta(days=5))
     assert [day.training for day in chart.days] == [True] * 5 + [False]
-    with pytest.raises(SelectionError, match="trained on 2 days"):
+    with pytest.raises(DataError, match="trained on 2 days"):
         monitor(warehouse, version, since=DAY + timedelta(days=2))
 
 

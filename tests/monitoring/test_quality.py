@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.job import update_grams
 from fleet_slip.monitoring.plausibility import Fault
@@ -104,7 +104,7 @@ def test_vehicle_models_are_examined_one_after_the_other(warehouse: Warehouse) -
         together = examine(load_cohort(warehouse, f"{condition}\n"), few())
         assert examine_drives(warehouse, condition, few()) == together
         assert together.drives > 0
-    with pytest.raises(SelectionError, match="no drive satisfies"):
+    with pytest.raises(DataError, match="no drive satisfies"):
         examine_drives(warehouse, "mass_kg > 1e9")
 
 

@@ -15,7 +15,7 @@ import obstore
 import pytest
 
 import fleet_slip
-from fleet_slip.delta import Change, Unit, retried
+from fleet_slip.delta import Change, Unit, retry_conflicts
 from fleet_slip.errors import StorageError
 from fleet_slip.files import object_folder
 from fleet_slip.files.data_root import data_root
@@ -104,7 +104,7 @@ def test_units_land_once_where_answers_are_lost(root: Folder, server: Server) ->
             if snapshot.landed(f"unit-{number}") is None:
                 snapshot.commit(Change(add=[action], units=[Unit(f"unit-{number}", 1)]))
 
-        retried(attempt)
+        retry_conflicts(attempt)
 
     with server.misbehaving(failing=0.1), ThreadPoolExecutor(3) as executor:
         list(executor.map(bring, [n // 2 for n in range(12)]))  # each is brought twice

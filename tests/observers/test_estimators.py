@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError
 from fleet_slip.observers import ekf, kalman, luenberger, sliding_mode
 from fleet_slip.observers.signals import Floats, LabelledDrive
 from fleet_slip.vehicle.parameters import load_vehicle
@@ -85,7 +85,7 @@ def test_a_gap_of_the_sensors_is_bridged(name: str) -> None:
 def test_an_absent_sensor_is_named(name: str, field: str, message: str) -> None:
     estimate, parameters = ESTIMATORS[name]
     drive = slalom(CAR, 50)[0]
-    with pytest.raises(SelectionError, match=message):
+    with pytest.raises(DataError, match=message):
         estimate(replace(drive, **{field: np.full(50, np.nan)}), CAR, parameters)
 
 

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError
 from fleet_slip.observers import kalman
 from fleet_slip.observers.kalman import Belief, FilterNoise, covariances, predict, run, update
 from fleet_slip.observers.outages import TUNNEL_S, tunnel, without_fixes
@@ -320,7 +320,7 @@ def test_gaps_of_the_accelerometers_are_bridged() -> None:
 
 def test_drive_without_gps_is_refused() -> None:
     drive = without_fixes(slalom(CAR, 50)[0], np.ones(50, dtype=bool))
-    with pytest.raises(SelectionError, match="no GPS fix"):
+    with pytest.raises(DataError, match="no GPS fix"):
         kalman.estimate(drive, CAR, FilterNoise())
 
 

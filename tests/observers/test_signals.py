@@ -6,7 +6,7 @@ import duckdb
 import numpy as np
 import pytest
 
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError
 from fleet_slip.observers.angle import sideslip_angle
 from fleet_slip.observers.signals import DriveSignals, held, read_drive
 
@@ -37,7 +37,7 @@ def test_a_drive_is_read_in_order_with_nan_for_null(database: duckdb.DuckDBPyCon
 
 
 def test_an_unknown_drive_is_refused(database: duckdb.DuckDBPyConnection) -> None:
-    with pytest.raises(SelectionError, match="no drive is called 'c'"):
+    with pytest.raises(DataError, match="no drive is called 'c'"):
         read_drive(database, "c")
 
 
@@ -47,7 +47,7 @@ def test_gaps_take_the_value_before_and_a_leading_one_the_first() -> None:
     assert held(values, "ax").tolist() == [2, 2, 2, 2, 5, 5]
     whole = np.array([1.0, 2.0])
     assert held(whole, "ax") is whole
-    with pytest.raises(SelectionError, match="no ax"):
+    with pytest.raises(DataError, match="no ax"):
         held(np.full(3, nan), "ax")
 
 

@@ -8,7 +8,7 @@ import pytest
 from pydantic import Field
 
 from fleet_slip.config import Config
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError
 from fleet_slip.observers import ekf, kalman, luenberger, sliding_mode
 from fleet_slip.observers.kalman import FilterNoise
 from fleet_slip.observers.signals import DriveSignals, Floats, LabelledDrive
@@ -97,5 +97,5 @@ def test_what_is_tunable_exists_and_is_positive(names: tuple[str, ...], paramete
 def test_drives_without_labels_are_refused(executor: Executor) -> None:
     drive = labelled(1, rows=100)
     unknown = LabelledDrive("x", drive.signals, np.full(100, np.nan))
-    with pytest.raises(SelectionError, match="no row has both"):
+    with pytest.raises(DataError, match="no row has both"):
         error_std_rad(lambda d: kalman.estimate(d, CAR, FilterNoise()), [unknown], executor)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError
 from fleet_slip.regression.crossval import CrossValidation, cross_validate_inputs
 from fleet_slip.regression.folds import CohortFolds, by_hash, by_value, hash_fold
 from fleet_slip.regression.gram import Gram, GramTable
@@ -77,7 +77,7 @@ def test_drives_without_a_signal_serve_the_models_that_do_not_need_it() -> None:
     together = cohort_of(drives, [0, 1, 2] * 4)
     assert both == cross_validate_inputs("two", together, ["x1", "x2"], "y", SCALES)
     assert cross_validate_inputs("three", cohort, ["x3"], "y", SCALES).drives == 6
-    with pytest.raises(SelectionError, match="no Gram of gyro"):
+    with pytest.raises(DataError, match="no Gram of gyro"):
         cohort.serving(["gyro"], "y")
 
 
@@ -85,7 +85,7 @@ def test_folds_lacking_a_signal_are_an_error() -> None:
     drives = random_drives(7, drives=4)
     full = GramTable.from_grams([gram_of(counts) for counts in drives[:2]])
     cohort = CohortFolds.of([full, full.restrict(["x1", "y"])], by_value(["a", "a", "b", "b"]))
-    with pytest.raises(SelectionError, match="fold b has no rows with all of x2, y"):
+    with pytest.raises(DataError, match="fold b has no rows with all of x2, y"):
         cohort.serving(["x2"], "y")
 
 
@@ -114,13 +114,13 @@ def test_folds_that_no_drive_falls_into_are_left_out() -> None:
 
 
 def test_single_folds_are_errors() -> None:
-    with pytest.raises(SelectionError, match="the cohort has one"):
+    with pytest.raises(DataError, match="the cohort has one"):
         by_hash(["a", "a"], 5)
-    with pytest.raises(SelectionError, match="at least two folds"):
+    with pytest.raises(DataError, match="at least two folds"):
         by_hash(["a", "b"], 1)
-    with pytest.raises(SelectionError, match="the cohort has one: waterford"):
+    with pytest.raises(DataError, match="the cohort has one: waterford"):
         by_value(["waterford", "waterford"])
-    with pytest.raises(SelectionError, match="no value"):
+    with pytest.raises(DataError, match="no value"):
         by_value(["a", None])
 
 
@@ -161,7 +161,7 @@ def test_a_clear_best_wins_and_ties_go_to_the_declared_order() -> None:
     assert "no other model is within" in choose(clear).reason
     tied = [candidate("b", 2, 0.9, 0.01), candidate("a", 2, 0.9, 0.01)]
     assert choose(tied).model.name == "b"
-    with pytest.raises(SelectionError, match="empty"):
+    with pytest.raises(DataError, match="empty"):
         choose([])
 
 

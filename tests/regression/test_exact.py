@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError
 from fleet_slip.regression.elimination import eliminate, inverse_matrix
 from fleet_slip.regression.exact import (
     condition_number,
@@ -105,22 +105,22 @@ def test_dependent_signals_are_named_with_the_relation() -> None:
     counts = np.column_stack([left, other, 2 * left - other + 3, constant, label])
     gram = Gram.from_counts(("steer_fl", "ay", "steer_fr", "ax", "sideslip"), counts)
     inputs = ["steer_fl", "ay", "steer_fr", "ax"]
-    with pytest.raises(SelectionError) as raised:
+    with pytest.raises(DataError) as raised:
         fit(gram, inputs, "sideslip")
     assert "steer_fr is a linear combination of steer_fl, ay" in str(raised.value)
     assert "steer_fr = 2 steer_fl - 1 ay + 3" in str(raised.value)
     assert "ax is constant (6 counts)" in str(raised.value)
     assert "steer_fl is" not in str(raised.value)
-    with pytest.raises(SelectionError, match="steer_fr is a linear"):
+    with pytest.raises(DataError, match="steer_fr is a linear"):
         nested_fits(gram, inputs, "sideslip")
     assert dependence(gram, inputs[:2]) == ""
 
 
 def test_too_few_rows_and_none() -> None:
     gram = gram_of(np.array([[1, 2, 3], [4, 6, 5]]))
-    with pytest.raises(SelectionError, match="only 2 rows"):
+    with pytest.raises(DataError, match="only 2 rows"):
         fit(gram, ["x1", "x2"], "y")
-    with pytest.raises(SelectionError, match="no rows"):
+    with pytest.raises(DataError, match="no rows"):
         fit(Gram.zero(("x", "y")), ["x"], "y")
 
 

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import betainc
 
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError
 from fleet_slip.regression import special
 from fleet_slip.regression.drives import DriveMoments, serving_drives
 from fleet_slip.regression.exact import fit
@@ -106,21 +106,21 @@ def test_variance_inflation_is_that_of_the_inverse_correlations() -> None:
     inflation = variance_inflation(gram_of(counts), names(4)[:-1])
     np.testing.assert_allclose([*inflation.values()], expected, rtol=1e-9)
     twin = np.column_stack([counts[:, 0], counts[:, 0], counts[:, -1]])
-    with pytest.raises(SelectionError, match="x2 is a linear combination of x1"):
+    with pytest.raises(DataError, match="x2 is a linear combination of x1"):
         variance_inflation(gram_of(twin), ["x1", "x2"])
 
 
 def test_questions_without_an_answer_are_errors() -> None:
     drives = random_drives(1, drives=2)
     gram = gram_of(drives[0])
-    with pytest.raises(SelectionError, match="two groups"):
+    with pytest.raises(DataError, match="two groups"):
         chow([gram], ["x1"], "y")
-    with pytest.raises(SelectionError, match="two drives"):
+    with pytest.raises(DataError, match="two drives"):
         cluster(fit(gram, ["x1"], "y"), moments_of(drives[:1]), unit_scales(4))
     few = gram_of(drives[0][:2, [0, -1]])
-    with pytest.raises(SelectionError, match="2 rows cannot tell"):
+    with pytest.raises(DataError, match="2 rows cannot tell"):
         classical(fit(few, ["x1"], "y"), unit_scales(1))
-    with pytest.raises(SelectionError, match="no drive of the cohort has all"):
+    with pytest.raises(DataError, match="no drive of the cohort has all"):
         serving_drives([moments_table()], ["x9"])
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError
 from fleet_slip.regression.crossval import cross_validate, least_squares
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.exact import fit
@@ -82,7 +82,7 @@ def test_repeats_agree_with_exact_cross_validation() -> None:
 
 def test_too_few_drives() -> None:
     moments = DriveMoments.of(table_of(random_drives(5, drives=3)))
-    with pytest.raises(SelectionError, match="3 drives cannot fill 5 folds"):
+    with pytest.raises(DataError, match="3 drives cannot fill 5 folds"):
         repeated_cross_validation(moments, 5, 1, seed=0)
-    with pytest.raises(SelectionError, match="at least two drives"):
+    with pytest.raises(DataError, match="at least two drives"):
         bootstrap_coefficients(moments.take(np.array([0])), 10, seed=0)

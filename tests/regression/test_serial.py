@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.errors import SelectionError
-from fleet_slip.regression.disturbance import disturbed
+from fleet_slip.errors import DataError
+from fleet_slip.regression.disturbance import disturb
 from fleet_slip.regression.exact import fit
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.gram import Gram
@@ -95,9 +95,9 @@ def test_serial_correlation_needs_a_residual() -> None:
     x = np.arange(20) ** 2
     drives = [np.column_stack([x, 3 * x + 1])]
     gram = gram_of(drives[0])
-    with pytest.raises(SelectionError, match="no residual"):
+    with pytest.raises(DataError, match="no residual"):
         serial_correlation(fit(gram, ["x1"], "y").model, gram, lag_gram(drives))
-    with pytest.raises(SelectionError, match="no residual"):
+    with pytest.raises(DataError, match="no residual"):
         autoregressive_fit(lag_gram(drives), ["x1"], "y")
 
 
@@ -108,7 +108,7 @@ def test_disturbance_equals_simulated_noise_and_bias() -> None:
     scales = {name: Fraction(1, 1000) for name in names(4)}
     model = fit(gram, ["x1", "x2", "x4"], "y").model
     bias, noise = {"x1": 0.05, "x4": -0.1}, {"x1": 0.03, "x2": 0.2}
-    sums = disturbed(error_sums(model, gram), model, scales, bias=bias, noise=noise)
+    sums = disturb(error_sums(model, gram), model, scales, bias=bias, noise=noise)
     expected = sums.figures(scales["y"])
     copies = np.tile(counts.astype(float), (150, 1)) / 1000
     copies[:, 0] += 0.05 + rng.normal(size=len(copies)) * 0.03
@@ -132,9 +132,9 @@ def test_bias_alone_is_exact_and_nothing_changes_nothing() -> None:
     moved = counts.copy()
     moved[:, 0] += 25
     sums = error_sums(model, gram)
-    assert disturbed(sums, model, scales, bias={"x1": 0.25}) == error_sums(
+    assert disturb(sums, model, scales, bias={"x1": 0.25}) == error_sums(
         model, gram_of(moved), Fraction(gram.sum("y"), gram.n)
     )
-    assert disturbed(sums, model, scales) == sums
-    with pytest.raises(SelectionError, match="does not use x2: it uses x1, x3"):
-        disturbed(sums, model, scales, noise={"x2": 1.0})
+    assert disturb(sums, model, scales) == sums
+    with pytest.raises(DataError, match="does not use x2: it uses x1, x3"):
+        disturb(sums, model, scales, noise={"x2": 1.0})

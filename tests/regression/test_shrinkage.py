@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from sklearn.linear_model import Ridge
 
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError
 from fleet_slip.regression import pace as pace_module
 from fleet_slip.regression.crossval import Procedure, cross_validate
 from fleet_slip.regression.evidence import Evidence
@@ -103,9 +103,9 @@ def test_errors_in_variables_recovers_the_clean_slope() -> None:
     assert attenuated == pytest.approx(0.5 / 1.49, rel=0.02)
     model = errors_in_variables(gram, ["x1"], "y", {"x1": 700.0}, unit_scales(1))
     assert model.weights["x1"] == pytest.approx(0.5, rel=0.02)
-    with pytest.raises(SelectionError, match="positive definite at x1"):
+    with pytest.raises(DataError, match="positive definite at x1"):
         errors_in_variables(gram, ["x1"], "y", {"x1": 2000.0}, unit_scales(1))
-    with pytest.raises(SelectionError, match="noise is given for gyro"):
+    with pytest.raises(DataError, match="noise is given for gyro"):
         errors_in_variables(gram, ["x1"], "y", {"gyro": 1.0}, unit_scales(1))
 
 
@@ -189,10 +189,10 @@ def test_pace_needs_no_row_and_names_its_mistakes() -> None:
     assert pace(gram, inputs, "y", "ols").weights == pytest.approx(
         fit(gram, inputs, "y").model.weights
     )
-    with pytest.raises(SelectionError, match="unknown estimator 'pace7'"):
+    with pytest.raises(DataError, match="unknown estimator 'pace7'"):
         pace(gram, inputs, "y", "pace7")
     exact = Gram.from_counts(("x1", "y"), np.array([[1, 2], [2, 4], [3, 6], [5, 10]]))
-    with pytest.raises(SelectionError, match="no noise"):
+    with pytest.raises(DataError, match="no noise"):
         pace(exact, ["x1"], "y", "eb")
     assert (james_stein(np.array([0.1, 0.1, 0.1])) == 0).all()
     assert (pace_module.threshold(4.0)(np.array([1.9, -2.1])) == [0, -2.1]).all()

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleet_slip.errors import SelectionError
+from fleet_slip.errors import DataError
 from fleet_slip.evaluation.results import keep
 from fleet_slip.files.documents import Document
 from fleet_slip.files.local_folder import LocalFolder
@@ -214,7 +214,7 @@ def test_an_evaluation_of_other_data_is_refused(reported: Reported, data: Report
             place = place[key]
         place[path[-1]] += 0.001
         keep(Warehouse(LocalFolder(copy)), content)
-        with pytest.raises(SelectionError, match=f"{told}.* has changed since evaluation 2"):
+        with pytest.raises(DataError, match=f"{told}.* has changed since evaluation 2"):
             call(copy, "report", "--model", "smoke")
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from fleet_slip.evaluation.drives import FloatArray
-from fleet_slip.evaluation.runs import Run
+from fleet_slip.evaluation.runs import EvaluatedScenario
 from fleet_slip.report.figures.lines import smoothed
 from fleet_slip.report.figures.series import Line
 from fleet_slip.report.style import Size, colour
@@ -18,13 +18,15 @@ SMOOTHED_S = 0.5
 HEIGHT_IN = 3.3
 
 
-def lateral_acceleration(run: Run) -> FloatArray:
+def lateral_acceleration(run: EvaluatedScenario) -> FloatArray:
     """Return |ay| in m/s² at each tick: the sensor's, less its stated bias, smoothed."""
     ay = run.drive.signals["ay_mps2"] - run.drive.scenario.sensors.ay_bias_mps2
     return np.abs(smoothed(ay, int(SMOOTHED_S * SAMPLE_RATE_HZ)))
 
 
-def error_by_bin(runs: Sequence[Run], estimator: str) -> tuple[FloatArray, FloatArray]:
+def error_by_bin(
+    runs: Sequence[EvaluatedScenario], estimator: str
+) -> tuple[FloatArray, FloatArray]:
     """Return the middle of each bin in m/s² and the root mean square error in it, in deg."""
     acceleration = np.concatenate([lateral_acceleration(run) for run in runs])
     error = np.concatenate(
@@ -47,7 +49,7 @@ def error_by_bin(runs: Sequence[Run], estimator: str) -> tuple[FloatArray, Float
 
 
 def error_by_acceleration(
-    runs: Sequence[Run], lines: Sequence[Line], trained_to_mps2: float, size: Size
+    runs: Sequence[EvaluatedScenario], lines: Sequence[Line], trained_to_mps2: float, size: Size
 ) -> Figure:
     """Draw the error of each estimator over the lateral acceleration, on a logarithmic scale."""
     figure = Figure(figsize=(size.width_in, HEIGHT_IN))

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from fleet_slip.evaluation.drives import FloatArray
-from fleet_slip.evaluation.runs import Run
+from fleet_slip.evaluation.runs import EvaluatedScenario
 from fleet_slip.evaluation.stability import stretches
 from fleet_slip.report.figures.lines import band
 from fleet_slip.report.style import Size, colour
@@ -48,7 +48,7 @@ class Block:
     """
 
     title: str
-    run: Run
+    run: EvaluatedScenario
     lines: tuple[Line, ...]
     strips: tuple[Line, ...] = ()
     shaded: str | None = None

@@ -2,7 +2,7 @@
 
 from matplotlib.figure import Figure
 
-from fleet_slip.evaluation.drives import Drive
+from fleet_slip.evaluation.drives import EvaluatedDrive
 from fleet_slip.report.figures.lines import band
 from fleet_slip.report.style import Size, colour
 
@@ -10,7 +10,7 @@ HEIGHT_IN = 2.0
 KMH_PER_MPS = 3.6
 
 
-def speed(drive: Drive, size: Size) -> Figure:
+def speed(drive: EvaluatedDrive, size: Size) -> Figure:
     """Draw the true speed of a drive."""
     figure = Figure(figsize=(size.width_in, HEIGHT_IN))
     axes = figure.add_axes(

@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from fleet_slip.evaluation.drives import Drive, FloatArray
-from fleet_slip.evaluation.runs import Run
+from fleet_slip.evaluation.drives import EvaluatedDrive, FloatArray
+from fleet_slip.evaluation.runs import EvaluatedScenario
 from fleet_slip.report.figures.lines import smoothed
 from fleet_slip.report.style import Size, colour
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
@@ -25,7 +25,7 @@ KEY_IN = 0.62
 HEAD_IN = 0.3
 
 
-def positions(drive: Drive) -> tuple[FloatArray, FloatArray]:
+def positions(drive: EvaluatedDrive) -> tuple[FloatArray, FloatArray]:
     """Return x and y of the car in m, shape (ticks,): along the centre line, and off it."""
     line = drive.scenario.track.centre_line(SPACING_M)
     x, y, heading = (
@@ -36,7 +36,7 @@ def positions(drive: Drive) -> tuple[FloatArray, FloatArray]:
     return x - offset * np.sin(heading), y + offset * np.cos(heading)
 
 
-def error_map(runs: Sequence[tuple[str, Run]], estimator: str, size: Size) -> Figure:
+def error_map(runs: Sequence[tuple[str, EvaluatedScenario]], estimator: str, size: Size) -> Figure:
     """Draw a map for each drive, side by side where there is room."""
     columns = len(runs) if size.wide else 1
     rows = -(-len(runs) // columns)
@@ -57,7 +57,7 @@ def error_map(runs: Sequence[tuple[str, Run]], estimator: str, size: Size) -> Fi
     return figure
 
 
-def _draw(axes: Axes, run: Run, estimator: str) -> None:
+def _draw(axes: Axes, run: EvaluatedScenario, estimator: str) -> None:
     x, y = positions(run.drive)
     error = np.degrees(run.estimates[estimator] - run.drive.sideslip_rad)
     error = smoothed(error, int(SMOOTHED_S * SAMPLE_RATE_HZ))
@@ -78,7 +78,7 @@ def _draw(axes: Axes, run: Run, estimator: str) -> None:
     axes.set_axis_off()
 
 
-def _stretches(kinds: FloatArray, kind: int, drive: Drive) -> Iterator[slice]:
+def _stretches(kinds: FloatArray, kind: int, drive: EvaluatedDrive) -> Iterator[slice]:
     """Yield the samples of each stretch of one class, a few metres apart, joined to the next."""
     edges = np.flatnonzero(np.diff(kinds == kind, prepend=False, append=False))
     metre = np.median(drive.speed_mps) / SAMPLE_RATE_HZ
