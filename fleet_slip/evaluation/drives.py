@@ -122,7 +122,7 @@ def apply_failure(
 ) -> dict[str, FloatArray]:
     """Return signals, by name, as a car with the failure logs them; the given ones stay.
 
-    Raises `DataError` if the drive ends before the failure begins.
+    Raises `QuestionError` if the drive ends before the failure begins.
     """
     until_s = np.inf if failure.until_s is None else failure.until_s
     failed = (time_s >= failure.from_s) & (time_s < until_s)

@@ -146,7 +146,7 @@ def gram_condition(condition: str, feature_set: str, inputs: Sequence[str]) -> s
 
 
 def require_row_folds(feature_set: str, count: int) -> None:
-    """Raise `DataError` if a feature set has not made so many folds of rows."""
+    """Raise `QuestionError` if a feature set has not made so many folds of rows."""
     made = features().feature_set(feature_set).row_folds
     if made is None:
         known = ", ".join(name for name, one in features().sets.items() if one.row_folds)

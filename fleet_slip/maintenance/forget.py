@@ -60,7 +60,7 @@ def forget(
 ) -> ForgetReport:
     """Forget drives; with `now`, delete the replaced files at once instead of by `vacuum`.
 
-    It can be repeated after any interruption. Raises `DataError` if there never was such a
+    It can be repeated after any interruption. Raises `QuestionError` if there never was such a
     drive, `StorageError`, or `ConflictError`.
     """
     audit = Audit(warehouse.root)

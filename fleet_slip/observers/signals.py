@@ -52,7 +52,7 @@ class LabelledDrive:
 def read_drive(database: duckdb.DuckDBPyConnection, drive_id: str) -> LabelledDrive:
     """Read a drive from the view `log` of a warehouse (`fleet_slip.views.connect`).
 
-    Raises `DataError` if there is no such drive.
+    Raises `QuestionError` if there is no such drive.
     """
     label = catalogue()[catalogue().label].column
     columns = [*(field.name for field in fields(DriveSignals)), label]

@@ -115,7 +115,11 @@ RANKINGS: dict[str, Ranking] = {
 
 
 def rank(name: str, gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
-    """Order the inputs by a ranking. Raises `DataError` for an unknown or dependent one."""
+    """Order the inputs by a ranking.
+
+    Raises `QuestionError` for an unknown ranking, `DataError` if inputs
+    are dependent.
+    """
     if name not in RANKINGS:
         raise QuestionError(f"unknown ranking {name!r}. Known rankings: {', '.join(RANKINGS)}.")
     return RANKINGS[name](gram, inputs, label)

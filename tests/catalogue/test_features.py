@@ -16,7 +16,7 @@ from fleet_slip.catalogue import features as features_module
 from fleet_slip.catalogue.features import features, lag_signals, load_features, with_features
 from fleet_slip.catalogue.signals import COUNT_MAX, catalogue
 from fleet_slip.delta import Change, Unit
-from fleet_slip.errors import ConfigError, DataError
+from fleet_slip.errors import ConfigError, DataError, QuestionError
 from fleet_slip.grams import job as gram_job
 from fleet_slip.grams import statement as gram_statement
 from fleet_slip.grams.cohort import load_cohort
@@ -211,7 +211,7 @@ def test_rows_fall_into_folds_by_a_hash_that_never_changes(warehouse: Warehouse)
     assert cohort_gram(warehouse, "rows", signals) == cohort_gram(warehouse, "signals", signals)
     assert len(cohort.folds("row", 5).serving(["ax", "ay"], LABEL).grams) == 5
     assert cohort.folds("row", 5).serving(["ax", "ay"], LABEL).drives == 1
-    with pytest.raises(DataError, match="Feature sets that make them: rows"):
+    with pytest.raises(QuestionError, match="Feature sets that make them: rows"):
         load_cohort(warehouse, "true").folds("row", 5)
 
 

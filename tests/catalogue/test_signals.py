@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet_slip.catalogue.signals import Signal, catalogue, load_catalogue
-from fleet_slip.errors import ConfigError, DataError
+from fleet_slip.errors import ConfigError, QuestionError
 from fleet_slip.resources import folder
 
 SHIPPED = (folder("configs") / "signals.toml").read_text()
@@ -64,7 +64,7 @@ def test_a_mistake_is_told_with_file_key_and_reason(
 def test_a_missing_catalogue_and_an_unknown_signal_are_told(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no such file"):
         load_catalogue(tmp_path / "none.toml")
-    with pytest.raises(DataError, match=r"unknown signal 'beta'. Known signals: ax, ay"):
+    with pytest.raises(QuestionError, match=r"unknown signal 'beta'. Known signals: ax, ay"):
         catalogue()["beta"]
 
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from fleet_slip.errors import DataError
+from fleet_slip.errors import QuestionError
 from fleet_slip.evaluation.drives import apply_failure
 from fleet_slip.evaluation.errors import error_figures
 from fleet_slip.evaluation.estimators import LinearEstimate
@@ -69,7 +69,7 @@ def test_a_stuck_signal_keeps_its_value_and_a_missing_one_has_none() -> None:
 
 def test_a_failure_after_the_drives_end_is_an_error() -> None:
     late = Failure(kind="missing", signals=("ax",), from_s=9)
-    with pytest.raises(DataError, match="begins at"):
+    with pytest.raises(QuestionError, match="begins at"):
         apply_failure({"ax": np.zeros(3)}, np.arange(3) / 100, late)
 
 

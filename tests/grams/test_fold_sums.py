@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.growth_history import write_fleet, write_grams
 from fleet_slip.catalogue.features import PLAIN
-from fleet_slip.errors import DataError, FleetSlipError
+from fleet_slip.errors import DataError, FleetSlipError, QuestionError
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams import reader as gram_reader
 from fleet_slip.grams.cohort import load_cohort
@@ -125,7 +125,7 @@ def test_sums_of_other_folds_are_refused(fleet: Warehouse) -> None:
 
 
 def test_folds_of_rows_need_a_set_that_made_them(fleet: Warehouse) -> None:
-    with pytest.raises(DataError, match="of whole drives"):
+    with pytest.raises(QuestionError, match="of whole drives"):
         sum_cohort(fleet, Folding(by="row"))
 
 

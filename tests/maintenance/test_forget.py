@@ -14,7 +14,7 @@ import pytest
 import fleet_slip
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.delta import Change
-from fleet_slip.errors import DataError, RefusedError, StorageError
+from fleet_slip.errors import QuestionError, RefusedError, StorageError
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams import job as gram_job
 from fleet_slip.grams.cohort import load_cohort
@@ -123,7 +123,7 @@ def test_the_record_names_nobody_and_can_be_asked(tmp_path: Path) -> None:
     assert audit.state(Forgettable("drive", "beta-1")) == "done"
     assert audit.state(Forgettable("vehicle", "beta-1")) is None
     assert not forget(warehouse, Forgettable("drive", "beta-1"), now=True).drives
-    with pytest.raises(DataError, match="no drive has vehicle_id 'delta'"):
+    with pytest.raises(QuestionError, match="no drive has vehicle_id 'delta'"):
         forget(warehouse, Forgettable("vehicle", "delta"))
 
 

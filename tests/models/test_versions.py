@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from fleet_slip.errors import DataError, RefusedError, StorageError
+from fleet_slip.errors import QuestionError, RefusedError, StorageError
 from fleet_slip.files.documents import Document, DocumentFolder
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.models.aliases import CHAMPION, AliasHistory
@@ -111,14 +111,14 @@ def test_aliases_move_and_go_back(tmp_path: Path) -> None:
 
 def test_unknown_names_versions_and_aliases_say_what_there_is(tmp_path: Path) -> None:
     registry = Registry(LocalFolder(tmp_path))
-    with pytest.raises(DataError, match=r"no model is called 'x'.*publish one with"):
+    with pytest.raises(QuestionError, match=r"no model is called 'x'.*publish one with"):
         registry.resolve("x")
     registry.publish(manifest())
-    with pytest.raises(DataError, match=r"It has: 1\."):
+    with pytest.raises(QuestionError, match=r"It has: 1\."):
         registry.resolve("sideslip@7")
-    with pytest.raises(DataError, match=r"It has: 1, champion\."):
+    with pytest.raises(QuestionError, match=r"It has: 1, champion\."):
         registry.resolve("sideslip@best")
-    with pytest.raises(DataError, match="no model is called"):
+    with pytest.raises(QuestionError, match="no model is called"):
         registry.resolve("../../etc@1")
 
 

@@ -6,7 +6,7 @@ import duckdb
 import numpy as np
 import pytest
 
-from fleet_slip.errors import DataError
+from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.observers.angle import sideslip_angle
 from fleet_slip.observers.signals import DriveSignals, held, read_drive
 
@@ -37,7 +37,7 @@ def test_a_drive_is_read_in_order_with_nan_for_null(database: duckdb.DuckDBPyCon
 
 
 def test_an_unknown_drive_is_refused(database: duckdb.DuckDBPyConnection) -> None:
-    with pytest.raises(DataError, match="no drive is called 'c'"):
+    with pytest.raises(QuestionError, match="no drive is called 'c'"):
         read_drive(database, "c")
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fleet_slip.errors import DataError
+from fleet_slip.errors import QuestionError
 from fleet_slip.regression.crossval import cross_validate, least_squares
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.exact import fit
@@ -103,7 +103,7 @@ def test_inner_cross_validation_needs_folds() -> None:
     assignment = by_value([0, 0, 0, 1, 1, 1])
     folds = CohortFolds.of([table], assignment).serving(INPUTS, "y")
     training = Training(folds, None, unit_scales(5))
-    with pytest.raises(DataError, match="at least three folds"):
+    with pytest.raises(QuestionError, match="at least three folds"):
         cross_validate_selection(
             "x", training, assignment.fold, INPUTS, "y", Rule("t", CROSS_VALIDATION)
         )

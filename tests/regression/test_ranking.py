@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy import integrate, stats
 from sklearn.linear_model import ElasticNet, lars_path_gram
 
-from fleet_slip.errors import DataError
+from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression import criteria
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.evidence import Evidence
@@ -218,12 +218,12 @@ def test_equals_keep_their_declared_order(name: str) -> None:
 def test_ranking_mistakes_are_named() -> None:
     counts = np.concatenate(random_drives(1))
     twin = gram_of(np.column_stack([counts[:, 0], counts[:, [0, -1]]]))
-    with pytest.raises(DataError, match="unknown ranking 'size'"):
+    with pytest.raises(QuestionError, match="unknown ranking 'size'"):
         rank("size", twin, ["x1"], "y")
     for name in set(RANKINGS) - {"declared"}:
         with pytest.raises(DataError, match="x2 is a linear combination of x1"):
             rank(name, twin, ["x1", "x2"], "y")
-    with pytest.raises(DataError, match="unknown criterion"):
+    with pytest.raises(QuestionError, match="unknown criterion"):
         criteria.best_size("aicc", Evidence.naive(nested_fits(gram_of(counts), ["x1"], "y")))
 
 

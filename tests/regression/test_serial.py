@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.errors import DataError
+from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression.disturbance import disturb
 from fleet_slip.regression.exact import fit
 from fleet_slip.regression.figures import error_sums
@@ -136,5 +136,5 @@ def test_bias_alone_is_exact_and_nothing_changes_nothing() -> None:
         model, gram_of(moved), Fraction(gram.sum("y"), gram.n)
     )
     assert disturb(sums, model, scales) == sums
-    with pytest.raises(DataError, match="does not use x2: it uses x1, x3"):
+    with pytest.raises(QuestionError, match="does not use x2: it uses x1, x3"):
         disturb(sums, model, scales, noise={"x2": 1.0})

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from sklearn.linear_model import Ridge
 
-from fleet_slip.errors import DataError
+from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression import pace as pace_module
 from fleet_slip.regression.crossval import Procedure, cross_validate
 from fleet_slip.regression.evidence import Evidence
@@ -105,7 +105,7 @@ def test_errors_in_variables_recovers_the_clean_slope() -> None:
     assert model.weights["x1"] == pytest.approx(0.5, rel=0.02)
     with pytest.raises(DataError, match="positive definite at x1"):
         errors_in_variables(gram, ["x1"], "y", {"x1": 2000.0}, unit_scales(1))
-    with pytest.raises(DataError, match="noise is given for gyro"):
+    with pytest.raises(QuestionError, match="noise is given for gyro"):
         errors_in_variables(gram, ["x1"], "y", {"gyro": 1.0}, unit_scales(1))
 
 
