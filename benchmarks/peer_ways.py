@@ -58,7 +58,7 @@ def _read(paths: list[str]) -> NDArray[np.float64]:
 
 
 def fleet_slip(threads: int) -> Fit:
-    from fleet_slip.grams.job import FILES_PER_QUERY  # noqa: PLC0415
+    from fleet_slip.grams.aggregation import FILES_PER_QUERY  # noqa: PLC0415
     from fleet_slip.grams.statement import gram_statement  # noqa: PLC0415
     from fleet_slip.regression.exact import fit  # noqa: PLC0415
     from fleet_slip.regression.gram import Gram  # noqa: PLC0415

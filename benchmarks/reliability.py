@@ -32,7 +32,8 @@ from fleet_slip.maintenance.audit import Forgettable
 from fleet_slip.maintenance.compaction import compact
 from fleet_slip.maintenance.forget import forget
 from fleet_slip.maintenance.vacuum import vacuum
-from fleet_slip.maintenance.verify import problem_of, verify
+from fleet_slip.maintenance.verify import verify
+from fleet_slip.maintenance.verify_files import problem_of
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.job import simulate_campaign
 from fleet_slip.warehouse.tables import Warehouse

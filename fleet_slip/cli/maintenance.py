@@ -20,7 +20,7 @@ from fleet_slip.maintenance.retention import load_retention
 from fleet_slip.maintenance.retention import retain as apply_retention
 from fleet_slip.maintenance.vacuum import RETENTION_HOURS, VacuumReport
 from fleet_slip.maintenance.vacuum import vacuum as remove_expired
-from fleet_slip.maintenance.verify import Damage, Verification
+from fleet_slip.maintenance.verification import Damage, Verification
 from fleet_slip.maintenance.verify import verify as verify_root
 from fleet_slip.runs.log import step
 from fleet_slip.warehouse.tables import Warehouse

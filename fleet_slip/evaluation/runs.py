@@ -12,7 +12,8 @@ from fleet_slip.evaluation.errors import ErrorFigures, error_figures
 from fleet_slip.evaluation.estimators import Estimate
 from fleet_slip.evaluation.stability import CRITERION, unstable
 from fleet_slip.grams.job import update_grams
-from fleet_slip.simulation.job import Progress, SimulationReport, simulate_batches
+from fleet_slip.progress import Progress, no_progress
+from fleet_slip.simulation.job import SimulationReport, simulate_batches
 from fleet_slip.simulation.scenario import Scenario
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.warehouse.tables import Warehouse
@@ -58,7 +59,7 @@ def simulate_scenarios(
     warehouse: Warehouse,
     scenarios: Sequence[Scenario],
     executor: Executor,
-    progress: Progress = lambda _rows, _all: None,
+    progress: Progress = no_progress,
 ) -> SimulationReport:
     """Write the drives that are not in the logs yet, and bring the Gram rows up to date.
 

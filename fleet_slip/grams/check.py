@@ -1,7 +1,7 @@
 """Checks the Gram rows against two other ways to compute them, bit for bit."""
 
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -13,7 +13,8 @@ import pyarrow.compute as pc
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.delta import TableFile
 from fleet_slip.errors import DataError, StorageError
-from fleet_slip.grams.job import aggregate
+from fleet_slip.grams.aggregation import aggregate
+from fleet_slip.progress import Progress, no_progress
 from fleet_slip.regression.gram import Gram
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -34,7 +35,7 @@ class CheckReport:
 def check_grams(
     warehouse: Warehouse,
     count: int,
-    progress: Callable[[int, int], None] = lambda _more, _all: None,
+    progress: Progress = no_progress,
 ) -> CheckReport:
     """Check the Gram rows of evenly chosen log files.
 

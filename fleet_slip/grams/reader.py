@@ -12,7 +12,7 @@ import pyarrow as pa
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.delta.table import Snapshot, Table
 from fleet_slip.errors import DataError
-from fleet_slip.grams.job import find_backlog
+from fleet_slip.grams.backlog import find_backlog
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.database import database_errors
 from fleet_slip.warehouse.read_only_sql import one_query

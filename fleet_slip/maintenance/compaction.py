@@ -4,20 +4,18 @@ The Gram rows follow by the reconciliation of the Gram job, which reads the new 
 the time that writing them took. Until then those of the old files stand, of the same drives.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from datetime import date
 
 from fleet_slip.delta import Change, Snapshot, TableFile, retry_conflicts
 from fleet_slip.grams.job import reconcile
 from fleet_slip.maintenance.rewriting import read_drives
+from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.tables import Warehouse
 
 TARGET_ROWS = 2_000_000
 """Rows of a compacted file or fewer. A file of more than half of it is left alone."""
-
-Progress = Callable[[int, int], None]
-"""Called with days done since the last call, and days in all."""
 
 
 @dataclass(frozen=True)
@@ -41,12 +39,12 @@ class CompactionReport:
 def compact(
     warehouse: Warehouse,
     target_rows: int = TARGET_ROWS,
-    progress: Progress = lambda _more, _all: None,
+    progress: Progress = no_progress,
 ) -> CompactionReport:
     """Compact every day, in a commit each, and bring the Gram rows up to date.
 
-    Running it again does nothing. Raises `StorageError`, or `ConflictError` if other processes keep
-    changing the same files.
+    Running it again does nothing. `progress` counts days. Raises `StorageError`, or `ConflictError`
+    if other processes keep changing the same files.
     """
     warehouse.require()
     before = warehouse.logs.snapshot()

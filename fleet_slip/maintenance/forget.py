@@ -6,7 +6,7 @@ in one commit; the Gram rows follow by reconciliation. `fleet_slip/maintenance/a
 record of it.
 """
 
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import pyarrow as pa
@@ -21,13 +21,11 @@ from fleet_slip.maintenance.old_files import quarantined_of, remove_old_files
 from fleet_slip.maintenance.rewriting import read_drives
 from fleet_slip.models.manifest import TrainedOn
 from fleet_slip.models.versions import Registry
+from fleet_slip.progress import Progress, no_progress
 from fleet_slip.views import connect
 from fleet_slip.warehouse.database import database_errors
 from fleet_slip.warehouse.read_only_sql import one_query
 from fleet_slip.warehouse.tables import Warehouse
-
-Progress = Callable[[int, int], None]
-"""Called with files rewritten since the last call, and files to rewrite in all."""
 
 
 @dataclass(frozen=True)
@@ -56,12 +54,12 @@ def forget(
     subject: Forgettable,
     *,
     now: bool = False,
-    progress: Progress = lambda _more, _all: None,
+    progress: Progress = no_progress,
 ) -> ForgetReport:
     """Forget drives; with `now`, delete the replaced files at once instead of by `vacuum`.
 
-    It can be repeated after any interruption. Raises `QuestionError` if there never was such a
-    drive, `StorageError`, or `ConflictError`.
+    It can be repeated after any interruption. `progress` counts files to rewrite. Raises
+    `DataError` if there never was such a drive, `StorageError`, or `ConflictError`.
     """
     audit = Audit(warehouse.root)
     located = locate(warehouse.grams.snapshot(), subject)

@@ -16,7 +16,7 @@ A migration that was killed is run again; until step 3 nothing of the old data i
 
 import contextlib
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
@@ -36,10 +36,8 @@ from fleet_slip.delta.sealing import NOTE, sealed
 from fleet_slip.errors import ConflictError, RefusedError, StorageError
 from fleet_slip.files.storage_errors import storage_errors
 from fleet_slip.maintenance.rewriting import read_drives
+from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.tables import Warehouse
-
-Progress = Callable[[int, int], None]
-"""Called with rows rewritten since the last call, and rows in all."""
 
 
 @dataclass(frozen=True)
@@ -59,12 +57,12 @@ class MigrationReport:
         return bool(self.added or self.rescaled)
 
 
-def migrate(warehouse: Warehouse, progress: Progress = lambda _more, _all: None) -> MigrationReport:
+def migrate(warehouse: Warehouse, progress: Progress = no_progress) -> MigrationReport:
     """Make the logs agree with the catalogue. Running it again does nothing.
 
-    Raises `RefusedError` if counts would not fit int16 in a new scale: then nothing is changed but
-    the announcement, which a migration back to the old catalogue takes away. Raises
-    `ConflictError` if another process changed the table at the same moment.
+    `progress` counts rows. Raises `RefusedError` if counts would not fit int16 in a new scale: then
+    nothing is changed but the announcement, which a migration back to the old catalogue takes away.
+    Raises `ConflictError` if another process changed the table at the same moment.
     """
     warehouse.require()
     _add_columns_that_came_later(warehouse.quarantine)

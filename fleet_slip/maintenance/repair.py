@@ -21,7 +21,8 @@ from fleet_slip.delta.checkpoints import (
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.files.storage_errors import storage_errors
 from fleet_slip.grams.job import reconcile
-from fleet_slip.maintenance.verify import Verification, problem_of
+from fleet_slip.maintenance.verification import Verification
+from fleet_slip.maintenance.verify_files import problem_of
 from fleet_slip.resources import config_names
 from fleet_slip.simulation.campaign import Batch, Campaign, DriveSpec, load_campaign
 from fleet_slip.simulation.drives import simulate_batch

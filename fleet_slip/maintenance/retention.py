@@ -1,6 +1,5 @@
 """How long data is kept: `configs/retention.toml`, or a file of the user's own."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import date, timedelta
 
@@ -11,10 +10,9 @@ from fleet_slip.errors import ConfigError, RefusedError
 from fleet_slip.maintenance.audit import Forgettable
 from fleet_slip.maintenance.forget import ForgetReport, forget
 from fleet_slip.maintenance.vacuum import RETENTION_HOURS, VacuumReport, vacuum
+from fleet_slip.progress import Progress, no_progress
 from fleet_slip.resources import find_config, folder
 from fleet_slip.warehouse.tables import Warehouse
-
-Progress = Callable[[int, int], None]
 
 
 class Retention(Config):
@@ -43,11 +41,12 @@ def retain(
     warehouse: Warehouse,
     retention: Retention,
     today: date,
-    progress: Progress = lambda _more, _all: None,
+    progress: Progress = no_progress,
 ) -> RetentionReport:
     """Forget the drives that are older than retention says, then vacuum.
 
-    Raises `RefusedError` if not one drive would be left, as with a clock that is wrong.
+    `progress` counts files to rewrite. Raises `RefusedError` if not one drive would be left, as
+    with a clock that is wrong.
     """
     warehouse.require()
     try:

@@ -5,7 +5,7 @@ interrupted job goes on with the batches that have not landed.
 """
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from datetime import date
@@ -17,12 +17,10 @@ from deltalake.transaction import AddAction
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.delta import Change, Snapshot, Unit, retry_conflicts
 from fleet_slip.errors import RefusedError
+from fleet_slip.progress import Progress, no_progress
 from fleet_slip.simulation.campaign import Batch, Campaign
 from fleet_slip.simulation.drives import simulate_batch
 from fleet_slip.warehouse.tables import Warehouse
-
-Progress = Callable[[int, int], None]
-"""Called with rows landed since the last call, and rows expected in all."""
 
 
 @dataclass
@@ -82,7 +80,7 @@ def simulate_campaign(
     campaign: Campaign,
     days: Iterable[date],
     executor: Executor,
-    progress: Progress = lambda _rows, _all: None,
+    progress: Progress = no_progress,
 ) -> SimulationReport:
     """Simulate what has not landed of the given days of a campaign, and land each batch.
 
@@ -137,7 +135,7 @@ def simulate_batches(
     warehouse: Warehouse,
     batches: Sequence[Batch],
     executor: Executor,
-    progress: Progress = lambda _rows, _all: None,
+    progress: Progress = no_progress,
 ) -> SimulationReport:
     """Simulate the batches that have not landed, and land each.
 

@@ -16,7 +16,8 @@ from fleet_slip.catalogue import features as features_module
 from fleet_slip.catalogue.features import features, lag_signals, load_features, with_features
 from fleet_slip.catalogue.signals import COUNT_MAX, catalogue
 from fleet_slip.delta import Change, Unit
-from fleet_slip.errors import ConfigError, DataError, QuestionError
+from fleet_slip.errors import ConfigError, DataError
+from fleet_slip.grams import aggregation
 from fleet_slip.grams import job as gram_job
 from fleet_slip.grams import statement as gram_statement
 from fleet_slip.grams.cohort import load_cohort
@@ -177,7 +178,7 @@ def test_a_changed_definition_never_mixes_with_the_old_rows(
     changed = load_features(tmp_path / "features.toml")
     assert changed.identity("motion") != before.identity("motion")
     assert changed.identity("lags") == before.identity("lags")
-    for module in (features_module, gram_job, gram_statement):
+    for module in (features_module, aggregation, gram_job, gram_statement):
         monkeypatch.setattr(module, "features", lambda: changed)
     assert update_grams(warehouse, feature_set="motion").rows_read == 300
     rows = pa.concat_tables(

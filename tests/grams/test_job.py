@@ -13,13 +13,11 @@ from hypothesis import strategies as st
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.delta import Change, Unit
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams import job as gram_job
+from fleet_slip.grams import gram_files
+from fleet_slip.grams.aggregation import aggregate
+from fleet_slip.grams.backlog import find_backlog
 from fleet_slip.grams.check import check_grams, grams_of
-from fleet_slip.grams.job import (
-    aggregate,
-    find_backlog,
-    update_grams,
-)
+from fleet_slip.grams.job import update_grams
 from fleet_slip.grams.statement import gram_statement
 from fleet_slip.warehouse.tables import Warehouse
 from tests.conftest import DAY, land, log_rows, random_counts
@@ -123,7 +121,7 @@ def test_many_small_gram_files_are_merged_without_changing_a_row(
     warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     most = 8
-    monkeypatch.setattr(gram_job, "SMALL_FILES_MAX", most)
+    monkeypatch.setattr(gram_files, "SMALL_FILES_MAX", most)
     rng = np.random.default_rng(4)
     for number in range(most + 2):
         land(warehouse, f"f{number}", log_rows(f"d{number}", random_counts(rng, 3)))
@@ -136,8 +134,8 @@ def test_many_small_gram_files_are_merged_without_changing_a_row(
 def test_merging_and_rewriting_take_few_rows_at_a_time(
     warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(gram_job, "FILE_ROWS", 5)
-    monkeypatch.setattr(gram_job, "SMALL_FILES_MAX", 4)
+    monkeypatch.setattr(gram_files, "FILE_ROWS", 5)
+    monkeypatch.setattr(gram_files, "SMALL_FILES_MAX", 4)
     rng = np.random.default_rng(6)
     for number in range(9):
         drives = [log_rows(f"d{number}-{i}", random_counts(rng, 3)) for i in range(3)]

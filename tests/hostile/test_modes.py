@@ -10,6 +10,7 @@ import pytest
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.job import update_grams
 from fleet_slip.models.versions import Registry
+from fleet_slip.progress import no_progress
 from fleet_slip.warehouse.tables import Warehouse
 from tests.conftest import land, log_rows, path_of, random_counts
 from tests.models.test_versions import manifest
@@ -21,7 +22,7 @@ def test_nobody_gets_more_rights_than_the_umask_gives(tmp_path: Path, umask: int
     try:
         warehouse = Warehouse(LocalFolder(tmp_path / "data"))
         land(warehouse, "one", log_rows("d", random_counts(np.random.default_rng(1), 20)))
-        update_grams(warehouse, lambda _more, _total: None)
+        update_grams(warehouse, no_progress)
         Registry(warehouse.root / "models").publish(manifest())
     finally:
         os.umask(old)

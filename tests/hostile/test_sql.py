@@ -18,6 +18,7 @@ from fleet_slip.errors import FleetSlipError, QuestionError, StorageError
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.job import update_grams
+from fleet_slip.progress import no_progress
 from fleet_slip.views import connect
 from fleet_slip.warehouse.database import database_errors, interruptible
 from fleet_slip.warehouse.read_only_sql import one_query
@@ -31,7 +32,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     warehouse = Warehouse(LocalFolder(tmp_path_factory.mktemp("sql") / "data"))
     rng = np.random.default_rng(1)
     land(warehouse, "one", *(log_rows(f"d{i}", random_counts(rng, 50)) for i in range(2)))
-    update_grams(warehouse, lambda _more, _total: None)
+    update_grams(warehouse, no_progress)
     return path_of(warehouse.root)
 
 

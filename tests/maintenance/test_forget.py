@@ -17,8 +17,9 @@ from fleet_slip.delta import Change
 from fleet_slip.errors import QuestionError, RefusedError, StorageError
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams import job as gram_job
+from fleet_slip.grams.aggregation import aggregate
 from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.grams.job import aggregate, update_grams
+from fleet_slip.grams.job import update_grams
 from fleet_slip.ingest.job import ingest_file
 from fleet_slip.maintenance.audit import Audit, Forgettable
 from fleet_slip.maintenance.compaction import compact

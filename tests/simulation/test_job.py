@@ -9,6 +9,7 @@ import pytest
 
 from fleet_slip.errors import RefusedError
 from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.progress import no_progress
 from fleet_slip.simulation.campaign import Batch, Campaign, load_campaign
 from fleet_slip.simulation.job import SimulationReport, simulate_batches, simulate_campaign
 from fleet_slip.warehouse.tables import Warehouse
@@ -60,32 +61,32 @@ def test_a_changed_campaign_is_refused_before_anything_is_written(tmp_path: Path
         simulate_campaign(Warehouse(LocalFolder(tmp_path)), campaign(), late, executor)
     before = Warehouse(LocalFolder(tmp_path)).logs.snapshot()
     with pytest.raises(RefusedError, match="was changed"):
-        run(tmp_path, campaign(seed=77), lambda _rows, _all: None)
+        run(tmp_path, campaign(seed=77), no_progress)
     after = Warehouse(LocalFolder(tmp_path)).logs.snapshot()
     assert (after.version, after.rows) == (before.version, before.rows)
 
 
 def test_the_report_says_where_the_time_went(tmp_path: Path) -> None:
-    report = run(tmp_path, campaign(), lambda _rows, _all: None)
+    report = run(tmp_path, campaign(), no_progress)
     seconds = report.seconds
     assert min(seconds.simulate, seconds.encode, seconds.write, seconds.commit) > 0
     assert seconds.tasks == seconds.simulate + seconds.encode + seconds.write
     assert seconds.commit < seconds.elapsed
     assert seconds.tasks < 2 * seconds.elapsed
-    again = run(tmp_path, campaign(), lambda _rows, _all: None)
+    again = run(tmp_path, campaign(), no_progress)
     assert (again.rows, again.days_present, again.seconds.tasks) == (0, DAYS, 0)
 
 
 def test_a_complete_day_is_never_planned_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run(tmp_path, campaign(), lambda _rows, _all: None)
+    run(tmp_path, campaign(), no_progress)
     before = Warehouse(LocalFolder(tmp_path)).logs.snapshot()
     monkeypatch.setattr(type(campaign()), "batches", None)
-    again = run(tmp_path, campaign(), lambda _rows, _all: None)
+    again = run(tmp_path, campaign(), no_progress)
     assert (again.days_present, again.logs_version) == (DAYS, before.version)
     with pytest.raises(RefusedError, match="was changed"):
-        run(tmp_path, campaign(seed=77), lambda _rows, _all: None)
+        run(tmp_path, campaign(seed=77), no_progress)
 
 
 def test_days_that_landed_before_they_were_recorded_are_recorded(tmp_path: Path) -> None:
@@ -93,7 +94,7 @@ def test_days_that_landed_before_they_were_recorded_are_recorded(tmp_path: Path)
     batches = [batch for day in campaign().days() for batch in campaign().batches(day)]
     with ThreadPoolExecutor(2) as executor:
         simulate_batches(warehouse, batches, executor)
-    found = [run(tmp_path, campaign(), lambda _rows, _all: None) for _ in range(2)]
+    found = [run(tmp_path, campaign(), no_progress) for _ in range(2)]
     assert [report.rows for report in found] == [0, 0]
     assert [report.days_present for report in found] == [0, DAYS]
     assert found[0].logs_version == found[1].logs_version

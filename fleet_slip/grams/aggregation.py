@@ -1,0 +1,102 @@
+"""Runs `jobs/gram.sql` over log files: in this process, or as tasks of an executor."""
+
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from functools import partial
+from math import ceil
+
+import duckdb
+import pyarrow as pa
+
+from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.compute.tasks import in_flight, run_tasks
+from fleet_slip.delta import (
+    TableFile,
+    absent_columns,
+)
+from fleet_slip.grams.statement import gram_statement
+from fleet_slip.progress import Progress, no_progress
+from fleet_slip.warehouse.database import database_errors, open_database
+from fleet_slip.warehouse.tables import Warehouse
+
+FILES_PER_QUERY = 16
+"""Planning 77 aggregates costs 20 ms, so that one query takes many files."""
+
+LAGGED_FILES_PER_QUERY = 2
+"""Rows are sorted to find the one before, which takes memory for all rows of a query."""
+
+
+def aggregate(
+    warehouse: Warehouse,
+    files: Sequence[TableFile],
+    progress: Progress = no_progress,
+    threads: int | None = None,
+    feature_set: str = PLAIN,
+    executor: Executor | None = None,
+) -> pa.Table:
+    """Return the Gram rows of log files, in the schema of `grams`, sorted by file and drive.
+
+    The query runs in this process, on all of its cores unless `threads` says how many; or, with an
+    executor of other processes, as tasks of some files and one thread each.
+    """
+    lagged = features().feature_set(feature_set).lagged
+    step = LAGGED_FILES_PER_QUERY if lagged else FILES_PER_QUERY
+    total = sum(file.rows for file in files)
+    parts = [warehouse.grams.schema.empty_table()]
+    if executor is None:
+        with open_database(reading=warehouse.logs.folder, threads=threads) as database:
+            for group in _groups(files, step):
+                parts.append(_query(database, warehouse, group, feature_set))
+                progress(sum(file.rows for file in group), total)
+        return pa.concat_tables(parts)
+    groups = _groups(files, min(step, max(1, ceil(len(files) / in_flight(executor)))))
+    task = partial(_aggregate_group, warehouse, feature_set)
+    done: dict[str, pa.Table] = {}
+    for group, rows in run_tasks(executor, task, groups, _group_name):
+        done[group[0].path] = rows
+        progress(sum(file.rows for file in group), total)
+    return pa.concat_tables([*parts, *(done[group[0].path] for group in groups)])
+
+
+def _groups(files: Sequence[TableFile], step: int) -> list[Sequence[TableFile]]:
+    return [files[first : first + step] for first in range(0, len(files), step)]
+
+
+def _group_name(group: Sequence[TableFile]) -> str:
+    return f"the Gram rows of {len(group)} log files from {group[0].path}"
+
+
+def _aggregate_group(
+    warehouse: Warehouse, feature_set: str, files: Sequence[TableFile]
+) -> pa.Table:
+    with open_database(reading=warehouse.logs.folder, threads=1) as database:
+        return _query(database, warehouse, files, feature_set)
+
+
+def _query(
+    database: duckdb.DuckDBPyConnection,
+    warehouse: Warehouse,
+    files: Sequence[TableFile],
+    feature_set: str,
+) -> pa.Table:
+    paths = {warehouse.logs.uri(file.path): file.path for file in files}
+    whole = feature_set == PLAIN and _signals_are_whole(warehouse, files)
+    absent = absent_columns(files, warehouse.catalogue.signals)
+    statement = gram_statement(warehouse.catalogue, feature_set, whole=whole, absent=absent)
+    identity = features().identity(feature_set)
+    with database_errors(f"the Gram query over {len(files)} log files in {warehouse.logs.folder}"):
+        database.execute("SET VARIABLE log_files = $files", {"files": list(paths)})
+        rows = database.sql(statement, params={"feature_set": identity}).to_arrow_table()
+    relative = pa.array([paths[path] for path in rows["file"].to_pylist()], pa.string())
+    return rows.set_column(rows.schema.get_field_index("file"), "file", relative).cast(
+        warehouse.grams.schema
+    )
+
+
+def _signals_are_whole(warehouse: Warehouse, files: Sequence[TableFile]) -> bool:
+    """Whether each signal is in all rows of a file or in none, by the Delta log's statistics."""
+    return all(
+        file.null_counts.get(signal, file.rows) in (0, file.rows)
+        for file in files
+        for signal in warehouse.catalogue.gram_signals
+    )

@@ -1,0 +1,104 @@
+"""Compares data files with the checksums in their names, byte for byte, and with the Delta log."""
+
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+from functools import partial
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from fleet_slip.compute.tasks import LocalThreads, run_tasks
+from fleet_slip.delta import Snapshot, Table, TableFile, checksum_in, checksum_of
+from fleet_slip.errors import FleetSlipError
+from fleet_slip.files.storage_errors import storage_errors
+from fleet_slip.maintenance.verification import Damage, Verification
+from fleet_slip.progress import Progress
+
+TASK_BYTES = 2**27
+
+TASK_FILES = 64
+"""A task reads about so many bytes, or so many files."""
+
+
+def verify_files(
+    snapshot: Snapshot, report: Verification, progress: Progress, executor: Executor | None
+) -> list[TableFile]:
+    """Return the files of a table that are what they must be."""
+    table = snapshot.table
+    problems: dict[str, str | None] = {}
+    with LocalThreads(os.cpu_count() or 1) as threads:
+        groups = _groups(snapshot.files)
+        task = partial(_problems_of, table)
+        for group, found in run_tasks(executor or threads, task, groups, _group_name):
+            problems |= found
+            progress(sum(file.size_bytes for file in group), snapshot.size_bytes)
+    for path, problem in sorted(problems.items()):
+        if problem:
+            report.findings.append(Damage("file", f"{table.folder.name}/{path}", problem))
+    report.files += len(snapshot.files)
+    report.size_bytes += snapshot.size_bytes
+    report.rows += snapshot.rows if table.folder.name == "logs" else 0
+    return [file for file in snapshot.files if not problems[file.path]]
+
+
+def _groups(files: Sequence[TableFile]) -> Iterator[tuple[TableFile, ...]]:
+    """Divide files into groups that each take a task about a second."""
+    group: tuple[TableFile, ...] = ()
+    for file in files:
+        group = (*group, file)
+        if sum(one.size_bytes for one in group) >= TASK_BYTES or len(group) == TASK_FILES:
+            yield group
+            group = ()
+    if group:
+        yield group
+
+
+def _group_name(group: Sequence[TableFile]) -> str:
+    return f"the bytes of {len(group)} files from {group[0].path}"
+
+
+def _problems_of(table: Table, files: Sequence[TableFile]) -> dict[str, str | None]:
+    return {file.path: problem_of(table, file) for file in files}
+
+
+def problem_of(table: Table, file: TableFile) -> str | None:
+    """Return what is wrong with a data file, or None."""
+    path = f"{table.folder}/{file.path}"
+    try:
+        content = table.folder.read(file.path)
+        if len(content) != file.size_bytes:
+            return f"has {len(content):,} bytes instead of {file.size_bytes:,}"
+        expected = checksum_in(file.path)
+        if expected and checksum_of(content) != expected:
+            return "its bytes do not match the checksum in its name"
+        with storage_errors(path):
+            metadata = pq.read_metadata(pa.BufferReader(content))
+    except FleetSlipError as error:
+        return str(error).removeprefix(f"{path}: ")
+    return _contradiction(file, metadata)
+
+
+def _contradiction(file: TableFile, metadata: pq.FileMetaData) -> str | None:
+    """Return in what a file's footer and the Delta log differ, or None."""
+    if metadata.num_rows != file.rows:
+        return f"has {metadata.num_rows:,} rows, the Delta log says {file.rows:,}"
+    if (nulls := _null_counts(metadata)).items() - file.null_counts.items():
+        wrong = [name for name, count in nulls.items() if file.null_counts.get(name) != count]
+        return f"the Delta log states other numbers of nulls of {', '.join(wrong)}"
+    if file.day and not file.path.startswith(f"day={file.day}/"):
+        return f"the Delta log says that it is of {file.day}"
+    return None
+
+
+def _null_counts(metadata: pq.FileMetaData) -> dict[str, int]:
+    """Return the number of nulls of each plain column, from the file's own statistics."""
+    counts: dict[str, int] = {}
+    for group in range(metadata.num_row_groups):
+        for number in range(metadata.num_columns):
+            column = metadata.row_group(group).column(number)
+            statistics = column.statistics
+            if "." not in column.path_in_schema and statistics and statistics.has_null_count:
+                name = column.path_in_schema
+                counts[name] = counts.get(name, 0) + statistics.null_count
+    return counts

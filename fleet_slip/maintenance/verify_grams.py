@@ -1,0 +1,90 @@
+"""Looks for drives that are not whole, and for Gram rows that are not those of their logs."""
+
+from collections.abc import Collection, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import partial
+
+from fleet_slip.compute.tasks import run_tasks
+from fleet_slip.delta import TableFile
+from fleet_slip.grams.check import DriveGrams, grams_by_blocks, read_counts, stored_grams
+from fleet_slip.maintenance.verification import Damage, Verification
+from fleet_slip.resources import read_sql
+from fleet_slip.warehouse.database import database_errors, open_database
+from fleet_slip.warehouse.tables import Warehouse
+
+SAMPLE = 4
+"""Log files whose Gram rows are computed again, evenly chosen, unless all are asked for."""
+
+
+def verify_drives(warehouse: Warehouse, files: Sequence[TableFile], report: Verification) -> None:
+    """Look for drives that are not whole, or stand in several files."""
+    paths = [warehouse.logs.uri(file.path) for file in files]
+    database = open_database(reading=warehouse.logs.folder)
+    with database, database_errors("verifying the drives"):
+        database.execute("SET VARIABLE log_files = $files", {"files": paths})
+        rows = database.execute(read_sql("jobs", "verify_drives.sql")).fetchall()
+    for drive, in_files, beginnings, n, file in rows:
+        problem = f"{n:,} rows in {in_files} files with {beginnings} rows of tick 0; one is {file}"
+        report.findings.append(Damage("drive", drive, problem))
+
+
+@dataclass(frozen=True)
+class SoundFiles:
+    """The files of a data root whose bytes are what they must be, and what the logs consist of."""
+
+    logs: Sequence[TableFile]
+    grams: Sequence[TableFile]
+    active: Collection[str]
+    """Paths of all active log files, sound or not."""
+
+
+def verify_grams(
+    warehouse: Warehouse,
+    sound: SoundFiles,
+    report: Verification,
+    full: bool,
+    executor: Executor | None,
+) -> None:
+    """Look for Gram rows that stand twice, are not those of their rows, are missing or left over.
+
+    Gram rows of `SAMPLE` log files are computed again; with `full`, those of all.
+    """
+    _verify_unique(warehouse, sound.grams, report)
+    stored = stored_grams(warehouse, sound.grams)
+    covered = [file for file in sound.logs if file.path in stored]
+    step = 1 if full else max(1, len(covered) // SAMPLE)
+    task = partial(_compute_grams, warehouse)
+    for file, computed in run_tasks(executor, task, covered[::step], _name_task):
+        for drive in _differing_drives(stored[file.path], computed):
+            problem = f"the stored Gram row of drive {drive} is not that of its rows"
+            report.findings.append(Damage("gram", f"logs/{file.path}", problem))
+        report.log_files_recomputed += 1
+    missing = len(sound.logs) - len(covered)
+    stale = stored.keys() - set(sound.active)
+    if missing or stale:
+        problem = f"{missing} log files have no Gram rows, {len(stale)} with Gram rows are gone"
+        report.findings.append(Damage("backlog", "grams", f"{problem}; run: fleet-slip gram"))
+
+
+def _verify_unique(warehouse: Warehouse, grams: Sequence[TableFile], report: Verification) -> None:
+    paths = [warehouse.grams.uri(file.path) for file in grams]
+    database = open_database(reading=warehouse.grams.folder)
+    with database, database_errors("verifying the Gram rows"):
+        database.execute("SET VARIABLE gram_files = $files", {"files": paths})
+        twice = database.execute(read_sql("jobs", "verify_grams.sql")).fetchall()
+    for identity, file, drive, n in twice:
+        problem = f"the Gram row {identity} of drive {drive} stands {n} times"
+        report.findings.append(Damage("gram", f"logs/{file}", problem))
+
+
+def _compute_grams(warehouse: Warehouse, file: TableFile) -> DriveGrams:
+    return grams_by_blocks(warehouse, read_counts(warehouse, file))
+
+
+def _name_task(file: TableFile) -> str:
+    return f"the Gram rows of {file.path}"
+
+
+def _differing_drives(one: DriveGrams, two: DriveGrams) -> list[str]:
+    return sorted({key[0] for key in one.keys() | two.keys() if one.get(key) != two.get(key)})
