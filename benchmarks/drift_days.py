@@ -22,7 +22,8 @@ from fleet_slip.monitoring.monitor import Limits
 from fleet_slip.monitoring.thresholds import thresholds
 from fleet_slip.regression.exact import LinearModel, fit
 from fleet_slip.regression.figures import error_sums
-from fleet_slip.regression.gram import Gram, GramTable
+from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.gram_table import GramTable
 from fleet_slip.warehouse.tables import Warehouse
 
 WHEELS = ("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")

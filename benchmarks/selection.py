@@ -16,10 +16,10 @@ import numpy as np
 import pyarrow as pa
 
 from benchmarks.statistics import Fleet, simulate
+from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.delta import Change
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.regression.gram import IntArray
 from fleet_slip.selection.request import SelectionPlan, run_plan
 from fleet_slip.warehouse.tables import Warehouse
 

@@ -21,7 +21,7 @@ from fleet_slip.regression.crossval import cross_validate_inputs
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.exact import correlation_matrix, fit
 from fleet_slip.regression.folds import CohortFolds, by_hash
-from fleet_slip.regression.gram import GramTable
+from fleet_slip.regression.gram_table import GramTable
 from fleet_slip.regression.inference import cluster
 from fleet_slip.regression.nested_choice import (
     Rule,

@@ -11,6 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
+from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.cohort import load_cohort
@@ -20,7 +21,6 @@ from fleet_slip.regression.drives import DriveMoments, serving_drives
 from fleet_slip.regression.evidence import Evidence
 from fleet_slip.regression.exact import correlation_matrix, fit
 from fleet_slip.regression.folds import CohortFolds, by_hash
-from fleet_slip.regression.gram import IntArray
 from fleet_slip.regression.inference import classical, cluster
 from fleet_slip.regression.nested import nested_fits
 from fleet_slip.regression.nested_choice import (

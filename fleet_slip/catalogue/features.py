@@ -4,7 +4,6 @@ A feature is an integer function of the counts of one row. A feature set is the 
 of Gram row, and how a drive's rows are divided into several Gram rows, if they are.
 """
 
-import hashlib
 import re
 from collections.abc import Mapping, Sequence
 from decimal import Decimal
@@ -15,10 +14,10 @@ from itertools import pairwise
 
 from pydantic import Field, model_validator
 
+from fleet_slip.canonical import canonical_json, sha256_of
 from fleet_slip.catalogue.signals import COUNT_MAX, Identifier, Signal, SIUnit, catalogue
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import QuestionError
-from fleet_slip.files.documents import canonical_json
 from fleet_slip.resources import folder
 
 PLAIN = "signals"
@@ -209,7 +208,7 @@ class FeatureCatalogue(Config):
             "row_folds": one.row_folds,
             "lagged": one.lagged,
         }
-        digest = hashlib.sha256(canonical_json(content).encode()).hexdigest()
+        digest = sha256_of(canonical_json(content))
         return f"{name}-{digest[:12]}"
 
     def name_of(self, identity: str) -> str:

@@ -95,13 +95,20 @@ def _read(snapshot: Snapshot, name: str) -> _Commit:
 
 def _problem(commit: _Commit, must_be_sealed: bool) -> str | None:
     stated = commit.note.get(SEAL)
-    if stated is not None and stated != seal(commit.note, commit.sealed_actions):
+    if stated is not None and not _has_seal(commit, stated):
         return "its content does not match the checksum that it states"
     if stated is None and must_be_sealed and commit.sealed_actions:
         return "states no checksum, although earlier commits do: damage, or another program's"
     if _number(commit.name) == 0 and not _made_as_stated(commit):
         return "states in two ways what the table is"
     return None
+
+
+def _has_seal(commit: _Commit, stated: Any) -> bool:
+    try:
+        return bool(stated == seal(commit.note, commit.sealed_actions))
+    except ValueError:  # a number that is none, which only damage puts there
+        return False
 
 
 def _made_as_stated(commit: _Commit) -> bool:

@@ -13,6 +13,8 @@ from typing import Any
 
 from deltalake.transaction import AddAction, RemoveAction
 
+from fleet_slip.canonical import canonical_json
+
 NOTE = "fleet_slip"
 """Key of the note in a commit's own metadata."""
 
@@ -37,8 +39,8 @@ def sealed(
 def seal(note: Mapping[str, Any], actions: Sequence[Action]) -> str:
     """Return the checksum of a note and of actions as the log has them, in any order."""
     rest = {key: value for key, value in note.items() if key != SEAL}
-    texts = [_canonical({k: _stated(k, v) for k, v in action.items()}) for action in actions]
-    text = "\n".join([_canonical(rest), *sorted(texts)])
+    texts = [canonical_json({k: _stated(k, v) for k, v in action.items()}) for action in actions]
+    text = "\n".join([canonical_json(rest), *sorted(texts)])
     return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
 
 
@@ -73,7 +75,3 @@ def _stated(kind: str, content: Any) -> Any:
         return content
     added = {"extendedFileMetadata"} if kind == "remove" else set()
     return {k: v for k, v in content.items() if v is not None and k not in added}
-
-
-def _canonical(content: Mapping[str, Any]) -> str:
-    return json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=False)

@@ -7,8 +7,8 @@ from functools import cached_property
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from numpy.typing import NDArray
 
+from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import SCENARIO
 from fleet_slip.errors import DataError, QuestionError
@@ -18,9 +18,6 @@ from fleet_slip.simulation.sensors import GPS_SIGNALS
 from fleet_slip.views import connect
 from fleet_slip.warehouse.database import database_errors
 from fleet_slip.warehouse.tables import Warehouse
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 SLOWEST_MPS = 2.0
 """Speed below which a side-slip angle is not evaluated: at standstill there is none."""

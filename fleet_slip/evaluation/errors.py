@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from fleet_slip.evaluation.drives import BoolArray, FloatArray
+from fleet_slip.arrays import BoolArray, FloatArray
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError
-from fleet_slip.evaluation.drives import FloatArray
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.versions import ModelVersion

@@ -5,8 +5,8 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.evaluation.comparison import FleetComparison, compare
-from fleet_slip.evaluation.drives import FloatArray
 from fleet_slip.evaluation.estimators import Estimate, Signals, TrainedModels, train_models
 from fleet_slip.evaluation.filters import filter_bank
 from fleet_slip.evaluation.results import document

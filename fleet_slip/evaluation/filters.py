@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.config import Config
-from fleet_slip.evaluation.drives import FloatArray
 from fleet_slip.evaluation.estimators import Estimate, Signals
 from fleet_slip.files.documents import DocumentFolder
 from fleet_slip.grams.cohort import Cohort

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.evaluation.drives import BoolArray, EvaluatedDrive, FloatArray, load_drives
+from fleet_slip.evaluation.drives import EvaluatedDrive, load_drives
 from fleet_slip.evaluation.errors import ErrorFigures, error_figures
 from fleet_slip.evaluation.estimators import Estimate
 from fleet_slip.evaluation.stability import CRITERION, unstable

@@ -15,7 +15,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from fleet_slip.evaluation.drives import BoolArray, EvaluatedDrive, FloatArray
+from fleet_slip.arrays import BoolArray, FloatArray
+from fleet_slip.evaluation.drives import EvaluatedDrive
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.vehicle.parameters import VehicleParameters, constants
 from fleet_slip.vehicle.tyre import brush_force

@@ -5,13 +5,13 @@ that number first. So numbers are consecutive, no document is ever half there, n
 what is decided by the newest document can be added right after it or not at all.
 """
 
-import hashlib
 import json
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from fleet_slip.canonical import canonical_json, sha256_of
 from fleet_slip.errors import ConflictError, StorageError
 from fleet_slip.files.folder import Folder
 
@@ -25,16 +25,9 @@ MAX_DIGITS = 9
 _NUMBER = re.compile(rf"([1-9][0-9]{{0,{MAX_DIGITS - 1}}})\.json")
 
 
-def canonical_json(content: Mapping[str, Any]) -> str:
-    """Return the one text of a JSON document that its checksum is taken from."""
-    return json.dumps(
-        content, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
-    )
-
-
 def checksum(content: Mapping[str, Any]) -> str:
     """Return the SHA-256 of a document's canonical text, in hexadecimal."""
-    return hashlib.sha256(canonical_json(content).encode()).hexdigest()
+    return sha256_of(canonical_json(content))
 
 
 @dataclass(frozen=True)

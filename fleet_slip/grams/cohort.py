@@ -9,8 +9,8 @@ import duckdb
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from numpy.typing import NDArray
 
+from fleet_slip.arrays import BoolArray, IntArray
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import SCENARIO, TRAINING_DRIVES
@@ -19,7 +19,8 @@ from fleet_slip.grams.folding import FOLD_KEYS, ROW_FOLDS
 from fleet_slip.grams.reader import GramReader, open_grams
 from fleet_slip.regression.drives import serving_drives
 from fleet_slip.regression.folds import CohortFolds, FoldAssignment, by_hash, by_value
-from fleet_slip.regression.gram import GramTable, IntArray, packed_size
+from fleet_slip.regression.gram import packed_size
+from fleet_slip.regression.gram_table import GramTable
 from fleet_slip.warehouse.database import database_errors
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -117,7 +118,7 @@ class Cohort:
         )
         return Served(merged, self.drives.take(rows[order[first]]))
 
-    def part(self, wanted: NDArray[np.bool_]) -> "Cohort":
+    def part(self, wanted: BoolArray) -> "Cohort":
         """Return the cohort with some of its Gram rows only; the mask lists them all."""
         stops = np.cumsum([len(table) for table in self.tables])[:-1]
         masks = np.split(wanted, stops)
@@ -225,10 +226,10 @@ def gram_table(signals: str, rows: pa.Table | pa.RecordBatch) -> GramTable:
     )
 
 
-def _matrix(lists: pa.ChunkedArray | pa.ListArray, width: int) -> NDArray[np.int64]:
+def _matrix(lists: pa.ChunkedArray | pa.ListArray, width: int) -> IntArray:
     chunks = lists.chunks if isinstance(lists, pa.ChunkedArray) else [lists]
     parts = [chunk.flatten().to_numpy() for chunk in chunks]
-    values: NDArray[np.int64] = parts[0] if len(parts) == 1 else np.concatenate(parts)
+    values: IntArray = parts[0] if len(parts) == 1 else np.concatenate(parts)
     return values.reshape(-1, width)
 
 

@@ -12,6 +12,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from fleet_slip.arrays import BoolArray, IntArray
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.errors import DataError
@@ -26,7 +27,7 @@ from fleet_slip.grams.cohort import (
 from fleet_slip.grams.folding import FOLD_KEYS, ROW_FOLDS, Folding
 from fleet_slip.grams.reader import GramReader, OpenedGrams, open_grams
 from fleet_slip.regression.folds import CohortFolds, hash_number
-from fleet_slip.regression.gram import Gram, IntArray
+from fleet_slip.regression.gram import Gram
 from fleet_slip.warehouse.database import database_errors
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -134,7 +135,7 @@ def hash_numbers(ids: pa.Array) -> NDArray[np.uint64]:
     return np.fromiter(map(hash_number, ids.to_pylist()), dtype=np.uint64, count=len(ids))
 
 
-def by_signals(batch: pa.RecordBatch) -> Iterator[tuple[str, pa.RecordBatch, NDArray[np.bool_]]]:
+def by_signals(batch: pa.RecordBatch) -> Iterator[tuple[str, pa.RecordBatch, BoolArray]]:
     """Yield each set of signals in a batch of Gram rows, its rows, and which those are."""
     names = batch["signals"].unique().to_pylist()
     if len(names) == 1:

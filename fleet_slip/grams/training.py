@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError
@@ -10,7 +11,6 @@ from fleet_slip.grams.cohort import Cohort, Served, assign
 from fleet_slip.grams.folding import FOLD_KEYS, ROW_FOLDS, Folding
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.folds import CohortFolds, Folds
-from fleet_slip.regression.gram import IntArray
 from fleet_slip.regression.nested_choice import Training
 
 

@@ -10,9 +10,10 @@ import polars as pl
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.signals import Signal, catalogue
 from fleet_slip.ingest.mapping import FromColumn, Mapping
-from fleet_slip.ingest.resampling import FloatArray, Method, choose_method, resampler
+from fleet_slip.ingest.resampling import Method, choose_method, resampler
 
 SOURCE = "measured"
 _SECONDS_PER_DAY = 86_400
@@ -80,7 +81,7 @@ def to_ticks(rows: pl.DataFrame, mapping: Mapping, interval_s: float) -> Ticked:
     return Ticked(method, start_s, ticks[somewhere].astype(np.int32), counts)
 
 
-def _counts(signal: Signal, values: FloatArray, absent: NDArray[np.bool_]) -> pa.Array:
+def _counts(signal: Signal, values: FloatArray, absent: BoolArray) -> pa.Array:
     """Round values to counts. The clip catches a resampled value's last bit, no more."""
     rounded = np.rint(values / float(signal.scale)).clip(signal.min_count, signal.max_count)
     return pa.array(np.where(absent, 0, rounded).astype(np.int16), mask=absent)

@@ -1,12 +1,12 @@
 """The mapping of a measured log: which column is which signal, in which unit, with which sign."""
 
-import json
 from datetime import UTC, date, datetime
 from typing import Annotated
 
 import polars as pl
 from pydantic import AfterValidator, Field, StringConstraints, field_validator, model_validator
 
+from fleet_slip.canonical import canonical_ascii
 from fleet_slip.catalogue.signals import Identifier, catalogue
 from fleet_slip.config import Config, load_config
 from fleet_slip.ingest.units import conversion_factor
@@ -160,7 +160,7 @@ class Mapping(Config):
 
     def canonical_json(self) -> str:
         """The mapping as JSON that does not depend on the order or layout of its TOML file."""
-        return json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
+        return canonical_ascii(self.model_dump(mode="json"))
 
 
 def _reads_back(timestamp_format: str) -> bool:

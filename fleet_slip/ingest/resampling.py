@@ -9,11 +9,10 @@ from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 
-FloatArray = NDArray[np.float64]
 Method = Literal["snap", "interpolate", "average"]
 
 STEP_S = float(SAMPLE_TIME_S)
@@ -42,7 +41,7 @@ def choose_method(time_s: FloatArray, interval_s: float) -> Method:
 
 def resampler(
     time_s: FloatArray, method: Method, longest_gap_s: float
-) -> tuple[NDArray[np.int64], Callable[[FloatArray], FloatArray]]:
+) -> tuple[IntArray, Callable[[FloatArray], FloatArray]]:
     """Return the ticks of a drive, and what brings one signal's samples onto them."""
     if method == "snap":
         return snap(time_s), lambda values: values
@@ -51,9 +50,9 @@ def resampler(
     return np.arange(at_s.size), lambda values: resample(time_s, values, at_s, longest_gap_s)
 
 
-def snap(time_s: FloatArray) -> NDArray[np.int64]:
+def snap(time_s: FloatArray) -> IntArray:
     """Return the tick nearest to each sample, the first sample being tick 0."""
-    ticks: NDArray[np.int64] = np.rint((time_s - time_s[0]) / STEP_S).astype(np.int64)
+    ticks: IntArray = np.rint((time_s - time_s[0]) / STEP_S).astype(np.int64)
     return ticks
 
 
@@ -108,7 +107,7 @@ def average(
     first = np.clip(np.searchsorted(time_s, start, side="right") - 1, 0, step.size - 1)
     last = np.clip(np.searchsorted(time_s, end) - 1, 0, step.size - 1)
 
-    def integral(i: NDArray[np.int64], t: FloatArray) -> FloatArray:
+    def integral(i: IntArray, t: FloatArray) -> FloatArray:
         into = t - time_s[i]
         return np.asarray(area[i] + into * (values[i] + slope[i] * into / 2), dtype=np.float64)
 

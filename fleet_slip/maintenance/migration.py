@@ -29,6 +29,7 @@ from deltalake.schema import Schema
 from deltalake.transaction import AddAction, RemoveAction
 from numpy.typing import NDArray
 
+from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.signals import COUNT_MAX
 from fleet_slip.delta import Snapshot, Table, TableFile
 from fleet_slip.delta.schema import SCALE, TARGET, Evolution, compare_schemas, scales_of
@@ -90,7 +91,7 @@ def _add_columns_that_came_later(table: Table) -> None:
         _add_columns(table, delta, found)
 
 
-def rescale_counts(counts: NDArray[np.int16], ratio: Fraction) -> NDArray[np.int64]:
+def rescale_counts(counts: NDArray[np.int16], ratio: Fraction) -> IntArray:
     """Return counts times a ratio, rounded to the nearest integer, halves to even."""
     scaled = 2 * counts.astype(np.int64) * ratio.numerator + ratio.denominator
     nearest = scaled // (2 * ratio.denominator)

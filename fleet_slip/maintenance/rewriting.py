@@ -10,8 +10,8 @@ from collections.abc import Collection, Sequence
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from numpy.typing import NDArray
 
+from fleet_slip.arrays import IntArray
 from fleet_slip.delta import Table, TableFile
 
 
@@ -51,7 +51,7 @@ def _read(table: Table, file: TableFile, without: Collection[str]) -> pa.Table:
     return rows.filter(pc.invert(unwanted.take(ids.indices)))
 
 
-def _order(rows: pa.Table) -> NDArray[np.int64]:
+def _order(rows: pa.Table) -> IntArray:
     """Return the order by drive, then tick."""
     ids = rows["drive_id"].combine_chunks()
     rank = np.argsort(np.argsort(np.array(ids.dictionary.to_pylist(), dtype=object)))

@@ -7,8 +7,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.regression.gram import GramTable
-from fleet_slip.regression.special import FloatArray
+from fleet_slip.arrays import BoolArray, FloatArray
+from fleet_slip.regression.gram_table import GramTable
 
 AT_ONCE = 2**12
 """Drives whose matrices are held at once: some 1.4 KB each."""
@@ -71,7 +71,7 @@ class DriveBatches:
     rows: NDArray[np.intp]
 
     @classmethod
-    def of(cls, table: GramTable, wanted: NDArray[np.bool_] | None = None) -> "DriveBatches":
+    def of(cls, table: GramTable, wanted: BoolArray | None = None) -> "DriveBatches":
         """Take all drives of a table, or those of a mask."""
         return cls(table, np.arange(len(table)) if wanted is None else np.flatnonzero(wanted))
 

@@ -18,11 +18,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.monitoring.moments import DriveBatches, MeanMoments
 from fleet_slip.monitoring.plausibility import Fault
 from fleet_slip.monitoring.thresholds import QualityThresholds
-from fleet_slip.regression.gram import GramTable
-from fleet_slip.regression.special import FloatArray
+from fleet_slip.regression.gram_table import GramTable
 
 PAIRS = (("wheel_fl", "wheel_fr"), ("wheel_rl", "wheel_rr"), ("steer_fl", "steer_fr"))
 """Signals whose plugs may be exchanged."""
@@ -138,7 +138,7 @@ class Peers:
             self.limits,
         )
 
-    def suspects(self, drives: DriveBatches) -> NDArray[np.bool_]:
+    def suspects(self, drives: DriveBatches) -> BoolArray:
         """Say which drives have a figure beyond the limit."""
         worst = drives.each(lambda batch: self.worst(self.full, batch))
         return np.asarray(worst > self.limits.limit)
@@ -201,8 +201,8 @@ class Peers:
 
 
 def settle(
-    table: GramTable, in_order: NDArray[np.bool_], label: str, limits: QualityThresholds
-) -> tuple[Peers, NDArray[np.bool_]]:
+    table: GramTable, in_order: BoolArray, label: str, limits: QualityThresholds
+) -> tuple[Peers, BoolArray]:
     """Fit a cohort's peers on the drives in order, leaving suspects out until they stay the same.
 
     Starts from the drives that are plausible. Returns the peers and which drives are suspect.

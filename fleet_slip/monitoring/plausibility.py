@@ -10,12 +10,11 @@ from dataclasses import dataclass
 from itertools import count
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.monitoring.moments import AT_ONCE, DriveBatches, MeanMoments
-from fleet_slip.regression.gram import GramTable
-from fleet_slip.regression.special import FloatArray
+from fleet_slip.regression.gram_table import GramTable
 
 WITNESSES: Mapping[str, Mapping[str, int]] = {
     "ay": {"ay": 1},
@@ -134,7 +133,7 @@ def _correlations(moments: MeanMoments, names: Sequence[str]) -> FloatArray:
     )
 
 
-def _fault(names: Sequence[str], against: NDArray[np.bool_], medians: FloatArray) -> Fault:
+def _fault(names: Sequence[str], against: BoolArray, medians: FloatArray) -> Fault:
     contrary = [name for name, yes in zip(names, against, strict=True) if yes]
     figure = f"correlation {medians[against].min():+.2f} with the other signs of turning"
     swapped = [name for name in contrary if len(WITNESSES[name]) == 2]

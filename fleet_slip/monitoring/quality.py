@@ -17,7 +17,7 @@ from fleet_slip.monitoring.moments import DriveBatches
 from fleet_slip.monitoring.peers import settle
 from fleet_slip.monitoring.plausibility import Fault, implausible
 from fleet_slip.monitoring.thresholds import QualityThresholds, thresholds
-from fleet_slip.regression.gram import GramTable
+from fleet_slip.regression.gram_table import GramTable
 from fleet_slip.warehouse.database import database_errors
 from fleet_slip.warehouse.tables import Warehouse
 

@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from fleet_slip.observers.signals import Floats
+from fleet_slip.arrays import FloatArray
 
 SLOWEST_MPS = 1.0
 """Longitudinal velocity below which the angle is taken as if the car drove so fast."""
 
 
-def sideslip_angle(vx_mps: Floats, vy_mps: Floats) -> Floats:
+def sideslip_angle(vx_mps: FloatArray, vy_mps: FloatArray) -> FloatArray:
     """Return β = arctan(vy / vx) in rad, equations (12) and (13).
 
     At rest the quotient has no limit and noise would turn the angle by up to π. Below

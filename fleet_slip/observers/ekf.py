@@ -16,10 +16,11 @@ import numba
 import numpy as np
 from pydantic import Field, FiniteFloat
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.config import Config
 from fleet_slip.observers import yaw_rate
 from fleet_slip.observers.angle import sideslip_angle
-from fleet_slip.observers.signals import STEP_S, DriveSignals, Floats, held
+from fleet_slip.observers.signals import STEP_S, DriveSignals, held
 from fleet_slip.observers.single_track import (
     SLOWEST_MPS,
     SingleTrack,
@@ -239,8 +240,14 @@ def update(x: Belief, vx: float, yaw_rate: float, ay: float, steer: float, m: Mo
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _filter(
-    ax: Floats, ay: Floats, yaw_rate: Floats, vx: Floats, steer: Floats, x: Belief, m: Model
-) -> Floats:
+    ax: FloatArray,
+    ay: FloatArray,
+    yaw_rate: FloatArray,
+    vx: FloatArray,
+    steer: FloatArray,
+    x: Belief,
+    m: Model,
+) -> FloatArray:
     means = np.empty((2, len(ax)))
     for k in range(len(ax)):
         if k > 0:
@@ -271,7 +278,7 @@ def build_model(track: SingleTrack, noise: EkfNoise) -> Model:
     )
 
 
-def estimate(drive: DriveSignals, car: VehicleParameters, noise: EkfNoise) -> Floats:
+def estimate(drive: DriveSignals, car: VehicleParameters, noise: EkfNoise) -> FloatArray:
     """Estimate side-slip in rad at every row. Gaps of a sensor are bridged by the value before.
 
     Raises `DataError` if a sensor is absent.

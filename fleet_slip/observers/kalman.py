@@ -12,11 +12,12 @@ import numba
 import numpy as np
 from pydantic import Field, FiniteFloat
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.config import Config
 from fleet_slip.errors import DataError
 from fleet_slip.observers import yaw_rate
 from fleet_slip.observers.angle import sideslip_angle
-from fleet_slip.observers.signals import STEP_S, DriveSignals, Floats, held
+from fleet_slip.observers.signals import STEP_S, DriveSignals, held
 from fleet_slip.observers.yaw_rate import YawRateNoise
 from fleet_slip.simulation.sensors import Sensors
 from fleet_slip.vehicle.parameters import VehicleParameters
@@ -229,15 +230,15 @@ def update(x: Belief, gps_vx: float, gps_vy: float, c: Covariances) -> Belief:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _filter(
-    ax: Floats,
-    ay: Floats,
-    yaw_rate: Floats,
-    gps_vx: Floats,
-    gps_vy: Floats,
+    ax: FloatArray,
+    ay: FloatArray,
+    yaw_rate: FloatArray,
+    gps_vx: FloatArray,
+    gps_vy: FloatArray,
     first_fix: int,
     dt: float,
     c: Covariances,
-) -> Floats:
+) -> FloatArray:
     means = np.full((4, len(ax)), np.nan)
     belief = first_belief(gps_vx[first_fix], gps_vy[first_fix], c)
     for k in range(first_fix, len(ax)):
@@ -256,13 +257,13 @@ def _filter(
 class KalmanEstimate:
     """The filter's mean at every row; NaN before the first fix."""
 
-    vx_mps: Floats
-    ax_bias_mps2: Floats
-    vy_mps: Floats
-    ay_bias_mps2: Floats
+    vx_mps: FloatArray
+    ax_bias_mps2: FloatArray
+    vy_mps: FloatArray
+    ay_bias_mps2: FloatArray
 
 
-def run(drive: DriveSignals, yaw_rate_rad_s: Floats, noise: FilterNoise) -> KalmanEstimate:
+def run(drive: DriveSignals, yaw_rate_rad_s: FloatArray, noise: FilterNoise) -> KalmanEstimate:
     """Run the filter over a drive with a yaw rate that is known.
 
     It begins at the first GPS fix, predicts at every row and updates at every fix. Gaps of the
@@ -286,7 +287,7 @@ def run(drive: DriveSignals, yaw_rate_rad_s: Floats, noise: FilterNoise) -> Kalm
     return KalmanEstimate(*means)
 
 
-def estimate(drive: DriveSignals, car: VehicleParameters, noise: FilterNoise) -> Floats:
+def estimate(drive: DriveSignals, car: VehicleParameters, noise: FilterNoise) -> FloatArray:
     """Estimate side-slip in rad at every row, NaN before the first fix. Raises as `run`.
 
     Of the car, only the geometry counts that turns wheel speeds into a yaw rate. All of it is

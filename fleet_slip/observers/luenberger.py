@@ -12,10 +12,11 @@ import numba
 import numpy as np
 from pydantic import Field, FiniteFloat
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.config import Config
 from fleet_slip.observers import yaw_rate
 from fleet_slip.observers.angle import sideslip_angle
-from fleet_slip.observers.signals import STEP_S, DriveSignals, Floats, held
+from fleet_slip.observers.signals import STEP_S, DriveSignals, held
 from fleet_slip.observers.single_track import (
     SingleTrack,
     StateSpace,
@@ -41,7 +42,7 @@ TUNABLE = ("lateral_velocity_1ps", "yaw_rate_1ps", "stiffness_factor", *yaw_rate
 """The parameters that `tuning.tune` should search."""
 
 
-def gains(space: StateSpace, poles: ObserverPoles) -> Floats:
+def gains(space: StateSpace, poles: ObserverPoles) -> FloatArray:
     """Return L for every row, as rows [l11, l12, l21, l22] of shape (4, n).
 
     A − L C = diag(−p1, −p2) has one solution, because C = [[0, 1], [a11, a12 + vx]] is regular:
@@ -55,8 +56,12 @@ def gains(space: StateSpace, poles: ObserverPoles) -> Floats:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _observe(
-    space: tuple[Floats, ...], gain: Floats, steer: Floats, yaw_rate: Floats, ay: Floats
-) -> Floats:
+    space: tuple[FloatArray, ...],
+    gain: FloatArray,
+    steer: FloatArray,
+    yaw_rate: FloatArray,
+    ay: FloatArray,
+) -> FloatArray:
     """Return vy, by Euler's forward step. The space is a `StateSpace` as a plain tuple."""
     a11, a12, a21, a22, b1, b2, vx_mps = space
     vy, r = 0.0, yaw_rate[0]
@@ -73,7 +78,7 @@ def _observe(
     return estimates
 
 
-def estimate(drive: DriveSignals, car: VehicleParameters, poles: ObserverPoles) -> Floats:
+def estimate(drive: DriveSignals, car: VehicleParameters, poles: ObserverPoles) -> FloatArray:
     """Estimate side-slip in rad at every row. Gaps of a sensor are bridged by the value before.
 
     Raises `DataError` if a sensor is absent.

@@ -7,8 +7,8 @@ Fixes that the log itself has not are not brought back.
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fleet_slip.arrays import BoolArray
 from fleet_slip.observers.signals import STEP_S, DriveSignals
 
 URBAN_FIX_S = 15.0
@@ -19,7 +19,7 @@ TUNNEL_S = 20.0
 """Time in the tunnel."""
 
 
-def urban(rows: int, generator: np.random.Generator) -> NDArray[np.bool_]:
+def urban(rows: int, generator: np.random.Generator) -> BoolArray:
     """Return where a drive through a city has no fix; it begins with one."""
     lost = np.zeros(rows, dtype=np.bool_)
     end_s = 0.0
@@ -30,14 +30,14 @@ def urban(rows: int, generator: np.random.Generator) -> NDArray[np.bool_]:
     return lost
 
 
-def tunnel(rows: int, begin_s: float) -> NDArray[np.bool_]:
+def tunnel(rows: int, begin_s: float) -> BoolArray:
     """Return where a drive with one tunnel of `TUNNEL_S` has no fix."""
     time_s = np.arange(rows) * STEP_S
-    lost: NDArray[np.bool_] = (time_s >= begin_s) & (time_s < begin_s + TUNNEL_S)
+    lost: BoolArray = (time_s >= begin_s) & (time_s < begin_s + TUNNEL_S)
     return lost
 
 
-def without_fixes(drive: DriveSignals, lost: NDArray[np.bool_]) -> DriveSignals:
+def without_fixes(drive: DriveSignals, lost: BoolArray) -> DriveSignals:
     """Return the drive without the GPS fixes where `lost` is true."""
     return replace(
         drive,

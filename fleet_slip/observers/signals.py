@@ -4,16 +4,14 @@ from dataclasses import dataclass, fields
 
 import duckdb
 import numpy as np
-from numpy.typing import NDArray
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.warehouse.database import database_errors
 
 STEP_S = float(SAMPLE_TIME_S)
 """Time Δt between two rows."""
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -23,17 +21,17 @@ class DriveSignals:
     Axes and signs are those of docs/conventions.md. GPS has its own rate and is NaN between fixes.
     """
 
-    ax_mps2: Floats
-    ay_mps2: Floats
-    yaw_rate_rad_s: Floats
-    wheel_fl_rad_s: Floats
-    wheel_fr_rad_s: Floats
-    wheel_rl_rad_s: Floats
-    wheel_rr_rad_s: Floats
-    steer_fl_rad: Floats
-    steer_fr_rad: Floats
-    gps_vx_mps: Floats
-    gps_vy_mps: Floats
+    ax_mps2: FloatArray
+    ay_mps2: FloatArray
+    yaw_rate_rad_s: FloatArray
+    wheel_fl_rad_s: FloatArray
+    wheel_fr_rad_s: FloatArray
+    wheel_rl_rad_s: FloatArray
+    wheel_rr_rad_s: FloatArray
+    steer_fl_rad: FloatArray
+    steer_fr_rad: FloatArray
+    gps_vx_mps: FloatArray
+    gps_vy_mps: FloatArray
 
     def __len__(self) -> int:
         """Return the number of rows."""
@@ -46,7 +44,7 @@ class LabelledDrive:
 
     drive_id: str
     signals: DriveSignals
-    sideslip_rad: Floats
+    sideslip_rad: FloatArray
 
 
 def read_drive(database: duckdb.DuckDBPyConnection, drive_id: str) -> LabelledDrive:
@@ -68,7 +66,7 @@ def read_drive(database: duckdb.DuckDBPyConnection, drive_id: str) -> LabelledDr
     return LabelledDrive(drive_id, DriveSignals(**arrays), sideslip_rad)
 
 
-def held(values: Floats, name: str) -> Floats:
+def held(values: FloatArray, name: str) -> FloatArray:
     """Return a signal with every gap filled by the value before it, a leading one by the first.
 
     Raises `DataError` if there is no value at all.

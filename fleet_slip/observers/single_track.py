@@ -15,7 +15,8 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from fleet_slip.observers.signals import DriveSignals, Floats, held
+from fleet_slip.arrays import FloatArray
+from fleet_slip.observers.signals import DriveSignals, held
 from fleet_slip.observers.wheel_speeds import undriven_axle
 from fleet_slip.vehicle.parameters import VehicleParameters, constants
 from fleet_slip.vehicle.tyre import cornering_stiffness
@@ -74,21 +75,21 @@ class StateSpace(NamedTuple):
     ay = v̇y + r vx gives C = [a11, a12 + vx] and D = b1.
     """
 
-    a11: Floats
-    a12: Floats
-    a21: Floats
-    a22: Floats
-    b1: Floats
-    b2: Floats
-    vx_mps: Floats
+    a11: FloatArray
+    a12: FloatArray
+    a21: FloatArray
+    a22: FloatArray
+    b1: FloatArray
+    b2: FloatArray
+    vx_mps: FloatArray
 
     @property
-    def c2(self) -> Floats:
+    def c2(self) -> FloatArray:
         """Lateral acceleration per yaw rate."""
         return self.a12 + self.vx_mps
 
 
-def state_space(model: SingleTrack, vx_mps: Floats) -> StateSpace:
+def state_space(model: SingleTrack, vx_mps: FloatArray) -> StateSpace:
     """Return the matrices of the model at each speed."""
     m, inertia = model.mass_kg, model.yaw_inertia_kgm2
     a, b = model.front_m, model.rear_m
@@ -106,11 +107,11 @@ def state_space(model: SingleTrack, vx_mps: Floats) -> StateSpace:
     )
 
 
-def measured_speed_mps(drive: DriveSignals, car: VehicleParameters) -> Floats:
+def measured_speed_mps(drive: DriveSignals, car: VehicleParameters) -> FloatArray:
     """Return the longitudinal velocity from wheel speeds. Raises `DataError` without them."""
     return held(undriven_axle(drive, car).vx_mps, "wheel speeds")
 
 
-def measured_steer_rad(drive: DriveSignals) -> Floats:
+def measured_steer_rad(drive: DriveSignals) -> FloatArray:
     """Return the mean angle of the front wheels. Raises `DataError` without them."""
     return held((drive.steer_fl_rad + drive.steer_fr_rad) / 2, "steer_fl and steer_fr")

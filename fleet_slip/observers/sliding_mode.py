@@ -16,10 +16,11 @@ import numba
 import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.config import Config
 from fleet_slip.observers import yaw_rate
 from fleet_slip.observers.angle import sideslip_angle
-from fleet_slip.observers.signals import STEP_S, DriveSignals, Floats, held
+from fleet_slip.observers.signals import STEP_S, DriveSignals, held
 from fleet_slip.observers.single_track import (
     SingleTrack,
     measured_speed_mps,
@@ -75,13 +76,13 @@ def saturate(value: float) -> float:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _observe(
-    space: tuple[Floats, ...],
-    steer: Floats,
-    yaw_rate: Floats,
-    measured_vy: Floats,
+    space: tuple[FloatArray, ...],
+    steer: FloatArray,
+    yaw_rate: FloatArray,
+    measured_vy: FloatArray,
     gains: tuple[float, float],
     layers: tuple[float, float],
-) -> Floats:
+) -> FloatArray:
     """Return vy, by Euler's forward step. The space is a `StateSpace` as a plain tuple."""
     a11, a12, a21, a22, b1, b2, _ = space
     vy, r = 0.0, yaw_rate[0]
@@ -96,7 +97,7 @@ def _observe(
     return estimates
 
 
-def estimate(drive: DriveSignals, car: VehicleParameters, gains: SlidingGains) -> Floats:
+def estimate(drive: DriveSignals, car: VehicleParameters, gains: SlidingGains) -> FloatArray:
     """Estimate side-slip in rad at every row. Gaps of a sensor are bridged by the value before.
 
     Raises `DataError` if a sensor is absent.

@@ -8,13 +8,14 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.config import Config
 from fleet_slip.errors import DataError
-from fleet_slip.observers.signals import DriveSignals, Floats, LabelledDrive
+from fleet_slip.observers.signals import DriveSignals, LabelledDrive
 from fleet_slip.vehicle.parameters import VehicleParameters
 
 P = TypeVar("P", bound=Config)
-Estimator = Callable[[DriveSignals, VehicleParameters, P], Floats]
+Estimator = Callable[[DriveSignals, VehicleParameters, P], FloatArray]
 """What every module of this package offers as `estimate`."""
 
 FIRST_FACTOR = 8.0
@@ -35,7 +36,9 @@ class Tuned(Generic[P]):
 
 
 def error_std_rad(
-    estimate: Callable[[DriveSignals], Floats], drives: Sequence[LabelledDrive], executor: Executor
+    estimate: Callable[[DriveSignals], FloatArray],
+    drives: Sequence[LabelledDrive],
+    executor: Executor,
 ) -> float:
     """Return the standard deviation of estimate − truth over all rows that have both.
 
@@ -88,7 +91,7 @@ def tune(
 
 def _bound(
     estimator: Estimator[P], parameters: P, car: VehicleParameters, drive: DriveSignals
-) -> Floats:
+) -> FloatArray:
     return estimator(drive, car, parameters)
 
 

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fleet_slip.observers.signals import DriveSignals, Floats
+from fleet_slip.arrays import FloatArray
+from fleet_slip.observers.signals import DriveSignals
 from fleet_slip.vehicle.parameters import VehicleParameters
 
 
@@ -16,17 +17,17 @@ from fleet_slip.vehicle.parameters import VehicleParameters
 class AxleSpeeds:
     """Velocity along the car of the two wheels of one axle, and their distance."""
 
-    left_mps: Floats
-    right_mps: Floats
-    track_m: Floats | float
+    left_mps: FloatArray
+    right_mps: FloatArray
+    track_m: FloatArray | float
 
     @property
-    def vx_mps(self) -> Floats:
+    def vx_mps(self) -> FloatArray:
         """Longitudinal velocity between the wheels."""
         return (self.left_mps + self.right_mps) / 2
 
     @property
-    def yaw_rate_rad_s(self) -> Floats:
+    def yaw_rate_rad_s(self) -> FloatArray:
         """Yaw rate of the line through the wheels."""
         return (self.right_mps - self.left_mps) / self.track_m
 

@@ -19,8 +19,9 @@ import numba
 import numpy as np
 from pydantic import Field, FiniteFloat
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.config import Config
-from fleet_slip.observers.signals import STEP_S, DriveSignals, Floats
+from fleet_slip.observers.signals import STEP_S, DriveSignals
 from fleet_slip.observers.wheel_speeds import undriven_axle
 from fleet_slip.simulation.sensors import Sensors
 from fleet_slip.vehicle.parameters import VehicleParameters
@@ -67,8 +68,8 @@ TUNABLE = (
 class YawRateEstimate:
     """Yaw rate and bias of the gyroscope at every row."""
 
-    yaw_rate_rad_s: Floats
-    gyro_bias_rad_s: Floats
+    yaw_rate_rad_s: FloatArray
+    gyro_bias_rad_s: FloatArray
 
 
 class Belief(NamedTuple):
@@ -115,8 +116,13 @@ def update(x: Belief, z: float, on_bias: float, variance: float) -> Belief:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _filter(
-    gyro: Floats, wheels: Floats, first: Belief, gyro_var: float, wheel_var: float, step_var: float
-) -> Floats:
+    gyro: FloatArray,
+    wheels: FloatArray,
+    first: Belief,
+    gyro_var: float,
+    wheel_var: float,
+    step_var: float,
+) -> FloatArray:
     estimates = np.empty((2, len(gyro)))
     belief = first
     for k in range(len(gyro)):

@@ -12,9 +12,10 @@ from functools import cache
 
 import numpy as np
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import QuestionError
 from fleet_slip.regression.evidence import Evidence
-from fleet_slip.regression.special import FloatArray, normal_cdf, normal_density
+from fleet_slip.regression.special import normal_cdf, normal_density
 
 
 @dataclass(frozen=True)

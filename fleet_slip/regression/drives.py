@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.errors import DataError
 from fleet_slip.regression.exact import LinearModel
-from fleet_slip.regression.gram import GramTable, packed_position, packed_size
-from fleet_slip.regression.special import FloatArray
+from fleet_slip.regression.gram import packed_position, packed_size
+from fleet_slip.regression.gram_table import GramTable
 
 
 def missing_signals_error(signals: Sequence[str]) -> DataError:
@@ -27,7 +28,7 @@ def missing_signals_error(signals: Sequence[str]) -> DataError:
 
 def serving_drives(
     tables: Sequence[GramTable], signals: Sequence[str]
-) -> tuple[GramTable, NDArray[np.bool_]]:
+) -> tuple[GramTable, BoolArray]:
     """Return one table of the drives that have all the signals, and which drives those are.
 
     The mask lists the drives of all tables one after another. Raises `DataError` if no

@@ -7,7 +7,8 @@ divisions and square roots alone, in one order.
 import math
 
 import numpy as np
-from numpy.typing import NDArray
+
+from fleet_slip.arrays import FloatArray
 
 MAX_SWEEPS = 60
 """Convergence is quadratic: five to ten sweeps are usual."""
@@ -15,7 +16,7 @@ MAX_SWEEPS = 60
 _UNIT_ROUNDOFF = 2.0**-53
 
 
-def symmetric_eigenvalues(matrix: NDArray[np.float64]) -> list[float]:
+def symmetric_eigenvalues(matrix: FloatArray) -> list[float]:
     """Return the eigenvalues of a symmetric matrix, shape (k, k), ascending.
 
     Cyclic Jacobi rotations (Golub and Van Loan, Matrix Computations, section 8.5). An element off
@@ -31,7 +32,7 @@ def symmetric_eigenvalues(matrix: NDArray[np.float64]) -> list[float]:
     return sorted(a.diagonal().tolist())
 
 
-def _rotate(a: NDArray[np.float64], p: int, q: int) -> bool:
+def _rotate(a: FloatArray, p: int, q: int) -> bool:
     """Make a[p, q] zero; return False if it was small already."""
     app, aqq, apq = float(a[p, p]), float(a[q, q]), float(a[p, q])
     if abs(apq) <= _UNIT_ROUNDOFF * math.sqrt(abs(app)) * math.sqrt(abs(aqq)):

@@ -6,8 +6,8 @@ from fractions import Fraction
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
 from fleet_slip.regression import rounding
 from fleet_slip.regression.eigenvalues import symmetric_eigenvalues
@@ -170,7 +170,7 @@ def _relation(fitted: Fit) -> str:
     return text
 
 
-def correlation_matrix(gram: Gram) -> NDArray[np.float64]:
+def correlation_matrix(gram: Gram) -> FloatArray:
     """Return the correlations of all signals, shape (k, k), each rounded once.
 
     A constant signal has zeros, also on the diagonal.

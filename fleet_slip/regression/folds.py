@@ -15,8 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from fleet_slip.arrays import IntArray
 from fleet_slip.errors import DataError
-from fleet_slip.regression.gram import Gram, GramTable, IntArray, positions
+from fleet_slip.regression.gram import Gram, positions
+from fleet_slip.regression.gram_table import GramTable
 
 
 def hash_number(key: str) -> int:

@@ -12,13 +12,13 @@ from typing import Literal
 
 import numpy as np
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
 from fleet_slip.regression import rounding, special
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.elimination import inverse_matrix
 from fleet_slip.regression.exact import Fit, Scales, dependence, fit, moments
 from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.special import FloatArray
 
 INTERCEPT = "intercept"
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
 from fleet_slip.regression.exact import LinearModel, correlation_matrix
 from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.special import FloatArray
 from fleet_slip.regression.standard import from_standardised
 
 _TIE = 1e-12

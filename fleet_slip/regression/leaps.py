@@ -2,11 +2,8 @@
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from fleet_slip.regression.special import FloatArray
-
-IntArray = NDArray[np.int64]
+from fleet_slip.arrays import FloatArray, IntArray
 
 
 def best_by_leaps(matrix: FloatArray, count: int) -> list[list[int]]:

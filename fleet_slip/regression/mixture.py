@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.regression.nnls import nonnegative_least_squares
-from fleet_slip.regression.special import FloatArray, normal_cdf, normal_density
+from fleet_slip.regression.special import normal_cdf, normal_density
 
 SEPARABLE = 0.05
 """Groups of points whose summed overlap is below this are fitted apart."""

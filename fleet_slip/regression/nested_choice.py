@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from fleet_slip.arrays import IntArray
 from fleet_slip.errors import QuestionError
 from fleet_slip.regression.criteria import best_size, criterion_values
 from fleet_slip.regression.crossval import (
@@ -23,7 +24,6 @@ from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.evidence import Evidence
 from fleet_slip.regression.exact import Fit, Scales
 from fleet_slip.regression.folds import Folds
-from fleet_slip.regression.gram import IntArray
 from fleet_slip.regression.nested import nested_fits
 from fleet_slip.regression.ranking import rank
 from fleet_slip.regression.winner import choose

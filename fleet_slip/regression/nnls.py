@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fleet_slip.regression.special import FloatArray
+from fleet_slip.arrays import FloatArray
 
 
 def nonnegative_least_squares(a: FloatArray, b: FloatArray) -> FloatArray:

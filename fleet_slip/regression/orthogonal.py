@@ -6,13 +6,13 @@ from fractions import Fraction
 
 import numpy as np
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
 from fleet_slip.regression import rounding
 from fleet_slip.regression.elimination import Elimination, eliminate
 from fleet_slip.regression.exact import LinearModel, dependence, fit_leading, moments
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.inference import noise_variance
-from fleet_slip.regression.special import FloatArray
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
 from fleet_slip.regression.exact import LinearModel
 from fleet_slip.regression.gram import Gram
@@ -25,7 +26,7 @@ from fleet_slip.regression.mixture import (
 )
 from fleet_slip.regression.orthogonal import OrthogonalResponses
 from fleet_slip.regression.ranking import backward
-from fleet_slip.regression.special import FloatArray, normal_density
+from fleet_slip.regression.special import normal_density
 
 Estimator = Callable[[FloatArray], FloatArray]
 

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.exact import LinearModel
-from fleet_slip.regression.special import FloatArray
 
 _BATCH_BYTES = 2**26
 

@@ -13,12 +13,12 @@ from fractions import Fraction
 
 import numpy as np
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression import rounding
 from fleet_slip.regression.elimination import eliminate
 from fleet_slip.regression.exact import LinearModel, Scales, correlation_matrix, moments
 from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.special import FloatArray
 from fleet_slip.regression.standard import from_standardised, through_means
 
 

@@ -6,9 +6,8 @@ Own code, because NumPy has none of them and the package needs nothing else of S
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from fleet_slip.arrays import FloatArray
 
 _TINY = 1e-300
 _erfc = np.vectorize(math.erfc, otypes=[np.float64])

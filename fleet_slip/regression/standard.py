@@ -5,10 +5,10 @@ from fractions import Fraction
 
 import numpy as np
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.regression import rounding
 from fleet_slip.regression.exact import LinearModel
 from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.special import FloatArray
 
 
 def lengths(gram: Gram) -> FloatArray:

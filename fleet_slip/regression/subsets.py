@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression.criteria import CRITERIA, subset_values
 from fleet_slip.regression.evidence import Evidence
 from fleet_slip.regression.exact import Fit, correlation_matrix, dependence, fit
 from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.special import FloatArray
 
 DOUBLING_LIMIT = 22
 """Most signals for which all subsets are computed: 2^22 take about two seconds."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fleet_slip.evaluation.drives import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.evaluation.runs import EvaluatedScenario
 from fleet_slip.regression.special import student_t_two_sided
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ

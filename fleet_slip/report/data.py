@@ -5,6 +5,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from fleet_slip.canonical import canonical_json, sha256_of
 from fleet_slip.catalogue.sources import SCENARIO
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation.estimators import (
@@ -17,7 +18,6 @@ from fleet_slip.evaluation.estimators import (
 from fleet_slip.evaluation.filters import FILTERS, bound
 from fleet_slip.evaluation.runs import EvaluatedScenario, run_all
 from fleet_slip.evaluation.targets import THE_PAPERS_CHOICE
-from fleet_slip.files.documents import canonical_json
 from fleet_slip.models.versions import ModelVersion
 from fleet_slip.report.coefficients import Coefficients, coefficient_table
 from fleet_slip.report.evaluated import Evaluated, latest_of
@@ -229,6 +229,4 @@ def _of_scenario(scenario: Scenario) -> ConfigHash:
     """Return the checksum of all that determines a scenario's drive, and of its failures."""
     failures = [failure.model_dump(mode="json") for failure in scenario.failures]
     text = canonical_json({"drive": scenario.batch().digest, "failures": failures})
-    return ConfigHash(
-        f"configs/scenarios/{scenario.name}.toml", hashlib.sha256(text.encode()).hexdigest()
-    )
+    return ConfigHash(f"configs/scenarios/{scenario.name}.toml", sha256_of(text))

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
+from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.evaluation.drives import FloatArray
 from fleet_slip.grams.cohort import assign
 from fleet_slip.grams.folding import FOLD_KEYS
 from fleet_slip.regression.crossval import CrossValidation, least_squares
@@ -24,7 +23,7 @@ from fleet_slip.warehouse.tables import Warehouse
 ANGLE_DEG = 0.05
 ACCELERATION_MPS2 = 0.1
 
-Integers = NDArray[np.int64]
+Integers = IntArray
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.evaluation.errors import ErrorFigures, error_figures
 from fleet_slip.evaluation.estimators import TABLE_ONE, Signals
@@ -16,8 +16,6 @@ from fleet_slip.rivals.learners import LEARNERS, Fitted, Learner, one_thread
 from fleet_slip.rivals.sample import Sample, draw_sample
 from fleet_slip.selection.model_list import load_model_list
 from fleet_slip.warehouse.tables import Warehouse
-
-FloatArray = NDArray[np.float64]
 
 GROUP = "rivals"
 

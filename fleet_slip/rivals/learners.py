@@ -8,11 +8,10 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import ConfigError
 
-FloatArray = NDArray[np.float64]
 SEED = 0
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohort import Cohort, assign
@@ -31,11 +32,11 @@ class Sample:
     """
 
     columns: tuple[str, ...]
-    inputs: NDArray[np.float64]
-    sideslip_rad: NDArray[np.float64]
+    inputs: FloatArray
+    sideslip_rad: FloatArray
     drive_id: NDArray[np.str_]
 
-    def of(self, columns: tuple[str, ...]) -> NDArray[np.float64]:
+    def of(self, columns: tuple[str, ...]) -> FloatArray:
         """Return some of the inputs, shape (rows, columns)."""
         return self.inputs[:, [self.columns.index(column) for column in columns]]
 

@@ -1,14 +1,13 @@
 """Model lists: the candidates that a selection compares, read from `configs/models/*.toml`."""
 
-import hashlib
 from collections.abc import Sequence
 
 from pydantic import Field, model_validator
 
+from fleet_slip.canonical import canonical_json, sha256_of
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.signals import Identifier, catalogue
 from fleet_slip.config import Config, load_config
-from fleet_slip.files.documents import canonical_json
 from fleet_slip.grams.folding import Folding
 from fleet_slip.resources import find_config
 
@@ -66,7 +65,7 @@ class ModelList(Config):
     def sha256(self) -> str:
         """Checksum of what the list says, whatever its layout."""
         content = self.model_dump(mode="json", exclude_defaults=True)
-        return hashlib.sha256(canonical_json(content).encode()).hexdigest()
+        return sha256_of(canonical_json(content))
 
 
 def load_model_list(name_or_path: str) -> ModelList:

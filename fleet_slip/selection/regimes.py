@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError
@@ -16,7 +17,7 @@ from fleet_slip.grams.statement import UNKNOWN_PART
 from fleet_slip.regression.crossval import held_out
 from fleet_slip.regression.exact import LinearModel, fit
 from fleet_slip.regression.figures import ErrorSums, Figures
-from fleet_slip.regression.gram import Gram, IntArray
+from fleet_slip.regression.gram import Gram
 
 ROWS_PER_COEFFICIENT = 100
 """A regime with fewer training rows, one second of driving a coefficient, uses the pooled model."""

@@ -1,14 +1,13 @@
 """What to select, as it is asked for on the command line, and its execution."""
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from fleet_slip.canonical import canonical_json, sha256_of
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.errors import ConfigError
-from fleet_slip.files.documents import canonical_json
 from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.grams.fold_sums import SummedCohort, sum_cohort
 from fleet_slip.grams.folding import ROW_FOLDS, Folding, FoldKey
@@ -160,7 +159,7 @@ def _ordered(cohort: Cohort, plan: SelectionPlan, folds: Folding) -> PlannedSele
     return PlannedSelection(
         Selection(cohort, folds, found.models, found.winner, {}, choice=found.choice),
         f"nested:{nested} {rule.ranking} {rule.criterion}",
-        hashlib.sha256(canonical_json(content).encode()).hexdigest(),
+        sha256_of(canonical_json(content)),
     )
 
 

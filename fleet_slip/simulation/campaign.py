@@ -4,8 +4,6 @@ A campaign is a function of its file alone. A drive depends on the campaign's se
 name, never on the number of days, on other drives or on the order in which they are simulated.
 """
 
-import hashlib
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,6 +16,7 @@ from typing import Annotated, Self
 import numpy as np
 from pydantic import Field, TypeAdapter, model_validator
 
+from fleet_slip.canonical import canonical_ascii, sha256_of
 from fleet_slip.catalogue.signals import Identifier
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import ConfigError
@@ -79,8 +78,7 @@ class Batch:
     def digest(self) -> str:
         """SHA-256 over all that determines the batch's bytes, as canonical JSON."""
         content = _BATCH.dump_python(self, mode="json")
-        canonical = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
-        return hashlib.sha256(canonical.encode()).hexdigest()
+        return sha256_of(canonical_ascii(content))
 
 
 _BATCH = TypeAdapter(Batch)
@@ -111,8 +109,7 @@ class Campaign(Config):
     def digest(self) -> str:
         """SHA-256 over all that determines a day's bytes: all but how many days there are."""
         content = self.model_dump(mode="json", exclude={"number_of_days", "description"})
-        canonical = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
-        return hashlib.sha256(canonical.encode()).hexdigest()
+        return sha256_of(canonical_ascii(content))
 
     def days(self) -> tuple[date, ...]:
         """Return all days, in order."""

@@ -4,7 +4,6 @@ A scenario says only in what it differs from its base. Its drive is simulated on
 logs under a source of its own, so that it can never be part of a training cohort.
 """
 
-import hashlib
 import json
 import re
 from collections.abc import Mapping
@@ -13,9 +12,10 @@ from datetime import date
 from typing import Any, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from fleet_slip.arrays import FloatArray
+from fleet_slip.canonical import sha256_of
 from fleet_slip.catalogue.signals import Identifier, catalogue
 from fleet_slip.catalogue.sources import SCENARIO
 from fleet_slip.config import Config, load_config, load_toml
@@ -77,7 +77,7 @@ class ScenarioDrive(DriveSpec):
         planned = super().profile
         return replace(planned, speed_mps=planned.speed_mps * self._factor(planned.station_m))
 
-    def _factor(self, station_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _factor(self, station_m: FloatArray) -> FloatArray:
         if not self.pace:
             return np.ones(len(station_m))
         stations = [point.station_m for point in self.pace]
@@ -98,7 +98,7 @@ class ScenarioBatch(Batch):
             for drive in self.drives
             if isinstance(drive, ScenarioDrive)
         ]
-        return hashlib.sha256(f"{super().digest} {json.dumps(paces)}".encode()).hexdigest()
+        return sha256_of(f"{super().digest} {json.dumps(paces)}")
 
 
 class Scenario(Config):

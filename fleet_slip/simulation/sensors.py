@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, FiniteFloat, field_validator
 
+from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, Signal, catalogue
 from fleet_slip.config import Config
 
@@ -84,7 +85,7 @@ class Measurement:
     """
 
     counts: dict[str, NDArray[np.int16]]
-    gps_fix: NDArray[np.bool_]
+    gps_fix: BoolArray
     saturated: int
 
 
@@ -103,10 +104,10 @@ class Recorder:
         self._outages = _Outages(sensors.gps, generator)
         self._ticks = 0
         self._counts: dict[str, list[NDArray[np.int16]]] = {}
-        self._gps_fix: list[NDArray[np.bool_]] = []
+        self._gps_fix: list[BoolArray] = []
         self._saturated = 0
 
-    def record(self, truth: Mapping[str, NDArray[np.float64]]) -> None:
+    def record(self, truth: Mapping[str, FloatArray]) -> None:
         """Measure the next block.
 
         `truth` holds a float64 array of one length for the SI column of every signal but GPS; a
@@ -124,7 +125,7 @@ class Recorder:
         self._record_gps(truth, ticks)
         self._ticks += ticks
 
-    def _record_gps(self, truth: Mapping[str, NDArray[np.float64]], ticks: int) -> None:
+    def _record_gps(self, truth: Mapping[str, FloatArray], ticks: int) -> None:
         fix = self._outages.fixes(self._ticks, ticks)
         self._gps_fix.append(fix)
         for name, column in GPS_SIGNALS.items():
@@ -140,7 +141,7 @@ class Recorder:
     def _add(
         self,
         name: str,
-        physical: NDArray[np.float64],
+        physical: FloatArray,
         noise: NDArray[np.float32],
         bias_and_std: tuple[float, float],
     ) -> None:
@@ -167,7 +168,7 @@ def _joined(parts: list[NDArray[Scalar]]) -> NDArray[Scalar]:
 
 
 def measure(
-    truth: Mapping[str, NDArray[np.float64]], sensors: Sensors, generator: np.random.Generator
+    truth: Mapping[str, FloatArray], sensors: Sensors, generator: np.random.Generator
 ) -> Measurement:
     """Measure one drive in one block; see `Recorder`."""
     recorder = Recorder(sensors, generator)
@@ -175,7 +176,7 @@ def measure(
     return recorder.measurement()
 
 
-def quantise(physical: NDArray[np.float64], signal: Signal) -> tuple[NDArray[np.int16], int]:
+def quantise(physical: FloatArray, signal: Signal) -> tuple[NDArray[np.int16], int]:
     """Return `physical / scale` as counts, and how many values were clipped to the valid range.
 
     Halves round to even. NaN is clipped as well, to the lower end.
@@ -184,7 +185,7 @@ def quantise(physical: NDArray[np.float64], signal: Signal) -> tuple[NDArray[np.
 
 
 def _noisy_counts(
-    physical: NDArray[np.float64],
+    physical: FloatArray,
     noise: NDArray[np.float32],
     bias_and_std: tuple[float, float],
     signal: Signal,
@@ -197,7 +198,7 @@ def _noisy_counts(
 
 @numba.njit(cache=True, nogil=True)
 def _quantise(
-    physical: NDArray[np.float64],
+    physical: FloatArray,
     noise: NDArray[np.float32],
     bias_and_std: tuple[float, float],
     scale: float,
@@ -228,7 +229,7 @@ class _Outages:
         self._begin_s = 0.0
         self._end_s = 0.0
 
-    def fixes(self, first: int, ticks: int) -> NDArray[np.bool_]:
+    def fixes(self, first: int, ticks: int) -> BoolArray:
         """Return for so many ticks from a first one, the next ones, whether there is a fix."""
         period = SAMPLE_RATE_HZ // self._gps.rate_hz
         fix = np.zeros(ticks, dtype=np.bool_)
@@ -242,6 +243,6 @@ class _Outages:
             self._clear(fix, first)
         return fix
 
-    def _clear(self, fix: NDArray[np.bool_], first: int) -> None:
+    def _clear(self, fix: BoolArray, first: int) -> None:
         begin, end = (int(s * SAMPLE_RATE_HZ) - first for s in (self._begin_s, self._end_s))
         fix[max(begin, 0) : max(end, 0)] = False

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, FiniteFloat
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.config import Config
 from fleet_slip.simulation.track import Track
 
@@ -32,8 +32,8 @@ class SpeedProfile:
 
     track: Track
     spacing_m: float
-    station_m: NDArray[np.float64]
-    speed_mps: NDArray[np.float64]
+    station_m: FloatArray
+    speed_mps: FloatArray
 
     def time_s(self, laps: float) -> float:
         """Return the time from the start over so many laps, or over a part of one, in s.
@@ -70,9 +70,7 @@ def speed_profile(track: Track, limits: SpeedLimits, spacing_m: float) -> SpeedP
 
 
 @numba.njit(cache=True, nogil=True)
-def _pass(
-    cap: NDArray[np.float64], load: NDArray[np.float64], gain: float, periodic: bool
-) -> NDArray[np.float64]:
+def _pass(cap: FloatArray, load: FloatArray, gain: float, periodic: bool) -> FloatArray:
     """Limit how fast the squared speed w rises from point to point.
 
     The next w is the larger root of ((w - w_before) / gain)² + (load w)² = 1, at most its cap,

@@ -5,9 +5,10 @@ from functools import cached_property
 from typing import Annotated, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field, FiniteFloat, model_validator
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import Identifier
 from fleet_slip.config import Config, load_config
 from fleet_slip.resources import find_config
@@ -48,10 +49,10 @@ class CentreLine:
     All arrays have the same shape. `heading_rad` is continuous, not wrapped to one turn.
     """
 
-    station_m: NDArray[np.float64]
-    x_m: NDArray[np.float64]
-    y_m: NDArray[np.float64]
-    heading_rad: NDArray[np.float64]
+    station_m: FloatArray
+    x_m: FloatArray
+    y_m: FloatArray
+    heading_rad: FloatArray
 
 
 class Track(Config):
@@ -92,12 +93,12 @@ class Track(Config):
         return self
 
     @cached_property
-    def _knots_m(self) -> NDArray[np.float64]:
+    def _knots_m(self) -> FloatArray:
         """Stations of the segments' ends, from 0 to the length of the track."""
         return np.concatenate([[0.0], np.cumsum([s.length_m for s in self.segments])])
 
     @cached_property
-    def _curvature_at_knots_1pm(self) -> NDArray[np.float64]:
+    def _curvature_at_knots_1pm(self) -> FloatArray:
         first = [segment.curvature_1pm[0] for segment in self.segments]
         return np.array([*first, self.segments[-1].curvature_1pm[1]])
 
@@ -106,7 +107,7 @@ class Track(Config):
         """Length of the centre line, in m."""
         return float(self._knots_m[-1])
 
-    def curvature(self, station_m: ArrayLike) -> NDArray[np.float64]:
+    def curvature(self, station_m: ArrayLike) -> FloatArray:
         """Return the curvature in 1/m at stations in m.
 
         Stations outside the track wrap around a closed one and stay at the ends of an open one.
@@ -116,7 +117,7 @@ class Track(Config):
             station = np.mod(station, self.length_m)
         return np.interp(station, self._knots_m, self._curvature_at_knots_1pm)
 
-    def grid(self, spacing_m: float) -> tuple[NDArray[np.float64], float]:
+    def grid(self, spacing_m: float) -> tuple[FloatArray, float]:
         """Return evenly spaced stations in m and their spacing, as near `spacing_m` as fits.
 
         The stations begin at 0. On an open track they end at its end; on a closed one they end
@@ -147,7 +148,7 @@ class Track(Config):
         gap_rad = 2 * np.pi * abs(turns - round(turns))
         return float(np.hypot(line.x_m[-1], line.y_m[-1])), float(gap_rad)
 
-    def _integrate(self, nodes: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    def _integrate(self, nodes: FloatArray) -> tuple[FloatArray, ...]:
         """Return x, y and heading at sorted stations between which curvature is linear."""
         step = np.diff(nodes)
         curvature = self.curvature(nodes)
@@ -163,7 +164,7 @@ class Track(Config):
         return x, y, heading
 
 
-def _cumulative(increments: NDArray[np.float64]) -> NDArray[np.float64]:
+def _cumulative(increments: FloatArray) -> FloatArray:
     return np.concatenate([[0.0], np.cumsum(increments)])
 
 

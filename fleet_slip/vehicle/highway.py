@@ -14,8 +14,8 @@ import numba
 import numpy as np
 from highway_env.vehicle.dynamics import BicycleVehicle
 from highway_env.vehicle.kinematics import Vehicle
-from numpy.typing import NDArray
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.vehicle.compiling import equation
 from fleet_slip.vehicle.dynamics import NO_EXTENSIONS, Extensions, build_derivative
 from fleet_slip.vehicle.integration import (
@@ -114,7 +114,7 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
     MAX_SPEED: float = 70.0
     MIN_SPEED: float = -70.0
 
-    position: NDArray[np.float64]
+    position: FloatArray
     heading: float
     speed: float
     lateral_speed: float
@@ -184,7 +184,7 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
         )
 
     @property
-    def wheel_speeds(self) -> NDArray[np.float64]:
+    def wheel_speeds(self) -> FloatArray:
         """Angular velocities fl, fr, rl, rr in rad/s."""
         return np.array(self._hidden[-4:])
 
@@ -209,13 +209,13 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
         return Controls(angle, float(self.action["acceleration"]))
 
     @property
-    def velocity(self) -> NDArray[np.float64]:
+    def velocity(self) -> FloatArray:
         """Velocity of the centre of gravity in highway-env's plane, with its lateral part."""
         cosine, sine = math.cos(self.heading), math.sin(self.heading)
         vx, vy = self.speed, self.lateral_speed
         return np.array([vx * cosine - vy * sine, vx * sine + vy * cosine])
 
-    def derivative_func(self, time: float, state: NDArray[np.float64], **_: Any) -> Any:
+    def derivative_func(self, time: float, state: FloatArray, **_: Any) -> Any:
         """Return the rates of highway-env's state (x, y, heading, vx, vy, yaw rate), (6, 1)."""
         del time
         heading, vx, vy, yaw_rate = (float(value) for value in state[2:, 0])

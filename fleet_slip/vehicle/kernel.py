@@ -4,9 +4,8 @@ Each lane carries one drive; a lane whose drive has ended takes the next one. At
 scalar part looks up the road and records; the driver's law and the physics are loops over all lanes
 that the compiler turns into vector instructions.
 
-A lane records a block of samples. When a block is full or a drive ends the loop stops, so that the
-caller takes the block; then it is called again. So a drive of any length needs the same memory, and
-a block is still in the processor's cache when it is measured.
+When a lane's block of samples is full or its drive ends, the loop stops so that the caller takes
+the block; then it is called again.
 """
 
 import hashlib
@@ -16,9 +15,7 @@ from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fleet_slip.vehicle.arctangent import arctan2
 from fleet_slip.vehicle.compiling import equation, kernel
 from fleet_slip.vehicle.driver import (
     SAMPLE_S,
@@ -29,6 +26,24 @@ from fleet_slip.vehicle.driver import (
 )
 from fleet_slip.vehicle.dynamics import derivative
 from fleet_slip.vehicle.integration import SECOND_ORDER, Slopes, advance
+from fleet_slip.vehicle.lane_blocks import BLOCK, at, fill_angles, record
+from fleet_slip.vehicle.lane_memory import (
+    CAR,
+    CONTROLS,
+    DRIVE,
+    FIRST,
+    FORCE,
+    HANDLING,
+    LAP,
+    NOBODY,
+    ORDER,
+    PATH,
+    POSE,
+    POSE_SLOPES,
+    SLOPES,
+    STATE,
+    TICK,
+)
 from fleet_slip.vehicle.parameters import Constants
 from fleet_slip.vehicle.pose import Path, Pose, PoseSlopes, advance_pose, pose_slopes
 from fleet_slip.vehicle.rows import LANES, read, write
@@ -40,10 +55,8 @@ LOST_OFFSET_M = 10.0
 LOST_SLIP_TANGENT = math.sqrt(3.0)
 """Side-slip of 60°."""
 LOST_SPEED_MPS = 0.5
-NOBODY = -1
-"""Drive of a lane that has none, and tick of a loss that has not happened."""
 
-PLAN = np.dtype(
+ROUTE = np.dtype(
     [
         ("first", np.int64),  # index of the road's first entry in the table of all roads
         ("last", np.int64),
@@ -59,84 +72,33 @@ PLAN = np.dtype(
 CURVATURE, SPEED, ACCELERATION = range(3)
 """Columns of the table of all roads: curvature, target speed, target acceleration."""
 
-DRIVE, TICK, LAP, FIRST = range(4)
-"""Rows of the book of lanes: which drive a lane carries, its next sample, its lap, and the tick of
-the first sample of its block."""
-
 SAMPLES, LOST = range(2)
 """Columns of the result: number of samples of a drive, and the tick of its loss or `NOBODY`."""
 
-CHANNELS = (
-    "ax_mps2",
-    "ay_mps2",
-    "yaw_rate_rad_s",
-    "steering_wheel_rad",
-    "wheel_fl_rad_s",
-    "wheel_fr_rad_s",
-    "wheel_rl_rad_s",
-    "wheel_rr_rad_s",
-    "steer_fl_rad",
-    "steer_fr_rad",
-    "sideslip_rad",
-    "vx_mps",
-    "vy_mps",
-    "station_m",
-    "lateral_offset_m",
-)
-"""What a lane records."""
-
-BLOCK = 2**16
-"""Samples of a block: 11 minutes of a drive."""
-
-STRIDE = BLOCK + 8
-"""Distance between two channels of a block: with a power of two all channels would share the same
-few lines of the processor's cache."""
-
-BLOCK_SHAPE = (LANES, len(CHANNELS), STRIDE)
-"""Shape of the blocks of all lanes."""
-
-STATE = 0
-SLOPES = STATE + len(State._fields)
-POSE = SLOPES + len(Slopes._fields)
-POSE_SLOPES = POSE + len(Pose._fields)
-CONTROLS = POSE_SLOPES + len(PoseSlopes._fields)
-PATH = CONTROLS + len(Controls._fields)
-FORCE = PATH + len(Path._fields)
-"""Specific force ax, ay at the sample."""
-ORDER = FORCE + 2
-"""Extrapolation of the integration: 0 in a drive's first step."""
-CAR = ORDER + 1
-HANDLING = CAR + len(Constants._fields)
-ROWS = HANDLING + len(Handling._fields)
-
-STEER = Constants._fields.index("steer_per_wheel")
-ACKERMANN = Constants._fields.index("ackermann")
-INVERSE_RADIUS = Constants._fields.index("inverse_radius")
-
 
 @equation
-def _place(plan: Any, station: float) -> tuple[int, float]:
+def _place(route: Any, station: float) -> tuple[int, float]:
     """Return the entry at or before a station, and how far towards the next the station is.
 
     A closed road's entries are continued beyond its length by what a driver sees ahead.
     """
-    place = station * plan.inverse_spacing
-    entry = min(max(math.floor(place), 0), plan.last - plan.first - 1)
-    return plan.first + entry, min(max(place - entry, 0.0), 1.0)
+    place = station * route.inverse_spacing
+    entry = min(max(math.floor(place), 0), route.last - route.first - 1)
+    return route.first + entry, min(max(place - entry, 0.0), 1.0)
 
 
 @equation
-def _look_up(roads: Any, plan: Any, x: State, station: float, lost: bool) -> Path:
+def _look_up(roads: Any, route: Any, x: State, station: float, lost: bool) -> Path:
     """Return what the driver sees of the road from a station."""
-    here, share = _place(plan, station)
+    here, share = _place(route, station)
     curvature = roads[here, CURVATURE]
     change = roads[here + 1, CURVATURE] - curvature
-    ahead, part = _place(plan, station + STEERING_PREVIEW_S * x.vx)
-    soon, bit = _place(plan, station + SPEED_PREVIEW_S * x.vx)
+    ahead, part = _place(route, station + STEERING_PREVIEW_S * x.vx)
+    soon, bit = _place(route, station + SPEED_PREVIEW_S * x.vx)
     return Path(
         station,
         curvature + share * change,
-        change * plan.inverse_spacing,
+        change * route.inverse_spacing,
         (1.0 - part) * roads[ahead, CURVATURE] + part * roads[ahead + 1, CURVATURE],
         (1.0 - bit) * roads[soon, SPEED] + bit * roads[soon + 1, SPEED],
         (1.0 - bit) * roads[soon, ACCELERATION] + bit * roads[soon + 1, ACCELERATION],
@@ -193,28 +155,7 @@ def _has_lost(x: State, pose: Pose) -> bool:
 
 
 @equation
-def _at(lane: int, channel: int, sample: int) -> int:
-    """Return where a sample of a channel stands in the blocks."""
-    return (lane * len(CHANNELS) + channel) * STRIDE + sample
-
-
-@equation
-def _record(truth: Any, lane: int, sample: int, x: State, pose: Pose) -> None:
-    """Write the sample that begins here, but for the specific force, which the next step gives."""
-    truth[_at(lane, 2, sample)] = x.yaw_rate
-    truth[_at(lane, 3, sample)] = x.steering_wheel
-    truth[_at(lane, 4, sample)] = x.wheel_fl
-    truth[_at(lane, 5, sample)] = x.wheel_fr
-    truth[_at(lane, 6, sample)] = x.wheel_rl
-    truth[_at(lane, 7, sample)] = x.wheel_rr
-    truth[_at(lane, 11, sample)] = x.vx
-    truth[_at(lane, 12, sample)] = x.vy
-    truth[_at(lane, 13, sample)] = pose.station
-    truth[_at(lane, 14, sample)] = pose.offset
-
-
-@equation
-def _look(memory: Any, book: Any, plans: Any, roads: Any, truth: Any, ended: Any) -> None:
+def _look(memory: Any, book: Any, routes: Any, roads: Any, truth: Any, ended: Any) -> None:
     """Record where all cars are and look up the road before them."""
     for lane in range(LANES):
         drive, tick = book[DRIVE, lane], book[TICK, lane]
@@ -223,32 +164,32 @@ def _look(memory: Any, book: Any, plans: Any, roads: Any, truth: Any, ended: Any
             pose = read(memory, POSE, lane, Pose)
             if ended[drive, LOST] == NOBODY and _has_lost(x, pose):
                 ended[drive, LOST] = tick
-            _record(truth, lane, tick - book[FIRST, lane], x, pose)
+            record(truth, lane, tick - book[FIRST, lane], x, pose)
             lost = ended[drive, LOST] != NOBODY
-            write(memory, PATH, lane, _look_up(roads, plans[drive], x, pose.station, lost))
+            write(memory, PATH, lane, _look_up(roads, routes[drive], x, pose.station, lost))
 
 
 @equation
-def _move_on(memory: Any, book: Any, plans: Any, truth: Any, ended: Any) -> int:
+def _move_on(memory: Any, book: Any, routes: Any, truth: Any, ended: Any) -> int:
     """Count the sample and the laps of all cars; return how many blocks are complete."""
     complete = 0
     for lane in range(LANES):
         drive, tick = book[DRIVE, lane], book[TICK, lane]
         if drive != NOBODY:
-            plan = plans[drive]
+            route = routes[drive]
             sample = tick - book[FIRST, lane]
-            truth[_at(lane, 0, sample)] = memory[FORCE * LANES + lane]
-            truth[_at(lane, 1, sample)] = memory[(FORCE + 1) * LANES + lane]
+            truth[at(lane, 0, sample)] = memory[FORCE * LANES + lane]
+            truth[at(lane, 1, sample)] = memory[(FORCE + 1) * LANES + lane]
             station = memory[POSE * LANES + lane]
-            gone = book[LAP, lane] * plan.length_m + station
-            if plan.closed:
-                lap = 1 if station >= plan.length_m else -1 if station < 0.0 else 0
+            gone = book[LAP, lane] * route.length_m + station
+            if route.closed:
+                lap = 1 if station >= route.length_m else -1 if station < 0.0 else 0
                 book[LAP, lane] += lap
-                memory[POSE * LANES + lane] = station - lap * plan.length_m
+                memory[POSE * LANES + lane] = station - lap * route.length_m
             book[TICK, lane] = tick + 1
             lost = ended[drive, LOST]
             given_up = lost != NOBODY and tick >= lost + AFTER_LOSS
-            if given_up or gone >= plan.distance_m or tick + 1 == plan.samples:
+            if given_up or gone >= route.distance_m or tick + 1 == route.samples:
                 ended[drive, SAMPLES] = tick + 1
                 complete += 1
             elif sample + 1 == BLOCK:
@@ -257,59 +198,16 @@ def _move_on(memory: Any, book: Any, plans: Any, truth: Any, ended: Any) -> int:
 
 
 @equation
-def _angles(wheel: Any, left: Any, right: Any, vx: Any, vy: Any, slip: Any, car: Any) -> None:
-    """Fill in the road wheels' angles and the side-slip angle of a block."""
-    steer, ackermann = car[STEER], car[ACKERMANN]
-    for tick in range(len(wheel)):
-        tangent = steer * wheel[tick]
-        left[tick] = arctan2(tangent, 1.0 - ackermann * tangent)
-    for tick in range(len(wheel)):
-        tangent = steer * wheel[tick]
-        right[tick] = arctan2(tangent, 1.0 + ackermann * tangent)
-    for tick in range(len(wheel)):
-        slip[tick] = arctan2(vy[tick], vx[tick])
-
-
-@equation
 def _finish(truth: Any, book: Any, ended: Any, cars: Any) -> None:
     """Fill in what follows from the recorded in the blocks that are complete."""
     for lane in range(LANES):
         drive, samples = book[DRIVE, lane], book[TICK, lane] - book[FIRST, lane]
         if drive != NOBODY and (samples == BLOCK or ended[drive, SAMPLES] != NOBODY):
-            wheel = truth[_at(lane, 3, 0) :][:samples]
-            left, right = truth[_at(lane, 8, 0) :][:samples], truth[_at(lane, 9, 0) :][:samples]
-            slip = truth[_at(lane, 10, 0) :][:samples]
-            vx, vy = truth[_at(lane, 11, 0) :][:samples], truth[_at(lane, 12, 0) :][:samples]
-            _angles(wheel, left, right, vx, vy, slip, cars[drive])
-
-
-def empty_lanes() -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return the memory and the book of lanes without a drive: cars at rest."""
-    return np.zeros(ROWS * LANES), np.full((4, LANES), NOBODY)
-
-
-def begin(
-    memory: NDArray[np.float64],
-    book: NDArray[np.int64],
-    lane: int,
-    drive: int,
-    car: NDArray[np.float64],
-    speed_mps: float,
-) -> None:
-    """Put a drive on a lane: rolling straight along the line at a speed."""
-    book[:, lane] = drive, 0, 0, 0
-    spin = speed_mps * car[INVERSE_RADIUS]
-    column = memory.reshape(ROWS, LANES)[:, lane]
-    column[:] = 0.0
-    column[CAR : CAR + len(car)] = car
-    column[STATE : STATE + len(State._fields)] = State(speed_mps, *6 * (0.0,), *4 * (spin,))
-    column[POSE : POSE + len(Pose._fields)] = Pose(0.0, 0.0, 1.0, 0.0)
-
-
-def clear(memory: NDArray[np.float64], book: NDArray[np.int64], lane: int) -> None:
-    """Let nothing stand on a lane: a car at rest."""
-    book[DRIVE, lane] = NOBODY
-    memory.reshape(ROWS, LANES)[:, lane] = 0.0
+            wheel = truth[at(lane, 3, 0) :][:samples]
+            left, right = truth[at(lane, 8, 0) :][:samples], truth[at(lane, 9, 0) :][:samples]
+            slip = truth[at(lane, 10, 0) :][:samples]
+            vx, vy = truth[at(lane, 11, 0) :][:samples], truth[at(lane, 12, 0) :][:samples]
+            fill_angles(wheel, left, right, vx, vy, slip, cars[drive])
 
 
 def build_kernel(sources: str) -> Callable[..., None]:
@@ -320,7 +218,7 @@ def build_kernel(sources: str) -> Callable[..., None]:
     """
 
     def simulate(
-        plans: Any,
+        routes: Any,
         cars: Any,
         roads: Any,
         steps: int,
@@ -331,7 +229,7 @@ def build_kernel(sources: str) -> Callable[..., None]:
     ) -> None:
         """Drive on, from sample to sample, until a lane's block is complete.
 
-        `plans` are of dtype `PLAN` and point into the table `roads`; `cars` has `Constants` and
+        `routes` are of dtype `ROUTE` and point into the table `roads`; `cars` has `Constants` and
         `Handling` in rows; a sample takes `steps` steps. `truth` has `BLOCK_SHAPE`, made flat;
         `ended` gets the number of samples and the tick of the loss of each drive. There must be a
         drive on some lane.
@@ -339,11 +237,11 @@ def build_kernel(sources: str) -> Callable[..., None]:
         _ = sources
         complete = 0
         while complete == 0:
-            _look(memory, book, plans, roads, truth, ended)
+            _look(memory, book, routes, roads, truth, ended)
             _decide(memory)
             for step in range(steps):
                 _integrate(memory, SAMPLE_S / steps, step == 0)
-            complete = _move_on(memory, book, plans, truth, ended)
+            complete = _move_on(memory, book, routes, truth, ended)
         _finish(truth, book, ended, cars)
 
     return simulate

@@ -8,11 +8,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import ConfigError
-from fleet_slip.vehicle import kernel
+from fleet_slip.vehicle import kernel, lane_memory
 from fleet_slip.vehicle.driver import SAMPLE_S, handling
 from fleet_slip.vehicle.integration import STEP_S
 from fleet_slip.vehicle.kernel import LOST_SPEED_MPS
+from fleet_slip.vehicle.lane_blocks import BLOCK, BLOCK_SHAPE, CHANNELS
+from fleet_slip.vehicle.lane_memory import DRIVE, FIRST, NOBODY
 from fleet_slip.vehicle.parameters import VehicleParameters, constants
 
 STEPS_PER_SAMPLE = round(SAMPLE_S / STEP_S)
@@ -35,9 +38,9 @@ class Road(NamedTuple):
     """
 
     spacing_m: float
-    curvature_1pm: NDArray[np.float64]
+    curvature_1pm: FloatArray
     """Curvature of the line, (m,), positive to the left."""
-    speed_mps: NDArray[np.float64]
+    speed_mps: FloatArray
     """Target speed, (m,), already times the speed factor."""
     length_m: float
     closed: bool
@@ -59,35 +62,35 @@ class LaneDrive:
 class Truth:
     """What happened in one drive, at 100 Hz: float64 arrays of one length, signs after ISO 8855."""
 
-    ax_mps2: NDArray[np.float64]
+    ax_mps2: FloatArray
     """Longitudinal specific force at the centre of gravity."""
-    ay_mps2: NDArray[np.float64]
+    ay_mps2: FloatArray
     """Lateral specific force at the centre of gravity."""
-    yaw_rate_rad_s: NDArray[np.float64]
-    steering_wheel_rad: NDArray[np.float64]
-    wheel_fl_rad_s: NDArray[np.float64]
-    wheel_fr_rad_s: NDArray[np.float64]
-    wheel_rl_rad_s: NDArray[np.float64]
-    wheel_rr_rad_s: NDArray[np.float64]
-    steer_fl_rad: NDArray[np.float64]
-    steer_fr_rad: NDArray[np.float64]
-    sideslip_rad: NDArray[np.float64]
-    vx_mps: NDArray[np.float64]
-    vy_mps: NDArray[np.float64]
-    station_m: NDArray[np.float64]
+    yaw_rate_rad_s: FloatArray
+    steering_wheel_rad: FloatArray
+    wheel_fl_rad_s: FloatArray
+    wheel_fr_rad_s: FloatArray
+    wheel_rl_rad_s: FloatArray
+    wheel_rr_rad_s: FloatArray
+    steer_fl_rad: FloatArray
+    steer_fr_rad: FloatArray
+    sideslip_rad: FloatArray
+    vx_mps: FloatArray
+    vy_mps: FloatArray
+    station_m: FloatArray
     """Distance along the road within the lap."""
-    lateral_offset_m: NDArray[np.float64]
+    lateral_offset_m: FloatArray
     lost_control_tick: int | None
     """First tick at which the driver had lost the car; None where he never did."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """What happened in a part of a drive: at most `kernel.BLOCK` samples, without a gap."""
+    """What happened in a part of a drive: at most `BLOCK` samples, without a gap."""
 
     drive: int
     """Which of the drives."""
-    channels: dict[str, NDArray[np.float64]]
+    channels: dict[str, FloatArray]
     """The arrays of `Truth`. Their memory is used again for the next block."""
     last: bool
     """Whether the drive ends with it."""
@@ -112,31 +115,31 @@ def simulate_blocks(
         return
     for drive in drives:
         _check(drive)
-    plans, roads = _plans(drives)
+    routes, roads = _routes(drives)
     cars = np.array([(*constants(d.vehicle, d.adhesion), *handling(d.vehicle)) for d in drives])
-    waiting = np.argsort(plans["samples"], kind="stable").tolist()
-    ended = np.full((len(drives), 2), kernel.NOBODY)
-    memory, book = kernel.empty_lanes()
-    truth = np.empty(kernel.BLOCK_SHAPE)
+    waiting = np.argsort(routes["samples"], kind="stable").tolist()
+    ended = np.full((len(drives), 2), NOBODY)
+    memory, book = lane_memory.empty_lanes()
+    truth = np.empty(BLOCK_SHAPE)
     while True:
-        for lane in np.flatnonzero(book[kernel.DRIVE] == kernel.NOBODY)[: len(waiting)]:
+        for lane in np.flatnonzero(book[DRIVE] == NOBODY)[: len(waiting)]:
             drive = waiting.pop()
-            speed_mps = roads[plans["first"][drive], kernel.SPEED]
-            kernel.begin(memory, book, lane, drive, cars[drive], speed_mps)
-        if (book[kernel.DRIVE] == kernel.NOBODY).all():
+            speed_mps = roads[routes["first"][drive], kernel.SPEED]
+            lane_memory.begin(memory, book, lane, drive, cars[drive], speed_mps)
+        if (book[DRIVE] == NOBODY).all():
             return
         kernel.simulate(
-            plans, cars, roads, steps_per_sample, memory, book, truth.reshape(-1), ended
+            routes, cars, roads, steps_per_sample, memory, book, truth.reshape(-1), ended
         )
         for lane, (drive, tick, _, first) in enumerate(book.T.tolist()):
-            last = drive != kernel.NOBODY and ended[drive, kernel.SAMPLES] != kernel.NOBODY
-            if last or tick - first == kernel.BLOCK:
+            last = drive != NOBODY and ended[drive, kernel.SAMPLES] != NOBODY
+            if last or tick - first == BLOCK:
                 lost = int(ended[drive, kernel.LOST])
-                channels = dict(zip(kernel.CHANNELS, truth[lane, :, : tick - first], strict=True))
-                yield Block(drive, channels, last, None if lost == kernel.NOBODY else lost)
-                book[kernel.FIRST, lane] = tick
+                channels = dict(zip(CHANNELS, truth[lane, :, : tick - first], strict=True))
+                yield Block(drive, channels, last, None if lost == NOBODY else lost)
+                book[FIRST, lane] = tick
             if last:
-                kernel.clear(memory, book, lane)
+                lane_memory.clear(memory, book, lane)
 
 
 def simulate_drives(
@@ -146,14 +149,14 @@ def simulate_drives(
 
     Takes 120 bytes a sample.
     """
-    parts: list[list[dict[str, NDArray[np.float64]]]] = [[] for _ in drives]
+    parts: list[list[dict[str, FloatArray]]] = [[] for _ in drives]
     lost: dict[int, int | None] = {}
     for block in simulate_blocks(drives, steps_per_sample):
         parts[block.drive].append({name: x.copy() for name, x in block.channels.items()})
         lost[block.drive] = block.lost_control_tick
     return [
         Truth(
-            **{name: np.concatenate([part[name] for part in some]) for name in kernel.CHANNELS},
+            **{name: np.concatenate([part[name] for part in some]) for name in CHANNELS},
             lost_control_tick=lost[drive],
         )
         for drive, some in enumerate(parts)
@@ -167,7 +170,7 @@ def planned_time_s(road: Road, distance_m: float) -> float:
     return lap_s * distance_m / road.length_m
 
 
-def target_acceleration(road: Road) -> NDArray[np.float64]:
+def target_acceleration(road: Road) -> FloatArray:
     """Return the acceleration d(v²/2)/ds of the target speed at the road's entries, in m/s².
 
     Central differences; interpolated linearly it is continuous, so that a drive does not hinge on
@@ -179,7 +182,7 @@ def target_acceleration(road: Road) -> NDArray[np.float64]:
     return np.gradient(energy, road.spacing_m)
 
 
-def _table(road: Road) -> NDArray[np.float64]:
+def _table(road: Road) -> FloatArray:
     """Return what the kernel looks up of a road: curvature, target speed and acceleration.
 
     The table of a closed road goes on beyond its length by what a driver sees ahead.
@@ -189,20 +192,22 @@ def _table(road: Road) -> NDArray[np.float64]:
     return np.take(columns, range(len(columns) + further), axis=0, mode="wrap")
 
 
-def _plans(drives: Sequence[LaneDrive]) -> tuple[NDArray[np.void], NDArray[np.float64]]:
-    """Return what the kernel knows of the drives, `kernel.PLAN`, and the table of all roads."""
+def _routes(drives: Sequence[LaneDrive]) -> tuple[NDArray[np.void], FloatArray]:
+    """Return what the kernel knows of the drives, `kernel.ROUTE`, and the table of all roads."""
     roads = {id(drive.road): drive.road for drive in drives}
     tables = [_table(road) for road in roads.values()]
     ends = np.cumsum([len(table) for table in tables])
     spans = dict(zip(roads, zip([0, *ends[:-1]], ends - 1, strict=True), strict=True))
-    plans = np.array([_plan(drive, *spans[id(drive.road)]) for drive in drives], dtype=kernel.PLAN)
-    return plans, np.concatenate(tables)
+    routes = np.array(
+        [_route(drive, *spans[id(drive.road)]) for drive in drives], dtype=kernel.ROUTE
+    )
+    return routes, np.concatenate(tables)
 
 
-def _plan(
+def _route(
     drive: LaneDrive, first: int, last: int
 ) -> tuple[int, int, float, float, bool, float, int]:
-    """Return a drive's row of `kernel.PLAN`."""
+    """Return a drive's row of `kernel.ROUTE`."""
     road = drive.road
     distance_m = (drive.laps if road.closed else min(drive.laps, 1.0)) * road.length_m
     samples = math.ceil((PATIENCE * planned_time_s(road, distance_m) + GRACE_S) / SAMPLE_S)

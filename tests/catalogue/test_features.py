@@ -22,7 +22,8 @@ from fleet_slip.grams import job as gram_job
 from fleet_slip.grams import statement as gram_statement
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.job import update_grams
-from fleet_slip.regression.gram import Gram, GramTable
+from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.gram_table import GramTable
 from fleet_slip.resources import folder
 from fleet_slip.warehouse.tables import Warehouse
 from tests.conftest import land, log_rows, random_counts

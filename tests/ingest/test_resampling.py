@@ -4,8 +4,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.ingest.resampling import (
-    FloatArray,
     average,
     choose_method,
     interpolate,

@@ -5,8 +5,9 @@ from datetime import date
 
 import numpy as np
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.observers.signals import STEP_S, DriveSignals, Floats, LabelledDrive
+from fleet_slip.observers.signals import STEP_S, DriveSignals, LabelledDrive
 from fleet_slip.simulation.campaign import Batch, load_campaign
 from fleet_slip.simulation.drives import simulate_batch
 from fleet_slip.vehicle.parameters import VehicleParameters
@@ -16,14 +17,14 @@ GPS_EVERY = 10
 
 def rolling_drive(
     car: VehicleParameters,
-    vx_mps: Floats,
-    vy_mps: Floats,
-    yaw_rate_rad_s: Floats,
-    steer_rad: Floats,
+    vx_mps: FloatArray,
+    vy_mps: FloatArray,
+    yaw_rate_rad_s: FloatArray,
+    steer_rad: FloatArray,
 ) -> DriveSignals:
     """Return what exact sensors read of a motion, with wheels that roll without slip."""
 
-    def rate(values: Floats) -> Floats:
+    def rate(values: FloatArray) -> FloatArray:
         return np.diff(values, prepend=values[:1]) / STEP_S
 
     radius, half_track = car.tyre.rolling_radius_m, car.body.track_front_m / 2
@@ -48,7 +49,7 @@ def rolling_drive(
     )
 
 
-def slalom(car: VehicleParameters, rows: int) -> tuple[DriveSignals, Floats]:
+def slalom(car: VehicleParameters, rows: int) -> tuple[DriveSignals, FloatArray]:
     """Return an exact drive through curves at changing speed, and its side-slip."""
     time_s = np.arange(rows) * STEP_S
     vx = 20.0 + 5.0 * np.sin(0.2 * time_s)
@@ -62,7 +63,7 @@ def noisy(drive: DriveSignals, seed: int) -> DriveSignals:
     """Return the drive as sensors with the paper's initial noise and bias report it."""
     generator = np.random.default_rng(seed)
 
-    def measured(values: Floats, bias: float, std: float) -> Floats:
+    def measured(values: FloatArray, bias: float, std: float) -> FloatArray:
         return values + bias + std * generator.standard_normal(len(values))
 
     return DriveSignals(

@@ -5,9 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.observers import ekf
 from fleet_slip.observers.ekf import Belief, EkfNoise, build_model, lateral_force, rates
-from fleet_slip.observers.signals import STEP_S, DriveSignals, Floats
+from fleet_slip.observers.signals import STEP_S, DriveSignals
 from fleet_slip.observers.single_track import SingleTrack
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.observers.drives import rolling_drive
@@ -18,11 +19,11 @@ MODEL = build_model(TRACK, EkfNoise())
 UNCERTAIN = np.array([[0.5, 0.02, 0.01], [0.02, 0.3, -0.05], [0.01, -0.05, 0.2]])
 
 
-def belief(vx: float, vy: float, r: float, p: Floats = UNCERTAIN) -> Belief:
+def belief(vx: float, vy: float, r: float, p: FloatArray = UNCERTAIN) -> Belief:
     return Belief(vx, vy, r, *p[np.triu_indices(3)])
 
 
-def dense(x: Belief) -> Floats:
+def dense(x: Belief) -> FloatArray:
     upper = np.zeros((3, 3))
     upper[np.triu_indices(3)] = x[3:]
     return upper + np.triu(upper, 1).T
@@ -82,7 +83,7 @@ def test_prediction_and_measurement_are_the_textbook_algebra() -> None:
     steer, ax = 0.04, 1.2
     h = 1e-6
 
-    def flow(state: Floats) -> Floats:
+    def flow(state: FloatArray) -> FloatArray:
         d = rates(belief(*state), steer, MODEL)
         vx, vy, r = state
         return state + STEP_S * np.array([ax + r * vy, d.ay - r * vx, d.yaw])
@@ -103,7 +104,7 @@ def test_prediction_and_measurement_are_the_textbook_algebra() -> None:
     np.testing.assert_allclose(dense(found), expected, rtol=0, atol=1e-14)
 
 
-def drive_of_the_model(steer: Floats, vx: Floats) -> tuple[DriveSignals, Floats]:
+def drive_of_the_model(steer: FloatArray, vx: FloatArray) -> tuple[DriveSignals, FloatArray]:
     """Return what exact sensors read of the nonlinear model, and its side-slip."""
     vy, r = np.zeros(len(vx)), np.zeros(len(vx))
     for k in range(len(vx) - 1):

@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
 from fleet_slip.observers import ekf, kalman, luenberger, sliding_mode
-from fleet_slip.observers.signals import Floats, LabelledDrive
+from fleet_slip.observers.signals import LabelledDrive
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.observers.drives import mirrored, noisy, rolling_drive, simulated_drive, slalom
 
 CAR = load_vehicle("d_class_sedan")
-ESTIMATORS: dict[str, tuple[Callable[..., Floats], Any]] = {
+ESTIMATORS: dict[str, tuple[Callable[..., FloatArray], Any]] = {
     "kalman": (kalman.estimate, kalman.FilterNoise()),
     "ekf": (ekf.estimate, ekf.EkfNoise()),
     "luenberger": (luenberger.estimate, luenberger.ObserverPoles()),
@@ -27,7 +28,7 @@ OBSERVERS = pytest.mark.parametrize("name", ["ekf", "luenberger", "sliding_mode"
 simulated = cache(simulated_drive)
 
 
-def run(name: str, drive: LabelledDrive) -> Floats:
+def run(name: str, drive: LabelledDrive) -> FloatArray:
     estimate, parameters = ESTIMATORS[name]
     return estimate(drive.signals, CAR, parameters)
 

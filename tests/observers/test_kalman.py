@@ -9,11 +9,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
 from fleet_slip.observers import kalman
 from fleet_slip.observers.kalman import Belief, FilterNoise, covariances, predict, run, update
 from fleet_slip.observers.outages import TUNNEL_S, tunnel, without_fixes
-from fleet_slip.observers.signals import STEP_S, DriveSignals, Floats
+from fleet_slip.observers.signals import STEP_S, DriveSignals
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.observers.drives import GPS_EVERY, mirrored, noisy, rolling_drive, slalom
 
@@ -22,13 +23,13 @@ H = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0]])
 NOISE = FilterNoise(ax_std_mps2=0.1, ay_std_mps2=0.2, bias_walk_mps2_per_sqrt_s=0.02)
 
 
-def transition(yaw_rate: float) -> Floats:
+def transition(yaw_rate: float) -> FloatArray:
     """F(k), from equation (5) by the paper's differences."""
     kinematics = np.array([[0, -1, yaw_rate, 0], [0] * 4, [-yaw_rate, 0, 0, -1], [0] * 4])
     return np.eye(4) + STEP_S * kinematics
 
 
-def matrices(noise: FilterNoise) -> tuple[Floats, Floats, Floats]:
+def matrices(noise: FilterNoise) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Q, R and the first P."""
     b1 = STEP_S * H.T
     walk = noise.bias_walk_mps2_per_sqrt_s**2 * STEP_S
@@ -38,7 +39,7 @@ def matrices(noise: FilterNoise) -> tuple[Floats, Floats, Floats]:
     return q + np.diag([0, walk, 0, walk]), r, first
 
 
-def textbook_filter(drive: DriveSignals, yaw_rate: Floats, noise: FilterNoise) -> Floats:
+def textbook_filter(drive: DriveSignals, yaw_rate: FloatArray, noise: FilterNoise) -> FloatArray:
     """Equations (9) to (11) as they stand, dense and without Joseph."""
     q, r, p = matrices(noise)
     x = np.array([drive.gps_vx_mps[0], 0, drive.gps_vy_mps[0], 0])
@@ -56,7 +57,9 @@ def textbook_filter(drive: DriveSignals, yaw_rate: Floats, noise: FilterNoise) -
     return np.array(means).T
 
 
-def generate(rows: int, noise: FilterNoise, seed: int) -> tuple[DriveSignals, Floats, Floats]:
+def generate(
+    rows: int, noise: FilterNoise, seed: int
+) -> tuple[DriveSignals, FloatArray, FloatArray]:
     """Return signals, yaw rate and true states of a drive that the filter's own model makes."""
     generator = np.random.default_rng(seed)
     drive, _ = slalom(CAR, rows)
@@ -77,13 +80,13 @@ def generate(rows: int, noise: FilterNoise, seed: int) -> tuple[DriveSignals, Fl
     return replace(drive, gps_vx_mps=gps[0], gps_vy_mps=gps[1]), yaw_rate, truth
 
 
-def dense(belief: Belief) -> Floats:
+def dense(belief: Belief) -> FloatArray:
     upper = np.zeros((4, 4))
     upper[np.triu_indices(4)] = belief[4:]
     return upper + np.triu(upper, 1).T
 
 
-def stacked(found: kalman.KalmanEstimate) -> Floats:
+def stacked(found: kalman.KalmanEstimate) -> FloatArray:
     return np.stack([found.vx_mps, found.ax_bias_mps2, found.vy_mps, found.ay_bias_mps2])
 
 
@@ -122,7 +125,7 @@ def test_agrees_with_the_joint_gaussian_posterior() -> None:
     np.testing.assert_allclose(dense(belief), posterior, rtol=0, atol=1e-9)
 
 
-def last_belief(drive: DriveSignals, yaw_rate: Floats, noise: FilterNoise) -> Belief:
+def last_belief(drive: DriveSignals, yaw_rate: FloatArray, noise: FilterNoise) -> Belief:
     c = covariances(noise)
     belief = kalman.first_belief(drive.gps_vx_mps[0], drive.gps_vy_mps[0], c)
     for k in range(1, len(drive)):
@@ -152,7 +155,7 @@ def normalised_innovations(
     return found
 
 
-def innovations(assumed: FilterNoise) -> Floats:
+def innovations(assumed: FilterNoise) -> FloatArray:
     drive, yaw_rate, _ = generate(100_000, NOISE, seed=3)
     found = normalised_innovations(
         drive.ax_mps2,
@@ -162,11 +165,11 @@ def innovations(assumed: FilterNoise) -> Floats:
         drive.gps_vy_mps,
         covariances(assumed),
     )
-    whole: Floats = found[:, np.isfinite(found[0])]
+    whole: FloatArray = found[:, np.isfinite(found[0])]
     return whole
 
 
-def ljung_box(series: Floats, lags: int = 20) -> float:
+def ljung_box(series: FloatArray, lags: int = 20) -> float:
     """Return the p-value of the hypothesis that a series is white."""
     n = len(series)
     centred = series - series.mean()
@@ -276,7 +279,7 @@ def test_turned_axes_give_turned_velocities() -> None:
     drive = noisy(slalom(CAR, 3000)[0], seed=6)
     cosine, sine = float(np.cos(0.7)), float(np.sin(0.7))
 
-    def turned(x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    def turned(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         return cosine * x - sine * y, sine * x + cosine * y
 
     ax, ay = turned(drive.ax_mps2, drive.ay_mps2)

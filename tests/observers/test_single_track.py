@@ -9,9 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.observers import luenberger, sliding_mode
 from fleet_slip.observers.luenberger import ObserverPoles
-from fleet_slip.observers.signals import STEP_S, DriveSignals, Floats
+from fleet_slip.observers.signals import STEP_S, DriveSignals
 from fleet_slip.observers.single_track import SingleTrack, state_space
 from fleet_slip.observers.sliding_mode import SlidingGains
 from fleet_slip.vehicle.parameters import load_vehicle
@@ -19,7 +20,7 @@ from tests.observers.drives import rolling_drive
 
 CAR = load_vehicle("d_class_sedan")
 TRACK = SingleTrack.of(CAR)
-OBSERVERS: list[tuple[Callable[..., Floats], Any]] = [
+OBSERVERS: list[tuple[Callable[..., FloatArray], Any]] = [
     (luenberger.estimate, ObserverPoles()),
     (sliding_mode.estimate, SlidingGains()),
 ]
@@ -33,7 +34,7 @@ def steady_state(vx: float, steer: float) -> tuple[float, float]:
     return float(vy), float(rate)
 
 
-def linear_drive(vx: Floats, steer: Floats) -> tuple[DriveSignals, Floats]:
+def linear_drive(vx: FloatArray, steer: FloatArray) -> tuple[DriveSignals, FloatArray]:
     """Return what exact sensors read of the linear model, and its side-slip."""
     s = state_space(TRACK, vx)
     vy, rate = np.zeros(len(vx)), np.zeros(len(vx))
@@ -97,7 +98,7 @@ def test_error_of_the_luenberger_observer_decays_with_its_pole(p1: float) -> Non
 @pytest.mark.parametrize(("estimate", "parameters"), OBSERVERS)
 @pytest.mark.parametrize("vx", [8.0, 15.0, 30.0])
 def test_converges_to_steady_cornering(
-    estimate: Callable[..., Floats], parameters: Any, vx: float
+    estimate: Callable[..., FloatArray], parameters: Any, vx: float
 ) -> None:
     constant = np.ones(3000)
     drive, _ = linear_drive(vx * constant, 0.02 * constant)
@@ -107,7 +108,7 @@ def test_converges_to_steady_cornering(
 
 @pytest.mark.parametrize(("estimate", "parameters"), OBSERVERS)
 def test_follows_the_model_through_curves_at_changing_speed(
-    estimate: Callable[..., Floats], parameters: Any
+    estimate: Callable[..., FloatArray], parameters: Any
 ) -> None:
     time_s = np.arange(6000) * STEP_S
     drive, truth = linear_drive(20 + 8 * np.sin(0.1 * time_s), 0.03 * np.sin(1.5 * time_s))

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from pydantic import Field
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.config import Config
 from fleet_slip.errors import DataError
 from fleet_slip.observers import ekf, kalman, luenberger, sliding_mode
 from fleet_slip.observers.kalman import FilterNoise
-from fleet_slip.observers.signals import DriveSignals, Floats, LabelledDrive
+from fleet_slip.observers.signals import DriveSignals, LabelledDrive
 from fleet_slip.observers.tuning import error_std_rad, tune
 from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
 from tests.observers.drives import noisy, slalom
@@ -39,12 +40,12 @@ def labelled(seed: int, rows: int = 4000) -> LabelledDrive:
     return LabelledDrive(str(seed), noisy(exact, seed), truth)
 
 
-def valley(drive: DriveSignals, car: VehicleParameters, p: Parameters) -> Floats:
+def valley(drive: DriveSignals, car: VehicleParameters, p: Parameters) -> FloatArray:
     """Return an estimate whose error is smallest at a = 3 and inner.b = 0.2, in a bent valley."""
     x, y = np.log(p.a / 3), np.log(p.inner.b / 0.2)
     size = 0.01 + x**2 + y**2 + 0.5 * x * y
     _, truth = slalom(car, len(drive))
-    ripple: Floats = truth + size * np.where(np.arange(len(drive)) % 2, 1.0, -1.0)
+    ripple: FloatArray = truth + size * np.where(np.arange(len(drive)) % 2, 1.0, -1.0)
     return ripple
 
 

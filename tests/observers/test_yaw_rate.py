@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.observers import yaw_rate
-from fleet_slip.observers.signals import STEP_S, DriveSignals, Floats
+from fleet_slip.observers.signals import STEP_S, DriveSignals
 from fleet_slip.observers.wheel_speeds import undriven_axle
 from fleet_slip.observers.yaw_rate import YawRateNoise
 from fleet_slip.vehicle.parameters import load_vehicle
@@ -16,7 +17,7 @@ CAR = load_vehicle("d_class_sedan")
 NOISE = YawRateNoise()
 
 
-def textbook_filter(drive: DriveSignals, noise: YawRateNoise) -> Floats:
+def textbook_filter(drive: DriveSignals, noise: YawRateNoise) -> FloatArray:
     """Both measurements at once, dense."""
     x = np.zeros(2)
     p = np.diag([1.0, noise.gyro_bias_std_rad_s**2])

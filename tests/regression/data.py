@@ -1,6 +1,7 @@
 """Data and plain float64 formulas that the tests compare with."""
 
 import json
+from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.gram_table import GramTable
 
 REFERENCE = Path(__file__).parents[2].parent / "shared" / "reference"
 
@@ -63,6 +65,16 @@ def names(inputs: int) -> tuple[str, ...]:
 def gram_of(counts: Matrix) -> Gram:
     """Return the Gram of counts, label last."""
     return Gram.from_counts(names(counts.shape[1] - 1), counts)
+
+
+def table_of(grams: Sequence[Gram]) -> GramTable:
+    """Stack the Grams of drives."""
+    return GramTable(
+        grams[0].signals,
+        np.array([gram.n for gram in grams], dtype=np.int64),
+        np.array([gram.sums for gram in grams], dtype=np.int64),
+        np.array([gram.products for gram in grams], dtype=np.int64),
+    )
 
 
 def dense_fit(counts: Matrix) -> tuple[Matrix, float]:

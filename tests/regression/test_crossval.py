@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from fleet_slip.errors import DataError
 from fleet_slip.regression.crossval import CrossValidation, cross_validate_inputs
 from fleet_slip.regression.folds import CohortFolds, by_hash, by_value, hash_fold
-from fleet_slip.regression.gram import Gram, GramTable
+from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.winner import choose
+from tests.regression.data import table_of
 
 from .data import dense_fit, gram_of, names, random_drives
 
@@ -20,7 +21,7 @@ SCALES = {**{name: Fraction(1, 100) for name in names(6)}, "y": Fraction(1, 10_0
 
 
 def cohort_of(drives: list[np.ndarray], fold: list[int]) -> CohortFolds:
-    table = GramTable.from_grams([gram_of(counts) for counts in drives])
+    table = table_of([gram_of(counts) for counts in drives])
     return CohortFolds.of([table], by_value(fold))
 
 
@@ -66,8 +67,8 @@ def test_training_without_a_fold_is_training_on_the_other_drives_bit_for_bit() -
 
 def test_drives_without_a_signal_serve_the_models_that_do_not_need_it() -> None:
     drives = random_drives(7, drives=12)
-    full = GramTable.from_grams([gram_of(counts) for counts in drives[:6]])
-    poor = GramTable.from_grams(
+    full = table_of([gram_of(counts) for counts in drives[:6]])
+    poor = table_of(
         [Gram.from_counts(("y", "x1", "x2"), counts[:, [4, 0, 1]]) for counts in drives[6:]]
     )
     cohort = CohortFolds.of([full, poor], by_value([0, 1, 2] * 4))
@@ -83,7 +84,7 @@ def test_drives_without_a_signal_serve_the_models_that_do_not_need_it() -> None:
 
 def test_folds_lacking_a_signal_are_an_error() -> None:
     drives = random_drives(7, drives=4)
-    full = GramTable.from_grams([gram_of(counts) for counts in drives[:2]])
+    full = table_of([gram_of(counts) for counts in drives[:2]])
     cohort = CohortFolds.of([full, full.restrict(["x1", "y"])], by_value(["a", "a", "b", "b"]))
     with pytest.raises(DataError, match="fold b has no rows with all of x2, y"):
         cohort.serving(["x2"], "y")

@@ -7,7 +7,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from fleet_slip.errors import DataError
-from fleet_slip.regression.gram import Gram, GramTable, exact_sum, packed_position
+from fleet_slip.regression.gram import Gram, packed_position
+from fleet_slip.regression.gram_table import GramTable, exact_sum
+from tests.regression.data import table_of
 
 SIGNALS = ("ax", "ay", "sideslip")
 
@@ -114,7 +116,7 @@ def test_mistakes_are_named() -> None:
 @given(st.lists(counts_of_drive, min_size=1, max_size=8), st.randoms())
 def test_table_totals_equal_sums_of_grams(drives: list[np.ndarray], random) -> None:  # type: ignore[no-untyped-def]
     grams = [Gram.from_counts(SIGNALS, counts) for counts in drives]
-    table = GramTable.from_grams(grams)
+    table = table_of(grams)
     fold = np.array([random.randrange(3) for _ in grams])
     expected = [
         sum((g for g, f in zip(grams, fold, strict=True) if f == number), Gram.zero(SIGNALS))
@@ -138,7 +140,7 @@ def test_totals_beyond_64_bits_are_exact(values: np.ndarray) -> None:
 def test_moments_about_an_origin_are_those_of_shifted_counts(
     counts: np.ndarray, origin: list[int]
 ) -> None:
-    table = GramTable.from_grams([Gram.from_counts(SIGNALS, counts)])
+    table = table_of([Gram.from_counts(SIGNALS, counts)])
     shifted = Gram.from_counts(SIGNALS, counts.astype(np.int64) - np.array(origin))
     assert table.about(origin).row(0) == shifted
 

@@ -11,7 +11,7 @@ from fleet_slip.errors import DataError
 from fleet_slip.regression import special
 from fleet_slip.regression.drives import DriveMoments, serving_drives
 from fleet_slip.regression.exact import fit
-from fleet_slip.regression.gram import GramTable
+from fleet_slip.regression.gram_table import GramTable
 from fleet_slip.regression.inference import (
     chow,
     classical,
@@ -19,12 +19,13 @@ from fleet_slip.regression.inference import (
     cluster_covariance,
     variance_inflation,
 )
+from tests.regression.data import table_of
 
 from .data import dense_fit, gram_of, names, random_drives, unit_scales
 
 
 def moments_of(drives: list[np.ndarray]) -> DriveMoments:
-    return DriveMoments.of(GramTable.from_grams([gram_of(counts) for counts in drives]))
+    return DriveMoments.of(table_of([gram_of(counts) for counts in drives]))
 
 
 def dense_cluster_covariance(drives: list[np.ndarray]) -> np.ndarray:
@@ -125,7 +126,7 @@ def test_questions_without_an_answer_are_errors() -> None:
 
 
 def moments_table() -> GramTable:
-    return GramTable.from_grams([gram_of(random_drives(1)[0])])
+    return table_of([gram_of(random_drives(1)[0])])
 
 
 def test_serving_drives_stacks_tables() -> None:

@@ -9,7 +9,6 @@ from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.exact import fit
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.folds import CohortFolds, by_value
-from fleet_slip.regression.gram import GramTable
 from fleet_slip.regression.nested_choice import (
     CROSS_VALIDATION,
     Rule,
@@ -19,6 +18,7 @@ from fleet_slip.regression.nested_choice import (
     select_nested,
 )
 from fleet_slip.regression.subsets import best_subsets, choices
+from tests.regression.data import table_of
 
 from .data import gram_of, names, unit_scales
 
@@ -37,7 +37,7 @@ def sparse_drives(seed: int, drives: int = 40) -> list[np.ndarray]:
 
 
 def training_of(drives: list[np.ndarray], *, clustered: bool) -> tuple[Training, np.ndarray]:
-    table = GramTable.from_grams([gram_of(counts) for counts in drives])
+    table = table_of([gram_of(counts) for counts in drives])
     assignment = by_value([i % 5 for i in range(len(drives))])
     folds = CohortFolds.of([table], assignment).serving(INPUTS, "y")
     moments = DriveMoments.of(table) if clustered else None
@@ -77,7 +77,7 @@ def test_the_choice_is_made_again_inside_every_training_fold() -> None:
     tests = []
     for number in range(5):
         rest = [drive for drive, f in zip(drives, fold, strict=True) if f != number]
-        table = GramTable.from_grams([gram_of(counts) for counts in rest])
+        table = table_of([gram_of(counts) for counts in rest])
         folds = CohortFolds.of([table], by_value([i % 4 for i in range(16)]))
         inner = Training(folds.serving(INPUTS, "y"), DriveMoments.of(table), unit_scales(5))
         model = select_nested(inner, INPUTS, "y", rule).fit.model
@@ -99,7 +99,7 @@ def test_nested_models_are_cross_validated_in_order() -> None:
 
 def test_inner_cross_validation_needs_folds() -> None:
     drives = sparse_drives(4, drives=6)
-    table = GramTable.from_grams([gram_of(counts) for counts in drives])
+    table = table_of([gram_of(counts) for counts in drives])
     assignment = by_value([0, 0, 0, 1, 1, 1])
     folds = CohortFolds.of([table], assignment).serving(INPUTS, "y")
     training = Training(folds, None, unit_scales(5))

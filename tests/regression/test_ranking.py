@@ -15,13 +15,14 @@ from fleet_slip.regression import criteria
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.evidence import Evidence
 from fleet_slip.regression.exact import correlation_matrix, fit
-from fleet_slip.regression.gram import Gram, GramTable
+from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.inference import cluster
 from fleet_slip.regression.lars import lars_path, lasso_model, path_of_moments
 from fleet_slip.regression.leaps import best_by_leaps
 from fleet_slip.regression.nested import nested_fits, nested_models
 from fleet_slip.regression.ranking import RANKINGS, rank, replacement_sets
 from fleet_slip.regression.subsets import all_rss, best_subsets, candidates, signals_of
+from tests.regression.data import table_of
 
 from .data import dense_fit, gram_of, names, random_drives, reference, unit_scales
 
@@ -268,7 +269,7 @@ def test_likelihood_criteria_equal_their_textbook_form() -> None:
 def test_contributions_over_drives_are_squared_cluster_t_values() -> None:
     drives = random_drives(6, drives=20, noise=200)
     gram = gram_of(np.concatenate(drives))
-    moments = DriveMoments.of(GramTable.from_grams([gram_of(counts) for counts in drives]))
+    moments = DriveMoments.of(table_of([gram_of(counts) for counts in drives]))
     fits = nested_fits(gram, names(4)[:-1], "y")
     evidence = Evidence.clustered(fits, moments)
     t = cluster(fits[-1], moments, unit_scales(4)).estimates[-1].t
@@ -283,7 +284,7 @@ def test_independent_rows_have_about_as_many_effective_rows() -> None:
     drives = [np.rint(rng.normal(size=(30, 4)) * 500).astype(int) for _ in range(300)]
     for counts in drives:
         counts[:, 3] += counts[:, 0]
-    moments = DriveMoments.of(GramTable.from_grams([gram_of(counts) for counts in drives]))
+    moments = DriveMoments.of(table_of([gram_of(counts) for counts in drives]))
     fits = nested_fits(gram_of(np.concatenate(drives)), ["x1", "x2", "x3"], "y")
     assert Evidence.clustered(fits, moments).design_effect == pytest.approx(1, abs=0.2)
 

@@ -8,7 +8,7 @@ from fleet_slip.regression.crossval import cross_validate, least_squares
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.exact import fit
 from fleet_slip.regression.folds import CohortFolds, by_value
-from fleet_slip.regression.gram import GramTable
+from fleet_slip.regression.gram_table import GramTable
 from fleet_slip.regression.inference import cluster
 from fleet_slip.regression.resampling import (
     bootstrap_coefficients,
@@ -19,6 +19,7 @@ from fleet_slip.regression.resampling import (
     solve,
     to_counts,
 )
+from tests.regression import data
 
 from .data import gram_of, names, random_drives, unit_scales
 
@@ -26,7 +27,7 @@ INPUTS = names(4)[:-1]
 
 
 def table_of(drives: list[np.ndarray]) -> GramTable:
-    return GramTable.from_grams([gram_of(counts) for counts in drives])
+    return data.table_of([gram_of(counts) for counts in drives])
 
 
 def test_moments_solve_to_the_exact_coefficients() -> None:

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.exact import fit
-from fleet_slip.regression.gram import GramTable
 from fleet_slip.regression.inference import classical, cluster
 from fleet_slip.regression.serial import autoregressive_fit
+from tests.regression.data import table_of
 
 from .data import gram_of, names, unit_scales
 from .test_serial import autoregressive_drives, lag_gram
@@ -47,7 +47,7 @@ def test_coefficients_and_both_kinds_of_errors_agree(
     fitted = fit(gram_of(counts), names(inputs)[:-1], "y")
     model = sm.OLS(counts[:, -1].astype(float), sm.add_constant(counts[:, :-1].astype(float)))
     groups = np.repeat(np.arange(drives), [len(part) for part in parts])
-    moments = DriveMoments.of(GramTable.from_grams([gram_of(part) for part in parts]))
+    moments = DriveMoments.of(table_of([gram_of(part) for part in parts]))
     ours = [
         classical(fitted, unit_scales(inputs)),
         cluster(fitted, moments, unit_scales(inputs)),

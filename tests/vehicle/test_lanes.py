@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numba
 import numpy as np
 import pytest
+from fleet_slip.vehicle.lane_blocks import BLOCK, CHANNELS
 
 from fleet_slip.errors import ConfigError
 from fleet_slip.simulation.speed_profile import SpeedLimits, speed_profile
@@ -53,7 +54,7 @@ def drive(car: VehicleParameters, on: Road, adhesion: float = 1.0, laps: float =
 
 
 def assert_same_bits(one: Truth, other: Truth) -> None:
-    for name in kernel.CHANNELS:
+    for name in CHANNELS:
         assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
     assert one.lost_control_tick == other.lost_control_tick
 
@@ -93,7 +94,7 @@ def test_on_a_slippery_road_a_dry_speed_profile_loses_the_car(mass_kg: float) ->
     assert lost is not None
     assert len(truth.vx_mps) == lost + kernel.AFTER_LOSS + 1
     assert np.abs(truth.lateral_offset_m[:lost]).max() <= kernel.LOST_OFFSET_M
-    for name in kernel.CHANNELS:
+    for name in CHANNELS:
         assert np.isfinite(getattr(truth, name)).all()
     horizontal = np.hypot(truth.ax_mps2, truth.ay_mps2)
     assert horizontal.max() < 0.4 * 9.81 * 1.15
@@ -135,7 +136,7 @@ def test_a_drive_does_not_depend_on_the_others() -> None:
 def test_a_long_drive_comes_in_blocks_that_fit_together() -> None:
     """Side by side with short ones, whose lanes are taken again in the middle of a block."""
     on = circle(50.0, 15.0)
-    laps = 1.2 * kernel.BLOCK * 0.01 * 15.0 / on.length_m
+    laps = 1.2 * BLOCK * 0.01 * 15.0 / on.length_m
     long, short = LaneDrive(SEDAN, on, 1.0, laps), LaneDrive(SEDAN, on, 0.9, 3.0)
     blocks = [
         (len(block.channels["vx_mps"]), block.last)
@@ -143,11 +144,11 @@ def test_a_long_drive_comes_in_blocks_that_fit_together() -> None:
         if block.drive == 1
     ]
     assert [last for _, last in blocks] == [False, True]
-    assert blocks[0][0] == kernel.BLOCK
+    assert blocks[0][0] == BLOCK
     truth = simulate_drives([short, long, *[short] * 20])[1]
     assert len(truth.vx_mps) == sum(samples for samples, _ in blocks)
     assert_same_bits(truth, simulate_drives([long])[0])
-    border = slice(kernel.BLOCK - 3, kernel.BLOCK + 3)
+    border = slice(BLOCK - 3, BLOCK + 3)
     heading_rate = np.diff(truth.station_m)[border] % on.length_m / 0.5
     np.testing.assert_allclose(heading_rate, heading_rate.mean(), rtol=1e-3)
 

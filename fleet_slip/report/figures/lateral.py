@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from fleet_slip.evaluation.drives import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.evaluation.runs import EvaluatedScenario
 from fleet_slip.report.figures.lines import smoothed
 from fleet_slip.report.figures.series import Line

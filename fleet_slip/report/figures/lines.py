@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fleet_slip.evaluation.drives import FloatArray
+from fleet_slip.arrays import FloatArray
 
 
 @dataclass(frozen=True)

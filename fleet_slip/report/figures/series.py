@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from fleet_slip.evaluation.drives import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.evaluation.runs import EvaluatedScenario
 from fleet_slip.evaluation.stability import stretches
 from fleet_slip.report.figures.lines import band

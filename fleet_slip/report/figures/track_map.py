@@ -7,7 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from fleet_slip.evaluation.drives import EvaluatedDrive, FloatArray
+from fleet_slip.arrays import FloatArray
+from fleet_slip.evaluation.drives import EvaluatedDrive
 from fleet_slip.evaluation.runs import EvaluatedScenario
 from fleet_slip.report.figures.lines import smoothed
 from fleet_slip.report.style import Size, colour

@@ -1,0 +1,32 @@
+"""The one text of JSON content, whatever its order and layout, and the checksum of a text."""
+
+import hashlib
+import json
+from typing import Any
+
+
+def canonical_json(content: Any) -> str:
+    """Return content as JSON: keys sorted, no spaces, characters as they are.
+
+    Raises `ValueError` for numbers that JSON does not have.
+    """
+    return _canonical(content, ascii_only=False)
+
+
+def canonical_ascii(content: Any) -> str:
+    """Return content as `canonical_json` does, with characters beyond ASCII as escapes.
+
+    Campaigns and mappings have been known by the checksum of this text from the start.
+    """
+    return _canonical(content, ascii_only=True)
+
+
+def sha256_of(text: str) -> str:
+    """Return the SHA-256 of a text in UTF-8, in hexadecimal."""
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _canonical(content: Any, *, ascii_only: bool) -> str:
+    return json.dumps(
+        content, sort_keys=True, separators=(",", ":"), ensure_ascii=ascii_only, allow_nan=False
+    )
