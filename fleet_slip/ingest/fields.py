@@ -13,8 +13,8 @@ import polars as pl
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import InputError
+from fleet_slip.ingest.csv_batches import EXTRA_FIELDS
 from fleet_slip.ingest.mapping import FromColumn, Mapping
-from fleet_slip.ingest.reading import EXTRA_FIELDS
 from fleet_slip.ingest.units import conversion_factor
 
 RAW = "raw "

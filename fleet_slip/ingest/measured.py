@@ -9,11 +9,12 @@ import polars as pl
 import pyarrow as pa
 
 from fleet_slip.errors import InputError
+from fleet_slip.ingest.columns import shown
 from fleet_slip.ingest.drives import cut, drive_id, log_table, to_ticks
 from fleet_slip.ingest.fields import RAW, Field, fields_of
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.quarantine import DriveKeys, check_rows, with_values
-from fleet_slip.ingest.reading import MAX_ROWS, file_digest, read_batches, shown, unchanged
+from fleet_slip.ingest.reading import MAX_ROWS, file_digest, read_batches, unchanged
 from fleet_slip.ingest.resampling import STEP_S
 from fleet_slip.ingest.timebase import cut_into_drives, sample_interval_s
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA

@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import measured, read_measured, reading
+from fleet_slip.ingest import csv_batches, measured, read_measured, reading
 
 from .samples import a_mapping, csv_text, good_columns, read_text, reasons, ticks
 
@@ -72,7 +72,7 @@ def test_blocks_are_cut_at_lines_and_not_within_quotes(
     text = csv_text(columns)
     whole = read_text(tmp_path, text)
     for size in (32, 61, 100):
-        monkeypatch.setattr(reading, "BLOCK_BYTES", size)
+        monkeypatch.setattr(csv_batches, "BLOCK_BYTES", size)
         pieces = read_text(tmp_path, text)
         assert pieces.drives.equals(whole.drives)
         assert pieces.counts == whole.counts
@@ -114,7 +114,7 @@ def test_broken_csv_is_refused_in_one_line(tmp_path: Path, data: bytes, message:
 
 
 def test_a_line_without_end_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reading, "BLOCK_BYTES", 1000)
+    monkeypatch.setattr(csv_batches, "BLOCK_BYTES", 1000)
     data = b't,ax,beta\n0,1,"' + b"2\n" * 5000
     assert "Is a quote not closed?" in failure(write(tmp_path, data))
 

@@ -20,7 +20,7 @@ from fleet_slip.report import paper_tables
 from fleet_slip.report.blocks import blocks_won, difference
 from fleet_slip.report.claims import CLAIMS, judged
 from fleet_slip.report.claims.claim import Status
-from fleet_slip.report.claims.demonstration import noise_is_slight
+from fleet_slip.report.claims.conditions import noise_is_slight
 from fleet_slip.report.data import ReportData
 from fleet_slip.report.drawing import png_file, svg_file
 from fleet_slip.report.histogram import ANGLE_DEG, held_out_coefficients

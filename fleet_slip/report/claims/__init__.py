@@ -3,12 +3,13 @@
 from dataclasses import dataclass
 
 from fleet_slip.report.claims.claim import Claim, Verdict
-from fleet_slip.report.claims.demonstration import DEMONSTRATION
+from fleet_slip.report.claims.conditions import CONDITIONS
 from fleet_slip.report.claims.method import METHOD
+from fleet_slip.report.claims.models import MODELS
 from fleet_slip.report.claims.outcome import OUTCOME
 from fleet_slip.report.data import ReportData
 
-CLAIMS: tuple[Claim, ...] = (*METHOD, *DEMONSTRATION, *OUTCOME)
+CLAIMS: tuple[Claim, ...] = (*METHOD, *MODELS, *CONDITIONS, *OUTCOME)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,5 @@
-"""Claims of section III: the models, and what noise, mass, adhesion and another track do."""
+"""Claims of section III, A to D: what noise, mass, adhesion and another track do."""
 
-from fleet_slip.report.blocks import BLOCK_S, blocks_won
 from fleet_slip.report.claims.claim import (
     CLOSE,
     SLIGHT_DEG,
@@ -14,109 +13,9 @@ from fleet_slip.report.claims.claim import (
     verdict,
 )
 from fleet_slip.report.data import ReportData
-from fleet_slip.report.paper_tables import PAPER_TABLE_TWO
-from fleet_slip.report.text import count, degrees, listed, number
-from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
+from fleet_slip.report.text import degrees, listed, number
 
 GRAVITY_MPS2 = 9.81
-LAST_TWO = frozenset({"4", "5"})
-
-
-@claim(
-    "III",
-    "More than 2 million instances at a sample time of 0.01 s",
-    "more than 2 million rows at 100 Hz",
-)
-def two_million(data: ReportData) -> Verdict:
-    """Count the training rows."""
-    rows = data.trained.selection.cohort.rows
-    return verdict(
-        rows > 2_000_000 and SAMPLE_RATE_HZ == 100,
-        f"{count(rows)} rows at {SAMPLE_RATE_HZ} Hz",
-        "Simulated with our own vehicle model, not with CarSim.",
-    )
-
-
-@claim(
-    "III, Table I",
-    "The last two models have the best predictive accuracy",
-    "models 4 and 5 have the highest correlations",
-)
-def last_two_best(data: ReportData) -> Verdict:
-    """Rank the models by their cross-validated correlation."""
-    selection = data.trained.selection
-    ranked = sorted(selection.models, key=lambda model: model.correlation, reverse=True)
-    winner = selection.winner.model
-    return verdict(
-        {model.name for model in ranked[:2]} == LAST_TWO,
-        ", ".join(f"model {model.name} {number(model.correlation, 4)}" for model in ranked),
-        f"The smallest model within one standard error of the best is model {winner.name}, with "
-        f"{len(winner.signals)} signals: more signals gain less than chance could give.",
-    )
-
-
-@claim(
-    "III, Table I",
-    "Models 4 and 5 are exactly as accurate, as their steering angles are closely related",
-    "equal correlations to the four digits of Table I",
-)
-def exactly_as_accurate(data: ReportData) -> Verdict:
-    """Compare the correlations of models 4 and 5."""
-    values = {model.name: model.correlation for model in data.trained.selection.models}
-    if not values.keys() >= LAST_TWO:
-        raise NotEvaluatedError("models 4 and 5")
-    four, five = (data.evaluated.models[name] for name in ("4", "5"))
-    stds = [known(data, "car_rear_drive_sedan", name).std_deg for name in (four, five)]
-    return verdict(
-        round(values["4"], 4) == round(values["5"], 4),
-        f"{number(values['4'], 5)} and {number(values['5'], 5)}",
-        "That holds for the steering ratio that they were trained with. In a sedan with another "
-        f"one their errors are {degrees(stds[0])} and {degrees(stds[1])}: model 5 goes on "
-        "measuring road wheel angles, model 4 does not.",
-    )
-
-
-@claim(
-    "III, Table II",
-    "All models predict the side-slip angle accurately",
-    "each model's error standard deviation is at most that of Table II",
-)
-def all_accurate(data: ReportData) -> Verdict:
-    """Compare Table II with the paper's."""
-    stds = {
-        name: known(data, "nominal", estimator).std_deg
-        for name, estimator in data.evaluated.models.items()
-    }
-    truth = data.evaluated.scenarios["nominal"]["truth"]["sideslip_std_deg"]
-    return verdict(
-        all(std <= PAPER_TABLE_TWO[name][1] for name, std in stds.items()),
-        ", ".join(f"model {name} {degrees(std)}" for name, std in stds.items()),
-        f"The angle itself has a standard deviation of {degrees(truth, 2)}. How it was driven in "
-        "the paper is not known; slower bends are easier.",
-    )
-
-
-@claim(
-    "III, Figure 1",
-    "But for a short section, models 4 and 5 predict best",
-    f"one of them has the smallest error in all but one block of {BLOCK_S:g} s",
-)
-def best_but_for_a_section(data: ReportData) -> Verdict:
-    """Count in how many blocks of the nominal drive each model is best."""
-    stds = {
-        name: known(data, "nominal", estimator).std_deg
-        for name, estimator in data.evaluated.models.items()
-    }
-    won = blocks_won(data.runs["nominal"], list(data.evaluated.models.values()))
-    wins = {name: won[estimator] for name, estimator in data.evaluated.models.items()}
-    told = ", ".join(f"model {name} in {times}" for name, times in wins.items())
-    near = [std for name, std in stds.items() if name != "1"]
-    return verdict(
-        sum(wins[name] for name in LAST_TWO) >= sum(wins.values()) - 1,
-        f"smallest error of {sum(wins.values())} blocks: {told}",
-        f"From model 2 on they differ by {degrees(max(near) - min(near))} in standard deviation, "
-        "so that chance decides a block.",
-    )
 
 
 @claim(
@@ -294,12 +193,7 @@ def generally_able(data: ReportData) -> Verdict:
     )
 
 
-DEMONSTRATION = (
-    two_million,
-    last_two_best,
-    exactly_as_accurate,
-    all_accurate,
-    best_but_for_a_section,
+CONDITIONS = (
     sensor_quality,
     noise_is_slight,
     mass_is_insignificant,

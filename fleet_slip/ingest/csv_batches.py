@@ -1,0 +1,104 @@
+"""Reads CSV in blocks of whole lines, each field as the text that it is."""
+
+import csv
+from collections.abc import Iterator, Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import polars as pl
+
+from fleet_slip.errors import InputError
+from fleet_slip.ingest.columns import find_columns, shown
+from fleet_slip.ingest.mapping import CsvFormat
+
+BLOCK_BYTES = 2**24
+"""CSV is parsed in blocks of about this size."""
+
+MAX_LINE_BYTES = 2**20
+
+EXTRA_FIELDS = "\0extra fields"
+"""Column of a CSV batch: what a line has after the header's last column, null if nothing."""
+
+
+def csv_batches(
+    stream: BinaryIO, file: Path, columns: Sequence[str], csv_format: CsvFormat
+) -> Iterator[pl.DataFrame]:
+    """Yield the named columns of CSV as text, and `EXTRA_FIELDS`. Raises `InputError`."""
+    names = _csv_header(stream, file, csv_format)
+    positions = find_columns(file, names, columns)
+    # Columns are read by position: Polars renames duplicates. The line of separators before each
+    # block fixes the number of fields and keeps a block from looking like a compressed file.
+    fields = [f"column {i}" for i in range(len(names))] + [EXTRA_FIELDS]
+    padding = csv_format.separator.encode() * len(names) + b"\n"
+    selection = [pl.col(fields[i]).alias(name) for name, i in positions.items()]
+    for block in _whole_lines(stream, file):
+        frame = pl.scan_csv(
+            BytesIO(padding + block),
+            has_header=False,
+            separator=csv_format.separator,
+            schema=dict.fromkeys(fields, pl.String),
+            truncate_ragged_lines=True,
+        )
+        yield frame.select(*selection, EXTRA_FIELDS).collect().slice(1)
+
+
+def _csv_header(stream: BinaryIO, file: Path, csv_format: CsvFormat) -> list[str]:
+    line = stream.readline(MAX_LINE_BYTES + 1)
+    if not line.strip():
+        raise InputError(
+            f"{shown(file)}: {'its first line is' if line else 'it is'} empty. Export it again."
+        )
+    if len(line) > MAX_LINE_BYTES:
+        raise InputError(
+            f"{shown(file)}: the header is longer than {MAX_LINE_BYTES:,} bytes. Is it a CSV file?"
+        )
+    text = _decode(line.removeprefix(b"\xef\xbb\xbf"), file).rstrip("\r\n")
+    try:
+        names = next(csv.reader([text], delimiter=csv_format.separator, strict=True))
+    except csv.Error as error:
+        raise InputError(f"{shown(file)}: its header is not CSV: {error}.") from None
+    return [name.strip() for name in names]
+
+
+def _whole_lines(stream: BinaryIO, file: Path) -> Iterator[bytes]:
+    """Yield blocks of UTF-8 that end with a line; a line break in quotes does not end one."""
+    rest = b""
+    while block := stream.read(BLOCK_BYTES):
+        block = rest + block
+        end = _end_of_lines(block)
+        if not end and len(block) > 2 * BLOCK_BYTES:
+            raise InputError(
+                f"{shown(file)}: a line is longer than {BLOCK_BYTES:,} bytes. "
+                "Is a quote not closed?"
+            )
+        if end:
+            _decode(block[:end], file)
+            yield block[:end]
+        rest = block[end:]
+    if rest:
+        _decode(rest, file)
+        yield rest
+
+
+def _end_of_lines(block: bytes) -> int:
+    """Return where the last whole line ends: behind a line break with no open quote before it."""
+    end = block.rfind(b"\n") + 1
+    if block.count(b'"', 0, end) % 2 == 0:
+        return end
+    characters = np.frombuffer(block[:end], dtype=np.uint8)
+    open_quote = np.logical_xor.accumulate(characters == ord('"'))
+    ends = np.flatnonzero((characters == ord("\n")) & ~open_quote)
+    return int(ends[-1]) + 1 if ends.size else 0
+
+
+def _decode(block: bytes, file: Path) -> str:
+    advice = "Save it as UTF-8 text, or give a Parquet file."
+    if b"\0" in block:
+        raise InputError(f"{shown(file)}: binary or UTF-16, not a UTF-8 CSV file. {advice}")
+    try:
+        return block.decode("utf-8")
+    except UnicodeDecodeError as error:
+        line = block[error.start - min(error.start, 20) : error.start + 20]
+        raise InputError(f"{shown(file)}: not UTF-8, near {line!r}. {advice}") from None

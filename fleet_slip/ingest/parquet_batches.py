@@ -1,0 +1,109 @@
+"""Reads Parquet in batches: text, numbers as float64, dates and timestamps."""
+
+from collections.abc import Iterator, Sequence
+from datetime import date
+from pathlib import Path
+from typing import BinaryIO
+
+import polars as pl
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from fleet_slip.errors import InputError
+from fleet_slip.ingest.columns import find_columns, shown
+
+BATCH_ROWS = 2**17
+"""Parquet is read in batches of this many rows."""
+
+MAX_FOOTER_BYTES = 2**24
+MAX_TEXT = 1_000
+"""Characters of one text in Parquet: a dictionary can repeat a long one for the price of a bit."""
+
+PARQUET_MAGIC = b"PAR1"
+_PER_DAY = {unit: 86_400 * 10**power for unit, power in {"s": 0, "ms": 3, "us": 6, "ns": 9}.items()}
+_FIRST_DAY = date.min.toordinal() - date(1970, 1, 1).toordinal()
+_END_DAY = date.max.toordinal() + 1 - date(1970, 1, 1).toordinal()
+
+
+def parquet_batches(
+    stream: BinaryIO, file: Path, columns: Sequence[str], max_rows: int
+) -> Iterator[pl.DataFrame]:
+    """Yield the named columns of Parquet. Raises `InputError`."""
+    _require_sane_footer(stream, file)
+    schema = pq.ParquetFile(stream).schema_arrow
+    find_columns(file, schema.names, columns)
+    texts = [name for name in columns if _is_text(schema.field(name).type)]
+    parquet = pq.ParquetFile(stream, read_dictionary=texts, page_checksum_verification=True)
+    if parquet.metadata.num_rows > max_rows:
+        raise InputError(
+            f"{shown(file)}: {parquet.metadata.num_rows:,} rows, at most {max_rows:,} are read. "
+            "Split the file."
+        )
+    for batch in parquet.iter_batches(BATCH_ROWS, columns=list(columns)):
+        plain = {name: _plain(batch.column(name), name, file) for name in columns}
+        yield pl.DataFrame(pa.table(plain))
+
+
+def _require_sane_footer(stream: BinaryIO, file: Path) -> None:
+    size = stream.seek(0, 2)
+    stream.seek(max(0, size - 8))
+    tail = stream.read(8)
+    stream.seek(0)
+    if tail[4:] != PARQUET_MAGIC or size < 12:
+        raise InputError(
+            f"{shown(file)}: begins as a Parquet file but has no footer: it is truncated. "
+            "Copy it again."
+        )
+    if int.from_bytes(tail[:4], "little") > MAX_FOOTER_BYTES:
+        raise InputError(
+            f"{shown(file)}: its footer is too large. Write fewer columns or row groups."
+        )
+
+
+def _is_text(arrow_type: pa.DataType) -> bool:
+    if pa.types.is_dictionary(arrow_type):
+        arrow_type = arrow_type.value_type
+    return bool(pa.types.is_string(arrow_type) or pa.types.is_large_string(arrow_type))
+
+
+def _plain(array: pa.Array, name: str, file: Path) -> pa.Array:
+    """Return a column as text, float64, date or timestamp. Raises `InputError` for others."""
+    array.validate(full=True)  # what Parquet calls text need not be UTF-8, and Polars trusts it
+    if pa.types.is_dictionary(array.type):
+        longest = pc.max(pc.utf8_length(array.dictionary)).as_py() if _is_text(array.type) else 0
+        if longest is not None and longest > MAX_TEXT:
+            raise InputError(
+                f"{shown(file)}: column {name!r} has texts of {longest:,} characters, "
+                f"at most {MAX_TEXT:,} are read."
+            )
+        array = array.dictionary_decode()
+    kind = array.type
+    if _is_text(kind):
+        return array
+    if pa.types.is_date(kind) or pa.types.is_timestamp(kind):
+        return _in_calendar(array)
+    if pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_decimal(kind):
+        return pc.cast(array, pa.float64(), safe=False)
+    if pa.types.is_null(kind):
+        return pc.cast(array, pa.float64())
+    raise InputError(
+        f"{shown(file)}: column {name!r} has the type {shown(kind)[:80]}, which is neither a "
+        "number, text nor a time. Convert it or map another one."
+    )
+
+
+def _in_calendar(array: pa.Array) -> pa.Array:
+    """Return dates or timestamps with null for those outside the years 1 to 9999.
+
+    They are no times of a drive, and Polars panics when it should show one.
+    """
+    kind = array.type
+    if pa.types.is_date32(kind):
+        counts, per_day = pc.cast(pc.cast(array, pa.int32()), pa.int64()), 1
+    else:
+        unit = "ms" if pa.types.is_date64(kind) else kind.unit
+        counts, per_day = pc.cast(array, pa.int64()), _PER_DAY[unit]
+    first, end = (max(-(2**63), min(2**63 - 1, days * per_day)) for days in (_FIRST_DAY, _END_DAY))
+    inside = pc.and_(pc.greater_equal(counts, first), pc.less(counts, end))
+    return pc.if_else(inside, array, pa.scalar(None, kind))
