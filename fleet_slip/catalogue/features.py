@@ -183,7 +183,7 @@ class FeatureCatalogue(Config):
         return self
 
     def feature_set(self, name: str) -> FeatureSet:
-        """Return a feature set by name. Raises `DataError` for an unknown one."""
+        """Return a feature set by name. Raises `QuestionError` for an unknown one."""
         if name == PLAIN:
             return FeatureSet(description="The logged signals", signals=catalogue().inputs)
         if name not in self.sets:
@@ -214,7 +214,7 @@ class FeatureCatalogue(Config):
     def name_of(self, identity: str) -> str:
         """Return the name of the set that Gram rows are of, if it is still defined like that.
 
-        Raises `DataError` otherwise.
+        Raises `QuestionError` otherwise.
         """
         name = identity.rpartition("-")[0] or identity
         if name in {PLAIN, *self.sets} and self.identity(name) == identity:

@@ -8,7 +8,7 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.errors import DataError
+from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.versions import ModelVersion
@@ -47,11 +47,11 @@ class LinearEstimate:
     def published(cls, manifest: Manifest) -> "LinearEstimate":
         """Return the estimator that a manifest publishes.
 
-        Raises `DataError` for a model with features, which are SQL and not signals.
+        Raises `QuestionError` for a model with features, which are SQL and not signals.
         """
         features = [term.signal for term in manifest.terms if term.sql]
         if features:
-            raise DataError(
+            raise QuestionError(
                 f"{manifest.name} uses the features {', '.join(features)}, and test drives are "
                 "evaluated on signals alone. Use: fleet-slip score"
             )

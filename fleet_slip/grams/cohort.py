@@ -89,8 +89,8 @@ class Cohort:
 
         By `drive`: hashed into `count` folds. By another key of `FOLD_KEYS`: one fold for each
         value, or hashed into `count` folds if there are more values than that. By `row`: the folds
-        that the feature set made of single rows, `count` of them. Raises `DataError` if it
-        made none.
+        that the feature set made of single rows, `count` of them. Raises `QuestionError` if
+        it made none.
         """
         if by == ROW_FOLDS:
             require_row_folds(self.feature_set, count)
@@ -177,9 +177,9 @@ def load_cohort(
 ) -> Cohort:
     """Read the Gram rows of the drives that satisfy a condition.
 
-    Raises `DataError` if the condition is not valid SQL, no drive satisfies it, or the
-    feature set has not been computed for all logs; `RefusedError` if a drive of an evaluation
-    scenario satisfies it.
+    Raises `QuestionError` if the condition is not valid SQL, `DataError` if no drive satisfies it
+    or the feature set has not been computed for all logs, and `RefusedError` if a drive of an
+    evaluation scenario satisfies it.
     """
     with open_grams(warehouse, condition, feature_set) as opened:
         statement = opened.statement("cohort.sql", condition)

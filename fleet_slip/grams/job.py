@@ -52,8 +52,8 @@ def update_grams(
 ) -> GramReport:
     """Bring the Gram rows of a feature set up to date. Running it again does nothing.
 
-    An executor runs the queries elsewhere; see `aggregate`. Raises `DataError` for an unknown
-    set, `StorageError`, `ConflictError` if other processes keep changing the table, or
+    An executor runs the queries elsewhere; see `aggregate`. Raises `QuestionError` for an
+    unknown set, `StorageError`, `ConflictError` if other processes keep changing the table, or
     `ClusterError`.
     """
     return retry_conflicts(lambda: _update_once(warehouse, progress, feature_set, executor))

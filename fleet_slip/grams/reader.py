@@ -36,7 +36,7 @@ class OpenedGrams:
     grams_version: int
 
     def statement(self, name: str, condition: str) -> str:
-        """Return a statement of `jobs/` for a condition. Raises `DataError`."""
+        """Return a statement of `jobs/` for a condition. Raises `QuestionError`."""
         text = read_sql("jobs", name).format(condition=condition, feature_set=self.identity)
         with database_errors(f"the cohort {condition!r}"):
             return one_query(self.database, text)

@@ -44,7 +44,7 @@ def gram_statement(
 
     `whole` states that no file has a column of the set in only some of its rows; `absent` are the
     signals that no file has, since they came to the catalogue later. Raises
-    `DataError` for an unknown set.
+    `QuestionError` for an unknown set.
     """
     known = features()
     one = known.feature_set(feature_set)

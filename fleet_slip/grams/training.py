@@ -41,7 +41,7 @@ def drive_folds(
 ) -> DriveFolds:
     """Divide the drives that have all the inputs into folds. `naive` takes rows for independent.
 
-    Raises `DataError` if no drive has them all, or for folds of rows.
+    Raises `DataError` if no drive has them all, and `QuestionError` for folds of rows.
     """
     if plan.by == ROW_FOLDS:
         raise QuestionError(

@@ -59,7 +59,7 @@ def forget(
     """Forget drives; with `now`, delete the replaced files at once instead of by `vacuum`.
 
     It can be repeated after any interruption. `progress` counts files to rewrite. Raises
-    `DataError` if there never was such a drive, `StorageError`, or `ConflictError`.
+    `QuestionError` if there never was such a drive, `StorageError`, or `ConflictError`.
     """
     audit = Audit(warehouse.root)
     located = locate(warehouse.grams.snapshot(), subject)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.arrays import IntArray
-from fleet_slip.errors import DataError
+from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression.gram import Gram, positions
 from fleet_slip.regression.gram_table import GramTable
 
@@ -64,10 +64,10 @@ def by_hash(keys: Sequence[str], count: int) -> FoldAssignment:
 
     Drives with the same key share a fold. A fold that no drive falls into, as happens in small
     cohorts, is left out: a drive's fold must not depend on which other drives there are. Raises
-    `DataError` if fewer than two folds are left.
+    `DataError` if fewer than two folds are left, `QuestionError` if fewer are asked for.
     """
     if count < 2:
-        raise DataError(f"cross-validation needs at least two folds, not {count}.")
+        raise QuestionError(f"cross-validation needs at least two folds, not {count}.")
     numbers = [hash_fold(key, count) for key in keys]
     used = sorted(set(numbers))
     fold = np.searchsorted(used, numbers).astype(np.int64)

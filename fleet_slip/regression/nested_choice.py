@@ -95,7 +95,8 @@ class Training:
 def select_nested(training: Training, inputs: Sequence[str], label: str, rule: Rule) -> Selection:
     """Rank the inputs, and choose one of the nested models.
 
-    Raises `DataError` for dependent signals, an unknown rule, or a label without noise.
+    Raises `DataError` for dependent signals or a label without noise, and `QuestionError` for an
+    unknown rule.
     """
     total = training.folds.total
     order = rank(rule.ranking, total, inputs, label)

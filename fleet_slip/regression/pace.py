@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.errors import DataError
+from fleet_slip.errors import QuestionError
 from fleet_slip.regression.exact import LinearModel
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.mixture import (
@@ -49,12 +49,12 @@ def pace(
     By the theory, the constant is estimated as it is. With `weka_compatible` it takes part in the
     mixture and may be shrunk, and the estimators have the deviations of WEKA 3.9's
     PaceRegression: subset does what nested does, and the expected contributions of pace2 and
-    pace4 are WEKA's. Raises `DataError` for an unknown estimator, dependent signals, or a
-    label without noise.
+    pace4 are WEKA's. Raises `QuestionError` for an unknown estimator, `DataError` for
+    dependent signals or a label without noise.
     """
     known = WEKA_ESTIMATORS if weka_compatible else ESTIMATORS
     if estimator not in known:
-        raise DataError(f"unknown estimator {estimator!r}. Known: {', '.join(known)}.")
+        raise QuestionError(f"unknown estimator {estimator!r}. Known: {', '.join(known)}.")
     return shrink(gram, inputs, label, known[estimator], constant=weka_compatible)
 
 

@@ -64,7 +64,8 @@ def errors_in_variables(
     """Return the model of counts for signals without the noise that they were logged with.
 
     `noise` is the standard deviation of the sensors, in physical units. Raises `DataError`
-    if there is less variance in the signals than that.
+    if there is less variance in the signals than that, and `QuestionError` for noise of a signal
+    that is not among the inputs.
     """
     variances = _variances(gram, inputs, noise, scales)
     return penalised(gram, inputs, label, [-variance for variance in variances])

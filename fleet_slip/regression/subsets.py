@@ -69,7 +69,7 @@ def best_subsets(gram: Gram, inputs: Sequence[str], label: str, count: int = 2) 
     """Return the `count` best models of each size 0..k, re-checked and ordered exactly.
 
     Ties go to the signals declared first. Raises `DataError` for dependent signals or a
-    constant label.
+    constant label, and `QuestionError` for more than `MOST_INPUTS`.
     """
     relations = dependence(gram, inputs)
     if relations:

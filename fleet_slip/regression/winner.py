@@ -8,7 +8,7 @@ justify a richer model.
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from fleet_slip.errors import DataError
+from fleet_slip.errors import QuestionError
 from fleet_slip.regression.crossval import CrossValidation
 
 
@@ -26,10 +26,10 @@ def choose(models: Sequence[CrossValidation]) -> Winner:
 
     The best pooled correlation is the reference. Among the models whose correlation is at most one
     standard error (of the best, over its folds) below it, the fewest signals win; then the higher
-    exact correlation; then the declared order. Raises `DataError` for an empty list.
+    exact correlation; then the declared order. Raises `QuestionError` for an empty list.
     """
     if not models:
-        raise DataError("no model to choose from: the list of models is empty.")
+        raise QuestionError("no model to choose from: the list of models is empty.")
     best = max(models, key=lambda model: model.sums.signed_r_squared)
     threshold = best.correlation - best.standard_error
     near = [model for model in models if model is best or model.correlation >= threshold]

@@ -94,7 +94,7 @@ class RegimeComparison:
 def regime_names(cohort: Cohort, over: Sequence[str]) -> list[str]:
     """Return the regime of each Gram row, by some of the regimes that its set divides by.
 
-    Raises `DataError` if the set does not divide by one of them.
+    Raises `QuestionError` if the set does not divide by one of them.
     """
     divided = features().feature_set(cohort.feature_set).regimes
     unknown = [name for name in over if name not in divided]
@@ -127,7 +127,8 @@ def compare_regimes(
 ) -> RegimeComparison:
     """Cross-validate one model for all regimes and one for each, on drives that have the inputs.
 
-    Raises `DataError` for a feature set without regimes, absent signals, or empty folds.
+    Raises `QuestionError` for a feature set without regimes, and `DataError` for absent signals or
+    empty folds.
     """
     if plan.by == ROW_FOLDS:
         raise QuestionError("rows are divided by regime already: fold by drive, or by vehicle.")

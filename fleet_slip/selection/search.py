@@ -86,7 +86,7 @@ class OrderedSelection:
 def check_criterion(name: str) -> str:
     """Return the criterion that a name means, `cv` being cross-validation.
 
-    Raises `DataError` for an unknown one.
+    Raises `QuestionError` for an unknown one.
     """
     if name == "cv":
         return CROSS_VALIDATION
@@ -101,8 +101,8 @@ def select_ranked(
 ) -> OrderedSelection:
     """Rank the inputs and choose one of the nested models, on the drives that have them all.
 
-    Raises `DataError` if no drive has them all, if they are linearly dependent, for an unknown
-    rule, or if the criterion keeps none of them.
+    Raises `DataError` if no drive has them all, if they are linearly dependent, or if the criterion
+    keeps none of them, and `QuestionError` for an unknown rule.
     """
     label = catalogue().label
     if plan.by == ROW_FOLDS:

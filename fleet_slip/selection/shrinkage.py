@@ -53,8 +53,8 @@ def compare_shrinkage(
 
     Ridge and lasso choose their penalty by cross-validation inside each training fold. Pace
     weighs effects by the noise; drives count as independent, so its noise is larger by the design
-    effect, unless `naive`. Raises `DataError` for fewer than three folds, or dependent
-    signals.
+    effect, unless `naive`. Raises `QuestionError` for fewer than three folds, and
+    `DataError` for dependent signals.
     """
     label = catalogue().label
     ready = drive_folds(cohort, inputs, plan)

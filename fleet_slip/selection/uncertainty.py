@@ -51,7 +51,7 @@ def uncertainty(
 ) -> Uncertainty:
     """Draw the drives with replacement `bootstrap` times, deal the folds anew `repeat` times.
 
-    Raises `DataError` for folds of rows, or too few drives.
+    Raises `QuestionError` for folds of rows, `DataError` for too few drives.
     """
     label = catalogue().label
     ready = drive_folds(cohort, model.signals, plan)

@@ -51,8 +51,8 @@ def what_if(
     """Return the figures to expect once bias and white noise come on top of what is logged.
 
     `model` is one of counts; `bias` and `noise` (standard deviations) are in SI units. Raises
-    `DataError` for a signal that the model does not use, or uses inside a feature: there
-    the effect is not linear.
+    `QuestionError` for a signal that the model does not use, or uses inside a feature: there the
+    effect is not linear.
     """
     for name in {*bias, *noise}:
         _require_linear(name, model)

@@ -16,7 +16,7 @@ from fleet_slip.catalogue import features as features_module
 from fleet_slip.catalogue.features import features, lag_signals, load_features, with_features
 from fleet_slip.catalogue.signals import COUNT_MAX, catalogue
 from fleet_slip.delta import Change, Unit
-from fleet_slip.errors import ConfigError, DataError
+from fleet_slip.errors import ConfigError, DataError, QuestionError
 from fleet_slip.grams import aggregation
 from fleet_slip.grams import job as gram_job
 from fleet_slip.grams import statement as gram_statement

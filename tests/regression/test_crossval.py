@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.errors import DataError
+from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression.crossval import CrossValidation, cross_validate_inputs
 from fleet_slip.regression.folds import CohortFolds, by_hash, by_value, hash_fold
 from fleet_slip.regression.gram import Gram
@@ -117,7 +117,7 @@ def test_folds_that_no_drive_falls_into_are_left_out() -> None:
 def test_single_folds_are_errors() -> None:
     with pytest.raises(DataError, match="the cohort has one"):
         by_hash(["a", "a"], 5)
-    with pytest.raises(DataError, match="at least two folds"):
+    with pytest.raises(QuestionError, match="at least two folds"):
         by_hash(["a", "b"], 1)
     with pytest.raises(DataError, match="the cohort has one: waterford"):
         by_value(["waterford", "waterford"])
@@ -162,7 +162,7 @@ def test_a_clear_best_wins_and_ties_go_to_the_declared_order() -> None:
     assert "no other model is within" in choose(clear).reason
     tied = [candidate("b", 2, 0.9, 0.01), candidate("a", 2, 0.9, 0.01)]
     assert choose(tied).model.name == "b"
-    with pytest.raises(DataError, match="empty"):
+    with pytest.raises(QuestionError, match="empty"):
         choose([])
 
 

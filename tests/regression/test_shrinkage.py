@@ -189,7 +189,7 @@ def test_pace_needs_no_row_and_names_its_mistakes() -> None:
     assert pace(gram, inputs, "y", "ols").weights == pytest.approx(
         fit(gram, inputs, "y").model.weights
     )
-    with pytest.raises(DataError, match="unknown estimator 'pace7'"):
+    with pytest.raises(QuestionError, match="unknown estimator 'pace7'"):
         pace(gram, inputs, "y", "pace7")
     exact = Gram.from_counts(("x1", "y"), np.array([[1, 2], [2, 4], [3, 6], [5, 10]]))
     with pytest.raises(DataError, match="no noise"):

@@ -8,7 +8,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
-from fleet_slip.vehicle.lane_blocks import BLOCK, CHANNELS
 from numpy.typing import NDArray
 
 from fleet_slip.catalogue.signals import catalogue
@@ -17,6 +16,7 @@ from fleet_slip.simulation.campaign import Batch, DriveSpec, load_campaign
 from fleet_slip.simulation.drives import DriveLog, simulate_batch, simulate_logs, tabulate
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ, measure
 from fleet_slip.simulation.track import load_track
+from fleet_slip.vehicle.lane_blocks import BLOCK, CHANNELS
 
 DAY = date(2024, 5, 1)
 

@@ -7,12 +7,12 @@ from concurrent.futures import ThreadPoolExecutor
 import numba
 import numpy as np
 import pytest
-from fleet_slip.vehicle.lane_blocks import BLOCK, CHANNELS
 
 from fleet_slip.errors import ConfigError
 from fleet_slip.simulation.speed_profile import SpeedLimits, speed_profile
 from fleet_slip.simulation.track import load_track
 from fleet_slip.vehicle import kernel
+from fleet_slip.vehicle.lane_blocks import BLOCK, CHANNELS
 from fleet_slip.vehicle.lanes import LaneDrive, Road, Truth, simulate_blocks, simulate_drives
 from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
 from tests.vehicle.harness import SEDAN
