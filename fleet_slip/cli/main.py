@@ -10,7 +10,8 @@ import typer
 from fleet_slip.cli.commands import MARKUP, CommandGroup
 from fleet_slip.cli.logs import LOG_VARIABLE, LogFormat, configure_logs
 from fleet_slip.cli.output import say
-from fleet_slip.errors import FleetSlipError
+from fleet_slip.cli.streams import Streams
+from fleet_slip.errors import FleetSlipError, StorageError
 from fleet_slip.files.data_root import ROOT_VARIABLE, data_root
 
 INTERRUPTED = 130
@@ -73,15 +74,27 @@ def options(
 
 def main() -> None:
     """Run the command line; an expected error becomes one line on stderr and its exit code."""
+    streams = Streams()
     configure_logs(LogFormat.AUTO)
+    exit_code = _exit_code_of_app()
+    if reason := streams.unprinted():
+        say(
+            f"error: standard output: {reason}. What was asked for is done, not all printed.",
+            logging.ERROR,
+        )
+        exit_code = exit_code or StorageError.exit_code
+    sys.exit(exit_code)
+
+
+def _exit_code_of_app() -> int:
     try:
         app()
     except FleetSlipError as error:
         say(f"error: {error}", logging.ERROR)
-        sys.exit(error.exit_code)
+        return error.exit_code
     except KeyboardInterrupt:
         say("interrupted; run the same command again to go on.", logging.WARNING)
-        sys.exit(INTERRUPTED)
-    except BrokenPipeError:
-        sys.stderr.close()
-        sys.exit(0)
+        return INTERRUPTED
+    except SystemExit as ended:
+        return ended.code if isinstance(ended.code, int) else 0
+    return 0
