@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from fleet_slip.delta.sealing import NOTE, SEAL, seal
+from fleet_slip.delta.sealing import NOTE, SEAL, seal_of
 from fleet_slip.files.folder import TEMPORARY_PREFIX
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.resources import find_config
@@ -95,7 +95,7 @@ def _removed_long_ago(log: str) -> str:
     ):
         note = json.loads(info[NOTE])
         stated = [action for action in actions if action.keys() & {"add", "remove", "txn"}]
-        info[NOTE] = json.dumps({**note, SEAL: seal(note, stated)})
+        info[NOTE] = json.dumps({**note, SEAL: seal_of(note, stated)})
     return "\n".join(map(json.dumps, actions))
 
 

@@ -22,7 +22,7 @@ from fleet_slip.models.publish import manifest_of, publish
 from fleet_slip.models.versions import Registry
 from fleet_slip.monitoring.chart import draw
 from fleet_slip.monitoring.monitor import Chart, monitor
-from fleet_slip.selection.request import SelectionPlan, run_plan
+from fleet_slip.selection.request import SelectionRequest, answer_request
 from fleet_slip.simulation.campaign import Campaign, load_campaign
 from fleet_slip.simulation.job import simulate_campaign
 from fleet_slip.warehouse.tables import Warehouse
@@ -75,7 +75,7 @@ def land(warehouse: Warehouse, campaign: Campaign) -> None:
 
 
 def train(warehouse: Warehouse) -> None:
-    planned = run_plan(warehouse, SelectionPlan(cohort=COHORT))
+    planned = answer_request(warehouse, SelectionRequest(cohort=COHORT))
     manifest = manifest_of(planned.selection, "sideslip", planned.label, planned.config_sha256)
     publish(Registry(warehouse.root / "models"), manifest, planned.selection)
 

@@ -22,7 +22,7 @@ from fleet_slip.grams.fold_sums import sum_cohort
 from fleet_slip.grams.reader import GramReader
 from fleet_slip.regression.exact import fit
 from fleet_slip.selection.model_list import load_model_list
-from fleet_slip.selection.request import SelectionPlan, run_plan
+from fleet_slip.selection.request import SelectionRequest, answer_request
 from fleet_slip.warehouse.tables import Warehouse
 
 ROUNDS = 7
@@ -57,7 +57,9 @@ def main(root: str, condition: str) -> None:
         "read_and_fit_ms": median_ms(lambda: fitted_from_disk(warehouse)),
         "read_again_and_fit_ms": again_ms,
         "fit_ms": median_ms(lambda: fit(cohort.serving(INPUTS).table.total(), INPUTS, label)),
-        "select_ms": median_ms(lambda: run_plan(warehouse, SelectionPlan(cohort=condition))),
+        "select_ms": median_ms(
+            lambda: answer_request(warehouse, SelectionRequest(cohort=condition))
+        ),
     }
     print(json.dumps(figures))
 

@@ -20,20 +20,20 @@ from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.delta import Change
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.selection.request import SelectionPlan, run_plan
+from fleet_slip.selection.request import SelectionRequest, answer_request
 from fleet_slip.warehouse.tables import Warehouse
 
 DRIVES_PER_FILE = 500
 
 PLANS = {
-    "Table I": SelectionPlan(),
-    "backward order, BIC by drives, choice in every fold": SelectionPlan(
+    "Table I": SelectionRequest(),
+    "backward order, BIC by drives, choice in every fold": SelectionRequest(
         rank="backward", criterion="bic"
     ),
-    "the same, 1,000 bootstraps, 100 repeats": SelectionPlan(
+    "the same, 1,000 bootstraps, 100 repeats": SelectionRequest(
         rank="backward", criterion="bic", bootstrap=1000, repeat=100
     ),
-    "all subsets, 1,000 bootstraps": SelectionPlan(all_subsets=True, bootstrap=1000),
+    "all subsets, 1,000 bootstraps": SelectionRequest(all_subsets=True, bootstrap=1000),
 }
 
 
@@ -74,11 +74,11 @@ def _lists(values: IntArray) -> pa.Array:
     return pa.ListArray.from_arrays(offsets, pa.array(values.ravel()))
 
 
-def timed(name: str, warehouse: Warehouse, plan: SelectionPlan) -> None:
+def timed(name: str, warehouse: Warehouse, plan: SelectionRequest) -> None:
     best = np.inf
     for _ in range(3):
         start = time.perf_counter()
-        run_plan(warehouse, plan)
+        answer_request(warehouse, plan)
         best = min(best, time.perf_counter() - start)
     print(f"{name:<58} {best * 1000:8.0f} ms", flush=True)
 

@@ -17,11 +17,11 @@ from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.regression.criteria import CRITERIA, criterion_values
 from fleet_slip.regression.disturbance import disturb
-from fleet_slip.regression.drives import DriveMoments, serving_drives
+from fleet_slip.regression.drive_moments import DriveMoments, serving_drives
 from fleet_slip.regression.evidence import Evidence
 from fleet_slip.regression.exact import correlation_matrix, fit
 from fleet_slip.regression.folds import CohortFolds, by_hash
-from fleet_slip.regression.inference import classical, cluster
+from fleet_slip.regression.inference import infer_by_drives, infer_classically
 from fleet_slip.regression.nested import nested_fits
 from fleet_slip.regression.nested_choice import (
     CROSS_VALIDATION,
@@ -37,7 +37,7 @@ from fleet_slip.regression.resampling import (
     percentile_interval,
     repeated_cross_validation,
 )
-from fleet_slip.regression.subsets import all_rss, best_subsets, choices, subset_sizes
+from fleet_slip.regression.subsets import all_rss, best_subsets, pick_sizes, subset_sizes
 from fleet_slip.warehouse.tables import Warehouse
 
 IMAGES = Path(__file__).parents[1] / "docs" / "images"
@@ -70,7 +70,10 @@ def evidence(training: Training) -> None:
     for name in CRITERIA:
         sizes = [int(np.argmin(criterion_values(name, known))) for known in (rows, drives)]
         print(f"  {name:<15} keeps {sizes[0]} by rows, {sizes[1]} by drives")
-    naive, robust = classical(fits[-1], SCALES), cluster(fits[-1], training.drives, SCALES)
+    naive, robust = (
+        infer_classically(fits[-1], SCALES),
+        infer_by_drives(fits[-1], training.drives, SCALES),
+    )
     for one, other in zip(naive.estimates, robust.estimates, strict=True):
         errors = f"{one.standard_error:.2g} or {other.standard_error:.2g}"
         print(f"  {one.name:<10} {one.value:12.6f} +- {errors}")
@@ -117,7 +120,7 @@ def subsets(training: Training) -> None:
         print(f"  {result.best.size} R2 {result.best.r_squared:.5f} gap {gap:>8} {names}")
     fits = nested_fits(total, NINE, LABEL)
     assert training.drives is not None
-    print(" ", choices(results, Evidence.clustered(fits, training.drives)))
+    print(" ", pick_sizes(results, Evidence.clustered(fits, training.drives)))
     rss = all_rss(correlation_matrix(total.restrict([*NINE, LABEL])))
     size = subset_sizes(len(NINE)).astype(np.float64)
     figure, axes = plt.subplots(figsize=(6.4, 3.4))

@@ -35,12 +35,12 @@ from fleet_slip.grams.job import update_grams
 from fleet_slip.ingest.job import ingest_file
 from fleet_slip.ingest.mapping import Mapping, load_mapping
 from fleet_slip.maintenance.retention import load_retention
-from fleet_slip.models.manifest import check_model_name
+from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.score import score
 from fleet_slip.models.versions import Registry
 from fleet_slip.resources import find_config, folder
 from fleet_slip.selection.model_list import load_model_list
-from fleet_slip.selection.request import SelectionPlan, run_plan
+from fleet_slip.selection.request import SelectionRequest, answer_request
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.simulation.track import load_track
@@ -118,7 +118,9 @@ def names(rng: random.Random, place: Path) -> None:
         database.sql("FROM log").fetchall()
         database.sql("FROM drives").fetchall()
     load_cohort(warehouse, condition)
-    run_plan(warehouse, SelectionPlan(cohort=condition, nested="ax", by=rng.choice(FOLD_KEYS)))
+    answer_request(
+        warehouse, SelectionRequest(cohort=condition, nested="ax", by=rng.choice(FOLD_KEYS))
+    )
 
 
 def references(rng: random.Random, place: Path) -> None:
@@ -130,7 +132,7 @@ def references(rng: random.Random, place: Path) -> None:
         case 0:
             registry.resolve(word)
         case 1:
-            check_model_name(word)
+            require_model_name(word)
         case 2:
             find_config(rng.choice(["campaigns", "models", "tracks"]), word)
         case 3:
@@ -138,9 +140,11 @@ def references(rng: random.Random, place: Path) -> None:
         case 4:
             registry.rollback(word, word)
         case 5:
-            run_plan(warehouse, SelectionPlan(nested=f"ax,{word}", folds=2))
+            answer_request(warehouse, SelectionRequest(nested=f"ax,{word}", folds=2))
         case _:
-            run_plan(warehouse, SelectionPlan(models=word, features=rng.choice([word, None])))
+            answer_request(
+                warehouse, SelectionRequest(models=word, features=rng.choice([word, None]))
+            )
 
 
 # Configurations
@@ -304,7 +308,7 @@ def _use(root: Path) -> None:
             lambda: read("log"),
             lambda: read("grams"),
             lambda: load_cohort(warehouse),
-            lambda: run_plan(warehouse, SelectionPlan(nested="ax,ay", folds=2)),
+            lambda: answer_request(warehouse, SelectionRequest(nested="ax,ay", folds=2)),
             lambda: score(
                 warehouse, Registry(LocalFolder(root / "models")).resolve(MODEL).manifest, "true"
             ),

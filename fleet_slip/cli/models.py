@@ -10,7 +10,7 @@ from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.signing import signing_key
 from fleet_slip.maintenance.audit import Audit
 from fleet_slip.models.aliases import CHAMPION
-from fleet_slip.models.manifest import check_model_name
+from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.versions import ModelVersion, Registry
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -157,7 +157,7 @@ def promote(
     alias: Alias = CHAMPION,
 ) -> None:
     """Point an alias, the champion unless told otherwise, at a version."""
-    check_model_name(alias)
+    require_model_name(alias)
     registry = registry_of(context.obj)
     version = registry.resolve(reference)
     registry.promote(version.manifest.name, version.version, alias)

@@ -22,11 +22,11 @@ from fleet_slip.cli.selecting import (
     print_selection,
 )
 from fleet_slip.cli.signing import SignKey
-from fleet_slip.models.manifest import check_model_name
+from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.publish import Publication, manifest_of
 from fleet_slip.models.publish import publish as publish_selection
 from fleet_slip.runs.log import step
-from fleet_slip.selection.request import SelectionPlan, run_plan
+from fleet_slip.selection.request import SelectionRequest, answer_request
 
 
 def register(app: typer.Typer) -> None:
@@ -58,8 +58,8 @@ def publish(
 
     The options are those of select.
     """
-    check_model_name(name)
-    plan = SelectionPlan(
+    require_model_name(name)
+    request = SelectionRequest(
         cohort=cohort,
         models=models,
         nested=nested,
@@ -72,9 +72,9 @@ def publish(
         naive=naive,
     )
     with step("select"):
-        planned = run_plan(context.obj, plan)
-    selection = planned.selection
-    manifest = manifest_of(selection, name, planned.label, planned.config_sha256)
+        answer = answer_request(context.obj, request)
+    selection = answer.selection
+    manifest = manifest_of(selection, name, answer.label, answer.config_sha256)
     registry = registry_of(context.obj, sign_key)
     publication = publish_selection(registry, manifest, selection, force=force)
     if json:

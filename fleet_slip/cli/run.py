@@ -15,11 +15,11 @@ from fleet_slip.cli.selecting import print_selection
 from fleet_slip.cli.workers import Cluster, Threads, workers
 from fleet_slip.errors import RefusedError
 from fleet_slip.maintenance.audit import Audit
-from fleet_slip.models.manifest import check_model_name
+from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.publish import Publication, manifest_of, publish
 from fleet_slip.runs.log import step
 from fleet_slip.selection.compare import Selection
-from fleet_slip.selection.request import PlannedSelection, SelectionPlan, run_plan
+from fleet_slip.selection.request import RequestedSelection, SelectionRequest, answer_request
 
 DEFAULT_CAMPAIGN = "waterford"
 
@@ -57,7 +57,7 @@ def run(
 
     started = time.monotonic()
     plan = load_campaign(campaign)
-    model_name = check_model_name(name or plan.name)
+    model_name = require_model_name(name or plan.name)
     lock = f".run-{plan.name}.lock"
     with context.obj.root.exclusive(lock, lambda: say(f"{plan.name}: waiting for another run")):
         with workers(context, cluster, threads) as (warehouse, executor):
@@ -65,10 +65,10 @@ def run(
             gram = run_gram(warehouse, executor)
         condition = f"campaign = '{plan.name}'"
         with step("select"):
-            planned = run_plan(context.obj, SelectionPlan(cohort=condition, models=models))
-        selection = planned.selection
+            answer = answer_request(context.obj, SelectionRequest(cohort=condition, models=models))
+        selection = answer.selection
         with step("publish"):
-            publication, refusal = _publish(context, planned, model_name)
+            publication, refusal = _publish(context, answer, model_name)
     changed = simulation.changed or gram.changed or (publication is not None and publication.new)
     summary = {
         "campaign": plan.name,
@@ -86,15 +86,15 @@ def run(
 
 
 def _publish(
-    context: typer.Context, planned: PlannedSelection, name: str
+    context: typer.Context, answer: RequestedSelection, name: str
 ) -> tuple[Publication | None, str]:
-    manifest = manifest_of(planned.selection, name, planned.label, planned.config_sha256)
+    manifest = manifest_of(answer.selection, name, answer.label, answer.config_sha256)
     registry = registry_of(context.obj)
     champion = registry.champion(name)
     # What was trained on forgotten drives is replaced, even if the new model is worse.
     tainted = champion and champion.reference in Audit(context.obj.root).marked_models()
     try:
-        return publish(registry, manifest, planned.selection, force=bool(tainted)), ""
+        return publish(registry, manifest, answer.selection, force=bool(tainted)), ""
     except RefusedError as error:
         return None, str(error)
 

@@ -13,8 +13,8 @@ from fleet_slip.regression.crossval import CrossValidation
 from fleet_slip.regression.nested_choice import CROSS_VALIDATION
 from fleet_slip.regression.ranking import RANKINGS
 from fleet_slip.selection.compare import Selection
-from fleet_slip.selection.request import DEFAULT_MODELS, SelectionPlan, run_plan
-from fleet_slip.selection.search import OrderedChoice
+from fleet_slip.selection.request import DEFAULT_MODELS, SelectionRequest, answer_request
+from fleet_slip.selection.search import SearchChoice
 from fleet_slip.selection.uncertainty import Uncertainty
 
 Cohort = Annotated[
@@ -126,7 +126,7 @@ def select(
 
     Search all subsets: **fleet-slip select --all-subsets --criterion cv --bootstrap 1000**
     """
-    plan = SelectionPlan(
+    request = SelectionRequest(
         cohort=cohort,
         models=models,
         nested=nested,
@@ -140,7 +140,7 @@ def select(
         repeat=repeat,
         bootstrap=bootstrap,
     )
-    selection = run_plan(context.obj, plan).selection
+    selection = answer_request(context.obj, request).selection
     if json:
         print_json(selection.as_dict())
     else:
@@ -192,7 +192,7 @@ def _figures(model: CrossValidation) -> list[str]:
     ]
 
 
-def _print_choice(choice: OrderedChoice) -> None:
+def _print_choice(choice: SearchChoice) -> None:
     worth = (
         f"taking {choice.evidence.kind} for independent, the cohort is worth "
         f"{choice.evidence.rows:,.0f} rows"
@@ -223,7 +223,7 @@ def _print_choice(choice: OrderedChoice) -> None:
         )
 
 
-def _criterion_name(choice: OrderedChoice) -> str:
+def _criterion_name(choice: SearchChoice) -> str:
     if choice.rule.criterion == CROSS_VALIDATION:
         return "minus correlation"
     return choice.rule.criterion

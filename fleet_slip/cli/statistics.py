@@ -188,9 +188,9 @@ def regimes(
     """
     drives = load_cohort(context.obj, cohort, feature_set)
     inputs = inputs_of(drives, signals or WHOLE_SET)
-    plan = Folding(by=by, count=folds or Folding().count)
+    folding = Folding(by=by, count=folds or Folding().count)
     divided_by = [name.strip() for name in over.split(",")] if over else []
-    result = compare_regimes(drives, inputs, plan, divided_by)
+    result = compare_regimes(drives, inputs, folding, divided_by)
     if json:
         print_json({"cohort": cohort, **result.as_dict()})
     else:
@@ -242,13 +242,13 @@ def shrink(
     """
     drives = load_cohort(context.obj, cohort, feature_set or PLAIN)
     inputs = inputs_of(drives, signals or WHOLE_SET)
-    plan = Folding(by=by, count=folds or Folding().count)
-    found = compare_shrinkage(drives, inputs, plan, naive=naive)
+    folding = Folding(by=by, count=folds or Folding().count)
+    found = compare_shrinkage(drives, inputs, folding, naive=naive)
     if json:
         print_json({"cohort": cohort, "methods": [one.as_dict() for one in found]})
         return
     print_table(
-        f"{found[0].cross_validation.drives:,} drives, {plan.count} folds by {by}",
+        f"{found[0].cross_validation.drives:,} drives, {folding.count} folds by {by}",
         ["method", "signals kept", "penalty", "correlation", "RMSE deg", "mean deg", "std deg"],
         [
             [

@@ -81,7 +81,7 @@ def unsealed_checkpoints(table: Folder) -> list[str]:
     return [name for name in _checkpoints(table) if name not in known]
 
 
-def dispensable(table: Folder, damaged: str) -> bool:
+def list_dispensable(table: Folder, damaged: str) -> bool:
     """Whether a table can be read without a checkpoint: from an earlier one, or from its start."""
     names = (table / LOG).names()
     commits = {int(found[1]) for found in map(_COMMIT.fullmatch, names) if found}
@@ -92,7 +92,7 @@ def dispensable(table: Folder, damaged: str) -> bool:
 
 
 def remove_checkpoint(table: Folder, name: str) -> None:
-    """Remove a checkpoint that is `dispensable`, and the note that may name it."""
+    """Remove a checkpoint that is `list_dispensable`, and the note that may name it."""
     for file in _log_files(table):
         if file.name in (name, LATEST):
             file.folder.remove(file)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fleet_slip.delta import Snapshot
-from fleet_slip.delta.sealing import NOTE, SEAL, Action, seal
+from fleet_slip.delta.sealing import NOTE, SEAL, Action, seal_of
 from fleet_slip.errors import StorageError
 
 _COMMIT = re.compile(r"\d{20}\.json")
@@ -40,7 +40,7 @@ class _Commit:
         return [action for action in self.actions if kinds & action.keys()]
 
 
-def log_problems(snapshot: Snapshot) -> Iterator[tuple[str, str]]:
+def find_commit_faults(snapshot: Snapshot) -> Iterator[tuple[str, str]]:
     """Yield what is wrong with the log up to a snapshot: the commit's file below it, and what."""
     if snapshot.version is None:
         return
@@ -106,7 +106,7 @@ def _problem(commit: _Commit, must_be_sealed: bool) -> str | None:
 
 def _has_seal(commit: _Commit, stated: Any) -> bool:
     try:
-        return bool(stated == seal(commit.note, commit.sealed_actions))
+        return bool(stated == seal_of(commit.note, commit.sealed_actions))
     except ValueError:  # a number that is none, which only damage puts there
         return False
 

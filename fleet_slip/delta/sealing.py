@@ -25,7 +25,7 @@ Action = Mapping[str, Any]
 """One action as the log has it: `{"add": {...}}`, `{"remove": {...}}`, `{"txn": {...}}`."""
 
 
-def sealed(
+def seal_note(
     note: Mapping[str, Any],
     actions: Sequence[AddAction | RemoveAction],
     units: Mapping[str, int],
@@ -33,10 +33,10 @@ def sealed(
     """Return a commit's note as text, with the checksum of itself, its actions and its units."""
     stated = [_added(a) if isinstance(a, AddAction) else _removed(a) for a in actions]
     stated += [{"txn": {"appId": name, "version": number}} for name, number in units.items()]
-    return json.dumps({**note, SEAL: seal(note, stated)})
+    return json.dumps({**note, SEAL: seal_of(note, stated)})
 
 
-def seal(note: Mapping[str, Any], actions: Sequence[Action]) -> str:
+def seal_of(note: Mapping[str, Any], actions: Sequence[Action]) -> str:
     """Return the checksum of a note and of actions as the log has them, in any order."""
     rest = {key: value for key, value in note.items() if key != SEAL}
     texts = [canonical_json({k: _stated(k, v) for k, v in action.items()}) for action in actions]

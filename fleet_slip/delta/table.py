@@ -18,7 +18,7 @@ from fleet_slip.delta.conflicts import is_conflict
 from fleet_slip.delta.encoding import Encoded, Encoding, checksum_in
 from fleet_slip.delta.files import TableFile, active_files, have_same_columns, read_actions
 from fleet_slip.delta.schema import require_readable, require_writable
-from fleet_slip.delta.sealing import NOTE, sealed
+from fleet_slip.delta.sealing import NOTE, seal_note
 from fleet_slip.errors import ConflictError
 from fleet_slip.files.folder import Folder
 from fleet_slip.files.storage_errors import first_line, storage_errors
@@ -113,7 +113,7 @@ class Table:
             name=self.folder.name,
             description=self.description,
             storage_options=self.folder.delta_options,
-            commit_properties=CommitProperties(custom_metadata={NOTE: sealed({}, [], {})}),
+            commit_properties=CommitProperties(custom_metadata={NOTE: seal_note({}, [], {})}),
         )
         return (self.open_delta(version=0) if delta.version() else delta) or delta
 
@@ -188,7 +188,7 @@ class Snapshot:
         a file; and `StorageError` if the log cannot be written.
         """
         table, actions = self.table, change.actions()
-        note = sealed(change.note, actions, {u.name: u.version for u in change.units})
+        note = seal_note(change.note, actions, {u.name: u.version for u in change.units})
         with storage_errors(table.folder):
             try:
                 delta = self.delta or table.create()

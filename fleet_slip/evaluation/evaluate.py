@@ -11,7 +11,7 @@ from fleet_slip.evaluation.estimators import Estimate, Signals, TrainedModels, t
 from fleet_slip.evaluation.filters import filter_bank
 from fleet_slip.evaluation.results import document
 from fleet_slip.evaluation.runs import EvaluatedScenario, run_all
-from fleet_slip.evaluation.targets import Check, checks, filter_checks
+from fleet_slip.evaluation.targets import Check, check_filter_targets, check_targets
 from fleet_slip.grams.cohort import Cohort
 from fleet_slip.models.versions import ModelVersion
 from fleet_slip.simulation.scenario import Scenario, load_scenario
@@ -120,8 +120,8 @@ def evaluate(
         competitors=competitors,
         runs=runs,
         checks=(
-            *checks(runs, first.table_one, first.estimators()),
-            *filter_checks(runs, first.table_one),
+            *check_targets(runs, first.table_one, first.estimators()),
+            *check_filter_targets(runs, first.table_one),
         ),
         comparisons=tuple(
             row for fleet in competitors.fleets for row in compare(runs, first, fleet)

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from fleet_slip.evaluation.drives import EvaluatedDrive
+from fleet_slip.evaluation.evaluated_drives import EvaluatedDrive
 from fleet_slip.evaluation.runs import EvaluatedScenario, Result, Section
-from fleet_slip.evaluation.stability import rear_compliance, stretches
+from fleet_slip.evaluation.stability import find_stretches, rear_compliance
 from fleet_slip.files.documents import Document, DocumentFolder, checksum
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -73,7 +73,7 @@ def _section(drive: EvaluatedDrive, section: Section) -> dict[str, Any]:
         "name": section.name,
         "criterion": section.criterion,
         "rows": int(section.rows.sum()),
-        "stretches": [asdict(stretch) for stretch in stretches(drive, section.rows)],
+        "stretches": [asdict(stretch) for stretch in find_stretches(drive, section.rows)],
     }
 
 
@@ -102,7 +102,7 @@ def keep(warehouse: Warehouse, content: Mapping[str, Any]) -> Document:
     return documents.after_newest(attempt)
 
 
-def latest(warehouse: Warehouse) -> Document | None:
+def read_latest(warehouse: Warehouse) -> Document | None:
     """Return the latest evaluation, or None before the first."""
     numbers = folder(warehouse).numbers()
     return folder(warehouse).read(numbers[-1]) if numbers else None

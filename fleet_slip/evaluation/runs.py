@@ -8,10 +8,10 @@ import numpy as np
 
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.evaluation.drives import EvaluatedDrive, load_drives
 from fleet_slip.evaluation.errors import ErrorFigures, error_figures
 from fleet_slip.evaluation.estimators import Estimate
-from fleet_slip.evaluation.stability import CRITERION, unstable
+from fleet_slip.evaluation.evaluated_drives import EvaluatedDrive, load_drives
+from fleet_slip.evaluation.stability import CRITERION, find_unstable
 from fleet_slip.grams.job import update_grams
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.simulation.job import SimulationReport, simulate_batches
@@ -110,7 +110,7 @@ def _result(drive: EvaluatedDrive, parts: Sequence[Section], estimate_rad: Float
 def sections(drive: EvaluatedDrive) -> tuple[Section, ...]:
     """Return the sections of a drive that have any rows."""
     found = (
-        Section("unstable", CRITERION, unstable(drive)),
+        Section("unstable", CRITERION, find_unstable(drive)),
         Section(
             "gps_outage",
             f"more than {GPS_OUTAGE_S:g} s since the last fix of satellite navigation",

@@ -16,7 +16,7 @@ from itertools import pairwise
 import numpy as np
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.evaluation.drives import EvaluatedDrive
+from fleet_slip.evaluation.evaluated_drives import EvaluatedDrive
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.vehicle.parameters import VehicleParameters, constants
 from fleet_slip.vehicle.tyre import brush_force
@@ -80,7 +80,7 @@ def slip_angles(drive: EvaluatedDrive) -> tuple[FloatArray, FloatArray]:
     return front, rear
 
 
-def unstable(drive: EvaluatedDrive) -> BoolArray:
+def find_unstable(drive: EvaluatedDrive) -> BoolArray:
     """Return for each tick whether the car is within an unstable stretch."""
     peak = peak_slip(drive.scenario.car, drive.scenario.adhesion)
     front, rear = slip_angles(drive)
@@ -98,7 +98,7 @@ def join(mask: BoolArray, gap: int) -> BoolArray:
     return joined
 
 
-def stretches(drive: EvaluatedDrive, mask: BoolArray) -> tuple[Stretch, ...]:
+def find_stretches(drive: EvaluatedDrive, mask: BoolArray) -> tuple[Stretch, ...]:
     """Return where a mask over the ticks of a drive is true."""
     return tuple(
         Stretch(

@@ -12,7 +12,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.evaluation.errors import ErrorFigures
 from fleet_slip.evaluation.estimators import LinearEstimate
 from fleet_slip.evaluation.runs import GPS_OUTAGE_S, EvaluatedScenario
-from fleet_slip.evaluation.stability import rear_compliance, stretches
+from fleet_slip.evaluation.stability import find_stretches, rear_compliance
 from fleet_slip.simulation.sensors import Sensors
 
 TABLE_TWO_STD_DEG = {"1": 0.3018, "2": 0.1754, "3": 0.1556, "4": 0.1549, "5": 0.1505}
@@ -115,7 +115,7 @@ class Check:
         return content
 
 
-def checks(
+def check_targets(
     runs: Sequence[EvaluatedScenario],
     models: Mapping[str, str],
     estimators: Mapping[str, LinearEstimate],
@@ -159,7 +159,7 @@ THE_PAPERS_CHOICE = "4"
 """The model of Table I that the paper compares with the Kalman filter."""
 
 
-def filter_checks(
+def check_filter_targets(
     runs: Sequence[EvaluatedScenario], models: Mapping[str, str]
 ) -> tuple[Check, ...]:
     """Check that the regression has a smaller error than the paper's Kalman filter has.
@@ -175,11 +175,11 @@ def filter_checks(
         if run.scenario.name in FILTER_SCENARIOS
         for rival in ("kalman", "kalman_tuned")
         if rival in run.results
-        for check in _filter_checks(run, name, rival)
+        for check in _check_filters(run, name, rival)
     )
 
 
-def _filter_checks(run: EvaluatedScenario, name: str, rival: str) -> Iterator[Check]:
+def _check_filters(run: EvaluatedScenario, name: str, rival: str) -> Iterator[Check]:
     ours, theirs = run.results[name], run.results[rival]
     parts = [("error std", ours.whole, theirs.whole, _CORRECTED)]
     if "gps_outage" in ours.inside:
@@ -207,7 +207,7 @@ _CORRECTED = (
 
 def _drift(run: EvaluatedScenario) -> str:
     (section,) = (part for part in run.sections if part.name == "gps_outage")
-    longest_s = max(s.until_s - s.from_s for s in stretches(run.drive, section.rows))
+    longest_s = max(s.until_s - s.from_s for s in find_stretches(run.drive, section.rows))
     return (
         f"The longest outage of this drive lasts {longest_s + GPS_OUTAGE_S:.0f} s. With biases "
         "known from before, the integrated accelerations drift no further in that time than the "

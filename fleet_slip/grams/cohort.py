@@ -17,7 +17,7 @@ from fleet_slip.catalogue.sources import SCENARIO, TRAINING_DRIVES
 from fleet_slip.errors import DataError, QuestionError, RefusedError
 from fleet_slip.grams.folding import FOLD_KEYS, ROW_FOLDS
 from fleet_slip.grams.reader import GramReader, open_grams
-from fleet_slip.regression.drives import serving_drives
+from fleet_slip.regression.drive_moments import serving_drives
 from fleet_slip.regression.folds import CohortFolds, FoldAssignment, by_hash, by_value
 from fleet_slip.regression.gram import packed_size
 from fleet_slip.regression.gram_table import GramTable
@@ -95,7 +95,7 @@ class Cohort:
         if by == ROW_FOLDS:
             require_row_folds(self.feature_set, count)
         values = self.drives[FOLD_KEYS[by]].to_pylist()
-        return CohortFolds.of(self.tables, assign(values, by, count), self.drive_numbers)
+        return CohortFolds.of(self.tables, assign_folds(values, by, count), self.drive_numbers)
 
     def serving(self, inputs: Sequence[str]) -> Served:
         """Return the drives that have the label and all the inputs, one Gram row each.
@@ -161,7 +161,7 @@ def require_row_folds(feature_set: str, count: int) -> None:
         )
 
 
-def assign(values: Sequence[Any], by: str, count: int) -> FoldAssignment:
+def assign_folds(values: Sequence[Any], by: str, count: int) -> FoldAssignment:
     """Assign Gram rows to folds by the values of a fold key."""
     if by == ROW_FOLDS:
         return by_value([(int(value) - 1) % count + 1 for value in values])

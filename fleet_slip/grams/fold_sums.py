@@ -17,7 +17,7 @@ from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohort import (
-    assign,
+    assign_folds,
     empty_cohort_error,
     gram_condition,
     gram_table,
@@ -41,7 +41,7 @@ class SummedCohort:
 
     Attributes:
         condition: SQL condition on the columns of the view `drives`.
-        plan: how the cohort was divided.
+        folding: how the cohort was divided.
         sums: the Gram of each fold.
         rows, drive_count: number of rows of the logs, and of drives, behind the cohort.
         logs_version, grams_version: versions of the Delta tables that were read.
@@ -49,7 +49,7 @@ class SummedCohort:
     """
 
     condition: str
-    plan: Folding
+    folding: Folding
     sums: CohortFolds
     rows: int
     drive_count: int
@@ -67,8 +67,8 @@ class SummedCohort:
 
     def folds(self, by: str, count: int) -> CohortFolds:
         """Return the folds, which must be those that were asked for when the cohort was read."""
-        if (by, count) != (self.plan.by, self.plan.count):
-            raise ValueError(f"the sums are over {self.plan}, not over {count} folds by {by}")
+        if (by, count) != (self.folding.by, self.folding.count):
+            raise ValueError(f"the sums are over {self.folding}, not over {count} folds by {by}")
         return self.sums
 
     def gram_condition(self, inputs: Sequence[str]) -> str:
@@ -78,7 +78,7 @@ class SummedCohort:
 
 def sum_cohort(
     warehouse: Warehouse | GramReader,
-    plan: Folding,
+    folding: Folding,
     condition: str = TRAINING_DRIVES,
     feature_set: str = PLAIN,
 ) -> SummedCohort:
@@ -87,10 +87,10 @@ def sum_cohort(
     Raises like `fleet_slip.grams.cohort.load_cohort`, and `DataError`
     if there are not two folds.
     """
-    if plan.by == ROW_FOLDS:
-        require_row_folds(feature_set, plan.count)
+    if folding.by == ROW_FOLDS:
+        require_row_folds(feature_set, folding.count)
     with open_grams(warehouse, condition, feature_set) as opened:
-        names, fold_of = _folding(opened, plan, condition)
+        names, fold_of = _folding(opened, folding, condition)
         sums = _Sums(len(names), fold_of)
         for batch in opened.batches(condition):
             require_training(batch["source"].unique().to_pylist(), condition)
@@ -99,7 +99,7 @@ def sum_cohort(
             raise empty_cohort_error(opened.database, condition)
     return SummedCohort(
         condition=condition,
-        plan=plan,
+        folding=folding,
         sums=sums.folds(names),
         rows=sum(gram.n for grams in sums.tables.values() for gram in grams),
         drive_count=sums.drive_count,
@@ -109,19 +109,19 @@ def sum_cohort(
     )
 
 
-def _folding(opened: OpenedGrams, plan: Folding, condition: str) -> tuple[list[str], FoldOf]:
+def _folding(opened: OpenedGrams, folding: Folding, condition: str) -> tuple[list[str], FoldOf]:
     """Return the names of all folds that there may be, and what tells the fold of a Gram row."""
-    if plan.by == "drive":
-        names = [str(fold + 1) for fold in range(plan.count)]
-        return names, lambda _, drives: (drives % plan.count).astype(np.int64)
-    key = FOLD_KEYS[plan.by]
+    if folding.by == "drive":
+        names = [str(fold + 1) for fold in range(folding.count)]
+        return names, lambda _, drives: (drives % folding.count).astype(np.int64)
+    key = FOLD_KEYS[folding.by]
     text = opened.statement("cohort_sums.sql", condition)
     with database_errors(f"the cohort {condition!r}"):
         found = opened.database.sql(f"SELECT DISTINCT {key} FROM ({text})").to_arrow_table()
     values = found[key].combine_chunks()
     if not len(values):
         raise empty_cohort_error(opened.database, condition)
-    assignment = assign(values.to_pylist(), plan.by, plan.count)
+    assignment = assign_folds(values.to_pylist(), folding.by, folding.count)
 
     def fold_of(batch: pa.RecordBatch, _: NDArray[np.uint64]) -> IntArray:
         at: IntArray = pc.index_in(batch[key], value_set=values).to_numpy()

@@ -7,9 +7,9 @@ from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError
-from fleet_slip.grams.cohort import Cohort, Served, assign
+from fleet_slip.grams.cohort import Cohort, Served, assign_folds
 from fleet_slip.grams.folding import FOLD_KEYS, ROW_FOLDS, Folding
-from fleet_slip.regression.drives import DriveMoments
+from fleet_slip.regression.drive_moments import DriveMoments
 from fleet_slip.regression.folds import CohortFolds, Folds
 from fleet_slip.regression.nested_choice import Training
 
@@ -37,24 +37,26 @@ class DriveFolds:
 
 
 def drive_folds(
-    cohort: Cohort, inputs: Sequence[str], plan: Folding, *, naive: bool = False
+    cohort: Cohort, inputs: Sequence[str], folding: Folding, *, naive: bool = False
 ) -> DriveFolds:
     """Divide the drives that have all the inputs into folds. `naive` takes rows for independent.
 
     Raises `DataError` if no drive has them all, and `QuestionError` for folds of rows.
     """
-    if plan.by == ROW_FOLDS:
+    if folding.by == ROW_FOLDS:
         raise QuestionError(
             "with folds of rows there are no drives to hold out. Fold by drive for this."
         )
     served = cohort.serving(inputs)
-    assignment = assign(served.drives[FOLD_KEYS[plan.by]].to_pylist(), plan.by, plan.count)
+    assignment = assign_folds(
+        served.drives[FOLD_KEYS[folding.by]].to_pylist(), folding.by, folding.count
+    )
     folds = CohortFolds.of([served.table], assignment).serving(inputs, catalogue().label)
     moments = None if naive else DriveMoments.of(served.table)
     return DriveFolds(served, assignment.fold, Training(folds, moments, input_scales()))
 
 
-def row_training(cohort: Cohort, inputs: Sequence[str], plan: Folding) -> Training:
+def row_training(cohort: Cohort, inputs: Sequence[str], folding: Folding) -> Training:
     """Return folds of rows; rows then count as independent. Raises `DataError`."""
-    folds: Folds = cohort.folds(plan.by, plan.count).serving(inputs, catalogue().label)
+    folds: Folds = cohort.folds(folding.by, folding.count).serving(inputs, catalogue().label)
     return Training(folds, None, input_scales())

@@ -17,7 +17,7 @@ def shown(text: object) -> str:
     return plain if plain.isprintable() else repr(plain)
 
 
-def find_columns(file: Path, names: Sequence[str], wanted: Iterable[str]) -> dict[str, int]:
+def require_columns(file: Path, names: Sequence[str], wanted: Iterable[str]) -> dict[str, int]:
     """Return where each wanted column stands. Raises `InputError` for none or two of a name."""
     if len(names) > MAX_COLUMNS:
         raise InputError(

@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.columns import find_columns, shown
+from fleet_slip.ingest.columns import require_columns, shown
 from fleet_slip.ingest.mapping import CsvFormat
 
 BLOCK_BYTES = 2**24
@@ -27,7 +27,7 @@ def csv_batches(
 ) -> Iterator[pl.DataFrame]:
     """Yield the named columns of CSV as text, and `EXTRA_FIELDS`. Raises `InputError`."""
     names = _csv_header(stream, file, csv_format)
-    positions = find_columns(file, names, columns)
+    positions = require_columns(file, names, columns)
     # Columns are read by position: Polars renames duplicates. The line of separators before each
     # block fixes the number of fields and keeps a block from looking like a compressed file.
     fields = [f"column {i}" for i in range(len(names))] + [EXTRA_FIELDS]
@@ -74,11 +74,11 @@ def _whole_lines(stream: BinaryIO, file: Path) -> Iterator[bytes]:
                 "Is a quote not closed?"
             )
         if end:
-            _decode(block[:end], file)
+            _require_text(block[:end], file)
             yield block[:end]
         rest = block[end:]
     if rest:
-        _decode(rest, file)
+        _require_text(rest, file)
         yield rest
 
 
@@ -91,6 +91,10 @@ def _end_of_lines(block: bytes) -> int:
     open_quote = np.logical_xor.accumulate(characters == ord('"'))
     ends = np.flatnonzero((characters == ord("\n")) & ~open_quote)
     return int(ends[-1]) + 1 if ends.size else 0
+
+
+def _require_text(block: bytes, file: Path) -> None:
+    _decode(block, file)
 
 
 def _decode(block: bytes, file: Path) -> str:

@@ -72,7 +72,7 @@ def fields_of(mapping: Mapping, schema: pl.Schema) -> list[Field]:
     return fields
 
 
-def problems(*cases: tuple[pl.Expr, str]) -> pl.Expr:
+def find_problems(*cases: tuple[pl.Expr, str]) -> pl.Expr:
     """Return the index of the first reason whose condition holds, else null."""
     return pl.coalesce(
         [
@@ -83,7 +83,7 @@ def problems(*cases: tuple[pl.Expr, str]) -> pl.Expr:
 
 
 def _condition(condition: pl.Expr, reason: str, raw: pl.Expr) -> Field:
-    return Field("", "condition", raw, raw, problems((condition, reason)))
+    return Field("", "condition", raw, raw, find_problems((condition, reason)))
 
 
 def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> Field:
@@ -93,7 +93,7 @@ def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> Field:
     signal, value = catalogue()[name], pl.col(name)
     count = value / float(signal.scale)
     outside = (count <= signal.min_count - 0.5) | (count >= signal.max_count + 0.5)
-    problem = problems(
+    problem = find_problems(
         (value.is_null() & present, "not_a_number"),
         (~value.is_finite(), "not_finite"),
         (outside, "out_of_range"),
@@ -104,7 +104,7 @@ def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> Field:
 def _positive(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Field:
     raw, number, present = _number(column, schema, mapping)
     value = pl.col(name)
-    problem = problems(
+    problem = find_problems(
         (value.is_null() & present, "not_a_number"),
         (~value.is_finite(), "not_finite"),
         (value <= 0, "out_of_range"),
@@ -119,7 +119,7 @@ def _text(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Field:
         whole = raw.cast(pl.Int64, strict=False)
         text = pl.when(whole == raw).then(whole.cast(pl.String)).otherwise(text)
     too_long = pl.col(name).str.len_chars() > LONGEST_TEXT
-    problem = problems((pl.col(name).is_null(), "missing"), (too_long, "out_of_range"))
+    problem = find_problems((pl.col(name).is_null(), "missing"), (too_long, "out_of_range"))
     return Field(name, "key", raw, _without_missing(text, mapping), problem)
 
 
@@ -135,7 +135,7 @@ def _day(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Field:
         case other:
             raise _unfit(column, other, "a date such as 2024-05-31")
     outside = (value < pl.lit(_FIRST_DAY)) | (value >= pl.lit(_END_DAY))
-    problem = problems(
+    problem = find_problems(
         (text.is_null(), "missing"), (value.is_null(), "not_a_time"), (outside, "out_of_range")
     )
     return Field(name, "key", raw, day, problem)
@@ -147,7 +147,7 @@ def _time(column: str, schema: pl.Schema, mapping: Mapping) -> Field:
         return _timestamp(column, schema, mapping)
     raw, number, present = _number(column, schema, mapping)
     value = pl.col("time")
-    problem = problems(
+    problem = find_problems(
         (value.is_null() & present, "not_a_number"),
         (value.is_null(), "missing"),
         (~value.is_finite(), "not_finite"),
@@ -169,7 +169,7 @@ def _timestamp(column: str, schema: pl.Schema, mapping: Mapping) -> Field:
         raise _unfit(column, kind, needed)
     first, end = (datetime.combine(day, datetime.min.time()) for day in (_FIRST_DAY, _END_DAY))
     outside = (value < 0) | (value >= (end - first).total_seconds())
-    problem = problems(
+    problem = find_problems(
         (text.is_null(), "missing"), (value.is_null(), "not_a_time"), (outside, "out_of_range")
     )
     return Field("time", "time", raw, moment.dt.epoch("us") / 1e6, problem)

@@ -9,7 +9,7 @@ from pydantic import AfterValidator, Field, StringConstraints, field_validator, 
 from fleet_slip.canonical import canonical_ascii
 from fleet_slip.catalogue.signals import Identifier, catalogue
 from fleet_slip.config import Config, load_config
-from fleet_slip.ingest.units import conversion_factor
+from fleet_slip.ingest.units import conversion_factor, require_unit
 from fleet_slip.resources import find_config
 
 
@@ -84,7 +84,7 @@ class TimeBase(Config):
             raise ValueError("longest_gap_s cannot be larger than split_gap_s")
         if self.unit is not None:
             try:
-                conversion_factor(self.unit, "s")
+                require_unit(self.unit, "s")
             except ValueError as error:
                 raise ValueError(f"{self.column} {error}") from None
         return self
@@ -133,7 +133,7 @@ class Mapping(Config):
             if name not in known:
                 raise ValueError(f"unknown signal {name!r}. Known signals: {', '.join(known)}")
             try:
-                conversion_factor(column.unit, known[name].unit, name)
+                require_unit(column.unit, known[name].unit, name)
             except ValueError as error:
                 raise ValueError(f"signals.{name}: {column.column} {error}") from None
         return self

@@ -10,11 +10,11 @@ import pyarrow as pa
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import shown
-from fleet_slip.ingest.drives import cut, drive_id, log_table, to_ticks
 from fleet_slip.ingest.fields import RAW, Field, fields_of
 from fleet_slip.ingest.mapping import Mapping
+from fleet_slip.ingest.measured_drives import cut, drive_id, log_table, to_ticks
 from fleet_slip.ingest.quarantine import DriveKeys, check_rows, with_values
-from fleet_slip.ingest.reading import MAX_ROWS, file_digest, read_batches, unchanged
+from fleet_slip.ingest.reading import MAX_ROWS, file_digest, read_batches, require_unchanged
 from fleet_slip.ingest.resampling import STEP_S
 from fleet_slip.ingest.timebase import cut_into_drives, sample_interval_s
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA
@@ -63,12 +63,12 @@ def read_measured(file: Path, mapping: Mapping) -> MeasuredLog:
     Raises `InputError` if the file cannot be read, is not what the mapping says, or has no usable
     row.
     """
-    with unchanged(file):
+    with require_unchanged(file):
         digest = _identity(file, mapping)
         rows, bad, keys, rows_read = _check(file, mapping)
     rows, misplaced = cut_into_drives(rows, mapping.time)
     bad = pl.concat([bad, misplaced]).sort("row")
-    _check_usable(file, mapping, rows, bad)
+    _require_usable(file, mapping, rows, bad)
 
     prefix = f"{mapping.name}-{digest[:12]}"
     interval_s = sample_interval_s(rows)
@@ -131,7 +131,7 @@ def _check(file: Path, mapping: Mapping) -> tuple[pl.DataFrame, pl.DataFrame, Dr
     return pl.concat(good), pl.concat(bad), keys, rows_read
 
 
-def _check_usable(file: Path, mapping: Mapping, rows: pl.DataFrame, bad: pl.DataFrame) -> None:
+def _require_usable(file: Path, mapping: Mapping, rows: pl.DataFrame, bad: pl.DataFrame) -> None:
     if rows.is_empty():
         reasons = ", ".join(f"{n:,} {reason}" for reason, n in Counter(bad["reason"]).most_common())
         first = bad.row(0, named=True)

@@ -11,7 +11,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.columns import find_columns, shown
+from fleet_slip.ingest.columns import require_columns, shown
 
 BATCH_ROWS = 2**17
 """Parquet is read in batches of this many rows."""
@@ -32,7 +32,7 @@ def parquet_batches(
     """Yield the named columns of Parquet. Raises `InputError`."""
     _require_sane_footer(stream, file)
     schema = pq.ParquetFile(stream).schema_arrow
-    find_columns(file, schema.names, columns)
+    require_columns(file, schema.names, columns)
     texts = [name for name in columns if _is_text(schema.field(name).type)]
     parquet = pq.ParquetFile(stream, read_dictionary=texts, page_checksum_verification=True)
     if parquet.metadata.num_rows > max_rows:

@@ -18,6 +18,11 @@ _NEEDS = {
 }
 
 
+def require_unit(unit: str, si_unit: str, quantity: str = "it") -> None:
+    """Raise `ValueError` for a unit that has no `conversion_factor`."""
+    conversion_factor(unit, si_unit, quantity)
+
+
 def conversion_factor(unit: str, si_unit: str, quantity: str = "it") -> float:
     """Return f in `value in si_unit = f * value in unit`; `quantity` is what messages call it.
 

@@ -33,7 +33,7 @@ from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.signals import COUNT_MAX
 from fleet_slip.delta import Snapshot, Table, TableFile
 from fleet_slip.delta.schema import SCALE, TARGET, Evolution, compare_schemas, scales_of
-from fleet_slip.delta.sealing import NOTE, sealed
+from fleet_slip.delta.sealing import NOTE, seal_note
 from fleet_slip.errors import ConflictError, RefusedError, StorageError
 from fleet_slip.files.storage_errors import storage_errors
 from fleet_slip.maintenance.rewriting import read_drives
@@ -146,7 +146,7 @@ def _rescale(table: Table, found: Evolution, progress: Progress) -> tuple[int, i
             schema=table.schema,
             partition_by=list(table.partition_by),
             commit_properties=CommitProperties(
-                custom_metadata={NOTE: sealed({"job": "migrate"}, actions, {})}
+                custom_metadata={NOTE: seal_note({"job": "migrate"}, actions, {})}
             ),
         )
     return len(actions), before.rows

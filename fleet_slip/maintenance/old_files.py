@@ -10,7 +10,7 @@ from fleet_slip.delta import Snapshot
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.files.folder import StoredFile
 from fleet_slip.maintenance.audit import Forgettable
-from fleet_slip.maintenance.vacuum import replaced, unreferenced
+from fleet_slip.maintenance.vacuum import find_replaced, find_unreferenced
 from fleet_slip.warehouse.tables import Warehouse
 
 BEING_WRITTEN_HOURS = 1.0
@@ -35,9 +35,9 @@ def remove_old_files(
 
 def _readable(snapshot: Snapshot) -> Iterator[tuple[StoredFile, pa.Table]]:
     """Yield replaced files and leftovers that are not being written, with what tells the drives."""
-    known = replaced(snapshot)
+    known = find_replaced(snapshot)
     wanted = {"drive_id", "vehicle_id", "day"}
-    for file in unreferenced(snapshot.table):
+    for file in find_unreferenced(snapshot.table):
         if file.path not in known and file.age_hours < BEING_WRITTEN_HOURS:
             continue
         try:

@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 from fleet_slip.delta import Change, TableFile, retry_conflicts
 from fleet_slip.delta.checkpoints import (
     checkpoint_faults,
-    dispensable,
+    list_dispensable,
     remove_checkpoint,
     seal_checkpoints,
 )
@@ -50,7 +50,7 @@ def _sum_up_again(warehouse: Warehouse) -> list[str]:
     rebuilt = []
     for table in warehouse.tables:
         for fault in list(checkpoint_faults(table.folder)):
-            if not dispensable(table.folder, fault.name):
+            if not list_dispensable(table.folder, fault.name):
                 continue
             remove_checkpoint(table.folder, fault.name)
             delta = table.open_delta()

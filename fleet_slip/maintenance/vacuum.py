@@ -38,7 +38,7 @@ def vacuum(
     """
     warehouse.require()
     removed = []
-    for file in expired(warehouse, retention_hours):
+    for file in find_expired(warehouse, retention_hours):
         if dry_run or file.folder.remove(file):
             removed.append(file)
     if not dry_run:
@@ -50,21 +50,21 @@ def vacuum(
     )
 
 
-def expired(warehouse: Warehouse, retention_hours: float) -> list[StoredFile]:
+def find_expired(warehouse: Warehouse, retention_hours: float) -> list[StoredFile]:
     """Return the files that `vacuum` removes."""
     found = []
     for table in warehouse.tables:
-        files = unreferenced(table)
+        files = find_unreferenced(table)
         snapshot = table.snapshot()
         if snapshot.version is None:  # its Delta log may have been lost, and these be its data
             continue
         kept = removed_since(snapshot, retention_hours)
         found += [file for file in files if file.path not in kept]
-    found += temporary_files(warehouse)
+    found += find_temporary_files(warehouse)
     return [file for file in found if file.age_hours >= retention_hours]
 
 
-def unreferenced(table: Table) -> list[StoredFile]:
+def find_unreferenced(table: Table) -> list[StoredFile]:
     """Return the data files below a table that its current version does not refer to."""
     # Listed before the log is read: a file that is committed meanwhile is not taken for a leftover.
     files = [
@@ -78,7 +78,7 @@ def unreferenced(table: Table) -> list[StoredFile]:
     return [file for file in files if file.path not in active]
 
 
-def temporary_files(warehouse: Warehouse) -> list[StoredFile]:
+def find_temporary_files(warehouse: Warehouse) -> list[StoredFile]:
     """Return what killed writers left under temporary names: ours, and the Delta library's."""
     return [
         file
@@ -91,14 +91,14 @@ _OF_DELTA = re.compile(r"[^/]+/_delta_log/[^/]*#[^/]*")
 """Temporary names of the Delta library, in a file system."""
 
 
-def replaced(snapshot: Snapshot) -> set[str]:
+def find_replaced(snapshot: Snapshot) -> set[str]:
     """Return the paths of files that a commit removed from a table, ever."""
     return set(_removed_before(snapshot, 0))
 
 
 def removed_since(snapshot: Snapshot, hours: float) -> set[str]:
     """Return the paths of files that a commit of the last hours removed from a table."""
-    return replaced(snapshot) - set(_removed_before(snapshot, hours))
+    return find_replaced(snapshot) - set(_removed_before(snapshot, hours))
 
 
 def _removed_before(snapshot: Snapshot, hours: float) -> Iterator[str]:

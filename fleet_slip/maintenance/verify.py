@@ -11,11 +11,11 @@ from concurrent.futures import Executor
 from fleet_slip.delta import Snapshot, Table
 from fleet_slip.delta.checkpoints import FOLDER as CHECKSUMS
 from fleet_slip.delta.checkpoints import checkpoint_faults, unsealed_checkpoints
-from fleet_slip.delta.commit_check import log_problems
+from fleet_slip.delta.commit_check import find_commit_faults
 from fleet_slip.errors import FleetSlipError, StorageError
 from fleet_slip.files.documents import DocumentFolder
 from fleet_slip.files.folder import StoredFile
-from fleet_slip.maintenance.vacuum import replaced, temporary_files, unreferenced
+from fleet_slip.maintenance.vacuum import find_replaced, find_temporary_files, find_unreferenced
 from fleet_slip.maintenance.verification import Damage, Verification
 from fleet_slip.maintenance.verify_documents import verify_documents, verify_models
 from fleet_slip.maintenance.verify_files import verify_files
@@ -38,12 +38,12 @@ def verify(
     """
     report = Verification()
     warehouse.require()
-    snapshots = _snapshots(warehouse, report)
+    snapshots = _open_tables(warehouse, report)
     good = {table: verify_files(s, report, progress, executor) for table, s in snapshots.items()}
     logs, grams = (good.get(table, []) for table in ("logs", "grams"))
     if logs:
         verify_drives(warehouse, logs, report)
-    _require_logs(snapshots, report)
+    _report_missing_logs(snapshots, report)
     if grams:
         active = {file.path for file in snapshots["logs"].files} if "logs" in snapshots else set()
         verify_grams(warehouse, SoundFiles(logs, grams, active), report, full, executor)
@@ -58,7 +58,7 @@ def verify(
     return report
 
 
-def _snapshots(warehouse: Warehouse, report: Verification) -> dict[str, Snapshot]:
+def _open_tables(warehouse: Warehouse, report: Verification) -> dict[str, Snapshot]:
     found = {}
     for table in warehouse.tables:
         _verify_checkpoints(table, report)
@@ -69,7 +69,7 @@ def _snapshots(warehouse: Warehouse, report: Verification) -> dict[str, Snapshot
             report.findings.append(Damage("log", table.folder.name, str(error)))
         else:
             found[table.folder.name] = snapshot
-            for file, problem in log_problems(snapshot):
+            for file, problem in find_commit_faults(snapshot):
                 path = f"{table.folder.name}/_delta_log/{file}"
                 report.findings.append(Damage("log", path, problem))
     return found
@@ -96,7 +96,7 @@ def _any_table(snapshots: Mapping[str, Snapshot]) -> bool:
     return any(snapshot.version is not None for snapshot in snapshots.values())
 
 
-def _require_logs(snapshots: Mapping[str, Snapshot], report: Verification) -> None:
+def _report_missing_logs(snapshots: Mapping[str, Snapshot], report: Verification) -> None:
     """Report a table of logs that is gone, as a folder that was not mounted is."""
     logs, grams = snapshots.get("logs"), snapshots.get("grams")
     if logs and grams and logs.version is None and grams.rows:
@@ -108,14 +108,14 @@ def _list_unreferenced(
     warehouse: Warehouse, snapshots: dict[str, Snapshot], report: Verification
 ) -> None:
     for snapshot in snapshots.values():
-        known = replaced(snapshot)
-        for file in unreferenced(snapshot.table):
+        known = find_replaced(snapshot)
+        for file in find_unreferenced(snapshot.table):
             what = "replaced" if file.path in known else "never committed"
             then = "fleet-slip vacuum removes it in time"
             if snapshot.version is None:
                 then = "if the table had a Delta log, restore that from a backup"
             _remark(warehouse, file, f"{what}; {then}", report)
-    for file in temporary_files(warehouse):
+    for file in find_temporary_files(warehouse):
         _remark(warehouse, file, "left by a killed job, or being written", report)
 
 

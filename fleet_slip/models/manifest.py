@@ -153,7 +153,7 @@ class Manifest(Config):
         )
 
 
-def check_model_name(name: str) -> str:
+def require_model_name(name: str) -> str:
     """Return a name that a model or an alias may have. Raises `ConfigError` otherwise."""
     if not re.fullmatch(IDENTIFIER_PATTERN, name):
         raise ConfigError(

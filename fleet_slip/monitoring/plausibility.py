@@ -48,17 +48,17 @@ class Fault:
     figure: str
 
 
-def implausible(table: GramTable, min_correlation: float) -> dict[int, Fault]:
+def find_implausible(table: GramTable, min_correlation: float) -> dict[int, Fault]:
     """Return the drives whose sensors contradict one another or stand still, with the fault."""
     faults: dict[int, Fault] = {}
     for first, moments in zip(count(0, AT_ONCE), DriveBatches.of(table)):
-        turning = reversed_or_swapped(moments, min_correlation)
+        turning = find_reversed_or_swapped(moments, min_correlation)
         found = steering_swapped(moments) | turning
         faults |= {first + drive: fault for drive, fault in found.items()}
-    return faults | stuck(table)
+    return faults | find_stuck(table)
 
 
-def stuck(table: GramTable) -> dict[int, Fault]:
+def find_stuck(table: GramTable) -> dict[int, Fault]:
     """Return the drives in which a signal never changed while most others did.
 
     Exact: the sum of squares about the mean is the integer zero.
@@ -75,7 +75,7 @@ def stuck(table: GramTable) -> dict[int, Fault]:
     return faults
 
 
-def reversed_or_swapped(moments: MeanMoments, min_correlation: float) -> dict[int, Fault]:
+def find_reversed_or_swapped(moments: MeanMoments, min_correlation: float) -> dict[int, Fault]:
     """Return the drives in which witnesses of the turning direction contradict the majority.
 
     A witness is reversed if the median of its correlations with the others is below

@@ -15,7 +15,7 @@ from fleet_slip.grams.cohort import Cohort, empty_cohort_error, load_cohort, req
 from fleet_slip.grams.reader import GramReader
 from fleet_slip.monitoring.moments import DriveBatches
 from fleet_slip.monitoring.peers import settle
-from fleet_slip.monitoring.plausibility import Fault, implausible
+from fleet_slip.monitoring.plausibility import Fault, find_implausible
 from fleet_slip.monitoring.thresholds import QualityThresholds, thresholds
 from fleet_slip.regression.gram_table import GramTable
 from fleet_slip.warehouse.database import database_errors
@@ -107,14 +107,14 @@ def _day_and_drive(finding: SensorFault) -> tuple[date, str]:
 def examine(cohort: Cohort, limits: QualityThresholds | None = None) -> QualityReport:
     """Examine each drive of a cohort, beside the drives of its vehicle model.
 
-    First for what no car does (`implausible`), then by comparison with its peers, if it has
+    First for what no car does (`find_implausible`), then by comparison with its peers, if it has
     `min_drives` of them.
     """
     limits = limits or thresholds().quality
     drives = compared = 0
     findings = []
     for table, metadata in _groups(cohort, limits.min_rows):
-        faults = implausible(table, limits.min_correlation)
+        faults = find_implausible(table, limits.min_correlation)
         faults |= _saturated(table, metadata, limits)
         in_order = np.array([drive not in faults for drive in range(len(table))])
         if in_order.sum() >= limits.min_drives:

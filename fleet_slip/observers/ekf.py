@@ -20,7 +20,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.config import Config
 from fleet_slip.observers import yaw_rate
 from fleet_slip.observers.angle import sideslip_angle
-from fleet_slip.observers.signals import STEP_S, DriveSignals, held
+from fleet_slip.observers.signals import STEP_S, DriveSignals, hold_last
 from fleet_slip.observers.single_track import (
     SLOWEST_MPS,
     SingleTrack,
@@ -287,8 +287,8 @@ def estimate(drive: DriveSignals, car: VehicleParameters, noise: EkfNoise) -> Fl
     vx_mps = measured_speed_mps(drive, car)
     p0, p1, p2 = (std**2 for std in INITIAL_STD)
     means = _filter(
-        held(drive.ax_mps2, "ax"),
-        held(drive.ay_mps2, "ay"),
+        hold_last(drive.ax_mps2, "ax"),
+        hold_last(drive.ay_mps2, "ay"),
         turning,
         vx_mps,
         measured_steer_rad(drive),

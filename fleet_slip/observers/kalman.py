@@ -17,7 +17,7 @@ from fleet_slip.config import Config
 from fleet_slip.errors import DataError
 from fleet_slip.observers import yaw_rate
 from fleet_slip.observers.angle import sideslip_angle
-from fleet_slip.observers.signals import STEP_S, DriveSignals, held
+from fleet_slip.observers.signals import STEP_S, DriveSignals, hold_last
 from fleet_slip.observers.yaw_rate import YawRateNoise
 from fleet_slip.simulation.sensors import Sensors
 from fleet_slip.vehicle.parameters import VehicleParameters
@@ -275,8 +275,8 @@ def run(drive: DriveSignals, yaw_rate_rad_s: FloatArray, noise: FilterNoise) -> 
             "the drive has no GPS fix, which the Kalman filter begins with. Choose drives with GPS."
         )
     means = _filter(
-        held(drive.ax_mps2, "ax"),
-        held(drive.ay_mps2, "ay"),
+        hold_last(drive.ax_mps2, "ax"),
+        hold_last(drive.ay_mps2, "ay"),
         yaw_rate_rad_s,
         drive.gps_vx_mps,
         drive.gps_vy_mps,

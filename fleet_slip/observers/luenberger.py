@@ -16,7 +16,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.config import Config
 from fleet_slip.observers import yaw_rate
 from fleet_slip.observers.angle import sideslip_angle
-from fleet_slip.observers.signals import STEP_S, DriveSignals, held
+from fleet_slip.observers.signals import STEP_S, DriveSignals, hold_last
 from fleet_slip.observers.single_track import (
     SingleTrack,
     StateSpace,
@@ -90,6 +90,6 @@ def estimate(drive: DriveSignals, car: VehicleParameters, poles: ObserverPoles) 
         gains(space, poles),
         measured_steer_rad(drive),
         yaw_rate.estimate(drive, car, poles.yaw_rate).yaw_rate_rad_s,
-        held(drive.ay_mps2, "ay"),
+        hold_last(drive.ay_mps2, "ay"),
     )
     return sideslip_angle(vx_mps, vy_mps)

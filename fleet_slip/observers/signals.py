@@ -66,7 +66,7 @@ def read_drive(database: duckdb.DuckDBPyConnection, drive_id: str) -> LabelledDr
     return LabelledDrive(drive_id, DriveSignals(**arrays), sideslip_rad)
 
 
-def held(values: FloatArray, name: str) -> FloatArray:
+def hold_last(values: FloatArray, name: str) -> FloatArray:
     """Return a signal with every gap filled by the value before it, a leading one by the first.
 
     Raises `DataError` if there is no value at all.

@@ -16,7 +16,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.observers.signals import DriveSignals, held
+from fleet_slip.observers.signals import DriveSignals, hold_last
 from fleet_slip.observers.wheel_speeds import undriven_axle
 from fleet_slip.vehicle.parameters import VehicleParameters, constants
 from fleet_slip.vehicle.tyre import cornering_stiffness
@@ -109,9 +109,9 @@ def state_space(model: SingleTrack, vx_mps: FloatArray) -> StateSpace:
 
 def measured_speed_mps(drive: DriveSignals, car: VehicleParameters) -> FloatArray:
     """Return the longitudinal velocity from wheel speeds. Raises `DataError` without them."""
-    return held(undriven_axle(drive, car).vx_mps, "wheel speeds")
+    return hold_last(undriven_axle(drive, car).vx_mps, "wheel speeds")
 
 
 def measured_steer_rad(drive: DriveSignals) -> FloatArray:
     """Return the mean angle of the front wheels. Raises `DataError` without them."""
-    return held((drive.steer_fl_rad + drive.steer_fr_rad) / 2, "steer_fl and steer_fr")
+    return hold_last((drive.steer_fl_rad + drive.steer_fr_rad) / 2, "steer_fl and steer_fr")

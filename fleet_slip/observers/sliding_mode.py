@@ -20,7 +20,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.config import Config
 from fleet_slip.observers import yaw_rate
 from fleet_slip.observers.angle import sideslip_angle
-from fleet_slip.observers.signals import STEP_S, DriveSignals, held
+from fleet_slip.observers.signals import STEP_S, DriveSignals, hold_last
 from fleet_slip.observers.single_track import (
     SingleTrack,
     measured_speed_mps,
@@ -106,7 +106,7 @@ def estimate(drive: DriveSignals, car: VehicleParameters, gains: SlidingGains) -
     space = state_space(SingleTrack.of(car, gains.stiffness_factor), vx_mps)
     steer = measured_steer_rad(drive)
     turning = yaw_rate.estimate(drive, car, gains.yaw_rate).yaw_rate_rad_s
-    ay_mps2 = held(drive.ay_mps2, "ay")
+    ay_mps2 = hold_last(drive.ay_mps2, "ay")
     vy_mps = _observe(
         tuple(space),
         steer,

@@ -16,7 +16,7 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
-from fleet_slip.regression.drives import DriveMoments
+from fleet_slip.regression.drive_moments import DriveMoments
 from fleet_slip.regression.exact import Fit
 from fleet_slip.regression.inference import drive_scores, noise_variance, small_sample_factor
 

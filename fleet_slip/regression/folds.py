@@ -17,7 +17,7 @@ import numpy as np
 
 from fleet_slip.arrays import IntArray
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.regression.gram import Gram, positions
+from fleet_slip.regression.gram import Gram, require_signals
 from fleet_slip.regression.gram_table import GramTable
 
 
@@ -156,7 +156,7 @@ class CohortFolds:
         served = [i for i, grams in enumerate(self.tables) if set(signals) <= set(grams[0].signals)]
         if not served:
             known = sorted({name for grams in self.tables for name in grams[0].signals})
-            positions(known, signals)
+            require_signals(known, signals)
             raise DataError(
                 f"no drive of the cohort has all of {', '.join(signals)}. Use fewer signals, or "
                 "another cohort."

@@ -185,14 +185,19 @@ class Gram:
             )
 
 
-def positions(signals: Sequence[str], wanted: Sequence[str]) -> list[int]:
-    """Return the index of each wanted signal. Raises `DataError` for an absent one."""
+def require_signals(signals: Sequence[str], wanted: Sequence[str]) -> None:
+    """Raise `DataError` for a wanted signal that is absent."""
     missing = [name for name in wanted if name not in signals]
     if missing:
         raise DataError(
             f"no Gram of {', '.join(missing)}: the drives have {', '.join(signals)}. "
             "Leave the signal out, or choose a cohort that has it."
         )
+
+
+def positions(signals: Sequence[str], wanted: Sequence[str]) -> list[int]:
+    """Return the index of each wanted signal. Raises `DataError` for an absent one."""
+    require_signals(signals, wanted)
     return [signals.index(name) for name in wanted]
 
 

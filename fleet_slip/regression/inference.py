@@ -15,7 +15,7 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
 from fleet_slip.regression import rounding, special
-from fleet_slip.regression.drives import DriveMoments
+from fleet_slip.regression.drive_moments import DriveMoments
 from fleet_slip.regression.elimination import inverse_matrix
 from fleet_slip.regression.exact import Fit, Scales, dependence, fit, moments
 from fleet_slip.regression.gram import Gram
@@ -64,11 +64,15 @@ def noise_variance(fitted: Fit) -> Fraction:
 
     Raises `DataError` if there are no more rows than coefficients.
     """
+    _require_noise(fitted)
+    return fitted.rss / fitted.degrees_of_freedom
+
+
+def _require_noise(fitted: Fit) -> None:
     if fitted.degrees_of_freedom <= 0:
         raise DataError(
             f"{fitted.gram.n} rows cannot tell the noise of a model with {fitted.size} signals."
         )
-    return fitted.rss / fitted.degrees_of_freedom
 
 
 def classical_variances(fitted: Fit, variance: Fraction) -> list[Fraction]:
@@ -89,7 +93,7 @@ def classical_variances(fitted: Fit, variance: Fraction) -> list[Fraction]:
     return [variance * (1 + form) / gram.n, *slopes]
 
 
-def classical(fitted: Fit, scales: Scales, variance: Fraction | None = None) -> Inference:
+def infer_classically(fitted: Fit, scales: Scales, variance: Fraction | None = None) -> Inference:
     """Return standard errors for independent rows, rounded once from exact rationals.
 
     `variance` is that of the noise in counts^2 if it is from another model (the full one, for
@@ -106,7 +110,7 @@ def classical(fitted: Fit, scales: Scales, variance: Fraction | None = None) -> 
     )
 
 
-def cluster(fitted: Fit, drives: DriveMoments, scales: Scales) -> Inference:
+def infer_by_drives(fitted: Fit, drives: DriveMoments, scales: Scales) -> Inference:
     """Return cluster-robust standard errors, one cluster a drive (Cameron and Miller 2015).
 
     V = c B (sum_p s_p s_p') B with B = (X'X)^-1, s_p the drive's sum of x times residual, and
@@ -145,7 +149,7 @@ def small_sample_factor(fitted: Fit, clusters: int) -> float:
     """Return P/(P-1) (n-1)/(n-k-1). Raises `DataError` for a single drive."""
     if clusters < 2:
         raise DataError("cluster-robust errors need at least two drives.")
-    noise_variance(fitted)
+    _require_noise(fitted)
     return clusters / (clusters - 1) * (fitted.gram.n - 1) / fitted.degrees_of_freedom
 
 
@@ -178,7 +182,7 @@ class ChowTest:
     p: float
 
 
-def chow(groups: Sequence[Gram], inputs: Sequence[str], label: str) -> ChowTest:
+def chow_test(groups: Sequence[Gram], inputs: Sequence[str], label: str) -> ChowTest:
     """Compare one model for all groups with one for each.
 
     F = ((RSS_pool - sum RSS_p) / ((P-1)(k+1))) / (sum RSS_p / (n - P(k+1))).
@@ -213,12 +217,14 @@ class WaldTest:
     p: float
 
 
-def wald(one: Fit, one_drives: DriveMoments, other: Fit, other_drives: DriveMoments) -> WaldTest:
+def wald_test(
+    one: Fit, one_drives: DriveMoments, other: Fit, other_drives: DriveMoments
+) -> WaldTest:
     """Compare the coefficients of the same model fitted to two sets of drives.
 
     F = d'(V_1 + V_2)^-1 d / (k + 1), d the difference and V the cluster-robust covariances; its
-    denominator is the number of drives minus two (Cameron and Miller 2015). Unlike `chow`, it does
-    not take neighbouring rows for independent. Raises `DataError` with fewer drives than
+    denominator is the number of drives minus two (Cameron and Miller 2015). Unlike `chow_test`, it
+    does not take neighbouring rows for independent. Raises `DataError` with fewer drives than
     coefficients.
     """
     size, drives = one.size + 1, len(one_drives) + len(other_drives)

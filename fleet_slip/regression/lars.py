@@ -75,7 +75,7 @@ def path_of_moments(
     )
 
 
-def lasso_model(
+def fit_lasso(
     gram: Gram, inputs: Sequence[str], label: str, penalty: float, ridge: float = 0.0
 ) -> LinearModel:
     """Return the lasso (or elastic net) of counts; the penalty is in correlations, 0..1."""

@@ -16,7 +16,7 @@ from fleet_slip.regression.exact import (
     moments,
 )
 from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.inference import Inference, classical, noise_variance
+from fleet_slip.regression.inference import Inference, infer_classically, noise_variance
 
 
 def nested_fits(gram: Gram, order: Sequence[str], label: str) -> list[Fit]:
@@ -83,7 +83,7 @@ def nested_models(
     return [
         NestedModel(
             fitted,
-            classical(fitted, scales, variance),
+            infer_classically(fitted, scales, variance),
             known.contributions[size - 1] if size else 0.0,
             distances[size],
             condition_number(gram, fitted.model.signals),

@@ -20,7 +20,7 @@ from fleet_slip.regression.crossval import (
     held_out,
     least_squares,
 )
-from fleet_slip.regression.drives import DriveMoments
+from fleet_slip.regression.drive_moments import DriveMoments
 from fleet_slip.regression.evidence import Evidence
 from fleet_slip.regression.exact import Fit, Scales
 from fleet_slip.regression.folds import Folds
@@ -41,7 +41,7 @@ class Rule:
 
 
 @dataclass(frozen=True)
-class Selection:
+class NestedChoice:
     """A choice among the nested models of an order.
 
     Attributes:
@@ -92,7 +92,9 @@ class Training:
     scales: Scales
 
 
-def select_nested(training: Training, inputs: Sequence[str], label: str, rule: Rule) -> Selection:
+def select_nested(
+    training: Training, inputs: Sequence[str], label: str, rule: Rule
+) -> NestedChoice:
     """Rank the inputs, and choose one of the nested models.
 
     Raises `DataError` for dependent signals or a label without noise, and `QuestionError` for an
@@ -112,7 +114,7 @@ def select_nested(training: Training, inputs: Sequence[str], label: str, rule: R
     else:
         size = best_size(rule.criterion, evidence)
         values = tuple(criterion_values(rule.criterion, evidence).tolist())
-    return Selection(order, size, fits[size], evidence, values)
+    return NestedChoice(order, size, fits[size], evidence, values)
 
 
 def cross_validate_nested(

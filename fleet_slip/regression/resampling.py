@@ -12,7 +12,7 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
-from fleet_slip.regression.drives import DriveMoments
+from fleet_slip.regression.drive_moments import DriveMoments
 from fleet_slip.regression.exact import LinearModel
 
 _BATCH_BYTES = 2**26

@@ -22,7 +22,7 @@ from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.standard import from_standardised, through_means
 
 
-def penalised(
+def fit_penalised(
     gram: Gram, inputs: Sequence[str], label: str, penalties: Sequence[Fraction]
 ) -> LinearModel:
     """Solve (S + diag(penalties)) b = S_xy exactly; penalties in counts^2 of each input.
@@ -48,17 +48,17 @@ def penalised(
     return through_means(part, label, slopes)
 
 
-def noise_matched(
+def fit_noise_matched(
     gram: Gram, inputs: Sequence[str], label: str, noise: Mapping[str, float], scales: Scales
 ) -> LinearModel:
     """Return the model of counts that is best once noise is added to the signals.
 
     `noise` is the standard deviation of independent noise to come, in physical units.
     """
-    return penalised(gram, inputs, label, _variances(gram, inputs, noise, scales))
+    return fit_penalised(gram, inputs, label, _variances(gram, inputs, noise, scales))
 
 
-def errors_in_variables(
+def fit_errors_in_variables(
     gram: Gram, inputs: Sequence[str], label: str, noise: Mapping[str, float], scales: Scales
 ) -> LinearModel:
     """Return the model of counts for signals without the noise that they were logged with.
@@ -68,7 +68,7 @@ def errors_in_variables(
     that is not among the inputs.
     """
     variances = _variances(gram, inputs, noise, scales)
-    return penalised(gram, inputs, label, [-variance for variance in variances])
+    return fit_penalised(gram, inputs, label, [-variance for variance in variances])
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def ridge_path(
     return RidgePath(grid, coefficients, rss, degrees, gcv)
 
 
-def ridge_model(gram: Gram, inputs: Sequence[str], label: str, penalty: float) -> LinearModel:
+def fit_ridge(gram: Gram, inputs: Sequence[str], label: str, penalty: float) -> LinearModel:
     """Return the ridge model of counts at one penalty on the correlation matrix.
 
     `cross_validate` with this for a procedure gives the figures at a penalty.

@@ -62,7 +62,7 @@ def serial_correlation(model: LinearModel, gram: Gram, lagged: LagGram) -> Seria
     return SerialCorrelation(float(now_before / before), float(steps / total))
 
 
-def quasi_differenced(lagged: LagGram, signals: Sequence[str], rho: Fraction) -> Gram:
+def quasi_difference(lagged: LagGram, signals: Sequence[str], rho: Fraction) -> Gram:
     """Return the Gram of q u_t - p u_{t-1} for rho = p / q, exactly.
 
     Its counts are worth 1/q of the signals'; coefficients are unaffected, the intercept becomes
@@ -87,7 +87,7 @@ class AutoregressiveFit:
     differenced: Fit
 
 
-def autoregressive_fit(lagged: LagGram, inputs: Sequence[str], label: str) -> AutoregressiveFit:
+def fit_autoregressive(lagged: LagGram, inputs: Sequence[str], label: str) -> AutoregressiveFit:
     """Return the AR(1) fit by iterated Cochrane-Orcutt (1949) from a lag Gram.
 
     rho is kept on a grid of 2^-20, so that each step is exact; it stops when rho does not change.
@@ -96,7 +96,7 @@ def autoregressive_fit(lagged: LagGram, inputs: Sequence[str], label: str) -> Au
     signals = [*inputs, label]
     rho = Fraction(0)
     for _ in range(_ROUNDS):
-        differenced = fit(quasi_differenced(lagged, signals, rho), inputs, label)
+        differenced = fit(quasi_difference(lagged, signals, rho), inputs, label)
         level = differenced.model.intercept / (rho.denominator - rho.numerator)
         coefficients = differenced.model.coefficients
         model = LinearModel(tuple(inputs), label, coefficients, level)
@@ -132,4 +132,4 @@ def _difference(model: LinearModel) -> LinearModel:
 
 
 def _with_differences(model: LinearModel, lagged: LagGram) -> Gram:
-    return quasi_differenced(lagged, [*model.signals, model.label], Fraction(1))
+    return quasi_difference(lagged, [*model.signals, model.label], Fraction(1))

@@ -86,7 +86,7 @@ def best_subsets(gram: Gram, inputs: Sequence[str], label: str, count: int = 2) 
     return [_exact_best(part, inputs, label, masks, count) for masks in found]
 
 
-def choices(results: Sequence[SizeResult], evidence: Evidence) -> dict[str, int]:
+def pick_sizes(results: Sequence[SizeResult], evidence: Evidence) -> dict[str, int]:
     """Return the size that each criterion picks among the best models of every size.
 
     The evidence is that of the full model in any order.

@@ -12,7 +12,7 @@ from typing import Literal
 from fleet_slip.regression.exact import LinearModel
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.ridge import penalised, standardised_penalty, standardised_size
+from fleet_slip.regression.ridge import fit_penalised, standardised_penalty, standardised_size
 
 Selection = Literal["none", "m5", "greedy"]
 
@@ -64,7 +64,7 @@ class _Search:
 
     def fit(self, inputs: list[str]) -> LinearModel:
         penalties = standardised_penalty(self.gram, inputs, self.ridge)
-        return penalised(self.gram, inputs, self.label, penalties)
+        return fit_penalised(self.gram, inputs, self.label, penalties)
 
 
 class _Akaike:

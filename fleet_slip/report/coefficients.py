@@ -6,9 +6,14 @@ from dataclasses import dataclass
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.grams.cohort import Cohort
-from fleet_slip.regression.drives import DriveMoments
+from fleet_slip.regression.drive_moments import DriveMoments
 from fleet_slip.regression.exact import fit
-from fleet_slip.regression.inference import INTERCEPT, classical, cluster, variance_inflation
+from fleet_slip.regression.inference import (
+    INTERCEPT,
+    infer_by_drives,
+    infer_classically,
+    variance_inflation,
+)
 
 
 @dataclass(frozen=True)
@@ -59,7 +64,7 @@ def coefficient_table(cohort: Cohort, model: str, inputs: Sequence[str]) -> Coef
     moments = DriveMoments.of(served.table)
     fitted = fit(served.table.total(), inputs, label)
     scales = {name: signals[name].exact_scale for name in (*inputs, label)}
-    robust, naive = cluster(fitted, moments, scales), classical(fitted, scales)
+    robust, naive = infer_by_drives(fitted, moments, scales), infer_classically(fitted, scales)
     inflation = variance_inflation(fitted.gram, inputs)
     spread = dict(zip(moments.signals, moments.spread.tolist(), strict=True))
     rows = []

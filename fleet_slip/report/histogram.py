@@ -10,7 +10,7 @@ import pyarrow as pa
 
 from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.cohort import assign
+from fleet_slip.grams.cohort import assign_folds
 from fleet_slip.grams.folding import FOLD_KEYS
 from fleet_slip.regression.crossval import CrossValidation, least_squares
 from fleet_slip.regression.exact import LinearModel
@@ -91,10 +91,10 @@ def held_out_histogram(
 
 def held_out_coefficients(selection: Selection, model: CrossValidation) -> pa.Table:
     """Return for each drive the model, in SI units, that was fitted without the drive's fold."""
-    plan, label = selection.folds, catalogue().label
+    folding, label = selection.folds, catalogue().label
     drives = selection.cohort.drives
-    assignment = assign(drives[FOLD_KEYS[plan.by]].to_pylist(), plan.by, plan.count)
-    folds = selection.cohort.folds(plan.by, plan.count).serving(model.signals, label)
+    assignment = assign_folds(drives[FOLD_KEYS[folding.by]].to_pylist(), folding.by, folding.count)
+    folds = selection.cohort.folds(folding.by, folding.count).serving(model.signals, label)
     fit = least_squares(model.signals, label)
     scales = {name: catalogue()[name].exact_scale for name in (*model.signals, label)}
     models = [fit(folds.total - fold).physical(scales) for fold in folds.grams]

@@ -9,7 +9,7 @@ from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
 
 from fleet_slip.report import paper_tables, tables
-from fleet_slip.report.claims import Judged, judged
+from fleet_slip.report.claims import Judged, judge_claims
 from fleet_slip.report.claims.claim import Status
 from fleet_slip.report.data import ReportData
 from fleet_slip.report.drawing import inline_svgs
@@ -50,7 +50,7 @@ def render(data: ReportData, shown: Sequence[Picture]) -> str:
         Drawn(one, {kind: Markup(svg) for kind, svg in inline_svgs(one).items()})  # noqa: S704
         for one in shown
     ]
-    claims = judged(data)
+    claims = judge_claims(data)
     page = environment.get_template("report.html.j2").render(
         css=Markup((TEMPLATES / "report.css").read_text(encoding="utf-8")),  # noqa: S704
         palette={name.replace("_", "-"): tone for name, tone in PALETTE.items()},

@@ -23,7 +23,7 @@ PAPER_TABLE_TWO = {
 
 def table_one(data: ReportData) -> Table:
     """Return Table I: cross-validated correlation of the five models."""
-    plan = data.trained.selection.folds
+    folding = data.trained.selection.folds
     rows: list[list[str | Cell]] = [
         [
             model.name,
@@ -46,8 +46,8 @@ def table_one(data: ReportData) -> Table:
         rows,
         left=2,
         note=(
-            f"{plan.count} folds by {plan.by}, {count(data.trained.selection.cohort.rows)} rows. "
-            f"{winner}"
+            f"{folding.count} folds by {folding.by}, "
+            f"{count(data.trained.selection.cohort.rows)} rows. {winner}"
         ),
     )
 

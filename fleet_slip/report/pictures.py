@@ -43,7 +43,7 @@ class Picture:
     draw: Callable[[Size], Figure]
 
 
-def pictures(data: ReportData) -> tuple[Picture, ...]:
+def draw_pictures(data: ReportData) -> tuple[Picture, ...]:
     """Return all figures whose drives were evaluated."""
     return (*_of_the_paper(data), *_beyond_the_paper(data))
 

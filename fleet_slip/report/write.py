@@ -7,7 +7,7 @@ from fleet_slip.models.versions import ModelVersion
 from fleet_slip.report.data import gather
 from fleet_slip.report.drawing import png_file, svg_file
 from fleet_slip.report.page import render
-from fleet_slip.report.pictures import pictures
+from fleet_slip.report.pictures import draw_pictures
 from fleet_slip.warehouse.tables import Warehouse
 
 PAGE = "report.html"
@@ -30,7 +30,7 @@ def write_report(warehouse: Warehouse, version: ModelVersion, output: Folder) ->
     version has not been evaluated, or not on today's data.
     """
     data = gather(warehouse, version)
-    shown = pictures(data)
+    shown = draw_pictures(data)
     page = render(data, shown).encode("utf-8")
     for picture in shown:
         output.put(f"{FIGURES}/{picture.key}.svg", svg_file(picture).encode("utf-8"))

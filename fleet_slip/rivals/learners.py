@@ -176,9 +176,13 @@ def one_thread() -> Iterator[None]:
     Raises `ConfigError` if scikit-learn is not installed.
     """
     # The limit holds for libraries that are loaded.
-    _scikit_learn("ensemble")
+    _require_scikit_learn()
     with import_module("threadpoolctl").threadpool_limits(limits=1):
         yield
+
+
+def _require_scikit_learn() -> None:
+    _scikit_learn("ensemble")
 
 
 def _scikit_learn(module: str) -> Any:

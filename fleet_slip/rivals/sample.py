@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError
-from fleet_slip.grams.cohort import Cohort, assign
+from fleet_slip.grams.cohort import Cohort, assign_folds
 from fleet_slip.regression.folds import FoldAssignment
 from fleet_slip.resources import read_sql
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
@@ -42,7 +42,7 @@ class Sample:
 
     def folds(self, count: int) -> FoldAssignment:
         """Divide the rows as the regression's cross-validation divides the drives."""
-        return assign(self.drive_id.tolist(), "drive", count)
+        return assign_folds(self.drive_id.tolist(), "drive", count)
 
 
 def draw_sample(

@@ -16,7 +16,7 @@ from fleet_slip.regression.crossval import CrossValidation, cross_validate_input
 from fleet_slip.regression.folds import CohortFolds
 from fleet_slip.regression.winner import Winner, choose
 from fleet_slip.selection.model_list import CandidateModel
-from fleet_slip.selection.search import OrderedChoice
+from fleet_slip.selection.search import SearchChoice
 from fleet_slip.selection.uncertainty import Uncertainty
 
 AnyCohort = TypeVar("AnyCohort", bound=Cohort | SummedCohort, default=Cohort)
@@ -41,7 +41,7 @@ class Selection(Generic[AnyCohort]):
     models: tuple[CrossValidation, ...]
     winner: Winner
     skipped: dict[str, str]
-    choice: OrderedChoice | None = None
+    choice: SearchChoice | None = None
     uncertainty: Uncertainty | None = None
 
     def as_dict(self) -> dict[str, Any]:

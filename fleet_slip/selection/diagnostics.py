@@ -8,26 +8,26 @@ from fleet_slip.catalogue.features import LAG, input_scales, lag_signals
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import Cohort, Served
-from fleet_slip.regression.drives import DriveMoments, serving_drives
+from fleet_slip.regression.drive_moments import DriveMoments, serving_drives
 from fleet_slip.regression.evidence import Evidence
 from fleet_slip.regression.exact import Fit, LinearModel, condition_number, fit
 from fleet_slip.regression.inference import (
     ChowTest,
     Inference,
     WaldTest,
-    chow,
-    classical,
-    cluster,
+    chow_test,
+    infer_by_drives,
+    infer_classically,
     variance_inflation,
-    wald,
+    wald_test,
 )
 from fleet_slip.regression.nested import nested_fits
-from fleet_slip.regression.ridge import errors_in_variables
+from fleet_slip.regression.ridge import fit_errors_in_variables
 from fleet_slip.regression.serial import (
     AutoregressiveFit,
     LagGram,
     SerialCorrelation,
-    autoregressive_fit,
+    fit_autoregressive,
     serial_correlation,
 )
 
@@ -148,12 +148,12 @@ def diagnose(
     fitted = fits[-1]
     free = None
     if sensor_noise:
-        free = errors_in_variables(total, inputs, label, sensor_noise, scales).physical(scales)
+        free = fit_errors_in_variables(total, inputs, label, sensor_noise, scales).physical(scales)
     return Diagnosis(
         fitted=fitted,
         drives=len(served.table),
-        naive=classical(fitted, scales),
-        robust=cluster(fitted, moments, scales),
+        naive=infer_classically(fitted, scales),
+        robust=infer_by_drives(fitted, moments, scales),
         inflation=variance_inflation(total, inputs),
         condition_number=condition_number(total, inputs),
         evidence=Evidence.clustered(fits, moments),
@@ -167,11 +167,11 @@ def _serial(fitted: Fit, lagged: Cohort) -> SerialDiagnosis:
     inputs, label = fitted.model.signals, fitted.model.label
     table, _ = serving_drives(lagged.tables, lag_signals([*inputs, label]))
     gram = LagGram(table.total(), LAG)
-    autoregressive = autoregressive_fit(gram, inputs, label)
+    autoregressive = fit_autoregressive(gram, inputs, label)
     return SerialDiagnosis(
         serial_correlation(fitted.model, fitted.gram, gram),
         autoregressive,
-        classical(autoregressive.differenced, input_scales()),
+        infer_classically(autoregressive.differenced, input_scales()),
     )
 
 
@@ -188,7 +188,7 @@ def _compare(here: Served, fitted: Fit, moments: DriveMoments, against: Cohort) 
     other = fit(there.table.total(), inputs, label)
     return CohortComparison(
         against.condition,
-        cluster(other, other_moments, input_scales()),
-        chow([fitted.gram, other.gram], inputs, label),
-        wald(fitted, moments, other, other_moments),
+        infer_by_drives(other, other_moments, input_scales()),
+        chow_test([fitted.gram, other.gram], inputs, label),
+        wald_test(fitted, moments, other, other_moments),
     )

@@ -11,10 +11,11 @@ from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.grams.cohort import Cohort, assign
+from fleet_slip.grams.cohort import Cohort, assign_folds
 from fleet_slip.grams.folding import FOLD_KEYS, ROW_FOLDS, Folding
 from fleet_slip.grams.statement import UNKNOWN_PART
 from fleet_slip.regression.crossval import held_out
+from fleet_slip.regression.drive_moments import require_serving_drives
 from fleet_slip.regression.exact import LinearModel, fit
 from fleet_slip.regression.figures import ErrorSums, Figures
 from fleet_slip.regression.gram import Gram
@@ -123,19 +124,21 @@ def band_order(cohort: Cohort, names: Sequence[str]) -> list[str]:
 
 
 def compare_regimes(
-    cohort: Cohort, inputs: Sequence[str], plan: Folding, over: Sequence[str] = ()
+    cohort: Cohort, inputs: Sequence[str], folding: Folding, over: Sequence[str] = ()
 ) -> RegimeComparison:
     """Cross-validate one model for all regimes and one for each, on drives that have the inputs.
 
     Raises `QuestionError` for a feature set without regimes, and `DataError` for absent signals or
     empty folds.
     """
-    if plan.by == ROW_FOLDS:
+    if folding.by == ROW_FOLDS:
         raise QuestionError("rows are divided by regime already: fold by drive, or by vehicle.")
     names = regime_names(cohort, over)
     order = band_order(cohort, names)
     regime = np.array([order.index(name) for name in names], dtype=np.int64)
-    assignment = assign(cohort.drives[FOLD_KEYS[plan.by]].to_pylist(), plan.by, plan.count)
+    assignment = assign_folds(
+        cohort.drives[FOLD_KEYS[folding.by]].to_pylist(), folding.by, folding.count
+    )
     grid = _Grid.of(cohort, inputs, regime, len(order), assignment.fold, len(assignment.names))
     pooled = [grid.pooled(f) for f in range(grid.folds)]
     sums = {
@@ -203,6 +206,7 @@ class _Grid:
         folds: int,
     ) -> "_Grid":
         signals = [*inputs, catalogue().label]
+        require_serving_drives(cohort.tables, signals)
         cell = regime * folds + fold
         cells = [Gram.zero(signals)] * (regimes * folds)
         stops = np.cumsum([len(table) for table in cohort.tables])[:-1]
@@ -210,7 +214,6 @@ class _Grid:
             if set(signals) <= set(table.signals):
                 found = table.restrict(signals).totals(mine, regimes * folds)
                 cells = [a + b for a, b in zip(cells, found, strict=True)]
-        cohort.serving(inputs)
         grams = tuple(tuple(cells[r * folds : (r + 1) * folds]) for r in range(regimes))
         return cls(tuple(inputs), grams, sum(cells[1:], cells[0]))
 

@@ -19,8 +19,8 @@ from fleet_slip.selection.model_list import (
     load_model_list,
     nested_models,
 )
-from fleet_slip.selection.search import check_criterion, select_ranked, select_subsets
-from fleet_slip.selection.uncertainty import uncertainty
+from fleet_slip.selection.search import require_criterion, select_ranked, select_subsets
+from fleet_slip.selection.uncertainty import estimate_uncertainty
 from fleet_slip.warehouse.tables import Warehouse
 
 DEFAULT_MODELS = "table1"
@@ -30,7 +30,7 @@ WHOLE_SET = "catalogue"
 
 
 @dataclass(frozen=True)
-class SelectionPlan:
+class SelectionRequest:
     """What to select.
 
     Attributes:
@@ -70,7 +70,7 @@ class SelectionPlan:
 
 
 @dataclass(frozen=True)
-class PlannedSelection:
+class RequestedSelection:
     """A selection, what it was made from, and a checksum of that."""
 
     selection: Selection[Any]
@@ -78,75 +78,81 @@ class PlannedSelection:
     config_sha256: str
 
 
-def run_plan(warehouse: Warehouse, plan: SelectionPlan) -> PlannedSelection:
-    """Select as planned. Raises `ConfigError` for options that do not go together."""
-    if plan.ordered and plan.models:
+def answer_request(warehouse: Warehouse, request: SelectionRequest) -> RequestedSelection:
+    """Select as asked. Raises `ConfigError` for options that do not go together."""
+    if request.ordered and request.models:
         raise ConfigError(
             "a list of models is compared by cross-validation as it stands: leave out --models, or "
             "--rank, --criterion, --all-subsets and --naive, which search among the inputs of "
             "--nested."
         )
-    if plan.rank and plan.all_subsets:
+    if request.rank and request.all_subsets:
         raise ConfigError("--all-subsets needs no order: leave out --rank.")
-    name = plan.models or (None if plan.nested or plan.ordered else DEFAULT_MODELS)
+    name = request.models or (None if request.nested or request.ordered else DEFAULT_MODELS)
     model_list = load_model_list(name) if name else None
-    folds = _fold_plan(plan, model_list)
-    feature_set = _feature_set(plan, model_list)
-    if not plan.ordered and not plan.resampled:
-        return _listed(
-            sum_cohort(warehouse, folds, plan.cohort, feature_set), plan, model_list, folds
+    folds = _folding(request, model_list)
+    feature_set = _feature_set(request, model_list)
+    if not request.ordered and not request.resampled:
+        return _compare_listed(
+            sum_cohort(warehouse, folds, request.cohort, feature_set), request, model_list, folds
         )
-    cohort = load_cohort(warehouse, plan.cohort, feature_set)
-    planned = (
-        _ordered(cohort, plan, folds) if plan.ordered else _listed(cohort, plan, model_list, folds)
+    cohort = load_cohort(warehouse, request.cohort, feature_set)
+    answer = (
+        _search(cohort, request, folds)
+        if request.ordered
+        else _compare_listed(cohort, request, model_list, folds)
     )
-    if not plan.resampled:
-        return planned
-    figures = uncertainty(
-        cohort, planned.selection.winner.model, folds, bootstrap=plan.bootstrap, repeat=plan.repeat
+    if not request.resampled:
+        return answer
+    figures = estimate_uncertainty(
+        cohort,
+        answer.selection.winner.model,
+        folds,
+        bootstrap=request.bootstrap,
+        repeat=request.repeat,
     )
-    return replace(planned, selection=replace(planned.selection, uncertainty=figures))
+    return replace(answer, selection=replace(answer.selection, uncertainty=figures))
 
 
-def _fold_plan(plan: SelectionPlan, model_list: ModelList | None) -> Folding:
+def _folding(request: SelectionRequest, model_list: ModelList | None) -> Folding:
     listed = model_list.folds if model_list else Folding()
-    return Folding(by=plan.by or listed.by, count=plan.folds or listed.count)
+    return Folding(by=request.by or listed.by, count=request.folds or listed.count)
 
 
-def _feature_set(plan: SelectionPlan, model_list: ModelList | None) -> str:
-    named = plan.features or (model_list.features if model_list else PLAIN)
-    if plan.by == ROW_FOLDS and named == PLAIN:
+def _feature_set(request: SelectionRequest, model_list: ModelList | None) -> str:
+    named = request.features or (model_list.features if model_list else PLAIN)
+    if request.by == ROW_FOLDS and named == PLAIN:
         return next(name for name, one in features().sets.items() if one.row_folds)
     return named
 
 
-def _listed(
+def _compare_listed(
     cohort: Cohort | SummedCohort,
-    plan: SelectionPlan,
+    request: SelectionRequest,
     model_list: ModelList | None,
     folds: Folding,
-) -> PlannedSelection:
+) -> RequestedSelection:
     listed = model_list.model if model_list else ()
-    nested = nested_models(inputs_of(cohort, plan.nested)) if plan.nested else ()
+    nested = nested_models(inputs_of(cohort, request.nested)) if request.nested else ()
     described = ModelList(
         description=model_list.description if model_list else "Nested models of an order",
         features=cohort.feature_set,
         folds=folds,
         model=(*listed, *nested),
     )
-    name = plan.models or (DEFAULT_MODELS if listed else None)
-    label = "+".join(filter(None, [name, f"nested:{plan.nested}" if nested else None]))
-    return PlannedSelection(select(cohort, described.model, folds), label, described.sha256)
+    name = request.models or (DEFAULT_MODELS if listed else None)
+    label = "+".join(filter(None, [name, f"nested:{request.nested}" if nested else None]))
+    return RequestedSelection(select(cohort, described.model, folds), label, described.sha256)
 
 
-def _ordered(cohort: Cohort, plan: SelectionPlan, folds: Folding) -> PlannedSelection:
-    nested = plan.nested or WHOLE_SET
+def _search(cohort: Cohort, request: SelectionRequest, folds: Folding) -> RequestedSelection:
+    nested = request.nested or WHOLE_SET
     inputs = inputs_of(cohort, nested)
-    rule = Rule(plan.rank or "declared", check_criterion(plan.criterion or "cv"))
-    if plan.all_subsets:
-        found = select_subsets(cohort, inputs, folds, rule.criterion, naive=plan.naive)
+    rule = Rule(request.rank or "declared", require_criterion(request.criterion or "cv"))
+    if request.all_subsets:
+        found = select_subsets(cohort, inputs, folds, rule.criterion, naive=request.naive)
     else:
-        found = select_ranked(cohort, inputs, folds, rule, naive=plan.naive)
+        found = select_ranked(cohort, inputs, folds, rule, naive=request.naive)
     rule = found.choice.rule
     described = ModelList(
         description="Inputs to choose from",
@@ -156,7 +162,7 @@ def _ordered(cohort: Cohort, plan: SelectionPlan, folds: Folding) -> PlannedSele
     )
     content = {"inputs": described.sha256, "ranking": rule.ranking, "criterion": rule.criterion}
     content |= {"evidence": found.choice.evidence.kind}
-    return PlannedSelection(
+    return RequestedSelection(
         Selection(cohort, folds, found.models, found.winner, {}, choice=found.choice),
         f"nested:{nested} {rule.ranking} {rule.criterion}",
         sha256_of(canonical_json(content)),
@@ -170,10 +176,10 @@ def inputs_of(cohort: Cohort | SummedCohort, order: str) -> tuple[str, ...]:
     """
     if order == WHOLE_SET:
         return cohort.inputs
-    return check_inputs(order.split(","), cohort.feature_set)
+    return require_inputs(order.split(","), cohort.feature_set)
 
 
-def check_inputs(names: Sequence[str], feature_set: str) -> tuple[str, ...]:
+def require_inputs(names: Sequence[str], feature_set: str) -> tuple[str, ...]:
     """Return the names of inputs of a feature set. Raises `ConfigError` for what is none."""
     known = features().feature_set(feature_set).inputs
     order = tuple(name.strip() for name in names)

@@ -24,8 +24,8 @@ from fleet_slip.regression.nested_choice import (
     cross_validate_selection,
     select_nested,
 )
-from fleet_slip.regression.nested_choice import Selection as NestedSelection
-from fleet_slip.regression.subsets import SizeResult, best_subsets, choices
+from fleet_slip.regression.nested_choice import NestedChoice as NestedSelection
+from fleet_slip.regression.subsets import SizeResult, best_subsets, pick_sizes
 from fleet_slip.regression.winner import Winner, choose
 
 ALL_SUBSETS = "all-subsets"
@@ -36,7 +36,7 @@ FEWEST_FOLDS = 3
 
 
 @dataclass(frozen=True)
-class OrderedChoice:
+class SearchChoice:
     """How a number of signals was chosen.
 
     Attributes:
@@ -75,15 +75,15 @@ class OrderedChoice:
 
 
 @dataclass(frozen=True)
-class OrderedSelection:
+class SearchResult:
     """The candidates of a ranking or of all subsets, the winner, and how it was chosen."""
 
     models: tuple[CrossValidation, ...]
     winner: Winner
-    choice: OrderedChoice
+    choice: SearchChoice
 
 
-def check_criterion(name: str) -> str:
+def require_criterion(name: str) -> str:
     """Return the criterion that a name means, `cv` being cross-validation.
 
     Raises `QuestionError` for an unknown one.
@@ -97,18 +97,18 @@ def check_criterion(name: str) -> str:
 
 
 def select_ranked(
-    cohort: Cohort, inputs: Sequence[str], plan: Folding, rule: Rule, *, naive: bool = False
-) -> OrderedSelection:
+    cohort: Cohort, inputs: Sequence[str], folding: Folding, rule: Rule, *, naive: bool = False
+) -> SearchResult:
     """Rank the inputs and choose one of the nested models, on the drives that have them all.
 
     Raises `DataError` if no drive has them all, if they are linearly dependent, or if the criterion
     keeps none of them, and `QuestionError` for an unknown rule.
     """
     label = catalogue().label
-    if plan.by == ROW_FOLDS:
-        training, fold = row_training(cohort, inputs, plan), np.empty(0, dtype=np.int64)
+    if folding.by == ROW_FOLDS:
+        training, fold = row_training(cohort, inputs, folding), np.empty(0, dtype=np.int64)
     else:
-        ready = drive_folds(cohort, inputs, plan, naive=naive)
+        ready = drive_folds(cohort, inputs, folding, naive=naive)
         training, fold = ready.training, ready.fold
     chosen = select_nested(training, inputs, label, rule)
     models = cross_validate_nested(training.folds, chosen.order, label, training.scales)[1:]
@@ -119,26 +119,26 @@ def select_ranked(
         winner = choose(models)
     else:
         winner = _winner(models, chosen.size, rule, chosen.evidence)
-    choice = OrderedChoice(rule, chosen.evidence, nested=chosen, honest=honest)
-    return OrderedSelection(tuple(models), winner, choice)
+    choice = SearchChoice(rule, chosen.evidence, nested=chosen, honest=honest)
+    return SearchResult(tuple(models), winner, choice)
 
 
 def select_subsets(
-    cohort: Cohort, inputs: Sequence[str], plan: Folding, criterion: str, *, naive: bool = False
-) -> OrderedSelection:
+    cohort: Cohort, inputs: Sequence[str], folding: Folding, criterion: str, *, naive: bool = False
+) -> SearchResult:
     """Find the best subset of every size and choose one of them.
 
     Raises `DataError` as `select_ranked` does.
     """
     label = catalogue().label
-    if plan.by == ROW_FOLDS:
-        training = row_training(cohort, inputs, plan)
+    if folding.by == ROW_FOLDS:
+        training = row_training(cohort, inputs, folding)
     else:
-        training = drive_folds(cohort, inputs, plan, naive=naive).training
+        training = drive_folds(cohort, inputs, folding, naive=naive).training
     total = training.folds.total
     results = best_subsets(total, inputs, label)
     evidence = _evidence(training, inputs)
-    picks = choices(results, evidence)
+    picks = pick_sizes(results, evidence)
     models = [
         cross_validate(
             f"best {result.best.size}",
@@ -153,8 +153,8 @@ def select_subsets(
         winner = choose(models)
     else:
         winner = _winner(models, picks[criterion], rule, evidence)
-    choice = OrderedChoice(rule, evidence, subsets=tuple(results), picks=picks)
-    return OrderedSelection(tuple(models), winner, choice)
+    choice = SearchChoice(rule, evidence, subsets=tuple(results), picks=picks)
+    return SearchResult(tuple(models), winner, choice)
 
 
 def _evidence(training: Training, inputs: Sequence[str]) -> Evidence:

@@ -22,10 +22,10 @@ from fleet_slip.regression.crossval import (
 from fleet_slip.regression.evidence import Evidence
 from fleet_slip.regression.exact import Scales
 from fleet_slip.regression.folds import Folds
-from fleet_slip.regression.lars import lasso_model
+from fleet_slip.regression.lars import fit_lasso
 from fleet_slip.regression.nested import nested_fits
 from fleet_slip.regression.pace import ESTIMATORS, Estimator, shrink
-from fleet_slip.regression.ridge import ridge_model
+from fleet_slip.regression.ridge import fit_ridge
 from fleet_slip.selection.search import FEWEST_FOLDS
 
 PENALTIES = tuple(float(10.0**exponent) for exponent in np.arange(-6, 0.01, 0.5))
@@ -47,7 +47,7 @@ class Shrunk:
 
 
 def compare_shrinkage(
-    cohort: Cohort, inputs: Sequence[str], plan: Folding, *, naive: bool = False
+    cohort: Cohort, inputs: Sequence[str], folding: Folding, *, naive: bool = False
 ) -> tuple[Shrunk, ...]:
     """Cross-validate every method on the drives that have all the inputs.
 
@@ -57,7 +57,7 @@ def compare_shrinkage(
     `DataError` for dependent signals.
     """
     label = catalogue().label
-    ready = drive_folds(cohort, inputs, plan)
+    ready = drive_folds(cohort, inputs, folding)
     folds, scales = ready.training.folds, ready.training.scales
     if len(folds.grams) < FEWEST_FOLDS:
         raise QuestionError("choosing a penalty inside the training folds needs three folds.")
@@ -67,8 +67,8 @@ def compare_shrinkage(
         effect = Evidence.clustered(fits, ready.moments).design_effect
     found = [Shrunk(cross_validate("least squares", folds, least_squares(inputs, label), scales))]
     penalised: dict[str, Callable[[float], Procedure]] = {
-        "ridge": lambda penalty: lambda gram: ridge_model(gram, inputs, label, penalty),
-        "lasso": lambda penalty: lambda gram: lasso_model(gram, inputs, label, penalty),
+        "ridge": lambda penalty: lambda gram: fit_ridge(gram, inputs, label, penalty),
+        "lasso": lambda penalty: lambda gram: fit_lasso(gram, inputs, label, penalty),
     }
     found += [_penalised(name, folds, make, scales) for name, make in penalised.items()]
     for name in PACE:

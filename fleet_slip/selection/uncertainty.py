@@ -41,10 +41,10 @@ class Uncertainty:
         return asdict(self)
 
 
-def uncertainty(
+def estimate_uncertainty(
     cohort: Cohort,
     model: CrossValidation,
-    plan: Folding,
+    folding: Folding,
     *,
     bootstrap: int | None,
     repeat: int | None,
@@ -54,7 +54,7 @@ def uncertainty(
     Raises `QuestionError` for folds of rows, `DataError` for too few drives.
     """
     label = catalogue().label
-    ready = drive_folds(cohort, model.signals, plan)
+    ready = drive_folds(cohort, model.signals, folding)
     interval = None
     if bootstrap:
         folds = ready.training.folds
@@ -63,7 +63,7 @@ def uncertainty(
         interval = percentile_interval(bootstrap_correlations(products, bootstrap, SEED))
     repeated = None
     if repeat:
-        repeated = repeated_cross_validation(ready.moments, plan.count, repeat, SEED)
+        repeated = repeated_cross_validation(ready.moments, folding.count, repeat, SEED)
     return Uncertainty(
         interval,
         repeat or 0,

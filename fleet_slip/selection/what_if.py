@@ -10,7 +10,7 @@ from fleet_slip.grams.cohort import Cohort
 from fleet_slip.regression.disturbance import disturb
 from fleet_slip.regression.exact import LinearModel
 from fleet_slip.regression.figures import Figures, error_sums
-from fleet_slip.regression.ridge import noise_matched
+from fleet_slip.regression.ridge import fit_noise_matched
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def what_if(
     def after(one: LinearModel) -> Figures:
         return disturb(error_sums(one, total), one, scales, bias=bias, noise=noise).figures(unit)
 
-    refitted = noise_matched(total, model.signals, model.label, noise, scales)
+    refitted = fit_noise_matched(total, model.signals, model.label, noise, scales)
     return WhatIf(
         len(served.table),
         error_sums(model, total).figures(unit),

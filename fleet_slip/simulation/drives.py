@@ -1,4 +1,4 @@
-"""From drives to the rows of a log: plan the speed, drive the car, measure, tabulate counts."""
+"""From drives to the rows of a log: choose the speed, drive the car, measure, tabulate counts."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

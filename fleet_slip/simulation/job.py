@@ -94,7 +94,7 @@ def simulate_campaign(
     begun = [d for d in open_days if snapshot.landed(unit_name(campaign.name, d, 0)) is not None]
     for day in begun:  # before anything is written, so that a changed campaign is refused
         for batch in campaign.batches(day):
-            has_landed(snapshot, batch)
+            require_unchanged(snapshot, batch)
     plan = (campaign.batches(day) for day in open_days)
     report = _simulate(warehouse, plan, len(open_days), executor, progress)
     report.days_present = len(every) - len(open_days)
@@ -145,7 +145,7 @@ def simulate_batches(
     """
     snapshot = warehouse.logs.snapshot()
     for batch in batches:
-        has_landed(snapshot, batch)
+        require_unchanged(snapshot, batch)
     return _simulate(warehouse, [batches], 1, executor, progress)
 
 
@@ -214,6 +214,11 @@ def has_landed(snapshot: Snapshot, batch: Batch) -> bool:
     if landed is not None and landed != unit_of(batch).version:
         raise _changed(batch.campaign, batch.day)
     return landed is not None
+
+
+def require_unchanged(snapshot: Snapshot, batch: Batch) -> None:
+    """Raise `RefusedError` if another batch has the place of this one in the logs."""
+    has_landed(snapshot, batch)
 
 
 def _changed(campaign: str, day: date) -> RefusedError:

@@ -18,7 +18,7 @@ from fleet_slip.simulation.track import Track
 
 
 class SpeedLimits(Config):
-    """What the plan allows itself: the half axes of the friction ellipse, and a top speed."""
+    """What the profile allows itself: the half axes of the friction ellipse, and a top speed."""
 
     lateral_mps2: FiniteFloat = Field(gt=0)
     acceleration_mps2: FiniteFloat = Field(gt=0)

@@ -114,7 +114,7 @@ def simulate_blocks(
     if not drives:
         return
     for drive in drives:
-        _check(drive)
+        _require_usable(drive)
     routes, roads = _routes(drives)
     cars = np.array([(*constants(d.vehicle, d.adhesion), *handling(d.vehicle)) for d in drives])
     waiting = np.argsort(routes["samples"], kind="stable").tolist()
@@ -214,7 +214,7 @@ def _route(
     return first, last, 1 / road.spacing_m, road.length_m, road.closed, distance_m, samples
 
 
-def _check(drive: LaneDrive) -> None:
+def _require_usable(drive: LaneDrive) -> None:
     road = drive.road
     entries = len(road.curvature_1pm)
     if len(road.speed_mps) != entries or entries < 2:

@@ -111,19 +111,19 @@ def database_errors(doing: str) -> Iterator[None]:
             raise KeyboardInterrupt from None
         raise
     except (duckdb.OutOfMemoryException, MemoryError) as error:
-        reason = first_line(error) or "out of memory"
+        reason = duckdb_message(error) or "out of memory"
         raise StorageError(f"{doing} failed: {reason}. Ask for less at once.") from None
     except _OF_FILES as error:
-        raise StorageError(f"{doing} failed: {first_line(error)}. {_RESTORE}") from None
+        raise StorageError(f"{doing} failed: {duckdb_message(error)}. {_RESTORE}") from None
     except duckdb.Error as error:
         if type(error) is duckdb.Error:  # what its Parquet reader raises at damaged metadata
-            raise StorageError(f"{doing} failed: {first_line(error)}. {_RESTORE}") from None
-        raise QuestionError(f"{doing} failed: {first_line(error)}") from None
+            raise StorageError(f"{doing} failed: {duckdb_message(error)}. {_RESTORE}") from None
+        raise QuestionError(f"{doing} failed: {duckdb_message(error)}") from None
     except UnicodeDecodeError:  # the message quotes bytes of a damaged file
         raise StorageError(f"{doing} failed: a file is damaged. {_RESTORE}") from None
 
 
-def first_line(error: BaseException) -> str:
+def duckdb_message(error: BaseException) -> str:
     """Return DuckDB's message on one line, without the excerpt of the statement or its advice."""
     text = str(error).partition("\n\nLINE ")[0].partition("\n\nPossible solutions:")[0]
     if "Traceback (most recent call last)" in text:  # of Python that DuckDB called to read a file

@@ -12,7 +12,7 @@ from typing import Any
 import duckdb
 
 from fleet_slip.errors import QuestionError
-from fleet_slip.warehouse.database import first_line
+from fleet_slip.warehouse.database import duckdb_message
 
 LONGEST_QUERY = 100_000
 """Characters of one query. Planning takes more than linear time in some of them."""
@@ -60,7 +60,7 @@ def one_query(database: duckdb.DuckDBPyConnection, text: str) -> str:
     except UnicodeEncodeError:
         raise QuestionError("not valid SQL: it is not Unicode text.") from None
     except duckdb.Error as error:
-        raise QuestionError(f"not valid SQL: {first_line(error)}") from None
+        raise QuestionError(f"not valid SQL: {duckdb_message(error)}") from None
     if len(statements) != 1:
         raise QuestionError(f"one SQL statement is expected, not {len(statements)}.")
     explained = statements[0].type == duckdb.StatementType.EXPLAIN

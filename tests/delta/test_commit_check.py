@@ -11,7 +11,7 @@ import pytest
 from deltalake import DeltaTable
 
 from fleet_slip.delta import Change, Unit
-from fleet_slip.delta.commit_check import log_problems
+from fleet_slip.delta.commit_check import find_commit_faults
 from fleet_slip.grams.job import update_grams
 from fleet_slip.maintenance.compaction import compact
 from fleet_slip.maintenance.verify import verify
@@ -62,7 +62,7 @@ def _without_nulls(content: dict[str, Any]) -> dict[str, Any]:
 
 
 def test_sound_logs_have_no_problems(root: Warehouse) -> None:
-    assert [list(log_problems(table.snapshot())) for table in root.tables] == [[], [], []]
+    assert [list(find_commit_faults(table.snapshot())) for table in root.tables] == [[], [], []]
     assert all(b"sha256" in file.read_bytes() for file in commits(root))
 
 
@@ -77,7 +77,7 @@ def test_every_bit_of_a_log_that_has_consequences_is_guarded(root: Warehouse) ->
             damaged = bytearray(content)
             damaged[bit // 8] ^= 1 << bit % 8
             file.write_bytes(damaged)
-            if not any(name == file.name for name, _ in log_problems(snapshot)):
+            if not any(name == file.name for name, _ in find_commit_faults(snapshot)):
                 assert consequences(bytes(damaged)) == done, damaged[bit // 8 - 40 : bit // 8 + 40]
         file.write_bytes(content)
 

@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 
 from fleet_slip.cli.main import app
 from fleet_slip.errors import RefusedError
-from fleet_slip.evaluation.drives import load_drives
 from fleet_slip.evaluation.estimators import LinearEstimate
+from fleet_slip.evaluation.evaluated_drives import load_drives
 from fleet_slip.evaluation.filters import FILTERS, bound
 from fleet_slip.evaluation.results import keep
 from fleet_slip.files.documents import DocumentFolder

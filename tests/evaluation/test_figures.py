@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from fleet_slip.errors import QuestionError
-from fleet_slip.evaluation.drives import apply_failure
 from fleet_slip.evaluation.errors import error_figures
 from fleet_slip.evaluation.estimators import LinearEstimate
+from fleet_slip.evaluation.evaluated_drives import apply_failure
 from fleet_slip.evaluation.stability import join, peak_slip
 from fleet_slip.evaluation.targets import passed_noise_deg
 from fleet_slip.simulation.scenario import Failure, load_scenario

@@ -20,7 +20,7 @@ from fleet_slip.grams.job import update_grams
 from fleet_slip.grams.reader import GramReader
 from fleet_slip.selection.compare import select
 from fleet_slip.selection.model_list import load_model_list
-from fleet_slip.selection.request import SelectionPlan, run_plan
+from fleet_slip.selection.request import SelectionRequest, answer_request
 from fleet_slip.views import VIEWS, connect, needed_views
 from fleet_slip.warehouse.tables import Warehouse
 from tests.conftest import DAY, land, log_rows, random_counts
@@ -103,7 +103,7 @@ def test_days_add_up_to_those_of_the_drives(
 
 def test_a_listed_selection_is_the_same_either_way(fleet: Warehouse) -> None:
     whole = select(load_cohort(fleet), MODELS.model, MODELS.folds)
-    planned = run_plan(fleet, SelectionPlan()).selection
+    planned = answer_request(fleet, SelectionRequest()).selection
     assert planned.as_dict() == whole.as_dict()
 
 
@@ -158,7 +158,7 @@ def test_a_query_of_gram_rows_needs_no_log_file(tmp_path: Path) -> None:
     query = "SELECT count(*) FROM grams"
     with connect(tmp_path, query=query) as database:
         assert database.execute(query).fetchone() == (20,)
-    assert run_plan(warehouse, SelectionPlan()).selection.cohort.drive_count == 20
+    assert answer_request(warehouse, SelectionRequest()).selection.cohort.drive_count == 20
 
 
 def test_a_query_of_a_day_needs_the_files_of_that_day(tmp_path: Path) -> None:

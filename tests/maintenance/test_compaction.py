@@ -18,7 +18,7 @@ from fleet_slip.files.folder import TEMPORARY_PREFIX
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.job import update_grams
 from fleet_slip.maintenance.compaction import compact
-from fleet_slip.maintenance.vacuum import expired, unreferenced, vacuum
+from fleet_slip.maintenance.vacuum import find_expired, find_unreferenced, vacuum
 from fleet_slip.warehouse.tables import Warehouse
 from tests.conftest import DAY, land, log_rows, path_of, random_counts
 
@@ -131,7 +131,7 @@ def test_vacuum_removes_replaced_files_after_the_retention(
     planned = vacuum(six, dry_run=True)
     assert len(planned.files) == 7  # six log files and the Gram file that named them
     assert vacuum(six).files == planned.files
-    assert not unreferenced(six.logs)
+    assert not find_unreferenced(six.logs)
     assert answers(six) == before
     assert vacuum(six).files == ()
 
@@ -173,7 +173,7 @@ def test_vacuum_puts_back_a_file_that_was_written_again_meanwhile(six: Warehouse
     rows = log_rows("g", random_counts(np.random.default_rng(2), 9))
     path = path_of(six.logs.folder) / six.logs.write_file("again", rows, DAY).path
     os.utime(path, (0, 0))
-    (judged,) = expired(six, 1)
+    (judged,) = find_expired(six, 1)
     content = path.read_bytes()
     six.logs.write_file("again", rows, DAY)  # the same name and bytes, about to be committed
     assert not judged.folder.remove(judged)

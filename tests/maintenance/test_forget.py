@@ -26,7 +26,7 @@ from fleet_slip.maintenance.compaction import compact
 from fleet_slip.maintenance.find_drives import Located, drives_by_file, locate
 from fleet_slip.maintenance.forget import forget
 from fleet_slip.maintenance.retention import Retention, retain
-from fleet_slip.maintenance.vacuum import unreferenced
+from fleet_slip.maintenance.vacuum import find_unreferenced
 from fleet_slip.regression.exact import fit
 from fleet_slip.warehouse.tables import Warehouse
 from tests.conftest import COMMAND, RunCommand, land, log_rows, random_counts
@@ -182,7 +182,7 @@ def test_quarantined_rows_of_the_car_go_too(tmp_path: Path) -> None:
     forget(warehouse, Forgettable("vehicle", "beta"), now=True)
     (path,) = warehouse.quarantine.snapshot().paths
     assert pq.read_table(path)["drive_id"].to_pylist() == ["alfa-1", None, "beta-10"]
-    assert not unreferenced(warehouse.quarantine)
+    assert not find_unreferenced(warehouse.quarantine)
 
 
 @pytest.mark.parametrize("subject", ["vehicle", "drive"])

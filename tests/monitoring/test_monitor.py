@@ -16,7 +16,7 @@ from fleet_slip.models.publish import manifest_of, publish
 from fleet_slip.models.versions import ModelVersion, Registry
 from fleet_slip.monitoring.monitor import Chart, Limits, monitor
 from fleet_slip.regression.special import student_t_quantile
-from fleet_slip.selection.request import SelectionPlan, run_plan
+from fleet_slip.selection.request import SelectionRequest, answer_request
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
 from tests.conftest import DAY, RunCommand, land, log_rows
@@ -42,7 +42,7 @@ def add_days(warehouse: Warehouse, first: int, number: int, bias_rad: float = 0)
 @pytest.fixture
 def trained(warehouse: Warehouse) -> tuple[Warehouse, ModelVersion]:
     add_days(warehouse, 0, TRAINING_DAYS)
-    planned = run_plan(warehouse, SelectionPlan())
+    planned = answer_request(warehouse, SelectionRequest())
     manifest = manifest_of(planned.selection, "m", planned.label, planned.config_sha256)
     registry = Registry(warehouse.root / "models")
     return warehouse, publish(registry, manifest, planned.selection).version
@@ -75,8 +75,8 @@ def test_a_training_day_is_judged_by_a_model_that_it_did_not_make(
     warehouse, version = trained
     first = monitor(warehouse, version).days[0]
     signals = ",".join(version.manifest.signals)
-    plan = SelectionPlan(cohort=f"day > '{DAY}'", nested=signals)
-    without = run_plan(warehouse, plan).selection
+    plan = SelectionRequest(cohort=f"day > '{DAY}'", nested=signals)
+    without = answer_request(warehouse, plan).selection
     model = next(m for m in without.models if m.signals == version.manifest.signals)
     estimate = " + ".join(
         f"{float(b)!r} * {term.column}"

@@ -8,7 +8,7 @@ import pytest
 
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.observers.angle import sideslip_angle
-from fleet_slip.observers.signals import DriveSignals, held, read_drive
+from fleet_slip.observers.signals import DriveSignals, hold_last, read_drive
 
 
 @pytest.fixture
@@ -44,11 +44,11 @@ def test_an_unknown_drive_is_refused(database: duckdb.DuckDBPyConnection) -> Non
 def test_gaps_take_the_value_before_and_a_leading_one_the_first() -> None:
     nan = np.nan
     values = np.array([nan, 2.0, nan, nan, 5.0, nan])
-    assert held(values, "ax").tolist() == [2, 2, 2, 2, 5, 5]
+    assert hold_last(values, "ax").tolist() == [2, 2, 2, 2, 5, 5]
     whole = np.array([1.0, 2.0])
-    assert held(whole, "ax") is whole
+    assert hold_last(whole, "ax") is whole
     with pytest.raises(DataError, match="no ax"):
-        held(np.full(3, nan), "ax")
+        hold_last(np.full(3, nan), "ax")
 
 
 def test_angle_is_the_arctangent_and_goes_to_zero_with_vy_at_rest() -> None:

@@ -9,14 +9,14 @@ from scipy.special import betainc
 
 from fleet_slip.errors import DataError
 from fleet_slip.regression import special
-from fleet_slip.regression.drives import DriveMoments, serving_drives
+from fleet_slip.regression.drive_moments import DriveMoments, serving_drives
 from fleet_slip.regression.exact import fit
 from fleet_slip.regression.gram_table import GramTable
 from fleet_slip.regression.inference import (
-    chow,
-    classical,
-    cluster,
+    chow_test,
     cluster_covariance,
+    infer_by_drives,
+    infer_classically,
     variance_inflation,
 )
 from tests.regression.data import table_of
@@ -48,7 +48,7 @@ def dense_cluster_covariance(drives: list[np.ndarray]) -> np.ndarray:
 @given(st.integers(0, 10**6), st.integers(1, 5))
 def test_classical_errors_equal_dense(seed: int, inputs: int) -> None:
     counts = np.concatenate(random_drives(seed, drives=2, inputs=inputs))
-    result = classical(fit(gram_of(counts), names(inputs)[:-1], "y"), unit_scales(inputs))
+    result = infer_classically(fit(gram_of(counts), names(inputs)[:-1], "y"), unit_scales(inputs))
     b, rss = dense_fit(counts)
     x = np.column_stack([np.ones(len(counts)), counts[:, :-1]])
     degrees = len(counts) - inputs - 1
@@ -67,7 +67,7 @@ def test_cluster_errors_equal_dense(seed: int, inputs: int) -> None:
     fitted = fit(gram_of(np.concatenate(drives)), names(inputs)[:-1], "y")
     covariance = cluster_covariance(fitted, moments_of(drives))
     np.testing.assert_allclose(covariance, dense_cluster_covariance(drives), rtol=1e-8, atol=1e-12)
-    result = cluster(fitted, moments_of(drives), unit_scales(inputs))
+    result = infer_by_drives(fitted, moments_of(drives), unit_scales(inputs))
     errors = [estimate.standard_error for estimate in result.estimates]
     np.testing.assert_allclose(errors, np.sqrt(np.diag(covariance)), rtol=1e-12)
     assert result.degrees_of_freedom == 8
@@ -83,8 +83,8 @@ def test_cluster_errors_of_a_smaller_model() -> None:
 def test_drive_effects_make_the_classical_error_too_small() -> None:
     drives = random_drives(8, drives=30, noise=300)
     fitted = fit(gram_of(np.concatenate(drives)), names(4)[:-1], "y")
-    naive = classical(fitted, unit_scales(4)).estimates[0].standard_error
-    robust = cluster(fitted, moments_of(drives), unit_scales(4)).estimates[0].standard_error
+    naive = infer_classically(fitted, unit_scales(4)).estimates[0].standard_error
+    robust = infer_by_drives(fitted, moments_of(drives), unit_scales(4)).estimates[0].standard_error
     assert robust > 3 * naive
 
 
@@ -92,7 +92,7 @@ def test_drive_effects_make_the_classical_error_too_small() -> None:
 @given(st.integers(0, 10**6))
 def test_chow_equals_dense(seed: int) -> None:
     drives = random_drives(seed, drives=3)
-    result = chow([gram_of(counts) for counts in drives], names(4)[:-1], "y")
+    result = chow_test([gram_of(counts) for counts in drives], names(4)[:-1], "y")
     apart = sum(dense_fit(counts)[1] for counts in drives)
     pooled = dense_fit(np.concatenate(drives))[1]
     f = (pooled - apart) / 10 / (apart / (180 - 15))
@@ -115,12 +115,12 @@ def test_questions_without_an_answer_are_errors() -> None:
     drives = random_drives(1, drives=2)
     gram = gram_of(drives[0])
     with pytest.raises(DataError, match="two groups"):
-        chow([gram], ["x1"], "y")
+        chow_test([gram], ["x1"], "y")
     with pytest.raises(DataError, match="two drives"):
-        cluster(fit(gram, ["x1"], "y"), moments_of(drives[:1]), unit_scales(4))
+        infer_by_drives(fit(gram, ["x1"], "y"), moments_of(drives[:1]), unit_scales(4))
     few = gram_of(drives[0][:2, [0, -1]])
     with pytest.raises(DataError, match="2 rows cannot tell"):
-        classical(fit(few, ["x1"], "y"), unit_scales(1))
+        infer_classically(fit(few, ["x1"], "y"), unit_scales(1))
     with pytest.raises(DataError, match="no drive of the cohort has all"):
         serving_drives([moments_table()], ["x9"])
 

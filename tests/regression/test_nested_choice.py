@@ -5,7 +5,7 @@ import pytest
 
 from fleet_slip.errors import QuestionError
 from fleet_slip.regression.crossval import cross_validate, least_squares
-from fleet_slip.regression.drives import DriveMoments
+from fleet_slip.regression.drive_moments import DriveMoments
 from fleet_slip.regression.exact import fit
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.folds import CohortFolds, by_value
@@ -17,7 +17,7 @@ from fleet_slip.regression.nested_choice import (
     cross_validate_selection,
     select_nested,
 )
-from fleet_slip.regression.subsets import best_subsets, choices
+from fleet_slip.regression.subsets import best_subsets, pick_sizes
 from tests.regression.data import table_of
 
 from .data import gram_of, names, unit_scales
@@ -113,7 +113,7 @@ def test_criteria_choose_among_the_best_subsets() -> None:
     training, _ = training_of(sparse_drives(5), clustered=True)
     selection = select_nested(training, INPUTS, "y", Rule("t", "cp"))
     results = best_subsets(training.folds.total, INPUTS, "y")
-    picked = choices(results, selection.evidence)
+    picked = pick_sizes(results, selection.evidence)
     assert picked["bic"] == 2
     assert set(results[2].best.model.signals) == {"x2", "x4"}
     assert results[2].as_dict()["signals"] == ["x2", "x4"]

@@ -10,7 +10,7 @@ import pytest
 
 from fleet_slip.regression.exact import fit
 from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.inference import classical
+from fleet_slip.regression.inference import infer_classically
 
 from .data import columns_to_counts, reference
 
@@ -51,7 +51,7 @@ def test_certified_digits(name: str) -> None:
         "y",
         intercept=problem["model"]["intercept"],
     )
-    result = classical(fitted, dict(zip(signals, scales, strict=True)))
+    result = infer_classically(fitted, dict(zip(signals, scales, strict=True)))
     certified = problem["certified"]
     assert len(result.estimates) == len(certified["coef"])
     for estimate, value, error in zip(

@@ -12,12 +12,12 @@ from sklearn.linear_model import ElasticNet, lars_path_gram
 
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression import criteria
-from fleet_slip.regression.drives import DriveMoments
+from fleet_slip.regression.drive_moments import DriveMoments
 from fleet_slip.regression.evidence import Evidence
 from fleet_slip.regression.exact import correlation_matrix, fit
 from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.inference import cluster
-from fleet_slip.regression.lars import lars_path, lasso_model, path_of_moments
+from fleet_slip.regression.inference import infer_by_drives
+from fleet_slip.regression.lars import fit_lasso, lars_path, path_of_moments
 from fleet_slip.regression.leaps import best_by_leaps
 from fleet_slip.regression.nested import nested_fits, nested_models
 from fleet_slip.regression.ranking import RANKINGS, rank, replacement_sets
@@ -148,7 +148,7 @@ def test_elastic_net_equals_scikit_learn() -> None:
     net.set_params(max_iter=100_000).fit(x[:, :5], x[:, 5])
     path = lars_path(gram, names(5)[:-1], "y", lasso=True, ridge=0.02)
     np.testing.assert_allclose(path.at(0.1), net.coef_, atol=1e-7)
-    model = lasso_model(gram, names(5)[:-1], "y", 0.1, 0.02)
+    model = fit_lasso(gram, names(5)[:-1], "y", 0.1, 0.02)
     unit = counts.std(axis=0)
     for name, b in model.weights.items():
         i = names(5).index(name)
@@ -272,7 +272,7 @@ def test_contributions_over_drives_are_squared_cluster_t_values() -> None:
     moments = DriveMoments.of(table_of([gram_of(counts) for counts in drives]))
     fits = nested_fits(gram, names(4)[:-1], "y")
     evidence = Evidence.clustered(fits, moments)
-    t = cluster(fits[-1], moments, unit_scales(4)).estimates[-1].t
+    t = infer_by_drives(fits[-1], moments, unit_scales(4)).estimates[-1].t
     assert evidence.contributions[-1] == pytest.approx(t**2, rel=1e-9)
     assert evidence.kind == "drives"
     assert 6 <= evidence.rows <= gram.n

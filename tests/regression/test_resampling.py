@@ -5,11 +5,11 @@ import pytest
 
 from fleet_slip.errors import DataError
 from fleet_slip.regression.crossval import cross_validate, least_squares
-from fleet_slip.regression.drives import DriveMoments
+from fleet_slip.regression.drive_moments import DriveMoments
 from fleet_slip.regression.exact import fit
 from fleet_slip.regression.folds import CohortFolds, by_value
 from fleet_slip.regression.gram_table import GramTable
-from fleet_slip.regression.inference import cluster
+from fleet_slip.regression.inference import infer_by_drives
 from fleet_slip.regression.resampling import (
     bootstrap_coefficients,
     bootstrap_correlations,
@@ -63,7 +63,7 @@ def test_bootstrap_spread_is_the_cluster_robust_error() -> None:
     moments = DriveMoments.of(table_of(drives))
     draws = bootstrap_coefficients(moments, 2000, seed=3)
     fitted = fit(gram_of(np.concatenate(drives)), INPUTS, "y")
-    errors = [e.standard_error for e in cluster(fitted, moments, unit_scales(4)).estimates]
+    errors = [e.standard_error for e in infer_by_drives(fitted, moments, unit_scales(4)).estimates]
     np.testing.assert_allclose(draws.std(axis=0), errors, rtol=0.15)
 
 

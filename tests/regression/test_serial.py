@@ -14,8 +14,8 @@ from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.serial import (
     LagGram,
-    autoregressive_fit,
-    quasi_differenced,
+    fit_autoregressive,
+    quasi_difference,
     serial_correlation,
 )
 
@@ -68,12 +68,12 @@ def test_quasi_differences_are_exact(seed: int, rho: Fraction) -> None:
     drives = autoregressive_drives(seed, 0.5, rows=30)
     p, q = rho.numerator, rho.denominator
     counts = np.concatenate([q * drive[1:] - p * drive[:-1] for drive in drives])
-    assert quasi_differenced(lag_gram(drives), names(2), rho) == gram_of(counts)
+    assert quasi_difference(lag_gram(drives), names(2), rho) == gram_of(counts)
 
 
 def test_generalised_least_squares_equals_iterated_rows() -> None:
     drives = autoregressive_drives(11, 0.9)
-    result = autoregressive_fit(lag_gram(drives), ["x1", "x2"], "y")
+    result = fit_autoregressive(lag_gram(drives), ["x1", "x2"], "y")
     rho = 0.0
     for _ in range(50):
         rows = np.concatenate([d[1:] - rho * d[:-1] for d in drives])
@@ -98,7 +98,7 @@ def test_serial_correlation_needs_a_residual() -> None:
     with pytest.raises(DataError, match="no residual"):
         serial_correlation(fit(gram, ["x1"], "y").model, gram, lag_gram(drives))
     with pytest.raises(DataError, match="no residual"):
-        autoregressive_fit(lag_gram(drives), ["x1"], "y")
+        fit_autoregressive(lag_gram(drives), ["x1"], "y")
 
 
 def test_disturbance_equals_simulated_noise_and_bias() -> None:

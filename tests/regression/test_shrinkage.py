@@ -28,10 +28,10 @@ from fleet_slip.regression.nnls import nonnegative_least_squares
 from fleet_slip.regression.orthogonal import OrthogonalResponses
 from fleet_slip.regression.pace import ESTIMATORS, james_stein, pace
 from fleet_slip.regression.ridge import (
-    errors_in_variables,
-    noise_matched,
-    penalised,
-    ridge_model,
+    fit_errors_in_variables,
+    fit_noise_matched,
+    fit_penalised,
+    fit_ridge,
     ridge_path,
 )
 
@@ -51,7 +51,7 @@ def test_ridge_equals_scikit_learn(seed: int, penalty: float) -> None:
     assert path.rss[0] == pytest.approx(np.sum((x[:, 4] - x[:, :4] @ beta) ** 2), rel=1e-6)
     hat = x[:, :4] @ np.linalg.solve(x[:, :4].T @ x[:, :4] + penalty * np.eye(4), x[:, :4].T)
     assert path.degrees[0] == pytest.approx(np.trace(hat), rel=1e-6)
-    model = ridge_model(gram, names(4)[:-1], "y", penalty)
+    model = fit_ridge(gram, names(4)[:-1], "y", penalty)
     predicted = counts[:, :4] @ [*model.weights.values()] + model.offset
     assert np.mean(predicted - counts[:, 4]) == pytest.approx(0, abs=1e-6)
 
@@ -62,13 +62,13 @@ def test_the_ridge_path_starts_at_least_squares_and_is_cross_validated() -> None
     inputs = names(4)[:-1]
     ols = fit(gram, inputs, "y").model
     np.testing.assert_allclose(
-        [*ridge_model(gram, inputs, "y", 0).weights.values()],
+        [*fit_ridge(gram, inputs, "y", 0).weights.values()],
         [*ols.weights.values()],
         rtol=1e-9,
     )
 
     def ridge(penalty: float) -> Procedure:
-        return lambda gram: ridge_model(gram, inputs, "y", penalty)
+        return lambda gram: fit_ridge(gram, inputs, "y", penalty)
 
     folds = Folds(tuple(gram_of(counts) for counts in drives), tuple("abcdefghijkl"), 12)
     least, most = (
@@ -84,7 +84,7 @@ def test_noise_matched_ridge_is_best_under_that_noise() -> None:
     counts = np.concatenate(random_drives(4, drives=6)).astype(float)
     inputs = names(4)[:-1]
     sigma = {"x1": 200.0, "x3": 80.0}
-    model = noise_matched(gram_of(counts.astype(int)), inputs, "y", sigma, unit_scales(4))
+    model = fit_noise_matched(gram_of(counts.astype(int)), inputs, "y", sigma, unit_scales(4))
     copies = np.tile(counts, (60, 1))
     copies[:, 0] += rng.normal(size=len(copies)) * 200
     copies[:, 2] += rng.normal(size=len(copies)) * 80
@@ -101,18 +101,18 @@ def test_errors_in_variables_recovers_the_clean_slope() -> None:
     gram = gram_of(np.rint(noisy).astype(np.int64))
     attenuated = fit(gram, ["x1"], "y").model.weights["x1"]
     assert attenuated == pytest.approx(0.5 / 1.49, rel=0.02)
-    model = errors_in_variables(gram, ["x1"], "y", {"x1": 700.0}, unit_scales(1))
+    model = fit_errors_in_variables(gram, ["x1"], "y", {"x1": 700.0}, unit_scales(1))
     assert model.weights["x1"] == pytest.approx(0.5, rel=0.02)
     with pytest.raises(DataError, match="positive definite at x1"):
-        errors_in_variables(gram, ["x1"], "y", {"x1": 2000.0}, unit_scales(1))
+        fit_errors_in_variables(gram, ["x1"], "y", {"x1": 2000.0}, unit_scales(1))
     with pytest.raises(QuestionError, match="noise is given for gyro"):
-        errors_in_variables(gram, ["x1"], "y", {"gyro": 1.0}, unit_scales(1))
+        fit_errors_in_variables(gram, ["x1"], "y", {"gyro": 1.0}, unit_scales(1))
 
 
 def test_no_penalty_is_least_squares_exactly() -> None:
     gram = gram_of(np.concatenate(random_drives(6)))
     inputs = names(4)[:-1]
-    assert penalised(gram, inputs, "y", [Fraction(0)] * 4) == fit(gram, inputs, "y").model
+    assert fit_penalised(gram, inputs, "y", [Fraction(0)] * 4) == fit(gram, inputs, "y").model
 
 
 @settings(max_examples=60)

@@ -5,10 +5,10 @@ import statsmodels.api as sm
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.regression.drives import DriveMoments
+from fleet_slip.regression.drive_moments import DriveMoments
 from fleet_slip.regression.exact import fit
-from fleet_slip.regression.inference import classical, cluster
-from fleet_slip.regression.serial import autoregressive_fit
+from fleet_slip.regression.inference import infer_by_drives, infer_classically
+from fleet_slip.regression.serial import fit_autoregressive
 from tests.regression.data import table_of
 
 from .data import gram_of, names, unit_scales
@@ -49,8 +49,8 @@ def test_coefficients_and_both_kinds_of_errors_agree(
     groups = np.repeat(np.arange(drives), [len(part) for part in parts])
     moments = DriveMoments.of(table_of([gram_of(part) for part in parts]))
     ours = [
-        classical(fitted, unit_scales(inputs)),
-        cluster(fitted, moments, unit_scales(inputs)),
+        infer_classically(fitted, unit_scales(inputs)),
+        infer_by_drives(fitted, moments, unit_scales(inputs)),
     ]
     theirs = [model.fit(), model.fit(cov_type="cluster", cov_kwds={"groups": groups})]
     for mine, other in zip(ours, theirs, strict=True):
@@ -66,7 +66,7 @@ def test_coefficients_and_both_kinds_of_errors_agree(
 @given(seed=st.integers(0, 10**6), rho=st.floats(-0.8, 0.9))
 def test_the_autoregressive_fit_agrees_at_its_correlation(seed: int, rho: float) -> None:
     drive = autoregressive_drives(seed, rho, drives=1)[0]
-    result = autoregressive_fit(lag_gram([drive]), ["x1", "x2"], "y")
+    result = fit_autoregressive(lag_gram([drive]), ["x1", "x2"], "y")
     design = sm.add_constant(drive[:, :-1].astype(float))
     other = sm.GLSAR(drive[:, -1].astype(float), design, rho=[result.rho]).fit()
     values = [result.model.offset, *result.model.weights.values()]

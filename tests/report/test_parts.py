@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from fleet_slip.report.drawing import inline, inline_svgs
 from fleet_slip.report.figures.lateral import apart
-from fleet_slip.report.figures.lines import band, smoothed
+from fleet_slip.report.figures.lines import band, smooth
 from fleet_slip.report.pictures import Picture
 from fleet_slip.report.style import PALETTE, Size, colour
 from fleet_slip.report.text import degrees, listed, number, percent, scientific, size
@@ -53,7 +53,7 @@ def test_a_band_has_a_gap_where_there_is_no_value() -> None:
 
 
 def test_smoothing_keeps_a_constant() -> None:
-    np.testing.assert_allclose(smoothed(np.full(7, 3.0), 4), 3.0)
+    np.testing.assert_allclose(smooth(np.full(7, 3.0), 4), 3.0)
 
 
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=6))

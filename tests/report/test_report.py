@@ -18,14 +18,14 @@ from fleet_slip.files.documents import Document
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.report import paper_tables
 from fleet_slip.report.blocks import blocks_won, difference
-from fleet_slip.report.claims import CLAIMS, judged
+from fleet_slip.report.claims import CLAIMS, judge_claims
 from fleet_slip.report.claims.claim import Status
 from fleet_slip.report.claims.conditions import noise_is_slight
 from fleet_slip.report.data import ReportData
 from fleet_slip.report.drawing import png_file, svg_file
 from fleet_slip.report.histogram import ANGLE_DEG, held_out_coefficients
 from fleet_slip.report.page import render
-from fleet_slip.report.pictures import pictures
+from fleet_slip.report.pictures import draw_pictures
 from fleet_slip.report.text import number
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
@@ -95,7 +95,7 @@ def test_a_scenario_that_was_left_out_is_said(reported: Reported, page: Page) ->
 
 def test_the_same_data_give_the_same_bytes(reported: Reported, data: ReportData) -> None:
     """Gathered and drawn once more, in another process where tests run in several."""
-    shown = pictures(data)
+    shown = draw_pictures(data)
     assert render(data, shown) == reported.page.read_text(encoding="utf-8")
     density = next(picture for picture in shown if picture.key == "density")
     assert png_file(density) == (reported.figures / "density.png").read_bytes()
@@ -174,7 +174,7 @@ def changed(data: ReportData, content: Any) -> ReportData:
 
 
 def test_every_claim_is_judged(data: ReportData) -> None:
-    verdicts = judged(data)
+    verdicts = judge_claims(data)
     assert len(verdicts) == len(CLAIMS)
     assert len({one.claim.statement for one in verdicts}) == len(CLAIMS)
     for one in verdicts:

@@ -20,6 +20,6 @@ class Judged:
     verdict: Verdict
 
 
-def judged(data: ReportData) -> tuple[Judged, ...]:
+def judge_claims(data: ReportData) -> tuple[Judged, ...]:
     """Judge all claims."""
     return tuple(Judged(claim, claim.judge(data)) for claim in CLAIMS)

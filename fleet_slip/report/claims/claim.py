@@ -105,6 +105,12 @@ def known(data: ReportData, scenario: str, estimator: str | None = None) -> Know
     return complete(data.evaluated.figures(scenario, name), f"{name} on {scenario}")
 
 
+def require_known(data: ReportData, *scenarios: str) -> None:
+    """Raise `NotEvaluatedError` if the paper's choice has no figures on one of the drives."""
+    for scenario in scenarios:
+        known(data, scenario)
+
+
 def complete(found: ErrorFigures | None, what: str) -> Known:
     """Return figures that are all there. Raises `NotEvaluatedError` otherwise."""
     if (

@@ -10,6 +10,7 @@ from fleet_slip.report.claims.claim import (
     complete,
     known,
     not_testable,
+    require_known,
     verdict,
 )
 from fleet_slip.report.data import ReportData
@@ -119,8 +120,7 @@ def appropriate_at_0_4(data: ReportData) -> Verdict:
 )
 def loses_stability(data: ReportData) -> Verdict:
     """Look where tyres slip beyond their peak."""
-    known(data, "nominal")
-    known(data, "adhesion_0_4")
+    require_known(data, "nominal", "adhesion_0_4")
     found = data.evaluated.stretches("adhesion_0_4", "unstable")
     told = listed([f"{begin:.0f}\N{EN DASH}{end:.0f} s" for begin, end in found])
     scenarios = data.evaluated.scenarios

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.evaluation.runs import EvaluatedScenario
-from fleet_slip.report.figures.lines import smoothed
+from fleet_slip.report.figures.lines import smooth
 from fleet_slip.report.figures.series import Line
 from fleet_slip.report.style import Size, colour
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
@@ -21,7 +21,7 @@ HEIGHT_IN = 3.3
 def lateral_acceleration(run: EvaluatedScenario) -> FloatArray:
     """Return |ay| in m/s² at each tick: the sensor's, less its stated bias, smoothed."""
     ay = run.drive.signals["ay_mps2"] - run.drive.scenario.sensors.ay_bias_mps2
-    return np.abs(smoothed(ay, int(SMOOTHED_S * SAMPLE_RATE_HZ)))
+    return np.abs(smooth(ay, int(SMOOTHED_S * SAMPLE_RATE_HZ)))
 
 
 def error_by_bin(

@@ -40,7 +40,7 @@ def band(x: FloatArray, y: FloatArray, bins: int) -> Band:
     return Band(middle, *(np.where(none, np.nan, values) for values in (mean, low, high)))
 
 
-def smoothed(values: FloatArray, samples: int) -> FloatArray:
+def smooth(values: FloatArray, samples: int) -> FloatArray:
     """Return the mean over a window around each sample, shorter at both ends; shape (rows,)."""
     window = np.ones(samples)
     count = np.convolve(np.ones(len(values)), window, mode="same")

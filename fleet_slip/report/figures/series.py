@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.evaluation.runs import EvaluatedScenario
-from fleet_slip.evaluation.stability import stretches
+from fleet_slip.evaluation.stability import find_stretches
 from fleet_slip.report.figures.lines import band
 from fleet_slip.report.style import Size, colour
 from fleet_slip.report.text import degrees
@@ -144,7 +144,7 @@ def _shade(axes: Axes, block: Block) -> None:
     for section in block.run.sections:
         if section.name == block.shaded:
             name = "unstable" if section.name == "unstable" else "outage"
-            for stretch in stretches(block.run.drive, section.rows):
+            for stretch in find_stretches(block.run.drive, section.rows):
                 axes.axvspan(
                     stretch.from_s, stretch.until_s, color=colour(name), alpha=0.16, linewidth=0
                 )

@@ -2,7 +2,7 @@
 
 from matplotlib.figure import Figure
 
-from fleet_slip.evaluation.drives import EvaluatedDrive
+from fleet_slip.evaluation.evaluated_drives import EvaluatedDrive
 from fleet_slip.report.figures.lines import band
 from fleet_slip.report.style import Size, colour
 

@@ -8,9 +8,9 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.evaluation.drives import EvaluatedDrive
+from fleet_slip.evaluation.evaluated_drives import EvaluatedDrive
 from fleet_slip.evaluation.runs import EvaluatedScenario
-from fleet_slip.report.figures.lines import smoothed
+from fleet_slip.report.figures.lines import smooth
 from fleet_slip.report.style import Size, colour
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 
@@ -61,7 +61,7 @@ def error_map(runs: Sequence[tuple[str, EvaluatedScenario]], estimator: str, siz
 def _draw(axes: Axes, run: EvaluatedScenario, estimator: str) -> None:
     x, y = positions(run.drive)
     error = np.degrees(run.estimates[estimator] - run.drive.sideslip_rad)
-    error = smoothed(error, int(SMOOTHED_S * SAMPLE_RATE_HZ))
+    error = smooth(error, int(SMOOTHED_S * SAMPLE_RATE_HZ))
     shown = np.isfinite(error) & run.drive.evaluated
     classes = np.digitize(error, EDGES_DEG)
     kinds = np.where(shown, classes, -1)

@@ -26,6 +26,12 @@ def missing_signals_error(signals: Sequence[str]) -> DataError:
     )
 
 
+def require_serving_drives(tables: Sequence[GramTable], signals: Sequence[str]) -> None:
+    """Raise `DataError` if no drive has all the signals."""
+    if not any(set(signals) <= set(table.signals) for table in tables):
+        raise missing_signals_error(signals)
+
+
 def serving_drives(
     tables: Sequence[GramTable], signals: Sequence[str]
 ) -> tuple[GramTable, BoolArray]:
@@ -34,9 +40,8 @@ def serving_drives(
     The mask lists the drives of all tables one after another. Raises `DataError` if no
     drive has all the signals.
     """
+    require_serving_drives(tables, signals)
     served = [set(signals) <= set(table.signals) for table in tables]
-    if not any(served):
-        raise missing_signals_error(signals)
     parts = [table.restrict(signals) for table, yes in zip(tables, served, strict=True) if yes]
     mask = np.repeat(served, [len(table) for table in tables])
     if len(parts) == 1:
