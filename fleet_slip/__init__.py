@@ -1,20 +1,65 @@
 """Side-slip angle estimation from fleet logs.
 
-`connect(root)` returns a DuckDB connection with the warehouse's views; see `fleet_slip.views`.
+Many cars log cheap signals, a few also log their side-slip angle. Logs become exact Gram matrices;
+from these every model, cohort and fold follows without reading a row again; the winner becomes a
+numbered model version, which is one dot product.
+
+    import fleet_slip
+
+    fleet = fleet_slip.open("data")
+    log = fleet.sql("SELECT * FROM log WHERE day = '2024-05-01'").pl()
+    model = fleet.model("wet@1")
+    beta_rad = model.predict(log)
+
+`open` returns a `Fleet`, whose methods are the commands of `fleet-slip`; `connect` returns a DuckDB
+connection with the views alone. Physical values are in SI units, and the columns carry them:
+`ax_mps2`, `yaw_rate_rad_s`, `sideslip_rad`. Axes and signs are those of ISO 8855. Every error that
+can be expected is a `FleetSlipError`, and says what to do next.
 """
 
+from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from fleet_slip.api.fleet import Fleet
+    from fleet_slip.errors import FleetSlipError
+    from fleet_slip.files.folder import Folder
+    from fleet_slip.models.model_version import ModelVersion
     from fleet_slip.views import connect
 
-__all__ = ["connect"]
+__all__ = ["Fleet", "FleetSlipError", "ModelVersion", "connect", "open"]
+
+_HOMES = {
+    "Fleet": "fleet_slip.api.fleet",
+    "FleetSlipError": "fleet_slip.errors",
+    "ModelVersion": "fleet_slip.models.model_version",
+    "connect": "fleet_slip.views",
+}
+"""Where the names are that are imported when they are first used: importing the package is fast."""
+
+
+def open(root: "Folder | Path | str | None" = None) -> "Fleet":  # noqa: A001 - as in gzip
+    """Return the fleet whose warehouse is at `root`; nothing is read or written yet.
+
+    `root` is the path of a folder, the URL of a place on an object store (`s3://BUCKET/PATH`,
+    `gs://`, `az://`), or None for `$FLEET_SLIP_ROOT`, else `./data`. Credentials come from the
+    environment. Raises `StorageError` for a path or URL that cannot be a data root.
+    """
+    from fleet_slip.api.fleet import Fleet  # noqa: PLC0415 - pyarrow and Delta
+    from fleet_slip.files.data_root import data_root  # noqa: PLC0415
+    from fleet_slip.warehouse.tables import Warehouse  # noqa: PLC0415
+
+    return Fleet(Warehouse(data_root(root)))
 
 
 def __getattr__(name: str) -> Any:
-    """Import `connect` when it is first used: DuckDB is not needed to import a module."""
-    if name == "connect":
-        from fleet_slip.views import connect  # noqa: PLC0415
-
-        return connect
+    """Import a name of the package when it is first used."""
+    if name in _HOMES:
+        return getattr(import_module(_HOMES[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """Name what `help` shows."""
+    return [*globals(), *_HOMES]

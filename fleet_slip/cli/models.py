@@ -11,7 +11,8 @@ from fleet_slip.cli.signing import signing_key
 from fleet_slip.maintenance.audit import Audit
 from fleet_slip.models.aliases import CHAMPION
 from fleet_slip.models.manifest import require_model_name
-from fleet_slip.models.versions import ModelVersion, Registry
+from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.models.versions import Registry
 from fleet_slip.warehouse.tables import Warehouse
 
 Reference = Annotated[

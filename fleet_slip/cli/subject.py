@@ -10,7 +10,8 @@ from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.cli.models import registry_of
 from fleet_slip.errors import ConfigError, QuestionError
 from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.models.versions import ModelVersion, Registry
+from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.models.versions import Registry
 from fleet_slip.selection.request import WHOLE_SET, inputs_of
 from fleet_slip.warehouse.tables import Warehouse
 

@@ -11,7 +11,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.models.manifest import Manifest
-from fleet_slip.models.versions import ModelVersion
+from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.regression.exact import LinearModel
 from fleet_slip.selection.compare import Selection, select
 from fleet_slip.selection.model_list import load_model_list

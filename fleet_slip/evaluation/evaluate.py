@@ -13,7 +13,7 @@ from fleet_slip.evaluation.results import document
 from fleet_slip.evaluation.runs import EvaluatedScenario, run_all
 from fleet_slip.evaluation.targets import Check, check_filter_targets, check_targets
 from fleet_slip.grams.cohort import Cohort
-from fleet_slip.models.versions import ModelVersion
+from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.simulation.scenario import Scenario, load_scenario
 from fleet_slip.warehouse.tables import Warehouse
 

@@ -10,8 +10,9 @@ import polars as pl
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.catalogue.signals import Signal, catalogue
+from fleet_slip.arrays import FloatArray
+from fleet_slip.catalogue.counts import round_to_counts
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.ingest.mapping import FromColumn, Mapping
 from fleet_slip.ingest.resampling import Method, choose_method, resampler
 
@@ -73,18 +74,12 @@ def to_ticks(rows: pl.DataFrame, mapping: Mapping, interval_s: float) -> Ticked:
         values = rows[name].to_numpy().astype(np.float64)
         between_samples = method != "snap" and name == catalogue().label
         values = _on_the_circle(resample, values) if between_samples else resample(values)
-        absent = np.isnan(values)
-        somewhere |= ~absent
-        counts[name] = _counts(catalogue()[name], values, absent)
+        somewhere |= ~np.isnan(values)
+        # Rounding clips a resampled value's last bit, no more: the rest is in quarantine.
+        counts[name] = round_to_counts(values, catalogue()[name])
     if not somewhere.all():
         counts = {name: array.filter(pa.array(somewhere)) for name, array in counts.items()}
     return Ticked(method, start_s, ticks[somewhere].astype(np.int32), counts)
-
-
-def _counts(signal: Signal, values: FloatArray, absent: BoolArray) -> pa.Array:
-    """Round values to counts. The clip catches a resampled value's last bit, no more."""
-    rounded = np.rint(values / float(signal.scale)).clip(signal.min_count, signal.max_count)
-    return pa.array(np.where(absent, 0, rounded).astype(np.int16), mask=absent)
 
 
 def _on_the_circle(resample: Callable[[FloatArray], FloatArray], angle: FloatArray) -> FloatArray:

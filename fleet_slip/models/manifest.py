@@ -76,6 +76,14 @@ class ModelTerm(Config):
         """Physical value of one count, exactly."""
         return Fraction(self.scale)
 
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """The logged signals that it is computed from: itself, or what its SQL names."""
+        if not self.sql:
+            return (self.signal,)
+        words = {*_SQL_WORD.findall(self.sql)}
+        return tuple(name for name in catalogue().signals if name in words)
+
 
 class ModelLabel(Config):
     """What a model estimates."""
@@ -137,6 +145,19 @@ class Manifest(Config):
     def signals(self) -> tuple[str, ...]:
         """Names of the model's inputs."""
         return tuple(term.signal for term in self.terms)
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Columns in SI units that the model needs, each once, in the order of its terms."""
+        signals = catalogue()
+        needed = (
+            column
+            for term in self.terms
+            for column in (
+                [signals[name].column for name in term.inputs] if term.sql else [term.column]
+            )
+        )
+        return tuple(dict.fromkeys(needed))
 
     @property
     def features(self) -> dict[str, str]:

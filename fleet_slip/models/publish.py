@@ -17,7 +17,8 @@ from fleet_slip.models.manifest import (
     SelectedBy,
     TrainedOn,
 )
-from fleet_slip.models.versions import ModelVersion, Registry
+from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.models.versions import Registry
 from fleet_slip.regression.crossval import CrossValidation
 from fleet_slip.selection.compare import Selection, validate
 from fleet_slip.selection.model_list import CandidateModel

@@ -22,23 +22,10 @@ from fleet_slip.files.documents import MAX_DIGITS, DocumentFolder
 from fleet_slip.files.folder import Folder
 from fleet_slip.models.aliases import CHAMPION, AliasHistory
 from fleet_slip.models.manifest import Manifest
+from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.signing import require_signature, require_signing_key, sign
 
 _IDENTIFIER = re.compile(IDENTIFIER_PATTERN)
-
-
-@dataclass(frozen=True)
-class ModelVersion:
-    """A manifest with its number and verified checksum."""
-
-    version: int
-    manifest: Manifest
-    sha256: str
-
-    @property
-    def reference(self) -> str:
-        """The version as it is named on the command line: `NAME@VERSION`."""
-        return f"{self.manifest.name}@{self.version}"
 
 
 @dataclass(frozen=True)
@@ -55,6 +42,12 @@ class Registry:
             for name in self.folder.names()
             if _IDENTIFIER.fullmatch(name) and (self.folder / name / "versions").exists()
         ]
+
+    def require(self, name: str) -> None:
+        """Raise `QuestionError` if no model is called so."""
+        if name not in self.names():
+            known = ", ".join(self.names()) or "none yet; publish one with: fleet-slip publish"
+            raise QuestionError(f"no model is called {name!r}. Models: {known}.")
 
     def versions(self, name: str) -> list[int]:
         """Return the version numbers of a model, ascending."""
@@ -108,9 +101,7 @@ class Registry:
         `NAME` alone is its champion. Raises `QuestionError` for an unknown one.
         """
         name, _, which = reference.partition("@")
-        if name not in self.names():
-            known = ", ".join(self.names()) or "none yet; publish one with: fleet-slip publish"
-            raise QuestionError(f"no model is called {name!r}. Models: {known}.")
+        self.require(name)
         which = which or CHAMPION
         if which.isascii() and which.isdigit() and len(which) <= MAX_DIGITS:
             return self.load(name, int(which))
@@ -200,9 +191,10 @@ class Registry:
 
         return history.decide(move)
 
-    def as_table(self) -> pa.Table:
-        """Return all versions of all models as rows."""
-        rows = [row for name in self.names() for row in self._rows(name)]
+    def as_table(self, name: str | None = None) -> pa.Table:
+        """Return all versions of all models, or of one, as rows."""
+        names = self.names() if name is None else [name]
+        rows = [row for one in names for row in self._rows(one)]
         return pa.Table.from_pylist(rows, schema=_TABLE_SCHEMA)
 
     def _rows(self, name: str) -> list[Mapping[str, Any]]:

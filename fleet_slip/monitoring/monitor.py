@@ -20,7 +20,7 @@ from fleet_slip.catalogue.features import input_scales
 from fleet_slip.errors import DataError, StorageError
 from fleet_slip.grams.day_sums import sum_days
 from fleet_slip.models.counts_model import counts_model
-from fleet_slip.models.versions import ModelVersion
+from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.monitoring.thresholds import MonitorThresholds, thresholds
 from fleet_slip.regression.exact import LinearModel, fit
 from fleet_slip.regression.figures import error_sums

@@ -18,7 +18,7 @@ from fleet_slip.evaluation.estimators import (
 from fleet_slip.evaluation.filters import FILTERS, bound
 from fleet_slip.evaluation.runs import EvaluatedScenario, run_all
 from fleet_slip.evaluation.targets import THE_PAPERS_CHOICE
-from fleet_slip.models.versions import ModelVersion
+from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.report.coefficients import Coefficients, coefficient_table
 from fleet_slip.report.evaluated import Evaluated, latest_of
 from fleet_slip.report.histogram import Histogram, held_out_histogram

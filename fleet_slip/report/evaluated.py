@@ -9,7 +9,7 @@ from fleet_slip.errors import DataError
 from fleet_slip.evaluation.errors import ErrorFigures
 from fleet_slip.evaluation.results import folder
 from fleet_slip.files.documents import Document
-from fleet_slip.models.versions import ModelVersion
+from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.warehouse.tables import Warehouse
 
 Side = Literal["inside", "outside"]

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from fleet_slip.files.folder import Folder
-from fleet_slip.models.versions import ModelVersion
+from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.report.data import gather
 from fleet_slip.report.drawing import png_file, svg_file
 from fleet_slip.report.page import render

@@ -1,0 +1,1 @@
+"""The Python API, on which the command line is written; `fleet_slip.open` is the way in."""

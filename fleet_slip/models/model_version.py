@@ -1,0 +1,80 @@
+"""One published version of a model, which estimates angles from data frames."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol, overload
+
+from fleet_slip.models.manifest import Manifest
+
+if TYPE_CHECKING:
+    import polars as pl
+    from numpy import float64
+    from numpy.typing import ArrayLike, NDArray
+
+
+class ArrowStream(Protocol):
+    """A table of Arrow, or of a library that hands its tables over as Arrow."""
+
+    def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
+        """Return the table's batches."""
+
+
+class PandasFrame(Protocol):
+    """A data frame of pandas, which need not be installed."""
+
+    @property
+    def iloc(self) -> Any:
+        """Rows by position."""
+
+
+@dataclass(frozen=True)
+class ModelVersion:
+    """A manifest with its number and verified checksum."""
+
+    version: int
+    manifest: Manifest
+    sha256: str
+
+    @property
+    def reference(self) -> str:
+        """The version as it is named on the command line: `NAME@VERSION`."""
+        return f"{self.manifest.name}@{self.version}"
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Columns in SI units that `predict` needs, named as in the view `log`."""
+        return self.manifest.columns
+
+    @overload
+    def predict(self, frame: "pl.DataFrame") -> "pl.Series": ...
+    @overload
+    def predict(
+        self, frame: "Mapping[str, ArrayLike | Sequence[float | None]]"
+    ) -> "NDArray[float64]": ...
+    @overload
+    def predict(self, frame: ArrowStream | PandasFrame) -> Any: ...
+    def predict(self, frame: Any) -> Any:
+        """Estimate the side-slip angle in rad for each row of a frame.
+
+        The frame has the columns of `columns` in SI units, as the view `log` has them; others are
+        left alone. A model with features rounds the signals that they are made of to counts, half
+        to even, and clips them to their valid range, as the sensors do. On the rows of the logs the
+        angles have the bits that `score` computes.
+
+        | frame | returned, one float64 for each row | no angle |
+        | --- | --- | --- |
+        | `polars.DataFrame` | `polars.Series` | null |
+        | `pandas.DataFrame` | `pandas.Series` with its index | NaN |
+        | `pyarrow.RecordBatch` | `pyarrow.Array` | null |
+        | `pyarrow.Table`, a DuckDB relation, any Arrow stream | `pyarrow.ChunkedArray` | null |
+        | mapping of names to arrays of shape (rows,) | `numpy.ndarray` of shape (rows,) | NaN |
+
+        There is no angle where an input is null or NaN, or a feature has no value, such as a
+        curvature at standstill.
+
+        Raises `InputError` for a column that is missing (it says what is there), is there twice, is
+        not of numbers, has infinite ones, or differs from the others in length.
+        """
+        from fleet_slip.models.predict import predict  # noqa: PLC0415 - DuckDB, not for show
+
+        return predict(self.manifest, frame)

@@ -1,0 +1,122 @@
+"""A fleet in Python: what a notebook asks of it."""
+
+import gc
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+import fleet_slip
+from fleet_slip import Fleet
+from fleet_slip.errors import QuestionError, StorageError
+
+
+def test_opening_touches_nothing_and_the_root_follows_the_rule(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("FLEET_SLIP_ROOT", raising=False)
+    assert str(fleet_slip.open().root) == "data"
+    monkeypatch.setenv("FLEET_SLIP_ROOT", "elsewhere")
+    assert repr(fleet_slip.open()) == "Fleet('elsewhere')"
+    assert str(fleet_slip.open(tmp_path / "x").root) == str(tmp_path / "x")
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(StorageError, match="s3://BUCKET/PATH"):
+        fleet_slip.open("ftp://somewhere/else")
+
+
+def test_importing_the_package_imports_no_engine() -> None:
+    program = "import sys, fleet_slip; print(*sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert not {"numpy", "pyarrow", "duckdb", "polars", "pydantic"} & {*done.stdout.split()}
+
+
+def test_help_shows_every_exported_name() -> None:
+    for name in fleet_slip.__all__:
+        assert name in dir(fleet_slip)
+        assert getattr(fleet_slip, name).__doc__
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = fleet_slip.nothing
+
+
+def test_a_relation_keeps_its_connection(fleet: Fleet) -> None:
+    relation = fleet.sql("SELECT drive_id, ax_mps2 FROM log").filter("ax_mps2 > 0")
+    gc.collect()
+    counted = relation.aggregate("count(*) AS n")
+    del relation
+    gc.collect()
+    ((n,),) = counted.fetchall()
+    assert n > 10_000
+    again = fleet.sql("SELECT count(*) FROM log WHERE ax_mps2 > 0").fetchall()
+    assert again == [(n,)]
+
+
+def test_answers_come_as_frames_of_any_library(fleet: Fleet) -> None:
+    relation = fleet.sql("SELECT drive_id, tick FROM log ORDER BY ALL LIMIT 5")
+    tables = relation.pl().to_arrow(), relation.to_arrow_table(), relation.arrow().read_all()
+    assert {table.num_rows for table in tables} == {5}
+    assert relation.df().shape == (5, 2)
+
+
+@pytest.mark.parametrize(
+    ("query", "said"),
+    [
+        ("COPY (SELECT 1) TO 'x.csv'", "only queries are allowed"),
+        ("DROP VIEW log", "only queries are allowed"),
+        ("SET threads = 1", "only queries are allowed"),
+        ("SELECT 1; SELECT 2", "one SQL statement is expected, not 2"),
+        ("", "one SQL statement is expected, not 0"),
+        ("SELECT nothing FROM log", "the query failed: Binder Error"),
+        ("FROM read_csv('/etc/passwd')", "cannot be called after FROM"),
+        ("SELECT 'a' ||", "not valid SQL"),
+    ],
+)
+def test_a_query_reads_the_warehouse_and_nothing_else(fleet: Fleet, query: str, said: str) -> None:
+    with pytest.raises(QuestionError, match=said):
+        fleet.sql(query)
+
+
+def test_a_relation_cannot_write(fleet: Fleet, tmp_path: Path) -> None:
+    relation = fleet.sql("SELECT 1 AS a")
+    with pytest.raises(Exception, match=r"(?i)disabled|permission"):
+        relation.write_parquet(str(tmp_path / "x.parquet"))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_wrong_root_is_not_an_empty_warehouse(tmp_path: Path) -> None:
+    nowhere = fleet_slip.open(tmp_path / "nothing")
+    for ask in (lambda: nowhere.sql("FROM log"), nowhere.models):
+        with pytest.raises(StorageError, match="there is no data root"):
+            ask()
+
+
+def test_models_are_listed_and_found(fleet: Fleet) -> None:
+    table = fleet.models()
+    assert {"smoke", "bent"} == {*table["name"].to_pylist()}
+    assert table["trained_on_forgotten"].to_pylist() == [False, False]
+    assert fleet.models("bent").num_rows == 1
+    assert fleet.model("smoke").reference == "smoke@1"
+    assert fleet.model("smoke@1") == fleet.model("smoke@champion") == fleet.model("smoke")
+    for ask in (lambda: fleet.models("nobody"), lambda: fleet.model("nobody@1")):
+        with pytest.raises(QuestionError, match=r"'nobody'\. Models: bent, smoke"):
+            ask()
+
+
+def test_threads_share_a_fleet_and_a_model(fleet: Fleet) -> None:
+    model = fleet.model("bent")
+    answers: dict[int, object] = {}
+
+    def ask(number: int) -> None:
+        rows = fleet.sql(f"FROM log WHERE tick % 2 = {number % 2} ORDER BY drive_id, tick").pl()
+        answers[number] = model.predict(rows).to_list()
+
+    threads = [threading.Thread(target=ask, args=(number,)) for number in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(120)
+    assert answers[0] == answers[2] != answers[1] == answers[3]

@@ -1,0 +1,22 @@
+"""A user's lines are typed. mypy --strict checks this file; running it checks the types' word."""
+
+from typing import assert_type
+
+import duckdb
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+import fleet_slip
+from fleet_slip import Fleet, ModelVersion
+
+
+def test_a_users_lines_are_typed(fleet: Fleet) -> None:
+    assert_type(fleet_slip.open("data"), Fleet)
+    log = assert_type(fleet.sql("FROM log LIMIT 10"), duckdb.DuckDBPyRelation).pl()
+    model = assert_type(fleet.model("smoke@1"), ModelVersion)
+    frame = pl.DataFrame(log)
+    assert isinstance(assert_type(model.predict(frame), pl.Series), pl.Series)
+    columns = {name: frame[name].to_numpy() for name in model.columns}
+    angles = assert_type(model.predict(columns), NDArray[np.float64])
+    assert angles.dtype == np.float64
