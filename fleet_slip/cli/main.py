@@ -1,6 +1,7 @@
 """The `fleet-slip` command: its options, its commands and its exit codes."""
 
 import logging
+import os
 import sys
 from importlib.metadata import version
 from typing import Annotated
@@ -13,6 +14,7 @@ from fleet_slip.cli.output import say
 from fleet_slip.cli.streams import Streams
 from fleet_slip.errors import FleetSlipError, StorageError
 from fleet_slip.files.data_root import ROOT_VARIABLE, data_root
+from fleet_slip.limits import require_limits
 
 INTERRUPTED = 130
 
@@ -66,9 +68,10 @@ def options(
 
     Start with: **fleet-slip run --campaign smoke**
     """
+    configure_logs(log)
+    require_limits()
     from fleet_slip.warehouse.tables import Warehouse  # noqa: PLC0415 - pyarrow and Delta, not for --help
 
-    configure_logs(log)
     context.obj = Warehouse(data_root(root))
 
 
@@ -76,6 +79,7 @@ def main() -> None:
     """Run the command line; an expected error becomes one line on stderr and its exit code."""
     streams = Streams()
     configure_logs(LogFormat.AUTO)
+    _choose_code_folder()
     exit_code = _exit_code_of_app()
     if reason := streams.unprinted():
         say(
@@ -92,9 +96,19 @@ def _exit_code_of_app() -> int:
     except FleetSlipError as error:
         say(f"error: {error}", logging.ERROR)
         return error.exit_code
+    except MemoryError as error:
+        say(f"error: out of memory: {error}. Ask for less at once, or give it more.", logging.ERROR)
+        return StorageError.exit_code
     except KeyboardInterrupt:
         say("interrupted; run the same command again to go on.", logging.WARNING)
         return INTERRUPTED
     except SystemExit as ended:
         return ended.code if isinstance(ended.code, int) else 0
     return 0
+
+
+def _choose_code_folder() -> None:
+    """Keep compiled code in the cache folder that systemd made for a service, if it did."""
+    folder = os.environ.get("CACHE_DIRECTORY", "").partition(":")[0]
+    if folder:
+        os.environ.setdefault("NUMBA_CACHE_DIR", folder)

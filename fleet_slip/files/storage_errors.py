@@ -39,6 +39,7 @@ def _reason(error: OSError) -> str:
         errno.EPERM: "not permitted. Check the owner of the data root, or choose --root.",
         errno.EROFS: "the file system is read-only. Choose a writable data root with --root.",
         errno.ENOTDIR: "a part of the path is a file, not a folder. Choose another --root.",
+        errno.EMFILE: "this process may have no more files open. Raise the limit: ulimit -n 1024",
         errno.EEXIST: "a file, or a link to nothing, is where a folder must be. Choose another "
         "--root.",
         errno.ELOOP: "the path is a loop of links. Choose another --root.",

@@ -12,11 +12,11 @@ correct it. With the lateral forces F of the axles:
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from pydantic import Field, FiniteFloat
 
 from fleet_slip.arrays import FloatArray
+from fleet_slip.compiling import kernel
 from fleet_slip.config import Config
 from fleet_slip.observers import yaw_rate
 from fleet_slip.observers.angle import sideslip_angle
@@ -105,7 +105,7 @@ class LateralForce(NamedTuple):
     per_r: float
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def lateral_force(
     x: Belief, steer: float, lever: float, stiffness: float, grip: float
 ) -> LateralForce:
@@ -150,7 +150,7 @@ class Rates(NamedTuple):
     yaw_r: float
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def rates(x: Belief, steer: float, m: Model) -> Rates:
     """Return (Ff cos δ + Fr)/m and (a Ff cos δ − b Fr)/I, linearised."""
     f = lateral_force(x, steer, m.front, m.stiffness_front, m.grip_front)
@@ -167,7 +167,7 @@ def rates(x: Belief, steer: float, m: Model) -> Rates:
     )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def predict(x: Belief, ax: float, steer: float, dt: float, m: Model) -> Belief:
     """Return the belief one step later: x ← x + Δt f(x), P ← F P Fᵀ + Q, F = I + Δt ∂f/∂x."""
     d = rates(x, steer, m)
@@ -196,7 +196,7 @@ def predict(x: Belief, ax: float, steer: float, dt: float, m: Model) -> Belief:
     )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def condition(
     x: Belief, h0: float, h1: float, h2: float, innovation: float, variance: float
 ) -> Belief:
@@ -226,7 +226,7 @@ def condition(
     )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def update(x: Belief, vx: float, yaw_rate: float, ay: float, steer: float, m: Model) -> Belief:
     """Return the belief given wheel speed, yaw rate and lateral acceleration, one after the other.
 
@@ -238,7 +238,7 @@ def update(x: Belief, vx: float, yaw_rate: float, ay: float, steer: float, m: Mo
     return condition(x, d.ay_vx, d.ay_vy, d.ay_r, ay - d.ay, m.r_ay)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _filter(
     ax: FloatArray,
     ay: FloatArray,

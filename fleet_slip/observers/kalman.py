@@ -8,11 +8,11 @@ plus; (5b), from which it follows, and the mechanics ask for a minus, which stan
 from dataclasses import dataclass
 from typing import NamedTuple, Self
 
-import numba
 import numpy as np
 from pydantic import Field, FiniteFloat
 
 from fleet_slip.arrays import FloatArray
+from fleet_slip.compiling import kernel
 from fleet_slip.config import Config
 from fleet_slip.errors import DataError
 from fleet_slip.observers import yaw_rate
@@ -109,7 +109,7 @@ class Belief(NamedTuple):
     p33: float
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def first_belief(gps_vx: float, gps_vy: float, c: Covariances) -> Belief:
     """Return the belief at the first fix: its velocity, and biases around zero."""
     return Belief(
@@ -117,7 +117,7 @@ def first_belief(gps_vx: float, gps_vy: float, c: Covariances) -> Belief:
     )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def predict(x: Belief, ax: float, ay: float, yaw_rate: float, dt: float, c: Covariances) -> Belief:
     """Return the belief one step later, equations (6), (7) and (9).
 
@@ -154,7 +154,7 @@ def predict(x: Belief, ax: float, ay: float, yaw_rate: float, dt: float, c: Cova
     )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _gain(p0: float, p2: float, x: Belief, c: Covariances) -> tuple[float, float]:
     """Return one row of K from the row of P Hᵀ."""
     s00, s02, s22 = x.p00 + c.r_ux, x.p02, x.p22 + c.r_uy
@@ -162,7 +162,7 @@ def _gain(p0: float, p2: float, x: Belief, c: Covariances) -> tuple[float, float
     return (p0 * s22 - p2 * s02) / determinant, (p2 * s00 - p0 * s02) / determinant
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _residual(
     p0: float, p2: float, k: tuple[float, float], x: Belief, c: Covariances
 ) -> tuple[float, float]:
@@ -173,7 +173,7 @@ def _residual(
     )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _joseph(
     p: float,
     p0: float,
@@ -190,7 +190,7 @@ def _joseph(
     return p - k[0] * p0 - k[1] * p2 + residual[0] * across[0] + residual[1] * across[1]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def update(x: Belief, gps_vx: float, gps_vy: float, c: Covariances) -> Belief:
     """Return the belief given a fix, equations (10) and (11), H selecting u_x and u_y.
 
@@ -228,7 +228,7 @@ def update(x: Belief, gps_vx: float, gps_vy: float, c: Covariances) -> Belief:
     )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _filter(
     ax: FloatArray,
     ay: FloatArray,

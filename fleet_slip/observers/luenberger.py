@@ -8,11 +8,11 @@ transversal forces", IEEE Transactions on Industrial Electronics 51 (2004). Late
 a second output here: a car near neutral steer hardly shows vy in its yaw rate.
 """
 
-import numba
 import numpy as np
 from pydantic import Field, FiniteFloat
 
 from fleet_slip.arrays import FloatArray
+from fleet_slip.compiling import kernel
 from fleet_slip.config import Config
 from fleet_slip.observers import yaw_rate
 from fleet_slip.observers.angle import sideslip_angle
@@ -54,7 +54,7 @@ def gains(space: StateSpace, poles: ObserverPoles) -> FloatArray:
     return np.stack([space.a12 - l12 * space.c2, l12, space.a22 + p2 - l22 * space.c2, l22])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _observe(
     space: tuple[FloatArray, ...],
     gain: FloatArray,

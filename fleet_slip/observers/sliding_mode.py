@@ -12,11 +12,11 @@ allows at any speed: r_y = r and vy_y = (ay − D δ − (a12 + vx) r) / a11.
 
 from typing import Self
 
-import numba
 import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
 from fleet_slip.arrays import FloatArray
+from fleet_slip.compiling import kernel
 from fleet_slip.config import Config
 from fleet_slip.observers import yaw_rate
 from fleet_slip.observers.angle import sideslip_angle
@@ -68,13 +68,13 @@ TUNABLE = (
 """The parameters that `tuning.tune` should search."""
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def saturate(value: float) -> float:
     """Return the value within ±1."""
     return min(max(value, -1.0), 1.0)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _observe(
     space: tuple[FloatArray, ...],
     steer: FloatArray,

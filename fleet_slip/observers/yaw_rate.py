@@ -15,11 +15,11 @@ Wheels that brake in a corner slip more on the unloaded side: rows of braking gi
 from dataclasses import dataclass
 from typing import NamedTuple, Self
 
-import numba
 import numpy as np
 from pydantic import Field, FiniteFloat
 
 from fleet_slip.arrays import FloatArray
+from fleet_slip.compiling import kernel
 from fleet_slip.config import Config
 from fleet_slip.observers.signals import STEP_S, DriveSignals
 from fleet_slip.observers.wheel_speeds import undriven_axle
@@ -82,13 +82,13 @@ class Belief(NamedTuple):
     p11: float
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def predict(x: Belief, step_variance: float) -> Belief:
     """Return the belief one step later: P + diag((Δt σ)², 0)."""
     return Belief(x.r, x.b, x.p00 + step_variance, x.p01, x.p11)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def update(x: Belief, z: float, on_bias: float, variance: float) -> Belief:
     """Return the belief given z = r + on_bias · b + w, in Joseph form.
 
@@ -114,7 +114,7 @@ def update(x: Belief, z: float, on_bias: float, variance: float) -> Belief:
     )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _filter(
     gyro: FloatArray,
     wheels: FloatArray,

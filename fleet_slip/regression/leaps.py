@@ -1,9 +1,9 @@
 """Leaps and bounds: best subsets of each size without computing all (Furnival and Wilson 1974)."""
 
-import numba
 import numpy as np
 
 from fleet_slip.arrays import FloatArray, IntArray
+from fleet_slip.compiling import kernel
 
 
 def best_by_leaps(matrix: FloatArray, count: int) -> list[list[int]]:
@@ -25,7 +25,7 @@ def best_by_leaps(matrix: FloatArray, count: int) -> list[list[int]]:
     ]
 
 
-@numba.njit(cache=True)
+@kernel
 def _offer(best: FloatArray, masks: IntArray, size: int, rss: float, mask: int) -> None:
     worst = np.argmax(best[size])
     if rss < best[size, worst]:
@@ -33,7 +33,7 @@ def _offer(best: FloatArray, masks: IntArray, size: int, rss: float, mask: int) 
         masks[size, worst] = mask
 
 
-@numba.njit(cache=True)
+@kernel
 def _branch(
     inverse: FloatArray, present: IntArray, kept: int, best: FloatArray, masks: IntArray
 ) -> None:
@@ -63,7 +63,7 @@ def _branch(
             _branch(_without(inverse, i), np.delete(present, i), i, best, masks)
 
 
-@numba.njit(cache=True)
+@kernel
 def _without(inverse: FloatArray, i: int) -> FloatArray:
     """Return the inverse of the moments without signal i: a Schur complement of the inverse."""
     keep = np.delete(np.arange(len(inverse)), i)

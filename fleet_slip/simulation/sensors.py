@@ -4,13 +4,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TypeVar
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, FiniteFloat, field_validator
 
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, Signal, catalogue
+from fleet_slip.compiling import kernel
 from fleet_slip.config import Config
 
 SAMPLE_RATE_HZ = int(1 / SAMPLE_TIME_S)
@@ -196,7 +196,7 @@ def _noisy_counts(
     return counts, int(clipped)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _quantise(
     physical: FloatArray,
     noise: NDArray[np.float32],

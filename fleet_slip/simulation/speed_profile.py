@@ -8,11 +8,11 @@ never makes any point slower.
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from pydantic import Field, FiniteFloat
 
 from fleet_slip.arrays import FloatArray
+from fleet_slip.compiling import kernel
 from fleet_slip.config import Config
 from fleet_slip.simulation.track import Track
 
@@ -69,7 +69,7 @@ def speed_profile(track: Track, limits: SpeedLimits, spacing_m: float) -> SpeedP
     return SpeedProfile(track, step_m, station_m, np.sqrt(squared[::-1]))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _pass(cap: FloatArray, load: FloatArray, gain: float, periodic: bool) -> FloatArray:
     """Limit how fast the squared speed w rises from point to point.
 

@@ -6,7 +6,7 @@ arctangent. The error here is below 1e-12 rad, eight orders of magnitude under o
 
 import math
 
-from fleet_slip.vehicle.compiling import equation
+from fleet_slip.compiling import equation
 
 TAN_PI_8 = math.sqrt(2.0) - 1.0
 SMALLEST = 1e-300

@@ -10,7 +10,7 @@ road: on a slippery one he is wrong.
 import math
 from typing import NamedTuple
 
-from fleet_slip.vehicle.compiling import equation
+from fleet_slip.compiling import equation
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2, Constants, VehicleParameters, constants
 from fleet_slip.vehicle.pose import Path, Pose
 from fleet_slip.vehicle.state import Controls, State

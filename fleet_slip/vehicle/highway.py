@@ -16,7 +16,7 @@ from highway_env.vehicle.dynamics import BicycleVehicle
 from highway_env.vehicle.kinematics import Vehicle
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.vehicle.compiling import equation
+from fleet_slip.compiling import equation
 from fleet_slip.vehicle.dynamics import NO_EXTENSIONS, Extensions, build_derivative
 from fleet_slip.vehicle.integration import (
     FIRST_ORDER,

@@ -8,7 +8,7 @@ explicit step would have to be far shorter.
 
 from typing import NamedTuple
 
-from fleet_slip.vehicle.compiling import equation
+from fleet_slip.compiling import equation
 from fleet_slip.vehicle.dynamics import Derivative
 from fleet_slip.vehicle.parameters import Constants
 from fleet_slip.vehicle.state import State

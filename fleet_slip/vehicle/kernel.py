@@ -16,7 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from fleet_slip.vehicle.compiling import equation, kernel
+from fleet_slip import compiling
+from fleet_slip.compiling import equation, kernel
 from fleet_slip.vehicle.driver import (
     SAMPLE_S,
     SPEED_PREVIEW_S,
@@ -248,9 +249,9 @@ def build_kernel(sources: str) -> Callable[..., None]:
 
 
 def _source_digest() -> str:
-    """Return a digest of this package's sources, so that a change of any recompiles the kernel."""
+    """Return a digest of all sources concerned, so that a change of any recompiles the kernel."""
     digest = hashlib.sha256()
-    for file in sorted(FilePath(__file__).parent.glob("*.py")):
+    for file in [*sorted(FilePath(__file__).parent.glob("*.py")), FilePath(compiling.__file__)]:
         digest.update(file.read_bytes())
     return digest.hexdigest()
 

@@ -5,8 +5,8 @@ A block is still in the processor's cache when it is measured.
 
 from typing import Any
 
+from fleet_slip.compiling import equation
 from fleet_slip.vehicle.arctangent import arctan2
-from fleet_slip.vehicle.compiling import equation
 from fleet_slip.vehicle.lane_memory import ACKERMANN, STEER
 from fleet_slip.vehicle.pose import Pose
 from fleet_slip.vehicle.rows import LANES

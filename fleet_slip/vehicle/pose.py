@@ -6,7 +6,7 @@ heading as a unit vector no angle has to be taken.
 
 from typing import NamedTuple
 
-from fleet_slip.vehicle.compiling import equation
+from fleet_slip.compiling import equation
 from fleet_slip.vehicle.integration import extrapolate
 from fleet_slip.vehicle.state import State
 

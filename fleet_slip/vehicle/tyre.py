@@ -9,7 +9,7 @@ the contact patch into its sticking and its sliding part. `docs/vehicle.md` deri
 import math
 from typing import NamedTuple
 
-from fleet_slip.vehicle.compiling import equation
+from fleet_slip.compiling import equation
 from fleet_slip.vehicle.parameters import Constants
 
 CREEP_SPEED_MPS = 2.5

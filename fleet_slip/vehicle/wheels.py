@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
-from fleet_slip.vehicle.compiling import equation
+from fleet_slip.compiling import equation
 from fleet_slip.vehicle.parameters import Constants
 from fleet_slip.vehicle.state import Controls, State
 from fleet_slip.vehicle.tyre import brush_force, linear_force

@@ -1,18 +1,17 @@
 """DuckDB connections: how they are opened, what they may use, and how their errors are told."""
 
 import contextlib
-import os
 import resource
 import uuid
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
-from pathlib import Path
 from typing import TypeVar
 
 import duckdb
 
 from fleet_slip.errors import FleetSlipError, QuestionError, StorageError
 from fleet_slip.files.folder import Folder
+from fleet_slip.limits import memory_bytes
 
 SPILL_LIMIT = "20GB"
 """Largest size of what one connection may write to disk for a query beyond its memory."""
@@ -21,8 +20,6 @@ LOOK_S = 0.1
 """How often a waiting query looks whether Ctrl-C was pressed."""
 
 Result = TypeVar("Result")
-
-CGROUP_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 
 
 def open_database(
@@ -48,15 +45,6 @@ def open_database(
     if reading:
         reading.let_read(database)
     return database
-
-
-def memory_bytes() -> int:
-    """Return the memory that this process may have: the machine's, or less in a container."""
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    for file in CGROUP_LIMITS:
-        with contextlib.suppress(OSError, ValueError):
-            memory = min(memory, int(Path(file).read_text(encoding="ascii")))
-    return memory
 
 
 def limit_memory() -> None:

@@ -1,0 +1,69 @@
+"""What this process may have of the system, and the least that it needs."""
+
+import contextlib
+import os
+import resource
+from collections.abc import Iterator
+from pathlib import Path
+
+from fleet_slip.errors import StorageError
+
+CGROUPS = Path("/sys/fs/cgroup")
+OWN_CGROUP = Path("/proc/self/cgroup")
+
+LIBRARIES_BYTES = 3 * 2**30
+"""Address space that the libraries reserve, nearly all of it never used."""
+THREAD_BYTES = 2**28
+"""The same for each processor: stacks and heaps of the threads that the libraries start."""
+OPEN_FILES = 64
+
+
+def memory_bytes() -> int:
+    """Return the memory for data: the machine's, or less in a control group or under a limit."""
+    allowed = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"), *_cgroup_limits()]
+    address_space, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if address_space != resource.RLIM_INFINITY:
+        allowed.append(max(address_space - LIBRARIES_BYTES, THREAD_BYTES))
+    return min(allowed)
+
+
+def require_limits() -> None:
+    """Raise `StorageError` under limits of the shell that the libraries do not survive.
+
+    Without address space the Delta library aborts the process or its threads wait for each other
+    for ever; without files it panics. So they are told beforehand.
+    """
+    needed = LIBRARIES_BYTES + THREAD_BYTES * len(os.sched_getaffinity(0))
+    allowed, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if allowed != resource.RLIM_INFINITY and allowed < needed:
+        raise StorageError(
+            f"this process may have {allowed // 2**20:,} MiB of address space and needs "
+            f"{needed // 2**20:,} MiB, most of it reserved and never used. Raise the limit: "
+            f"ulimit -v {needed // 2**10}. To limit memory itself use a control group, such as "
+            "systemd's MemoryMax=."
+        )
+    files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if files != resource.RLIM_INFINITY and files < OPEN_FILES:
+        raise StorageError(
+            f"this process may have {files} files open and needs {OPEN_FILES}. Raise the limit: "
+            "ulimit -n 1024"
+        )
+
+
+def _cgroup_limits() -> Iterator[int]:
+    """Yield the limits of memory of this process's control group and of those above it."""
+    with contextlib.suppress(OSError):
+        for line in OWN_CGROUP.read_text(encoding="utf-8").splitlines():
+            _, kinds, path = line.split(":", 2)
+            if kinds and "memory" not in kinds.split(","):
+                continue
+            # In a container the path may be the host's, and the limit at the top.
+            top, name = (
+                (CGROUPS / "memory", "memory.limit_in_bytes") if kinds else (CGROUPS, "memory.max")
+            )
+            group = top / path.lstrip("/")
+            for folder in (group, *group.parents):
+                with contextlib.suppress(OSError, ValueError):
+                    yield int((folder / name).read_text(encoding="ascii"))
+                if folder == top:
+                    break

@@ -1,0 +1,78 @@
+"""Limits that a shell or a control group sets."""
+
+import os
+import resource
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from fleet_slip import limits
+from fleet_slip.errors import StorageError
+from tests.conftest import COMMAND, Finished
+
+ENOUGH_KIB = (limits.LIBRARIES_BYTES + limits.THREAD_BYTES * len(os.sched_getaffinity(0))) // 2**10
+
+
+def run_limited(root: Path, limit: str) -> Finished:
+    command = f"ulimit {limit} && exec {COMMAND} --root {root} run --campaign smoke --days 1"
+    done = subprocess.run(
+        ["bash", "-c", command], capture_output=True, text=True, check=False, timeout=120
+    )
+    return Finished(done.returncode, done.stdout, done.stderr)
+
+
+@pytest.mark.parametrize(
+    ("limit", "needed"),
+    [
+        ("-v 1500000", f"ulimit -v {ENOUGH_KIB}"),
+        ("-v 1000000", f"ulimit -v {ENOUGH_KIB}"),
+        (f"-v {ENOUGH_KIB - 1}", f"ulimit -v {ENOUGH_KIB}"),
+        ("-n 12", "ulimit -n 1024"),
+    ],
+)
+def test_too_narrow_a_limit_is_told_before_anything_is_done(
+    tmp_path: Path, limit: str, needed: str
+) -> None:
+    done = run_limited(tmp_path / "data", limit)
+    assert (done.exit_code, len(done.stderr.splitlines())) == (StorageError.exit_code, 1)
+    assert needed in done.stderr
+    assert not (tmp_path / "data").exists()
+
+
+@pytest.mark.parametrize("limit", [f"-v {ENOUGH_KIB}", f"-n {limits.OPEN_FILES}"])
+def test_what_is_said_to_be_enough_is_enough(tmp_path: Path, limit: str) -> None:
+    done = run_limited(tmp_path / "data", limit)
+    assert done.exit_code == 0, done.stderr
+    assert (tmp_path / "data/models/smoke/versions/1.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("membership", "file"),
+    [
+        ("0::/system.slice/fleet-slip.service", "system.slice/fleet-slip.service/memory.max"),
+        ("0::/system.slice/fleet-slip.service", "system.slice/memory.max"),
+        ("0::/of/the/host", "memory.max"),
+        ("7:cpu:/\n5:memory,hugetlb:/docker/1", "memory/docker/1/memory.limit_in_bytes"),
+        ("5:memory:/docker/1", "memory/memory.limit_in_bytes"),
+    ],
+)
+def test_the_limit_of_a_control_group_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, membership: str, file: str
+) -> None:
+    """Of systemd's MemoryMax= and of a container, in both versions of control groups."""
+    (tmp_path / "cgroup").write_text(membership + "\n")
+    (tmp_path / "fs" / file).parent.mkdir(parents=True)
+    (tmp_path / "fs" / file).write_text("123456789\n")
+    (tmp_path / "fs/memory.max").touch()
+    monkeypatch.setattr(limits, "CGROUPS", tmp_path / "fs")
+    monkeypatch.setattr(limits, "OWN_CGROUP", tmp_path / "cgroup")
+    assert limits.memory_bytes() == 123456789
+
+
+def test_data_gets_what_the_libraries_leave_of_the_address_space(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    allowed = limits.LIBRARIES_BYTES + 10**9
+    monkeypatch.setattr(resource, "getrlimit", lambda _kind: (allowed, allowed))
+    assert limits.memory_bytes() == 10**9

@@ -1,0 +1,132 @@
+"""The shipped systemd service's conditions, without systemd.
+
+Another user without a home, the whole file system read-only but for the data root and the cache
+folder, and no more environment than systemd gives: by mounts in a namespace of their own.
+"""
+
+import configparser
+import json
+import os
+import shlex
+import shutil
+import stat
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import COMMAND
+
+UNIT = Path(__file__).parents[2] / "jobs/schedule/fleet-slip.service"
+NOBODY = 65534
+
+
+def can_confine() -> bool:
+    if os.geteuid() != 0 or not shutil.which("unshare") or not shutil.which("setpriv"):
+        return False
+    made = subprocess.run(
+        ["unshare", "--mount", "mount", "-o", "remount,bind,ro", "/"],
+        check=False,
+        capture_output=True,
+    )
+    return made.returncode == 0
+
+
+pytestmark = pytest.mark.skipif(
+    not can_confine(), reason="a service is confined by root, with unshare and setpriv"
+)
+
+
+@pytest.fixture
+def service() -> dict[str, str]:
+    parser = configparser.ConfigParser(strict=False, interpolation=None)
+    parser.optionxform = str  # type: ignore[assignment,method-assign]
+    parser.read(UNIT)
+    return dict(parser["Service"])
+
+
+@pytest.fixture
+def folder() -> Iterator[Path]:
+    """A folder that another user can reach; pytest's own is closed to others."""
+    with tempfile.TemporaryDirectory() as name:
+        Path(name).chmod(0o755)
+        yield Path(name)
+
+
+def confined(service: dict[str, str], folder: Path, arguments: list[str], **extra: str) -> str:
+    """Return a script that does in a mount namespace what systemd does for the service."""
+    assert service["ProtectSystem"] == "strict"
+    state = Path(service["ReadWritePaths"])
+    lines = ["set -e"]
+    environment = dict([service["Environment"].split("=", 1)]) | extra
+    places = {state: folder / "state"}
+    if "CacheDirectory" in service:
+        cache = Path("/var/cache") / service["CacheDirectory"]
+        places[cache] = folder / "cache"
+        environment["CACHE_DIRECTORY"] = str(cache)
+    for place, real in places.items():
+        real.mkdir(exist_ok=True)
+        os.chown(real, NOBODY, NOBODY)
+        lines += [
+            f"mount -t tmpfs none {place.parent}",
+            f"mkdir {place}",
+            f"mount --bind {real} {place}",
+        ]
+    for closed in closed_folders(Path(sys.executable), folder / "shown"):
+        lines += closed
+    lines.append("mount -o remount,bind,ro /")
+    variables = " ".join(f"{k}={shlex.quote(v)}" for k, v in environment.items())
+    lines.append(
+        f"cd / && exec setpriv --reuid={NOBODY} --regid={NOBODY} --clear-groups --no-new-privs "
+        f"env -i PATH=/usr/bin:/bin {variables} {COMMAND} {shlex.join(arguments)}"
+    )
+    return "\n".join(lines)
+
+
+def closed_folders(program: Path, aside: Path) -> Iterator[list[str]]:
+    """Yield how to show others what a program needs of a folder that is closed to them."""
+    file = program.resolve()
+    for parent, child in zip(file.parents[1:], file.parents, strict=False):
+        if not parent.stat().st_mode & stat.S_IXOTH:
+            yield [
+                f"mkdir -p {aside} && mount --bind {child} {aside}",
+                f"mount -t tmpfs -o mode=755 none {parent} && mkdir {child}",
+                f"mount --move {aside} {child}",
+            ]
+
+
+def run(script: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        ["unshare", "--mount", "--propagation", "private", "bash", "-c", script],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+
+
+JOB = ["run", "--campaign", "smoke", "--days", "1", "--json"]
+
+
+def test_the_service_does_its_job_and_keeps_its_compiled_code(
+    service: dict[str, str], folder: Path
+) -> None:
+    done = run(confined(service, folder, JOB))
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["publish"]["new"]
+    assert "compiled" not in done.stderr
+    assert (folder / "state/models/smoke/versions/1.json").stat().st_uid == NOBODY
+    assert list((folder / "cache").rglob("*.nbi"))
+
+
+def test_without_a_cache_folder_it_does_its_job_and_says_what_that_costs(
+    service: dict[str, str], folder: Path
+) -> None:
+    del service["CacheDirectory"]
+    done = run(confined(service, folder, JOB))
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["publish"]["new"]
+    assert done.stderr.count("no folder where compiled code can be kept") == 1
