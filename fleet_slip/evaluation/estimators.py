@@ -99,7 +99,7 @@ class TrainedModels:
         trained = {
             "kind": "regression",
             "group": self.version.reference,
-            "cohort": self.selection.cohort.condition,
+            "cohort": self.selection.cohort.condition.text,
             "drives": self.selection.cohort.drives.num_rows,
             "rows": self.selection.cohort.rows,
         }

@@ -21,7 +21,7 @@ from fleet_slip.regression.drive_moments import serving_drives
 from fleet_slip.regression.folds import CohortFolds, FoldAssignment, by_hash, by_value
 from fleet_slip.regression.gram import packed_size
 from fleet_slip.regression.gram_table import GramTable
-from fleet_slip.warehouse.database import database_errors
+from fleet_slip.warehouse.condition import Condition, asking, parse_condition
 from fleet_slip.warehouse.tables import Warehouse
 
 
@@ -46,14 +46,14 @@ class Cohort:
     divides its rows.
 
     Attributes:
-        condition: SQL condition on the columns of the view `drives`.
+        condition: which drives, by the columns of the view `drives`.
         tables: one `GramTable` for each set of signals.
         drives: metadata of each Gram row, in the order of the tables.
         logs_version, grams_version: versions of the Delta tables that were read.
         feature_set: which Gram rows these are.
     """
 
-    condition: str
+    condition: Condition
     tables: tuple[GramTable, ...]
     drives: pa.Table
     logs_version: int
@@ -137,11 +137,11 @@ class Cohort:
         return gram_condition(self.condition, self.feature_set, inputs)
 
 
-def gram_condition(condition: str, feature_set: str, inputs: Sequence[str]) -> str:
+def gram_condition(condition: Condition, feature_set: str, inputs: Sequence[str]) -> str:
     """Return the SQL condition on the view `grams` of a cohort's rows that have some inputs."""
     wanted = ", ".join(f"'{name}'" for name in [*inputs, catalogue().label])
     return (
-        f"feature_set = '{features().identity(feature_set)}' AND ({condition}) AND "
+        f"feature_set = '{features().identity(feature_set)}' AND {condition.sql} AND "
         f"list_has_all(string_split(signals, ','), [{wanted}])"
     )
 
@@ -172,18 +172,19 @@ def assign_folds(values: Sequence[Any], by: str, count: int) -> FoldAssignment:
 
 def load_cohort(
     warehouse: Warehouse | GramReader,
-    condition: str = TRAINING_DRIVES,
+    condition: str | Condition = TRAINING_DRIVES,
     feature_set: str = PLAIN,
 ) -> Cohort:
     """Read the Gram rows of the drives that satisfy a condition.
 
-    Raises `QuestionError` if the condition is not valid SQL, `DataError` if no drive satisfies it
-    or the feature set has not been computed for all logs, and `RefusedError` if a drive of an
-    evaluation scenario satisfies it.
+    Raises `QuestionError` if the condition is not one SQL expression on the columns of `drives`,
+    `DataError` if no drive satisfies it or the feature set has not been computed for all logs, and
+    `RefusedError` if a drive of an evaluation scenario satisfies it.
     """
-    with open_grams(warehouse, condition, feature_set) as opened:
+    condition = parse_condition(condition)
+    with open_grams(warehouse, feature_set) as opened:
         statement = opened.statement("cohort.sql", condition)
-        with database_errors(f"the cohort {condition!r}"):
+        with asking(opened.database, condition):
             rows = opened.database.sql(statement).to_arrow_table()
         if not rows.num_rows:
             raise empty_cohort_error(opened.database, condition)
@@ -205,12 +206,12 @@ def load_cohort(
     )
 
 
-def require_training(sources: Iterable[str], condition: str) -> None:
+def require_training(sources: Iterable[str], condition: Condition) -> None:
     """Raise `RefusedError` if drives of a scenario are among those of a condition."""
     if SCENARIO in sources:
         raise RefusedError(
-            f"the cohort {condition!r} has drives of evaluation scenarios, which no model may be "
-            f"trained on. Add to the condition: AND {TRAINING_DRIVES}"
+            f"the cohort {condition.text!r} has drives of evaluation scenarios, which no model "
+            f"may be trained on. Add to the condition: AND {TRAINING_DRIVES}"
         )
 
 
@@ -233,14 +234,14 @@ def _matrix(lists: pa.ChunkedArray | pa.ListArray, width: int) -> IntArray:
     return values.reshape(-1, width)
 
 
-def empty_cohort_error(database: duckdb.DuckDBPyConnection, condition: str) -> DataError:
+def empty_cohort_error(database: duckdb.DuckDBPyConnection, condition: Condition) -> DataError:
     """Return the error that no drive satisfies a condition."""
     examples = database.execute(
         "SELECT string_agg(DISTINCT source, ', '), string_agg(DISTINCT campaign, ', ') FROM grams"
     ).fetchone()
     sources, campaigns = examples or ("", "")
     return DataError(
-        f"no drive satisfies the cohort condition {condition!r}. The warehouse has sources "
+        f"no drive satisfies the cohort condition {condition.text!r}. The warehouse has sources "
         f"{sources} and campaigns {campaigns}. See the columns with: "
         'fleet-slip sql "DESCRIBE drives"'
     )

@@ -15,6 +15,7 @@ from fleet_slip.grams.fold_sums import by_signals, hash_numbers
 from fleet_slip.grams.reader import GramReader, open_grams
 from fleet_slip.regression.drive_moments import missing_signals_error
 from fleet_slip.regression.gram import Gram
+from fleet_slip.warehouse.condition import Condition, parse_condition
 from fleet_slip.warehouse.tables import Warehouse
 
 
@@ -30,7 +31,7 @@ class DailySums:
 def sum_days(
     source: Warehouse | GramReader,
     inputs: Sequence[str],
-    condition: str = TRAINING_DRIVES,
+    condition: str | Condition = TRAINING_DRIVES,
     feature_set: str = PLAIN,
 ) -> DailySums:
     """Add up, day by day, the Gram rows of the drives that have the label and all the inputs.
@@ -42,7 +43,8 @@ def sum_days(
     grams: dict[date, Gram] = {}
     drives: dict[date, list[NDArray[np.uint64]]] = {}
     found = False
-    with open_grams(source, condition, feature_set) as opened:
+    condition = parse_condition(condition)
+    with open_grams(source, feature_set) as opened:
         for batch in opened.batches(condition):
             found = True
             require_training(batch["source"].unique().to_pylist(), condition)

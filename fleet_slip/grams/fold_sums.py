@@ -28,7 +28,7 @@ from fleet_slip.grams.folding import FOLD_KEYS, ROW_FOLDS, Folding
 from fleet_slip.grams.reader import GramReader, OpenedGrams, open_grams
 from fleet_slip.regression.folds import CohortFolds, hash_number
 from fleet_slip.regression.gram import Gram
-from fleet_slip.warehouse.database import database_errors
+from fleet_slip.warehouse.condition import Condition, asking, parse_condition
 from fleet_slip.warehouse.tables import Warehouse
 
 FoldOf = Callable[[pa.RecordBatch, NDArray[np.uint64]], IntArray]
@@ -40,7 +40,7 @@ class SummedCohort:
     """What a selection from given models needs of a cohort; see `fleet_slip.grams.cohort.Cohort`.
 
     Attributes:
-        condition: SQL condition on the columns of the view `drives`.
+        condition: which drives, by the columns of the view `drives`.
         folding: how the cohort was divided.
         sums: the Gram of each fold.
         rows, drive_count: number of rows of the logs, and of drives, behind the cohort.
@@ -48,7 +48,7 @@ class SummedCohort:
         feature_set: which Gram rows were read.
     """
 
-    condition: str
+    condition: Condition
     folding: Folding
     sums: CohortFolds
     rows: int
@@ -79,7 +79,7 @@ class SummedCohort:
 def sum_cohort(
     warehouse: Warehouse | GramReader,
     folding: Folding,
-    condition: str = TRAINING_DRIVES,
+    condition: str | Condition = TRAINING_DRIVES,
     feature_set: str = PLAIN,
 ) -> SummedCohort:
     """Add up the Gram rows of the drives that satisfy a condition, over each fold.
@@ -87,9 +87,10 @@ def sum_cohort(
     Raises like `fleet_slip.grams.cohort.load_cohort`, and `DataError`
     if there are not two folds.
     """
+    condition = parse_condition(condition)
     if folding.by == ROW_FOLDS:
         require_row_folds(feature_set, folding.count)
-    with open_grams(warehouse, condition, feature_set) as opened:
+    with open_grams(warehouse, feature_set) as opened:
         names, fold_of = _folding(opened, folding, condition)
         sums = _Sums(len(names), fold_of)
         for batch in opened.batches(condition):
@@ -109,14 +110,16 @@ def sum_cohort(
     )
 
 
-def _folding(opened: OpenedGrams, folding: Folding, condition: str) -> tuple[list[str], FoldOf]:
+def _folding(
+    opened: OpenedGrams, folding: Folding, condition: Condition
+) -> tuple[list[str], FoldOf]:
     """Return the names of all folds that there may be, and what tells the fold of a Gram row."""
     if folding.by == "drive":
         names = [str(fold + 1) for fold in range(folding.count)]
         return names, lambda _, drives: (drives % folding.count).astype(np.int64)
     key = FOLD_KEYS[folding.by]
     text = opened.statement("cohort_sums.sql", condition)
-    with database_errors(f"the cohort {condition!r}"):
+    with asking(opened.database, condition):
         found = opened.database.sql(f"SELECT DISTINCT {key} FROM ({text})").to_arrow_table()
     values = found[key].combine_chunks()
     if not len(values):

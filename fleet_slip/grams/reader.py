@@ -14,13 +14,9 @@ from fleet_slip.delta.table import Snapshot, Table
 from fleet_slip.errors import DataError
 from fleet_slip.grams.backlog import find_backlog
 from fleet_slip.resources import read_sql
-from fleet_slip.warehouse.database import database_errors
-from fleet_slip.warehouse.read_only_sql import one_query
-from fleet_slip.warehouse.table_views import connect_tables, lock, open_tables, views_in
+from fleet_slip.warehouse.condition import Condition, asking
+from fleet_slip.warehouse.table_views import lock, open_tables
 from fleet_slip.warehouse.tables import Warehouse
-
-GRAMS_ALONE = frozenset({"grams"})
-"""What most conditions ask for: columns of the Gram rows themselves."""
 
 BATCH_ROWS = 2**13
 """Gram rows of one batch: some 700 bytes each."""
@@ -35,16 +31,14 @@ class OpenedGrams:
     logs_version: int
     grams_version: int
 
-    def statement(self, name: str, condition: str) -> str:
-        """Return a statement of `jobs/` for a condition. Raises `QuestionError`."""
-        text = read_sql("jobs", name).format(condition=condition, feature_set=self.identity)
-        with database_errors(f"the cohort {condition!r}"):
-            return one_query(self.database, text)
+    def statement(self, name: str, condition: Condition) -> str:
+        """Return a statement of `jobs/` for a condition."""
+        return read_sql("jobs", name).format(condition=condition.sql, feature_set=self.identity)
 
-    def batches(self, condition: str) -> Iterator[pa.RecordBatch]:
+    def batches(self, condition: Condition) -> Iterator[pa.RecordBatch]:
         """Yield the Gram rows of a cohort in any order, with what their fold is told from."""
         statement = self.statement("cohort_sums.sql", condition)
-        with database_errors(f"the cohort {condition!r}"):
+        with asking(self.database, condition):
             yield from self.database.sql(statement).to_arrow_reader(BATCH_ROWS)
 
 
@@ -61,7 +55,6 @@ class GramReader:
         self._logs: Snapshot | None = None
         self._grams: Snapshot | None = None
         self._database: duckdb.DuckDBPyConnection | None = None
-        self._alone = False
 
     def __enter__(self) -> Self:
         """Return the reader."""
@@ -71,8 +64,8 @@ class GramReader:
         """Close the connection."""
         self._close()
 
-    def opened(self, condition: str, feature_set: str) -> OpenedGrams:
-        """Return what a cohort's condition may ask for, until the next call.
+    def opened(self, feature_set: str) -> OpenedGrams:
+        """Return the Gram rows of a feature set, until the next call.
 
         Raises `DataError` if there are no Gram rows, or if those of the feature set are not
         complete.
@@ -83,7 +76,7 @@ class GramReader:
             grams = _newest(self._grams, self._warehouse.grams)
             if grams is not self._grams:
                 self._close()
-            database = self._connected(grams, f"FROM grams WHERE {condition}")
+            database = self._connected(grams)
             logs = renewing.result()
         self._logs, self._grams = logs, grams
         if not grams.rows:
@@ -96,16 +89,10 @@ class GramReader:
             _require_complete(logs, grams, feature_set, identity)
         return OpenedGrams(database, identity, logs.version or 0, grams.version or 0)
 
-    def _connected(self, grams: Snapshot, query: str) -> duckdb.DuckDBPyConnection:
-        alone = views_in(query) == GRAMS_ALONE
-        if self._database is None or not (alone and self._alone):
-            self._close()
-            if alone:
-                self._database = open_tables(self._warehouse, GRAMS_ALONE, [grams])
-                lock(self._database, grams.paths)
-            else:
-                self._database = connect_tables(self._warehouse, query)
-            self._alone = alone
+    def _connected(self, grams: Snapshot) -> duckdb.DuckDBPyConnection:
+        if self._database is None:
+            self._database = open_tables(self._warehouse, {"grams"}, [grams])
+            lock(self._database, grams.paths)
         return self._database
 
     def _close(self) -> None:
@@ -115,15 +102,13 @@ class GramReader:
 
 
 @contextlib.contextmanager
-def open_grams(
-    source: Warehouse | GramReader, condition: str, feature_set: str
-) -> Iterator[OpenedGrams]:
-    """Open what a cohort's condition may ask for, anew unless by a reader. Raises like `opened`."""
+def open_grams(source: Warehouse | GramReader, feature_set: str) -> Iterator[OpenedGrams]:
+    """Open the Gram rows of a feature set, anew unless by a reader. Raises like `opened`."""
     if isinstance(source, GramReader):
-        yield source.opened(condition, feature_set)
+        yield source.opened(feature_set)
     else:
         with GramReader(source) as reader:
-            yield reader.opened(condition, feature_set)
+            yield reader.opened(feature_set)
 
 
 def _newest(before: Snapshot | None, table: Table) -> Snapshot:

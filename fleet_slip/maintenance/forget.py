@@ -23,8 +23,7 @@ from fleet_slip.models.manifest import TrainedOn
 from fleet_slip.models.versions import Registry
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.views import connect
-from fleet_slip.warehouse.database import database_errors
-from fleet_slip.warehouse.read_only_sql import one_query
+from fleet_slip.warehouse.condition import asking, parse_condition
 from fleet_slip.warehouse.tables import Warehouse
 
 
@@ -181,18 +180,16 @@ def _in_cohorts(
 ) -> dict[str, frozenset[str]]:
     """Return which of some drives each cohort has; all, of a cohort that cannot be asked for."""
     found = {}
-    with connect(warehouse.root, query=" ".join(["grams", *cohorts])) as database:
+    with connect(warehouse.root, query="grams") as database:
         database.register(
             "forgotten", pa.table({"drive_id": pa.array(sorted(drives), pa.string())})
         )
         for cohort in cohorts:
-            statement = (
-                "SELECT DISTINCT drive_id FROM grams WHERE drive_id IN (FROM forgotten) AND "
-                f"({cohort}\n)"
-            )
+            asked = "SELECT DISTINCT drive_id FROM grams WHERE drive_id IN (FROM forgotten) AND "
             try:
-                with database_errors(f"the cohort {cohort!r}"):
-                    rows = database.execute(one_query(database, statement)).fetchall()
+                condition = parse_condition(cohort)
+                with asking(database, condition):
+                    rows = database.execute(asked + condition.sql).fetchall()
                 found[cohort] = frozenset(row[0] for row in rows)
             except FleetSlipError:
                 found[cohort] = frozenset(drives)

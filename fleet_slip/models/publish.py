@@ -53,7 +53,7 @@ def manifest_of(
         ),
         cross_validation=_cross_validated(winner, selection),
         trained_on=TrainedOn(
-            cohort=selection.cohort.condition,
+            cohort=selection.cohort.condition.text,
             feature_set=features().identity(selection.cohort.feature_set),
             drives=winner.drives,
             rows=winner.pooled.rows,

@@ -8,8 +8,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.resources import read_sql
-from fleet_slip.warehouse.database import database_errors
-from fleet_slip.warehouse.read_only_sql import one_query
+from fleet_slip.warehouse.condition import Condition, asking, parse_condition, row_columns
 from fleet_slip.warehouse.table_views import connect_tables
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -34,10 +33,11 @@ class Score:
         return asdict(self)
 
 
-def score_statement(manifest: Manifest, condition: str) -> str:
+def score_statement(manifest: Manifest, condition: str | Condition) -> str:
     """Return `jobs/score.sql` for a model: its dot product over the logs in SI units.
 
-    Features are computed as the manifest defines them, whatever they are called today.
+    Features are computed as the manifest defines them, whatever they are called today. Raises
+    `QuestionError` if the condition is not one expression on the columns of the view `log`.
     """
     terms = [f"{term.coefficient!r} * {term.column}" for term in manifest.terms]
     columns = [term.column for term in manifest.terms] + [manifest.label.column]
@@ -46,7 +46,7 @@ def score_statement(manifest: Manifest, condition: str) -> str:
         label=manifest.label.column,
         rows=_rows(manifest),
         complete=" AND ".join(f"{column} IS NOT NULL" for column in columns),
-        condition=condition,
+        condition=parse_condition(condition, row_columns()).sql,
     )
 
 
@@ -67,18 +67,20 @@ def _rows(manifest: Manifest) -> str:
     )"""
 
 
-def score(warehouse: Warehouse, manifest: Manifest, condition: str) -> Score:
-    """Score a model. Raises `DataError` if the cohort has no row with its signals."""
-    text = score_statement(manifest, condition)
-    with connect_tables(warehouse, text) as database:
-        statement = one_query(database, text)
-        with database_errors(f"scoring on the cohort {condition!r}"):
-            result = database.execute(statement)
-            names = [column[0] for column in result.description or ()]
-            row = result.fetchone()
+def score(warehouse: Warehouse, manifest: Manifest, condition: str | Condition) -> Score:
+    """Score a model on the rows of `log` that satisfy a condition.
+
+    Raises like `score_statement`, and `DataError` if no such row has the model's signals.
+    """
+    condition = parse_condition(condition, row_columns())
+    statement = score_statement(manifest, condition)
+    with connect_tables(warehouse, statement) as database, asking(database, condition):
+        result = database.execute(statement)
+        names = [column[0] for column in result.description or ()]
+        row = result.fetchone()
     if row is None or not row[0]:
         raise DataError(
-            f"no row of the cohort {condition!r} has {', '.join(manifest.signals)} and "
+            f"no row of the cohort {condition.text!r} has {', '.join(manifest.signals)} and "
             f"{manifest.label.signal}. Choose another cohort, or a model with fewer signals."
         )
     figures = dict(zip(names, row, strict=True))

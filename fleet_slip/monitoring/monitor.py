@@ -26,6 +26,7 @@ from fleet_slip.regression.exact import LinearModel, fit
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.special import student_t_quantile
+from fleet_slip.warehouse.condition import Condition, parse_condition
 from fleet_slip.warehouse.tables import Warehouse
 
 
@@ -100,7 +101,7 @@ class Chart:
 def monitor(
     warehouse: Warehouse,
     version: ModelVersion,
-    condition: str | None = None,
+    condition: str | Condition | None = None,
     since: date | None = None,
     limits: MonitorThresholds | None = None,
 ) -> Chart:
@@ -112,7 +113,7 @@ def monitor(
     """
     limits = limits or thresholds().monitor
     manifest = version.manifest
-    condition = condition or manifest.trained_on.cohort
+    condition = parse_condition(condition or manifest.trained_on.cohort)
     sums = sum_days(warehouse, manifest.signals, condition, manifest.trained_on.feature_set)
     days, grams = sums.days, sums.grams
     last = _last_training_day(warehouse, version) if since is None else None
@@ -120,7 +121,8 @@ def monitor(
     if sum(training) < limits.min_training_days:
         raise DataError(
             f"{version.reference} was trained on {sum(training)} days of the cohort "
-            f"{condition!r}, too few to tell what is usual. Choose another --since or --cohort; "
+            f"{condition.text!r}, too few to tell what is usual. Choose another --since or "
+            f"--cohort; "
             f"{limits.min_training_days} days are needed."
         )
     models = _models(counts_model(manifest), grams, training)
@@ -134,7 +136,7 @@ def monitor(
     mean = Limits.of([day.error_mean_deg for day in usual], limits.false_alarms_per_day)
     std = Limits.above([day.error_std_deg for day in usual], limits.false_alarms_per_day)
     judged = tuple(day if day.training else _judged(day, mean, std) for day in found)
-    return Chart(version.reference, condition, judged, mean, std)
+    return Chart(version.reference, condition.text, judged, mean, std)
 
 
 def _models(

@@ -18,7 +18,7 @@ from fleet_slip.monitoring.peers import settle
 from fleet_slip.monitoring.plausibility import Fault, find_implausible
 from fleet_slip.monitoring.thresholds import QualityThresholds, thresholds
 from fleet_slip.regression.gram_table import GramTable
-from fleet_slip.warehouse.database import database_errors
+from fleet_slip.warehouse.condition import Condition, asking, parse_condition
 from fleet_slip.warehouse.tables import Warehouse
 
 
@@ -62,17 +62,18 @@ class QualityReport:
 
 def examine_drives(
     warehouse: Warehouse,
-    condition: str = TRAINING_DRIVES,
+    condition: str | Condition = TRAINING_DRIVES,
     limits: QualityThresholds | None = None,
 ) -> QualityReport:
     """Examine the drives that satisfy a condition, with one vehicle model's at a time in memory.
 
     Raises like `fleet_slip.grams.cohort.load_cohort`.
     """
+    drives = parse_condition(condition)
     with GramReader(warehouse) as reader:
         reports = [
-            examine(load_cohort(reader, f"({condition}\n) AND {of_model}"), limits)
-            for of_model in _vehicle_models(reader, condition)
+            examine(load_cohort(reader, drives & of_model), limits)
+            for of_model in _vehicle_models(reader, drives)
         ]
     findings = [finding for report in reports for finding in report.findings]
     return QualityReport(
@@ -82,18 +83,20 @@ def examine_drives(
     )
 
 
-def _vehicle_models(reader: GramReader, condition: str) -> list[str]:
+def _vehicle_models(reader: GramReader, condition: Condition) -> list[Condition]:
     """Return, for each vehicle model of a cohort, the condition that a drive is of it."""
-    opened = reader.opened(condition, PLAIN)
+    opened = reader.opened(PLAIN)
     cohort = opened.statement("cohort.sql", condition)
-    with database_errors(f"the cohort {condition!r}"):
+    with asking(opened.database, condition):
         statement = f"SELECT DISTINCT vehicle_model, source FROM ({cohort}\n)"
         found = opened.database.sql(statement).fetchall()
     if not found:
         raise empty_cohort_error(opened.database, condition)
     require_training({source for _, source in found}, condition)
     models = sorted({model for model, _ in found}, key=str)
-    return [f"vehicle_model IS NOT DISTINCT FROM {_literal(model)}" for model in models]
+    return [
+        parse_condition(f"vehicle_model IS NOT DISTINCT FROM {_literal(model)}") for model in models
+    ]
 
 
 def _literal(text: str | None) -> str:

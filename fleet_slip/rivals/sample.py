@@ -66,7 +66,7 @@ def draw_sample(
     with connect(warehouse.root) as database, database_errors("drawing a sample"):
         found = database.sql(statement, params=parameters).to_arrow_table()
     if not found.num_rows:
-        raise DataError(f"no row of {cohort.condition!r} has all of {', '.join(names)}.")
+        raise DataError(f"no row of {cohort.condition.text!r} has all of {', '.join(names)}.")
     values = np.stack([found[column].to_numpy() for column in columns], axis=1)
     return Sample(
         columns=tuple(columns[:-1]),

@@ -53,7 +53,7 @@ class Selection(Generic[AnyCohort]):
             ],
             "winner": self.winner.model.name,
             "reason": self.winner.reason,
-            "cohort": self.cohort.condition,
+            "cohort": self.cohort.condition.text,
             "feature_set": features().identity(self.cohort.feature_set),
             "drives": self.cohort.drive_count,
             "rows": self.cohort.rows,

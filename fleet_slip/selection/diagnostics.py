@@ -187,7 +187,7 @@ def _compare(here: Served, fitted: Fit, moments: DriveMoments, against: Cohort) 
     other_moments = DriveMoments.of(there.table)
     other = fit(there.table.total(), inputs, label)
     return CohortComparison(
-        against.condition,
+        against.condition.text,
         infer_by_drives(other, other_moments, input_scales()),
         chow_test([fitted.gram, other.gram], inputs, label),
         wald_test(fitted, moments, other, other_moments),

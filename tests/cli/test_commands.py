@@ -173,6 +173,14 @@ def test_the_grams_agree_however_computed(run_command: RunCommand, smoke_root: P
     assert "sum(ax::INTEGER * ax::INTEGER)" in run_command("gram", "--sql").stdout
 
 
+FORGED = (
+    "false) UNION ALL SELECT 'd' || i, 'v', 'm', 'simulated', 'c', 't', 1, 1, 1, 0, "
+    "DATE '2024-05-01', NULL, 'ay,sideslip', 9, 0, [i, i], [1, 2, 9] "
+    "FROM range(1, 9) r(i) WHERE (true"
+)
+"""Gram rows that nobody measured."""
+
+
 @pytest.mark.parametrize(
     ("arguments", "exit_code", "message"),
     [
@@ -182,7 +190,15 @@ def test_the_grams_agree_however_computed(run_command: RunCommand, smoke_root: P
         (["run", "--campaign", "smoke", "--through", "1999-01-01"], 3, "lasts from"),
         (["select", "--cohort", "campaign = 'none'"], 5, "no drive satisfies"),
         (["select", "--cohort", "campain = 'x'"], 5, "campain"),
-        (["select", "--cohort", "true) OR (true"], 5, ""),
+        (["select", "--cohort", "true) OR (true"], 5, "not valid SQL"),
+        (["select", "--cohort", "random() < 0.5"], 5, "must mean the same for ever"),
+        (["publish", "forged", "--cohort", FORGED], 5, "not valid SQL"),
+        (["diagnose", "smoke", "--against", "day < now()"], 5, "must mean the same for ever"),
+        (["what-if", "smoke", "--cohort", "EXISTS (FROM log)", "--bias", "ay=1"], 5, "subquery"),
+        (["regimes", "--cohort", "n > 1"], 5, "names the column 'n'"),
+        (["quality", "--cohort", "true) OR (true"], 5, "not valid SQL"),
+        (["monitor", "smoke", "--cohort", "true UNION SELECT 1"], 5, "not valid SQL"),
+        (["score", "smoke", "--cohort", "true) OR (true"], 5, "not valid SQL"),
         (["select", "--cohort", "1; DROP VIEW grams"], 5, "not valid SQL"),
         (["select", "--nested", "ax,beta"], 3, "beta is not an input"),
         (["select", "--models", "table9"], 3, "Known: table1"),

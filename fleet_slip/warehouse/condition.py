@@ -1,0 +1,197 @@
+"""Conditions that people write and manifests keep: one SQL expression on a drive's columns each.
+
+A condition becomes part of statements that nobody looks at, tonight and in years. So it is parsed
+by itself, before it stands in any of them, and must be one expression made of the columns that it
+is about, constants, and operators and functions whose value depends on their arguments alone: no
+subquery, no random number, no clock. What stands in statements is not its text but what the parser
+understood, written out again.
+"""
+
+import contextlib
+import functools
+import json
+import threading
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import duckdb
+
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.errors import QuestionError, printable
+from fleet_slip.warehouse.database import database_errors, duckdb_message
+from fleet_slip.warehouse.lasting_sql import Tree, problems
+from fleet_slip.warehouse.read_only_sql import LONGEST_QUERY
+
+LONGEST_S = 3600.0
+"""No condition is asked for longer: what a manifest keeps is read by jobs that nobody watches."""
+
+_PLACES = frozenset({"query_location", "query_location_length"})
+
+_QUERY = "SELECT 1 FROM drives WHERE "
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A condition that has passed; `parse_condition` makes it.
+
+    Attributes:
+        text: as it was written, which people are shown and manifests keep.
+        sql: the same, written out by the parser in parentheses, which stands in statements.
+    """
+
+    text: str
+    sql: str
+
+    def __str__(self) -> str:
+        """Return it as it was written."""
+        return self.text
+
+    def __and__(self, other: "Condition") -> "Condition":
+        """Return the condition that both are true."""
+        both = f"({self.sql} AND {other.sql})"
+        return Condition(both, both)
+
+
+@contextlib.contextmanager
+def asking(
+    database: duckdb.DuckDBPyConnection, condition: Condition, limit_s: float = LONGEST_S
+) -> Iterator[None]:
+    """Turn the errors of a query with a condition into ours, and end it when it takes too long.
+
+    Not for two queries of a connection at once. Raises `QuestionError` once the time is over.
+    """
+    over = threading.Event()
+
+    def stop() -> None:
+        over.set()
+        database.interrupt()
+
+    timer = threading.Timer(limit_s, stop)
+    timer.daemon = True
+    timer.start()
+    try:
+        with database_errors(f"the cohort {condition.text!r}"):
+            yield
+    except BaseException:
+        if not over.is_set():
+            raise
+        raise QuestionError(
+            f"the cohort {condition.text!r} was not found within {limit_s:g} s. Ask for less."
+        ) from None
+    finally:
+        timer.cancel()
+
+
+def parse_condition(text: str | Condition, columns: Collection[str] | None = None) -> Condition:
+    """Return a condition on some columns, by default those that tell drives apart.
+
+    Raises `QuestionError` for what is not one expression, or asks for more than the columns.
+    """
+    if isinstance(text, Condition):
+        return text
+    return _parsed(text, frozenset(drive_columns() if columns is None else columns))
+
+
+def drive_columns() -> tuple[str, ...]:
+    """Return the columns that the condition of a cohort may use: a drive's metadata and its day."""
+    return (*catalogue().drive, "day")
+
+
+def row_columns() -> tuple[str, ...]:
+    """Return the columns that a condition on the rows of the view `log` may use."""
+    signals = (signal.column for signal in catalogue().signals.values())
+    return (*drive_columns(), "tick", "time_s", *signals)
+
+
+@functools.lru_cache(maxsize=256)
+def _parsed(text: str, columns: frozenset[str]) -> Condition:
+    shown = f"the condition {printable(text[:200])!r}"
+    if len(text) > LONGEST_QUERY:
+        raise QuestionError(
+            f"{shown} … has {len(text):,} characters, at most {LONGEST_QUERY:,} are read."
+        )
+    try:
+        tree = _expression(text, shown)
+        _require_plain(tree, columns, shown)
+        sql = _written(tree)
+        if sql is None or _meaning(_expression(sql, shown)) != _meaning(tree):
+            raise QuestionError(f"{shown} cannot be written out again. Say it more simply.")
+    except RecursionError:
+        raise QuestionError(f"{shown} is nested too deeply. Divide it into parts.") from None
+    return Condition(text, f"({sql})")
+
+
+def _expression(text: str, shown: str) -> Tree:
+    """Return what the parser makes of a condition, which must be one expression by itself.
+
+    It stands alone and in parentheses. What closes a parenthesis is no expression alone, and what
+    goes on after the expression (LIMIT, UNION, a second statement) none in parentheses.
+    """
+    alone, enclosed = _parse(f"{text}\n", shown), _parse(f"(\n{text}\n)", shown)
+    template = _parse("true", shown)
+    if alone != enclosed or {**alone, "where_clause": None} != {**template, "where_clause": None}:
+        raise QuestionError(f"{shown} is not one SQL expression.")
+    found: Tree = alone["where_clause"]
+    return found
+
+
+def _parse(text: str, shown: str) -> Tree:
+    try:
+        (serialised,) = _ask("SELECT json_serialize_sql($text::VARCHAR)", _QUERY + text)
+    except (UnicodeEncodeError, duckdb.Error) as error:
+        raise QuestionError(f"{shown} is not valid SQL: {duckdb_message(error)}.") from None
+    answer = json.loads(serialised, object_hook=_without_place)
+    if answer["error"]:
+        reason = " ".join(str(answer.get("error_message")).split())
+        raise QuestionError(f"{shown} is not valid SQL: {reason}.")
+    if len(answer["statements"]) != 1:
+        raise QuestionError(f"{shown} is not one SQL expression.")
+    node: Tree = answer["statements"][0]["node"]
+    return node
+
+
+def _without_place(node: dict[str, Any]) -> dict[str, Any]:
+    """Return a node of the parsed text without where it stood."""
+    return {key: value for key, value in node.items() if key not in _PLACES}
+
+
+def _meaning(value: Any) -> Any:
+    """Return a tree without whether functions were written as operators."""
+    if isinstance(value, dict):
+        return {key: _meaning(part) for key, part in value.items() if key != "is_operator"}
+    return [_meaning(part) for part in value] if isinstance(value, list) else value
+
+
+def _written(tree: Tree) -> str | None:
+    """Return an expression as the parser writes it; None if it cannot."""
+    (template,) = _ask("SELECT json_serialize_sql($text::VARCHAR)", f"{_QUERY}true")
+    query = json.loads(template)
+    query["statements"][0]["node"]["where_clause"] = tree
+    try:
+        (text,) = _ask("SELECT json_deserialize_sql($text::JSON)", json.dumps(query))
+    except duckdb.Error:
+        return None
+    text = str(text)
+    return text.removeprefix(_QUERY) if text.startswith(_QUERY) else None
+
+
+_asking = threading.Lock()
+
+
+@functools.cache
+def _parser() -> duckdb.DuckDBPyConnection:
+    """Return a connection that parses and has nothing else."""
+    return duckdb.connect(":memory:", config={"threads": 1, "enable_external_access": False})
+
+
+def _ask(statement: str, text: str) -> tuple[Any, ...]:
+    with _asking:
+        [row] = _parser().execute(statement, {"text": text}).fetchall()
+    return tuple(row)
+
+
+def _require_plain(tree: Tree, columns: frozenset[str], shown: str) -> None:
+    """Raise `QuestionError` for the first part of an expression that is not allowed."""
+    for problem in problems(tree, columns):
+        raise QuestionError(f"{shown} {problem}")

@@ -1,0 +1,232 @@
+"""A condition is one expression on a drive's columns, and means the same for ever."""
+
+import duckdb
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.errors import QuestionError
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.day_sums import sum_days
+from fleet_slip.grams.fold_sums import sum_cohort
+from fleet_slip.grams.folding import Folding
+from fleet_slip.grams.job import update_grams
+from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.models.score import score_statement
+from fleet_slip.monitoring.monitor import monitor
+from fleet_slip.monitoring.quality import examine_drives
+from fleet_slip.warehouse.condition import asking, drive_columns, parse_condition
+from fleet_slip.warehouse.tables import Warehouse
+from tests.conftest import land, log_rows, random_counts
+from tests.models.test_versions import manifest
+
+LASTING = [
+    "true",
+    "source <> 'scenario'",
+    "adhesion < 0.8 AND mass_kg BETWEEN 1000 AND 2000",
+    "campaign IN ('a', 'test') AND NOT day IS NULL",
+    "CASE WHEN adhesion > 0.7 THEN drive_id = 'd1' ELSE true END",
+    "drive_id LIKE 'd%' ESCAPE '$' OR drive_id SIMILAR TO 'd[0-9]'",
+    "drive_id NOT LIKE 'x%' AND drive_id ILIKE 'D_' AND drive_id GLOB 'd*'",
+    "regexp_matches(drive_id, '[13]$')",
+    "day >= DATE '2024-05-01' - INTERVAL 1 DAY",
+    "day >= '2024-05-01' AND extract(year FROM day) = 2024",
+    "vehicle_id IS NOT DISTINCT FROM 'car-1'",
+    "track IN ['waterford_hills'] -- of the paper",
+    "coalesce(saturated, 0) / 2 <= 1 AND mass_kg % 2 = 0",
+    "TRY_CAST(substring(drive_id FROM 2) AS INT) > 1",
+    "md5(drive_id) < '8'",
+    "adhesion IS TRUE",
+    "\"DAY\" = '2024-05-01' OR vehicle_model = 'it''s'",
+]
+
+NOT_ALONE = [
+    "",
+    "  ",
+    "true) OR (true",
+    "false) UNION ALL SELECT 1 FROM range(1, 9) r(i) WHERE (true",
+    "true UNION ALL SELECT 1 FROM drives WHERE true",
+    "true LIMIT 1",
+    "true GROUP BY 1",
+    "true ORDER BY 1",
+    "true QUALIFY true",
+    "true WINDOW w AS ()",
+    "true USING SAMPLE 1",
+    "true; SELECT 1",
+    "true;",
+    "true, true",
+    "true /*",
+    "true OR",
+    "{condition}",
+    "\ud800",
+    "drive_id = '\0'",
+    "(" * 3000 + "true" + ")" * 3000,
+    "true" + " AND true" * 20_000,
+]
+
+FLEETING = [
+    "random() < 0.5",
+    "day < now()",
+    "day < current_date",
+    "day < today()",
+    "day < get_current_time()",
+    "drive_id < uuid()::VARCHAR",
+    "getenv('HOME') = 'x'",
+    "getvariable('gram_files') IS NULL",
+    "current_setting('threads') > 1",
+    "nextval('x') > 1",
+    "hash(drive_id) % 2 = 0",
+    "day::TIMESTAMPTZ < '2024-05-01'",
+    "day AT TIME ZONE 'UTC' < '2024-05-01'",
+    "error('x')",
+    "txid_current() > 1",
+]
+
+MORE_THAN_COLUMNS = [
+    "drive_id IN (SELECT drive_id FROM log)",
+    "EXISTS (SELECT 1)",
+    "mass_kg > ALL (SELECT 1)",
+    "EXISTS (FROM read_text('/etc/passwd'))",
+    "*",
+    "COLUMNS('mass.*') > 1",
+    "drive_id = $1",
+    "drive_id = ?",
+    "#1 = 1",
+    "n > 1",
+    "sums[1] > 1",
+    "rowid = 1",
+    "grams.n > 1",
+    "sum(mass_kg) OVER () > 1",
+    "count(*) > 1",
+    "list_filter([1], lambda x: x > 1) = [1]",
+    "repeat(drive_id, 1000000000) = 'x'",
+    "replace(drive_id, 'd', 'dddd') = 'x'",
+    "system.main.lower(drive_id) = 'x'",
+    "lower(drive_id ORDER BY 1) = 'x'",
+]
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Warehouse:
+    """A warehouse of four drives with different metadata."""
+    warehouse = Warehouse(LocalFolder(tmp_path_factory.mktemp("condition") / "data"))
+    rng = np.random.default_rng(1)
+    drives = [
+        log_rows(f"d{i}", random_counts(rng, 30), adhesion=0.6 + 0.1 * i, mass_kg=1200.0 + 100 * i)
+        for i in range(4)
+    ]
+    land(warehouse, "one", *drives)
+    update_grams(warehouse)
+    return warehouse
+
+
+@pytest.mark.parametrize("text", LASTING)
+def test_what_stands_in_statements_means_what_was_written(fleet: Warehouse, text: str) -> None:
+    condition = parse_condition(text)
+    drives = load_cohort(fleet, "true").drives
+    with duckdb.connect() as database:
+        database.register("drives", drives)
+        written, meant = (
+            database.execute(f"SELECT drive_id FROM drives WHERE ({where}\n)").fetchall()
+            for where in (text, condition.sql)
+        )
+    assert written == meant
+    assert parse_condition(condition.sql)
+    assert str(condition) == text
+
+
+@pytest.mark.parametrize("text", [*NOT_ALONE, *FLEETING, *MORE_THAN_COLUMNS])
+def test_anything_else_is_refused(text: str) -> None:
+    with pytest.raises(QuestionError) as refused:
+        parse_condition(text)
+    assert str(refused.value).isprintable()
+    assert len(str(refused.value)) < 1500
+
+
+@pytest.mark.parametrize("text", ["true) OR (true", "random() < 0.5", "EXISTS (SELECT 1)"])
+def test_every_way_in_passes_the_same_gate(fleet: Warehouse, text: str) -> None:
+    published = manifest()
+    kept = published.model_copy(
+        update={"trained_on": published.trained_on.model_copy(update={"cohort": text})}
+    )
+    ways = (
+        lambda: load_cohort(fleet, text),
+        lambda: sum_cohort(fleet, Folding(), text),
+        lambda: sum_days(fleet, ["ay"], text),
+        lambda: examine_drives(fleet, text),
+        lambda: score_statement(published, text),
+        lambda: monitor(fleet, ModelVersion(1, published, ""), text),
+        lambda: monitor(fleet, ModelVersion(1, kept, "")),
+    )
+    for way in ways:
+        with pytest.raises(QuestionError, match="the condition"):
+            way()
+
+
+def test_a_score_may_ask_about_rows() -> None:
+    assert "abs(ay_mps2) > 3" in score_statement(manifest(), "abs(ay_mps2) > 3")
+    with pytest.raises(QuestionError, match="ay_mps2"):
+        parse_condition("abs(ay_mps2) > 3")
+
+
+def test_conditions_are_joined_as_they_are_meant() -> None:
+    both = parse_condition("adhesion < 1 OR true") & parse_condition("false")
+    with duckdb.connect() as database:
+        answer = database.execute(f"SELECT {both.sql} FROM (SELECT 2 AS adhesion)").fetchall()
+    assert answer == [(False,)]
+    assert parse_condition(both.text)
+
+
+@settings(max_examples=300)
+@given(
+    st.lists(
+        st.sampled_from(
+            [
+                *"()*,;+-",
+                "--", "/*", "*/", "'", '"', "'x'", "1", "\n",
+                "true", "false", "NULL", "AND", "OR", "NOT", "=", "<", "IN", "IS",
+                "LIKE", "BETWEEN", "drive_id", "adhesion", "day", "UNION",
+                "SELECT", "FROM drives", "WHERE", "LIMIT",
+                "lower", "abs", "CASE", "WHEN", "THEN", "ELSE", "END", "::", "DATE", "EXISTS",
+            ]
+        ),
+        max_size=12,
+    ).map(" ".join)
+)  # fmt: skip
+def test_whatever_passes_cannot_leave_its_parentheses(text: str) -> None:
+    try:
+        condition = parse_condition(text)
+    except QuestionError:
+        return
+    names = {**catalogue().drive_schema.empty_table().to_pydict(), "day": []}
+    with duckdb.connect() as database:
+        columns = ", ".join(
+            f"{'0' if catalogue().drive[n].type != 'string' else repr('x')} AS {n}"
+            if n in catalogue().drive
+            else f"DATE '2024-05-01' AS {n}"
+            for n in names
+        )
+        statement = f"SELECT count(*) FROM (SELECT {columns}) WHERE false AND {condition.sql}"
+        try:
+            assert database.execute(statement).fetchall() == [(0,)]
+        except duckdb.Error as error:
+            assert "syntax" not in str(error).lower()
+
+
+def test_every_column_of_a_drive_may_be_named() -> None:
+    for name in drive_columns():
+        assert parse_condition(f"{name} IS NOT NULL").sql
+
+
+def test_asking_ends_when_the_time_is_over() -> None:
+    condition = parse_condition("true")
+    endless = "SELECT count(*) FROM range(1000000) a(x), range(1000000) b(y) WHERE x * y % 7 = 3"
+    with (
+        duckdb.connect() as database,
+        pytest.raises(QuestionError, match="was not found within"),
+        asking(database, condition, limit_s=0.1),
+    ):
+        database.execute(endless).fetchall()
