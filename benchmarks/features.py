@@ -19,7 +19,7 @@ from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.grams.job import update_grams
-from fleet_slip.regression.crossval import held_out
+from fleet_slip.regression.crossval import held_out_errors
 from fleet_slip.regression.exact import fit
 from fleet_slip.regression.figures import Figures
 from fleet_slip.regression.folds import CohortFolds, by_hash
@@ -65,7 +65,7 @@ def transfer(trained: Sequence[Gram], tested: Sequence[Gram], inputs: Sequence[s
     """Train on one side without a fold, test on the other side of that fold; pool the folds."""
     total = sum(trained[1:], trained[0])
     sums = [
-        held_out(fit(total - mine, inputs, LABEL).model, total - mine, test)
+        held_out_errors(fit(total - mine, inputs, LABEL).model, total - mine, test)
         for mine, test in zip(trained, tested, strict=True)
     ]
     return sum(sums[1:], sums[0]).figures(input_scales()[LABEL])

@@ -1,10 +1,9 @@
-"""Features and feature sets: `configs/features.toml` as types, and the integer SQL they become.
+"""Features and feature sets: `configs/features.toml` as types.
 
 A feature is an integer function of the counts of one row. A feature set is the columns of one kind
 of Gram row, and how a drive's rows are divided into several Gram rows, if they are.
 """
 
-import re
 from collections.abc import Mapping, Sequence
 from decimal import Decimal
 from fractions import Fraction
@@ -15,7 +14,8 @@ from itertools import pairwise
 from pydantic import Field, model_validator
 
 from fleet_slip.canonical import canonical_json, sha256_of
-from fleet_slip.catalogue.signals import COUNT_MAX, Identifier, Signal, SIUnit, catalogue
+from fleet_slip.catalogue.feature_sql import integer_sql, names_in
+from fleet_slip.catalogue.signals import Identifier, Signal, SIUnit, catalogue
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import QuestionError
 from fleet_slip.resources import folder
@@ -25,24 +25,6 @@ PLAIN = "signals"
 
 LAG = "_lag"
 """What the column of a signal's previous value ends in."""
-
-_FUNCTIONS = frozenset({"abs", "sign"})
-_WORD = re.compile(r"[a-z_][a-z0-9_]*")
-_INTEGER_SQL = re.compile(r"[a-z0-9_+\-*() ]+")
-
-
-def integer_sql(text: str) -> str:
-    """Return an expression over counts with every signal widened to 64 bits.
-
-    Raises `ValueError` for anything but integer arithmetic on input signals.
-    """
-    inputs = catalogue().inputs
-    unknown = sorted(set(_WORD.findall(text)) - _FUNCTIONS - set(inputs))
-    if unknown:
-        raise ValueError(f"{', '.join(unknown)}: not an input signal, abs or sign")
-    if not _INTEGER_SQL.fullmatch(text):
-        raise ValueError(f"{text!r} is not integer arithmetic of + - * ( )")
-    return _WORD.sub(lambda m: f"{m[0]}::BIGINT" if m[0] in inputs else m[0], text)
 
 
 def lag_signals(signals: Sequence[str]) -> tuple[str, ...]:
@@ -91,7 +73,7 @@ class Feature(Config):
     @property
     def inputs(self) -> tuple[str, ...]:
         """The signals that it is computed from, in catalogue order."""
-        used = {*_WORD.findall(self.counts), *_WORD.findall(self.divided_by or "")}
+        used = names_in(self.counts) | names_in(self.divided_by or "")
         return tuple(name for name in catalogue().inputs if name in used)
 
     @property
@@ -250,46 +232,3 @@ def input_scales() -> Mapping[str, Fraction]:
     signals = catalogue()
     scales = {name: signals[name].exact_scale for name in signals.gram_signals}
     return scales | {name: one.exact_scale for name, one in features().features.items()}
-
-
-def with_absent(rows: str, absent: Sequence[str]) -> str:
-    """Return a table expression with signals that none of its files has, as nulls."""
-    if not absent:
-        return rows
-    nulls = ", ".join(f"NULL::SMALLINT AS {name}" for name in absent)
-    return f"(SELECT *, {nulls} FROM {rows})"
-
-
-def with_features(rows: str, definitions: Mapping[str, str]) -> str:
-    """Return a subquery: the rows with features as columns of counts, clipped to int16.
-
-    `rows` is a table expression with counts; `definitions` gives the SQL of each feature. The
-    column `clipped` says how many of the features of a row were out of range.
-    """
-    if not definitions:
-        return rows
-    separator = ",\n            "
-    computed = separator.join(f"{sql} AS {name}" for name, sql in definitions.items())
-    inside = separator.join(f"{clipped_sql(name)} AS {name}" for name in definitions)
-    outside = " + ".join(
-        f"coalesce(abs({name}) > {COUNT_MAX}, false)::INTEGER" for name in definitions
-    )
-    return f"""(
-        SELECT * REPLACE (
-            {inside}
-        ),
-            {outside} AS clipped
-        FROM (
-            SELECT *,
-            {computed}
-            FROM {rows}
-        )
-    )"""
-
-
-def clipped_sql(name: str) -> str:
-    """Return the SQL of an integer column clipped to the range of counts; null stays null."""
-    return (
-        f"CASE WHEN {name} > {COUNT_MAX} THEN {COUNT_MAX} "
-        f"WHEN {name} < -{COUNT_MAX} THEN -{COUNT_MAX} ELSE {name} END::SMALLINT"
-    )

@@ -5,15 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
-from fleet_slip.catalogue.features import (
-    LAG,
-    PLAIN,
-    FeatureCatalogue,
-    Regime,
-    features,
-    with_absent,
-    with_features,
-)
+from fleet_slip.catalogue.feature_sql import with_absent, with_features
+from fleet_slip.catalogue.features import LAG, PLAIN, FeatureCatalogue, Regime, features
 from fleet_slip.catalogue.signals import SignalCatalogue
 from fleet_slip.resources import read_sql
 

@@ -11,7 +11,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, FiniteFloat, PlainSerializer, PlainValidator
 
-from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN, Identifier, catalogue
+from fleet_slip.catalogue.feature_sql import require_integer_sql
+from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN, Identifier
 from fleet_slip.config import Config
 from fleet_slip.errors import ConfigError
 
@@ -40,21 +41,6 @@ Scale = Annotated[Decimal, Field(ge=Decimal("1e-12"), le=Decimal("1e12"), allow_
 
 Count = Annotated[int, Field(ge=0, lt=2**63)]
 
-_SQL_WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
-_SQL_CHARACTERS = re.compile(r"[A-Za-z0-9_+*/()<>=: -]{0,5000}")
-_SQL_WORDS = frozenset({"CASE", "WHEN", "THEN", "ELSE", "END", "BIGINT", "abs", "sign"})
-
-
-def _integer_arithmetic(sql: str) -> str:
-    """Return the SQL of a feature. Raises `ValueError` if it is more than integer arithmetic.
-
-    A manifest may come from anywhere, and this is the one text of it that becomes SQL.
-    """
-    words = set(_SQL_WORD.findall(sql)) - _SQL_WORDS - set(catalogue().signals)
-    if words or not _SQL_CHARACTERS.fullmatch(sql) or "--" in sql or "/*" in sql:
-        raise ValueError("is not integer arithmetic on the counts of signals")
-    return sql
-
 
 class ModelTerm(Config):
     """One signal of a model: `label = intercept + sum(coefficient * signal)`, in SI units.
@@ -67,7 +53,7 @@ class ModelTerm(Config):
     column: Identifier
     unit: str
     scale: Scale
-    sql: Annotated[str, AfterValidator(_integer_arithmetic)] = ""
+    sql: Annotated[str, AfterValidator(require_integer_sql)] = ""
     coefficient: FiniteFloat
     coefficient_exact: ExactFraction
 

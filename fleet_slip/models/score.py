@@ -3,7 +3,7 @@
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from fleet_slip.catalogue.features import with_features
+from fleet_slip.catalogue.feature_sql import with_features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError
 from fleet_slip.models.manifest import Manifest

@@ -90,10 +90,9 @@ def cross_validate(
 
     Raises `DataError` if a training fold cannot be fitted.
     """
-    tests = []
-    for fold in folds.grams:
-        training = folds.total - fold
-        tests.append(held_out(procedure(training), training, fold))
+    tests = [
+        held_out_errors(procedure(training), training, test) for training, test in folds.splits()
+    ]
     return assemble(name, folds, tests, procedure(folds.total), scales)
 
 
@@ -128,6 +127,6 @@ def cross_validate_inputs(
     return cross_validate(name, folds, least_squares(inputs, label), scales)
 
 
-def held_out(model: LinearModel, training: Gram, test: Gram) -> ErrorSums:
+def held_out_errors(model: LinearModel, training: Gram, test: Gram) -> ErrorSums:
     """Return the error sums on a test Gram of a model that was fitted on the training Gram."""
     return error_sums(model, test, Fraction(training.sum(model.label), training.n))

@@ -8,7 +8,7 @@ fewer than about five drives a fold, one may be empty, which is an error and not
 """
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -108,6 +108,19 @@ class Folds:
     def total(self) -> Gram:
         """The Gram of all folds."""
         return sum(self.grams[1:], self.grams[0])
+
+    def splits(self) -> Iterator[tuple[Gram, Gram]]:
+        """Yield for each fold the Gram of all others, to train on, and its own, to test on."""
+        for fold in self.grams:
+            yield self.total - fold, fold
+
+    def without(self, number: int, drives: int) -> "Folds":
+        """Return the other folds, which hold so many drives."""
+        return Folds(
+            self.grams[:number] + self.grams[number + 1 :],
+            self.names[:number] + self.names[number + 1 :],
+            drives,
+        )
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from fleet_slip.regression.crossval import (
     CrossValidation,
     assemble,
     cross_validate,
-    held_out,
+    held_out_errors,
     least_squares,
 )
 from fleet_slip.regression.drive_moments import DriveMoments
@@ -30,6 +30,10 @@ from fleet_slip.regression.winner import choose
 
 CROSS_VALIDATION = "cross-validation"
 """The criterion that cross-validates every nested model and applies the one-standard-error rule."""
+
+
+FEWEST_FOLDS = 3
+"""To make a choice again inside the training folds, two of them must be left."""
 
 
 @dataclass(frozen=True)
@@ -144,22 +148,16 @@ def cross_validate_selection(
     for number, test in enumerate(folds.grams):
         rest = _without(training, fold, number)
         model = select_nested(rest, inputs, label, rule).fit.model
-        tests.append(held_out(model, rest.folds.total, test))
+        tests.append(held_out_errors(model, rest.folds.total, test))
     chosen = select_nested(training, inputs, label, rule).fit.model
     return assemble(name, folds, tests, chosen, training.scales)
 
 
 def _without(training: Training, fold: IntArray, number: int) -> Training:
-    folds = training.folds
-    kept = [i for i in range(len(folds.grams)) if i != number]
-    if len(kept) < 2:
+    if len(training.folds.grams) < FEWEST_FOLDS:
         raise QuestionError("choosing inside the training folds needs at least three folds.")
     drives = training.drives
-    rest = Folds(
-        tuple(folds.grams[i] for i in kept),
-        tuple(folds.names[i] for i in kept),
-        int(np.count_nonzero(fold != number)),
-    )
+    rest = training.folds.without(number, int(np.count_nonzero(fold != number)))
     return Training(
         rest, drives.take(fold != number) if drives is not None else None, training.scales
     )

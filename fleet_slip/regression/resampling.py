@@ -7,6 +7,7 @@ products. The exact figures are those of `crossval`; these say how far to trust 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -73,9 +74,13 @@ def bootstrap_correlations(products: FloatArray, replicates: int, seed: int) -> 
     n, e, ee, y, ye, yy = totals.T
     # The prediction is the label plus the error.
     p, py, pp = y + e, yy + ye, yy + 2 * ye + ee
-    variances = (pp - p * p / n) * (yy - y * y / n)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray((py - p * y / n) / np.sqrt(variances))
+        return np.asarray(_correlation(n, p, pp, py, y, yy))
+
+
+def _correlation(n: Any, p: Any, pp: Any, py: Any, y: Any, yy: Any) -> Any:
+    """Return the correlation of predictions p with labels y from sums over n rows."""
+    return (py - p * y / n) / np.sqrt((pp - p * p / n) * (yy - y * y / n))
 
 
 def bootstrap_coefficients(drives: DriveMoments, replicates: int, seed: int) -> FloatArray:
@@ -148,12 +153,13 @@ def repeated_cross_validation(
         member = (fold[:, None, :] == np.arange(folds)[:, None]).astype(np.float64)
         totals = member.reshape(size * folds, -1) @ drives.packed
         for tests in drives.matrix(totals).reshape(size, folds, drives.size, drives.size):
-            figures.append(_pooled(tests, solve(tests.sum(axis=0) - tests)))
+            figures.append(_correlation_and_rmse(tests, solve(tests.sum(axis=0) - tests)))
     correlations, rmse = np.array(figures).T
     return RepeatedCrossValidation(correlations, rmse * float(drives.spread[-1]))
 
 
-def _pooled(tests: FloatArray, solutions: FloatArray) -> tuple[float, float]:
+def _correlation_and_rmse(tests: FloatArray, solutions: FloatArray) -> tuple[float, float]:
+    """Return the figures of models, one a fold, on the moments of their test rows together."""
     inputs, cross = tests[:, :-1, :-1], tests[:, :-1, -1]
     n, y, yy = tests[:, 0, 0].sum(), tests[:, 0, -1].sum(), tests[:, -1, -1].sum()
     p = np.einsum("fi,fi->", tests[:, 0, :-1], solutions)
@@ -161,8 +167,7 @@ def _pooled(tests: FloatArray, solutions: FloatArray) -> tuple[float, float]:
     py = np.einsum("fi,fi->", cross, solutions)
     v = np.concatenate([solutions, -np.ones((len(solutions), 1))], axis=1)
     error = np.einsum("fi,fij,fj->", v, tests, v)
-    correlation = (py - p * y / n) / np.sqrt((pp - p * p / n) * (yy - y * y / n))
-    return float(correlation), math.sqrt(max(float(error), 0.0) / n)
+    return float(_correlation(n, p, pp, py, y, yy)), math.sqrt(max(float(error), 0.0) / n)
 
 
 def _congruence(change: FloatArray) -> FloatArray:

@@ -97,7 +97,7 @@ def held_out_coefficients(selection: Selection, model: CrossValidation) -> pa.Ta
     folds = selection.cohort.folds(folding.by, folding.count).serving(model.signals, label)
     fit = least_squares(model.signals, label)
     scales = {name: catalogue()[name].exact_scale for name in (*model.signals, label)}
-    models = [fit(folds.total - fold).physical(scales) for fold in folds.grams]
+    models = [fit(training).physical(scales) for training, _ in folds.splits()]
     fold_of = dict(zip(drives["drive_id"].to_pylist(), assignment.fold.tolist(), strict=True))
     return pa.Table.from_pylist(
         [{"drive_id": drive, **_numbers(models[fold])} for drive, fold in fold_of.items()]

@@ -14,7 +14,7 @@ from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.cohort import Cohort, assign_folds
 from fleet_slip.grams.folding import FOLD_KEYS, ROW_FOLDS, Folding
 from fleet_slip.grams.statement import UNKNOWN_PART
-from fleet_slip.regression.crossval import held_out
+from fleet_slip.regression.crossval import held_out_errors
 from fleet_slip.regression.drive_moments import require_serving_drives
 from fleet_slip.regression.exact import LinearModel, fit
 from fleet_slip.regression.figures import ErrorSums, Figures
@@ -140,9 +140,9 @@ def compare_regimes(
         cohort.drives[FOLD_KEYS[folding.by]].to_pylist(), folding.by, folding.count
     )
     grid = _Grid.of(cohort, inputs, regime, len(order), assignment.fold, len(assignment.names))
-    pooled = [grid.pooled(f) for f in range(grid.folds)]
+    pooled = [grid.fit_together(f) for f in range(grid.folds)]
     sums = {
-        (r, f): grid.tested(r, f, pooled[f])
+        (r, f): grid.test(r, f, pooled[f])
         for r in range(len(order))
         for f in range(grid.folds)
         if grid.grams[r][f].n
@@ -217,19 +217,19 @@ class _Grid:
         grams = tuple(tuple(cells[r * folds : (r + 1) * folds]) for r in range(regimes))
         return cls(tuple(inputs), grams, sum(cells[1:], cells[0]))
 
-    def pooled(self, fold: int) -> tuple[LinearModel, Gram]:
+    def fit_together(self, fold: int) -> tuple[LinearModel, Gram]:
         """Return the model of all regimes without a fold, and the rows it was fitted on."""
         mine = [row[fold] for row in self.grams]
         training = self.total - sum(mine[1:], mine[0])
         return fit(training, self.inputs, catalogue().label).model, training
 
-    def tested(
+    def test(
         self, regime: int, fold: int, pooled: tuple[LinearModel, Gram]
     ) -> tuple[ErrorSums, ErrorSums, bool]:
         """Return the errors on one regime and fold by the pooled model and the regime's own."""
         test = self.grams[regime][fold]
         model, everything = pooled
-        by_pooled = held_out(model, everything, test)
+        by_pooled = held_out_errors(model, everything, test)
         others = [gram for f, gram in enumerate(self.grams[regime]) if f != fold]
         training = sum(others[1:], others[0])
         if training.n < ROWS_PER_COEFFICIENT * (len(self.inputs) + 1):
@@ -238,7 +238,7 @@ class _Grid:
             own = fit(training, self.inputs, catalogue().label).model
         except (DataError, QuestionError):
             return by_pooled, by_pooled, False
-        return by_pooled, held_out(own, everything, test), True
+        return by_pooled, held_out_errors(own, everything, test), True
 
 
 def _total(sums: Sequence[ErrorSums]) -> ErrorSums:

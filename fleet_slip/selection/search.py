@@ -18,6 +18,7 @@ from fleet_slip.regression.evidence import Evidence
 from fleet_slip.regression.nested import nested_fits
 from fleet_slip.regression.nested_choice import (
     CROSS_VALIDATION,
+    FEWEST_FOLDS,
     Rule,
     Training,
     cross_validate_nested,
@@ -30,9 +31,6 @@ from fleet_slip.regression.winner import Winner, choose
 
 ALL_SUBSETS = "all-subsets"
 """Instead of a ranking: the best subset of every size."""
-
-FEWEST_FOLDS = 3
-"""To make a choice again inside the training folds, two of them must be left."""
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from fleet_slip.regression.crossval import (
     Procedure,
     assemble,
     cross_validate,
-    held_out,
+    held_out_errors,
     least_squares,
 )
 from fleet_slip.regression.evidence import Evidence
@@ -24,9 +24,9 @@ from fleet_slip.regression.exact import Scales
 from fleet_slip.regression.folds import Folds
 from fleet_slip.regression.lars import fit_lasso
 from fleet_slip.regression.nested import nested_fits
+from fleet_slip.regression.nested_choice import FEWEST_FOLDS
 from fleet_slip.regression.pace import ESTIMATORS, Estimator, shrink
 from fleet_slip.regression.ridge import fit_ridge
-from fleet_slip.selection.search import FEWEST_FOLDS
 
 PENALTIES = tuple(float(10.0**exponent) for exponent in np.arange(-6, 0.01, 0.5))
 """Penalties on the correlation matrix that ridge and lasso choose from."""
@@ -93,13 +93,9 @@ def _penalised(
 ) -> Shrunk:
     tests = []
     for i, test in enumerate(folds.grams):
-        rest = Folds(
-            tuple(gram for j, gram in enumerate(folds.grams) if j != i),
-            tuple(fold for j, fold in enumerate(folds.names) if j != i),
-            folds.drives,
-        )
-        training = rest.total
-        tests.append(held_out(make(_best_penalty(rest, make))(training), training, test))
+        rest = folds.without(i, folds.drives)
+        model = make(_best_penalty(rest, make))(rest.total)
+        tests.append(held_out_errors(model, rest.total, test))
     penalty = _best_penalty(folds, make)
     return Shrunk(assemble(name, folds, tests, make(penalty)(folds.total), scales), penalty)
 
@@ -110,9 +106,8 @@ def _best_penalty(folds: Folds, make: Callable[[float], Procedure]) -> float:
     def error(penalty: float) -> float:
         procedure = make(penalty)
         total = 0.0
-        for test in folds.grams:
-            training = folds.total - test
-            total += float(held_out(procedure(training), training, test).squared_error)
+        for training, test in folds.splits():
+            total += float(held_out_errors(procedure(training), training, test).squared_error)
         return total
 
     return min(PENALTIES, key=error)

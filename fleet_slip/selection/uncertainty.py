@@ -57,8 +57,8 @@ def estimate_uncertainty(
     ready = drive_folds(cohort, model.signals, folding)
     interval = None
     if bootstrap:
-        folds = ready.training.folds
-        models = [fit(folds.total - test, model.signals, label).model for test in folds.grams]
+        splits = ready.training.folds.splits()
+        models = [fit(training, model.signals, label).model for training, _ in splits]
         products = held_out_products(ready.moments, ready.fold, models)
         interval = percentile_interval(bootstrap_correlations(products, bootstrap, SEED))
     repeated = None

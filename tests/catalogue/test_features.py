@@ -13,7 +13,8 @@ import pyarrow as pa
 import pytest
 
 from fleet_slip.catalogue import features as features_module
-from fleet_slip.catalogue.features import features, lag_signals, load_features, with_features
+from fleet_slip.catalogue.feature_sql import with_features
+from fleet_slip.catalogue.features import features, lag_signals, load_features
 from fleet_slip.catalogue.signals import COUNT_MAX, catalogue
 from fleet_slip.delta import Change, Unit
 from fleet_slip.errors import ConfigError, DataError, QuestionError
