@@ -100,9 +100,3 @@ def keep(warehouse: Warehouse, content: Mapping[str, Any]) -> Document:
         return documents.create(newest + 1, content)
 
     return documents.after_newest(attempt)
-
-
-def read_latest(warehouse: Warehouse) -> Document | None:
-    """Return the latest evaluation, or None before the first."""
-    numbers = folder(warehouse).numbers()
-    return folder(warehouse).read(numbers[-1]) if numbers else None

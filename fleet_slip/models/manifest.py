@@ -11,8 +11,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, FiniteFloat, PlainSerializer, PlainValidator
 
-from fleet_slip.catalogue.feature_sql import require_integer_sql
-from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN, Identifier
+from fleet_slip.catalogue.feature_sql import names_in, require_integer_sql
+from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN, Identifier, catalogue
 from fleet_slip.config import Config
 from fleet_slip.errors import ConfigError
 
@@ -67,7 +67,7 @@ class ModelTerm(Config):
         """The logged signals that it is computed from: itself, or what its SQL names."""
         if not self.sql:
             return (self.signal,)
-        words = {*_SQL_WORD.findall(self.sql)}
+        words = names_in(self.sql)
         return tuple(name for name in catalogue().signals if name in words)
 
 

@@ -13,7 +13,7 @@ import pyarrow as pa
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.counts import round_to_counts
-from fleet_slip.catalogue.features import with_features
+from fleet_slip.catalogue.feature_sql import with_features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError
 from fleet_slip.models.frames import open_frame

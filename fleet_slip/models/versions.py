@@ -123,13 +123,6 @@ class Registry:
         """Return the moves of a model's aliases."""
         return AliasHistory(DocumentFolder(self.folder / name / "history"))
 
-    def publish(self, manifest: Manifest) -> ModelVersion:
-        """Make a manifest the next version of its model, and its champion."""
-        version = self.add(manifest)
-        history = self.history(manifest.name)
-        history.decide(lambda newest: self.make_champion(version, after=newest) or None)
-        return version
-
     def add(self, manifest: Manifest) -> ModelVersion:
         """Make a manifest the next version of its model, to which nothing points yet.
 

@@ -1,15 +1,12 @@
-"""Takes GPS fixes away from a drive: a city's streets, or a tunnel.
+"""Where a drive has no GPS fix: in a city's streets, or a tunnel.
 
 The pattern is drawn from a generator that the caller seeds, so that every estimator meets the same.
-Fixes that the log itself has not are not brought back.
 """
-
-from dataclasses import replace
 
 import numpy as np
 
 from fleet_slip.arrays import BoolArray
-from fleet_slip.observers.signals import STEP_S, DriveSignals
+from fleet_slip.observers.signals import STEP_S
 
 URBAN_FIX_S = 15.0
 URBAN_LOST_S = 10.0
@@ -35,12 +32,3 @@ def tunnel(rows: int, begin_s: float) -> BoolArray:
     time_s = np.arange(rows) * STEP_S
     lost: BoolArray = (time_s >= begin_s) & (time_s < begin_s + TUNNEL_S)
     return lost
-
-
-def without_fixes(drive: DriveSignals, lost: BoolArray) -> DriveSignals:
-    """Return the drive without the GPS fixes where `lost` is true."""
-    return replace(
-        drive,
-        gps_vx_mps=np.where(lost, np.nan, drive.gps_vx_mps),
-        gps_vy_mps=np.where(lost, np.nan, drive.gps_vy_mps),
-    )

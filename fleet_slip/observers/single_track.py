@@ -62,12 +62,6 @@ class SingleTrack:
             grip_rear_n=2 * (c.friction - c.friction_per_load * rear) * rear,
         )
 
-    def steady_sideslip_rad(self, vx_mps: float, yaw_rate_rad_s: float) -> float:
-        """Return β of steady cornering, arctan(b r / vx − a m vx r / (Cr L))."""
-        wheelbase = self.front_m + self.rear_m
-        slip = self.front_m * self.mass_kg * vx_mps / (self.stiffness_rear_n * wheelbase)
-        return float(np.arctan(yaw_rate_rad_s * (self.rear_m / vx_mps - slip)))
-
 
 class StateSpace(NamedTuple):
     """ẋ = A x + B δ for every row of a drive, and the lateral acceleration C x + D δ.

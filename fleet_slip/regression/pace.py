@@ -6,13 +6,11 @@ sequence, pace4 selects dimensions, pace6 shrinks; all three with chi-square mix
 subset and eb do the same with normal mixtures of signed effects.
 """
 
-import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.errors import QuestionError
 from fleet_slip.regression.exact import LinearModel
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.mixture import (
@@ -36,46 +34,20 @@ _CERTAIN_SQUARE = 100.0
 _CERTAIN = 10.0
 
 
-def pace(
-    gram: Gram,
-    inputs: Sequence[str],
-    label: str,
-    estimator: str,
-    *,
-    weka_compatible: bool = False,
-) -> LinearModel:
-    """Return the Pace regression of counts, in backward-elimination order.
-
-    By the theory, the constant is estimated as it is. With `weka_compatible` it takes part in the
-    mixture and may be shrunk, and the estimators have the deviations of WEKA 3.9's
-    PaceRegression: subset does what nested does, and the expected contributions of pace2 and
-    pace4 are WEKA's. Raises `QuestionError` for an unknown estimator, `DataError` for
-    dependent signals or a label without noise.
-    """
-    known = WEKA_ESTIMATORS if weka_compatible else ESTIMATORS
-    if estimator not in known:
-        raise QuestionError(f"unknown estimator {estimator!r}. Known: {', '.join(known)}.")
-    return shrink(gram, inputs, label, known[estimator], constant=weka_compatible)
-
-
 def shrink(
     gram: Gram, inputs: Sequence[str], label: str, estimator: Estimator, *, constant: bool
 ) -> LinearModel:
     """Return the model of counts whose orthogonal responses an estimator has changed.
 
     The order is that of backward elimination; `constant` says whether the response of the
-    constant is among those to change. Raises `DataError` as `pace` does.
+    constant is among those to change: by the theory it is not. Raises `DataError` for dependent
+    signals or a label without noise.
     """
     basis = OrthogonalResponses.of(gram, backward(gram, inputs, label), label)
     a = basis.responses
     if constant:
         return basis.model(estimator(a))
     return basis.model(np.concatenate([a[:1], estimator(a[1:])]))
-
-
-def threshold(price: float) -> Estimator:
-    """Return the estimator that drops the dimensions with A_j below a price."""
-    return lambda a: np.where(np.abs(a) < math.sqrt(price), 0.0, a)
 
 
 def james_stein(a: FloatArray) -> FloatArray:
@@ -131,24 +103,18 @@ def empirical_bayes(a: FloatArray) -> FloatArray:
 
 def nested(a: FloatArray) -> FloatArray:
     """Keep the leading dimensions with the largest sum of E[2 a a* - a^2 | a]."""
-    return _leading(a, _normal_contributions(a))
+    return _leading(a, normal_contributions(a))
 
 
 def subset(a: FloatArray) -> FloatArray:
     """Keep the dimensions with E[2 a a* - a^2 | a] > 0."""
-    return np.where(_normal_contributions(a) > 0, a, 0.0)
+    return np.where(normal_contributions(a) > 0, a, 0.0)
 
 
 def _leading(a: FloatArray, contributions: FloatArray) -> FloatArray:
     total = np.concatenate([[0.0], np.cumsum(contributions)])
     kept = int(np.argmax(total))
     return np.where(np.arange(len(a)) < kept, a, 0.0)
-
-
-def _leading_weka(a: FloatArray, contributions: FloatArray) -> FloatArray:
-    """Keep the first dimension, the constant, in any case."""
-    kept = int(np.argmax(np.cumsum(contributions)))
-    return np.where(np.arange(len(a)) <= kept, a, 0.0)
 
 
 def _chi_square(a: FloatArray) -> Mixture:
@@ -161,7 +127,8 @@ def posterior_root(mixture: Mixture, size: float) -> FloatArray:
     return posterior(root, size, folded_density)
 
 
-def _normal_contributions(a: FloatArray) -> FloatArray:
+def normal_contributions(a: FloatArray) -> FloatArray:
+    """Return E[2 a a* - a^2 | a] under a normal mixture."""
     mixture = fit_mixture(a, NormalKernel())
     return np.array(
         [float(posterior(mixture, x, signed_density) @ (2 * x * mixture.points - x * x)) for x in a]
@@ -170,10 +137,10 @@ def _normal_contributions(a: FloatArray) -> FloatArray:
 
 def _chi_square_contributions(a: FloatArray) -> FloatArray:
     """Return H(A) = E[2 a a* - a^2 | A], the sign of a* unknown."""
-    return np.asarray(2 * np.abs(a) * _half_contributions(a, np.sqrt))
+    return np.asarray(2 * np.abs(a) * half_contributions(a, np.sqrt))
 
 
-def _half_contributions(a: FloatArray, effect: Callable[[FloatArray], FloatArray]) -> FloatArray:
+def half_contributions(a: FloatArray, effect: Callable[[FloatArray], FloatArray]) -> FloatArray:
     """Return int h dG / int [phi(a-m) + phi(a+m)] dG = H / (2a).
 
     h = (e - a/2) phi(a - m) - (e + a/2) phi(a + m), with the effect e = m by the theory.
@@ -187,21 +154,6 @@ def _half_contributions(a: FloatArray, effect: Callable[[FloatArray], FloatArray
     return np.array(result)
 
 
-def _weka_pace2(a: FloatArray) -> FloatArray:
-    kept = _leading_weka(a, _half_contributions(a, lambda points: points))
-    return np.where(kept**2 <= _NEGLIGIBLE_SQUARE, 0.0, kept)
-
-
-def _weka_pace4(a: FloatArray) -> FloatArray:
-    positive = _half_contributions(a, lambda points: points) > 0
-    return np.where(positive & (a**2 > _NEGLIGIBLE_SQUARE), a, 0.0)
-
-
-def _weka_nested(a: FloatArray) -> FloatArray:
-    kept = _leading_weka(a, _normal_contributions(a))
-    return np.where(np.abs(kept) <= _NEGLIGIBLE, 0.0, kept)
-
-
 ESTIMATORS: dict[str, Estimator] = {
     "ols": lambda a: a,
     "james-stein": james_stein,
@@ -212,14 +164,4 @@ ESTIMATORS: dict[str, Estimator] = {
     "eb": empirical_bayes,
     "nested": nested,
     "subset": subset,
-}
-
-WEKA_ESTIMATORS: dict[str, Estimator] = {
-    "ols": lambda a: a,
-    "pace2": _weka_pace2,
-    "pace4": _weka_pace4,
-    "pace6": pace6,
-    "eb": empirical_bayes,
-    "nested": _weka_nested,
-    "subset": _weka_nested,
 }

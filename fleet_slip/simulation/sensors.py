@@ -145,7 +145,7 @@ class Recorder:
         noise: NDArray[np.float32],
         bias_and_std: tuple[float, float],
     ) -> None:
-        counts, clipped = _noisy_counts(physical, noise, bias_and_std, catalogue()[name])
+        counts, clipped = noisy_counts(physical, noise, bias_and_std, catalogue()[name])
         self._counts.setdefault(name, []).append(counts)
         self._saturated += clipped
 
@@ -167,29 +167,16 @@ def _joined(parts: list[NDArray[Scalar]]) -> NDArray[Scalar]:
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
-def measure(
-    truth: Mapping[str, FloatArray], sensors: Sensors, generator: np.random.Generator
-) -> Measurement:
-    """Measure one drive in one block; see `Recorder`."""
-    recorder = Recorder(sensors, generator)
-    recorder.record(truth)
-    return recorder.measurement()
-
-
-def quantise(physical: FloatArray, signal: Signal) -> tuple[NDArray[np.int16], int]:
-    """Return `physical / scale` as counts, and how many values were clipped to the valid range.
-
-    Halves round to even. NaN is clipped as well, to the lower end.
-    """
-    return _noisy_counts(physical, np.zeros(len(physical), dtype=np.float32), EXACT, signal)
-
-
-def _noisy_counts(
+def noisy_counts(
     physical: FloatArray,
     noise: NDArray[np.float32],
     bias_and_std: tuple[float, float],
     signal: Signal,
 ) -> tuple[NDArray[np.int16], int]:
+    """Return `(physical + bias + std * noise) / scale` as counts, and how many were clipped.
+
+    Halves round to even. NaN is clipped as well, to the lower end.
+    """
     counts = np.empty(len(physical), dtype=np.int16)
     valid = (float(signal.min_count), float(signal.max_count))
     clipped = _quantise(physical, noise, bias_and_std, float(signal.scale), valid, counts)

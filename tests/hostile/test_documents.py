@@ -12,7 +12,7 @@ from fleet_slip.files.documents import DocumentFolder, checksum
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.models.versions import Registry
 from tests.conftest import path_of
-from tests.models.test_versions import manifest
+from tests.models.manifests import manifest, publish
 
 NAME = manifest().name
 
@@ -21,7 +21,7 @@ NAME = manifest().name
 def registry(tmp_path: Path) -> Registry:
     """A registry with one version."""
     registry = Registry(LocalFolder(tmp_path / "models"))
-    registry.publish(manifest())
+    publish(registry, manifest())
     return registry
 
 

@@ -13,7 +13,7 @@ from fleet_slip.models.versions import Registry
 from fleet_slip.progress import no_progress
 from fleet_slip.warehouse.tables import Warehouse
 from tests.conftest import land, log_rows, path_of, random_counts
-from tests.models.test_versions import manifest
+from tests.models.manifests import manifest, publish
 
 
 @pytest.mark.parametrize("umask", [0o022, 0o077])
@@ -23,7 +23,7 @@ def test_nobody_gets_more_rights_than_the_umask_gives(tmp_path: Path, umask: int
         warehouse = Warehouse(LocalFolder(tmp_path / "data"))
         land(warehouse, "one", log_rows("d", random_counts(np.random.default_rng(1), 20)))
         update_grams(warehouse, no_progress)
-        Registry(warehouse.root / "models").publish(manifest())
+        publish(Registry(warehouse.root / "models"), manifest())
     finally:
         os.umask(old)
     files = [*path_of(warehouse.root).rglob("*")]

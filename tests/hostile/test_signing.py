@@ -14,7 +14,7 @@ from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.models.signing import VERIFY_VARIABLE, make_keys
 from fleet_slip.models.versions import Registry
 from tests.conftest import RunCommand, path_of
-from tests.models.test_versions import manifest
+from tests.models.manifests import manifest, publish
 
 pytest.importorskip("cryptography", reason="signatures need the extra 'signing'")
 
@@ -29,7 +29,7 @@ def key(tmp_path: Path) -> Path:
 def signed(tmp_path: Path, key: Path, monkeypatch: pytest.MonkeyPatch) -> Registry:
     """A registry with one signed version, where signatures are asked for."""
     registry = Registry(LocalFolder(tmp_path / "models"), key)
-    registry.publish(manifest())
+    publish(registry, manifest())
     monkeypatch.setenv(VERIFY_VARIABLE, f"{key}.pub")
     return registry
 
@@ -59,7 +59,7 @@ def test_a_signed_version_is_loaded(signed: Registry) -> None:
 
 def test_a_signature_leaves_the_document_as_it_is(signed: Registry, tmp_path: Path) -> None:
     unsigned = Registry(LocalFolder(tmp_path / "others"))
-    unsigned.publish(manifest())
+    publish(unsigned, manifest())
     assert version_file(signed).read_bytes() == version_file(unsigned).read_bytes()
     assert not version_file(unsigned, suffix="sig").exists()
 
@@ -100,7 +100,7 @@ def test_another_key_is_refused(
 def test_an_unsigned_version_is_refused_until_it_is_signed(
     tmp_path: Path, key: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    Registry(LocalFolder(tmp_path / "models")).publish(manifest())
+    publish(Registry(LocalFolder(tmp_path / "models")), manifest())
     monkeypatch.setenv(VERIFY_VARIABLE, f"{key}.pub")
     registry = Registry(LocalFolder(tmp_path / "models"), key)
     with pytest.raises(RefusedError, match=r"is not signed.*fleet-slip sign"):
@@ -130,12 +130,12 @@ def test_keys_that_are_none_are_told_without_quoting_them(
 def test_a_key_that_cannot_sign_leaves_no_version_behind(signed: Registry, key: Path) -> None:
     key.chmod(0o644)
     with pytest.raises(ConfigError, match="chmod 600"):
-        signed.publish(manifest(Fraction(1, 2)))
+        publish(signed, manifest(Fraction(1, 2)))
     assert signed.versions(manifest().name) == [1]
 
 
 def test_there_is_no_way_back_to_what_is_not_signed(signed: Registry, key: Path) -> None:
-    signed.publish(manifest(Fraction(1, 2)))
+    publish(signed, manifest(Fraction(1, 2)))
     version_file(signed, suffix="sig").unlink()
     with pytest.raises(RefusedError, match="not signed"):
         signed.rollback(manifest().name, "champion")
@@ -148,7 +148,7 @@ def test_the_command_line_makes_keys_signs_and_refuses(
     made = run_command("keygen", "mine")
     assert made.exit_code == 0
     assert (tmp_path / "mine").read_text().splitlines()[1] not in made.stderr
-    Registry(LocalFolder(tmp_path / "data" / "models")).publish(manifest())
+    publish(Registry(LocalFolder(tmp_path / "data" / "models")), manifest())
     asking = {**os.environ, VERIFY_VARIABLE: "mine.pub"}
     name = manifest().name
     assert run_command("show", name, env=asking).exit_code == 7

@@ -2,7 +2,6 @@
 
 import json
 import multiprocessing
-from decimal import Decimal
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -13,49 +12,14 @@ from fleet_slip.errors import QuestionError, RefusedError, StorageError
 from fleet_slip.files.documents import Document, DocumentFolder
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.models.aliases import CHAMPION, AliasHistory
-from fleet_slip.models.manifest import (
-    CrossValidated,
-    Manifest,
-    ModelLabel,
-    ModelTerm,
-    SelectedBy,
-    TrainedOn,
-)
 from fleet_slip.models.versions import Registry
-
-
-def manifest(coefficient: Fraction = Fraction(1, 3), name: str = "sideslip") -> Manifest:
-    return Manifest(
-        name=name,
-        label=ModelLabel(
-            signal="sideslip", column="sideslip_rad", unit="rad", scale=Decimal("0.0001")
-        ),
-        intercept=0.0,
-        intercept_exact=Fraction(0),
-        terms=(
-            ModelTerm(
-                signal="ay",
-                column="ay_mps2",
-                unit="m/s^2",
-                scale=Decimal("0.001"),
-                coefficient=float(coefficient),
-                coefficient_exact=coefficient,
-            ),
-        ),
-        cross_validation=CrossValidated(
-            folds_by="drive", folds=5, correlation=0.99, correlation_standard_error=0.001,
-            rmse_deg=0.1, error_mean_deg=0.0, error_std_deg=0.1, condition_number=1.0,
-        ),
-        trained_on=TrainedOn(cohort="true", drives=3, rows=300, logs_version=1, grams_version=1),
-        selected_by=SelectedBy(model_list="table1", model="1", reason="best", config_sha256="0"),
-        package_version="0",
-    )  # fmt: skip
+from tests.models.manifests import manifest, publish
 
 
 def test_versions_are_consecutive_and_the_latest_published_is_champion(tmp_path: Path) -> None:
     registry = Registry(LocalFolder(tmp_path))
     for number in (1, 2, 3):
-        assert registry.publish(manifest(Fraction(number))).version == number
+        assert publish(registry, manifest(Fraction(number))).version == number
     assert registry.versions("sideslip") == [1, 2, 3]
     assert registry.resolve("sideslip").version == 3
     assert registry.resolve("sideslip@2").manifest.terms[0].coefficient == 2.0
@@ -64,7 +28,7 @@ def test_versions_are_consecutive_and_the_latest_published_is_champion(tmp_path:
 
 def test_a_manifest_keeps_every_digit(tmp_path: Path) -> None:
     exact = Fraction(123456789012345678901, 98765432109876543210987)
-    Registry(LocalFolder(tmp_path)).publish(manifest(exact))
+    publish(Registry(LocalFolder(tmp_path)), manifest(exact))
     loaded = Registry(LocalFolder(tmp_path)).load("sideslip", 1).manifest
     assert loaded == manifest(exact)
     assert loaded.terms[0].coefficient_exact == exact
@@ -77,13 +41,13 @@ def test_publishing_what_an_interrupted_run_left_uses_it(tmp_path: Path) -> None
         manifest().model_dump(mode="json")
     )
     assert registry.champion("sideslip") is None
-    assert registry.publish(manifest()).version == 1
+    assert publish(registry, manifest()).version == 1
     assert registry.versions("sideslip") == [1]
 
 
 @pytest.mark.parametrize("change", ["coefficient", "sha256", "truncated"])
 def test_a_changed_version_is_refused(tmp_path: Path, change: str) -> None:
-    Registry(LocalFolder(tmp_path)).publish(manifest())
+    publish(Registry(LocalFolder(tmp_path)), manifest())
     file = tmp_path / "sideslip" / "versions" / "1.json"
     envelope = json.loads(file.read_text())
     if change == "coefficient":
@@ -98,7 +62,7 @@ def test_a_changed_version_is_refused(tmp_path: Path, change: str) -> None:
 def test_aliases_move_and_go_back(tmp_path: Path) -> None:
     registry = Registry(LocalFolder(tmp_path))
     for number in (1, 2, 3):
-        registry.publish(manifest(Fraction(number)))
+        publish(registry, manifest(Fraction(number)))
     registry.promote("sideslip", 1, CHAMPION)
     registry.promote("sideslip", 2, "shadow")
     assert registry.history("sideslip").aliases() == {CHAMPION: 1, "shadow": 2}
@@ -113,7 +77,7 @@ def test_unknown_names_versions_and_aliases_say_what_there_is(tmp_path: Path) ->
     registry = Registry(LocalFolder(tmp_path))
     with pytest.raises(QuestionError, match=r"no model is called 'x'.*publish one with"):
         registry.resolve("x")
-    registry.publish(manifest())
+    publish(registry, manifest())
     with pytest.raises(QuestionError, match=r"It has: 1\."):
         registry.resolve("sideslip@7")
     with pytest.raises(QuestionError, match=r"It has: 1, champion\."):
@@ -124,7 +88,7 @@ def test_unknown_names_versions_and_aliases_say_what_there_is(tmp_path: Path) ->
 
 def _publish_ten(path: Path, writer: int) -> None:
     for number in range(10):
-        Registry(LocalFolder(path)).publish(manifest(Fraction(writer * 100 + number, 7)))
+        publish(Registry(LocalFolder(path)), manifest(Fraction(writer * 100 + number, 7)))
 
 
 def test_writers_at_once_never_share_a_number_or_lose_a_version(tmp_path: Path) -> None:
@@ -147,7 +111,7 @@ def _publish_the_same(path: Path, logs_version: int, barrier: Any) -> None:
     for model in range(20):
         barrier.wait()
         same = manifest(name=f"m{model}").model_copy(update={"trained_on": trained_on})
-        Registry(LocalFolder(path)).publish(same)
+        publish(Registry(LocalFolder(path)), same)
 
 
 def test_writers_at_once_publish_the_same_estimator_once(tmp_path: Path) -> None:
@@ -176,7 +140,7 @@ def test_what_was_decided_on_another_champion_is_decided_again(tmp_path: Path) -
     def decision(newest_move: int) -> bool | None:
         seen.append(history.pointed_at(CHAMPION))
         if len(seen) == 1:
-            registry.publish(manifest(Fraction(1)))  # another process, in between
+            publish(registry, manifest(Fraction(1)))  # another process, in between
         return registry.make_champion(challenger, after=newest_move) or None
 
     history.decide(decision)
@@ -189,7 +153,7 @@ def test_two_who_go_back_at_once_go_back_two_versions(
 ) -> None:
     registry = Registry(LocalFolder(tmp_path))
     for number in (1, 2, 3):
-        registry.publish(manifest(Fraction(number)))
+        publish(registry, manifest(Fraction(number)))
 
     def slow_move(history: AliasHistory, *arguments: Any, after: int) -> bool:
         monkeypatch.setattr(AliasHistory, "move", move)
@@ -209,7 +173,7 @@ def test_a_version_and_the_champion_are_found_without_reading_the_others(
 ) -> None:
     registry = Registry(LocalFolder(tmp_path))
     for number in range(1, 21):
-        registry.publish(manifest(Fraction(number)))
+        publish(registry, manifest(Fraction(number)))
     read: list[int] = []
 
     def counted(folder: DocumentFolder, number: int) -> Document:
@@ -231,7 +195,7 @@ def test_a_version_and_the_champion_are_found_without_reading_the_others(
 def test_an_alias_points_where_its_last_move_left_it(tmp_path: Path) -> None:
     registry = Registry(LocalFolder(tmp_path))
     for number in (1, 2, 3):
-        registry.publish(manifest(Fraction(number)))
+        publish(registry, manifest(Fraction(number)))
     registry.promote("sideslip", 1, "tested")
     registry.rollback("sideslip", CHAMPION)
     history = registry.history("sideslip")

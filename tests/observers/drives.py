@@ -5,9 +5,10 @@ from datetime import date
 
 import numpy as np
 
-from fleet_slip.arrays import FloatArray
+from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.observers.signals import STEP_S, DriveSignals, LabelledDrive
+from fleet_slip.observers.single_track import SingleTrack
 from fleet_slip.simulation.campaign import Batch, load_campaign
 from fleet_slip.simulation.drives import simulate_batch
 from fleet_slip.vehicle.parameters import VehicleParameters
@@ -108,3 +109,19 @@ def simulated_drive() -> LabelledDrive:
     names = DriveSignals.__dataclass_fields__
     signals = DriveSignals(**{name: columns[name] for name in names})
     return LabelledDrive("smoke", signals, columns["sideslip_rad"])
+
+
+def without_fixes(drive: DriveSignals, lost: BoolArray) -> DriveSignals:
+    """Return the drive without the GPS fixes where `lost` is true."""
+    return replace(
+        drive,
+        gps_vx_mps=np.where(lost, np.nan, drive.gps_vx_mps),
+        gps_vy_mps=np.where(lost, np.nan, drive.gps_vy_mps),
+    )
+
+
+def steady_sideslip_rad(car: SingleTrack, vx_mps: float, yaw_rate_rad_s: float) -> float:
+    """Return β of steady cornering, arctan(b r / vx − a m vx r / (Cr L))."""
+    wheelbase = car.front_m + car.rear_m
+    slip = car.front_m * car.mass_kg * vx_mps / (car.stiffness_rear_n * wheelbase)
+    return float(np.arctan(yaw_rate_rad_s * (car.rear_m / vx_mps - slip)))

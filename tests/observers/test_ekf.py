@@ -11,7 +11,7 @@ from fleet_slip.observers.ekf import Belief, EkfNoise, build_model, lateral_forc
 from fleet_slip.observers.signals import STEP_S, DriveSignals
 from fleet_slip.observers.single_track import SingleTrack
 from fleet_slip.vehicle.parameters import load_vehicle
-from tests.observers.drives import rolling_drive
+from tests.observers.drives import rolling_drive, steady_sideslip_rad
 
 CAR = load_vehicle("d_class_sedan")
 TRACK = SingleTrack.of(CAR)
@@ -125,7 +125,7 @@ def test_converges_on_data_of_its_own_model_near_the_limit() -> None:
 
 def test_agrees_with_analytic_steady_cornering() -> None:
     drive, _ = drive_of_the_model(np.full(3000, 0.001), np.full(3000, 20.0))
-    expected = TRACK.steady_sideslip_rad(20.0, drive.yaw_rate_rad_s[-1])
+    expected = steady_sideslip_rad(TRACK, 20.0, drive.yaw_rate_rad_s[-1])
     found = ekf.estimate(drive, CAR, EkfNoise())[-1]
     assert found == pytest.approx(expected, rel=0.02), "brush tyres are linear at small slip"
 

@@ -13,10 +13,10 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
 from fleet_slip.observers import kalman
 from fleet_slip.observers.kalman import Belief, FilterNoise, covariances, predict, run, update
-from fleet_slip.observers.outages import TUNNEL_S, tunnel, without_fixes
+from fleet_slip.observers.outages import TUNNEL_S, tunnel
 from fleet_slip.observers.signals import STEP_S, DriveSignals
 from fleet_slip.vehicle.parameters import load_vehicle
-from tests.observers.drives import GPS_EVERY, mirrored, noisy, rolling_drive, slalom
+from tests.observers.drives import GPS_EVERY, mirrored, noisy, rolling_drive, slalom, without_fixes
 
 CAR = load_vehicle("d_class_sedan")
 H = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0]])

@@ -1,12 +1,8 @@
 """Patterns of lost GPS: the stated times, and nothing but fixes lost."""
 
-from dataclasses import fields
-
 import numpy as np
 
-from fleet_slip.observers.outages import URBAN_FIX_S, URBAN_LOST_S, tunnel, urban, without_fixes
-from fleet_slip.vehicle.parameters import load_vehicle
-from tests.observers.drives import slalom
+from fleet_slip.observers.outages import URBAN_FIX_S, URBAN_LOST_S, tunnel, urban
 
 
 def test_urban_outages_have_the_stated_mean_times() -> None:
@@ -29,16 +25,3 @@ def test_a_tunnel_is_twenty_seconds_long() -> None:
     lost = tunnel(10_000, 30.0)
     assert np.flatnonzero(lost)[[0, -1]].tolist() == [3000, 4999]
     assert lost.sum() == 2000
-
-
-def test_only_fixes_are_lost_and_none_come_back() -> None:
-    drive, _ = slalom(load_vehicle("d_class_sedan"), 1000)
-    lost = tunnel(1000, 2.0)
-    masked = without_fixes(drive, lost)
-    assert np.isnan(masked.gps_vx_mps[lost]).all()
-    np.testing.assert_array_equal(masked.gps_vx_mps[~lost], drive.gps_vx_mps[~lost])
-    twice = without_fixes(masked, np.zeros(1000, dtype=bool))
-    np.testing.assert_array_equal(twice.gps_vy_mps, masked.gps_vy_mps)
-    for field in fields(drive):
-        if not field.name.startswith("gps"):
-            assert getattr(masked, field.name) is getattr(drive, field.name)

@@ -16,7 +16,7 @@ from fleet_slip.observers.signals import STEP_S, DriveSignals
 from fleet_slip.observers.single_track import SingleTrack, state_space
 from fleet_slip.observers.sliding_mode import SlidingGains
 from fleet_slip.vehicle.parameters import load_vehicle
-from tests.observers.drives import rolling_drive
+from tests.observers.drives import rolling_drive, steady_sideslip_rad
 
 CAR = load_vehicle("d_class_sedan")
 TRACK = SingleTrack.of(CAR)
@@ -49,7 +49,7 @@ def linear_drive(vx: FloatArray, steer: FloatArray) -> tuple[DriveSignals, Float
 @given(vx=st.floats(6, 45), steer=st.floats(-0.1, 0.1))
 def test_steady_sideslip_of_the_model_is_the_textbook_one(vx: float, steer: float) -> None:
     vy, rate = steady_state(vx, steer)
-    assert np.arctan2(vy, vx) == pytest.approx(TRACK.steady_sideslip_rad(vx, rate), abs=1e-12)
+    assert np.arctan2(vy, vx) == pytest.approx(steady_sideslip_rad(TRACK, vx, rate), abs=1e-12)
     # The kinematic radius, stretched by the understeer gradient.
     wheelbase = TRACK.front_m + TRACK.rear_m
     front = TRACK.rear_m / TRACK.stiffness_front_n
@@ -102,7 +102,7 @@ def test_converges_to_steady_cornering(
 ) -> None:
     constant = np.ones(3000)
     drive, _ = linear_drive(vx * constant, 0.02 * constant)
-    expected = TRACK.steady_sideslip_rad(vx, drive.yaw_rate_rad_s[-1])
+    expected = steady_sideslip_rad(TRACK, vx, drive.yaw_rate_rad_s[-1])
     assert estimate(drive, CAR, parameters)[-1] == pytest.approx(expected, abs=1e-5)
 
 

@@ -16,11 +16,11 @@ from fleet_slip.regression.exact import LinearModel, fit
 from fleet_slip.regression.folds import Folds
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.nested import nested_fits
-from fleet_slip.regression.pace import pace, shrink, threshold
+from fleet_slip.regression.pace import ESTIMATORS, shrink
 from fleet_slip.regression.ranking import backward
-from fleet_slip.regression.weka import weka_linear_regression
 
 from .data import REFERENCE, columns_to_counts, reference
+from .weka import threshold, weka_linear_regression, weka_pace
 
 DATASETS = ["diabetes_raw", "vehicle9"]
 RUNS = range(17)
@@ -76,7 +76,7 @@ def procedure(run: dict[str, Any], inputs: tuple[str, ...], label: str) -> Calla
             threshold(PRICES[estimator](gram.n, len(inputs))),
             constant=True,
         )
-    return lambda gram: pace(gram, inputs, label, estimator, weka_compatible=True)
+    return lambda gram: weka_pace(gram, inputs, label, estimator)
 
 
 def coefficients(model: LinearModel, inputs: tuple[str, ...], run: dict[str, Any]) -> list[float]:
@@ -127,7 +127,7 @@ def test_exact_answers(name: str) -> None:
 def test_the_theory_keeps_fewer_dimensions_than_weka() -> None:
     folds, inputs, label, _ = dataset("diabetes_raw")
     for estimator in ("pace2", "pace4"):
-        theory = pace(folds.total, inputs, label, estimator)
-        weka = pace(folds.total, inputs, label, estimator, weka_compatible=True)
+        theory = shrink(folds.total, inputs, label, ESTIMATORS[estimator], constant=False)
+        weka = weka_pace(folds.total, inputs, label, estimator)
         assert len(theory.signals) == 6
         assert len(weka.signals) == 8

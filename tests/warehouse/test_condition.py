@@ -21,7 +21,7 @@ from fleet_slip.monitoring.quality import examine_drives
 from fleet_slip.warehouse.condition import asking, drive_columns, parse_condition
 from fleet_slip.warehouse.tables import Warehouse
 from tests.conftest import land, log_rows, random_counts
-from tests.models.test_versions import manifest
+from tests.models.manifests import manifest
 
 LASTING = [
     "true",

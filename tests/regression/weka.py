@@ -1,20 +1,35 @@
-"""WEKA's LinearRegression from a Gram, so that its published results can be reproduced.
+"""WEKA's LinearRegression and PaceRegression from a Gram, to compare with what WEKA finds.
 
-The mathematics of WEKA 3.9 as observed: a small ridge on standardised moments, removal of signals
-with a standardised coefficient above 1.5, and an Akaike rule relative to the first model. The
-removal is harmful for collinear signals such as four wheel speeds: use `exact.fit` for work.
+The mathematics of WEKA 3.9 as observed. LinearRegression: a small ridge on standardised moments,
+removal of signals with a standardised coefficient above 1.5, and an Akaike rule relative to the
+first model. The removal is harmful for collinear signals such as four wheel speeds.
 """
 
+import math
 from collections.abc import Sequence
 from fractions import Fraction
 from typing import Literal
 
+import numpy as np
+
+from fleet_slip.arrays import FloatArray
 from fleet_slip.regression.exact import LinearModel
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.pace import (
+    Estimator,
+    empirical_bayes,
+    half_contributions,
+    normal_contributions,
+    pace6,
+    shrink,
+)
 from fleet_slip.regression.ridge import fit_penalised, standardised_penalty, standardised_size
 
 Selection = Literal["none", "m5", "greedy"]
+
+NEGLIGIBLE_SQUARE = 0.5
+NEGLIGIBLE = 0.7
 
 COLLINEAR = 1.5
 """Standardised coefficients above this are taken for a sign of collinearity."""
@@ -85,5 +100,51 @@ def _smallest(gram: Gram, model: LinearModel) -> list[str]:
     return [min(sizes, key=lambda name: sizes[name])]
 
 
-def _each(gram: Gram, model: LinearModel) -> list[str]:  # noqa: ARG001
+def _each(gram: Gram, model: LinearModel) -> list[str]:
     return list(model.signals)
+
+
+def weka_pace(gram: Gram, inputs: Sequence[str], label: str, estimator: str) -> LinearModel:
+    """Return the model of counts that WEKA's PaceRegression finds.
+
+    The constant takes part in the mixture and may be shrunk; subset does what nested does; and the
+    expected contributions of pace2 and pace4 are not those of the theory.
+    """
+    return shrink(gram, inputs, label, ESTIMATORS[estimator], constant=True)
+
+
+def threshold(price: float) -> Estimator:
+    """Return the estimator that drops the dimensions with A_j below a price."""
+    return lambda a: np.where(np.abs(a) < math.sqrt(price), 0.0, a)
+
+
+def _leading(a: FloatArray, contributions: FloatArray) -> FloatArray:
+    """Keep the first dimension, the constant, in any case."""
+    kept = int(np.argmax(np.cumsum(contributions)))
+    return np.where(np.arange(len(a)) <= kept, a, 0.0)
+
+
+def _pace2(a: FloatArray) -> FloatArray:
+    kept = _leading(a, half_contributions(a, lambda points: points))
+    return np.where(kept**2 <= NEGLIGIBLE_SQUARE, 0.0, kept)
+
+
+def _pace4(a: FloatArray) -> FloatArray:
+    positive = half_contributions(a, lambda points: points) > 0
+    return np.where(positive & (a**2 > NEGLIGIBLE_SQUARE), a, 0.0)
+
+
+def _nested(a: FloatArray) -> FloatArray:
+    kept = _leading(a, normal_contributions(a))
+    return np.where(np.abs(kept) <= NEGLIGIBLE, 0.0, kept)
+
+
+ESTIMATORS: dict[str, Estimator] = {
+    "ols": lambda a: a,
+    "pace2": _pace2,
+    "pace4": _pace4,
+    "pace6": pace6,
+    "eb": empirical_bayes,
+    "nested": _nested,
+    "subset": _nested,
+}
