@@ -1,5 +1,6 @@
 # `make run`  sets up .venv and runs the whole job on the default campaign into ./data.
-# `make test` sets up .venv and passes every check.
+# `make test` sets up .venv and passes every check that needs Python alone.
+# `make test-all` installs outside programs, such as a browser, and passes the checks that need them.
 # `make report` does what `make run` does, then writes ./data/report/report.html.
 PYTHON ?= python3
 VENV := .venv
@@ -7,7 +8,7 @@ BIN := $(VENV)/bin
 CAMPAIGN ?= waterford
 ROOT ?= data
 
-.PHONY: run report test lint setup bench clean
+.PHONY: run report test test-all lint setup bench clean
 
 run: setup
 	$(BIN)/fleet-slip --root $(ROOT) run --campaign $(CAMPAIGN)
@@ -18,6 +19,10 @@ report: run
 
 test: setup lint
 	$(BIN)/pytest -n 2
+
+test-all: setup
+	-tests/tools/install
+	$(BIN)/pytest -n 2 -rs --tools
 
 lint: setup
 	$(BIN)/ruff check .

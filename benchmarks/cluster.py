@@ -14,7 +14,6 @@ from collections.abc import Callable
 from concurrent.futures import Executor
 from pathlib import Path
 
-from benchmarks.dask_processes import dask_processes
 from fleet_slip.compute.cluster import cluster_executor
 from fleet_slip.compute.tasks import LocalThreads
 from fleet_slip.files.local_folder import LocalFolder
@@ -22,6 +21,7 @@ from fleet_slip.grams.job import update_grams
 from fleet_slip.simulation.campaign import Campaign, load_campaign
 from fleet_slip.simulation.job import simulate_campaign
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.dask_processes import dask_processes
 
 WARM_UP = "smoke"
 

@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from benchmarks.cluster import data_files
-from benchmarks.dask_processes import DaskProcesses
+from tests.support.dask_processes import DaskProcesses
 
 COMMAND = str(Path(sys.executable).with_name("fleet-slip"))
 NEAR, FAR = "fleet-slip-near", "fleet-slip-far"

@@ -19,7 +19,6 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-from benchmarks import growth_history as history
 from benchmarks.billion import PROGRAM
 from benchmarks.billion_campaigns import Sized, write
 from benchmarks.documents import insert
@@ -27,6 +26,7 @@ from benchmarks.usage import Usage, measured
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support import growth_history as history
 
 MODEL = "growth"
 BASE_FILES = 10

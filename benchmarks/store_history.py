@@ -20,7 +20,7 @@ from moto.core.models import DEFAULT_ACCOUNT_ID
 from moto.s3.models import s3_backends
 
 from benchmarks.billion import PROGRAM
-from tests.objects.server import Server
+from tests.support.s3_server import Server
 
 RUN = ("run", "--campaign", "smoke", "--days", "1")
 STATUS = ("status",)

@@ -1,28 +1,17 @@
-"""Fixtures that several tests share: a small warehouse, and the command line as a user runs it."""
+"""What every test gets: a warehouse, the command line as a user runs it, and the same examples."""
 
-import json
 import os
-import subprocess
-import sys
-from collections.abc import Callable
-from dataclasses import dataclass
-from datetime import date
+import shutil
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pyarrow as pa
 import pytest
 from hypothesis import HealthCheck, settings
 
-from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.delta import Change, Unit
-from fleet_slip.files.folder import Folder
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
-
-COMMAND = str(Path(sys.executable).with_name("fleet-slip"))
-DAY = date(2024, 5, 1)
+from tests.support.commands import Finished, RunCommand, done_on, run_on
+from tests.support.once import made_once
 
 os.environ["FLEET_SLIP_LOG"] = "text"  # a test reads what a person would
 
@@ -32,21 +21,51 @@ settings.register_profile("search", deadline=None, suppress_health_check=[Health
 settings.register_profile("fixed", settings.get_profile("search"), derandomize=True)
 settings.load_profile("fixed")
 
-
-@dataclass(frozen=True)
-class Finished:
-    """A command that has run."""
-
-    exit_code: int
-    stdout: str
-    stderr: str
-
-    @property
-    def json(self) -> Any:
-        return json.loads(self.stdout)
+LEFT_OUT = pytest.StashKey[dict[str, int]]()
+"""How many tests were left out because of each tool."""
 
 
-RunCommand = Callable[..., Finished]
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--tools",
+        action="store_true",
+        help="run the tests that need outside programs, and no others",
+    )
+
+
+def tools_of(item: pytest.Item) -> list[str]:
+    """Return the outside programs that a test needs."""
+    return [name for marker in item.iter_markers("tools") for name in marker.args]
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    with_tools = config.getoption("--tools")
+    left = [item for item in items if bool(tools_of(item)) != with_tools]
+    items[:] = [item for item in items if bool(tools_of(item)) == with_tools]
+    config.hook.pytest_deselected(items=left)
+    names = [name for item in left for name in tools_of(item)]
+    config.stash[LEFT_OUT] = {name: names.count(name) for name in sorted(set(names))}
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    missing = [name for name in tools_of(item) if shutil.which(name) is None]
+    if missing:
+        pytest.skip(f"{', '.join(missing)} is not here: tests/tools/install {' '.join(missing)}")
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    if hasattr(session.config, "workeroutput"):  # of pytest-xdist, for the process that reports
+        session.config.workeroutput["left_out"] = session.config.stash.get(LEFT_OUT, {})
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any) -> None:
+    node.config.stash[LEFT_OUT] = getattr(node, "workeroutput", {}).get("left_out", {})
+
+
+def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
+    for name, count in config.stash.get(LEFT_OUT, {}).items():
+        terminalreporter.write_line(f"left to `make test-all`: {count} tests that need {name}")
 
 
 @pytest.fixture
@@ -54,16 +73,7 @@ def run_command(tmp_path: Path) -> RunCommand:
     """Run `fleet-slip --root <tmp_path>/data ...` in a process of its own."""
 
     def run(*arguments: str, root: Path | None = None, **options: Any) -> Finished:
-        done = subprocess.run(
-            [COMMAND, "--root", str(root or tmp_path / "data"), *arguments],
-            capture_output=True,
-            text=True,
-            check=False,
-            cwd=tmp_path,
-            **options,
-        )
-        assert "Traceback" not in done.stderr, done.stderr
-        return Finished(done.returncode, done.stdout, done.stderr)
+        return run_on(root or tmp_path / "data", *arguments, cwd=tmp_path, **options)
 
     return run
 
@@ -74,47 +84,11 @@ def warehouse(tmp_path: Path) -> Warehouse:
     return Warehouse(LocalFolder(tmp_path / "data"))
 
 
-def path_of(folder: Folder) -> Path:
-    """Return where a folder of a file system is."""
-    return Path(str(folder))
+@pytest.fixture(scope="session")
+def smoke_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data root after `fleet-slip run --campaign smoke`. Nothing may change it: copy it first."""
 
+    def make(root: Path) -> None:
+        done_on(root, "run", "--campaign", "smoke")
 
-def random_counts(rng: np.random.Generator, rows: int) -> dict[str, Any]:
-    """Counts over the whole int16 range, the extremes among them."""
-    counts: dict[str, Any] = {}
-    for name in catalogue().signals:
-        values = rng.integers(-32768, 32768, rows)
-        values[:2] = (-32768, 32767)
-        counts[name] = values.astype(np.int16)
-    return counts
-
-
-def log_rows(drive_id: str, counts: dict[str, Any], day: date = DAY, **metadata: Any) -> pa.Table:
-    """Rows of the logs for one drive; a signal that is not given is absent."""
-    signals = catalogue()
-    rows = len(next(iter(counts.values())))
-    known: dict[str, Any] = {
-        "drive_id": drive_id,
-        "vehicle_id": "car-1",
-        "vehicle_model": "d_class_sedan",
-        "source": "simulated",
-        "campaign": "test",
-        "track": "waterford_hills",
-        "mass_kg": 1320.0,
-        "adhesion": 1.0,
-        "speed_factor": 0.8,
-        "lost_control_s": None,
-        "saturated": 0,
-        **metadata,
-    }
-    columns: dict[str, Any] = {"day": [day] * rows}
-    columns |= {name: [known[name]] * rows for name in signals.drive}
-    columns["tick"] = np.arange(rows, dtype=np.int32)
-    columns |= {name: counts.get(name, [None] * rows) for name in signals.signals}
-    return pa.table(columns, schema=signals.log_schema)
-
-
-def land(warehouse: Warehouse, name: str, *drives: pa.Table, day: date = DAY) -> None:
-    """Commit drives as one file of the logs."""
-    action = warehouse.logs.write_file(name, pa.concat_tables(drives), day)
-    warehouse.logs.snapshot().commit(Change(add=[action], units=[Unit(f"test/{name}", 1)]))
+    return made_once(tmp_path_factory, "smoke", make)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import atheris
 
-from benchmarks.fuzz.mutate import ByteRandom
+from tests.support.fuzz.mutate import ByteRandom
 
 INSTRUMENTED = ("fleet_slip", "tomllib", "json")
 
@@ -20,7 +20,7 @@ def main() -> None:
     """Instrument the package, then feed the target until libFuzzer stops."""
     name, *options = sys.argv[1:]
     with atheris.instrument_imports(include=list(INSTRUMENTED)):
-        targets = importlib.import_module("benchmarks.fuzz.targets")
+        targets = importlib.import_module("tests.support.fuzz.targets")
         errors = importlib.import_module("fleet_slip.errors")
     target, _ = targets.TARGETS[name]
     sandbox = Path(tempfile.mkdtemp(prefix="fleet-slip-fuzz-"))

@@ -44,7 +44,7 @@ def main() -> int:
     parser.add_argument("--target", help="only this one")
     parser.add_argument("--only", type=int, help="only the case with this number, in this process")
     options = parser.parse_args()
-    from benchmarks.fuzz.targets import TARGETS  # noqa: PLC0415 - processes load it themselves
+    from tests.support.fuzz.targets import TARGETS  # noqa: PLC0415 - processes load it themselves
 
     chosen = [options.target] if options.target else list(TARGETS)
     if options.only is not None:
@@ -121,8 +121,8 @@ def _work(pipe: Connection, name: str, numbers: range, seed: int) -> None:
 
 def _case(name: str, seed: int, number: int) -> tuple[str, str]:
     """Run one case. Return what it came to, and what is wrong with that, if anything."""
-    from benchmarks.fuzz.targets import TARGETS  # noqa: PLC0415
     from fleet_slip.errors import FleetSlipError  # noqa: PLC0415
+    from tests.support.fuzz.targets import TARGETS  # noqa: PLC0415
 
     sandbox = _sandbox()
     place = sandbox / "case"

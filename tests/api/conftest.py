@@ -7,7 +7,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip import Fleet
-from tests.conftest import COMMAND
+from tests.support.commands import COMMAND
 
 FEATURES = "ay,yaw_rate,steering_wheel,speed_squared,curvature,course_rate,ay_signed_square"
 

@@ -27,7 +27,7 @@ from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.gram_table import GramTable
 from fleet_slip.resources import folder
 from fleet_slip.warehouse.tables import Warehouse
-from tests.conftest import land, log_rows, random_counts
+from tests.support.logs import land, log_rows, random_counts
 
 RADIUS_M = Fraction(31, 100)
 INPUTS = catalogue().inputs

@@ -1,12 +1,13 @@
 """Starting the program: a command imports what it needs, and the list of commands is true."""
 
 import json
-import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from fleet_slip.cli.commands import COMMANDS, Command, load_commands
+from tests.support.commands import run
 
 TABLES = {"deltalake", "numpy", "pyarrow"}
 ENGINES = {"duckdb", "highway_env", "jinja2", "matplotlib", "numba", "pint", "polars"}
@@ -18,13 +19,8 @@ main()
 """
 
 
-def imported_by(*arguments: str) -> set[str]:
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, "--root", "nothing-here", *arguments],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+def imported_by(root: Path, *arguments: str) -> set[str]:
+    done = run([sys.executable, "-c", PROGRAM, "--root", str(root), *arguments])
     return set(json.loads(done.stderr.splitlines()[-1]))
 
 
@@ -39,9 +35,9 @@ def imported_by(*arguments: str) -> set[str]:
     ],
 )
 def test_a_command_does_not_wait_for_what_it_does_not_need(
-    arguments: list[str], spared: set[str]
+    tmp_path: Path, arguments: list[str], spared: set[str]
 ) -> None:
-    imported = imported_by(*arguments)
+    imported = imported_by(tmp_path / "nothing-here", *arguments)
     assert "fleet_slip.cli.main" in imported
     assert not imported & spared
 

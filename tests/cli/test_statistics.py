@@ -2,7 +2,7 @@
 
 import math
 import re
-import subprocess
+import shutil
 from pathlib import Path
 
 import duckdb
@@ -15,7 +15,8 @@ from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.cli.main import app
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.resources import find_config
-from tests.conftest import COMMAND, Finished, RunCommand
+from tests.support.commands import Finished, RunCommand, done_on
+from tests.support.once import made_once
 
 NOISE = {
     "ax": 0.1,
@@ -26,10 +27,6 @@ NOISE = {
     "wheel_fr": 0.02,
 }
 """The smoke campaign's sensors, in SI units."""
-
-
-def run(root: Path, *arguments: str) -> None:
-    subprocess.run([COMMAND, "--root", str(root), *arguments], check=True, cwd=root.parent)
 
 
 @pytest.fixture
@@ -47,17 +44,19 @@ def run_command(tmp_path: Path) -> RunCommand:
     return invoke
 
 
-@pytest.fixture(scope="module")
-def smoke_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture(scope="session")
+def every_set(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Path:
     """A data root with the smoke campaign, its model and all feature sets."""
-    root = tmp_path_factory.mktemp("statistics") / "data"
-    run(root, "run", "--campaign", "smoke")
-    run(root, "gram", "--features", "all")
-    return root
+
+    def make(root: Path) -> None:
+        shutil.copytree(smoke_root, root)
+        done_on(root, "gram", "--features", "all")
+
+    return made_once(tmp_path_factory, "every-set", make)
 
 
-def test_all_sets_are_up_to_date(run_command: RunCommand, smoke_root: Path) -> None:
-    reports = run_command("gram", "--features", "all", "--json", root=smoke_root).json
+def test_all_sets_are_up_to_date(run_command: RunCommand, every_set: Path) -> None:
+    reports = run_command("gram", "--features", "all", "--json", root=every_set).json
     assert [report["files_read"] for report in reports] == [0] * len(reports)
     assert [report["feature_set"] for report in reports] == [
         features().identity(name) for name in (PLAIN, *features().sets)
@@ -65,12 +64,12 @@ def test_all_sets_are_up_to_date(run_command: RunCommand, smoke_root: Path) -> N
 
 
 def test_a_criterion_chooses_from_a_ranking_and_says_how_sure(
-    run_command: RunCommand, smoke_root: Path
+    run_command: RunCommand, every_set: Path
 ) -> None:
     nested = ("--nested", "ax,ay,yaw_rate,steering_wheel,steer_fl")
     arguments = ("select", *nested, "--rank", "backward", "--criterion", "bic")
     report = run_command(
-        *arguments, "--bootstrap", "200", "--repeat", "5", "--json", root=smoke_root
+        *arguments, "--bootstrap", "200", "--repeat", "5", "--json", root=every_set
     ).json
     choice = report["choice"]
     assert sorted(choice["order"]) == ["ax", "ay", "steer_fl", "steering_wheel", "yaw_rate"]
@@ -82,18 +81,18 @@ def test_a_criterion_chooses_from_a_ranking_and_says_how_sure(
     interval = report["uncertainty"]["interval"]
     assert interval["low"] < winner["correlation"] < interval["high"]
     assert abs(choice["honest"]["correlation"] - winner["correlation"]) < 0.01
-    naive = run_command(*arguments, "--naive", "--json", root=smoke_root).json
+    naive = run_command(*arguments, "--naive", "--json", root=every_set).json
     assert naive["choice"]["effective_rows"] == naive["rows"]
-    table = run_command(*arguments, root=smoke_root).stdout
+    table = run_command(*arguments, root=every_set).stdout
     assert "order by backward" in table
     assert "made again inside every training fold" in table
 
 
 def test_all_subsets_report_the_best_of_every_size(
-    run_command: RunCommand, smoke_root: Path
+    run_command: RunCommand, every_set: Path
 ) -> None:
     report = run_command(
-        "select", "--all-subsets", "--nested", "ax,ay,yaw_rate,steer_fl", "--json", root=smoke_root
+        "select", "--all-subsets", "--nested", "ax,ay,yaw_rate,steer_fl", "--json", root=every_set
     ).json
     subsets = report["choice"]["subsets"]
     assert [one["size"] for one in subsets] == [0, 1, 2, 3, 4]
@@ -104,23 +103,23 @@ def test_all_subsets_report_the_best_of_every_size(
 
 
 def test_a_model_names_the_rows_that_it_was_made_of(
-    run_command: RunCommand, smoke_root: Path
+    run_command: RunCommand, every_set: Path
 ) -> None:
-    report = run_command("select", "--json", root=smoke_root).json
+    report = run_command("select", "--json", root=every_set).json
     model = report["models"][1]
     assert model["drives"] == report["drives"] == 8
-    with fleet_slip.connect(smoke_root) as database:
+    with fleet_slip.connect(every_set) as database:
         row = database.execute(
             f"SELECT count(DISTINCT drive_id), sum(n) FROM grams WHERE {model['gram_rows']}"
         ).fetchone()
     assert row == (model["drives"], model["rows"])
 
 
-def test_folds_of_rows_are_labelled_as_leaking(run_command: RunCommand, smoke_root: Path) -> None:
-    leaking = run_command("select", "--by", "row", root=smoke_root)
+def test_folds_of_rows_are_labelled_as_leaking(run_command: RunCommand, every_set: Path) -> None:
+    leaking = run_command("select", "--by", "row", root=every_set)
     assert "leak" in leaking.stderr
-    by_row = run_command("select", "--by", "row", "--json", root=smoke_root).json
-    by_drive = run_command("select", "--json", root=smoke_root).json
+    by_row = run_command("select", "--by", "row", "--json", root=every_set).json
+    by_drive = run_command("select", "--json", root=every_set).json
     assert by_row["folds"] == {"by": "row", "count": 5, "leaking": True}
     for leaky, honest in zip(by_row["models"], by_drive["models"], strict=True):
         assert leaky["rows"] == honest["rows"]
@@ -128,22 +127,22 @@ def test_folds_of_rows_are_labelled_as_leaking(run_command: RunCommand, smoke_ro
 
 
 def test_a_published_model_with_features_explains_and_evaluates_them(
-    run_command: RunCommand, smoke_root: Path
+    run_command: RunCommand, every_set: Path
 ) -> None:
     nested = ("--nested", "ay,steer_fl,curvature,speed_squared")
     arguments = ("--features", "motion", *nested, "--rank", "declared", "--criterion", "cp")
-    done = run_command("publish", "curved", *arguments, "--json", root=smoke_root)
+    done = run_command("publish", "curved", *arguments, "--json", root=every_set)
     assert done.exit_code == 0, done.stderr
-    shown = run_command("show", "curved", "--json", root=smoke_root).json
+    shown = run_command("show", "curved", "--json", root=every_set).json
     terms = {term["signal"]: term for term in shown["terms"]}
     assert terms["curvature"]["sql"] == features().features["curvature"].sql
     assert (terms["curvature"]["unit"], terms["ay"]["sql"]) == ("rad/m", "")
     assert shown["trained_on"]["feature_set"] == features().identity("motion")
-    assert "CASE WHEN" in run_command("show", "curved", root=smoke_root).stdout
-    score = run_command("score", "curved", "--json", root=smoke_root).json
+    assert "CASE WHEN" in run_command("show", "curved", root=every_set).stdout
+    score = run_command("score", "curved", "--json", root=every_set).json
     assert score["rows"] == shown["trained_on"]["rows"]
     assert abs(score["error_mean_deg"]) < 1e-9  # an OLS fit has no mean error on its own rows
-    with fleet_slip.connect(smoke_root) as database:
+    with fleet_slip.connect(every_set) as database:
         rows = database.sql("FROM log_counts").to_arrow_table()
     computed = duckdb.connect()
     computed.register("log_counts", rows)
@@ -154,15 +153,15 @@ def test_a_published_model_with_features_explains_and_evaluates_them(
     weights = np.array([term["coefficient"] for term in terms.values()])
     error = matrix[:, :-1] @ (scales * weights) + shown["intercept"] - matrix[:, -1] * 1e-4
     assert score["rmse_deg"] == pytest.approx(math.degrees(math.sqrt(np.mean(error**2))), rel=1e-9)
-    again = run_command("publish", "curved", *arguments, "--json", root=smoke_root).json
+    again = run_command("publish", "curved", *arguments, "--json", root=every_set).json
     assert not again["new"]
 
 
 def test_diagnose_shows_both_kinds_of_errors_and_the_serial_correlation(
-    run_command: RunCommand, smoke_root: Path
+    run_command: RunCommand, every_set: Path
 ) -> None:
     arguments = ("diagnose", "--signals", "ay,steer_fl", "--serial", "--sensor-noise", "ay=0.1")
-    report = run_command(*arguments, "--json", root=smoke_root).json
+    report = run_command(*arguments, "--json", root=every_set).json
     for naive, robust in zip(report["by_rows"], report["by_drives"], strict=True):
         assert naive["value"] == robust["value"]
         assert robust["standard_error"] > naive["standard_error"]
@@ -174,13 +173,13 @@ def test_diagnose_shows_both_kinds_of_errors_and_the_serial_correlation(
     assert abs(report["noise_free"]["ay"]) > abs(weights["ay"])  # noise attenuates
     fast, slow = "speed_factor > 0.85", "speed_factor <= 0.85"
     compared = ("diagnose", "--signals", "ay", "--cohort", fast, "--against", slow)
-    against = run_command(*compared, "--json", root=smoke_root).json["against"]
+    against = run_command(*compared, "--json", root=every_set).json["against"]
     assert against["chow_rows_independent"]["f"] > against["wald_drives_independent"]["f"] > 0
-    assert "Wald, by drives" in run_command(*compared, root=smoke_root).stdout
+    assert "Wald, by drives" in run_command(*compared, root=every_set).stdout
 
 
 def test_what_if_agrees_with_a_campaign_of_doubled_noise(
-    run_command: RunCommand, smoke_root: Path, tmp_path: Path
+    run_command: RunCommand, every_set: Path, tmp_path: Path
 ) -> None:
     text = find_config("campaigns", "smoke").read_text()
     stds = ("acceleration_std_mps2", "yaw_rate_std_rad_s", "wheel_speed_std_rad_s")
@@ -190,17 +189,17 @@ def test_what_if_agrees_with_a_campaign_of_doubled_noise(
         text = text.replace(std[0], f"{name} = {2 * float(std[1])}")
     (tmp_path / "noisy.toml").write_text(text)
     noisy = tmp_path / "noisy"
-    run(noisy, "simulate", str(tmp_path / "noisy.toml"))
+    done_on(noisy, "simulate", str(tmp_path / "noisy.toml"))
     nested = ("--nested", ",".join(NOISE), "--rank", "declared", "--criterion", "aic", "--naive")
-    run_command("publish", "doubled", *nested, root=smoke_root)
-    shown = run_command("show", "doubled", "--json", root=smoke_root).json
+    run_command("publish", "doubled", *nested, root=every_set)
+    shown = run_command("show", "doubled", "--json", root=every_set).json
     used = [term["signal"] for term in shown["terms"]]
     # Noise of twice the standard deviation is what there is, plus noise of sqrt(3) times it.
     options = [
         word for name in used for word in ("--noise", f"{name}={NOISE[name] * math.sqrt(3)}")
     ]
-    predicted = run_command("what-if", "doubled", *options, "--json", root=smoke_root).json
-    (noisy / "models").symlink_to(smoke_root / "models")
+    predicted = run_command("what-if", "doubled", *options, "--json", root=every_set).json
+    (noisy / "models").symlink_to(every_set / "models")
     simulated = run_command("score", "doubled", "--json", root=noisy).json
     assert predicted["after"]["rmse_deg"] > 1.2 * predicted["before"]["rmse_deg"]
     assert predicted["after"]["rmse_deg"] == pytest.approx(simulated["rmse_deg"], rel=0.01)
@@ -208,16 +207,16 @@ def test_what_if_agrees_with_a_campaign_of_doubled_noise(
     assert predicted["refitted_after"]["rmse_deg"] < predicted["after"]["rmse_deg"]
     # A bias of d in one signal moves the mean error by its coefficient times d.
     weight = next(term["coefficient"] for term in shown["terms"] if term["signal"] == "ay")
-    biased = run_command("what-if", "doubled", "--bias", "ay=0.5", "--json", root=smoke_root).json
+    biased = run_command("what-if", "doubled", "--bias", "ay=0.5", "--json", root=every_set).json
     moved = biased["after"]["error_mean_deg"] - biased["before"]["error_mean_deg"]
     assert moved == pytest.approx(math.degrees(weight * 0.5), rel=1e-9)
 
 
 def test_regimes_compare_one_model_with_one_for_each(
-    run_command: RunCommand, smoke_root: Path
+    run_command: RunCommand, every_set: Path
 ) -> None:
     arguments = ("regimes", "--over", "speed", "--signals", "ay,steer_fl,yaw_rate")
-    report = run_command(*arguments, "--json", root=smoke_root).json
+    report = run_command(*arguments, "--json", root=every_set).json
     rows = [one["rows"] for one in report["regimes"]]
     assert sum(rows) == report["pooled"]["rows"] == report["split"]["rows"]
     squares = sum(
@@ -225,19 +224,17 @@ def test_regimes_compare_one_model_with_one_for_each(
     )
     assert math.sqrt(squares / sum(rows)) == pytest.approx(report["pooled"]["rmse_deg"], rel=1e-9)
     whole = run_command(
-        "select", "--nested", "ay,steer_fl,yaw_rate", "--json", root=smoke_root
+        "select", "--nested", "ay,steer_fl,yaw_rate", "--json", root=every_set
     ).json["models"][-1]
     assert report["pooled"]["correlation"] == pytest.approx(whole["correlation"], rel=1e-12)
     assert report["winner"] == (
         "split" if report["gain"] > report["gain_standard_error"] else "pooled"
     )
-    assert "Choose" in run_command(*arguments, root=smoke_root).stdout
+    assert "Choose" in run_command(*arguments, root=every_set).stdout
 
 
-def test_shrinkage_is_compared_with_least_squares(
-    run_command: RunCommand, smoke_root: Path
-) -> None:
-    report = run_command("shrink", "--signals", "ay,ax,steer_fl", "--json", root=smoke_root).json
+def test_shrinkage_is_compared_with_least_squares(run_command: RunCommand, every_set: Path) -> None:
+    report = run_command("shrink", "--signals", "ay,ax,steer_fl", "--json", root=every_set).json
     by_name = {method["name"]: method for method in report["methods"]}
     assert set(by_name) >= {"least squares", "ridge", "lasso", "pace2", "pace6", "eb"}
     plain = by_name["least squares"]["correlation"]
@@ -272,19 +269,19 @@ def test_shrinkage_is_compared_with_least_squares(
     ],
 )
 def test_a_mistake_is_one_line_and_its_exit_code(
-    run_command: RunCommand, smoke_root: Path, arguments: list[str], exit_code: int, message: str
+    run_command: RunCommand, every_set: Path, arguments: list[str], exit_code: int, message: str
 ) -> None:
-    done = run_command(*arguments, root=smoke_root)
+    done = run_command(*arguments, root=every_set)
     assert done.exit_code == exit_code, done
     assert message in done.stderr.replace("\n", " ")
     assert done.stdout == ""
 
 
 def test_noise_inside_a_feature_has_no_closed_form(
-    run_command: RunCommand, smoke_root: Path
+    run_command: RunCommand, every_set: Path
 ) -> None:
     arguments = ("what-if", "--features", "motion", "--signals", "ay,ay_signed_square")
-    done = run_command(*arguments, "--noise", "ay=0.1", root=smoke_root)
+    done = run_command(*arguments, "--noise", "ay=0.1", root=every_set)
     assert done.exit_code == 5
     assert "ay_signed_square" in done.stderr
 

@@ -2,9 +2,7 @@
 
 import os
 import shlex
-import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,15 +10,16 @@ from typing import Any
 import pytest
 from distributed import Client
 
-from benchmarks.dask_processes import DaskProcesses, dask_processes
 from fleet_slip.compute.cluster import cluster_executor
 from fleet_slip.compute.cluster_worker import Marker, environment, pickled, work
 from fleet_slip.compute.tasks import LocalThreads, run_tasks
 from fleet_slip.errors import RefusedError, StorageError
 from fleet_slip.files.local_folder import LocalFolder
-from tests.cluster.work import Order, obey
-from tests.conftest import COMMAND, RunCommand
-from tests.ingest.samples import csv_text, good_columns
+from tests.support.commands import RunCommand, finish, run, start_on
+from tests.support.dask_processes import DaskProcesses, dask_processes
+from tests.support.measured import csv_text, good_columns
+from tests.support.orders import Order, obey
+from tests.support.waiting import until
 
 UNTIL_ALL_HAD_ONE = 1000
 """So many tasks that every worker gets one, however late it comes and busy the machine is."""
@@ -98,10 +97,10 @@ def test_a_killed_command_is_finished_by_the_next(
     local, there = tmp_path / "local", tmp_path / "there"
     assert run_command("simulate", "smoke", root=local).exit_code == 0
     command = ["simulate", "smoke", "--cluster", dask.address]
-    with subprocess.Popen([COMMAND, "--root", there, *command], stderr=subprocess.PIPE) as killed:
-        while not list(there.glob("logs/_delta_log/*.json")) and killed.poll() is None:
-            time.sleep(0.01)
-        killed.kill()
+    killed = start_on(there, *command)
+    until(lambda: list(there.glob("logs/_delta_log/*.json")) or killed.poll() is not None)
+    killed.kill()
+    finish(killed)
     assert run_command(*command, root=there).exit_code == 0
     assert stored(there) == stored(local)
 
@@ -131,7 +130,7 @@ def test_a_worker_that_does_not_see_the_data_root_writes_nothing(
     dask: DaskProcesses, tmp_path: Path
 ) -> None:
     own_mounts = ["unshare", "--mount"]
-    if subprocess.run([*own_mounts, "true"], check=False, capture_output=True).returncode:
+    if run([*own_mounts, "true"]).exit_code:
         pytest.skip("not permitted to hide a folder from a process")
     hide = f'mount -t tmpfs none {shlex.quote(str(tmp_path))} && exec "$0" "$@"'
     blind = dask.start_worker("--name", "blind", before=(*own_mounts, "sh", "-c", hide))
@@ -187,8 +186,8 @@ def test_without_dask_the_option_says_what_to_install(tmp_path: Path) -> None:
     )
     options = ["--root", str(tmp_path), "gram", "--cluster", "tcp://x:1"]
     command = [sys.executable, "-c", program, *options]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 3
+    done = run(command)
+    assert done.exit_code == 3
     assert "pip install 'fleet-slip[cluster]'" in done.stderr
 
 

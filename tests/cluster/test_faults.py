@@ -2,21 +2,21 @@
 
 import os
 import signal
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from threading import Timer
 
 import pytest
 from dask.config import set as dask_config
 
-from benchmarks.dask_processes import DaskProcesses, dask_processes
 from fleet_slip.compute import cluster as cluster_module
 from fleet_slip.compute.cluster import ClusterExecutor, cluster_executor
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import ClusterError
 from fleet_slip.files.local_folder import LocalFolder
-from tests.cluster.work import Order, obey
+from tests.support.dask_processes import DaskProcesses, dask_processes
+from tests.support.orders import Order, obey
+from tests.support.waiting import until
 
 pytestmark = pytest.mark.slow
 
@@ -44,13 +44,6 @@ def results(executor: ClusterExecutor, items: Sequence[Order]) -> dict[str, str]
 def begun_by(items: Sequence[Order]) -> set[int]:
     """Processes that began one of the tasks."""
     return {pid for order in items for pid in order.started_in}
-
-
-def until(condition: Callable[[], bool], seconds: float = 240) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.02)
 
 
 def test_workers_that_stop_or_die_delay_but_lose_nothing(

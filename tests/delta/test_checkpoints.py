@@ -12,7 +12,7 @@ from fleet_slip.delta.checkpoints import checkpoint_faults, sealed_checkpoints, 
 from fleet_slip.maintenance.repair import repair
 from fleet_slip.maintenance.verify import verify
 from fleet_slip.warehouse.tables import Warehouse
-from tests.conftest import land, log_rows, path_of
+from tests.support.logs import land, log_rows, path_of
 
 COUNTS = {"ax": np.arange(5), "sideslip": np.arange(5)}
 INTERVAL = 100

@@ -16,7 +16,7 @@ from fleet_slip.grams.job import update_grams
 from fleet_slip.maintenance.compaction import compact
 from fleet_slip.maintenance.verify import verify
 from fleet_slip.warehouse.tables import Warehouse
-from tests.conftest import DAY, land, log_rows
+from tests.support.logs import DAY, land, log_rows
 
 COUNTS = {"ax": np.arange(5), "sideslip": np.arange(5)}
 

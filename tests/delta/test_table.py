@@ -13,7 +13,7 @@ from fleet_slip.errors import ConflictError, StorageError
 from fleet_slip.files.folder import TEMPORARY_PREFIX
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
-from tests.conftest import DAY, log_rows, path_of, random_counts
+from tests.support.logs import DAY, log_rows, path_of, random_counts
 
 
 def rows(drive: str, count: int = 1000) -> object:

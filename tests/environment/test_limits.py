@@ -9,7 +9,7 @@ import pytest
 
 from fleet_slip import limits
 from fleet_slip.errors import StorageError
-from tests.conftest import COMMAND, Finished
+from tests.support.commands import COMMAND, Finished
 
 ENOUGH_KIB = (limits.LIBRARIES_BYTES + limits.THREAD_BYTES * len(os.sched_getaffinity(0))) // 2**10
 

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import COMMAND
+from tests.support.commands import COMMAND
 
 UNIT = Path(__file__).parents[2] / "jobs/schedule/fleet-slip.service"
 NOBODY = 65534

@@ -1,13 +1,12 @@
 """Standard streams that are closed, full, or a pipe that nobody reads: the work is done."""
 
 import shlex
-import subprocess
 from pathlib import Path
 
 import pytest
 
 from fleet_slip.errors import StorageError
-from tests.conftest import COMMAND, Finished
+from tests.support.commands import COMMAND, Finished, run
 
 FULL = Path("/dev/full")
 STORAGE = StorageError.exit_code
@@ -18,16 +17,10 @@ needs_a_full_device = pytest.mark.skipif(not FULL.exists(), reason="no /dev/full
 def run_in_shell(root: Path, arguments: str, redirection: str) -> Finished:
     """Run the command with bash's redirection; its own exit code, not that of the pipe's end."""
     command = f"{shlex.quote(COMMAND)} --root {shlex.quote(str(root))} {arguments} {redirection}"
-    done = subprocess.run(
-        ["bash", "-c", f"{command}; exit ${{PIPESTATUS[0]}}"],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-    )
+    done = run(["bash", "-c", f"{command}; exit ${{PIPESTATUS[0]}}"])
     assert "Traceback" not in done.stderr + done.stdout, done
     assert "Exception ignored" not in done.stderr, done
-    return Finished(done.returncode, done.stdout, done.stderr)
+    return done
 
 
 @pytest.mark.parametrize(
@@ -82,5 +75,5 @@ def test_a_closed_stream_is_not_taken_by_a_data_file(tmp_path: Path) -> None:
     python = shlex.quote(str(Path(COMMAND).with_name("python")))
     file = tmp_path / "data"
     command = f"{python} -c {shlex.quote(code)} {shlex.quote(str(file))} <&- >&- 2>&-"
-    subprocess.run(["bash", "-c", command], check=True, timeout=60)
+    assert run(["bash", "-c", command]).exit_code == 0
     assert file.read_bytes() == b""

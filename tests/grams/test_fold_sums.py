@@ -7,7 +7,6 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from benchmarks.growth_history import write_fleet, write_grams
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.errors import DataError, FleetSlipError, QuestionError
 from fleet_slip.files.local_folder import LocalFolder
@@ -23,7 +22,8 @@ from fleet_slip.selection.model_list import load_model_list
 from fleet_slip.selection.request import SelectionRequest, answer_request
 from fleet_slip.views import VIEWS, connect, needed_views
 from fleet_slip.warehouse.tables import Warehouse
-from tests.conftest import DAY, land, log_rows, random_counts
+from tests.support.growth_history import write_fleet, write_grams
+from tests.support.logs import DAY, land, log_rows, random_counts
 
 MODELS = load_model_list("table1")
 

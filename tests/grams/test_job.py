@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.delta import Change, Unit
+from fleet_slip.errors import StorageError
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams import gram_files
 from fleet_slip.grams.aggregation import aggregate
@@ -20,7 +21,7 @@ from fleet_slip.grams.check import check_grams, grams_of
 from fleet_slip.grams.job import update_grams
 from fleet_slip.grams.statement import gram_statement
 from fleet_slip.warehouse.tables import Warehouse
-from tests.conftest import DAY, land, log_rows, random_counts
+from tests.support.logs import DAY, land, log_rows, random_counts
 
 NAMES = catalogue().gram_signals
 
@@ -177,7 +178,7 @@ def test_the_check_finds_a_gram_row_that_is_not_of_its_file(
     action = warehouse.grams.write_file("wrong", wrong)
     warehouse.grams.snapshot().commit(Change(add=[action]))
     with pytest.raises(
-        Exception, match="the Gram of drive a by SQL and by the stored Gram rows differ"
+        StorageError, match="the Gram of drive a by SQL and by the stored Gram rows differ"
     ):
         check_grams(warehouse, 1)
     assert DAY in rows["day"].to_pylist()

@@ -5,7 +5,6 @@ Known vulnerabilities are looked up by `pip-audit`, which needs a network; this 
 
 import ast
 import re
-import subprocess
 import sys
 import tomllib
 from importlib.metadata import PackageNotFoundError, distribution, packages_distributions
@@ -15,6 +14,8 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+
+from tests.support.commands import run
 
 REPOSITORY = Path(__file__).parents[2]
 PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
@@ -93,8 +94,8 @@ def modules_of(file: Path) -> set[str]:
 
 def test_the_packages_fit_together() -> None:
     command = [sys.executable, "-m", "pip", "check", "--disable-pip-version-check"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout
+    done = run(command)
+    assert done.exit_code == 0, done.stdout
 
 
 def test_every_licence_lets_us_use_the_package() -> None:

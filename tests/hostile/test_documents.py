@@ -11,8 +11,8 @@ from fleet_slip.errors import FleetSlipError, StorageError
 from fleet_slip.files.documents import DocumentFolder, checksum
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.models.versions import Registry
-from tests.conftest import path_of
-from tests.models.manifests import manifest, publish
+from tests.support.logs import path_of
+from tests.support.manifests import manifest, publish
 
 NAME = manifest().name
 

@@ -8,7 +8,7 @@ import pytest
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.job import ingest_file
 from fleet_slip.warehouse.tables import Warehouse
-from tests.ingest.samples import a_mapping, csv_text, good_columns
+from tests.support.measured import a_mapping, csv_text, good_columns
 
 MIB = 2**20
 

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from benchmarks.fuzz.mutate import ByteRandom
-from benchmarks.fuzz.targets import TARGETS
 from fleet_slip.errors import FleetSlipError
+from tests.support.fuzz.mutate import ByteRandom
+from tests.support.fuzz.targets import TARGETS
 
 EXAMPLES = {"csv": 60, "parquet": 60, "config": 100, "sql": 60, "manifest": 40}
 FEW = 6

@@ -12,8 +12,8 @@ from fleet_slip.grams.job import update_grams
 from fleet_slip.models.versions import Registry
 from fleet_slip.progress import no_progress
 from fleet_slip.warehouse.tables import Warehouse
-from tests.conftest import land, log_rows, path_of, random_counts
-from tests.models.manifests import manifest, publish
+from tests.support.logs import land, log_rows, path_of, random_counts
+from tests.support.manifests import manifest, publish
 
 
 @pytest.mark.parametrize("umask", [0o022, 0o077])

@@ -13,8 +13,9 @@ from fleet_slip.files.documents import checksum
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.models.signing import VERIFY_VARIABLE, make_keys
 from fleet_slip.models.versions import Registry
-from tests.conftest import RunCommand, path_of
-from tests.models.manifests import manifest, publish
+from tests.support.commands import RunCommand
+from tests.support.logs import path_of
+from tests.support.manifests import manifest, publish
 
 pytest.importorskip("cryptography", reason="signatures need the extra 'signing'")
 

@@ -23,7 +23,8 @@ from fleet_slip.views import connect
 from fleet_slip.warehouse.database import database_errors, interruptible
 from fleet_slip.warehouse.read_only_sql import one_query
 from fleet_slip.warehouse.tables import Warehouse
-from tests.conftest import RunCommand, land, log_rows, path_of, random_counts
+from tests.support.commands import RunCommand
+from tests.support.logs import land, log_rows, path_of, random_counts
 
 
 @pytest.fixture(scope="module")

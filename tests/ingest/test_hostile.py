@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.ingest import MeasuredLog, read_measured
-
-from .samples import a_mapping, csv_text, good_columns
+from tests.support.measured import a_mapping, csv_text, good_columns
 
 CASES = settings(
     max_examples=100,

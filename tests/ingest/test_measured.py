@@ -15,8 +15,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import InputError
 from fleet_slip.ingest import load_mapping, measured, read_measured
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA
-
-from .samples import (
+from tests.support.measured import (
     a_mapping,
     csv_text,
     good_columns,
@@ -359,24 +358,3 @@ def test_the_worked_example_of_the_docs(tmp_path: Path) -> None:
     assert physical(log, "yaw_rate", 1e-4) == pytest.approx(np.radians([-0.25, -0.35]), abs=5e-5)
     assert physical(log, "wheel_fl", 0.01) == pytest.approx([64.10, 64.13], abs=0.006)
     assert log.drives["sideslip"].to_pylist() == [None, 21]
-
-
-RACE_CAR = Path(__file__).parents[2].parent / "shared" / "real" / "race_car_250lm.csv"
-
-
-@pytest.mark.skipif(not RACE_CAR.is_file(), reason="the measured race car log is not here")
-def test_a_measured_race_car_gives_the_known_regression() -> None:
-    log = read_measured(RACE_CAR, load_mapping("race_car_250lm"))
-    assert (log.counts.rows_kept, log.counts.ticks, log.counts.drives) == (55_001, 55_001, 1)
-    names = ("ax", "ay", "yaw_rate", "steer_fl", "steer_fr")
-    inputs = [physical(log, name, float(catalogue()[name].scale)) for name in names]
-    X = np.column_stack([np.ones(log.counts.ticks), *inputs])
-    y = physical(log, "sideslip", 1e-4)
-    assert np.degrees(y.std()) == pytest.approx(1.66, abs=0.005)
-    blocks = np.array_split(np.arange(y.size), 10)
-    estimate = np.empty_like(y)
-    for held_out in blocks:
-        rest = np.setdiff1d(np.arange(y.size), held_out)
-        estimate[held_out] = X[held_out] @ np.linalg.lstsq(X[rest], y[rest], rcond=None)[0]
-    assert np.corrcoef(estimate, y)[0, 1] == pytest.approx(0.940, abs=0.001)
-    assert np.degrees((estimate - y).std()) == pytest.approx(0.57, abs=0.005)

@@ -9,8 +9,7 @@ import pytest
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest import csv_batches, measured, read_measured, reading
-
-from .samples import a_mapping, csv_text, good_columns, read_text, reasons, ticks
+from tests.support.measured import a_mapping, csv_text, good_columns, read_text, reasons, ticks
 
 GOOD = csv_text(good_columns())
 

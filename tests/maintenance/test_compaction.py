@@ -20,7 +20,7 @@ from fleet_slip.grams.job import update_grams
 from fleet_slip.maintenance.compaction import compact
 from fleet_slip.maintenance.vacuum import find_expired, find_unreferenced, vacuum
 from fleet_slip.warehouse.tables import Warehouse
-from tests.conftest import DAY, land, log_rows, path_of, random_counts
+from tests.support.logs import DAY, land, log_rows, path_of, random_counts
 
 ALL_LOGS = "SELECT * FROM log_counts ORDER BY ALL"
 ALL_GRAMS = "SELECT * EXCLUDE file FROM grams ORDER BY ALL"

@@ -29,8 +29,9 @@ from fleet_slip.maintenance.retention import Retention, retain
 from fleet_slip.maintenance.vacuum import find_unreferenced
 from fleet_slip.regression.exact import fit
 from fleet_slip.warehouse.tables import Warehouse
-from tests.conftest import COMMAND, RunCommand, land, log_rows, random_counts
-from tests.ingest.samples import a_mapping, csv_text, good_columns
+from tests.support.commands import COMMAND, RunCommand
+from tests.support.logs import land, log_rows, random_counts
+from tests.support.measured import a_mapping, csv_text, good_columns
 
 CARS = ("alfa", "beta", "gamma")
 

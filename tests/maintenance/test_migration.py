@@ -23,7 +23,8 @@ from fleet_slip.maintenance.migration import migrate, rescale_counts
 from fleet_slip.resources import folder
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
-from tests.conftest import RunCommand, land, log_rows, path_of, random_counts
+from tests.support.commands import RunCommand
+from tests.support.logs import land, log_rows, path_of, random_counts
 
 SHIPPED = (folder("configs") / "signals.toml").read_text()
 

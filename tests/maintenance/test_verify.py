@@ -25,7 +25,8 @@ from fleet_slip.resources import find_config
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.job import simulate_campaign
 from fleet_slip.warehouse.tables import Warehouse
-from tests.conftest import DAY, RunCommand, land, log_rows, path_of, random_counts
+from tests.support.commands import RunCommand
+from tests.support.logs import DAY, land, log_rows, path_of, random_counts
 
 
 @pytest.fixture

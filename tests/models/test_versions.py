@@ -1,7 +1,6 @@
 """Model versions and aliases: numbered, immutable, verified, and safe with many writers."""
 
 import json
-import multiprocessing
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,9 @@ from fleet_slip.files.documents import Document, DocumentFolder
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.models.aliases import CHAMPION, AliasHistory
 from fleet_slip.models.versions import Registry
-from tests.models.manifests import manifest, publish
+from tests.support.commands import PATIENCE_S
+from tests.support.manifests import manifest, publish
+from tests.support.processes import SPAWN, call_at_once
 
 
 def test_versions_are_consecutive_and_the_latest_published_is_champion(tmp_path: Path) -> None:
@@ -92,12 +93,7 @@ def _publish_ten(path: Path, writer: int) -> None:
 
 
 def test_writers_at_once_never_share_a_number_or_lose_a_version(tmp_path: Path) -> None:
-    context = multiprocessing.get_context("spawn")
-    writers = [context.Process(target=_publish_ten, args=(tmp_path, n)) for n in range(4)]
-    for process in writers:
-        process.start()
-    for process in writers:
-        process.join()
+    call_at_once(_publish_ten, [(tmp_path, writer) for writer in range(4)])
     registry = Registry(LocalFolder(tmp_path))
     numbers = registry.versions("sideslip")
     assert numbers == list(range(1, 41))
@@ -115,15 +111,8 @@ def _publish_the_same(path: Path, logs_version: int, barrier: Any) -> None:
 
 
 def test_writers_at_once_publish_the_same_estimator_once(tmp_path: Path) -> None:
-    context = multiprocessing.get_context("spawn")
-    barrier = context.Barrier(3)
-    writers = [
-        context.Process(target=_publish_the_same, args=(tmp_path, n, barrier)) for n in range(3)
-    ]
-    for process in writers:
-        process.start()
-    for process in writers:
-        process.join()
+    barrier = SPAWN.Barrier(3, timeout=PATIENCE_S)
+    call_at_once(_publish_the_same, [(tmp_path, version, barrier) for version in range(3)])
     registry = Registry(LocalFolder(tmp_path))
     for model in range(20):
         assert registry.versions(f"m{model}") == [1]

@@ -20,8 +20,9 @@ from fleet_slip.regression.special import student_t_quantile
 from fleet_slip.selection.request import SelectionRequest, answer_request
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
-from tests.conftest import DAY, RunCommand, land, log_rows
-from tests.monitoring.cars import counts, drive
+from tests.support.cars import counts, drive
+from tests.support.commands import RunCommand
+from tests.support.logs import DAY, land, log_rows
 
 TRAINING_DAYS = 6
 

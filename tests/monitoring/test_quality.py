@@ -13,8 +13,9 @@ from fleet_slip.monitoring.plausibility import Fault
 from fleet_slip.monitoring.quality import QualityReport, examine, examine_drives
 from fleet_slip.monitoring.thresholds import QualityThresholds, thresholds
 from fleet_slip.warehouse.tables import Warehouse
-from tests.conftest import RunCommand, land, log_rows, random_counts
-from tests.monitoring.cars import TICKS, Signals, broken, counts, drive
+from tests.support.cars import TICKS, Signals, broken, counts, drive
+from tests.support.commands import RunCommand
+from tests.support.logs import land, log_rows, random_counts
 
 DRIVES = 30
 

@@ -1,6 +1,5 @@
 """The health of a warehouse, as a monitor asks for it."""
 
-import subprocess
 import sys
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -14,7 +13,8 @@ from fleet_slip.grams.job import update_grams
 from fleet_slip.monitoring.status import status_of
 from fleet_slip.runs.log import recording
 from fleet_slip.warehouse.tables import Warehouse
-from tests.conftest import DAY, RunCommand, land, log_rows, path_of, random_counts
+from tests.support.commands import RunCommand, run
+from tests.support.logs import DAY, land, log_rows, path_of, random_counts
 
 
 def test_freshness_backlog_and_age(warehouse: Warehouse) -> None:
@@ -60,8 +60,7 @@ def test_a_killed_run_is_known(warehouse: Warehouse) -> None:
         "with recording(LocalFolder(Path(sys.argv[1])), 'run', []):\n"
         "    os.kill(os.getpid(), signal.SIGKILL)"
     )
-    done = subprocess.run([sys.executable, "-c", code, str(warehouse.root)], check=False)
-    assert done.returncode == -9
+    assert run([sys.executable, "-c", code, str(warehouse.root)]).exit_code == -9
     (problem,) = status_of(warehouse).problems
     assert problem.startswith("run of ")
     assert problem.endswith(" was killed")

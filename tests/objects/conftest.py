@@ -6,9 +6,7 @@ import pytest
 
 from fleet_slip.files.data_root import data_root
 from fleet_slip.files.folder import Folder
-from fleet_slip.files.object_credentials import aws_profile
-from fleet_slip.files.object_folder import _store
-from tests.objects.server import Server
+from tests.support.s3_server import Server, forget_clients
 
 
 @pytest.fixture(scope="session")
@@ -25,12 +23,6 @@ def environment(server: Server, monkeypatch: pytest.MonkeyPatch) -> Iterator[Non
         monkeypatch.setenv(name, value)
     yield
     forget_clients()
-
-
-def forget_clients() -> None:
-    """Let this process look anew for credentials, as a new one would."""
-    aws_profile.cache_clear()
-    _store.cache_clear()
 
 
 @pytest.fixture

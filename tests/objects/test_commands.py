@@ -1,18 +1,16 @@
 """The command line on an object store: the same bits as in a folder, and nothing told of keys."""
 
-import os
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from benchmarks.dask_processes import dask_processes
 from fleet_slip.files.data_root import data_root
 from fleet_slip.files.folder import Folder
 from fleet_slip.files.local_folder import LocalFolder
-from tests.conftest import COMMAND, Finished
-from tests.objects.server import ACCESS_KEY, SECRET_KEY, Server
+from tests.support.commands import finish, start_on
+from tests.support.dask_processes import dask_processes
+from tests.support.s3_server import ACCESS_KEY, SECRET_KEY, Server, command_on
 
 DAMAGE, STORAGE = 9, 6
 
@@ -22,20 +20,6 @@ def stored(root: Folder) -> dict[str, bytes]:
     files = [file.path for file in root.files()]
     data = {path: b"" for path in files if path.endswith(".parquet")}
     return data | {path: root.read(path) for path in files if "/versions/" in path}
-
-
-def command_on(root: object, *arguments: str, **options: str) -> Finished:
-    """Run a command as a user would, and look for keys in what it prints."""
-    done = subprocess.run(
-        [COMMAND, "--root", str(root), *arguments],
-        capture_output=True,
-        text=True,
-        check=False,
-        env=os.environ | options,
-    )
-    for text in (done.stdout, done.stderr):
-        assert not [secret for secret in (ACCESS_KEY, SECRET_KEY, "Traceback") if secret in text]
-    return Finished(done.returncode, done.stdout, done.stderr)
 
 
 @pytest.fixture(scope="module")
@@ -124,18 +108,9 @@ def test_processes_at_once_lose_and_double_nothing(
 ) -> None:
     root = data_root(f"{server.bucket()}/data")
     with server.misbehaving(failing=0.03, slow_s=0.02):
-        at_once = [
-            subprocess.Popen(
-                [COMMAND, "--root", str(root), *arguments],
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
-                text=True,
-            )
-            for arguments in (["run", "--campaign", "smoke"],) * 2 + (["simulate", "smoke"],)
-        ]
-        for process in at_once:
-            _, told = process.communicate()
-            assert process.returncode == 0, told
+        jobs = (["run", "--campaign", "smoke"],) * 2 + (["simulate", "smoke"],)
+        for done in finish(*(start_on(root, *job) for job in jobs)):
+            assert done.exit_code == 0, done.stderr
     rows = command_on(root, "sql", "--json", "SELECT count(*) AS n FROM log").json
     assert rows == [{"n": 55957}]
     whole, expected = stored(root), stored(local)

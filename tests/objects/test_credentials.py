@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,10 +12,15 @@ from fleet_slip.delta import Change, Snapshot
 from fleet_slip.errors import StorageError
 from fleet_slip.files.data_root import data_root
 from fleet_slip.warehouse.tables import Warehouse
-from tests.conftest import DAY, log_rows, random_counts
-from tests.objects.conftest import forget_clients
-from tests.objects.server import ACCESS_KEY, SECRET_KEY, Server
-from tests.objects.test_commands import command_on
+from tests.support.logs import DAY, log_rows, random_counts
+from tests.support.s3_server import (
+    ACCESS_KEY,
+    SECRET_KEY,
+    Server,
+    command_on,
+    forget_clients,
+)
+from tests.support.waiting import until
 
 KEYS = f"aws_access_key_id = {ACCESS_KEY}\naws_secret_access_key = {SECRET_KEY}\n"
 
@@ -120,10 +124,12 @@ def test_temporary_credentials_are_had_anew_before_they_end(
         land(logs.snapshot(), "a")
         snapshot = logs.snapshot()
     key.write_text(ACCESS_KEY)
-    deadline = time.monotonic() + 240
-    while time.monotonic() < deadline:
+
+    def landed() -> bool:
         with contextlib.suppress(StorageError):
             land(snapshot, "b")
-            break
-        time.sleep(0.5)
+            return True
+        return False
+
+    until(landed)
     assert logs.snapshot().rows == 40

@@ -25,8 +25,8 @@ from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.job import update_grams
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
-from tests.conftest import DAY, land, log_rows, random_counts
-from tests.objects.server import ACCESS_KEY, SECRET_KEY, Server
+from tests.support.logs import DAY, land, log_rows, random_counts
+from tests.support.s3_server import ACCESS_KEY, SECRET_KEY, Server
 
 
 def rows(drive: str, count: int = 20) -> object:
@@ -128,8 +128,8 @@ def test_a_name_of_a_data_file_is_used_once(root: Folder) -> None:
     assert not logs.restore_file(file, rows("b"))
 
 
-def test_a_warehouse_is_sent_without_its_connections(root: Folder) -> None:
-    for place in (root, LocalFolder(Path("data"))):
+def test_a_warehouse_is_sent_without_its_connections(root: Folder, tmp_path: Path) -> None:
+    for place in (root, LocalFolder(tmp_path / "data")):
         warehouse = Warehouse(place)
         assert not warehouse.logs.folder.exists()
         sent = pickle.dumps((warehouse, warehouse.logs))

@@ -12,7 +12,7 @@ from fleet_slip.runs.history import gather_runs
 from fleet_slip.runs.log import Run, recording, step
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
-from tests.objects.server import Server
+from tests.support.s3_server import Server
 
 
 def record(root: Folder, name: str) -> None:

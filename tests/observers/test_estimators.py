@@ -13,7 +13,7 @@ from fleet_slip.errors import DataError
 from fleet_slip.observers import ekf, kalman, luenberger, sliding_mode
 from fleet_slip.observers.signals import LabelledDrive
 from fleet_slip.vehicle.parameters import load_vehicle
-from tests.observers.drives import mirrored, noisy, rolling_drive, simulated_drive, slalom
+from tests.support.drives import mirrored, noisy, rolling_drive, simulated_drive, slalom
 
 CAR = load_vehicle("d_class_sedan")
 ESTIMATORS: dict[str, tuple[Callable[..., FloatArray], Any]] = {

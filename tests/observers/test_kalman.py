@@ -16,7 +16,7 @@ from fleet_slip.observers.kalman import Belief, FilterNoise, covariances, predic
 from fleet_slip.observers.outages import TUNNEL_S, tunnel
 from fleet_slip.observers.signals import STEP_S, DriveSignals
 from fleet_slip.vehicle.parameters import load_vehicle
-from tests.observers.drives import GPS_EVERY, mirrored, noisy, rolling_drive, slalom, without_fixes
+from tests.support.drives import GPS_EVERY, mirrored, noisy, rolling_drive, slalom, without_fixes
 
 CAR = load_vehicle("d_class_sedan")
 H = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0]])

@@ -16,7 +16,7 @@ from fleet_slip.observers.signals import STEP_S, DriveSignals
 from fleet_slip.observers.single_track import SingleTrack, state_space
 from fleet_slip.observers.sliding_mode import SlidingGains
 from fleet_slip.vehicle.parameters import load_vehicle
-from tests.observers.drives import rolling_drive, steady_sideslip_rad
+from tests.support.drives import rolling_drive, steady_sideslip_rad
 
 CAR = load_vehicle("d_class_sedan")
 TRACK = SingleTrack.of(CAR)

@@ -15,7 +15,7 @@ from fleet_slip.observers.kalman import FilterNoise
 from fleet_slip.observers.signals import DriveSignals, LabelledDrive
 from fleet_slip.observers.tuning import error_std_rad, tune
 from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
-from tests.observers.drives import noisy, slalom
+from tests.support.drives import noisy, slalom
 
 CAR = load_vehicle("d_class_sedan")
 

@@ -11,7 +11,7 @@ from fleet_slip.observers.signals import STEP_S, DriveSignals
 from fleet_slip.observers.wheel_speeds import undriven_axle
 from fleet_slip.observers.yaw_rate import YawRateNoise
 from fleet_slip.vehicle.parameters import load_vehicle
-from tests.observers.drives import noisy, rolling_drive, slalom
+from tests.support.drives import noisy, rolling_drive, slalom
 
 CAR = load_vehicle("d_class_sedan")
 NOISE = YawRateNoise()

@@ -13,9 +13,7 @@ from fleet_slip.regression.crossval import CrossValidation, cross_validate_input
 from fleet_slip.regression.folds import CohortFolds, by_hash, by_value, hash_fold
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.winner import choose
-from tests.regression.data import table_of
-
-from .data import dense_fit, gram_of, names, random_drives
+from tests.support.counts import dense_fit, gram_of, names, random_drives, table_of
 
 SCALES = {**{name: Fraction(1, 100) for name in names(6)}, "y": Fraction(1, 10_000)}
 

@@ -18,8 +18,7 @@ from fleet_slip.regression.exact import (
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.nested import nested_fits
 from fleet_slip.regression.rounding import sqrt
-
-from .data import dense_fit, gram_of, names, random_drives
+from tests.support.counts import dense_fit, gram_of, names, random_drives
 
 
 @given(st.integers(0, 10**6), st.integers(1, 6))

@@ -9,7 +9,7 @@ from hypothesis.extra import numpy as hnp
 from fleet_slip.errors import DataError
 from fleet_slip.regression.gram import Gram, packed_position
 from fleet_slip.regression.gram_table import GramTable, exact_sum
-from tests.regression.data import table_of
+from tests.support.counts import table_of
 
 SIGNALS = ("ax", "ay", "sideslip")
 

@@ -19,9 +19,7 @@ from fleet_slip.regression.inference import (
     infer_classically,
     variance_inflation,
 )
-from tests.regression.data import table_of
-
-from .data import dense_fit, gram_of, names, random_drives, unit_scales
+from tests.support.counts import dense_fit, gram_of, names, random_drives, table_of, unit_scales
 
 
 def moments_of(drives: list[np.ndarray]) -> DriveMoments:

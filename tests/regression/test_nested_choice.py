@@ -18,9 +18,7 @@ from fleet_slip.regression.nested_choice import (
     select_nested,
 )
 from fleet_slip.regression.subsets import best_subsets, pick_sizes
-from tests.regression.data import table_of
-
-from .data import gram_of, names, unit_scales
+from tests.support.counts import gram_of, names, table_of, unit_scales
 
 INPUTS = names(5)[:-1]
 

@@ -11,8 +11,8 @@ import pytest
 from fleet_slip.regression.exact import fit
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.inference import infer_classically
-
-from .data import columns_to_counts, reference
+from tests.support.counts import columns_to_counts
+from tests.support.evidence import evidence
 
 PROBLEMS = ["norris", "noint1", "noint2", "longley", "wampler1", "wampler2", "wampler3"]
 DIGITS = 14
@@ -39,7 +39,7 @@ def polynomial(counts: Any, scales: list[Fraction], degree: int) -> tuple[Any, l
 
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_certified_digits(name: str) -> None:
-    problem = reference("nist/nist_strd_linear.json")[name]
+    problem = evidence("nist/nist_strd_linear.json")[name]
     counts, scales = columns_to_counts(problem["rows"])
     degree = problem["model"]["polynomial_degree"]
     if degree is not None:

@@ -22,9 +22,8 @@ from fleet_slip.regression.leaps import best_by_leaps
 from fleet_slip.regression.nested import nested_fits, nested_models
 from fleet_slip.regression.ranking import RANKINGS, rank, replacement_sets
 from fleet_slip.regression.subsets import all_rss, best_subsets, candidates, signals_of
-from tests.regression.data import table_of
-
-from .data import dense_fit, gram_of, names, random_drives, reference, unit_scales
+from tests.support.counts import dense_fit, gram_of, names, random_drives, table_of, unit_scales
+from tests.support.evidence import evidence
 
 ORDERS = {
     "forward": "forward_order",
@@ -39,8 +38,8 @@ ORDERS = {
 @pytest.fixture(scope="module")
 def diabetes() -> tuple[Gram, dict[str, Any]]:
     """Gram of the unscaled diabetes data as integers, and the outside answers."""
-    exact = reference("weka/diabetes_raw_exact.json")
-    answers = reference("subsets/diabetes_reference.json")
+    exact = evidence("weka/diabetes_raw_exact.json")
+    answers = evidence("subsets/diabetes_reference.json")
     raw = [[int(value) for value in row] for row in exact["gram_integer_ones_x_y"]]
     products = tuple(raw[i][j] for i in range(1, 12) for j in range(1, i + 1))
     return Gram((*answers["names"], "y"), raw[0][0], tuple(raw[0][1:]), products), answers
@@ -132,7 +131,7 @@ def test_lasso_equals_scikit_learn(seed: int) -> None:
 
 
 def test_the_lasso_path_of_r() -> None:
-    expected = reference("subsets/lars_R_reference.json")
+    expected = evidence("subsets/lars_R_reference.json")
     x, y = np.array(expected["X"]), np.array(expected["y"])
     path = path_of_moments(x.T @ x, x.T @ y, [f"x{i}" for i in range(5)], lasso=True)
     np.testing.assert_allclose(

@@ -19,20 +19,18 @@ from fleet_slip.regression.resampling import (
     solve,
     to_counts,
 )
-from tests.regression import data
-
-from .data import gram_of, names, random_drives, unit_scales
+from tests.support.counts import gram_of, names, random_drives, table_of, unit_scales
 
 INPUTS = names(4)[:-1]
 
 
-def table_of(drives: list[np.ndarray]) -> GramTable:
-    return data.table_of([gram_of(counts) for counts in drives])
+def table_of_drives(drives: list[np.ndarray]) -> GramTable:
+    return table_of([gram_of(counts) for counts in drives])
 
 
 def test_moments_solve_to_the_exact_coefficients() -> None:
     drives = random_drives(1)
-    moments = DriveMoments.of(table_of(drives))
+    moments = DriveMoments.of(table_of_drives(drives))
     solution = to_counts(moments, solve(moments.matrix(moments.packed.sum(axis=0))))
     exact = fit(gram_of(np.concatenate(drives)), INPUTS, "y").model
     np.testing.assert_allclose(solution, [exact.offset, *exact.weights.values()], rtol=1e-9)
@@ -40,7 +38,7 @@ def test_moments_solve_to_the_exact_coefficients() -> None:
 
 def test_held_out_products_pool_to_the_cross_validated_correlation() -> None:
     drives = random_drives(2, noise=200)
-    table = table_of(drives)
+    table = table_of_drives(drives)
     assignment = by_value([i % 4 for i in range(12)])
     folds = CohortFolds.of([table], assignment).serving(INPUTS[:2], "y")
     result = cross_validate("m", folds, least_squares(INPUTS[:2], "y"), unit_scales(4))
@@ -60,7 +58,7 @@ def test_held_out_products_pool_to_the_cross_validated_correlation() -> None:
 
 def test_bootstrap_spread_is_the_cluster_robust_error() -> None:
     drives = random_drives(3, drives=200, noise=200)
-    moments = DriveMoments.of(table_of(drives))
+    moments = DriveMoments.of(table_of_drives(drives))
     draws = bootstrap_coefficients(moments, 2000, seed=3)
     fitted = fit(gram_of(np.concatenate(drives)), INPUTS, "y")
     errors = [e.standard_error for e in infer_by_drives(fitted, moments, unit_scales(4)).estimates]
@@ -69,9 +67,9 @@ def test_bootstrap_spread_is_the_cluster_robust_error() -> None:
 
 def test_repeats_agree_with_exact_cross_validation() -> None:
     drives = random_drives(4, drives=15, noise=200)
-    moments = DriveMoments.of(table_of(drives))
+    moments = DriveMoments.of(table_of_drives(drives))
     repeated = repeated_cross_validation(moments, 15, 2, seed=0)
-    folds = CohortFolds.of([table_of(drives)], by_value(range(15))).serving(INPUTS, "y")
+    folds = CohortFolds.of([table_of_drives(drives)], by_value(range(15))).serving(INPUTS, "y")
     exact = cross_validate("loo", folds, least_squares(INPUTS, "y"), unit_scales(4))
     # With as many folds as drives every deal is the same: leave one drive out.
     np.testing.assert_allclose(repeated.correlations, exact.correlation, rtol=1e-9)
@@ -82,7 +80,7 @@ def test_repeats_agree_with_exact_cross_validation() -> None:
 
 
 def test_too_few_drives() -> None:
-    moments = DriveMoments.of(table_of(random_drives(5, drives=3)))
+    moments = DriveMoments.of(table_of_drives(random_drives(5, drives=3)))
     with pytest.raises(DataError, match="3 drives cannot fill 5 folds"):
         repeated_cross_validation(moments, 5, 1, seed=0)
     with pytest.raises(DataError, match="at least two drives"):

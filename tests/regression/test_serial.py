@@ -11,38 +11,19 @@ from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression.disturbance import disturb
 from fleet_slip.regression.exact import fit
 from fleet_slip.regression.figures import error_sums
-from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.serial import (
-    LagGram,
     fit_autoregressive,
     quasi_difference,
     serial_correlation,
 )
-
-from .data import dense_fit, gram_of, names, random_drives
-
-
-def autoregressive_drives(
-    seed: int, rho: float, drives: int = 3, rows: int = 400
-) -> list[np.ndarray]:
-    rng = np.random.default_rng(seed)
-    result = []
-    for _ in range(drives):
-        x = np.cumsum(rng.normal(size=(rows, 2)) * 40, axis=0)
-        noise = np.empty(rows)
-        noise[0] = rng.normal() * 100
-        for t in range(1, rows):
-            noise[t] = rho * noise[t - 1] + rng.normal() * 100
-        y = 2 * x[:, 0] - x[:, 1] + 500 + noise
-        result.append(np.rint(np.column_stack([x, y])).astype(np.int64))
-    return result
-
-
-def lag_gram(drives: list[np.ndarray]) -> LagGram:
-    now = names(drives[0].shape[1] - 1)
-    signals = (*now, *(f"{name}_before" for name in now))
-    pairs = [np.column_stack([drive[1:], drive[:-1]]) for drive in drives]
-    return LagGram(Gram.from_counts(signals, np.concatenate(pairs)), "_before")
+from tests.support.counts import (
+    autoregressive_drives,
+    dense_fit,
+    gram_of,
+    lag_gram,
+    names,
+    random_drives,
+)
 
 
 @settings(max_examples=20)

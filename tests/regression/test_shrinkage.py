@@ -33,9 +33,8 @@ from fleet_slip.regression.ridge import (
     fit_ridge,
     ridge_path,
 )
-
-from .data import gram_of, names, random_drives, unit_scales
-from .weka import threshold
+from tests.support.counts import gram_of, names, random_drives, unit_scales
+from tests.support.weka import threshold
 
 
 @settings(max_examples=25)

@@ -9,10 +9,14 @@ from fleet_slip.regression.drive_moments import DriveMoments
 from fleet_slip.regression.exact import fit
 from fleet_slip.regression.inference import infer_by_drives, infer_classically
 from fleet_slip.regression.serial import fit_autoregressive
-from tests.regression.data import table_of
-
-from .data import gram_of, names, unit_scales
-from .test_serial import autoregressive_drives, lag_gram
+from tests.support.counts import (
+    autoregressive_drives,
+    gram_of,
+    lag_gram,
+    names,
+    table_of,
+    unit_scales,
+)
 
 AGREEMENT = 1e-9
 

@@ -18,9 +18,9 @@ from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.nested import nested_fits
 from fleet_slip.regression.pace import ESTIMATORS, shrink
 from fleet_slip.regression.ranking import backward
-
-from .data import REFERENCE, columns_to_counts, reference
-from .weka import threshold, weka_linear_regression, weka_pace
+from tests.support.counts import columns_to_counts
+from tests.support.evidence import EVIDENCE, evidence
+from tests.support.weka import threshold, weka_linear_regression, weka_pace
 
 DATASETS = ["diabetes_raw", "vehicle9"]
 RUNS = range(17)
@@ -39,8 +39,8 @@ ROUNDED = {("vehicle9", 0): 4e-9, ("vehicle9", 1): 4e-9}
 
 @cache
 def dataset(name: str) -> tuple[Folds, tuple[str, ...], str, dict[str, Fraction]]:
-    runs = reference(f"weka/{name}_weka.json")
-    with (REFERENCE / "weka" / f"{name}.csv").open(encoding="utf-8") as file:
+    runs = evidence(f"weka/{name}_weka.json")
+    with (EVIDENCE / "weka" / f"{name}.csv").open(encoding="utf-8") as file:
         header, *rows = list(csv.reader(file))
     assert [int(row[0]) for row in rows] == list(range(len(rows)))
     counts, scales = columns_to_counts([row[1:] for row in rows])
@@ -89,7 +89,7 @@ def coefficients(model: LinearModel, inputs: tuple[str, ...], run: dict[str, Any
 @pytest.mark.parametrize("name", DATASETS)
 @pytest.mark.parametrize("number", RUNS)
 def test_coefficients_zeros_and_pooled_figures(name: str, number: int) -> None:
-    run = reference(f"weka/{name}_weka.json")["runs"][number]
+    run = evidence(f"weka/{name}_weka.json")["runs"][number]
     folds, inputs, label, scales = dataset(name)
     result: CrossValidation = cross_validate(
         run["options"], folds, procedure(run, inputs, label), scales
@@ -105,7 +105,7 @@ def test_coefficients_zeros_and_pooled_figures(name: str, number: int) -> None:
 
 @pytest.mark.parametrize("name", DATASETS)
 def test_exact_answers(name: str) -> None:
-    exact = reference(f"weka/{name}_exact.json")
+    exact = evidence(f"weka/{name}_exact.json")
     folds, inputs, label, scales = dataset(name)
     model = fit(folds.total, inputs, label).model.physical(scales)
     expected = [Fraction(int(p), int(q)) for p, q in exact["ols_coef_fraction"]]

@@ -1,6 +1,5 @@
-"""The page as a browser shows it. Needs Chromium, as Debian's package of that name."""
+"""The page as a browser shows it."""
 
-import shutil
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,17 +10,13 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from fleet_slip.report.style import PALETTE
-from tests.report.conftest import Reported
+from tests.support.reported import Reported
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 DESK_PX = 1200
 LONG_PX = 16000
 DARK = "--blink-settings=preferredColorScheme=0"
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed: apt install chromium"),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.tools("chromium")]
 
 
 @dataclass(frozen=True)
@@ -43,7 +38,7 @@ def show(
     shot = folder / "shot.png"
     done = subprocess.run(
         [
-            str(CHROMIUM),
+            "chromium",
             "--headless",
             "--no-sandbox",
             "--disable-gpu",

@@ -29,8 +29,8 @@ from fleet_slip.report.pictures import draw_pictures
 from fleet_slip.report.text import number
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
-from tests.conftest import RunCommand
-from tests.report.conftest import Reported, call
+from tests.support.commands import RunCommand
+from tests.support.reported import Reported, call
 
 pytestmark = pytest.mark.slow
 

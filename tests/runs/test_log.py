@@ -3,7 +3,6 @@
 import json
 import logging
 import os
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from fleet_slip.runs.log import (
     recording,
     step,
 )
-from tests.conftest import COMMAND, RunCommand
+from tests.support.commands import COMMAND, RunCommand, finish, run, start
 
 
 def runs(root: Path) -> list[dict[str, Any]]:
@@ -106,8 +105,8 @@ def test_processes_at_once_lose_no_record(tmp_path: Path) -> None:
         "for i in range(100):\n"
         "    with recording(LocalFolder(Path(sys.argv[1])), 'gram', ['x' * i]): pass"
     )
-    writers = [subprocess.Popen([sys.executable, "-c", code, str(tmp_path)]) for _ in range(4)]
-    assert [writer.wait() for writer in writers] == [0] * 4
+    writers = [start([sys.executable, "-c", code, str(tmp_path)]) for _ in range(4)]
+    assert [writer.exit_code for writer in finish(*writers)] == [0] * 4
     rows = runs(tmp_path)
     assert len(rows) == 400
     assert {row["outcome"] for row in rows} == {"done"}
@@ -152,7 +151,7 @@ def test_commands_are_recorded_and_questions_are_not(run_command: RunCommand) ->
 def test_the_log_is_json_where_no_person_reads_it(tmp_path: Path) -> None:
     command = [COMMAND, "--root", str(tmp_path / "data"), "gram", "--features", "unknown"]
     environment = {k: v for k, v in os.environ.items() if k != "FLEET_SLIP_LOG"}
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    done = run(command, env=environment)
     lines = [json.loads(line) for line in done.stderr.splitlines()]
     assert [line["event"] for line in lines] == [
         "run started",
@@ -161,14 +160,8 @@ def test_the_log_is_json_where_no_person_reads_it(tmp_path: Path) -> None:
         "message",
     ]
     assert len({line["run_id"] for line in lines[:3]}) == 1
-    assert lines[2]["exit_code"] == done.returncode == 5
+    assert lines[2]["exit_code"] == done.exit_code == 5
     assert lines[3]["level"] == "error"
     assert lines[3]["message"].startswith("error: no feature set is called 'unknown'")
-    text = subprocess.run(
-        [COMMAND, "--log", "text", *command[1:]],
-        capture_output=True,
-        text=True,
-        env=environment,
-        check=False,
-    )
+    text = run([COMMAND, "--log", "text", *command[1:]], env=environment)
     assert text.stderr.startswith("error: no feature set")

@@ -17,8 +17,7 @@ from fleet_slip.simulation.drives import DriveLog, simulate_batch, simulate_logs
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.simulation.track import load_track
 from fleet_slip.vehicle.lane_blocks import BLOCK, CHANNELS
-
-from .measuring import measure
+from tests.support.measuring import measure
 
 DAY = date(2024, 5, 1)
 

@@ -14,8 +14,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.config import load_config
 from fleet_slip.errors import ConfigError
 from fleet_slip.simulation.sensors import Gps, Recorder, Sensors
-
-from .measuring import measure, quantise
+from tests.support.measuring import measure, quantise
 
 TICKS = 200_000
 GPS = Gps(rate_hz=10, velocity_std_mps=0.05, time_between_outages_s=60, outage_duration_s=5)

@@ -11,8 +11,7 @@ from scipy.special import fresnel
 from fleet_slip.errors import ConfigError
 from fleet_slip.resources import config_names
 from fleet_slip.simulation.track import Segment, Track, load_track
-
-SHARED = Path(__file__).parents[2].parent / "shared" / "tracks"
+from tests.support.evidence import EVIDENCE
 
 
 def make_track(*segments: tuple[float, float, float], closed: bool = False) -> Track:
@@ -53,9 +52,7 @@ def test_circuits_have_the_stated_length_and_close(
     ],
 )
 def test_segments_are_those_of_the_source(name: str, file: str) -> None:
-    if not (SHARED / file).is_file():
-        pytest.skip("the source of the segments is not here")
-    with (SHARED / file).open() as lines:
+    with (EVIDENCE / "tracks" / file).open(encoding="utf-8") as lines:
         rows = [
             (float(r["length_m"]), float(r["kappa_start_1pm"]), float(r["kappa_end_1pm"]))
             for r in csv.DictReader(lines)

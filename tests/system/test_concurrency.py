@@ -1,16 +1,15 @@
 """Writers, a job that rearranges, and readers at once; and commands at once on one root."""
 
-import subprocess
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from benchmarks.reliability import concurrency
 from fleet_slip.files.local_folder import LocalFolder
-from tests.conftest import COMMAND, RunCommand
-from tests.ingest.samples import csv_text, good_columns
-from tests.system.test_crash import state
+from tests.support.commands import PATIENCE_S, RunCommand, finish, start_on
+from tests.support.measured import csv_text, good_columns
+from tests.support.state import state
+from tests.support.writers import concurrency
 
 MAPPING = """
 name = "test"
@@ -22,28 +21,15 @@ signals.sideslip = { column = "beta", unit = "deg" }
 
 
 @pytest.mark.slow
-def test_writers_lose_nothing_and_readers_see_whole_commits_in_order(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    concurrency(writers=3, commits=5)
-    assert "nothing lost or doubled" in capsys.readouterr().out
-
-
-def started(root: Path, command: list[str]) -> subprocess.Popen[str]:
-    """Start a command in a process of its own."""
-    return subprocess.Popen(
-        [COMMAND, "--root", str(root), *command],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+def test_writers_lose_nothing_and_readers_see_whole_commits_in_order() -> None:
+    said = concurrency(writers=3, commits=5, patience_s=PATIENCE_S)
+    assert "nothing lost or doubled" in said
 
 
 def at_once(root: Path, *commands: list[str]) -> list[tuple[int, str]]:
     """Run commands in processes of their own at the same time; return exit codes and stderr."""
-    running = [started(root, command) for command in commands]
-    answers = [process.communicate()[1] for process in running]
-    return [(p.returncode, text) for p, text in zip(running, answers, strict=True)]
+    running = [start_on(root, *command) for command in commands]
+    return [(done.exit_code, done.stderr) for done in finish(*running)]
 
 
 def contents(run_command: RunCommand, root: Path) -> list[Any]:
@@ -92,13 +78,13 @@ def test_the_second_run_of_a_campaign_waits_and_has_nothing_to_do(
     job = ["run", "--campaign", "smoke", "--threads", "1"]
     root = tmp_path / "data"
     with LocalFolder(root).exclusive(".run-smoke.lock", lambda: None):
-        running = [started(root, job) for _ in range(2)]
+        running = [start_on(root, *job) for _ in range(2)]
         for process in running:
             assert process.stderr
             assert process.stderr.readline() == "smoke: waiting for another run\n"
-    answers = [process.communicate()[1] for process in running]
-    assert [process.returncode for process in running] == [0, 0]
-    assert sum("nothing to do, smoke@1 is up to date" in text for text in answers) == 1
+    done = finish(*running)
+    assert [one.exit_code for one in done] == [0, 0]
+    assert sum("nothing to do, smoke@1 is up to date" in one.stderr for one in done) == 1
     alone = tmp_path / "alone"
     run_command(*job, root=alone)
     both, one = state(tmp_path / "data"), state(alone)

@@ -1,10 +1,8 @@
 """Commands that are killed in mid-work, a full disk, a read-only one, and files that go bad."""
 
-import hashlib
 import json
 import os
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -13,40 +11,19 @@ import pytest
 
 import fleet_slip
 from fleet_slip.files.folder import TEMPORARY_PREFIX
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.models.versions import Registry
-from fleet_slip.warehouse.tables import Warehouse
-from tests.conftest import COMMAND, RunCommand
+from tests.support.commands import RunCommand, run
+from tests.support.state import state
 
 JOB = ["run", "--campaign", "smoke", "--threads", "1"]
 KILLS = 30
-
-
-def state(root: Path) -> dict[str, Any]:
-    """All that a data root holds, apart from the moments at which it was written."""
-    warehouse = Warehouse(LocalFolder(root))
-    files = {
-        path: hashlib.sha256(Path(path).read_bytes()).hexdigest()
-        for table in (warehouse.logs, warehouse.grams)
-        for path in table.snapshot().paths
-    }
-    registry = Registry(LocalFolder(root / "models"))
-    return {
-        "files": {Path(path).relative_to(root): digest for path, digest in files.items()},
-        "versions": [registry.load("smoke", n).sha256 for n in registry.versions("smoke")],
-        "aliases": registry.history("smoke").aliases(),
-        "moves": [(move.command, move.version) for move in registry.history("smoke").moves()],
-    }
 
 
 @pytest.mark.slow
 def test_commands_that_are_killed_and_repeated_end_in_the_same_bits() -> None:
     """A tenth of what `python -m benchmarks.crash` does; a new process, because it forks."""
     command = [sys.executable, "-m", "benchmarks.crash", "--kills", str(KILLS)]
-    done = subprocess.run(
-        command, capture_output=True, text=True, check=False, cwd=Path(__file__).parents[2]
-    )
-    assert done.returncode == 0, done.stderr
+    done = run(command, cwd=Path(__file__).parents[2])
+    assert done.exit_code == 0, done.stderr
     assert f"{KILLS} kills survived" in done.stdout
 
 
@@ -70,12 +47,12 @@ def small_disk(tmp_path: Path) -> Any:
 
     def mount(options: str) -> Path:
         command = ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(folder)]
-        if subprocess.run(command, capture_output=True, check=False).returncode:
+        if run(command).exit_code:
             pytest.skip("this machine does not allow to mount a file system")
         return folder / "data"
 
     yield mount
-    subprocess.run(["umount", str(folder)], capture_output=True, check=False)
+    run(["umount", str(folder)])
 
 
 def test_a_full_disk_is_told_and_the_same_command_goes_on_after_it(
@@ -86,7 +63,7 @@ def test_a_full_disk_is_told_and_the_same_command_goes_on_after_it(
     assert full.exit_code == 6
     assert "the disk is full. Free some space" in full.stderr
     assert not list(root.rglob(f"{TEMPORARY_PREFIX}*"))
-    subprocess.run(["mount", "-o", "remount,size=20m", str(root.parent)], check=True)
+    assert not run(["mount", "-o", "remount,size=20m", str(root.parent)]).exit_code
     assert run_command(*JOB, root=root).exit_code == 0
     assert run_command(*JOB, root=tmp_path / "fresh").exit_code == 0
     assert state(root) == state(tmp_path / "fresh")
@@ -97,7 +74,7 @@ def test_a_read_only_root_is_told_and_can_be_queried(
 ) -> None:
     root = small_disk("size=20m")
     assert run_command(*JOB, root=root).exit_code == 0
-    subprocess.run(["mount", "-o", "remount,ro", str(root.parent)], check=True)
+    assert not run(["mount", "-o", "remount,ro", str(root.parent)]).exit_code
     for command in (["simulate", "waterford", "--days", "1"], ["publish", "other"]):
         refused = run_command(*command, root=root)
         assert refused.exit_code == 6
@@ -132,16 +109,9 @@ def failing_disk(tmp_path: Path) -> dict[str, str]:
     compiler = shutil.which("cc")
     if compiler is None:
         pytest.skip("this machine has no C compiler to make a disk fail with")
-    subprocess.run([compiler, "-shared", "-fPIC", "-o", library, source, "-ldl"], check=True)
+    made = run([compiler, "-shared", "-fPIC", "-o", library, source, "-ldl"])
+    assert made.exit_code == 0, made.stderr
     return {**os.environ, "LD_PRELOAD": str(library)}
-
-
-@pytest.fixture(scope="module")
-def done_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A data root after the job."""
-    root = tmp_path_factory.mktemp("done") / "data"
-    subprocess.run([COMMAND, "--root", str(root), *JOB], check=True, capture_output=True)
-    return root
 
 
 def digest(root: Path) -> Any:
@@ -156,11 +126,11 @@ def digest(root: Path) -> Any:
 def test_a_read_error_is_told_and_loses_nothing(
     run_command: RunCommand,
     tmp_path: Path,
-    done_once: Path,
+    smoke_root: Path,
     failing_disk: dict[str, str],
     failing: str,
 ) -> None:
-    shutil.copytree(done_once, tmp_path / "data")
+    shutil.copytree(smoke_root, tmp_path / "data")
     before = digest(tmp_path / "data")
     environment = {**failing_disk, "FAILING_PATH": failing}
     compacted = run_command("compact", env=environment)

@@ -11,7 +11,7 @@ from fleet_slip.vehicle.driver import handling
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2, constants, load_vehicle
 from fleet_slip.vehicle.state import Controls, State
 from fleet_slip.vehicle.tyre import cornering_stiffness
-from tests.vehicle.harness import CAR, SEDAN, Run, holding, kinetic_energy, rates, rolling
+from tests.support.rolling import CAR, SEDAN, Run, holding, kinetic_energy, rates, rolling
 
 RATIO = SEDAN.steering.ratio
 KNOWN = handling(SEDAN)

@@ -14,7 +14,7 @@ from fleet_slip.vehicle.dynamics import NO_EXTENSIONS
 from fleet_slip.vehicle.highway import FourWheelVehicle
 from fleet_slip.vehicle.parameters import load_vehicle
 from fleet_slip.vehicle.state import Controls
-from tests.vehicle.harness import SEDAN, Run, rolling
+from tests.support.rolling import SEDAN, Run, rolling
 
 gymnasium.register_envs(highway_env)
 

@@ -7,7 +7,7 @@ import pytest
 
 from fleet_slip.vehicle.arctangent import arctan2
 from fleet_slip.vehicle.state import Controls
-from tests.vehicle.harness import Run, rolling
+from tests.support.rolling import Run, rolling
 
 
 def error(step: float) -> float:

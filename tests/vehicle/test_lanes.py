@@ -15,7 +15,7 @@ from fleet_slip.vehicle import kernel
 from fleet_slip.vehicle.lane_blocks import BLOCK, CHANNELS
 from fleet_slip.vehicle.lanes import LaneDrive, Road, Truth, simulate_blocks, simulate_drives
 from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
-from tests.vehicle.harness import SEDAN
+from tests.support.rolling import SEDAN
 
 MASSES_KG = (1000.0, 1320.0, 1740.0)
 TRACKS = ("waterford_hills", "melbourne")

@@ -7,7 +7,7 @@ import pytest
 from fleet_slip.errors import ConfigError
 from fleet_slip.resources import config_names, find_config
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2, constants, load_vehicle
-from tests.vehicle.harness import CAR, SEDAN
+from tests.support.rolling import CAR, SEDAN
 
 
 @pytest.mark.parametrize("name", config_names("vehicles"))

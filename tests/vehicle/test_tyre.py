@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from fleet_slip.vehicle.parameters import Constants
 from fleet_slip.vehicle.tyre import TyreForce, brush_force, cornering_stiffness
-from tests.vehicle.harness import CAR
+from tests.support.rolling import CAR
 
 PEAK = CAR.stiffness_rear
 SPEED = 20.0

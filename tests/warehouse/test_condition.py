@@ -20,8 +20,8 @@ from fleet_slip.monitoring.monitor import monitor
 from fleet_slip.monitoring.quality import examine_drives
 from fleet_slip.warehouse.condition import asking, drive_columns, parse_condition
 from fleet_slip.warehouse.tables import Warehouse
-from tests.conftest import land, log_rows, random_counts
-from tests.models.manifests import manifest
+from tests.support.logs import land, log_rows, random_counts
+from tests.support.manifests import manifest
 
 LASTING = [
     "true",

@@ -20,8 +20,6 @@ import duckdb
 import numpy as np
 import pyarrow as pa
 
-from benchmarks.fuzz.files import MAPPINGS, csv_file, parquet_file
-from benchmarks.fuzz.mutate import WORDS, mutate_bytes, mutate_tree, to_json, to_toml
 from fleet_slip.catalogue.features import load_features
 from fleet_slip.catalogue.signals import catalogue, load_catalogue
 from fleet_slip.delta import Change, Unit
@@ -48,6 +46,8 @@ from fleet_slip.vehicle.parameters import load_vehicle
 from fleet_slip.views import connect
 from fleet_slip.warehouse.read_only_sql import one_query
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.fuzz.files import MAPPINGS, csv_file, parquet_file
+from tests.support.fuzz.mutate import WORDS, mutate_bytes, mutate_tree, to_json, to_toml
 
 Target = Callable[[random.Random, Path], None]
 """Takes the source of all choices, and an empty folder: all that may be written is below it."""

@@ -17,6 +17,10 @@ from typing import Any
 from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
 from werkzeug.serving import BaseWSGIServer, WSGIRequestHandler, make_server
 
+from fleet_slip.files.object_credentials import aws_profile
+from fleet_slip.files.object_folder import _store
+from tests.support.commands import PATIENCE_S, Finished, run_on
+
 ACCESS_KEY = "AKIDFORTESTS"
 SECRET_KEY = "s3cr3t/of+tests"  # noqa: S105 - for a server of our own
 SCOPE = "20260101/us-east-1/s3/aws4_request, SignedHeaders=host, Signature=0"
@@ -82,7 +86,7 @@ class Server:
             method="PUT",
             headers={"Authorization": f"AWS4-HMAC-SHA256 Credential={ACCESS_KEY}/{SCOPE}"},
         )
-        urllib.request.urlopen(request).close()  # noqa: S310
+        urllib.request.urlopen(request, timeout=PATIENCE_S).close()  # noqa: S310
         return f"s3://{name}"
 
     @contextmanager
@@ -118,6 +122,20 @@ class Server:
         with guard:
             answer: Iterable[bytes] = self._moto(environ, start)
             return answer
+
+
+def command_on(root: object, *arguments: str) -> Finished:
+    """Run a command as a user would, and look for keys in what it prints."""
+    done = run_on(root, *arguments)
+    for text in (done.stdout, done.stderr):
+        assert not [secret for secret in (ACCESS_KEY, SECRET_KEY) if secret in text]
+    return done
+
+
+def forget_clients() -> None:
+    """Let this process look anew for credentials, as a new one would."""
+    aws_profile.cache_clear()
+    _store.cache_clear()
 
 
 def _answer(start: StartResponse, status: str, code: str) -> Iterable[bytes]:

@@ -1,29 +1,17 @@
 """Data and plain float64 formulas that the tests compare with."""
 
-import json
 from collections.abc import Sequence
 from fractions import Fraction
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.gram_table import GramTable
-
-REFERENCE = Path(__file__).parents[2].parent / "shared" / "reference"
+from fleet_slip.regression.serial import LagGram
 
 Matrix = NDArray[Any]
-
-
-def reference(path: str) -> Any:
-    """Load a file of outside answers, or skip the test."""
-    file = REFERENCE / path
-    if not file.is_file():
-        pytest.skip(f"outside answers are not here: {path}")
-    return json.loads(file.read_text(encoding="utf-8"))
 
 
 def columns_to_counts(rows: list[list[str]]) -> tuple[Matrix, list[Fraction]]:
@@ -88,3 +76,26 @@ def dense_fit(counts: Matrix) -> tuple[Matrix, float]:
 def unit_scales(inputs: int) -> dict[str, Fraction]:
     """Return the scale 1 for x1, x2, ..., y."""
     return dict.fromkeys(names(inputs), Fraction(1))
+
+
+def autoregressive_drives(
+    seed: int, rho: float, drives: int = 3, rows: int = 400
+) -> list[np.ndarray]:
+    rng = np.random.default_rng(seed)
+    result = []
+    for _ in range(drives):
+        x = np.cumsum(rng.normal(size=(rows, 2)) * 40, axis=0)
+        noise = np.empty(rows)
+        noise[0] = rng.normal() * 100
+        for t in range(1, rows):
+            noise[t] = rho * noise[t - 1] + rng.normal() * 100
+        y = 2 * x[:, 0] - x[:, 1] + 500 + noise
+        result.append(np.rint(np.column_stack([x, y])).astype(np.int64))
+    return result
+
+
+def lag_gram(drives: list[np.ndarray]) -> LagGram:
+    now = names(drives[0].shape[1] - 1)
+    signals = (*now, *(f"{name}_before" for name in now))
+    pairs = [np.column_stack([drive[1:], drive[:-1]]) for drive in drives]
+    return LagGram(Gram.from_counts(signals, np.concatenate(pairs)), "_before")

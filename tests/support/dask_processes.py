@@ -14,7 +14,7 @@ from pathlib import Path
 from distributed import Client
 
 DASK = str(Path(sys.executable).with_name("dask"))
-REPOSITORY = Path(__file__).parents[1]
+REPOSITORY = Path(__file__).parents[2]
 START_S = 300.0
 
 Process = subprocess.Popen[bytes]

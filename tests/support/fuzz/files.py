@@ -8,8 +8,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from benchmarks.fuzz.mutate import NUMBERS, WORDS, mutate_bytes
 from fleet_slip.ingest.mapping import Mapping
+from tests.support.fuzz.mutate import NUMBERS, WORDS, mutate_bytes
 
 COLUMNS = ("t", "ax", "beta", "car", "day")
 _BASE: dict[str, Any] = {

@@ -1,0 +1,85 @@
+"""A log with the columns of a real recording, from the file to the coefficients."""
+
+from pathlib import Path
+
+import numpy as np
+
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.job import update_grams
+from fleet_slip.ingest import load_mapping
+from fleet_slip.ingest.job import ingest_file
+from fleet_slip.regression.exact import fit
+from fleet_slip.regression.inference import infer_classically
+from fleet_slip.views import connect
+from fleet_slip.warehouse.tables import Warehouse
+from tests.support.measured import csv_text
+
+COEFFICIENTS = {"ax": 2e-4, "ay": -3e-3, "yaw_rate": 0.08, "steer_fl": 0.15, "steer_fr": 0.1}
+OFFSET = 0.004
+
+
+def race_car_log(rows: int = 20_000) -> dict[str, list[float]]:
+    """A made-up lap with the columns and mixed units of `race_car_250lm`, and a known model."""
+    rng = np.random.default_rng(250)
+    t = np.arange(rows) / 100
+    periods_s = {"ax": 5.0, "ay": 9.0, "yaw_rate": 13.0, "steer_fl": 17.0, "steer_fr": 23.0}
+    sizes = {"ax": 4.0, "ay": 6.0, "yaw_rate": 0.4, "steer_fl": 0.08, "steer_fr": 0.08}
+    si = {
+        name: sizes[name] * (np.sin(2 * np.pi * t / s) + 0.1 * rng.standard_normal(rows))
+        for name, s in periods_s.items()
+    }
+    beta = OFFSET + sum(COEFFICIENTS[name] * values for name, values in si.items())
+    beta = beta + 0.01 * rng.standard_normal(rows)
+    vx = 30 + 5 * np.sin(t / 10)
+    return {
+        "time_s": [round(150 + float(x), 2) for x in t],
+        "ax_mps2": si["ax"].tolist(),
+        "ay_mps2": si["ay"].tolist(),
+        "yaw_rate_rad_s": si["yaw_rate"].tolist(),
+        "steer_fl_deg": np.degrees(si["steer_fl"]).tolist(),
+        "steer_fr_deg": np.degrees(si["steer_fr"]).tolist(),
+        "vx_kmh": (3.6 * vx).tolist(),
+        "vy_kmh": (3.6 * vx * np.tan(beta)).tolist(),
+        "sideslip_deg": np.degrees(beta).tolist(),
+    }
+
+
+def test_a_log_without_wheel_speeds_gives_its_model_through_the_shipped_mapping(
+    tmp_path: Path,
+) -> None:
+    """The columns are those of a real recording, which is not ours to give away."""
+    columns = race_car_log()
+    file = tmp_path / "lap.csv"
+    file.write_text(csv_text(columns))
+    warehouse = Warehouse(LocalFolder(tmp_path / "data"))
+    report = ingest_file(warehouse, file, load_mapping("race_car_250lm"))
+    assert (report.counts.rows_kept, report.counts.ticks, report.counts.drives) == (
+        20_000,
+        20_000,
+        1,
+    )
+    update_grams(warehouse)
+    with connect(warehouse.root) as database:
+        answer = database.sql("SELECT vehicle_id, mass_kg, adhesion, rows FROM drives").fetchall()
+        assert answer == [("250lm", None, None, 20_000)]
+        rows = database.sql("FROM log ORDER BY tick").to_arrow_table()
+    assert rows["wheel_fl_rad_s"].null_count == rows["steering_wheel_rad"].null_count == 20_000
+    for name, column, unit in (
+        ("sideslip", "sideslip_deg", np.pi / 180),
+        ("steer_fl", "steer_fl_deg", np.pi / 180),
+        ("vx", "vx_kmh", 1 / 3.6),
+    ):
+        signal = catalogue()[name]
+        half_a_count = 0.5001 * float(signal.scale)
+        given = np.array(columns[column]) * unit
+        np.testing.assert_allclose(rows[signal.column], given, rtol=0, atol=half_a_count)
+    (table,) = load_cohort(warehouse).tables
+    fitted = fit(table.total(), list(COEFFICIENTS), "sideslip")
+    scales = {name: s.exact_scale for name, s in catalogue().signals.items()}
+    for estimate, true in zip(
+        infer_classically(fitted, scales).estimates, [OFFSET, *COEFFICIENTS.values()], strict=True
+    ):
+        assert abs(estimate.value - true) < 4 * estimate.standard_error
+        assert estimate.standard_error < 0.2 * abs(true)

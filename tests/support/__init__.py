@@ -1,0 +1,1 @@
+"""What several tests, and some benchmarks, use: data, processes, servers, outside answers."""

@@ -1,0 +1,77 @@
+"""The command line in processes of their own, none of which lasts for ever."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+COMMAND = str(Path(sys.executable).with_name("fleet-slip"))
+PATIENCE_S = 400.0
+"""How long a process may take: many times what any takes, so that a busy machine fails no test."""
+
+Words = Sequence[str | Path]
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A process that has ended."""
+
+    exit_code: int
+    stdout: str
+    stderr: str
+
+    @property
+    def json(self) -> Any:
+        return json.loads(self.stdout)
+
+
+RunCommand = Callable[..., Finished]
+
+
+def run(words: Words, **options: Any) -> Finished:
+    """Run a program to its end; `TimeoutExpired` if it has none."""
+    done = subprocess.run(
+        words, capture_output=True, text=True, check=False, timeout=PATIENCE_S, **options
+    )
+    return Finished(done.returncode, done.stdout, done.stderr)
+
+
+def run_on(root: object, *arguments: str | Path, **options: Any) -> Finished:
+    """Run `fleet-slip --root ROOT ...`, which never shows a traceback."""
+    done = run([COMMAND, "--root", str(root), *arguments], **options)
+    assert "Traceback" not in done.stderr, done.stderr
+    return done
+
+
+def done_on(root: object, *arguments: str | Path, **options: Any) -> Finished:
+    """Run `fleet-slip --root ROOT ...`, which must succeed."""
+    done = run_on(root, *arguments, **options)
+    assert done.exit_code == 0, done.stderr
+    return done
+
+
+def start(words: Words, **options: Any) -> subprocess.Popen[str]:
+    """Start a program whose stdout and stderr are kept for `finish`."""
+    pipe = subprocess.PIPE
+    return subprocess.Popen(words, stdout=pipe, stderr=pipe, text=True, **options)
+
+
+def start_on(root: object, *arguments: str | Path, **options: Any) -> subprocess.Popen[str]:
+    """Start `fleet-slip --root ROOT ...`."""
+    return start([COMMAND, "--root", str(root), *arguments], **options)
+
+
+def finish(*processes: subprocess.Popen[str]) -> list[Finished]:
+    """Wait for processes that run at once; if one has no end, kill them all."""
+    try:
+        told = [process.communicate(timeout=PATIENCE_S) for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
+    return [
+        Finished(process.returncode, stdout, stderr)
+        for process, (stdout, stderr) in zip(processes, told, strict=True)
+    ]

@@ -1,0 +1,1 @@
+"""Hostile and broken input, made by mutation. `benchmarks.fuzz` takes its time with it."""

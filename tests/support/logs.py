@@ -1,0 +1,61 @@
+"""Rows of logs made up in memory, and landed in a warehouse."""
+
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.delta import Change, Unit
+from fleet_slip.files.folder import Folder
+from fleet_slip.warehouse.tables import Warehouse
+
+DAY = date(2024, 5, 1)
+
+
+def path_of(folder: Folder) -> Path:
+    """Return where a folder of a file system is."""
+    return Path(str(folder))
+
+
+def random_counts(rng: np.random.Generator, rows: int) -> dict[str, Any]:
+    """Counts over the whole int16 range, the extremes among them."""
+    counts: dict[str, Any] = {}
+    for name in catalogue().signals:
+        values = rng.integers(-32768, 32768, rows)
+        values[:2] = (-32768, 32767)
+        counts[name] = values.astype(np.int16)
+    return counts
+
+
+def log_rows(drive_id: str, counts: dict[str, Any], day: date = DAY, **metadata: Any) -> pa.Table:
+    """Rows of the logs for one drive; a signal that is not given is absent."""
+    signals = catalogue()
+    rows = len(next(iter(counts.values())))
+    known: dict[str, Any] = {
+        "drive_id": drive_id,
+        "vehicle_id": "car-1",
+        "vehicle_model": "d_class_sedan",
+        "source": "simulated",
+        "campaign": "test",
+        "track": "waterford_hills",
+        "mass_kg": 1320.0,
+        "adhesion": 1.0,
+        "speed_factor": 0.8,
+        "lost_control_s": None,
+        "saturated": 0,
+        **metadata,
+    }
+    columns: dict[str, Any] = {"day": [day] * rows}
+    columns |= {name: [known[name]] * rows for name in signals.drive}
+    columns["tick"] = np.arange(rows, dtype=np.int32)
+    columns |= {name: counts.get(name, [None] * rows) for name in signals.signals}
+    return pa.table(columns, schema=signals.log_schema)
+
+
+def land(warehouse: Warehouse, name: str, *drives: pa.Table, day: date = DAY) -> None:
+    """Commit drives as one file of the logs."""
+    action = warehouse.logs.write_file(name, pa.concat_tables(drives), day)
+    warehouse.logs.snapshot().commit(Change(add=[action], units=[Unit(f"test/{name}", 1)]))

@@ -1,0 +1,23 @@
+"""What is made once, for all tests and all test processes."""
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from fleet_slip.files.local_folder import LocalFolder
+
+
+def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
+    """Return a folder that the first process to ask for it makes, while the others wait."""
+    base = factory.getbasetemp()
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    made, begun = shared / name, shared / f"{name}-begun"
+    with LocalFolder(shared).exclusive(f"{name}.lock", lambda: None):
+        if not made.exists():
+            shutil.rmtree(begun, ignore_errors=True)  # of a process that was killed
+            make(begun)
+            begun.rename(made)
+    return made

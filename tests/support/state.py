@@ -1,0 +1,26 @@
+"""What a data root holds."""
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.models.versions import Registry
+from fleet_slip.warehouse.tables import Warehouse
+
+
+def state(root: Path) -> dict[str, Any]:
+    """All that a data root holds, apart from the moments at which it was written."""
+    warehouse = Warehouse(LocalFolder(root))
+    files = {
+        path: hashlib.sha256(Path(path).read_bytes()).hexdigest()
+        for table in (warehouse.logs, warehouse.grams)
+        for path in table.snapshot().paths
+    }
+    registry = Registry(LocalFolder(root / "models"))
+    return {
+        "files": {Path(path).relative_to(root): digest for path, digest in files.items()},
+        "versions": [registry.load("smoke", n).sha256 for n in registry.versions("smoke")],
+        "aliases": registry.history("smoke").aliases(),
+        "moves": [(move.command, move.version) for move in registry.history("smoke").moves()],
+    }
