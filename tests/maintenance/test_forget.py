@@ -29,7 +29,7 @@ from fleet_slip.maintenance.retention import Retention, retain
 from fleet_slip.maintenance.vacuum import find_unreferenced
 from fleet_slip.regression.exact import fit
 from fleet_slip.warehouse.tables import Warehouse
-from tests.support.commands import COMMAND, RunCommand
+from tests.support.commands import RunCommand
 from tests.support.logs import land, log_rows, random_counts
 from tests.support.measured import a_mapping, csv_text, good_columns
 
@@ -231,7 +231,6 @@ def test_retention_forgets_by_age_and_refuses_to_leave_nothing(tmp_path: Path) -
 def test_models_are_marked_and_run_trains_again_without_bringing_the_drive_back(
     run_command: RunCommand,
 ) -> None:
-    assert COMMAND
     run_command("run", "--campaign", "smoke")
     run_command("publish", "other", "--cohort", "day = '2024-05-02'")
     report = run_command("forget", "--drive", "smoke-2024-05-01-0001", "--now", "--json").json
