@@ -1,30 +1,30 @@
 """A data root with models, made once for all tests of the Python API."""
 
-import subprocess
+import shutil
 from pathlib import Path
 
 import pytest
 
 import fleet_slip
 from fleet_slip import Fleet
-from tests.support.commands import COMMAND
+from tests.support.commands import done_on
+from tests.support.once import made_once
 
 FEATURES = "ay,yaw_rate,steering_wheel,speed_squared,curvature,course_rate,ay_signed_square"
 
 
 @pytest.fixture(scope="session")
-def smoke_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bent_root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Path:
     """The campaign `smoke`, its model, and a model with features called `bent`."""
-    root = tmp_path_factory.mktemp("api") / "data"
-    for arguments in (
-        ["run", "--campaign", "smoke"],
-        ["gram", "--features", "motion"],
-        ["publish", "bent", "--features", "motion", "--nested", FEATURES],
-    ):
-        subprocess.run([COMMAND, "--root", str(root), *arguments], check=True)
-    return root
+
+    def make(root: Path) -> None:
+        shutil.copytree(smoke_root, root)
+        done_on(root, "gram", "--features", "motion")
+        done_on(root, "publish", "bent", "--features", "motion", "--nested", FEATURES)
+
+    return made_once(tmp_path_factory, "bent", make)
 
 
 @pytest.fixture
-def fleet(smoke_root: Path) -> Fleet:
-    return fleet_slip.open(smoke_root)
+def fleet(bent_root: Path) -> Fleet:
+    return fleet_slip.open(bent_root)

@@ -1,7 +1,6 @@
 """A fleet in Python: what a notebook asks of it."""
 
 import gc
-import subprocess
 import sys
 import threading
 from pathlib import Path
@@ -11,6 +10,7 @@ import pytest
 import fleet_slip
 from fleet_slip import Fleet
 from fleet_slip.errors import QuestionError, StorageError
+from tests.support.commands import run
 
 
 def test_opening_touches_nothing_and_the_root_follows_the_rule(
@@ -29,9 +29,8 @@ def test_opening_touches_nothing_and_the_root_follows_the_rule(
 
 def test_importing_the_package_imports_no_engine() -> None:
     program = "import sys, fleet_slip; print(*sys.modules)"
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    )
+    done = run([sys.executable, "-c", program])
+    assert done.exit_code == 0, done.stderr
     assert not {"numpy", "pyarrow", "duckdb", "polars", "pydantic"} & {*done.stdout.split()}
 
 

@@ -2,24 +2,20 @@
 
 import os
 import resource
-import subprocess
 from pathlib import Path
 
 import pytest
 
 from fleet_slip import limits
 from fleet_slip.errors import StorageError
-from tests.support.commands import COMMAND, Finished
+from tests.support.commands import COMMAND, Finished, run
 
 ENOUGH_KIB = (limits.LIBRARIES_BYTES + limits.THREAD_BYTES * len(os.sched_getaffinity(0))) // 2**10
 
 
 def run_limited(root: Path, limit: str) -> Finished:
     command = f"ulimit {limit} && exec {COMMAND} --root {root} run --campaign smoke --days 1"
-    done = subprocess.run(
-        ["bash", "-c", command], capture_output=True, text=True, check=False, timeout=120
-    )
-    return Finished(done.returncode, done.stdout, done.stderr)
+    return run(["bash", "-c", command])
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ import os
 import shlex
 import shutil
 import stat
-import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -18,7 +17,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.commands import COMMAND
+from tests.support import commands
+from tests.support.commands import COMMAND, Finished
 
 UNIT = Path(__file__).parents[2] / "jobs/schedule/fleet-slip.service"
 NOBODY = 65534
@@ -27,12 +27,8 @@ NOBODY = 65534
 def can_confine() -> bool:
     if os.geteuid() != 0 or not shutil.which("unshare") or not shutil.which("setpriv"):
         return False
-    made = subprocess.run(
-        ["unshare", "--mount", "mount", "-o", "remount,bind,ro", "/"],
-        check=False,
-        capture_output=True,
-    )
-    return made.returncode == 0
+    made = commands.run(["unshare", "--mount", "mount", "-o", "remount,bind,ro", "/"])
+    return made.exit_code == 0
 
 
 pytestmark = pytest.mark.skipif(
@@ -98,14 +94,8 @@ def closed_folders(program: Path, aside: Path) -> Iterator[list[str]]:
             ]
 
 
-def run(script: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        ["unshare", "--mount", "--propagation", "private", "bash", "-c", script],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=300,
-    )
+def run(script: str) -> Finished:
+    return commands.run(["unshare", "--mount", "--propagation", "private", "bash", "-c", script])
 
 
 JOB = ["run", "--campaign", "smoke", "--days", "1", "--json"]
@@ -115,7 +105,7 @@ def test_the_service_does_its_job_and_keeps_its_compiled_code(
     service: dict[str, str], folder: Path
 ) -> None:
     done = run(confined(service, folder, JOB))
-    assert done.returncode == 0, done.stderr
+    assert done.exit_code == 0, done.stderr
     assert json.loads(done.stdout)["publish"]["new"]
     assert "compiled" not in done.stderr
     assert (folder / "state/models/smoke/versions/1.json").stat().st_uid == NOBODY
@@ -127,6 +117,6 @@ def test_without_a_cache_folder_it_does_its_job_and_says_what_that_costs(
 ) -> None:
     del service["CacheDirectory"]
     done = run(confined(service, folder, JOB))
-    assert done.returncode == 0, done.stderr
+    assert done.exit_code == 0, done.stderr
     assert json.loads(done.stdout)["publish"]["new"]
     assert done.stderr.count("no folder where compiled code can be kept") == 1
