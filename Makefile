@@ -2,13 +2,14 @@
 # `make test` sets up .venv and passes every check that needs Python alone.
 # `make test-all` installs outside programs, such as a browser, and passes the checks that need them.
 # `make report` does what `make run` does, then writes ./data/report/report.html.
+# `make docs` builds the pages as a site, ./site/index.html; a warning is an error.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 CAMPAIGN ?= waterford
 ROOT ?= data
 
-.PHONY: run report test test-all lint setup bench clean
+.PHONY: run report test test-all lint docs setup bench clean
 
 run: setup
 	$(BIN)/fleet-slip --root $(ROOT) run --campaign $(CAMPAIGN)
@@ -30,6 +31,9 @@ lint: setup
 	$(BIN)/lint-imports
 	$(BIN)/mypy
 
+docs: $(VENV)/.docs-installed
+	$(BIN)/python -m zensical build --clean --strict
+
 bench: setup
 	$(BIN)/python -m benchmarks
 
@@ -41,5 +45,9 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable . --group dev
 	touch $@
 
+$(VENV)/.docs-installed: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --group docs
+	touch $@
+
 clean:
-	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) .cache site .mypy_cache .pytest_cache .ruff_cache
