@@ -1,0 +1,160 @@
+"""Code blocks of a page: found by Sybil, and each run as a reader would type it.
+
+- `console`: every line that begins with `$ ` is a command. The lines after it are what it prints;
+  `…` stands for any text, and a command without such lines may print anything.
+- `bash`, `python` and `sql` run as they are.
+- A block with a title, such as ```` ```toml title="mapping.toml" ````, becomes a file of that name.
+- A block below `<!-- not run: reason -->` is not run.
+- Blocks in the languages of `SHOWN` are for reading.
+"""
+
+import re
+import shlex
+import subprocess
+from collections.abc import Iterator
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from io import StringIO
+from pathlib import Path
+
+from sybil import Document, Example, Region
+from sybil.evaluators.python import PythonEvaluator
+from sybil.parsers.markdown.lexers import RawFencedCodeBlockLexer
+
+import fleet_slip
+from fleet_slip.cli.main import app
+from fleet_slip.errors import FleetSlipError
+
+RUN = frozenset({"console", "bash", "python", "sql"})
+SHOWN = frozenset({"text", "json", "toml", "yaml", "csv"})
+DEADLINE_S = 120
+
+_FENCES = RawFencedCodeBlockLexer(re.compile(r"(?P<language>\S*)(?P<options>[^\n]*)$\n", re.M))
+_TITLE = re.compile(r'\s*title="(?P<title>[\w.-]+)"\s*')
+_MARK = re.compile(r"<!-- not run: \S.* -->\n\Z")
+_run_python = PythonEvaluator()
+
+
+@dataclass(frozen=True)
+class Block:
+    """A code block of a page; the page's first line is line 1."""
+
+    line: int
+    language: str
+    options: str
+    source: str
+    marked: bool
+    example: Example
+
+    @property
+    def title(self) -> str | None:
+        """The name of the file that it stands for."""
+        found = _TITLE.fullmatch(self.options)
+        return found["title"] if found else None
+
+    @property
+    def fault(self) -> str | None:
+        """Why it is neither run, nor marked, nor for reading."""
+        if self.options and not self.title:
+            return f"unknown options {self.options.strip()!r}"
+        if self.language not in RUN | SHOWN:
+            return f"{self.language or 'no language'}: use one of {sorted(RUN | SHOWN)}"
+        if self.marked and self.language not in RUN:
+            return "marked as not run, but blocks of its language never are"
+        return None
+
+
+def blocks(page: Path) -> list[Block]:
+    """Return the code blocks of a page, in order."""
+    document = Document.parse(str(page), _regions)
+    return [_block(example) for example in document.examples()]
+
+
+def _regions(document: Document) -> Iterator[Region]:
+    for found in _FENCES(document):
+        yield Region(found.start, found.end, found.lexemes["source"], _run_python, found.lexemes)
+
+
+def _block(example: Example) -> Block:
+    before = example.document.text[: example.start]
+    lexemes = example.region.lexemes
+    return Block(
+        example.line,
+        lexemes["language"],
+        lexemes["options"],
+        str(lexemes["source"]),
+        _MARK.search(before) is not None,
+        example,
+    )
+
+
+def run(block: Block, known: dict[str, str]) -> None:
+    """Run a block in the working directory.
+
+    `known` are the outputs of commands that were run before the page was opened.
+    """
+    assert block.fault is None, block.fault
+    if block.title:
+        Path(block.title).write_text(block.source, encoding="utf-8")
+    elif block.marked or block.language in SHOWN:
+        return
+    elif block.language == "python":
+        block.example.evaluate()
+    elif block.language == "sql":
+        with fleet_slip.connect("data") as database:
+            assert database.execute(block.source).fetchall()
+    elif block.language == "bash":
+        printed_by_bash(block.source)
+    else:
+        for command, expected in _commands(block.source):
+            printed = known[command] if command in known else printed_by(command)
+            assert matches(printed, expected), f"{command}\nprinted\n{printed}\nnot\n{expected}"
+
+
+def _commands(session: str) -> Iterator[tuple[str, str]]:
+    first, *others = re.split(r"^\$ ", session, flags=re.M)
+    assert not first.strip(), f"a console block begins with a command, not with {first!r}"
+    for command in others:
+        typed, _, printed = command.partition("\n")
+        yield typed.strip(), printed
+
+
+def matches(printed: str, expected: str) -> bool:
+    """Return whether a text is as expected: `…` is any text, and runs of white space are equal."""
+    texts = (re.escape(" ".join(text.split())) for text in expected.split("…"))
+    pattern = r"\s?.*?\s?".join(texts)
+    return not expected.strip() or re.fullmatch(pattern, " ".join(printed.split())) is not None
+
+
+def printed_by(command: str) -> str:
+    """Return what a command prints, on stdout and stderr; it must succeed.
+
+    `fleet-slip` runs in this process: Python and its libraries are loaded once and not 60 times.
+    """
+    typed = shlex.split(command)
+    if typed[0] != "fleet-slip":
+        return printed_by_bash(command)
+    printed = StringIO()
+    with redirect_stdout(printed), redirect_stderr(printed):
+        try:
+            app(typed[1:])
+        except SystemExit as end:
+            assert not end.code, f"{command}\nended with {end.code} and\n{printed.getvalue()}"
+        except FleetSlipError as error:
+            raise AssertionError(f"{command}\nended with: {error}") from error
+    return printed.getvalue()
+
+
+def printed_by_bash(script: str) -> str:
+    """Return what lines of a shell print; all of them must succeed."""
+    done = subprocess.run(
+        ["bash", "-euo", "pipefail", "-c", script],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        check=False,
+        timeout=DEADLINE_S,
+    )
+    assert done.returncode == 0, f"{script}\nended with {done.returncode} and\n{done.stdout}"
+    return done.stdout

@@ -1,0 +1,128 @@
+"""What the pages say of the repository holds, and leads somewhere."""
+
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+from markdown_it import MarkdownIt
+
+HERE = Path(__file__).resolve().parents[2]
+DOCS = HERE / "docs"
+AT_THE_TOP = [HERE / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")]
+PACKAGE = HERE / "fleet_slip"
+
+
+def rows_of(page: Path, heading: str) -> list[list[str]]:
+    """Return the cells of the table that has this first heading."""
+    lines = page.read_text().splitlines()
+    first = next(n for n, line in enumerate(lines) if line.startswith(f"| {heading} |"))
+    rows = []
+    for line in lines[first + 2 :]:
+        if not line.startswith("|"):
+            break
+        rows.append([cell.strip() for cell in line.strip("|").split("|")])
+    return rows
+
+
+def names_of(page: Path, heading: str) -> list[str]:
+    return [cells[0].strip("`") for cells in rows_of(page, heading)]
+
+
+def test_the_architecture_lists_every_folder_once_and_none_besides() -> None:
+    folders = {f"{path.parent.name}/" for path in PACKAGE.glob("*/__init__.py")}
+    listed = names_of(DOCS / "architecture.md", "folder")
+    assert len(listed) == len(set(listed))
+    assert set(listed) == folders
+
+
+def test_the_architecture_lists_every_module_at_the_top_once_and_none_besides() -> None:
+    listed = names_of(DOCS / "architecture.md", "module at the top level")
+    assert sorted(listed) == sorted(path.name for path in PACKAGE.glob("*.py"))
+
+
+def test_the_architecture_names_what_exists() -> None:
+    page = DOCS / "architecture.md"
+    for name in names_of(page, "folder beside the package"):
+        assert (HERE / name).is_dir(), name
+    rows = rows_of(page, "section of the paper")
+    named = [name for _, *cells in rows for cell in cells for name in re.findall("`(.+?)`", cell)]
+    for name in named:
+        places = (HERE, PACKAGE, HERE / "configs/scenarios")
+        assert any(list(place.glob(name.rstrip("/"))) for place in places), name
+
+
+def test_folder_and_section_agree_in_both_directions() -> None:
+    page = DOCS / "architecture.md"
+    there = {
+        name
+        for _, cell, _ in rows_of(page, "section of the paper")
+        for name in re.findall("`(.+?)`", cell)
+    }
+    back = {cells[0].strip("`") for cells in rows_of(page, "folder") if cells[2]}
+    assert there == back
+
+
+def pages_in(nav: list[Any]) -> list[str]:
+    """Return the pages of a navigation, in order."""
+    pages: list[str] = []
+    for entry in nav:
+        target = entry if isinstance(entry, str) else next(iter(entry.values()))
+        pages += [target] if isinstance(target, str) else pages_in(target)
+    return pages
+
+
+def test_the_navigation_has_every_page_once_and_none_besides() -> None:
+    site = tomllib.loads((HERE / "zensical.toml").read_text())["project"]
+    listed = pages_in(site["nav"])
+    assert sorted(listed) == sorted(str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md"))
+
+
+def test_the_reference_has_every_folder() -> None:
+    folders = {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
+    assert folders <= {page.stem for page in (DOCS / "api").glob("*.md")}
+
+
+def targets(page: Path) -> list[str]:
+    """Return what a page links to and the pictures that it shows, without other sites."""
+    inline = MarkdownIt("commonmark").enable("table").parse(page.read_text())
+    found = [
+        str(child.attrs.get("href") or child.attrs.get("src"))
+        for token in inline
+        for child in token.children or []
+        if child.type in ("link_open", "image")
+    ]
+    return [target for target in found if "://" not in target]
+
+
+@pytest.mark.parametrize("page", AT_THE_TOP, ids=lambda page: page.name)
+def test_links_outside_the_site_lead_somewhere(page: Path) -> None:
+    """Links between pages, and their anchors, are checked by `make docs`."""
+    missing = [target for target in targets(page) if not (HERE / target.partition("#")[0]).exists()]
+    assert missing == []
+
+
+def test_pages_link_to_nothing_that_the_site_lacks() -> None:
+    outside = [
+        f"{page.relative_to(HERE)}: {target}"
+        for page in DOCS.rglob("*.md")
+        for target in targets(page)
+        if not (page.parent / target.partition("#")[0]).resolve().is_relative_to(DOCS)
+    ]
+    assert outside == []
+
+
+def test_the_readme_is_short() -> None:
+    assert len((HERE / "README.md").read_text().splitlines()) <= 120
+
+
+@pytest.mark.parametrize(
+    "page", [*AT_THE_TOP, *sorted(DOCS.rglob("*.md"))], ids=lambda page: page.name
+)
+def test_paths_of_the_package_exist(page: Path) -> None:
+    """A page that names a module names one that is there."""
+    named = re.findall(
+        r"\b((?:fleet_slip|tests|configs|jobs|benchmarks)/[\w/.-]*\.\w+)\b", page.read_text()
+    )
+    assert [name for name in named if not (HERE / name).exists()] == []
