@@ -37,6 +37,14 @@ def test_the_architecture_lists_every_folder_once_and_none_besides() -> None:
     assert set(listed) == folders
 
 
+def test_the_architecture_lists_folders_in_the_order_that_is_enforced() -> None:
+    tools = tomllib.loads((HERE / "pyproject.toml").read_text())["tool"]
+    (contract,) = tools["importlinter"]["contracts"]
+    folders = names_of(DOCS / "architecture.md", "folder")
+    layers = [f"{name}/" for layer in reversed(contract["layers"]) for name in layer.split(" | ")]
+    assert folders == [name for name in layers if name in folders]
+
+
 def test_the_architecture_lists_every_module_at_the_top_once_and_none_besides() -> None:
     listed = names_of(DOCS / "architecture.md", "module at the top level")
     assert sorted(listed) == sorted(path.name for path in PACKAGE.glob("*.py"))
