@@ -1,4 +1,4 @@
--- One Gram row a drive: exact sums and sums of products of the counts (docs/architecture.md).
+-- One Gram row a drive: exact sums and sums of products of the counts (docs/tables.md).
 CREATE VIEW grams AS
 SELECT
     feature_set,

@@ -139,7 +139,7 @@ def _print_chart(chart: Chart) -> None:
 def migrate(context: typer.Context, json: Json = False) -> None:
     """Bring the logs to the signal catalogue: add columns, convert counts to other scales.
 
-    See docs/operations.md before widening a scale. It can be repeated after any interruption.
+    See docs/schema.md before widening a scale. It can be repeated after any interruption.
     """
     with step("migrate") as figures, progress("migrate", "rows") as advance:
         report = migrate_logs(context.obj, advance)
