@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.docs.blocks import blocks, matches, printed_by, run
+from tests.support.once import made_once
 
 HERE = Path(__file__).resolve().parents[2]
 PAGES = [HERE / "README.md", HERE / "CONTRIBUTING.md", *sorted((HERE / "docs").rglob("*.md"))]
@@ -14,12 +15,17 @@ CODE = {str(page.relative_to(HERE)): found for page in PAGES if (found := blocks
 
 
 @pytest.fixture(scope="session")
-def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """What `make run` makes and prints."""
-    folder = tmp_path_factory.mktemp("made")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What `make run` makes, `data`, and prints, `printed`."""
+    return made_once(tmp_path_factory, "make_run", make_run)
+
+
+def make_run(folder: Path) -> None:
+    folder.mkdir()
     with pytest.MonkeyPatch.context() as patch:
         as_typed(patch, folder)
-        return folder / "data", printed_by("fleet-slip run --campaign waterford")
+        printed = printed_by("fleet-slip run --campaign waterford")
+    (folder / "printed").write_text(printed, encoding="utf-8")
 
 
 def as_typed(patch: pytest.MonkeyPatch, folder: Path) -> None:
@@ -33,13 +39,12 @@ def as_typed(patch: pytest.MonkeyPatch, folder: Path) -> None:
 
 @pytest.mark.parametrize("page", CODE)
 def test_the_code_of_a_page_runs(
-    page: str, made: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    page: str, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    root, printed = made
-    shutil.copytree(root, tmp_path / "data")
+    shutil.copytree(made / "data", tmp_path / "data")
     as_typed(monkeypatch, tmp_path)
     for block in CODE[page]:
-        run(block, {"make run": printed})
+        run(block, {"make run": (made / "printed").read_text(encoding="utf-8")})
 
 
 @pytest.mark.parametrize("page", CODE)
