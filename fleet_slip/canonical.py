@@ -4,13 +4,16 @@ import hashlib
 import json
 from typing import Any
 
+_TEXT = json.JSONEncoder(sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+_ASCII = json.JSONEncoder(sort_keys=True, separators=(",", ":"), allow_nan=False)
+
 
 def canonical_json(content: Any) -> str:
     """Return content as JSON: keys sorted, no spaces, characters as they are.
 
     Raises `ValueError` for numbers that JSON does not have.
     """
-    return _canonical(content, ascii_only=False)
+    return _TEXT.encode(content)
 
 
 def canonical_ascii(content: Any) -> str:
@@ -18,15 +21,9 @@ def canonical_ascii(content: Any) -> str:
 
     Campaigns and mappings have been known by the checksum of this text from the start.
     """
-    return _canonical(content, ascii_only=True)
+    return _ASCII.encode(content)
 
 
 def sha256_of(text: str) -> str:
     """Return the SHA-256 of a text in UTF-8, in hexadecimal."""
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _canonical(content: Any, *, ascii_only: bool) -> str:
-    return json.dumps(
-        content, sort_keys=True, separators=(",", ":"), ensure_ascii=ascii_only, allow_nan=False
-    )

@@ -18,7 +18,7 @@ from fleet_slip.maintenance.forget import ForgetReport
 from fleet_slip.maintenance.forget import forget as forget_drives
 from fleet_slip.maintenance.retention import load_retention
 from fleet_slip.maintenance.retention import retain as apply_retention
-from fleet_slip.maintenance.vacuum import RETENTION_HOURS, VacuumReport
+from fleet_slip.maintenance.vacuum import RETENTION_HOURS, VacuumReport, preview_vacuum
 from fleet_slip.maintenance.vacuum import vacuum as remove_expired
 from fleet_slip.maintenance.verification import Damage, Verification
 from fleet_slip.maintenance.verify import verify as verify_root
@@ -149,7 +149,7 @@ def vacuum(
 ) -> None:
     """Remove replaced files and leftovers of killed jobs when they are old enough."""
     with step("vacuum") as figures:
-        report = remove_expired(context.obj, retention_hours, dry_run=dry_run)
+        report = (preview_vacuum if dry_run else remove_expired)(context.obj, retention_hours)
         figures.size_bytes = report.size_bytes
     if json:
         print_json(asdict(report))

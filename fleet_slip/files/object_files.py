@@ -20,7 +20,11 @@ if TYPE_CHECKING:
 
 
 class ObjectReader(io.RawIOBase):
-    """An object as a file. It is read in as many requests as there are calls."""
+    """An object as a file. It is read in as many requests as there are calls.
+
+    The reader of obstore returns less than was asked for at the ends of its buffer, and reads the
+    buffer anew after every seek; DuckDB takes the first for a damaged file.
+    """
 
     def __init__(self, store: "ObjectStore", key: str, where: str, size: int | None = None) -> None:
         """Open an object; `where` names it in errors."""

@@ -17,7 +17,7 @@ from fleet_slip.errors import FleetSlipError, QuestionError
 from fleet_slip.grams.job import reconcile
 from fleet_slip.maintenance.audit import Audit, Forgettable
 from fleet_slip.maintenance.find_drives import Located, drives_by_file, locate
-from fleet_slip.maintenance.old_files import quarantined_of, remove_old_files
+from fleet_slip.maintenance.old_files import find_old_files, quarantined_of
 from fleet_slip.maintenance.rewriting import read_drives
 from fleet_slip.models.manifest import TrainedOn
 from fleet_slip.models.versions import Registry
@@ -76,7 +76,8 @@ def forget(
     _forget_quarantined(warehouse, subject, drives)
     rows, rewritten, removed = _rewrite_logs(warehouse, subject, located, progress)
     reconcile(warehouse)
-    deleted, left = remove_old_files(warehouse, subject, delete=now)
+    old = find_old_files(warehouse, subject)
+    deleted = sum(file.folder.remove(file) for file in old) if now else 0
     if drives or state == "begun":
         audit.end(subject)
     return ForgetReport(
@@ -86,7 +87,7 @@ def forget(
         files_removed=removed,
         models=tuple(models),
         old_files_deleted=deleted,
-        old_files_left=left,
+        old_files_left=len(old) - deleted,
     )
 
 

@@ -17,10 +17,8 @@ BEING_WRITTEN_HOURS = 1.0
 """A file that no commit ever knew and that is younger may belong to a job that is running."""
 
 
-def remove_old_files(
-    warehouse: Warehouse, subject: Forgettable, *, delete: bool
-) -> tuple[int, int]:
-    """Delete the files with the drives that no version refers to, or count them.
+def find_old_files(warehouse: Warehouse, subject: Forgettable) -> list[StoredFile]:
+    """Return the files with the drives that no version refers to, in the order of deletion.
 
     The logs come last: their old files may be all that tells the drives of a car in the quarantine.
     """
@@ -28,9 +26,7 @@ def remove_old_files(
     drives = {drive for _, names in logs for drive in names}
     old = list(_of_quarantine(warehouse.quarantine.snapshot(), subject, drives))
     old += [file for file, _ in _with_subject(warehouse.grams.snapshot(), subject)]
-    old += [file for file, _ in logs]
-    deleted = sum(file.folder.remove(file) for file in old) if delete else 0
-    return deleted, len(old) - deleted
+    return old + [file for file, _ in logs]
 
 
 def _readable(snapshot: Snapshot) -> Iterator[tuple[StoredFile, pa.Table]]:

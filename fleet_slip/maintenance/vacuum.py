@@ -7,7 +7,7 @@ it. A clock that was set back keeps files longer. Files of a table without a Del
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from fleet_slip.delta import Snapshot, Table
@@ -29,23 +29,28 @@ class VacuumReport:
     dry_run: bool
 
 
-def vacuum(
-    warehouse: Warehouse, retention_hours: float = RETENTION_HOURS, *, dry_run: bool = False
-) -> VacuumReport:
+def vacuum(warehouse: Warehouse, retention_hours: float = RETENTION_HOURS) -> VacuumReport:
     """Remove what nothing has referred to for some hours, and gather the records of runs.
 
     Raises `StorageError`.
     """
     warehouse.require()
-    removed = []
-    for file in find_expired(warehouse, retention_hours):
-        if dry_run or file.folder.remove(file):
-            removed.append(file)
-    if not dry_run:
-        gather_runs(warehouse.root)
+    expired = find_expired(warehouse, retention_hours)
+    removed = [file for file in expired if file.folder.remove(file)]
+    gather_runs(warehouse.root)
+    return _report(warehouse, removed, dry_run=False)
+
+
+def preview_vacuum(warehouse: Warehouse, retention_hours: float = RETENTION_HOURS) -> VacuumReport:
+    """Return what `vacuum` would remove. Raises `StorageError`."""
+    warehouse.require()
+    return _report(warehouse, find_expired(warehouse, retention_hours), dry_run=True)
+
+
+def _report(warehouse: Warehouse, files: Sequence[StoredFile], *, dry_run: bool) -> VacuumReport:
     return VacuumReport(
-        files=tuple(str(file).removeprefix(f"{warehouse.root}/") for file in removed),
-        size_bytes=sum(file.size_bytes for file in removed),
+        files=tuple(str(file).removeprefix(f"{warehouse.root}/") for file in files),
+        size_bytes=sum(file.size_bytes for file in files),
         dry_run=dry_run,
     )
 

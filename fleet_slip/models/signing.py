@@ -64,7 +64,7 @@ def require_signature(folder: Folder, number: int, name: str, sha256: str) -> No
     """
     if not (configured := os.environ.get(VERIFY_VARIABLE)):
         return
-    public = _read_key(Path(configured), private=False)
+    public = _read_key(Path(configured))[0]
     shown, file = f"{name}@{number}", f"{number}.sig"
     if file not in folder.names():
         raise RefusedError(
@@ -94,7 +94,7 @@ def _message(number: int, name: str, sha256: str) -> bytes:
 
 
 def _signed(key: Path, message: bytes) -> bytes:
-    secret = _read_key(key, private=True)
+    secret = _read_private_key(key)
     try:
         signature = _ed25519().sign(secret, message)
     except ValueError:
@@ -105,16 +105,20 @@ def _signed(key: Path, message: bytes) -> bytes:
     return bytes(signature)
 
 
-def _read_key(path: Path, *, private: bool) -> bytes:
-    try:
-        with path.open("rb") as stream:
-            mode = os.fstat(stream.fileno()).st_mode
-            content = stream.read(LONGEST_FILE_BYTES)
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{path}: the key cannot be read: {error}") from None
-    if private and mode & (stat.S_IRWXG | stat.S_IRWXO):
+def _read_private_key(path: Path) -> bytes:
+    content, mode = _read_key(path)
+    if mode & (stat.S_IRWXG | stat.S_IRWXO):
         raise ConfigError(f"{path}: others may read this private key. Run: chmod 600 {path}")
     return content
+
+
+def _read_key(path: Path) -> tuple[bytes, int]:
+    """Return a key's file and its mode."""
+    try:
+        with path.open("rb") as stream:
+            return stream.read(LONGEST_FILE_BYTES), os.fstat(stream.fileno()).st_mode
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path}: the key cannot be read: {error}") from None
 
 
 def _write_new(path: Path, content: bytes, mode: int) -> None:

@@ -42,29 +42,41 @@ class LarsPath:
         )
 
 
-def lars_path(
-    gram: Gram, inputs: Sequence[str], label: str, *, lasso: bool = False, ridge: float = 0.0
-) -> LarsPath:
-    """Return the LARS path, or with `lasso` the path of all minimisers of the lasso.
+def lars_path(gram: Gram, inputs: Sequence[str], label: str) -> LarsPath:
+    """Return the path of least-angle regression.
 
-    The lasso minimises |y - Xb|^2 / 2 + penalty |b|_1; `ridge` adds ridge |b|^2 / 2 (the elastic
-    net of Zou and Hastie 2005, without their rescaling). Ties to within rounding enter in the
-    declared order. Raises `DataError` for a constant signal.
+    Ties to within rounding enter in the declared order. Raises `DataError` for a constant signal.
     """
+    return _follow(_Walk(*_correlations(gram, inputs, label)), inputs)
+
+
+def lasso_path(gram: Gram, inputs: Sequence[str], label: str, *, ridge: float = 0.0) -> LarsPath:
+    """Return the path of all minimisers of the lasso, |y - Xb|^2 / 2 + penalty |b|_1.
+
+    `ridge` adds ridge |b|^2 / 2 (the elastic net of Zou and Hastie 2005, without their rescaling).
+    Ties to within rounding enter in the declared order. Raises `DataError` for a constant signal.
+    """
+    matrix, target = _correlations(gram, inputs, label)
+    return lasso_path_of_moments(matrix + ridge * np.eye(len(inputs)), target, inputs)
+
+
+def lasso_path_of_moments(
+    matrix: FloatArray, target: FloatArray, inputs: Sequence[str]
+) -> LarsPath:
+    """Return the path for moments X'X, shape (k, k), and X'y, shape (k,), in their own units."""
+    return _follow(_LassoWalk(matrix, target), inputs)
+
+
+def _correlations(gram: Gram, inputs: Sequence[str], label: str) -> tuple[FloatArray, FloatArray]:
     matrix = correlation_matrix(gram.restrict([*inputs, label]))
     constant = [name for i, name in enumerate([*inputs, label]) if matrix[i, i] == 0]
     if constant:
         raise DataError(f"{', '.join(constant)} is constant: leave it out.")
     k = len(inputs)
-    penalised = matrix[:k, :k] + ridge * np.eye(k)
-    return path_of_moments(penalised, matrix[:k, k], inputs, lasso=lasso)
+    return matrix[:k, :k], matrix[:k, k]
 
 
-def path_of_moments(
-    matrix: FloatArray, target: FloatArray, inputs: Sequence[str], *, lasso: bool
-) -> LarsPath:
-    """Return the path for moments X'X, shape (k, k), and X'y, shape (k,), in their own units."""
-    walk = _Walk(matrix, target, lasso=lasso)
+def _follow(walk: "_Walk", inputs: Sequence[str]) -> LarsPath:
     while walk.step():
         pass
     return LarsPath(
@@ -79,15 +91,15 @@ def fit_lasso(
     gram: Gram, inputs: Sequence[str], label: str, penalty: float, ridge: float = 0.0
 ) -> LinearModel:
     """Return the lasso (or elastic net) of counts; the penalty is in correlations, 0..1."""
-    path = lars_path(gram, inputs, label, lasso=True, ridge=ridge)
+    path = lasso_path(gram, inputs, label, ridge=ridge)
     return from_standardised(gram, inputs, label, path.at(penalty))
 
 
 class _Walk:
     """State of the path: all active signals keep the same absolute residual correlation."""
 
-    def __init__(self, matrix: FloatArray, target: FloatArray, *, lasso: bool) -> None:
-        self.matrix, self.target, self.lasso = matrix, target, lasso
+    def __init__(self, matrix: FloatArray, target: FloatArray) -> None:
+        self.matrix, self.target = matrix, target
         self.beta = np.zeros(len(target))
         self.active: list[int] = []
         self.entered: list[int] = []
@@ -108,8 +120,7 @@ class _Walk:
         direction[self.active] = np.linalg.solve(inner, signs)
         length = min(penalty, self._until_entry(residual, penalty, direction))
         self.dropped = None
-        if self.lasso:
-            length = self._until_zero(direction, length)
+        length = self._until_zero(direction, length)
         self.beta = self.beta + length * direction
         if self.dropped is not None:
             self.beta[self.dropped] = 0.0
@@ -142,6 +153,15 @@ class _Walk:
                 if speed > _TIE and gap > _TIE:
                     lengths.append(float(gap / speed))
         return min(lengths)
+
+    def _until_zero(self, direction: FloatArray, length: float) -> float:
+        """Return how far to go before an active coefficient must be dropped: never, in LARS."""
+        _ = direction
+        return length
+
+
+class _LassoWalk(_Walk):
+    """The same, with every signal dropped whose coefficient reaches zero."""
 
     def _until_zero(self, direction: FloatArray, length: float) -> float:
         for i in self.active:

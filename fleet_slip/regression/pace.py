@@ -34,19 +34,14 @@ _CERTAIN_SQUARE = 100.0
 _CERTAIN = 10.0
 
 
-def shrink(
-    gram: Gram, inputs: Sequence[str], label: str, estimator: Estimator, *, constant: bool
-) -> LinearModel:
+def shrink(gram: Gram, inputs: Sequence[str], label: str, estimator: Estimator) -> LinearModel:
     """Return the model of counts whose orthogonal responses an estimator has changed.
 
-    The order is that of backward elimination; `constant` says whether the response of the
-    constant is among those to change: by the theory it is not. Raises `DataError` for dependent
-    signals or a label without noise.
+    The order is that of backward elimination. The constant is estimated as it is. Raises
+    `DataError` for dependent signals or a label without noise.
     """
     basis = OrthogonalResponses.of(gram, backward(gram, inputs, label), label)
     a = basis.responses
-    if constant:
-        return basis.model(estimator(a))
     return basis.model(np.concatenate([a[:1], estimator(a[1:])]))
 
 

@@ -79,7 +79,7 @@ def compare_shrinkage(
 
 
 def _shrinking(inputs: Sequence[str], label: str, estimator: Estimator) -> Procedure:
-    return lambda gram: shrink(gram, inputs, label, estimator, constant=False)
+    return lambda gram: shrink(gram, inputs, label, estimator)
 
 
 def _by_effect(estimator: Estimator, effect: float) -> Estimator:

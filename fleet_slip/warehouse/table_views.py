@@ -37,7 +37,9 @@ def connect_tables(warehouse: Warehouse, query: str) -> duckdb.DuckDBPyConnectio
 def views_in(query: str, known: Iterable[str] = TABLE_VIEWS) -> frozenset[str]:
     """Return the views that a query may need: those whose name occurs in it as a word.
 
-    And what these are made of.
+    And what these are made of. DuckDB's own `get_table_names` is no help here: it binds the query,
+    so that JOIN USING, UNPIVOT, COLUMNS and parameters are errors before the views are there. A
+    word too many only opens a view too many.
     """
     named = {name for name in known if re.search(rf"\b{name}\b", query, re.I)}
     return frozenset(named.union(*(_VIEWS_ON_VIEWS.get(name, ()) for name in named)))

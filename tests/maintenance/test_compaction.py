@@ -18,7 +18,7 @@ from fleet_slip.files.folder import TEMPORARY_PREFIX
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.job import update_grams
 from fleet_slip.maintenance.compaction import compact
-from fleet_slip.maintenance.vacuum import find_expired, find_unreferenced, vacuum
+from fleet_slip.maintenance.vacuum import find_expired, find_unreferenced, preview_vacuum, vacuum
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import DAY, land, log_rows, path_of, random_counts
 
@@ -128,7 +128,7 @@ def test_vacuum_removes_replaced_files_after_the_retention(
     before = answers(six)
     compact(six)
     grow_old(six)
-    planned = vacuum(six, dry_run=True)
+    planned = preview_vacuum(six)
     assert len(planned.files) == 7  # six log files and the Gram file that named them
     assert vacuum(six).files == planned.files
     assert not find_unreferenced(six.logs)

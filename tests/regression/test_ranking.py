@@ -17,7 +17,7 @@ from fleet_slip.regression.evidence import Evidence
 from fleet_slip.regression.exact import correlation_matrix, fit
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.inference import infer_by_drives
-from fleet_slip.regression.lars import fit_lasso, lars_path, path_of_moments
+from fleet_slip.regression.lars import fit_lasso, lars_path, lasso_path, lasso_path_of_moments
 from fleet_slip.regression.leaps import best_by_leaps
 from fleet_slip.regression.nested import nested_fits, nested_models
 from fleet_slip.regression.ranking import RANKINGS, rank, replacement_sets
@@ -83,7 +83,7 @@ def test_diabetes_lars_and_lasso_paths(diabetes: tuple[Gram, dict[str, Any]]) ->
     np.testing.assert_allclose(
         path.penalties * length / gram.n, answers["lars_alphas"], rtol=1e-9, atol=1e-12
     )
-    lasso = lars_path(gram, inputs, "y", lasso=True)
+    lasso = lasso_path(gram, inputs, "y")
     np.testing.assert_allclose(
         lasso.penalties * length / gram.n,
         answers["lasso_breakpoint_alphas_sklearn"],
@@ -103,7 +103,7 @@ def test_diabetes_lars_and_lasso_paths(diabetes: tuple[Gram, dict[str, Any]]) ->
 def test_paths_meet_their_conditions(seed: int, lasso: bool) -> None:
     gram = gram_of(np.concatenate(random_drives(seed, drives=2, inputs=5)))
     matrix = correlation_matrix(gram)
-    path = lars_path(gram, names(5)[:-1], "y", lasso=lasso)
+    path = (lasso_path if lasso else lars_path)(gram, names(5)[:-1], "y")
     assert (np.diff(path.penalties) < 0).all()
     assert sorted(path.order) == list(names(5)[:-1])
     halfway = (path.penalties[1:] + path.penalties[:-1]) / 2
@@ -122,7 +122,7 @@ def test_paths_meet_their_conditions(seed: int, lasso: bool) -> None:
 def test_lasso_equals_scikit_learn(seed: int) -> None:
     gram = gram_of(np.concatenate(random_drives(seed, drives=2, inputs=5)))
     matrix = correlation_matrix(gram)
-    path = lars_path(gram, names(5)[:-1], "y", lasso=True)
+    path = lasso_path(gram, names(5)[:-1], "y")
     alphas, _, coefficients = lars_path_gram(
         matrix[:5, 5], matrix[:5, :5], n_samples=1, method="lasso"
     )
@@ -133,7 +133,7 @@ def test_lasso_equals_scikit_learn(seed: int) -> None:
 def test_the_lasso_path_of_r() -> None:
     expected = evidence("subsets/lars_R_reference.json")
     x, y = np.array(expected["X"]), np.array(expected["y"])
-    path = path_of_moments(x.T @ x, x.T @ y, [f"x{i}" for i in range(5)], lasso=True)
+    path = lasso_path_of_moments(x.T @ x, x.T @ y, [f"x{i}" for i in range(5)])
     np.testing.assert_allclose(
         path.coefficients.T, expected["R_beta_columns_are_steps"], rtol=1e-6, atol=1e-6
     )
@@ -145,7 +145,7 @@ def test_elastic_net_equals_scikit_learn() -> None:
     x = (counts - counts.mean(axis=0)) / np.sqrt(np.sum((counts - counts.mean(axis=0)) ** 2, 0))
     net = ElasticNet(alpha=0.12 / len(x), l1_ratio=0.1 / 0.12, fit_intercept=False, tol=1e-14)
     net.set_params(max_iter=100_000).fit(x[:, :5], x[:, 5])
-    path = lars_path(gram, names(5)[:-1], "y", lasso=True, ridge=0.02)
+    path = lasso_path(gram, names(5)[:-1], "y", ridge=0.02)
     np.testing.assert_allclose(path.at(0.1), net.coef_, atol=1e-7)
     model = fit_lasso(gram, names(5)[:-1], "y", 0.1, 0.02)
     unit = counts.std(axis=0)

@@ -185,10 +185,10 @@ def test_shrinkage_lowers_the_loss_when_most_effects_are_small() -> None:
 def test_pace_needs_no_row_and_names_its_mistakes() -> None:
     gram = gram_of(np.concatenate(random_drives(9, inputs=6)))
     inputs = names(6)[:-1]
-    found = shrink(gram, inputs, "y", ESTIMATORS["ols"], constant=False)
+    found = shrink(gram, inputs, "y", ESTIMATORS["ols"])
     assert found.weights == pytest.approx(fit(gram, inputs, "y").model.weights)
     exact = Gram.from_counts(("x1", "y"), np.array([[1, 2], [2, 4], [3, 6], [5, 10]]))
     with pytest.raises(DataError, match="no noise"):
-        shrink(exact, ["x1"], "y", ESTIMATORS["eb"], constant=False)
+        shrink(exact, ["x1"], "y", ESTIMATORS["eb"])
     assert (james_stein(np.array([0.1, 0.1, 0.1])) == 0).all()
     assert (threshold(4.0)(np.array([1.9, -2.1])) == [0, -2.1]).all()

@@ -20,7 +20,7 @@ from fleet_slip.regression.pace import ESTIMATORS, shrink
 from fleet_slip.regression.ranking import backward
 from tests.support.counts import columns_to_counts
 from tests.support.evidence import EVIDENCE, evidence
-from tests.support.weka import threshold, weka_linear_regression, weka_pace
+from tests.support.weka import WEKA_ESTIMATORS, threshold, weka_linear_regression, weka_pace
 
 DATASETS = ["diabetes_raw", "vehicle9"]
 RUNS = range(17)
@@ -67,16 +67,12 @@ def procedure(run: dict[str, Any], inputs: tuple[str, ...], label: str) -> Calla
     estimator = options.split()[1]
     if estimator == "olsc":
         price = float(options.split()[-1])
-        return lambda gram: shrink(gram, inputs, label, threshold(price), constant=True)
+        return lambda gram: weka_pace(gram, inputs, label, threshold(price))
     if estimator in PRICES:
-        return lambda gram: shrink(
-            gram,
-            inputs,
-            label,
-            threshold(PRICES[estimator](gram.n, len(inputs))),
-            constant=True,
+        return lambda gram: weka_pace(
+            gram, inputs, label, threshold(PRICES[estimator](gram.n, len(inputs)))
         )
-    return lambda gram: weka_pace(gram, inputs, label, estimator)
+    return lambda gram: weka_pace(gram, inputs, label, WEKA_ESTIMATORS[estimator])
 
 
 def coefficients(model: LinearModel, inputs: tuple[str, ...], run: dict[str, Any]) -> list[float]:
@@ -127,7 +123,7 @@ def test_exact_answers(name: str) -> None:
 def test_the_theory_keeps_fewer_dimensions_than_weka() -> None:
     folds, inputs, label, _ = dataset("diabetes_raw")
     for estimator in ("pace2", "pace4"):
-        theory = shrink(folds.total, inputs, label, ESTIMATORS[estimator], constant=False)
-        weka = weka_pace(folds.total, inputs, label, estimator)
+        theory = shrink(folds.total, inputs, label, ESTIMATORS[estimator])
+        weka = weka_pace(folds.total, inputs, label, WEKA_ESTIMATORS[estimator])
         assert len(theory.signals) == 6
         assert len(weka.signals) == 8

@@ -16,14 +16,15 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.regression.exact import LinearModel
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.orthogonal import OrthogonalResponses
 from fleet_slip.regression.pace import (
     Estimator,
     empirical_bayes,
     half_contributions,
     normal_contributions,
     pace6,
-    shrink,
 )
+from fleet_slip.regression.ranking import backward
 from fleet_slip.regression.ridge import fit_penalised, standardised_penalty, standardised_size
 
 Selection = Literal["none", "m5", "greedy"]
@@ -104,13 +105,14 @@ def _each(gram: Gram, model: LinearModel) -> list[str]:
     return list(model.signals)
 
 
-def weka_pace(gram: Gram, inputs: Sequence[str], label: str, estimator: str) -> LinearModel:
+def weka_pace(gram: Gram, inputs: Sequence[str], label: str, estimator: Estimator) -> LinearModel:
     """Return the model of counts that WEKA's PaceRegression finds.
 
     The constant takes part in the mixture and may be shrunk; subset does what nested does; and the
     expected contributions of pace2 and pace4 are not those of the theory.
     """
-    return shrink(gram, inputs, label, ESTIMATORS[estimator], constant=True)
+    basis = OrthogonalResponses.of(gram, backward(gram, inputs, label), label)
+    return basis.model(estimator(basis.responses))
 
 
 def threshold(price: float) -> Estimator:
@@ -139,7 +141,7 @@ def _nested(a: FloatArray) -> FloatArray:
     return np.where(np.abs(kept) <= NEGLIGIBLE, 0.0, kept)
 
 
-ESTIMATORS: dict[str, Estimator] = {
+WEKA_ESTIMATORS: dict[str, Estimator] = {
     "ols": lambda a: a,
     "pace2": _pace2,
     "pace4": _pace4,
