@@ -1,0 +1,38 @@
+"""The descriptions of columns beside the SQL, and the table `dictionary` that is made of them."""
+
+from pathlib import Path
+
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.views import VIEWS, connect
+from fleet_slip.warehouse.dictionary import SHARED, column_descriptions
+
+
+def columns(root: Path) -> dict[str, dict[str, tuple[str, str]]]:
+    """Return unit and description of every column, by view."""
+    found: dict[str, dict[str, tuple[str, str]]] = {}
+    with connect(root) as database:
+        for view, column, unit, description in database.sql(
+            'SELECT "view", "column", unit, description FROM dictionary'
+        ).fetchall():
+            found.setdefault(view, {})[column] = unit, description
+    return found
+
+
+def test_every_description_is_of_a_column_and_every_column_has_one(tmp_path: Path) -> None:
+    found = columns(tmp_path)
+    assert {*found, "dictionary"} == VIEWS
+    for view, described in column_descriptions().items():
+        shown = {name for of_view in found.values() for name in of_view}
+        assert described.keys() <= (shown if view == SHARED else found[view].keys()), view
+    for view, described_columns in found.items():
+        for column, (_, description) in described_columns.items():
+            assert description, (view, column)
+
+
+def test_a_column_has_the_unit_of_its_view(tmp_path: Path) -> None:
+    found = columns(tmp_path)
+    signal = catalogue()["ay"]
+    assert found["log_counts"]["ay"] == (f"{signal.scale} {signal.unit}", signal.description)
+    assert found["log"][signal.column] == (signal.unit, signal.description)
+    assert found["log"]["time_s"][0] == "s"
+    assert found["grams"]["products"][0] == "counts^2"
