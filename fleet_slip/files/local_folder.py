@@ -10,6 +10,7 @@ import errno
 import fcntl
 import os
 import shutil
+import stat
 import uuid
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -19,6 +20,7 @@ from typing import TYPE_CHECKING, Self
 
 import pyarrow as pa
 
+from fleet_slip.errors import StorageError
 from fleet_slip.files.folder import TEMPORARY_PREFIX, Content, StoredFile
 from fleet_slip.files.storage_errors import storage_errors
 
@@ -84,7 +86,10 @@ class LocalFolder:
 
     def read(self, path: str, longest: int | None = None) -> bytes:
         """Return the content of a file, or only its first bytes."""
-        with storage_errors(self.path / path), (self.path / path).open("rb") as file:
+        with (
+            _regular_file(self.path / path, os.O_RDONLY) as descriptor,
+            open(descriptor, "rb", closefd=False) as file,
+        ):
             return file.read(-1 if longest is None else longest)
 
     def read_many(self, paths: Sequence[str]) -> list[bytes | None]:
@@ -94,6 +99,8 @@ class LocalFolder:
     def open(self, path: str) -> pa.NativeFile:
         """Open a file for reading anywhere in it."""
         with storage_errors(self.path / path):
+            if not (self.path / path).is_file():  # a pipe would be waited for
+                raise FileNotFoundError(errno.ENOENT, "there is no such file")
             return pa.OSFile(str(self.path / path), "rb")
 
     def put(self, path: str, content: Content) -> None:
@@ -117,12 +124,9 @@ class LocalFolder:
         file = self.path / path
         with storage_errors(file):
             file.parent.mkdir(exist_ok=True)
-            descriptor = os.open(file, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
-            try:
-                os.write(descriptor, content)
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
+        with _regular_file(file, os.O_WRONLY | os.O_APPEND | os.O_CREAT) as descriptor:
+            os.write(descriptor, content)
+            os.fsync(descriptor)
 
     def remove(self, file: StoredFile) -> bool:
         """Delete the very file that a listing found; False if it is gone or was replaced.
@@ -172,7 +176,7 @@ class LocalFolder:
             with storage_errors(lock):
                 try:
                     lock.parent.mkdir(parents=True, exist_ok=True)
-                    file = stack.enter_context(lock.open("w"))
+                    file = stack.enter_context(_opened(lock, os.O_WRONLY | os.O_CREAT))
                 except OSError as error:
                     if error.errno != errno.EROFS:
                         raise
@@ -193,21 +197,60 @@ class LocalFolder:
         database: "duckdb.DuckDBPyConnection",  # noqa: ARG002
         wanted: Callable[[str], bool],
     ) -> list[str]:
-        """Return the URIs of the files whose paths are wanted: a connection can read them."""
-        return [f"{self.uri}/{file.path}" for file in self.files() if wanted(file.path)]
+        """Return the URIs of the files whose paths are wanted: a connection can read them.
+
+        A link is left out: it may lead anywhere.
+        """
+        paths = [self.path / file.path for file in self.files() if wanted(file.path)]
+        return [f"{self.uri}/{p.relative_to(self.path)}" for p in paths if not p.is_symlink()]
 
     def _judge(self, path: Path) -> StoredFile | None:
         try:
-            stat = path.stat(follow_symlinks=False)
+            found = path.stat(follow_symlinks=False)
         except FileNotFoundError:
             return None
         return StoredFile(
             self,
             path.relative_to(self.path).as_posix(),
-            stat.st_size,
-            stat.st_mtime_ns,
-            str(stat.st_ino),
+            found.st_size,
+            found.st_mtime_ns,
+            str(found.st_ino),
         )
+
+
+@contextlib.contextmanager
+def _opened(file: Path, flags: int) -> Iterator[int]:
+    """Open a file that is nothing but a file, and yield its descriptor.
+
+    A link is not followed, since it may lead to another's file; a pipe is not waited for.
+    """
+    safe = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    try:
+        descriptor = os.open(file, flags | safe, 0o666)
+    except OSError:
+        if file.is_symlink() or file.is_fifo():
+            raise _no_file(file) from None
+        raise
+    try:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise _no_file(file)
+        yield descriptor
+    finally:
+        os.close(descriptor)
+
+
+@contextlib.contextmanager
+def _regular_file(file: Path, flags: int) -> Iterator[int]:
+    """Do the same; what fails is a `StorageError`."""
+    with storage_errors(file), _opened(file, flags) as descriptor:
+        yield descriptor
+
+
+def _no_file(path: Path) -> StorageError:
+    return StorageError(
+        f"{path}: it is a link, a folder or a pipe where this program has a file. Find out who put "
+        "it there and remove it, or restore the file from a backup."
+    )
 
 
 @contextlib.contextmanager
