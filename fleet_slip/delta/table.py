@@ -179,7 +179,8 @@ class Snapshot:
         """Return the version of a unit of work that has landed, or None."""
         if self.delta is None:
             return None
-        return self.delta.transaction_version(unit_name)
+        with storage_errors(self.table.folder):
+            return self.delta.transaction_version(unit_name)
 
     def commit(self, change: Change) -> None:
         """Apply a change in one atomic commit on top of this snapshot.

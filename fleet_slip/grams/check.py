@@ -76,6 +76,20 @@ def grams_of(rows: pa.Table) -> DriveGrams:
     return found
 
 
+def differing_drives(one: DriveGrams, two: DriveGrams) -> list[str]:
+    """Return the drives whose Grams differ, sorted.
+
+    The order of the signals does not count: it is that of the catalogue when a row was made.
+    """
+    one, two = _in_one_order(one), _in_one_order(two)
+    return sorted({key[0] for key in one.keys() | two.keys() if one.get(key) != two.get(key)})
+
+
+def _in_one_order(grams: DriveGrams) -> DriveGrams:
+    ordered = ((drive, tuple(sorted(signals)), gram) for (drive, signals), gram in grams.items())
+    return {(drive, signals): gram.restrict(signals) for drive, signals, gram in ordered}
+
+
 def stored_grams(
     warehouse: Warehouse, files: Sequence[TableFile] | None = None
 ) -> dict[str, DriveGrams]:
@@ -166,10 +180,9 @@ def _check_by_integers(warehouse: Warehouse, file: TableFile, counts: pa.Table) 
 
 
 def _compare(file: TableFile, other: str, one: DriveGrams, two: DriveGrams) -> None:
-    for key in sorted(one.keys() | two.keys()):
-        if one.get(key) != two.get(key):
-            raise StorageError(
-                f"{file.path}: the Gram of drive {key[0]} by SQL and by {other} differ. If the "
-                "Gram job has not run since the logs changed, run: fleet-slip gram. Otherwise the "
-                "file or a library is damaged: keep both and report it."
-            )
+    if drives := differing_drives(one, two):
+        raise StorageError(
+            f"{file.path}: the Gram of drive {drives[0]} by SQL and by {other} differ. If the Gram "
+            "job has not run since the logs changed, run: fleet-slip gram. Otherwise the file or "
+            "a library is damaged: keep both and report it."
+        )

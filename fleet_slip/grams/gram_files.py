@@ -79,7 +79,8 @@ def rows_to_keep(
     """Yield the Gram rows of files, without those of stale log files."""
     dropped = pa.array(sorted(stale), pa.string())
     for file in files:
-        rows = grams.table.read(file.path).cast(grams.table.schema)
+        schema = grams.table.schema
+        rows = grams.table.read(file.path).select(schema.names).cast(schema)
         yield rows.filter(pc.invert(pc.is_in(rows["file"], dropped)))
 
 

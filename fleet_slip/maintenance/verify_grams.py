@@ -7,7 +7,13 @@ from functools import partial
 
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.delta import TableFile
-from fleet_slip.grams.check import DriveGrams, grams_by_blocks, read_counts, stored_grams
+from fleet_slip.grams.check import (
+    DriveGrams,
+    differing_drives,
+    grams_by_blocks,
+    read_counts,
+    stored_grams,
+)
 from fleet_slip.maintenance.verification import Damage, Verification
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.database import database_errors, open_database
@@ -56,7 +62,7 @@ def verify_grams(
     step = 1 if full else max(1, len(covered) // SAMPLE)
     task = partial(_compute_grams, warehouse)
     for file, computed in run_tasks(executor, task, covered[::step], _name_task):
-        for drive in _differing_drives(stored[file.path], computed):
+        for drive in differing_drives(stored[file.path], computed):
             problem = f"the stored Gram row of drive {drive} is not that of its rows"
             report.findings.append(Damage("gram", f"logs/{file.path}", problem))
         report.log_files_recomputed += 1
@@ -84,7 +90,3 @@ def _compute_grams(warehouse: Warehouse, file: TableFile) -> DriveGrams:
 
 def _name_task(file: TableFile) -> str:
     return f"the Gram rows of {file.path}"
-
-
-def _differing_drives(one: DriveGrams, two: DriveGrams) -> list[str]:
-    return sorted({key[0] for key in one.keys() | two.keys() if one.get(key) != two.get(key)})

@@ -189,3 +189,17 @@ def test_a_damaged_log_is_told(warehouse: Warehouse) -> None:
         entry.write_text("{ damaged")
     with pytest.raises(StorageError, match="the Delta log cannot be used"):
         warehouse.logs.snapshot()
+
+
+def test_what_the_delta_library_cannot_tell_of_a_unit_is_a_storage_error(
+    warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    land(warehouse, "one", log_rows("d", random_counts(np.random.default_rng(1), 20)))
+    snapshot = warehouse.logs.snapshot()
+
+    def fail(_table: object, _unit: str) -> None:
+        raise DeltaError("Generic error: a commit is damaged")
+
+    monkeypatch.setattr(DeltaTable, "transaction_version", fail)
+    with pytest.raises(StorageError, match="a commit is damaged"):
+        snapshot.landed("test/one")

@@ -1,0 +1,46 @@
+"""A signal catalogue in another order is the same catalogue."""
+
+import os
+import re
+from pathlib import Path
+
+import pytest
+
+from fleet_slip.resources import folder
+from tests.conftest import RunCommand
+
+
+def reordered(text: str) -> str:
+    """Return a catalogue with its signals, and its drive columns, in reverse order."""
+    comment, *tables = re.split(r"(?m)^(?=\[)", text)
+    kinds = ("[signals.", "[drive.")
+    tables = [one if one.endswith("\n") else one + "\n" for one in tables]
+    sorted_out = [[t for t in tables if t.startswith(kind)] for kind in kinds]
+    assert sum(map(len, sorted_out)) == len(tables)
+    return comment + "".join(t for group in sorted_out for t in reversed(group))
+
+
+@pytest.fixture
+def other(tmp_path: Path) -> dict[str, str]:
+    """The environment of a user whose catalogue is in reverse order."""
+    file = tmp_path / "signals.toml"
+    file.write_text(reordered((folder("configs") / "signals.toml").read_text()))
+    return {**os.environ, "FLEET_SLIP_SIGNALS": str(file)}
+
+
+def test_an_order_of_signals_is_no_damage(
+    run_command: RunCommand, other: dict[str, str]
+) -> None:
+    before = run_command("run", "--campaign", "smoke", "--days", "1", "--json")
+    assert before.exit_code == 0
+    for command in ("verify --full", "check", "gram"):
+        done = run_command(*command.split(), env=other)
+        assert done.exit_code == 0, (command, done.stderr)
+    after = run_command("run", "--campaign", "smoke", "--days", "1", "--json", env=other)
+    assert not after.json["changed"], after.stderr
+    assert after.json["select"]["models"] == before.json["select"]["models"]
+    assert run_command("compact", env=other).exit_code == 0
+    for environment in ({}, {"env": other}):
+        done = run_command("verify", "--full", **environment)
+        assert done.exit_code == 0, done.stderr
+
