@@ -1,5 +1,6 @@
 """Commands that fill the warehouse: simulate, ingest, gram, check."""
 
+import logging
 from concurrent.futures import Executor
 from dataclasses import asdict
 from datetime import date
@@ -166,8 +167,18 @@ def ingest(
             figures.rows += report["ticks"] if report["new"] else 0
             if not json:
                 say(_ingested(report))
+            for names in done.look_alikes:
+                say(_look_alike(done.file, names), logging.WARNING)
     if json:
         print_json([reports[str(file)] for file in files])
+
+
+def _look_alike(file: str, names: tuple[str, ...]) -> str:
+    return (
+        f"{file}: the names {' and '.join(map(ascii, names))} look the same and count as several: "
+        "they differ in their Unicode form. Write such names in one form in the files or the "
+        "mapping, normally NFC."
+    )
 
 
 def _ingested(report: dict[str, Any]) -> str:

@@ -1,6 +1,7 @@
 """Commands that read the warehouse in SQL: sql, shell."""
 
 import contextlib
+import logging
 import shutil
 import sys
 from collections.abc import Iterator
@@ -9,6 +10,7 @@ from typing import Annotated
 
 import duckdb
 import pyarrow as pa
+import pyarrow.compute as pc
 import typer
 from pyarrow.csv import write_csv
 
@@ -19,6 +21,8 @@ from fleet_slip.warehouse.database import database_errors, interruptible, limit_
 from fleet_slip.warehouse.read_only_sql import one_query
 
 ROWS_SHOWN = 40
+FORMULA = "^[=+@\\t\\r\\n＝＋－＠-]"
+"""What a text begins with that a spreadsheet executes."""
 
 
 def register(app: typer.Typer) -> None:
@@ -34,6 +38,14 @@ def sql(
     ],
     json: Json = False,
     csv: Annotated[bool, typer.Option("--csv", help="Print CSV on stdout.")] = False,
+    exact: Annotated[
+        bool,
+        typer.Option(
+            "--exact",
+            help="Print texts of CSV as they are, also those that a spreadsheet would take for "
+            "formulas. Otherwise these are marked by an apostrophe.",
+        ),
+    ] = False,
     unsafe: Annotated[
         bool,
         typer.Option(
@@ -53,7 +65,7 @@ def sql(
         limit_memory()
     with connect(context.obj.root, locked=not unsafe, query=text) as database:
         allowed = text if unsafe else one_query(database, text)
-        interruptible(database, lambda: _answer(database, allowed, json=json, csv=csv))
+        interruptible(database, lambda: _answer(database, allowed, json=json, csv=csv, exact=exact))
 
 
 def _read_stdin() -> str:
@@ -64,7 +76,12 @@ def _read_stdin() -> str:
 
 
 def _answer(
-    database: duckdb.DuckDBPyConnection, text: str, *, json: bool = False, csv: bool = False
+    database: duckdb.DuckDBPyConnection,
+    text: str,
+    *,
+    json: bool = False,
+    csv: bool = False,
+    exact: bool = False,
 ) -> None:
     with database_errors("the query"), _representation_errors():
         relation = database.sql(text)
@@ -73,9 +90,31 @@ def _answer(
         if json:
             print_json(relation.to_arrow_table().to_pylist())
         elif csv:
-            write_csv(relation.to_arrow_table(), sys.stdout.buffer)
+            answer = relation.to_arrow_table()
+            write_csv(answer if exact else _mark_formulas(answer), sys.stdout.buffer)
         else:
             relation.show(max_rows=ROWS_SHOWN, max_width=_width())
+
+
+def _mark_formulas(answer: pa.Table) -> pa.Table:
+    """Put an apostrophe before texts that a spreadsheet would take for formulas, and say so.
+
+    Logs of others may hold names such as `=HYPERLINK(…)`. After OWASP, "CSV Injection".
+    """
+    marked = 0
+    for i, field in enumerate(answer.schema):
+        if pa.types.is_string(field.type) or pa.types.is_large_string(field.type):
+            formula = pc.match_substring_regex(answer[i], FORMULA)
+            marked += pc.sum(formula).as_py() or 0
+            quoted = pc.binary_join_element_wise(pa.scalar("'", field.type), answer[i], "")
+            answer = answer.set_column(i, field.name, pc.if_else(formula, quoted, answer[i]))
+    if marked:
+        say(
+            f"{marked:,} texts that begin like a formula of a spreadsheet are marked by an "
+            "apostrophe. As they are: --exact",
+            logging.WARNING,
+        )
+    return answer
 
 
 @contextlib.contextmanager

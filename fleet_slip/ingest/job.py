@@ -13,6 +13,7 @@ from deltalake.transaction import AddAction
 
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.delta import Change, Table, Unit, retry_conflicts
+from fleet_slip.ingest.look_alikes import find_vehicles_like
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.measured import IngestCounts, MeasuredLog, read_measured
 from fleet_slip.warehouse.tables import Warehouse
@@ -25,6 +26,8 @@ class IngestReport:
     file: str
     new: bool
     counts: IngestCounts
+    look_alikes: tuple[tuple[str, ...], ...] = ()
+    """Names that differ only in their Unicode form: in the file, or of cars in the logs."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `ingest --json` prints."""
@@ -38,6 +41,7 @@ class IngestReport:
             "drives": self.counts.drives,
             "drives_resampled": self.counts.drives_resampled,
             "ticks": self.counts.ticks,
+            "look_alikes": self.look_alikes,
         }
 
 
@@ -47,6 +51,8 @@ class _Written:
 
     digest: str
     counts: IngestCounts
+    look_alikes: tuple[tuple[str, ...], ...] = ()
+    vehicles: tuple[str, ...] = ()
     quarantine: tuple[AddAction, ...] = ()
     logs: tuple[AddAction, ...] = ()
 
@@ -77,17 +83,20 @@ def ingest_files(
         note = {"job": "ingest", "mapping": mapping.name, "digest": written.digest}
         _commit(warehouse.quarantine, written.quarantine, written.unit, note)
         new = _commit(warehouse.logs, written.logs, written.unit, note)
-        yield IngestReport(str(file), new, written.counts)
+        vehicles = find_vehicles_like(warehouse, written.vehicles) if new else ()
+        look_alikes = tuple(sorted({*written.look_alikes, *vehicles}))
+        yield IngestReport(str(file), new, written.counts, look_alikes)
 
 
 def _write(warehouse: Warehouse, mapping: Mapping, file: Path) -> _Written:
     log = read_measured(file, mapping)
-    written = _Written(log.digest, log.counts)
+    written = _Written(log.digest, log.counts, log.look_alikes)
     if warehouse.logs.snapshot().landed(written.unit.name) is not None:
         return written
     quarantine = {None: log.quarantine} if log.quarantine.num_rows else {}
     return replace(
         written,
+        vehicles=tuple(log.drives["vehicle_id"].unique().to_pylist()),
         quarantine=_write_parts(warehouse.quarantine, quarantine, log),
         logs=_write_parts(warehouse.logs, _by_day(log.drives), log),
     )

@@ -11,6 +11,7 @@ import pyarrow as pa
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import shown
 from fleet_slip.ingest.fields import RAW, Field, fields_of
+from fleet_slip.ingest.look_alikes import find_look_alikes
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.measured_drives import cut, drive_id, log_table, to_ticks
 from fleet_slip.ingest.quarantine import DriveKeys, check_rows, with_values
@@ -50,6 +51,8 @@ class MeasuredLog:
     quarantine: pa.Table
     """`QUARANTINE_SCHEMA`, in the file's order."""
     counts: IngestCounts
+    look_alikes: tuple[tuple[str, ...], ...]
+    """Names of drives or cars in the file that differ only in their Unicode form."""
     digest: str
     """SHA-256 of the file's bytes and the mapping: what has the same one was ingested before."""
 
@@ -89,7 +92,9 @@ def read_measured(file: Path, mapping: Mapping) -> MeasuredLog:
         drives_resampled=sum(drive.method != "snap" for drive in ticked),
         ticks=table.num_rows,
     )
-    return MeasuredLog(table, _quarantine_table(file, bad, prefix, mapping, keys), counts, digest)
+    quarantine = _quarantine_table(file, bad, prefix, mapping, keys)
+    names = {text for key in keys.metadata() for text in key.values() if isinstance(text, str)}
+    return MeasuredLog(table, quarantine, counts, find_look_alikes(names), digest)
 
 
 def _identity(file: Path, mapping: Mapping) -> str:

@@ -7,13 +7,15 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from deltalake import DeltaTable
+from deltalake.exceptions import DeltaError
 
 from fleet_slip.delta import Change, Unit, checksum_in, checksum_of, retry_conflicts
 from fleet_slip.errors import ConflictError, StorageError
 from fleet_slip.files.folder import TEMPORARY_PREFIX
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
-from tests.support.logs import DAY, log_rows, path_of, random_counts
+from tests.support.logs import DAY, land, log_rows, path_of, random_counts
 
 
 def rows(drive: str, count: int = 1000) -> object:

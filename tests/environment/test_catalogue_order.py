@@ -28,9 +28,7 @@ def other(tmp_path: Path) -> dict[str, str]:
     return {**os.environ, "FLEET_SLIP_SIGNALS": str(file)}
 
 
-def test_an_order_of_signals_is_no_damage(
-    run_command: RunCommand, other: dict[str, str]
-) -> None:
+def test_an_order_of_signals_is_no_damage(run_command: RunCommand, other: dict[str, str]) -> None:
     before = run_command("run", "--campaign", "smoke", "--days", "1", "--json")
     assert before.exit_code == 0
     for command in ("verify --full", "check", "gram"):
@@ -43,4 +41,3 @@ def test_an_order_of_signals_is_no_damage(
     for environment in ({}, {"env": other}):
         done = run_command("verify", "--full", **environment)
         assert done.exit_code == 0, done.stderr
-
