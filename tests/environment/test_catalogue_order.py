@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from fleet_slip.resources import folder
-from tests.conftest import RunCommand
+from tests.support.commands import RunCommand
 
 
 def reordered(text: str) -> str:

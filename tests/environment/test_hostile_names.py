@@ -10,8 +10,8 @@ import pytest
 from fleet_slip.ingest.job import ingest_files
 from fleet_slip.ingest.look_alikes import find_look_alikes
 from fleet_slip.warehouse.tables import Warehouse
-from tests.conftest import RunCommand
-from tests.ingest.samples import a_mapping, csv_text, good_columns
+from tests.support.commands import RunCommand
+from tests.support.measured import a_mapping, csv_text, good_columns
 
 NFC, NFD = (unicodedata.normalize(form, "Zoë") for form in ("NFC", "NFD"))
 

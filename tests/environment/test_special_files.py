@@ -13,8 +13,8 @@ from fleet_slip.errors import StorageError
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.models.versions import Registry
 from fleet_slip.runs.log import recording
-from tests.conftest import RunCommand
-from tests.models.test_versions import manifest
+from tests.support.commands import RunCommand
+from tests.support.manifests import manifest
 
 Place = Callable[[Path], Path]
 
