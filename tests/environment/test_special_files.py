@@ -14,7 +14,7 @@ from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.models.versions import Registry
 from fleet_slip.runs.log import recording
 from tests.support.commands import RunCommand
-from tests.support.manifests import manifest
+from tests.support.manifests import manifest, publish
 
 Place = Callable[[Path], Path]
 
@@ -80,7 +80,7 @@ def test_a_document_is_read_from_a_file_only(
     tmp_path: Path, place: Place, file: str, run_command: RunCommand
 ) -> None:
     """Even a link to the very document: tomorrow it may lead to another."""
-    Registry(LocalFolder(tmp_path / "data/models")).publish(manifest())
+    publish(Registry(LocalFolder(tmp_path / "data/models")), manifest())
     document = tmp_path / "data/models/sideslip" / file
     content = document.read_text()
     other = place(document)
