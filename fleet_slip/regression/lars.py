@@ -45,7 +45,8 @@ class LarsPath:
 def lars_path(gram: Gram, inputs: Sequence[str], label: str) -> LarsPath:
     """Return the path of least-angle regression.
 
-    Ties to within rounding enter in the declared order. Raises `DataError` for a constant signal.
+    Ties to within rounding enter in the declared order. Raises `DataError` for a constant signal
+    or dependent ones.
     """
     return _follow(_Walk(*_correlations(gram, inputs, label)), inputs)
 
@@ -54,7 +55,8 @@ def lasso_path(gram: Gram, inputs: Sequence[str], label: str, *, ridge: float = 
     """Return the path of all minimisers of the lasso, |y - Xb|^2 / 2 + penalty |b|_1.
 
     `ridge` adds ridge |b|^2 / 2 (the elastic net of Zou and Hastie 2005, without their rescaling).
-    Ties to within rounding enter in the declared order. Raises `DataError` for a constant signal.
+    Ties to within rounding enter in the declared order. Raises `DataError` for a constant signal
+    or dependent ones.
     """
     matrix, target = _correlations(gram, inputs, label)
     return lasso_path_of_moments(matrix + ridge * np.eye(len(inputs)), target, inputs)
@@ -77,8 +79,13 @@ def _correlations(gram: Gram, inputs: Sequence[str], label: str) -> tuple[FloatA
 
 
 def _follow(walk: "_Walk", inputs: Sequence[str]) -> LarsPath:
-    while walk.step():
-        pass
+    try:
+        while walk.step():
+            pass
+    except np.linalg.LinAlgError:
+        raise DataError(
+            f"{', '.join(inputs)} are linearly dependent. Leave one of them out, or take more rows."
+        ) from None
     return LarsPath(
         tuple(inputs),
         tuple(inputs[i] for i in walk.entered),
