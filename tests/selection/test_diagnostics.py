@@ -1,0 +1,115 @@
+"""A model's fit examined: against the rows, and against a cohort with another law."""
+
+import numpy as np
+import pytest
+
+from fleet_slip.catalogue.features import LAG, input_scales, lag_signals
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.errors import QuestionError
+from fleet_slip.selection.diagnostics import diagnose
+from tests.support.cohorts import INPUTS, LABEL, Driven, cohort_of, driven, rows_of
+from tests.support.counts import dense_fit
+
+COEFFICIENTS = (0.1, 0.4, 0.9, 0.2)
+
+
+def test_figures_are_those_of_the_rows() -> None:
+    drives = driven(1, COEFFICIENTS)
+    found = diagnose(cohort_of(drives), INPUTS)
+    rows = rows_of(drives).astype(float)
+    b, rss = dense_fit(rows)
+    scales = input_scales()
+    units = [float(scales[LABEL] / scales[name]) for name in INPUTS]
+    slopes = [estimate.value for estimate in found.naive.estimates[1:]]
+    np.testing.assert_allclose(slopes, b[1:] * units, rtol=1e-9)
+    assert [e.value for e in found.robust.estimates] == [e.value for e in found.naive.estimates]
+    deviation = np.sqrt(rss / (len(rows) - 5)) * float(scales[LABEL])
+    assert found.naive.residual_std == pytest.approx(deviation, rel=1e-9)
+    correlations = np.corrcoef(rows[:, :-1].T)
+    inflation = np.diag(np.linalg.inv(correlations))
+    np.testing.assert_allclose([found.inflation[name] for name in INPUTS], inflation, rtol=1e-9)
+    assert found.condition_number == pytest.approx(np.linalg.cond(correlations), rel=1e-9)
+    assert (found.drives, found.fitted.gram.n) == (12, len(rows))
+    assert (found.serial, found.comparison, found.noise_free) == (None, None, None)
+    document = found.as_dict()
+    assert document["rows"] == len(rows)
+    assert document["design_effect"] == found.evidence.design_effect
+    assert not {"serial", "against", "noise_free"} & set(document)
+
+
+def test_an_offset_of_each_drive_makes_the_naive_errors_too_small() -> None:
+    """The rows of a drive repeat one draw of its offset."""
+    drives = driven(2, COEFFICIENTS, drives=20, rows=200, noise=10)
+    rng = np.random.default_rng(3)
+    for one in drives:
+        one.counts[:, -1] += int(rng.normal(0, 200))
+    found = diagnose(cohort_of(drives), INPUTS)
+    naive, robust = found.naive.estimates[0], found.robust.estimates[0]
+    assert robust.standard_error > 3 * naive.standard_error
+    assert found.evidence.kind == "drives"
+    assert found.evidence.rows < 20 * 200
+
+
+def test_cohorts_of_one_law_agree_and_of_two_do_not() -> None:
+    here = cohort_of(driven(3, COEFFICIENTS, drives=20, name="a"))
+    same = cohort_of(driven(4, COEFFICIENTS, drives=20, name="b"), condition="mass_kg > 1")
+    other = cohort_of(driven(5, (0.1, 0.4, 0.8, 0.2), drives=20, name="c"))
+    agreeing = diagnose(here, INPUTS, against=same).comparison
+    differing = diagnose(here, INPUTS, against=other).comparison
+    assert agreeing is not None
+    assert differing is not None
+    assert agreeing.condition == "mass_kg > 1"
+    assert agreeing.drives.p > 0.01
+    assert differing.drives.p < 1e-6
+    assert differing.rows.p < 1e-6
+    (yaw_rate,) = (e for e in differing.other.estimates if e.name == "yaw_rate")
+    scales = input_scales()
+    expected = 0.8 * float(scales[LABEL] / scales["yaw_rate"])
+    assert yaw_rate.value == pytest.approx(expected, abs=5 * yaw_rate.standard_error)
+
+
+def test_cohorts_that_share_drives_are_not_compared() -> None:
+    drives = driven(6, COEFFICIENTS)
+    here = cohort_of(drives)
+    with pytest.raises(QuestionError, match=r"share 12 drives, such as d00: .* AND NOT \(adhesion"):
+        diagnose(here, INPUTS, against=cohort_of(drives, condition="adhesion > 0.1"))
+
+
+def test_the_noise_of_a_sensor_is_taken_out() -> None:
+    """Noise on an input draws its coefficient towards zero, by a known factor."""
+    true = driven(7, (0.0, 0.0, 0.9, 0.0), drives=40, rows=200, noise=5)
+    rng = np.random.default_rng(8)
+    noise = 200.0
+    for one in true:
+        one.counts[:, 2] += np.rint(rng.normal(0, noise, len(one.counts))).astype(np.int64)
+    scale = float(catalogue()["yaw_rate"].scale)
+    found = diagnose(cohort_of(true), INPUTS, sensor_noise={"yaw_rate": noise * scale})
+    unit = float(input_scales()[LABEL]) / scale
+    (drawn,) = (e.value for e in found.naive.estimates if e.name == "yaw_rate")
+    assert found.noise_free is not None
+    assert drawn < 0.85 * 0.9 * unit
+    assert found.noise_free.weights["yaw_rate"] == pytest.approx(0.9 * unit, rel=0.01)
+    assert set(found.as_dict()["noise_free"]) == {"intercept", *INPUTS}
+
+
+def test_the_residual_says_as_much_of_the_next_as_was_put_in() -> None:
+    signals = (*INPUTS, LABEL)
+    rng = np.random.default_rng(9)
+    now, lagged = [], []
+    for one in driven(9, COEFFICIENTS, drives=10, rows=400, noise=0.0):
+        rest = np.zeros(400)
+        for tick in range(1, 400):
+            rest[tick] = 0.8 * rest[tick - 1] + rng.normal(0, 60)
+        counts = one.counts.copy()
+        counts[:, -1] += np.rint(rest).astype(np.int64)
+        now.append(Driven(one.drive, counts))
+        pairs = np.column_stack([counts[1:], counts[:-1]])
+        lagged.append(Driven(one.drive, pairs, signals=(*signals, *(f"{s}{LAG}" for s in signals))))
+    assert set(lag_signals(signals)) == {*signals, *(f"{s}{LAG}" for s in signals)}
+    serial = diagnose(cohort_of(now), INPUTS, lagged=cohort_of(lagged, feature_set="lags")).serial
+    assert serial is not None
+    assert serial.correlation.rho == pytest.approx(0.8, abs=0.03)
+    assert serial.autoregressive.rho == pytest.approx(0.8, abs=0.03)
+    errors = [e.standard_error for e in serial.inference.estimates]
+    assert len(errors) == len(INPUTS) + 1
+    assert min(errors) > 0
