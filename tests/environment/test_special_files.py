@@ -45,7 +45,7 @@ def test_a_lock_is_taken_on_a_file_only(
 ) -> None:
     (tmp_path / "data").mkdir()
     other = place(tmp_path / "data/.run-smoke.lock")
-    done = run_command("run", "--campaign", "smoke", "--days", "1", timeout=60)
+    done = run_command("run", "--campaign", "smoke", "--days", "1")
     assert done.exit_code == StorageError.exit_code
     assert ".run-smoke.lock: it is a link, a folder or a pipe" in done.stderr
     assert untouched(other)
@@ -86,7 +86,7 @@ def test_a_document_is_read_from_a_file_only(
     other = place(document)
     if other.is_file():
         other.write_text(content)
-    done = run_command("show", "sideslip", timeout=60)
+    done = run_command("show", "sideslip")
     assert done.exit_code == StorageError.exit_code
     assert "it is a link, a folder or a pipe" in done.stderr
 
