@@ -19,6 +19,7 @@ from fleet_slip.cli.selecting import (
     Naive,
     Nested,
     Rank,
+    WorthOption,
     print_selection,
 )
 from fleet_slip.cli.signing import SignKey
@@ -26,7 +27,7 @@ from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.publish import Publication, manifest_of
 from fleet_slip.models.publish import publish as publish_selection
 from fleet_slip.runs.log import step
-from fleet_slip.selection.request import SelectionRequest, answer_request
+from fleet_slip.selection.request import WORTH, SelectionRequest, answer_request, parse_worth
 
 
 def register(app: typer.Typer) -> None:
@@ -46,6 +47,7 @@ def publish(
     folds: FoldCount = None,
     rank: Rank = None,
     criterion: Criterion = None,
+    worth: WorthOption = WORTH,
     all_subsets: AllSubsets = False,
     naive: Naive = False,
     force: Annotated[
@@ -68,6 +70,7 @@ def publish(
         folds=folds,
         rank=rank,
         criterion=criterion,
+        worth=parse_worth(worth),
         all_subsets=all_subsets,
         naive=naive,
     )

@@ -11,7 +11,7 @@ from fleet_slip.cli.models import registry_of
 from fleet_slip.cli.output import Json, print_json, say
 from fleet_slip.cli.publishing import print_publication, published
 from fleet_slip.cli.recorded import record_run
-from fleet_slip.cli.selecting import print_selection
+from fleet_slip.cli.selecting import WorthOption, print_selection
 from fleet_slip.cli.workers import Cluster, Threads, workers
 from fleet_slip.errors import RefusedError
 from fleet_slip.maintenance.audit import Audit
@@ -19,7 +19,13 @@ from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.publish import Publication, manifest_of, publish
 from fleet_slip.runs.log import step
 from fleet_slip.selection.compare import Selection
-from fleet_slip.selection.request import RequestedSelection, SelectionRequest, answer_request
+from fleet_slip.selection.request import (
+    WORTH,
+    RequestedSelection,
+    SelectionRequest,
+    answer_request,
+    parse_worth,
+)
 
 DEFAULT_CAMPAIGN = "waterford"
 
@@ -43,6 +49,7 @@ def run(
     models: Annotated[
         str | None, typer.Option(help="A model list of configs/models, or a TOML file.")
     ] = None,
+    worth: WorthOption = WORTH,
     threads: Threads = None,
     cluster: Cluster = None,
     json: Json = False,
@@ -65,7 +72,10 @@ def run(
             gram = run_gram(warehouse, executor)
         condition = f"campaign = '{plan.name}'"
         with step("select"):
-            answer = answer_request(context.obj, SelectionRequest(cohort=condition, models=models))
+            answer = answer_request(
+                context.obj,
+                SelectionRequest(cohort=condition, models=models, worth=parse_worth(worth)),
+            )
         selection = answer.selection
         with step("publish"):
             publication, refusal = _publish(context, answer, model_name)

@@ -13,7 +13,13 @@ from fleet_slip.regression.crossval import CrossValidation
 from fleet_slip.regression.nested_choice import CROSS_VALIDATION
 from fleet_slip.regression.ranking import RANKINGS
 from fleet_slip.selection.compare import Selection
-from fleet_slip.selection.request import DEFAULT_MODELS, SelectionRequest, answer_request
+from fleet_slip.selection.request import (
+    DEFAULT_MODELS,
+    WORTH,
+    SelectionRequest,
+    answer_request,
+    parse_worth,
+)
 from fleet_slip.selection.search import SearchChoice
 from fleet_slip.selection.uncertainty import Uncertainty
 
@@ -62,9 +68,18 @@ Rank = Annotated[
 Criterion = Annotated[
     str | None,
     typer.Option(
-        help="What decides how many of the ranked inputs are kept: cv (the smallest model within "
-        f"one standard error of the best), {', '.join(CRITERIA)}. Default: cv.",
+        help="What decides how many of the ranked inputs are kept: cv (the smallest model that "
+        f"falls negligibly short of the best; see --worth), {', '.join(CRITERIA)}. Default: cv.",
         show_default=False,
+    ),
+]
+WorthOption = Annotated[
+    str,
+    typer.Option(
+        "--worth",
+        help="The smallest gain in RMSE that is worth a signal, such as 0.005deg or 2%. Of the "
+        "models that fall less short of the best, or by no more than one standard error of the "
+        "difference, that with the fewest signals wins.",
     ),
 ]
 AllSubsets = Annotated[
@@ -112,6 +127,7 @@ def select(
     folds: FoldCount = None,
     rank: Rank = None,
     criterion: Criterion = None,
+    worth: WorthOption = WORTH,
     all_subsets: AllSubsets = False,
     naive: Naive = False,
     repeat: Repeat = None,
@@ -135,6 +151,7 @@ def select(
         folds=folds,
         rank=rank,
         criterion=criterion,
+        worth=parse_worth(worth),
         all_subsets=all_subsets,
         naive=naive,
         repeat=repeat,

@@ -26,10 +26,10 @@ from fleet_slip.regression.exact import Fit, Scales
 from fleet_slip.regression.folds import Folds
 from fleet_slip.regression.nested import nested_fits
 from fleet_slip.regression.ranking import rank
-from fleet_slip.regression.winner import choose
+from fleet_slip.regression.winner import DEFAULT_WORTH, Worth, choose
 
 CROSS_VALIDATION = "cross-validation"
-"""The criterion that cross-validates every nested model and applies the one-standard-error rule."""
+"""The criterion that cross-validates all nested models; the smallest that is nearly best wins."""
 
 
 FEWEST_FOLDS = 3
@@ -38,10 +38,14 @@ FEWEST_FOLDS = 3
 
 @dataclass(frozen=True)
 class Rule:
-    """How to choose: a name in `RANKINGS`, and one in `CRITERIA` or `CROSS_VALIDATION`."""
+    """How to choose: a name in `RANKINGS`, and one in `CRITERIA` or `CROSS_VALIDATION`.
+
+    `worth` is what a signal must gain for cross-validation to keep it.
+    """
 
     ranking: str
     criterion: str
+    worth: Worth = DEFAULT_WORTH
 
 
 @dataclass(frozen=True)
@@ -113,7 +117,7 @@ def select_nested(
         evidence = Evidence.clustered(fits, training.drives)
     if rule.criterion == CROSS_VALIDATION:
         models = cross_validate_nested(training.folds, order, label, training.scales)
-        size = len(choose(models).model.signals)
+        size = len(choose(models, rule.worth).model.signals)
         values = tuple(-model.correlation for model in models)
     else:
         size = best_size(rule.criterion, evidence)

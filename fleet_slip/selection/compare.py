@@ -14,7 +14,7 @@ from fleet_slip.grams.fold_sums import SummedCohort
 from fleet_slip.grams.folding import ROW_FOLDS, Folding
 from fleet_slip.regression.crossval import CrossValidation, cross_validate_inputs
 from fleet_slip.regression.folds import CohortFolds
-from fleet_slip.regression.winner import Winner, choose
+from fleet_slip.regression.winner import DEFAULT_WORTH, Winner, Worth, choose
 from fleet_slip.selection.model_list import CandidateModel
 from fleet_slip.selection.search import SearchChoice
 from fleet_slip.selection.uncertainty import Uncertainty
@@ -64,6 +64,8 @@ class Selection(Generic[AnyCohort]):
             },
             "skipped": self.skipped,
         }
+        for model, shortfall in zip(document["models"], self.winner.shortfalls, strict=False):
+            model["shortfall"] = shortfall.as_dict()
         if self.choice is not None:
             document["choice"] = self.choice.as_dict()
         if self.uncertainty is not None:
@@ -72,7 +74,10 @@ class Selection(Generic[AnyCohort]):
 
 
 def select(
-    cohort: AnyCohort, candidates: Sequence[CandidateModel], folds: Folding
+    cohort: AnyCohort,
+    candidates: Sequence[CandidateModel],
+    folds: Folding,
+    worth: Worth = DEFAULT_WORTH,
 ) -> Selection[AnyCohort]:
     """Cross-validate each candidate and choose the winner.
 
@@ -90,7 +95,7 @@ def select(
     if not models:
         reasons = "; ".join(f"model {name}: {reason}" for name, reason in skipped.items())
         raise DataError(f"no candidate can be fitted on the cohort. {reasons}")
-    return Selection(cohort, folds, tuple(models), choose(models), skipped)
+    return Selection(cohort, folds, tuple(models), choose(models, worth), skipped)
 
 
 def validate(candidate: CandidateModel, folds: CohortFolds) -> CrossValidation:

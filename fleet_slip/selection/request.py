@@ -1,5 +1,7 @@
 """What to select, as it is asked for on the command line, and its execution."""
 
+import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -12,6 +14,7 @@ from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.grams.fold_sums import SummedCohort, sum_cohort
 from fleet_slip.grams.folding import ROW_FOLDS, Folding, FoldKey
 from fleet_slip.regression.nested_choice import Rule
+from fleet_slip.regression.winner import DEFAULT_WORTH, Worth
 from fleet_slip.selection.compare import Selection, select
 from fleet_slip.selection.model_list import (
     CandidateModel,
@@ -29,6 +32,24 @@ WHOLE_SET = "catalogue"
 """As an order of signals: all inputs of the feature set, in its order."""
 
 
+WORTH = "0.005deg"
+"""`DEFAULT_WORTH` as it is asked for."""
+
+_WORTH = re.compile(r"(\d+(?:\.\d*)?|\.\d+) ?(deg|%)")
+
+
+def parse_worth(text: str) -> Worth:
+    """Return a gain in RMSE from text such as `0.005deg` or `2%`. Raises `ConfigError`."""
+    found = _WORTH.fullmatch(text.strip())
+    if found is None:
+        raise ConfigError(
+            f"--worth {text}: write an angle such as {WORTH}, or a share of the best RMSE such as "
+            "2%."
+        )
+    amount = float(found[1])
+    return Worth(amount / 100, relative=True) if found[2] == "%" else Worth(math.radians(amount))
+
+
 @dataclass(frozen=True)
 class SelectionRequest:
     """What to select.
@@ -41,6 +62,7 @@ class SelectionRequest:
         by, folds: how to fold; by default what the list says.
         rank, criterion: rank the inputs of `nested` first; choose by a criterion.
         all_subsets: choose among the best subsets of `nested` instead of an order's.
+        worth: what a signal must gain for cross-validation to keep it.
         naive: take rows for independent instead of drives.
         bootstrap, repeat: how often to resample the winner's figures.
     """
@@ -53,6 +75,7 @@ class SelectionRequest:
     folds: int | None = None
     rank: str | None = None
     criterion: str | None = None
+    worth: Worth = DEFAULT_WORTH
     all_subsets: bool = False
     naive: bool = False
     bootstrap: int | None = None
@@ -142,15 +165,18 @@ def _compare_listed(
     )
     name = request.models or (DEFAULT_MODELS if listed else None)
     label = "+".join(filter(None, [name, f"nested:{request.nested}" if nested else None]))
-    return RequestedSelection(select(cohort, described.model, folds), label, described.sha256)
+    return RequestedSelection(
+        select(cohort, described.model, folds, request.worth), label, described.sha256
+    )
 
 
 def _search(cohort: Cohort, request: SelectionRequest, folds: Folding) -> RequestedSelection:
     nested = request.nested or WHOLE_SET
     inputs = inputs_of(cohort, nested)
-    rule = Rule(request.rank or "declared", require_criterion(request.criterion or "cv"))
+    criterion = require_criterion(request.criterion or "cv")
+    rule = Rule(request.rank or "declared", criterion, request.worth)
     if request.all_subsets:
-        found = select_subsets(cohort, inputs, folds, rule.criterion, naive=request.naive)
+        found = select_subsets(cohort, inputs, folds, rule, naive=request.naive)
     else:
         found = select_ranked(cohort, inputs, folds, rule, naive=request.naive)
     rule = found.choice.rule

@@ -1,7 +1,7 @@
 """Which signals of a set: the nested models of a ranking, or the best subset of every size."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -114,7 +114,7 @@ def select_ranked(
     if len(training.folds.grams) >= FEWEST_FOLDS:
         honest = cross_validate_selection("the choice itself", training, fold, inputs, label, rule)
     if rule.criterion == CROSS_VALIDATION:
-        winner = choose(models)
+        winner = choose(models, rule.worth)
     else:
         winner = _winner(models, chosen.size, rule, chosen.evidence)
     choice = SearchChoice(rule, chosen.evidence, nested=chosen, honest=honest)
@@ -122,7 +122,7 @@ def select_ranked(
 
 
 def select_subsets(
-    cohort: Cohort, inputs: Sequence[str], folding: Folding, criterion: str, *, naive: bool = False
+    cohort: Cohort, inputs: Sequence[str], folding: Folding, rule: Rule, *, naive: bool = False
 ) -> SearchResult:
     """Find the best subset of every size and choose one of them.
 
@@ -146,11 +146,11 @@ def select_subsets(
         )
         for result in results[1:]
     ]
-    rule = Rule(ALL_SUBSETS, criterion)
-    if criterion == CROSS_VALIDATION:
-        winner = choose(models)
+    rule = replace(rule, ranking=ALL_SUBSETS)
+    if rule.criterion == CROSS_VALIDATION:
+        winner = choose(models, rule.worth)
     else:
-        winner = _winner(models, picks[criterion], rule, evidence)
+        winner = _winner(models, picks[rule.criterion], rule, evidence)
     choice = SearchChoice(rule, evidence, subsets=tuple(results), picks=picks)
     return SearchResult(tuple(models), winner, choice)
 

@@ -1,5 +1,6 @@
 """Folds, cross-validation from Grams against the rows, and the choice of a winner."""
 
+import math
 from dataclasses import replace
 from fractions import Fraction
 
@@ -7,12 +8,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import stats
 
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression.crossval import CrossValidation, cross_validate_inputs
 from fleet_slip.regression.folds import CohortFolds, by_hash, by_value, hash_fold
 from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.winner import choose
+from fleet_slip.regression.winner import Worth, choose
 from tests.support.counts import dense_fit, gram_of, names, random_drives, table_of
 
 SCALES = {**{name: Fraction(1, 100) for name in names(6)}, "y": Fraction(1, 10_000)}
@@ -123,8 +125,8 @@ def test_single_folds_are_errors() -> None:
         by_value(["a", None])
 
 
-def candidate(name: str, size: int, correlation: float, error: float) -> CrossValidation:
-    """Return a real result with two folds' correlations placed to give a standard error."""
+def candidate(name: str, size: int, correlation: float, *rmses: float) -> CrossValidation:
+    """Return a real result with its correlation and two folds' RMSEs placed."""
     cohort = cohort_of(random_drives(1, inputs=6), [0, 1] * 6)
     inputs = names(6)[:size]
     result = cross_validate_inputs(name, cohort, inputs, "y", SCALES)
@@ -132,34 +134,65 @@ def candidate(name: str, size: int, correlation: float, error: float) -> CrossVa
     sums = replace(
         result.sums, n=1, p=Fraction(0), y=Fraction(0), pp=Fraction(1), yy=Fraction(1), py=r
     )
-    folds = tuple(
-        replace(fold, correlation=correlation + sign * error)
-        for fold, sign in zip(result.folds, (1, -1), strict=True)
-    )
-    return replace(
-        result, sums=sums, folds=folds, pooled=replace(result.pooled, correlation=correlation)
-    )
+    folds = tuple(replace(f, rmse=rmse) for f, rmse in zip(result.folds, rmses, strict=True))
+    pooled = replace(result.pooled, correlation=correlation, rmse=math.fsum(rmses) / len(rmses))
+    return replace(result, sums=sums, folds=folds, pooled=pooled)
 
 
-def test_the_smallest_model_within_one_standard_error_wins() -> None:
-    models = [
-        candidate("poor", 1, 0.90, 0.01),
-        candidate("small", 3, 0.985, 0.01),
-        candidate("twin", 3, 0.986, 0.01),
-        candidate("best", 5, 0.990, 0.01),
-    ]
-    winner = choose(models)
-    assert winner.model.name == "twin"
-    assert winner.best.name == "best"
-    assert "fewest signals (3) of the 3 models within one standard error (0.01)" in winner.reason
+def test_a_gain_that_is_real_and_worth_nothing_buys_no_signal() -> None:
+    """Folds differ by much more than models do: unpaired, no gain would be real."""
+    small = candidate("small", 3, 0.985, 1.10, 2.11)
+    best = candidate("best", 5, 0.990, 1.05, 2.05)
+    assert choose([small, best], Worth(0.06)).model is small
+    chosen = choose([small, best], Worth(0.05))
+    assert (chosen.model, chosen.best) == (best, best)
+    shortfall = chosen.shortfalls[0]
+    assert shortfall.rmse == pytest.approx(0.055)
+    assert shortfall.real
+    assert not shortfall.negligible
+    assert choose([small, best], Worth(0.04, relative=True)).model is small
+    assert choose([small, best], Worth(0.03, relative=True)).model is best
+    reason = choose([small, best], Worth(0.06)).reason
+    assert "fewest signals (3) of the 2 models whose error is negligibly larger" in reason
+    assert "is real, but less than" in reason
+
+
+def test_a_gain_that_is_not_real_buys_no_signal_however_large() -> None:
+    small = candidate("small", 3, 0.985, 1.00, 2.50)
+    best = candidate("best", 5, 0.990, 1.05, 2.05)
+    chosen = choose([small, best], Worth(0.001))
+    assert chosen.model is small
+    assert "is not real" in chosen.reason
+
+
+def test_the_standard_error_of_a_shortfall_is_that_of_a_paired_t_test() -> None:
+    cohort = cohort_of(random_drives(1, inputs=6), [0, 1, 2] * 4)
+    one, other = (cross_validate_inputs(str(k), cohort, names(6)[:k], "y", SCALES) for k in (3, 5))
+    chosen = choose([one, other])
+    rest = next(s for s in chosen.shortfalls if s.model is not chosen.best)
+    a, b = ([fold.rmse for fold in m.folds] for m in (rest.model, chosen.best))
+    expected = np.mean(np.subtract(a, b)) / stats.ttest_rel(a, b).statistic
+    assert rest.standard_error == pytest.approx(expected, rel=1e-9)
+
+
+def test_models_of_other_rows_are_compared_without_pairs() -> None:
+    best = candidate("best", 5, 0.990, 1.05, 2.05)
+    other = candidate("other", 3, 0.985, 1.10, 2.10)
+    fewer = tuple(replace(fold, rows=fold.rows - 1) for fold in other.folds)
+    chosen = choose([replace(other, folds=fewer), best], Worth(0.001))
+    assert chosen.shortfalls[0].standard_error == pytest.approx(math.hypot(0.5, 0.5))
+    assert chosen.model.name == "other"
 
 
 def test_a_clear_best_wins_and_ties_go_to_the_declared_order() -> None:
-    clear = [candidate("first", 1, 0.90, 0.01), candidate("best", 5, 0.990, 0.01)]
+    clear = [candidate("first", 1, 0.90, 2.0, 3.0), candidate("best", 5, 0.990, 1.0, 2.0)]
     assert choose(clear).model.name == "best"
-    assert "no other model is within" in choose(clear).reason
-    tied = [candidate("b", 2, 0.9, 0.01), candidate("a", 2, 0.9, 0.01)]
+    assert "error of every other model is larger by 0.005 deg or more" in choose(clear).reason
+    tied = [candidate("b", 2, 0.9, 1.0, 1.0), candidate("a", 2, 0.9, 1.0, 1.0)]
     assert choose(tied).model.name == "b"
+    twins = [candidate("twin", 2, 0.91, 1.0, 1.0), candidate("a", 2, 0.9, 1.0, 1.0)]
+    assert choose(twins[::-1]).model.name == "twin"
+    assert choose(clear[:1]).reason == "Model first is the only one."
     with pytest.raises(QuestionError, match="empty"):
         choose([])
 

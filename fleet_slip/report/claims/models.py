@@ -1,5 +1,6 @@
 """Claims of section III: how accurate the five models are."""
 
+from fleet_slip.regression.winner import Winner
 from fleet_slip.report.blocks import BLOCK_S, blocks_won
 from fleet_slip.report.claims.claim import (
     NotEvaluatedError,
@@ -40,12 +41,20 @@ def last_two_best(data: ReportData) -> Verdict:
     """Rank the models by their cross-validated correlation."""
     selection = data.trained.selection
     ranked = sorted(selection.models, key=lambda model: model.correlation, reverse=True)
-    winner = selection.winner.model
     return verdict(
         {model.name for model in ranked[:2]} == LAST_TWO,
         ", ".join(f"model {model.name} {number(model.correlation, 4)}" for model in ranked),
-        f"The smallest model within one standard error of the best is model {winner.name}, with "
-        f"{len(winner.signals)} signals: more signals gain less than chance could give.",
+        f"{_smallest(selection.winner)}.",
+    )
+
+
+def _smallest(winner: Winner) -> str:
+    if winner.model is winner.best:
+        return f"No model with fewer signals comes near model {winner.best.name}"
+    gain = next(s for s in winner.shortfalls if s.model is winner.model)
+    return (
+        f"Model {winner.model.name}, with {len(winner.model.signals)} signals, has an RMSE that is "
+        f"larger by {gain}: {'real' if gain.real else 'not real'}, and negligible"
     )
 
 
