@@ -72,8 +72,15 @@ class NormalKernel(Kernel):
         return normal_cdf(x - points)
 
 
+@dataclass(frozen=True)
 class ChiSquareKernel(Kernel):
-    """X ~ noncentral chi-square with one degree of freedom and noncentrality `point`."""
+    """X ~ noncentral chi-square with one degree of freedom and noncentrality `point`.
+
+    `reach` is how far the intervals above the data go, on the scale of roots: as far as those below
+    them, or less as in WEKA, where a slip makes it 0.5.
+    """
+
+    reach: float = 3.0
 
     def position(self, x: FloatArray) -> FloatArray:
         """Return the root, which has unit noise."""
@@ -90,7 +97,7 @@ class ChiSquareKernel(Kernel):
         low = np.where(root - 3 < _NEAR_ZERO, 0.0, (root - 3) ** 2)
         below = np.column_stack([low, np.maximum(data, _NEAR_ZERO)])
         start = np.where(data < _NEAR_ZERO, 0.0, data)
-        above = np.column_stack([start, (root + 0.5) ** 2])
+        above = np.column_stack([start, (root + self.reach) ** 2])
         return np.concatenate([below, above])
 
     def cdf(self, x: FloatArray, points: FloatArray) -> FloatArray:

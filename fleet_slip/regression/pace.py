@@ -1,9 +1,10 @@
 """Pace regression: adaptive shrinkage of orthogonal responses (Wang 2000, Wang and Witten 2002).
 
 The effects A_j of an order are samples from a mixture; the mixing distribution G, estimated from
-all of them, says how much each one is worth. Names follow Wang: pace2 truncates the nested
-sequence, pace4 selects dimensions, pace6 shrinks; all three with chi-square mixtures. nested,
-subset and eb do the same with normal mixtures of signed effects.
+all of them, says how much each one is worth. Names follow Wang: pace1 truncates the nested
+sequence, pace3 selects dimensions, pace5 shrinks, by a chi-square mixture that is known; pace2,
+pace4 and pace6 do the same by the one that is estimated from the very effects. nested, subset and
+eb are the latter with normal mixtures of signed effects.
 """
 
 from collections.abc import Callable, Sequence
@@ -51,19 +52,28 @@ def james_stein(a: FloatArray) -> FloatArray:
     return np.asarray(a * (1 - excess / total)) if total > excess else np.zeros_like(a)
 
 
-def pace2(a: FloatArray) -> FloatArray:
+def pace1(a: FloatArray, mixture: Mixture) -> FloatArray:
     """Keep the leading dimensions with the largest sum of expected contributions H(A)."""
-    return _leading(a, _chi_square_contributions(a))
+    return _leading(a, _contributions(a, mixture))
+
+
+def pace2(a: FloatArray) -> FloatArray:
+    """Do the same by the estimated mixture."""
+    return pace1(a, estimate_mixture(a))
+
+
+def pace3(a: FloatArray, mixture: Mixture) -> FloatArray:
+    """Keep the dimensions whose expected contribution H(A) is positive."""
+    return np.where(_contributions(a, mixture) > 0, a, 0.0)
 
 
 def pace4(a: FloatArray) -> FloatArray:
-    """Keep the dimensions whose expected contribution H(A) is positive."""
-    return np.where(_chi_square_contributions(a) > 0, a, 0.0)
+    """Do the same by the estimated mixture."""
+    return pace3(a, estimate_mixture(a))
 
 
-def pace6(a: FloatArray) -> FloatArray:
-    """Shrink to the squared posterior mean of |a*|."""
-    mixture = _chi_square(a)
+def pace5(a: FloatArray, mixture: Mixture) -> FloatArray:
+    """Shrink to the squared posterior mean of |a*|; the mixture's points are squared effects."""
     size = np.abs(a)
     roots = np.sqrt(mixture.points)
     square = np.array([float(posterior_root(mixture, x) @ roots) ** 2 for x in size])
@@ -71,12 +81,17 @@ def pace6(a: FloatArray) -> FloatArray:
     return np.where(square <= _NEGLIGIBLE_SQUARE, 0.0, np.sign(a) * np.sqrt(square))
 
 
+def pace6(a: FloatArray) -> FloatArray:
+    """Do the same by the estimated mixture."""
+    return pace5(a, estimate_mixture(a))
+
+
 def posterior_mean(a: FloatArray) -> FloatArray:
     """Shrink to the posterior mean of the signed a*: the least expected squared loss.
 
     sign(a) int m [phi(a-m) - phi(a+m)] dG / int [phi(a-m) + phi(a+m)] dG.
     """
-    mixture = _chi_square(a)
+    mixture = estimate_mixture(a)
     m = np.sqrt(mixture.points)
     result: list[float] = []
     for x in np.abs(a):
@@ -112,7 +127,8 @@ def _leading(a: FloatArray, contributions: FloatArray) -> FloatArray:
     return np.where(np.arange(len(a)) < kept, a, 0.0)
 
 
-def _chi_square(a: FloatArray) -> Mixture:
+def estimate_mixture(a: FloatArray) -> Mixture:
+    """Return the mixture of squared effects that the squares of these have come from."""
     return fit_mixture(a**2, ChiSquareKernel())
 
 
@@ -130,17 +146,18 @@ def normal_contributions(a: FloatArray) -> FloatArray:
     )
 
 
-def _chi_square_contributions(a: FloatArray) -> FloatArray:
+def _contributions(a: FloatArray, mixture: Mixture) -> FloatArray:
     """Return H(A) = E[2 a a* - a^2 | A], the sign of a* unknown."""
-    return np.asarray(2 * np.abs(a) * half_contributions(a, np.sqrt))
+    return np.asarray(2 * np.abs(a) * half_contributions(a, mixture, np.sqrt))
 
 
-def half_contributions(a: FloatArray, effect: Callable[[FloatArray], FloatArray]) -> FloatArray:
+def half_contributions(
+    a: FloatArray, mixture: Mixture, effect: Callable[[FloatArray], FloatArray]
+) -> FloatArray:
     """Return int h dG / int [phi(a-m) + phi(a+m)] dG = H / (2a).
 
     h = (e - a/2) phi(a - m) - (e + a/2) phi(a + m), with the effect e = m by the theory.
     """
-    mixture = _chi_square(a)
     m, e, w = np.sqrt(mixture.points), effect(mixture.points), mixture.weights
     result = []
     for x in np.abs(a):

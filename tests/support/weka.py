@@ -16,13 +16,14 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.regression.exact import LinearModel
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.mixture import ChiSquareKernel, Mixture, fit_mixture
 from fleet_slip.regression.orthogonal import OrthogonalResponses
 from fleet_slip.regression.pace import (
     Estimator,
     empirical_bayes,
     half_contributions,
     normal_contributions,
-    pace6,
+    pace5,
 )
 from fleet_slip.regression.ranking import backward
 from fleet_slip.regression.ridge import fit_penalised, standardised_penalty, standardised_size
@@ -126,13 +127,18 @@ def _leading(a: FloatArray, contributions: FloatArray) -> FloatArray:
     return np.where(np.arange(len(a)) <= kept, a, 0.0)
 
 
+def _mixture(a: FloatArray) -> Mixture:
+    """Fit it as WEKA does, whose intervals above the data reach less far than those below."""
+    return fit_mixture(a**2, ChiSquareKernel(reach=0.5))
+
+
 def _pace2(a: FloatArray) -> FloatArray:
-    kept = _leading(a, half_contributions(a, lambda points: points))
+    kept = _leading(a, half_contributions(a, _mixture(a), lambda points: points))
     return np.where(kept**2 <= NEGLIGIBLE_SQUARE, 0.0, kept)
 
 
 def _pace4(a: FloatArray) -> FloatArray:
-    positive = half_contributions(a, lambda points: points) > 0
+    positive = half_contributions(a, _mixture(a), lambda points: points) > 0
     return np.where(positive & (a**2 > NEGLIGIBLE_SQUARE), a, 0.0)
 
 
@@ -145,7 +151,7 @@ WEKA_ESTIMATORS: dict[str, Estimator] = {
     "ols": lambda a: a,
     "pace2": _pace2,
     "pace4": _pace4,
-    "pace6": pace6,
+    "pace6": lambda a: pace5(a, _mixture(a)),
     "eb": empirical_bayes,
     "nested": _nested,
     "subset": _nested,
