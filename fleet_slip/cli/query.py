@@ -17,7 +17,12 @@ from pyarrow.csv import write_csv
 from fleet_slip.cli.output import Json, print_json, say
 from fleet_slip.errors import FleetSlipError, QuestionError
 from fleet_slip.views import connect
-from fleet_slip.warehouse.database import database_errors, interruptible, limit_memory
+from fleet_slip.warehouse.database import (
+    check_opened_files,
+    interruptible,
+    limit_memory,
+    reading_files,
+)
 from fleet_slip.warehouse.read_only_sql import one_query
 
 ROWS_SHOWN = 40
@@ -83,17 +88,19 @@ def _answer(
     csv: bool = False,
     exact: bool = False,
 ) -> None:
-    with database_errors("the query"), _representation_errors():
+    with _representation_errors(), reading_files(database, "the query"):
         relation = database.sql(text)
         if relation is None:  # an unsafe statement without a result
             return
-        if json:
-            print_json(relation.to_arrow_table().to_pylist())
-        elif csv:
-            answer = relation.to_arrow_table()
-            write_csv(answer if exact else _mark_formulas(answer), sys.stdout.buffer)
-        else:
+        if not (json or csv):
             relation.show(max_rows=ROWS_SHOWN, max_width=_width())
+            return
+        rows = relation.to_arrow_table()
+        check_opened_files(database)  # before anything is printed
+        if json:
+            print_json(rows.to_pylist())
+        else:
+            write_csv(rows if exact else _mark_formulas(rows), sys.stdout.buffer)
 
 
 def _mark_formulas(answer: pa.Table) -> pa.Table:

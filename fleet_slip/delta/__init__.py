@@ -3,17 +3,18 @@
 A file is written as a whole, durably; only then is it committed to the table's Delta log. So a
 reader sees whole files of whole commits, or nothing.
 
-A file's name ends in the checksum of its bytes. The name is the one thing about a file that the
-Delta log, its checkpoints, Gram rows and a listing of the folder all keep, so that damage can be
-told years later; the same rows are always the same file; and a file that is made again from its
-source takes its place without a commit.
+A file's name ends in the checksums of its bytes (`fleet_slip.files.checksums`). The name is the one
+thing about a file that the Delta log, its checkpoints, Gram rows and a listing of the folder all
+keep, so that damage can be told years later; the same rows are always the same file; and a file
+that is made again from its source takes its place without a commit.
 """
 
 from fleet_slip.delta.change import Change, Unit
 from fleet_slip.delta.conflicts import retry_conflicts
-from fleet_slip.delta.encoding import Encoded, Encoding, checksum_in, checksum_of
+from fleet_slip.delta.encoding import Encoded, Encoding
 from fleet_slip.delta.files import TableFile, absent_columns
 from fleet_slip.delta.table import Snapshot, Table
+from fleet_slip.files.checksums import checksum_in, checksum_of
 
 __all__ = [
     "Change",

@@ -11,7 +11,7 @@ import contextlib
 import hashlib
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from fleet_slip.errors import ConflictError, StorageError
@@ -73,6 +73,22 @@ def checkpoint_faults(table: Folder) -> Iterator[CheckpointFault]:
                 yield CheckpointFault(name, "its bytes do not match the checksum kept of it")
         except StorageError as error:
             yield CheckpointFault(name, f"cannot be read: {error}")
+
+
+def newest_checkpoint(files: Iterable[StoredFile], version: int) -> StoredFile | None:
+    """Return the newest checkpoint of a log that a version is told from; None without one."""
+    found = [f for f in files if _CHECKPOINT.fullmatch(f.name) and _version(f.name) <= version]
+    return max(found, key=lambda file: file.name, default=None)
+
+
+def require_sealed(table: Folder, name: str) -> None:
+    """Raise `StorageError` for a checkpoint that is not what its checksum tells, if one is kept."""
+    expected = sealed_checkpoints(table).get(name)
+    if expected is not None and _digest(table, name) != expected:
+        raise StorageError(
+            f"{table}/{LOG}/{name}: its bytes do not match the checksum kept of it: it was "
+            "damaged. See what can be repaired with: fleet-slip verify --repair"
+        )
 
 
 def unsealed_checkpoints(table: Folder) -> list[str]:

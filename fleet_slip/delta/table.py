@@ -15,11 +15,13 @@ from deltalake.transaction import AddAction
 from fleet_slip.delta.change import Change, addition
 from fleet_slip.delta.checkpoints import seal_new_checkpoint
 from fleet_slip.delta.conflicts import is_conflict
-from fleet_slip.delta.encoding import Encoded, Encoding, checksum_in
+from fleet_slip.delta.encoding import Encoded, Encoding
 from fleet_slip.delta.files import TableFile, active_files, have_same_columns, read_actions
+from fleet_slip.delta.log_check import require_sound_log
 from fleet_slip.delta.schema import require_readable, require_writable
 from fleet_slip.delta.sealing import NOTE, seal_note
 from fleet_slip.errors import ConflictError
+from fleet_slip.files.checksums import checksum_in
 from fleet_slip.files.folder import Folder
 from fleet_slip.files.storage_errors import first_line, storage_errors
 
@@ -34,12 +36,15 @@ class Table:
     partition_by: tuple[str, ...] = ()
     description: str = ""
 
-    def snapshot(self, version: int | None = None) -> "Snapshot":
+    def snapshot(self, version: int | None = None, *, unchecked: bool = False) -> "Snapshot":
         """Return the table as it is now; a table that nobody has written yet is empty.
 
-        An earlier version can be asked for; `StorageError` is raised if it is no longer known.
+        An earlier version can be asked for; `StorageError` is raised if it is no longer known, or
+        if the log was damaged, unless it is to be `unchecked`: who looks for damage opens it.
         """
         delta = self.open_delta(version)
+        if delta is not None and not unchecked:
+            require_sound_log(self.folder, delta.version())
         if delta is not None and version is None:
             require_readable(self.folder, self.schema, delta)
         return Snapshot(self, delta)
@@ -59,7 +64,11 @@ class Table:
         return f"{self.folder.uri}/{path}"
 
     def read(self, path: str, columns: Sequence[str] | None = None) -> pa.Table:
-        """Return the rows of one of the table's files, or some columns of them."""
+        """Return the rows of one of the table's files, or some columns of them.
+
+        Raises `StorageError` if the file is not what its name says.
+        """
+        self.folder.check(path)
         with storage_errors(f"{self.folder}/{path}"), self.folder.open(path) as file:
             wanted = None if columns is None else list(columns)
             return pq.read_table(file, columns=wanted, partitioning=None)
@@ -70,11 +79,11 @@ class Table:
             return pq.read_metadata(file)
 
     def write_file(self, name: str, rows: pa.Table, day: date | None = None) -> AddAction:
-        """Write rows to the file NAME-CHECKSUM.parquet, durably; see `put`."""
+        """Write rows to the file NAME-CHECKSUMS.parquet, durably; see `put`."""
         return self.put(name, self.encode(rows), day)
 
     def put(self, name: str, encoded: Encoded, day: date | None = None) -> AddAction:
-        """Write a file's content to the file NAME-CHECKSUM.parquet, durably.
+        """Write a file's content to the file NAME-CHECKSUMS.parquet, durably.
 
         Returns the action that adds it to the table; it is not part of the table before that is
         committed. Where an interrupted run left a file of that name, it is replaced, or the new one
@@ -217,4 +226,4 @@ class Snapshot:
 
 def _file_path(name: str, encoded: Encoded, day: date | None) -> str:
     folder = f"day={day.isoformat()}/" if day else ""
-    return f"{folder}{name}-{encoded.checksum}.parquet"
+    return f"{folder}{name}-x{encoded.fast_checksum}-{encoded.checksum}.parquet"

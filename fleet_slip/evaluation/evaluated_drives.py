@@ -16,7 +16,7 @@ from fleet_slip.resources import read_sql
 from fleet_slip.simulation.scenario import Failure, Scenario
 from fleet_slip.simulation.sensors import GPS_SIGNALS
 from fleet_slip.views import connect
-from fleet_slip.warehouse.database import database_errors
+from fleet_slip.warehouse.database import reading_files
 from fleet_slip.warehouse.tables import Warehouse
 
 SLOWEST_MPS = 2.0
@@ -81,7 +81,7 @@ def load_drives(warehouse: Warehouse, scenarios: Sequence[Scenario]) -> tuple[Ev
     drives = sorted({scenario.drive_id for scenario in scenarios})
     with (
         connect(warehouse.root, query=statement) as database,
-        database_errors("reading the drives of scenarios"),
+        reading_files(database, "reading the drives of scenarios"),
     ):
         rows = database.sql(statement, params={"drives": drives}).to_arrow_table()
     return tuple(_drive(scenario, rows) for scenario in scenarios)

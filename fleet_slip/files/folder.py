@@ -79,6 +79,10 @@ class Folder(Protocol):
         """A folder of this machine for what a query cannot hold in memory."""
 
     @property
+    def is_local(self) -> bool:
+        """Whether its files are in a file system of this machine: read twice, they are the same."""
+
+    @property
     def reuses_names(self) -> bool:
         """Whether a data file's name may be written again after it was deleted, or meanwhile.
 
@@ -102,6 +106,12 @@ class Folder(Protocol):
 
     def read_many(self, paths: Sequence[str]) -> list[bytes | None]:
         """Return the content of files, None for one that is gone."""
+
+    def check(self, path: str) -> None:
+        """Raise `StorageError` if a data file is not what its name says and `open` would not tell.
+
+        Answers of an object store may differ, so that there the one that is used is looked at.
+        """
 
     def open(self, path: str) -> "pa.NativeFile":
         """Open a file for reading anywhere in it."""

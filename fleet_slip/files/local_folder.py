@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Self
 import pyarrow as pa
 
 from fleet_slip.errors import StorageError
+from fleet_slip.files.checksums import check_local_files
 from fleet_slip.files.folder import TEMPORARY_PREFIX, Content, StoredFile
 from fleet_slip.files.storage_errors import storage_errors
 
@@ -59,6 +60,11 @@ class LocalFolder:
         return self.path
 
     @property
+    def is_local(self) -> bool:
+        """Return True."""
+        return True
+
+    @property
     def reuses_names(self) -> bool:
         """Return True: `remove` deletes the very file that was found."""
         return True
@@ -95,6 +101,10 @@ class LocalFolder:
     def read_many(self, paths: Sequence[str]) -> list[bytes | None]:
         """Return the content of files, None for one that is gone."""
         return [self.read(path) if (self.path / path).is_file() else None for path in paths]
+
+    def check(self, path: str) -> None:
+        """Raise `StorageError` if a data file is not what its name says."""
+        check_local_files([str(self.path / path)])
 
     def open(self, path: str) -> pa.NativeFile:
         """Open a file for reading anywhere in it."""

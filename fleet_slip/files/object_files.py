@@ -1,16 +1,19 @@
 """Objects as files that can be read anywhere in them: for DuckDB and for pyarrow.
 
 Objects of a data root that are read in this way never change, so that a size is asked for once.
-DuckDB's Parquet reader merges what it needs into reads of about a megabyte.
+One whose name tells its checksum is fetched as a whole and compared, and what is read is read from
+those very bytes: another answer of the store might be another.
 """
 
 import io
+import threading
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 import fsspec
 import obstore
 
+from fleet_slip.files.checksums import checksum_in, require_content
 from fleet_slip.files.object_errors import object_errors
 
 if TYPE_CHECKING:
@@ -64,6 +67,38 @@ class ObjectReader(io.RawIOBase):
         return bytes(part)
 
 
+def open_object(
+    store: "ObjectStore", key: str, where: str, size: int | None = None
+) -> io.RawIOBase | io.BytesIO:
+    """Open an object. Raises `StorageError` if it is not what its name says."""
+    if checksum_in(key) is None:
+        return ObjectReader(store, key, where, size)
+    return io.BytesIO(_fetch(store, key, where))
+
+
+def _fetch(store: "ObjectStore", key: str, where: str) -> bytes:
+    """Return a whole object, compared with its name. DuckDB opens a file twice: some are kept."""
+    with _fetching:
+        if where in _fetched:
+            return _fetched[where]
+    with object_errors(where):
+        content = bytes(obstore.get(store, key).bytes())
+    require_content(key, content, where)
+    with _fetching:
+        _fetched[where] = content
+        while len(_fetched) > 1 and sum(map(len, _fetched.values())) > KEPT_BYTES:
+            del _fetched[next(iter(_fetched))]
+    return content
+
+
+KEPT_BYTES = 2**27
+"""Of the objects that were fetched last, so many bytes are kept."""
+
+_fetched: dict[str, bytes] = {}
+"""By URL: what a name with a checksum holds is the same wherever it is."""
+_fetching = threading.Lock()
+
+
 class ObjectFilesystem(fsspec.AbstractFileSystem):  # type: ignore[misc]
     """The objects of one bucket, for `duckdb.DuckDBPyConnection.register_filesystem`; read only."""
 
@@ -102,13 +137,13 @@ class ObjectFilesystem(fsspec.AbstractFileSystem):  # type: ignore[misc]
         """Return True; that it is not there shows when it is read."""
         return bool(path)
 
-    def open(self, path: str, mode: str = "rb", **_options: Any) -> ObjectReader:
+    def open(self, path: str, mode: str = "rb", **_options: Any) -> io.RawIOBase | io.BytesIO:
         """Open an object for reading. Raises `PermissionError` for any other mode."""
         if mode != "rb":
             raise PermissionError(f"{path}: a warehouse is only read through SQL")
         key = self._key(path)
         where = f"{self.protocol}://{self._name}/{key}"
-        return ObjectReader(self._store, key, where, self.info(path)["size"])
+        return open_object(self._store, key, where, self.info(path)["size"])
 
 
 class LentFile(fsspec.AbstractFileSystem):  # type: ignore[misc]

@@ -28,7 +28,7 @@ from fleet_slip.errors import StorageError
 from fleet_slip.files.folder import Content, StoredFile
 from fleet_slip.files.object_credentials import AwsProfile, aws_profile
 from fleet_slip.files.object_errors import object_errors
-from fleet_slip.files.object_files import LentFile, ObjectFilesystem, ObjectReader
+from fleet_slip.files.object_files import LentFile, ObjectFilesystem, open_object
 
 if TYPE_CHECKING:
     from obstore.store import ObjectStore
@@ -74,6 +74,11 @@ class ObjectFolder:
     def uri(self) -> str:
         """The folder as DuckDB and the Delta library know it."""
         return str(self)
+
+    @property
+    def is_local(self) -> bool:
+        """Return False."""
+        return False
 
     @property
     def reuses_names(self) -> bool:
@@ -137,9 +142,16 @@ class ObjectFolder:
         with ThreadPoolExecutor(READS_AT_ONCE) as executor:
             return list(executor.map(self._read_or_none, paths))
 
+    def check(self, path: str) -> None:
+        """Do nothing: what is opened is looked at."""
+
     def open(self, path: str) -> pa.NativeFile:
-        """Open a file for reading anywhere in it."""
-        return pa.PythonFile(ObjectReader(self._store, self._key(path), f"{self}/{path}"), "r")
+        """Open a file for reading anywhere in it.
+
+        Raises `StorageError` if the answer is not what the name of a data file says.
+        """
+        file = open_object(self._store, self._key(path), f"{self}/{path}")
+        return pa.PythonFile(file, "r")
 
     def put(self, path: str, content: Content) -> None:
         """Write a file as a whole, durably. A file of that name is replaced."""

@@ -16,7 +16,7 @@ from fleet_slip.delta import (
 )
 from fleet_slip.grams.statement import gram_statement
 from fleet_slip.progress import Progress, no_progress
-from fleet_slip.warehouse.database import database_errors, open_database
+from fleet_slip.warehouse.database import open_database, reading_files
 from fleet_slip.warehouse.tables import Warehouse
 
 FILES_PER_QUERY = 16
@@ -84,7 +84,8 @@ def _query(
     absent = absent_columns(files, warehouse.catalogue.signals)
     statement = gram_statement(warehouse.catalogue, feature_set, whole=whole, absent=absent)
     identity = features().identity(feature_set)
-    with database_errors(f"the Gram query over {len(files)} log files in {warehouse.logs.folder}"):
+    doing = f"the Gram query over {len(files)} log files in {warehouse.logs.folder}"
+    with reading_files(database, doing):
         database.execute("SET VARIABLE log_files = $files", {"files": list(paths)})
         rows = database.sql(statement, params={"feature_set": identity}).to_arrow_table()
     relative = pa.array([paths[path] for path in rows["file"].to_pylist()], pa.string())

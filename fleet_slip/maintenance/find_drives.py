@@ -10,7 +10,7 @@ from fleet_slip.delta import Snapshot
 from fleet_slip.maintenance.audit import Forgettable
 from fleet_slip.maintenance.old_files import rows_of
 from fleet_slip.resources import read_sql
-from fleet_slip.warehouse.database import database_errors, open_database
+from fleet_slip.warehouse.database import open_database, reading_files
 
 FILES_PER_QUERY = 256
 """DuckDB keeps what it read of each file of a query: some 70 KB."""
@@ -61,7 +61,7 @@ def drives_by_file(
     statement = read_sql("jobs", "find_drives.sql").format(condition=subject.condition)
     with (
         open_database(reading=logs.table.folder) as database,
-        database_errors(f"looking for drives in {logs.table.folder}"),
+        reading_files(database, f"looking for drives in {logs.table.folder}"),
     ):
         for first in range(0, len(unknown), FILES_PER_QUERY):
             paths = {

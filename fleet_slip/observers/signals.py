@@ -8,7 +8,7 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.warehouse.database import database_errors
+from fleet_slip.warehouse.database import reading_files
 
 STEP_S = float(SAMPLE_TIME_S)
 """Time Δt between two rows."""
@@ -54,7 +54,7 @@ def read_drive(database: duckdb.DuckDBPyConnection, drive_id: str) -> LabelledDr
     """
     label = catalogue()[catalogue().label].column
     columns = [*(field.name for field in fields(DriveSignals)), label]
-    with database_errors(f"reading the drive {drive_id!r}"):
+    with reading_files(database, f"reading the drive {drive_id!r}"):
         found = database.execute(
             f"SELECT {', '.join(columns)} FROM log WHERE drive_id = $drive_id ORDER BY time_s",
             {"drive_id": drive_id},

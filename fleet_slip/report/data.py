@@ -27,6 +27,7 @@ from fleet_slip.resources import folder
 from fleet_slip.selection.model_list import load_model_list
 from fleet_slip.simulation.scenario import Scenario, load_scenario, shipped_scenarios
 from fleet_slip.views import connect
+from fleet_slip.warehouse.database import reading_files
 from fleet_slip.warehouse.tables import Warehouse
 
 DRAWN_FILTERS = ("kalman", "kalman_tuned")
@@ -195,7 +196,7 @@ def _coefficients(trained: TrainedModels) -> tuple[Coefficients, ...]:
 
 
 def _tables(warehouse: Warehouse) -> tuple[TableSize, ...]:
-    with connect(warehouse.root) as database:
+    with connect(warehouse.root) as database, reading_files(database, "counting drives"):
         counted = database.execute(
             "SELECT source = $scenario, count(*) FROM drives GROUP BY ALL", {"scenario": SCENARIO}
         ).fetchall()

@@ -17,7 +17,7 @@ from fleet_slip.regression.exact import LinearModel
 from fleet_slip.resources import read_sql
 from fleet_slip.selection.compare import Selection
 from fleet_slip.views import connect
-from fleet_slip.warehouse.database import database_errors
+from fleet_slip.warehouse.database import reading_files
 from fleet_slip.warehouse.tables import Warehouse
 
 ANGLE_DEG = 0.05
@@ -83,7 +83,10 @@ def held_out_histogram(
         complete=" AND ".join(f"{signals[name].column} IS NOT NULL" for name in (*names, "ay")),
     )
     widths = {"angle_deg": ANGLE_DEG, "acceleration_mps2": ACCELERATION_MPS2}
-    with connect(warehouse.root) as database, database_errors("estimating held-out drives"):
+    with (
+        connect(warehouse.root) as database,
+        reading_files(database, "estimating held-out drives"),
+    ):
         database.register("held_out", held_out_coefficients(selection, model))
         found = database.sql(statement, params=widths).to_arrow_table()
     return Histogram(**{name: found[name].to_numpy() for name in found.column_names})

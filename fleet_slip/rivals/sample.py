@@ -13,7 +13,7 @@ from fleet_slip.regression.folds import FoldAssignment
 from fleet_slip.resources import read_sql
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.views import connect
-from fleet_slip.warehouse.database import database_errors
+from fleet_slip.warehouse.database import reading_files
 from fleet_slip.warehouse.tables import Warehouse
 
 SAMPLE_ROWS = 20_000
@@ -63,7 +63,7 @@ def draw_sample(
         "drives": sorted(set(cohort.drives["drive_id"].to_pylist())),
         "stride": max(1, cohort.rows // rows),
     }
-    with connect(warehouse.root) as database, database_errors("drawing a sample"):
+    with connect(warehouse.root) as database, reading_files(database, "drawing a sample"):
         found = database.sql(statement, params=parameters).to_arrow_table()
     if not found.num_rows:
         raise DataError(f"no row of {cohort.condition.text!r} has all of {', '.join(names)}.")

@@ -19,7 +19,7 @@ import duckdb
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError, printable
-from fleet_slip.warehouse.database import database_errors, duckdb_message
+from fleet_slip.warehouse.database import duckdb_message, reading_files
 from fleet_slip.warehouse.lasting_sql import Tree, problems
 from fleet_slip.warehouse.read_only_sql import LONGEST_QUERY
 
@@ -71,7 +71,7 @@ def asking(
     timer.daemon = True
     timer.start()
     try:
-        with database_errors(f"the cohort {condition.text!r}"):
+        with reading_files(database, f"the cohort {condition.text!r}"):
             yield
     except BaseException:
         if not over.is_set():

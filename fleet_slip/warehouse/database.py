@@ -10,6 +10,7 @@ from typing import TypeVar
 import duckdb
 
 from fleet_slip.errors import FleetSlipError, QuestionError, StorageError
+from fleet_slip.files.checksums import check_local_files
 from fleet_slip.files.folder import Folder
 from fleet_slip.limits import memory_bytes
 
@@ -44,6 +45,7 @@ def open_database(
     database = duckdb.connect(":memory:", config=config)
     if reading:
         reading.let_read(database)
+        database.execute("CALL enable_logging('FileSystem')")  # see `reading_files`
     return database
 
 
@@ -109,6 +111,32 @@ def database_errors(doing: str) -> Iterator[None]:
         raise QuestionError(f"{doing} failed: {duckdb_message(error)}") from None
     except UnicodeDecodeError:  # the message quotes bytes of a damaged file
         raise StorageError(f"{doing} failed: a file is damaged. {_RESTORE}") from None
+
+
+@contextlib.contextmanager
+def reading_files(database: duckdb.DuckDBPyConnection, doing: str) -> Iterator[None]:
+    """Turn DuckDB's errors into ours, and let nothing pass that came from a damaged file.
+
+    DuckDB's own log tells which files the queries of the connection have opened; each is compared
+    with the checksum in its name, whatever came of the query.
+    """
+    try:
+        with database_errors(doing):
+            yield
+    except (StorageError, QuestionError):
+        check_opened_files(database)
+        raise
+    check_opened_files(database)
+
+
+def check_opened_files(database: duckdb.DuckDBPyConnection) -> None:
+    """Raise `StorageError` if a file that a connection has opened is not what its name says."""
+    with database_errors("asking which files were read"):
+        opened = database.execute(_OPENED_FILES).fetchall()
+    check_local_files(path for (path,) in opened if "://" not in path)
+
+
+_OPENED_FILES = "SELECT DISTINCT path FROM duckdb_logs_parsed('FileSystem') WHERE op = 'OPEN'"
 
 
 def duckdb_message(error: BaseException) -> str:
