@@ -56,7 +56,13 @@ FoldBy = Annotated[
     ),
 ]
 FoldCount = Annotated[
-    int | None, typer.Option("--folds", min=2, help="Number of folds. Default: what the list says.")
+    str | None,
+    typer.Option(
+        "--folds",
+        metavar="NUMBER|each",
+        help="Number of folds, or each: every drive, or whatever folds are made of, is a fold of "
+        "its own. Default: what the list says.",
+    ),
 ]
 Rank = Annotated[
     str | None,

@@ -12,7 +12,7 @@ from fleet_slip.cli.selecting import Cohort, FoldCount, Naive
 from fleet_slip.cli.subject import FeatureSetOption, Model, Signals, quantities, subject_of
 from fleet_slip.errors import ConfigError
 from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.grams.folding import Folding, FoldKey
+from fleet_slip.grams.folding import Folding, FoldKey, make_folding
 from fleet_slip.models.counts_model import counts_model
 from fleet_slip.regression.exact import fit
 from fleet_slip.regression.figures import Figures
@@ -186,9 +186,9 @@ def regimes(
     One model for all rows is cross-validated against one for each regime. Needs Gram rows by
     regime: **fleet-slip gram --features regimes**
     """
+    folding = make_folding(by, folds or Folding().count)
     drives = load_cohort(context.obj, cohort, feature_set)
     inputs = inputs_of(drives, signals or WHOLE_SET)
-    folding = Folding(by=by, count=folds or Folding().count)
     divided_by = [name.strip() for name in over.split(",")] if over else []
     result = compare_regimes(drives, inputs, folding, divided_by)
     if json:
@@ -240,15 +240,16 @@ def shrink(
     Penalties are chosen by cross-validation inside each training fold. With many drives for each
     signal there is little to shrink; with few drives, or many features, it shows here.
     """
+    folding = make_folding(by, folds or Folding().count)
     drives = load_cohort(context.obj, cohort, feature_set or PLAIN)
     inputs = inputs_of(drives, signals or WHOLE_SET)
-    folding = Folding(by=by, count=folds or Folding().count)
     found = compare_shrinkage(drives, inputs, folding, naive=naive)
     if json:
         print_json({"cohort": cohort, "methods": [one.as_dict() for one in found]})
         return
+    first = found[0].cross_validation
     print_table(
-        f"{found[0].cross_validation.drives:,} drives, {folding.count} folds by {by}",
+        f"{first.drives:,} drives, {len(first.folds)} folds by {by}",
         ["method", "signals kept", "penalty", "correlation", "RMSE deg", "mean deg", "std deg"],
         [
             [

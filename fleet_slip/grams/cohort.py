@@ -15,7 +15,7 @@ from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import SCENARIO, TRAINING_DRIVES
 from fleet_slip.errors import DataError, QuestionError, RefusedError
-from fleet_slip.grams.folding import FOLD_KEYS, ROW_FOLDS
+from fleet_slip.grams.folding import EACH, FOLD_KEYS, ROW_FOLDS, FoldCount
 from fleet_slip.grams.reader import GramReader, open_grams
 from fleet_slip.regression.drive_moments import serving_drives
 from fleet_slip.regression.folds import CohortFolds, FoldAssignment, by_hash, by_value
@@ -84,11 +84,12 @@ class Cohort:
             name for name in features().feature_set(self.feature_set).inputs if name in found
         )
 
-    def folds(self, by: str, count: int) -> CohortFolds:
+    def folds(self, by: str, count: FoldCount) -> CohortFolds:
         """Divide the cohort into folds, of whole drives unless by `row`.
 
         By `drive`: hashed into `count` folds. By another key of `FOLD_KEYS`: one fold for each
-        value, or hashed into `count` folds if there are more values than that. By `row`: the folds
+        value, or hashed into `count` folds if there are more values than that. With `EACH`, every
+        drive or value is a fold. By `row`: the folds
         that the feature set made of single rows, `count` of them. Raises `QuestionError` if
         it made none.
         """
@@ -146,7 +147,11 @@ def gram_condition(condition: Condition, feature_set: str, inputs: Sequence[str]
     )
 
 
-def require_row_folds(feature_set: str, count: int) -> None:
+MOST_FOLDS = 10_000
+"""Each fold is an exact fit of every model."""
+
+
+def require_row_folds(feature_set: str, count: FoldCount) -> None:
     """Raise `QuestionError` if a feature set has not made so many folds of rows."""
     made = features().feature_set(feature_set).row_folds
     if made is None:
@@ -155,14 +160,24 @@ def require_row_folds(feature_set: str, count: int) -> None:
             f"the Gram rows of the feature set {feature_set} are of whole drives: folds of rows "
             f"are made when the logs are read. Feature sets that make them: {known}."
         )
-    if count > made:
+    if count == EACH or count > made:
         raise QuestionError(
             f"the feature set {feature_set} made {made} folds of rows; choose no more."
         )
 
 
-def assign_folds(values: Sequence[Any], by: str, count: int) -> FoldAssignment:
-    """Assign Gram rows to folds by the values of a fold key."""
+def assign_folds(values: Sequence[Any], by: str, count: FoldCount) -> FoldAssignment:
+    """Assign Gram rows to folds by the values of a fold key.
+
+    Raises `DataError` if there are not two folds, or too many.
+    """
+    if count == EACH:
+        if (number := len(set(values))) > MOST_FOLDS:
+            raise DataError(
+                f"the cohort has {number:,}, and at most {MOST_FOLDS:,} can be folds of their own. "
+                f"Fold by another key than {by}, or say how many folds."
+            )
+        return by_value(values)
     if by == ROW_FOLDS:
         return by_value([(int(value) - 1) % count + 1 for value in values])
     if by == "drive" or len(set(values)) > count:

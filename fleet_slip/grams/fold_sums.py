@@ -24,7 +24,7 @@ from fleet_slip.grams.cohort import (
     require_row_folds,
     require_training,
 )
-from fleet_slip.grams.folding import FOLD_KEYS, ROW_FOLDS, Folding
+from fleet_slip.grams.folding import EACH, FOLD_KEYS, ROW_FOLDS, FoldCount, Folding
 from fleet_slip.grams.reader import GramReader, OpenedGrams, open_grams
 from fleet_slip.regression.folds import CohortFolds, hash_number
 from fleet_slip.regression.gram import Gram
@@ -65,7 +65,7 @@ class SummedCohort:
             name for name in features().feature_set(self.feature_set).inputs if name in found
         )
 
-    def folds(self, by: str, count: int) -> CohortFolds:
+    def folds(self, by: str, count: FoldCount) -> CohortFolds:
         """Return the folds, which must be those that were asked for when the cohort was read."""
         if (by, count) != (self.folding.by, self.folding.count):
             raise ValueError(f"the sums are over {self.folding}, not over {count} folds by {by}")
@@ -114,9 +114,10 @@ def _folding(
     opened: OpenedGrams, folding: Folding, condition: Condition
 ) -> tuple[list[str], FoldOf]:
     """Return the names of all folds that there may be, and what tells the fold of a Gram row."""
-    if folding.by == "drive":
-        names = [str(fold + 1) for fold in range(folding.count)]
-        return names, lambda _, drives: (drives % folding.count).astype(np.int64)
+    count = folding.count
+    if folding.by == "drive" and count != EACH:
+        names = [str(fold + 1) for fold in range(count)]
+        return names, lambda _, drives: (drives % count).astype(np.int64)
     key = FOLD_KEYS[folding.by]
     text = opened.statement("cohort_sums.sql", condition)
     with asking(opened.database, condition):

@@ -1,10 +1,11 @@
 """How a cohort is divided into folds, and the columns that folds are made of."""
 
-from typing import Literal
+from typing import Annotated, Literal, TypeAlias
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from fleet_slip.config import Config
+from fleet_slip.errors import ConfigError
 
 FoldKey = Literal["drive", "vehicle", "track", "day", "mass", "adhesion", "row"]
 
@@ -23,8 +24,29 @@ ROW_FOLDS: FoldKey = "row"
 """Folds of single rows, as WEKA makes them. They leak: a test row's neighbours train the model."""
 
 
+EACH: Literal["each"] = "each"
+"""Instead of a number of folds: each drive, or vehicle, track or day, is a fold of its own."""
+
+FoldCount: TypeAlias = Annotated[int, Field(ge=2, le=1000)] | Literal["each"]
+
+
 class Folding(Config):
     """By what a cohort is divided, and into how many folds."""
 
     by: FoldKey = "drive"
-    count: int = Field(default=5, ge=2, le=1000)
+    count: FoldCount = 5
+
+    @model_validator(mode="after")
+    def _rows_are_dealt(self) -> "Folding":
+        if self.by == ROW_FOLDS and self.count == EACH:
+            raise ValueError("folds of rows were dealt when the logs were read: say how many.")
+        return self
+
+
+def make_folding(by: FoldKey, count: int | str) -> Folding:
+    """Return a folding that was asked for. Raises `ConfigError`."""
+    try:
+        return Folding.model_validate({"by": by, "count": count if count == EACH else int(count)})
+    except ValueError:
+        each = "" if by == ROW_FOLDS else f", or each: every {by} a fold of its own"
+        raise ConfigError(f"--folds {count}: choose a number from 2 to 1000{each}.") from None

@@ -59,7 +59,7 @@ class Selection(Generic[AnyCohort]):
             "rows": self.cohort.rows,
             "folds": {
                 "by": self.folds.by,
-                "count": self.folds.count,
+                "count": len(self.models[0].folds),
                 "leaking": self.folds.by == ROW_FOLDS,
             },
             "skipped": self.skipped,

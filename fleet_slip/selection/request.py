@@ -12,7 +12,7 @@ from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.errors import ConfigError
 from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.grams.fold_sums import SummedCohort, sum_cohort
-from fleet_slip.grams.folding import ROW_FOLDS, Folding, FoldKey
+from fleet_slip.grams.folding import EACH, ROW_FOLDS, Folding, FoldKey, make_folding
 from fleet_slip.regression.nested_choice import Rule
 from fleet_slip.regression.winner import DEFAULT_WORTH, Worth
 from fleet_slip.selection.compare import Selection, select
@@ -72,7 +72,7 @@ class SelectionRequest:
     nested: str | None = None
     features: str | None = None
     by: FoldKey | None = None
-    folds: int | None = None
+    folds: int | str | None = None
     rank: str | None = None
     criterion: str | None = None
     worth: Worth = DEFAULT_WORTH
@@ -139,7 +139,10 @@ def answer_request(warehouse: Warehouse, request: SelectionRequest) -> Requested
 
 def _folding(request: SelectionRequest, model_list: ModelList | None) -> Folding:
     listed = model_list.folds if model_list else Folding()
-    return Folding(by=request.by or listed.by, count=request.folds or listed.count)
+    folding = make_folding(request.by or listed.by, request.folds or listed.count)
+    if request.repeat and folding.count == EACH:
+        raise ConfigError("--repeat deals the folds anew, and --folds each has one deal only.")
+    return folding
 
 
 def _feature_set(request: SelectionRequest, model_list: ModelList | None) -> str:

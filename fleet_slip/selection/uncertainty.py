@@ -5,7 +5,7 @@ from typing import Any
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.grams.cohort import Cohort
-from fleet_slip.grams.folding import Folding
+from fleet_slip.grams.folding import EACH, Folding
 from fleet_slip.grams.training import drive_folds
 from fleet_slip.regression.crossval import CrossValidation
 from fleet_slip.regression.exact import fit
@@ -27,7 +27,7 @@ class Uncertainty:
 
     Attributes:
         interval: percentile interval by cluster bootstrap over drives.
-        repeats: number of deals of drives into folds.
+        repeats: number of deals of drives into folds; with `EACH` there is no other.
         repeated_mean, repeated_spread: mean and standard deviation of the correlation over them.
     """
 
@@ -62,7 +62,7 @@ def estimate_uncertainty(
         products = held_out_products(ready.moments, ready.fold, models)
         interval = percentile_interval(bootstrap_correlations(products, bootstrap, SEED))
     repeated = None
-    if repeat:
+    if repeat and folding.count != EACH:
         repeated = repeated_cross_validation(ready.moments, folding.count, repeat, SEED)
     return Uncertainty(
         interval,

@@ -299,3 +299,20 @@ def test_features_are_listed(run_command: RunCommand) -> None:
     assert "10 folds of rows" in run_command("features", "--sets").stdout
     listed = run_command("features", "--json").json
     assert listed["sets"]["motion"]["identity"] == features().identity("motion")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        *(f"{command} --folds 1001" for command in ("select", "regimes", "shrink", "publish m")),
+        *(f"select --folds {folds}" for folds in ("1", "-3", "few", "each --by row")),
+    ],
+)
+def test_a_number_of_folds_that_cannot_be_is_named(
+    run_command: RunCommand, tmp_path: Path, words: str
+) -> None:
+    (tmp_path / "data").mkdir()
+    done = run_command(*words.split())
+    assert done.exit_code == 3
+    asked = words.partition("--folds ")[2].partition(" ")[0]
+    assert f"error: --folds {asked}: choose a number from 2 to 1000" in done.stderr

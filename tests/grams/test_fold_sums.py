@@ -14,7 +14,7 @@ from fleet_slip.grams import reader as gram_reader
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.day_sums import sum_days
 from fleet_slip.grams.fold_sums import sum_cohort
-from fleet_slip.grams.folding import Folding, FoldKey
+from fleet_slip.grams.folding import FoldCount, Folding, FoldKey
 from fleet_slip.grams.job import update_grams
 from fleet_slip.grams.reader import GramReader
 from fleet_slip.selection.compare import select
@@ -37,12 +37,12 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Warehouse:
 
 
 @pytest.mark.parametrize("by", ["drive", "vehicle", "track", "day", "mass", "adhesion"])
-@pytest.mark.parametrize("batch", [7, 1000])
+@pytest.mark.parametrize(("batch", "count"), [(7, 4), (1000, 4), (7, "each")])
 def test_sums_equal_those_of_the_cohort(
-    fleet: Warehouse, monkeypatch: pytest.MonkeyPatch, by: FoldKey, batch: int
+    fleet: Warehouse, monkeypatch: pytest.MonkeyPatch, by: FoldKey, batch: int, count: FoldCount
 ) -> None:
     monkeypatch.setattr(gram_reader, "BATCH_ROWS", batch)
-    plan = Folding(by=by, count=4)
+    plan = Folding(by=by, count=count)
     cohort = load_cohort(fleet, "adhesion > 0.65")
     summed = sum_cohort(fleet, plan, "adhesion > 0.65")
     one, two = (each.folds(plan.by, plan.count) for each in (cohort, summed))
