@@ -1,6 +1,6 @@
 """Selecting: the command select, its options, and how a selection is printed."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Annotated, Any
 
 import typer
@@ -10,7 +10,7 @@ from fleet_slip.cli.output import Json, print_json, print_table, say, stdout
 from fleet_slip.grams.folding import ROW_FOLDS, FoldKey
 from fleet_slip.regression.criteria import CRITERIA
 from fleet_slip.regression.crossval import CrossValidation
-from fleet_slip.regression.nested_choice import CROSS_VALIDATION
+from fleet_slip.regression.nested_choice import CROSS_VALIDATION, NestedChoice
 from fleet_slip.regression.ranking import RANKINGS
 from fleet_slip.selection.compare import Selection
 from fleet_slip.selection.request import (
@@ -224,8 +224,8 @@ def _print_choice(choice: SearchChoice) -> None:
         nested = choice.nested
         print_table(
             f"order by {choice.rule.ranking}; {worth}",
-            ["", "added", "contribution A", _criterion_name(choice)],
-            _order_rows(nested.order, nested.evidence.contributions, nested.values, nested.size),
+            ["", "added", "contribution A", "D to full", "expected D", _criterion_name(choice)],
+            _order_rows(nested),
             left=2,
         )
     if choice.subsets is not None and choice.picks is not None:
@@ -252,14 +252,20 @@ def _criterion_name(choice: SearchChoice) -> str:
     return choice.rule.criterion
 
 
-def _order_rows(
-    order: Sequence[str], contributions: Sequence[float], values: Sequence[float], size: int
-) -> Iterator[list[str]]:
-    for j, value in enumerate(values):
-        added = order[j - 1] if j else "(none)"
-        contribution = f"{contributions[j - 1]:,.1f}" if j else ""
-        mark = " <" if j == size else "  "
-        yield [str(j), added, contribution, f"{value:,.4f}{mark}"]
+def _order_rows(nested: NestedChoice) -> Iterator[list[str]]:
+    """Return a line for each of the k+1 models, the empty one first.
+
+    The distance D is that of the paper's equation (2), in units of the noise: from the full model,
+    and as it is to be expected from the true one.
+    """
+    evidence = nested.evidence
+    columns = zip(nested.values, evidence.excess(), evidence.distances(), strict=True)
+    for j, (value, to_full, expected) in enumerate(columns):
+        added = nested.order[j - 1] if j else "(none)"
+        contribution = f"{evidence.contributions[j - 1]:,.1f}" if j else ""
+        mark = " <" if j == nested.size else "  "
+        figures = [contribution, f"{to_full:,.1f}", f"{expected:,.1f}"]
+        yield [str(j), added, *figures, f"{value:,.4f}{mark}"]
 
 
 def _print_honest(honest: CrossValidation) -> None:

@@ -79,6 +79,8 @@ class NestedChoice:
             "signals": list(self.signals),
             "criterion_values": list(self.values),
             "contributions": list(self.evidence.contributions),
+            "distances_to_full": self.evidence.excess().tolist(),
+            "expected_distances": list(self.evidence.distances()),
             "evidence": self.evidence.kind,
             "effective_rows": self.evidence.rows,
             "design_effect": self.evidence.design_effect,

@@ -73,7 +73,9 @@ def exactly_as_accurate(data: ReportData) -> Verdict:
     return verdict(
         round(values["4"], 4) == round(values["5"], 4),
         f"{number(values['4'], 5)} and {number(values['5'], 5)}",
-        "That holds for the steering ratio that they were trained with. In a sedan with another "
+        "Here the wheels' steering angles are functions of the steering wheel's, so nearly equal "
+        "figures come from the construction, and with it the result is no reproduction. They hold "
+        "for the steering ratio that the models were trained with. In a sedan with another "
         f"one their errors are {degrees(stds[0])} and {degrees(stds[1])}: model 5 goes on "
         "measuring road wheel angles, model 4 does not.",
     )
