@@ -21,10 +21,8 @@ import signal
 import sys
 import tempfile
 import time
-import traceback
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -37,6 +35,7 @@ import fleet_slip.ingest.job  # whatever a command imports late is here before t
 import fleet_slip.maintenance.repair
 import fleet_slip.simulation.job  # noqa: F401
 from benchmarks.crash_commands import COMMANDS, Command, prepare_inputs
+from benchmarks.forking import forked
 from fleet_slip.cli.main import main as fleet_slip_main
 from fleet_slip.delta import Table
 from fleet_slip.files.local_folder import LocalFolder
@@ -82,50 +81,6 @@ class Countdown:
             return result
 
         return wrapped
-
-
-@dataclass(frozen=True)
-class Ended:
-    """A forked process that is over."""
-
-    killed: bool
-    result: Any
-    seconds: float
-
-
-def forked(work: Callable[[], Any], kill_after_s: float | None = None) -> Ended:
-    """Do work in a forked process and return its result, or kill it after a time."""
-    with tempfile.TemporaryDirectory() as folder:
-        answer, noise = Path(folder) / "answer", Path(folder) / "noise"
-        started = time.monotonic()
-        process = os.fork()
-        if not process:
-            _child(work, answer, noise)
-        if kill_after_s is not None:
-            time.sleep(kill_after_s)
-            os.kill(process, signal.SIGKILL)
-        status = os.waitpid(process, 0)[1]
-        seconds = time.monotonic() - started
-        if os.WIFSIGNALED(status):
-            return Ended(True, None, seconds)
-        if os.WEXITSTATUS(status):
-            raise AssertionError(noise.read_text())
-        return Ended(False, json.loads(answer.read_text()), seconds)
-
-
-def _child(work: Callable[[], Any], answer: Path, noise: Path) -> None:
-    code = 1
-    try:
-        with noise.open("w") as file:
-            os.dup2(file.fileno(), 1)
-            os.dup2(file.fileno(), 2)
-            answer.write_text(json.dumps(work()))
-            code = 0
-    except BaseException:
-        traceback.print_exc()
-    finally:
-        sys.stderr.flush()
-        os._exit(code)
 
 
 def give(root: Path, arguments: tuple[str, ...], fatal: int = 0) -> int:
@@ -246,7 +201,7 @@ class Harness:
         return where
 
 
-def _load_code(inputs: Mapping[str, str]) -> None:
+def load_code(inputs: Mapping[str, str]) -> None:
     """Simulate a drive and read a mapping in this process, so that its forks need not load code."""
     plan = load_campaign(inputs["campaign"])
     simulate_logs(plan.drives(plan.days()[0])[:1])
@@ -260,7 +215,7 @@ def run(kills: int, seed: int, names: list[str]) -> Counter[tuple[str, str]]:
     done: Counter[tuple[str, str]] = Counter()
     with tempfile.TemporaryDirectory() as folder:
         inputs = prepare_inputs(Path(folder))
-        _load_code(inputs)
+        load_code(inputs)
         chosen = [command for command in COMMANDS if command.name in names]
         for place, command in enumerate(chosen):
             share = kills // len(chosen) + (place < kills % len(chosen))

@@ -1,0 +1,303 @@
+"""Lets every two commands that write meet at every point, and looks for what is lost or comes back.
+
+    python -m benchmarks.interleave [--schedules N] [--seed 0] [--first C ...] [--second C ...]
+                                    [--store] [--only FIRST/SECOND/POINT/FATE]
+
+Of two commands the first is stopped just before one of its durable calls, or looks at the
+warehouse; the second runs whole; then the first goes on, or dies (SIGKILL), at once or a few points
+later. Then this must be so:
+
+* no row that was committed is lost or doubled, and no reader sees half a change;
+* what `forget --now` has said to be gone is in no file, and the models trained on it are marked;
+* a version follows, in every bit, from the Gram rows that it names;
+* both commands, given again, end where they end if they never meet.
+
+Without --schedules it tries all; with it, so many of them, chosen by the seed.
+"""
+
+import argparse
+import contextlib
+import hashlib
+import importlib
+import itertools
+import pkgutil
+import random
+import shutil
+import sys
+import tempfile
+import time
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import fleet_slip
+from benchmarks import interleave_checks as checks
+from benchmarks.crash import load_code
+from benchmarks.forking import forked
+from benchmarks.interleave_checks import Drive
+from benchmarks.interleave_roots import (
+    COMMANDS,
+    SETTLING,
+    Inputs,
+    LocalRoots,
+    StoredRoots,
+    prepare,
+    write_inputs,
+)
+from benchmarks.interleave_server import serving
+from benchmarks.interleave_stops import Environment, Outcome, Running, command, use
+
+FATES = ("goes on", "dies", "dies 1 later", "dies 2 later", "dies 3 later")
+ROUNDS = 3
+"""So often both commands are given again until nothing fails."""
+FORGETTING = ("retain", "forget")
+UNHARMED = {0, 5, 6, 7, 8, 12}
+"""Exit codes of a command that met another; 6 where a file is gone that it was about to read."""
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Which commands meet, where the first stops, and what becomes of it."""
+
+    first: str
+    second: str
+    point: int
+    fate: str
+
+    def __str__(self) -> str:
+        """Return it as `--only` takes it."""
+        return f"{self.first}/{self.second}/{self.point}/{self.fate}"
+
+    @property
+    def die_after(self) -> int | None:
+        """So many points after the stop the first command dies; None if it goes on."""
+        if self.fate == FATES[0]:
+            return None
+        return FATES.index(self.fate) - 1
+
+
+class Pair:
+    """Two commands, a root on which they meet, and what they make of it if they do not meet."""
+
+    def __init__(self, first: str, second: str, inputs: Inputs, folder: Path, roots: Any) -> None:
+        self.first, self.second, self._inputs, self._roots = first, second, inputs, roots
+        self._both = {first, second}
+        self._before = prepare(folder / f"{first}-{second}", inputs, first, second)
+        self._root = ""
+        whole = inputs.environment(*self._both)
+        quiet = roots.copy(self._before)
+        ended = self._run(quiet, first)
+        self.points = ended.points
+        found = forked(lambda: _base(str(self._before), inputs.environment())).result
+        self._committed = {name: Drive(**one) for name, one in found.items()}
+        self._settle(quiet)
+        self._expected = forked(lambda: _state(quiet, whole)).result
+        assert not self._expected["damage"], self._expected
+
+    def remove(self) -> None:
+        shutil.rmtree(self._before)
+
+    def run(self, schedule: Schedule) -> list[str]:
+        """Return what is wrong after a schedule."""
+        root = self._root = self._roots.copy(self._before)
+        first = Running(root, *self._given(self.first), stop_at=schedule.point)
+        if not first.stopped():
+            first.end()
+            return []
+        second = self._run(root, self.second)
+        migrated = self.second == "migrate"
+        found = self._look(root, second, self.second, migrated, "while the first had stopped")
+        first.go_on(schedule.die_after)
+        ended = first.end()
+        done = [self.second] if second.exit_code == 0 else []
+        done += [self.first] if ended.exit_code == 0 else []
+        found += _harm(self.first, ended) + _harm(self.second, second)
+        if "repair" not in self._both:
+            migrated |= self.first == "migrate" and "migrate" in done
+            if schedule.die_after != 0:  # else nothing has changed since
+                found += self._look_again(root, done, migrated)
+        found += self._settle(root)
+        whole = self._inputs.environment(*self._both)
+        return found + forked(lambda: _final(root, whole, self._expected)).result
+
+    def _run(self, root: str, name: str) -> Outcome:
+        return Running(root, *self._given(name)).end()
+
+    def _given(self, name: str) -> tuple[tuple[str, ...], Environment]:
+        return self._inputs.arguments(name), self._inputs.environment(name)
+
+    def _look(self, root: str, outcome: Outcome, name: str, migrated: bool, when: str) -> list[str]:
+        if "repair" in self._both:
+            return []
+        done = [name] if outcome.exit_code == 0 else []
+        return [f"{one} ({when})" for one in self._look_again(root, done, migrated)]
+
+    def _look_again(self, root: str, done: Sequence[str], migrated: bool) -> list[str]:
+        gone = {(True, True): "both", (True, False): "car", (False, True): "day"}.get(
+            ("forget" in self._both, "retain" in self._both), ""
+        )
+        environments = [
+            self._inputs.environment(*(["migrate"] if m else [])) for m in (False, True)
+        ]
+        if migrated:
+            environments.reverse()
+        committed, forgotten = self._committed, "forget" in done
+        return list(
+            forked(lambda: _findings(root, environments, committed, gone, forgotten)).result
+        )
+
+    def _settle(self, root: str) -> list[str]:
+        """Give both commands again until both are done; return what keeps failing."""
+        order = [name for name in (*SETTLING, "gram", *FORGETTING) if name in self._both]
+        environment = self._inputs.environment(*self._both)
+        given = [(name, self._inputs.arguments(name)) for name in (*order, "gram")]
+        code, said = forked(lambda: _repeat(root, given, environment)).result
+        return [f"keeps failing: {said}"] if code else []
+
+
+def _repeat(
+    root: str, given: Sequence[tuple[str, tuple[str, ...]]], environment: Environment
+) -> tuple[int, str]:
+    failed: dict[str, int] = {}
+    for _ in range(ROUNDS):
+        codes = {name: command(root, arguments, environment) for name, arguments in given}
+        failed = {name: code for name, code in codes.items() if code}
+        if not failed:
+            break
+    return len(failed), ", ".join(f"{name} ends with {code}" for name, code in failed.items())
+
+
+def _base(root: str, environment: Environment) -> dict[str, Any]:
+    """Return the drives that are committed and have Gram rows; none that a pair may lose first."""
+    use(environment)
+    warehouse = checks.warehouse_at(root)
+    drives, _ = checks.drives_of(warehouse) if not _damaged(warehouse) else ({}, [])
+    grams = set(checks.grams_of(warehouse)) if drives else set()
+    return {name: vars(drive) for name, drive in drives.items() if name in grams}
+
+
+def _damaged(warehouse: Any) -> bool:
+    there = {file.path for file in warehouse.logs.folder.files()}
+    return any(file.path not in there for file in warehouse.logs.snapshot().files)
+
+
+def _state(root: str, environment: Environment) -> dict[str, Any]:
+    use(environment)
+    return checks.state(root)
+
+
+def _findings(
+    root: str,
+    environments: Sequence[Environment],
+    committed: dict[str, Drive],
+    gone: str,
+    forgotten: bool,
+) -> list[str]:
+    from fleet_slip.errors import RefusedError  # noqa: PLC0415
+
+    for environment in environments:
+        use(environment)
+        try:
+            found = checks.readers_findings(root, committed, gone)
+        except RefusedError:
+            continue
+        found += checks.version_findings(root)
+        return found + (checks.forgotten_findings(root) if forgotten else [])
+    return ["unreadable: in the scales of either catalogue"]
+
+
+def _final(root: str, environment: Environment, expected: dict[str, Any]) -> list[str]:
+    use(environment)
+    found = checks.state(root)
+    return [
+        f"other end: {key} {found[key] if key == 'damage' else ''}"
+        for key in expected
+        if found[key] != expected[key]
+    ]
+
+
+def _harm(name: str, outcome: Outcome) -> list[str]:
+    if outcome.exit_code is None or outcome.exit_code in UNHARMED:
+        return []
+    return [f"ends with {outcome.exit_code}: {name}: {outcome.said[-2000:]}"]
+
+
+def _load_code(inputs: Inputs) -> None:
+    """Import in this process what commands import when they are called; make hashing names fast."""
+    load_code(inputs.files)
+    for found in pkgutil.walk_packages(fleet_slip.__path__, "fleet_slip."):
+        with contextlib.suppress(ImportError):  # an extra that is not there
+            importlib.import_module(found.name)
+    importlib.import_module("pyarrow.dataset")
+    hashlib.scrypt = lambda text, *, salt, **_: hashlib.sha256(salt + text).digest()
+
+
+def schedules(pair: Pair, fates: Sequence[str]) -> Iterator[Schedule]:
+    """Yield all schedules of a pair."""
+    for point, fate in itertools.product(range(1, pair.points + 1), fates):
+        yield Schedule(pair.first, pair.second, point, fate)
+
+
+def run(options: argparse.Namespace, folder: Path, roots: Any) -> dict[str, list[Schedule]]:
+    """Run schedules; return those that found something, by what they found."""
+    inputs = write_inputs(folder / "inputs")
+    _load_code(inputs)
+    rng = random.Random(options.seed)  # noqa: S311
+    found: dict[str, list[Schedule]] = defaultdict(list)
+    pairs = list(itertools.product(options.first, options.second))
+    done, started = 0, time.monotonic()
+    for number, (first, second) in enumerate(pairs):
+        if options.only and (first, second) != tuple(options.only.split("/")[:2]):
+            continue
+        pair = Pair(first, second, inputs, folder, roots)
+        every = list(schedules(pair, FATES))
+        if options.only:
+            every = [one for one in every if str(one) == options.only]
+        elif options.schedules:
+            share = (options.schedules * (number + 1)) // len(pairs) - (
+                options.schedules * number
+            ) // len(pairs)
+            every = rng.sample(every, min(share, len(every)))
+        for schedule in every:
+            for finding in sorted(set(pair.run(schedule))):
+                found[f"{first} | {second}: {finding}"].append(schedule)
+        done += len(every)
+        pair.remove()
+        worst = Counter(
+            {k: len(v) for k, v in found.items() if k.startswith(f"{first} | {second}:")}
+        )
+        print(
+            f"{first:9s} {second:9s} {len(every):4d} schedules {worst.total():4d} findings",
+            flush=True,
+        )
+    print(f"{done} schedules, {time.monotonic() - started:.0f} s")
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--schedules", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--first", nargs="+", choices=COMMANDS, default=list(COMMANDS))
+    parser.add_argument("--second", nargs="+", choices=COMMANDS, default=list(COMMANDS))
+    parser.add_argument("--store", action="store_true")
+    parser.add_argument("--only", default="")
+    options = parser.parse_args()
+    memory = Path("/dev/shm")  # noqa: S108 - where there is one, nothing waits for a disk
+    with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as name:
+        folder = Path(name)
+        if options.store:
+            with serving() as server:
+                found = run(options, folder, StoredRoots(*server))
+        else:
+            found = run(options, folder, LocalRoots(folder))
+    for finding, by in sorted(found.items()):
+        print(f"{len(by):4d} x {finding}\n       --only '{by[0]}'")
+    print(f"{sum(map(len, found.values()))} findings of {len(found)} kinds")
+    sys.exit(bool(found))
+
+
+if __name__ == "__main__":
+    main()

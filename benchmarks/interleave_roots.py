@@ -1,0 +1,196 @@
+"""The commands that `benchmarks/interleave.py` pairs, and the small roots on which they meet."""
+
+import csv
+import math
+import random
+import shutil
+import urllib.request
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+
+from benchmarks.crash_commands import MAPPING, let_time_pass
+from benchmarks.interleave_stops import Environment, Running
+from fleet_slip.catalogue.signals import CATALOGUE_VARIABLE
+from fleet_slip.resources import find_config, folder
+
+CAR = "mini-0000"
+"""The car that is to be forgotten: simulated and measured, in what is there and in what comes."""
+
+FIRST_DAY, SECOND_DAY = date(2024, 5, 1), date(2024, 5, 2)
+"""`retain` forgets the first day."""
+
+ROWS = 100
+"""Rows of a measured drive of another car; one of the car's has one more."""
+
+RESCALED = "steer_fr"
+"""The signal to which `migrate` gives another scale."""
+
+TRAINING = ("--cohort", "vehicle_model = 'van'", "--by", "vehicle")
+PUBLISH = ("publish", "sideslip", *TRAINING, "--nested", "ay", "--force")
+
+COMMANDS: Mapping[str, tuple[str, ...]] = {
+    "simulate": ("simulate", "{campaign}", "--threads", "1"),
+    "ingest": ("ingest", "{new}", "--mapping", "{mapping}"),
+    "gram": ("gram",),
+    "publish": PUBLISH,
+    "promote": ("promote", "sideslip@1"),
+    "compact": ("compact",),
+    "vacuum": ("vacuum", "--retention-hours", "24"),
+    "retain": ("retain", "--config", "{retention}"),
+    "forget": ("forget", "--vehicle", CAR, "--now"),
+    "migrate": ("migrate",),
+    "repair": ("verify", "--repair", "--campaign", "{campaign}"),
+}
+LEFT_BY_KILLED = ("ingest", "simulate", "compact")
+"""Commands that were killed before their first commit, where `vacuum` comes in."""
+
+SETTLING = ("repair", "migrate", "simulate", "ingest", "compact", "publish", "promote", "vacuum")
+"""In this order commands are given again; then `gram`, and what forgets comes last."""
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Files that the commands read."""
+
+    folder: Path
+
+    @property
+    def files(self) -> Mapping[str, str]:
+        """Where each file is, by its name without the ending."""
+        return {path.stem: str(path) for path in self.folder.iterdir()}
+
+    def arguments(self, name: str) -> tuple[str, ...]:
+        """Return the command line of a command."""
+        return tuple(part.format(**self.files) for part in COMMANDS[name])
+
+    def environment(self, *names: str) -> Environment:
+        """Return the environment of commands; migrating needs another catalogue."""
+        chosen = "new_signals" if "migrate" in names else "signals"
+        return {CATALOGUE_VARIABLE: str(self.folder / f"{chosen}.toml"), "FLEET_SLIP_LOG": "text"}
+
+
+def write_inputs(where: Path) -> Inputs:
+    """Write a campaign of three days of two cars, measured logs, and configs."""
+    where.mkdir()
+    text = find_config("campaigns", "fleet").read_text(encoding="utf-8")
+    for old, new in (
+        ('name = "fleet"', 'name = "mini"'),
+        ("first_day = 2024-06-01", f"first_day = {FIRST_DAY}"),
+        ("number_of_days = 25", "number_of_days = 3"),
+        ("drives_per_day = 48", "drives_per_day = 3"),
+        ("laps = 1\n", "laps = 0.005\n"),
+        ("rows_per_file = 1_000_000", "rows_per_file = 150"),
+        ("cars = 300", "cars = 2"),
+    ):
+        assert old in text, old
+        text = text.replace(old, new)
+    (where / "campaign.toml").write_text(text, encoding="utf-8")
+    mapping = MAPPING.replace(str(FIRST_DAY), str(SECOND_DAY))
+    (where / "mapping.toml").write_text(mapping, encoding="utf-8")
+    for name, cars in (("old", ("car-2", "car-3")), ("later", ("car-4",)), ("new", ("car-5",))):
+        _measure(where / f"{name}.csv", (CAR, *cars))
+    days = (date.today() - SECOND_DAY).days
+    retention = f"drives_days = {days}\nreplaced_files_hours = 24\n"
+    (where / "retention.toml").write_text(retention, encoding="utf-8")
+    signals = (folder("configs") / "signals.toml").read_text(encoding="utf-8")
+    (where / "signals.toml").write_text(signals, encoding="utf-8")
+    before, found, after = signals.partition(f"[signals.{RESCALED}]")
+    rescaled = after.replace("scale = 0.00005", "scale = 0.0001", 1)
+    assert rescaled != after
+    (where / "new_signals.toml").write_text(before + found + rescaled, encoding="utf-8")
+    return Inputs(where)
+
+
+def _measure(path: Path, cars: tuple[str, ...]) -> None:
+    """Write a log in which each car's last row has to be refused."""
+    rng = random.Random(path.stem)  # noqa: S311
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["t", "car", "ax", "ay", "r", "beta"])
+        for car in cars:
+            rows = ROWS + (car == CAR)
+            for tick in range(rows + 1):
+                ay = 3 * math.sin(tick / 20) + rng.gauss(0, 0.1)
+                shown = "broken" if tick == rows else ay
+                writer.writerow([tick / 100, car, rng.gauss(0, 1), shown, ay / 20, -ay / 200])
+
+
+def prepare(root: Path, inputs: Inputs, first: str, second: str) -> Path:
+    """Make a root on which two commands have something to do."""
+    environment = inputs.environment()
+    known = inputs.files
+    for arguments in (
+        ("simulate", known["campaign"], "--days", "2", "--threads", "1"),
+        ("ingest", known["old"], "--mapping", known["mapping"]),
+        ("gram",),
+        PUBLISH,
+        ("publish", "sideslip", *TRAINING, "--nested", "ax", "--force"),
+        ("ingest", known["later"], "--mapping", known["mapping"]),
+    ):
+        _give(root, arguments, environment)
+    arranging: Mapping[str, Callable[[], None]] = {
+        "vacuum": lambda: _leave_what_killed_jobs_leave(root, inputs),
+        "repair": lambda: _lose_files(root),
+    }
+    for name in sorted({first, second} & arranging.keys(), reverse=True):  # vacuum, then repair
+        arranging[name]()
+    return root
+
+
+def _give(root: Path, arguments: tuple[str, ...], environment: Environment) -> None:
+    ended = Running(root, arguments, environment).end()
+    assert ended.exit_code == 0, ended.said
+
+
+def _leave_what_killed_jobs_leave(root: Path, inputs: Inputs) -> None:
+    for name in LEFT_BY_KILLED:
+        arguments, environment = inputs.arguments(name), inputs.environment()
+        ended = Running(root, arguments, environment, die_before="create_write_transaction").end()
+        assert ended.exit_code is None, ended.said
+    let_time_pass(root)
+
+
+def _lose_files(root: Path) -> None:
+    """Delete a simulated log file, of the second day, and a Gram file."""
+    next(iter(sorted(root.glob(f"logs/day={SECOND_DAY}/mini-*.parquet")))).unlink()
+    next(iter(sorted(root.glob("grams/*.parquet")))).unlink()
+
+
+class LocalRoots:
+    """Copies of a prepared root in a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def copy(self, prepared: Path) -> str:
+        """Return where a new copy is; the one before is gone."""
+        root = self._folder / "root"
+        shutil.rmtree(root, ignore_errors=True)
+        shutil.copytree(prepared, root)
+        return str(root)
+
+
+class StoredRoots:
+    """Copies of a prepared root on an S3 server that takes any signature."""
+
+    def __init__(self, url: str, bucket: str) -> None:
+        self._url, self._bucket, self._number = url, bucket, 0
+
+    def copy(self, prepared: Path) -> str:
+        """Return where a new copy is."""
+        from tests.objects.server import ACCESS_KEY, SCOPE  # noqa: PLC0415
+
+        self._number += 1
+        for file in sorted(prepared.rglob("*")):
+            if file.is_file():
+                path = f"{self._number}/{file.relative_to(prepared)}"
+                request = urllib.request.Request(  # noqa: S310
+                    f"{self._url}/{self._bucket}/{path}",
+                    data=file.read_bytes(),
+                    method="PUT",
+                    headers={"Authorization": f"AWS4-HMAC-SHA256 Credential={ACCESS_KEY}/{SCOPE}"},
+                )
+                urllib.request.urlopen(request).close()  # noqa: S310
+        return f"s3://{self._bucket}/{self._number}"
