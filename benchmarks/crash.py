@@ -40,11 +40,11 @@ from fleet_slip.cli.main import main as fleet_slip_main
 from fleet_slip.delta import Table
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.ingest.mapping import load_mapping
-from fleet_slip.maintenance.audit import Audit
 from fleet_slip.maintenance.verify import verify
 from fleet_slip.models.versions import Registry
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.drives import simulate_logs
+from fleet_slip.warehouse.audit import Audit
 from fleet_slip.warehouse.tables import Warehouse
 
 POINTS: tuple[tuple[Any, str], ...] = (

@@ -52,6 +52,7 @@ from benchmarks.interleave_stops import Environment, Outcome, Running, command, 
 FATES = ("goes on", "dies", "dies 1 later", "dies 2 later", "dies 3 later")
 ROUNDS = 3
 """So often both commands are given again until nothing fails."""
+PENDING = "pending"
 FORGETTING = ("retain", "forget")
 UNHARMED = {0, 5, 6, 7, 8, 12}
 """Exit codes of a command that met another; 6 where a file is gone that it was about to read."""
@@ -94,7 +95,8 @@ class Pair:
         self._committed = {name: Drive(**one) for name, one in found.items()}
         self._settle(quiet)
         self._expected = forked(lambda: _state(quiet, whole)).result
-        assert not self._expected["damage"], self._expected
+        self.alone = [f"alone: {finding}" for finding in self._expected["damage"]]
+        self._expected["damage"] = []
 
     def remove(self) -> None:
         shutil.rmtree(self._before)
@@ -111,8 +113,7 @@ class Pair:
         found = self._look(root, second, self.second, migrated, "while the first had stopped")
         first.go_on(schedule.die_after)
         ended = first.end()
-        done = [self.second] if second.exit_code == 0 else []
-        done += [self.first] if ended.exit_code == 0 else []
+        done = _done(self.second, second) + _done(self.first, ended)
         found += _harm(self.first, ended) + _harm(self.second, second)
         if "repair" not in self._both:
             migrated |= self.first == "migrate" and "migrate" in done
@@ -120,7 +121,9 @@ class Pair:
                 found += self._look_again(root, done, migrated)
         found += self._settle(root)
         whole = self._inputs.environment(*self._both)
-        return found + forked(lambda: _final(root, whole, self._expected)).result
+        forgotten = "forget" in self._both
+        final = forked(lambda: _final(root, whole, self._expected, forgotten)).result
+        return [*found, *map(str, final)]
 
     def _run(self, root: str, name: str) -> Outcome:
         return Running(root, *self._given(name)).end()
@@ -131,7 +134,7 @@ class Pair:
     def _look(self, root: str, outcome: Outcome, name: str, migrated: bool, when: str) -> list[str]:
         if "repair" in self._both:
             return []
-        done = [name] if outcome.exit_code == 0 else []
+        done = _done(name, outcome)
         return [f"{one} ({when})" for one in self._look_again(root, done, migrated)]
 
     def _look_again(self, root: str, done: Sequence[str], migrated: bool) -> list[str]:
@@ -143,10 +146,14 @@ class Pair:
         ]
         if migrated:
             environments.reverse()
-        committed, forgotten = self._committed, "forget" in done
-        return list(
-            forked(lambda: _findings(root, environments, committed, gone, forgotten)).result
-        )
+        committed = self._committed
+        forgotten = "all" if "forget" in done else "readable" if PENDING in done else ""
+        return [
+            str(one)
+            for one in forked(
+                lambda: _findings(root, environments, committed, gone, forgotten)
+            ).result
+        ]
 
     def _settle(self, root: str) -> list[str]:
         """Give both commands again until both are done; return what keeps failing."""
@@ -193,7 +200,7 @@ def _findings(
     environments: Sequence[Environment],
     committed: dict[str, Drive],
     gone: str,
-    forgotten: bool,
+    forgotten: str,
 ) -> list[str]:
     from fleet_slip.errors import RefusedError  # noqa: PLC0415
 
@@ -204,18 +211,28 @@ def _findings(
         except RefusedError:
             continue
         found += checks.version_findings(root)
-        return found + (checks.forgotten_findings(root) if forgotten else [])
+        if forgotten:
+            found += checks.forgotten_findings(root, forgotten == "all")
+        return found
     return ["unreadable: in the scales of either catalogue"]
 
 
-def _final(root: str, environment: Environment, expected: dict[str, Any]) -> list[str]:
+def _final(
+    root: str, environment: Environment, expected: dict[str, Any], forgotten: bool
+) -> list[str]:
     use(environment)
     found = checks.state(root)
-    return [
+    left = checks.forgotten_findings(root, unsaid=True) if forgotten else []
+    return [f"{one} (at the end)" for one in left] + [
         f"other end: {key} {found[key] if key == 'damage' else ''}"
         for key in expected
         if found[key] != expected[key]
     ]
+
+
+def _done(name: str, outcome: Outcome) -> list[str]:
+    """Return the command if it was done; if it has said that something is pending, that."""
+    return [name] if outcome.exit_code == 0 else [PENDING] if outcome.exit_code == 12 else []
 
 
 def _harm(name: str, outcome: Outcome) -> list[str]:
@@ -260,6 +277,8 @@ def run(options: argparse.Namespace, folder: Path, roots: Any) -> dict[str, list
                 options.schedules * number
             ) // len(pairs)
             every = rng.sample(every, min(share, len(every)))
+        for finding in pair.alone:
+            found[f"{first} | {second}: {finding}"].append(Schedule(first, second, 0, FATES[0]))
         for schedule in every:
             for finding in sorted(set(pair.run(schedule))):
                 found[f"{first} | {second}: {finding}"].append(schedule)

@@ -18,9 +18,10 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.delta import Table
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.files.data_root import data_root
-from fleet_slip.maintenance.audit import Audit
+from fleet_slip.maintenance.marks import marked_models
 from fleet_slip.maintenance.verify import verify
-from fleet_slip.models.versions import ModelVersion, Registry
+from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.models.versions import Registry
 from fleet_slip.regression.exact import fit
 from fleet_slip.regression.gram import Gram
 from fleet_slip.warehouse.tables import Warehouse
@@ -89,10 +90,12 @@ def state(root: str) -> dict[str, Any]:
 
 
 def grams_of(warehouse: Warehouse) -> Iterator[str]:
+    """Yield the drive of each Gram row of the signals that counts."""
     identity = features().identity(PLAIN)
+    active = {file.path for file in warehouse.logs.snapshot().files}
     for file in warehouse.grams.snapshot().files:
         for row in warehouse.grams.read(file.path).to_pylist():
-            if row["feature_set"] == identity:
+            if row["feature_set"] == identity and row["file"] in active:
                 yield row["drive_id"]
 
 
@@ -137,8 +140,11 @@ def may_be_missing(drive: Drive, gone: str) -> bool:
     return by_car or (gone in ("day", "both") and drive.day == str(FIRST_DAY))
 
 
-def forgotten_findings(root: str) -> list[str]:
-    """Return where the forgotten car still is, although `forget --now` has said that it is gone."""
+def forgotten_findings(root: str, unsaid: bool) -> list[str]:
+    """Return where the forgotten car still is, although `forget --now` has returned.
+
+    In files that no reader sees it may be, unless `unsaid`, if it has said so.
+    """
     warehouse = warehouse_at(root)
     found = []
     for table in warehouse.tables:
@@ -147,10 +153,10 @@ def forgotten_findings(root: str) -> list[str]:
             if "/_delta_log/" in f"/{file.path}" or not file.path.endswith(".parquet"):
                 continue
             where = "readable" if file.path in active else "unsaid"
-            if _has_car(table, file.path):
+            if (where == "readable" or unsaid) and _has_car(table, file.path):
                 found.append(f"{where}: {table.folder.name} has rows of the forgotten car")
     registry = Registry(warehouse.root / "models")
-    marked = Audit(warehouse.root).marked_models()
+    marked = marked_models(warehouse.root)
     for name in registry.names():
         for number in registry.versions(name):
             version = registry.load(name, number)

@@ -180,7 +180,7 @@ class StoredRoots:
 
     def copy(self, prepared: Path) -> str:
         """Return where a new copy is."""
-        from tests.objects.server import ACCESS_KEY, SCOPE  # noqa: PLC0415
+        from tests.support.s3_server import ACCESS_KEY, SCOPE  # noqa: PLC0415
 
         self._number += 1
         for file in sorted(prepared.rglob("*")):

@@ -23,7 +23,7 @@ def serving() -> Iterator[tuple[str, str]]:
 
 
 def _serve(connection: Any) -> None:
-    from tests.objects.server import Server  # noqa: PLC0415 - flask and moto, here only
+    from tests.support.s3_server import Server  # noqa: PLC0415 - flask and moto, here only
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     server = Server()

@@ -20,13 +20,13 @@ import pyarrow.parquet as pq
 
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.job import update_grams
-from fleet_slip.maintenance.audit import Forgettable
 from fleet_slip.maintenance.compaction import compact
 from fleet_slip.maintenance.forget import forget
 from fleet_slip.maintenance.verify import verify
 from fleet_slip.maintenance.verify_files import problem_of
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.job import simulate_campaign
+from fleet_slip.warehouse.audit import Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.writers import concurrency
 

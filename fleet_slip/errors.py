@@ -76,6 +76,12 @@ class AlarmError(FleetSlipError):
     exit_code = 10
 
 
+class PendingError(FleetSlipError):
+    """What was asked for is not all done yet; what is left has to wait for other jobs to end."""
+
+    exit_code = 12
+
+
 class ClusterError(FleetSlipError):
     """The cluster cannot be reached or used, or its workers died of a task."""
 

@@ -52,7 +52,7 @@ def connect(
     wanted = VIEWS if query is None else needed_views(query)
     snapshots = table_snapshots(warehouse, wanted)
     database = open_tables(warehouse, wanted, snapshots, threads=threads)
-    paths = paths_of(snapshots)
+    paths = paths_of(snapshots, wanted)
     if "runs" in wanted:
         runs = lend_runs(warehouse.root, database)
         paths += runs

@@ -1,2 +1,6 @@
--- The files of one snapshot of the Delta table.
-read_parquet(getvariable('gram_files'), union_by_name => true)
+-- The files of one snapshot of the Delta table. A Gram row counts while its log file is active: until its Gram rows are
+-- dropped, what was forgotten or compacted away is not seen.
+(
+    FROM read_parquet(getvariable('gram_files'), union_by_name => true)
+    WHERE file IN (SELECT unnest(getvariable('active_log_files')))
+)

@@ -21,14 +21,14 @@ class Serving(Rooted):
         was trained on drives that were forgotten since. Raises `QuestionError` for an unknown model
         and `StorageError` without a data root.
         """
-        from fleet_slip.maintenance.audit import Audit
+        from fleet_slip.maintenance.marks import marked_models
 
         self.warehouse.require()
         registry = self._registry()
         if name is not None:
             registry.require(name)
         found = registry.as_table(name)
-        marked = Audit(self.root).marked_models()
+        marked = marked_models(self.root)
         pairs = zip(found["name"].to_pylist(), found["version"].to_pylist(), strict=True)
         return found.append_column(
             "trained_on_forgotten", [[f"{name}@{version}" in marked for name, version in pairs]]

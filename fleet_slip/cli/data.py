@@ -112,11 +112,18 @@ def simulate(
     elif report.changed:
         say(
             f"{plan.name}: {report.drives} drives, {report.rows:,} rows in "
-            f"{report.batches_written} files, {report.size_bytes / report.rows:.1f} bytes a row"
+            f"{report.batches_written} files, {report.size_bytes / max(report.rows, 1):.1f} bytes "
+            f"a row{_left_out(report.drives_forgotten)}"
         )
         say(_where_the_time_went(report))
     else:
         say(f"{plan.name}: nothing to do, all {len(chosen)} days are there")
+
+
+def _left_out(drives: int) -> str:
+    if not drives:
+        return ""
+    return f"; {drives} drives left out, forgotten (fleet-slip forget --allow lets them come back)"
 
 
 def _where_the_time_went(report: "SimulationReport") -> str:
@@ -182,11 +189,13 @@ def _look_alike(file: str, names: tuple[str, ...]) -> str:
 
 
 def _ingested(report: dict[str, Any]) -> str:
-    if not report["new"]:
+    if not report["new"] and not report["drives_forgotten"]:
         return f"{report['file']}: nothing to do, it was ingested before"
     reasons = ", ".join(f"{n:,} {reason}" for reason, n in report["quarantined"].items())
-    return f"{report['file']}: {report['ticks']:,} rows in {report['drives']} drives" + (
-        f"; {report['rows_quarantined']:,} rows in quarantine ({reasons})" if reasons else ""
+    return (
+        f"{report['file']}: {report['ticks']:,} rows in {report['drives']} drives"
+        + (f"; {report['rows_quarantined']:,} rows in quarantine ({reasons})" if reasons else "")
+        + _left_out(report["drives_forgotten"])
     )
 
 

@@ -1,6 +1,8 @@
 """Commands that look after the warehouse: verify, compact, vacuum, forget, retain."""
 
+import sys
 from concurrent.futures import Executor
+from contextlib import nullcontext
 from dataclasses import asdict
 from datetime import date
 from typing import Annotated, Any
@@ -10,8 +12,7 @@ import typer
 from fleet_slip.cli.output import Json, print_json, print_table, progress, say
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.workers import Cluster, unless_local, workers
-from fleet_slip.errors import DamageError
-from fleet_slip.maintenance.audit import Forgettable
+from fleet_slip.errors import DamageError, PendingError, QuestionError, RefusedError
 from fleet_slip.maintenance.compaction import TARGET_ROWS
 from fleet_slip.maintenance.compaction import compact as compact_logs
 from fleet_slip.maintenance.forget import ForgetReport
@@ -22,8 +23,12 @@ from fleet_slip.maintenance.vacuum import RETENTION_HOURS, VacuumReport, preview
 from fleet_slip.maintenance.vacuum import vacuum as remove_expired
 from fleet_slip.maintenance.verification import Damage, Verification
 from fleet_slip.maintenance.verify import verify as verify_root
-from fleet_slip.runs.log import step
+from fleet_slip.runs.log import recording, step
+from fleet_slip.warehouse.audit import ALLOWED, Audit, Forgettable
 from fleet_slip.warehouse.tables import Warehouse
+
+PENDING_SHOWN = 5
+"""So many are named on a line; --json names all."""
 
 
 def register(app: typer.Typer) -> None:
@@ -54,7 +59,9 @@ def verify(
 
     Exits with 9 if there is damage that was not repaired.
     """
-    with workers(context, cluster) as (warehouse, executor):
+    # What repairs changes the warehouse; what only looks leaves no record.
+    recorded = recording(context.obj.root, "verify", sys.argv[1:]) if repair else nullcontext()
+    with recorded, workers(context, cluster) as (warehouse, executor):
         report = _verify(warehouse, executor, full=full)
         rebuilt: list[str] = []
         if repair:
@@ -173,15 +180,25 @@ def forget(
         bool,
         typer.Option("--now", help="Delete the old files at once, not when vacuum is due."),
     ] = False,
+    allow: Annotated[
+        bool,
+        typer.Option("--allow", help="Let it come back: land its new rows again from now on."),
+    ] = False,
     json: Json = False,
 ) -> None:
     """Forget a vehicle or a drive: in logs, Gram rows and quarantine; mark the models it trained.
 
-    Simulating or ingesting the same again does not bring it back. `fleet-slip run` retrains.
+    No job brings it back, nor one that is under way: its rows are left out, until --allow.
+    `fleet-slip run` retrains. With --now it exits with 12 while anything may be left: repeat it.
     """
     if (vehicle is None) == (drive is None):
         raise typer.BadParameter("give one of --vehicle and --drive.")
+    if allow and now:
+        raise typer.BadParameter("give one of --allow and --now.")
     subject = Forgettable("drive", drive) if drive else Forgettable("vehicle", vehicle or "")
+    if allow:
+        _allow(context.obj, subject, json=json)
+        return
     with step("forget") as figures, progress("forget", "files") as advance:
         report = forget_drives(context.obj, subject, now=now, progress=advance)
         figures.rows = report.rows
@@ -189,6 +206,31 @@ def forget(
         print_json(asdict(report))
     else:
         _say_forgotten(report)
+    if now and report.pending:
+        raise PendingError(
+            f"{len(report.pending)} may still have its rows, in files that no reader sees: "
+            f"{', '.join(report.pending[:PENDING_SHOWN])}. Repeat this command when they have "
+            "ended, or for files of killed jobs after an hour."
+        )
+
+
+def _allow(warehouse: Warehouse, subject: Forgettable, *, json: bool) -> None:
+    audit = Audit(warehouse.root)
+    warehouse.require()
+    state = audit.state(subject)
+    if state is None:
+        raise QuestionError(f"{subject.kind} {subject.value!r} was never forgotten.")
+    if state == "begun":
+        raise RefusedError(
+            f"{subject.kind} {subject.value!r} is being forgotten. Give the command that forgets "
+            "it again, until it is done; then allow it."
+        )
+    if state != ALLOWED:
+        audit.allow(subject)
+    if json:
+        print_json({"allowed": True, "changed": state != ALLOWED})
+    else:
+        say("its new rows are landed again from now on; what was forgotten stays forgotten")
 
 
 def _say_forgotten(report: ForgetReport) -> None:

@@ -8,7 +8,7 @@ import typer
 from fleet_slip.cli.output import Json, print_json, print_table, say
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.signing import signing_key
-from fleet_slip.maintenance.audit import Audit
+from fleet_slip.maintenance.marks import marked_models
 from fleet_slip.models.aliases import CHAMPION
 from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.model_version import ModelVersion
@@ -42,7 +42,7 @@ def models(
     """List the published model versions."""
     context.obj.require()
     registry = registry_of(context.obj)
-    marked = Audit(context.obj.root).marked_models()
+    marked = marked_models(context.obj.root)
     rows = [
         {**row, "trained_on_forgotten": f"{row['name']}@{row['version']}" in marked}
         for row in registry.as_table().to_pylist()

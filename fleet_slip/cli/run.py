@@ -14,7 +14,7 @@ from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.selecting import WorthOption, print_selection
 from fleet_slip.cli.workers import Cluster, Threads, workers
 from fleet_slip.errors import RefusedError
-from fleet_slip.maintenance.audit import Audit
+from fleet_slip.maintenance.marks import marked_models
 from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.publish import Publication, manifest_of, publish
 from fleet_slip.runs.log import step
@@ -102,7 +102,7 @@ def _publish(
     registry = registry_of(context.obj)
     champion = registry.champion(name)
     # What was trained on forgotten drives is replaced, even if the new model is worse.
-    tainted = champion and champion.reference in Audit(context.obj.root).marked_models()
+    tainted = champion and champion.reference in marked_models(context.obj.root)
     try:
         return publish(registry, manifest, answer.selection, force=bool(tainted)), ""
     except RefusedError as error:

@@ -9,9 +9,9 @@ keep, so that damage can be told years later; the same rows are always the same 
 that is made again from its source takes its place without a commit.
 """
 
-from fleet_slip.delta.change import Change, Unit
+from fleet_slip.delta.change import Change, Unit, rows_in
 from fleet_slip.delta.conflicts import retry_conflicts
-from fleet_slip.delta.encoding import Encoded, Encoding
+from fleet_slip.delta.encoding import Encoded, Encoding, only_used_values
 from fleet_slip.delta.files import TableFile, absent_columns
 from fleet_slip.delta.table import Snapshot, Table
 from fleet_slip.files.checksums import checksum_in, checksum_of
@@ -27,5 +27,7 @@ __all__ = [
     "absent_columns",
     "checksum_in",
     "checksum_of",
+    "only_used_values",
     "retry_conflicts",
+    "rows_in",
 ]

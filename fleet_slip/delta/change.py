@@ -1,5 +1,6 @@
 """What one commit does to a table, and which units of work land with it."""
 
+import json
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -49,6 +50,11 @@ class Change:
                 if file.path not in both
             ),
         ]
+
+
+def rows_in(action: AddAction) -> int:
+    """Return the number of rows of a file that an action adds."""
+    return int(json.loads(action.stats)["numRecords"])
 
 
 def addition(path: str, encoded: Encoded, day: date | None) -> AddAction:

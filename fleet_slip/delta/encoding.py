@@ -57,6 +57,14 @@ class Encoding:
         return Encoded(content, checksum_of(content), fast_checksum_of(content), statistics)
 
 
+def only_used_values(rows: pa.Table) -> pa.Table:
+    """Return rows whose dictionaries have the values that occur only, in the order they occur in.
+
+    A file has a dictionary as it is given, the names of rows that were left out with it.
+    """
+    return pa.table({name: _compact(rows[name].combine_chunks()) for name in rows.column_names})
+
+
 def _required(rows: pa.Table) -> pa.Table:
     """Return the rows with columns without a null declared so.
 
@@ -69,3 +77,10 @@ def _required(rows: pa.Table) -> pa.Table:
 def _statistics(rows: pa.Table) -> dict[str, Any]:
     nulls = {name: rows[name].null_count for name in rows.schema.names}
     return {"numRecords": rows.num_rows, "nullCount": nulls}
+
+
+def _compact(column: pa.Array) -> pa.Array:
+    if not pa.types.is_dictionary(column.type):
+        return column
+    codes = column.indices.dictionary_encode()
+    return pa.DictionaryArray.from_arrays(codes.indices, column.dictionary.take(codes.dictionary))

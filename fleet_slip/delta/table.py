@@ -1,7 +1,8 @@
 """A Delta table of a data root, and one version of it: reading, writing files, committing."""
 
+import math
 import uuid
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import date
 from functools import cached_property
@@ -14,7 +15,7 @@ from deltalake.transaction import AddAction
 
 from fleet_slip.delta.change import Change, addition
 from fleet_slip.delta.checkpoints import seal_new_checkpoint
-from fleet_slip.delta.conflicts import is_conflict
+from fleet_slip.delta.conflicts import is_conflict, retry_conflicts
 from fleet_slip.delta.encoding import Encoded, Encoding
 from fleet_slip.delta.files import TableFile, active_files, have_same_columns, read_actions
 from fleet_slip.delta.log_check import require_sound_log
@@ -24,6 +25,9 @@ from fleet_slip.errors import ConflictError
 from fleet_slip.files.checksums import checksum_in
 from fleet_slip.files.folder import Folder
 from fleet_slip.files.storage_errors import first_line, storage_errors
+
+FENCE = "fleet_slip.fence"
+"""Property of a table that is changed so that commits under way are in conflict."""
 
 
 @dataclass(frozen=True)
@@ -86,16 +90,25 @@ class Table:
         """Write a file's content to the file NAME-CHECKSUMS.parquet, durably.
 
         Returns the action that adds it to the table; it is not part of the table before that is
-        committed. Where an interrupted run left a file of that name, it is replaced, or the new one
-        gets a longer name.
+        committed. Where there is a file of that name, of an interrupted run or of another process,
+        the new one gets a longer name. So a file that is not committed is its writer's alone: who
+        deletes it can take it from nobody else.
         """
         path = _file_path(name, encoded, day)
-        if self.folder.reuses_names:
-            self.folder.put(path, encoded.content)
-        else:
-            while not self.folder.create(path, encoded.content):
-                path = _file_path(f"{name}-{uuid.uuid4().hex[:8]}", encoded, day)
+        while not self.folder.create(path, encoded.content):
+            path = _file_path(f"{name}-{uuid.uuid4().hex[:8]}", encoded, day)
         return addition(path, encoded, day)
+
+    def discard(self, actions: Iterable[AddAction]) -> None:
+        """Delete files that this process wrote and a commit has not added, as its conflict told.
+
+        The log is asked first: where the answer to a commit was lost on the way, the attempt is
+        made again and is in conflict with itself.
+        """
+        landed = {file.path for file in Snapshot(self, self.open_delta()).files}
+        for action in actions:
+            if action.path not in landed:
+                self.folder.delete(action.path)
 
     def restore_file(self, file: TableFile, rows: pa.Table) -> bool:
         """Write a file again if rows make the very bytes that its name tells; False if not."""
@@ -108,6 +121,39 @@ class Table:
     def encode(self, rows: pa.Table) -> Encoded:
         """Return the content of a file with these rows."""
         return self.encoding.encode(rows, omitted=self.partition_by)
+
+    def fence(self) -> None:
+        """Make a conflict of every commit that began before now and has not landed.
+
+        It changes a property of the table: Delta refuses a commit that began before a change of
+        metadata. So who commits after this has looked at the table, and at whatever it looks at
+        after that, since now. Raises `ConflictError` if others keep changing the table.
+        """
+        retry_conflicts(self._fence_once)
+
+    def _fence_once(self) -> None:
+        with storage_errors(self.folder):
+            try:
+                delta = self.open_delta() or self.create()
+                delta.alter.set_table_properties(
+                    {FENCE: uuid.uuid4().hex},
+                    raise_if_not_exists=False,
+                    commit_properties=CommitProperties(
+                        custom_metadata={NOTE: seal_note({"job": "fence"}, [], {})}
+                    ),
+                )
+            except CommitFailedError as error:
+                raise self._conflict(error) from None
+            self.folder.settle_commits(delta.version() - 1)
+
+    def _conflict(self, error: CommitFailedError) -> Exception:
+        """Return what a failed commit is to be raised as: a conflict, or the fault that it is."""
+        if not is_conflict(error):
+            return error
+        return ConflictError(
+            f"{self.folder}: another process changed the table at the same moment "
+            f"({first_line(error)}). Run the same command again."
+        )
 
     def create(self) -> DeltaTable:
         """Make the table, and return it as it was made, even if others have written to it since.
@@ -184,12 +230,40 @@ class Snapshot:
             self.delta.update_incremental()
         return self if self.version == version else self.table.snapshot()
 
+    def removed(self, before_hours: float = 0) -> set[str]:
+        """Return the paths of files that a commit removed, so many hours ago or earlier.
+
+        Those of the last week at least; checkpoints forget what was removed before.
+        """
+        if self.delta is None:
+            return set()
+        with storage_errors(self.table.folder):
+            return set(
+                self.delta.vacuum(
+                    math.ceil(before_hours),
+                    dry_run=True,
+                    enforce_retention_duration=False,
+                    full=False,
+                )
+            )
+
     def landed(self, unit_name: str) -> int | None:
         """Return the version of a unit of work that has landed, or None."""
         if self.delta is None:
             return None
         with storage_errors(self.table.folder):
             return self.delta.transaction_version(unit_name)
+
+    def commit_or_discard(self, change: Change) -> None:
+        """Apply a change like `commit`; after a conflict delete the files that it was to add.
+
+        For who writes its files anew in the next attempt.
+        """
+        try:
+            self.commit(change)
+        except ConflictError:
+            self.table.discard(change.add)
+            raise
 
     def commit(self, change: Change) -> None:
         """Apply a change in one atomic commit on top of this snapshot.
@@ -214,12 +288,7 @@ class Snapshot:
                     ),
                 )
             except CommitFailedError as error:
-                if not is_conflict(error):
-                    raise
-                raise ConflictError(
-                    f"{table.folder}: another process changed the table at the same moment "
-                    f"({first_line(error)}). Run the same command again."
-                ) from None
+                raise table._conflict(error) from None
             table.folder.settle_commits(self.version)
             seal_new_checkpoint(table.folder, self.version)
 

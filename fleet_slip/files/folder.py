@@ -82,13 +82,6 @@ class Folder(Protocol):
     def is_local(self) -> bool:
         """Whether its files are in a file system of this machine: read twice, they are the same."""
 
-    @property
-    def reuses_names(self) -> bool:
-        """Whether a data file's name may be written again after it was deleted, or meanwhile.
-
-        Not where `remove` could delete what was written a moment ago under the same name.
-        """
-
     def __truediv__(self, name: str) -> Self:
         """Return a folder below this one."""
 
@@ -127,6 +120,9 @@ class Folder(Protocol):
 
     def remove(self, file: StoredFile) -> bool:
         """Delete the very file that a listing found; False if it is gone or was replaced."""
+
+    def delete(self, path: str) -> None:
+        """Delete a file of a name that no other process writes; nothing if it is gone."""
 
     def settle_commits(self, before: int | None) -> None:
         """Make the commits after a version durable, if the folder is a Delta table."""

@@ -64,11 +64,6 @@ class LocalFolder:
         """Return True."""
         return True
 
-    @property
-    def reuses_names(self) -> bool:
-        """Return True: `remove` deletes the very file that was found."""
-        return True
-
     def __truediv__(self, name: str) -> Self:
         """Return a folder below this one."""
         return type(self)(self.path / name)
@@ -141,10 +136,12 @@ class LocalFolder:
     def remove(self, file: StoredFile) -> bool:
         """Delete the very file that a listing found; False if it is gone or was replaced.
 
-        A job may be writing a file of the same name and bytes at this moment. So the file is moved
-        aside first; if it is not the one that was found it is put back.
+        A repair may write a file of the same name at this moment. So the file is looked at before
+        it is moved aside, and again after it; if it is not the one that was found it is put back.
         """
         path = self.path / file.path
+        if self._judge(path) != file:
+            return False
         aside = path.with_name(f"{TEMPORARY_PREFIX}{uuid.uuid4().hex}")
         with storage_errors(path):
             try:
@@ -158,6 +155,11 @@ class LocalFolder:
                     path.hardlink_to(aside)
             aside.unlink()
         return same
+
+    def delete(self, path: str) -> None:
+        """Delete a file of a name that no other process writes; nothing if it is gone."""
+        with storage_errors(self.path / path):
+            (self.path / path).unlink(missing_ok=True)
 
     def settle_commits(self, before: int | None) -> None:
         """Make the commits to this table after a version durable: the Delta library does not."""

@@ -81,11 +81,6 @@ class ObjectFolder:
         return False
 
     @property
-    def reuses_names(self) -> bool:
-        """Whether a name may be written again: `remove` may delete what is written meanwhile."""
-        return False
-
-    @property
     def delta_options(self) -> dict[str, str] | None:
         """Options of the Delta library; credentials it finds where we do."""
         profile = _profile(self.bucket)
@@ -176,7 +171,7 @@ class ObjectFolder:
         """Delete the very file that a listing found; False if it is gone or was replaced.
 
         It is looked at first. What is written between looking and deleting would be deleted, so
-        that no name of a data file is used twice (`reuses_names`).
+        that no name of a data file is used twice (`Table.put`).
         """
         with object_errors(str(file)):
             try:
@@ -187,6 +182,11 @@ class ObjectFolder:
                 return False
             obstore.delete(self._store, self._key(file.path))
         return True
+
+    def delete(self, path: str) -> None:
+        """Delete a file of a name that no other process writes; nothing if it is gone."""
+        with object_errors(f"{self}/{path}"), contextlib.suppress(FileNotFoundError):
+            obstore.delete(self._store, self._key(path))
 
     def settle_commits(self, before: int | None) -> None:
         """Make commits durable, as they are."""

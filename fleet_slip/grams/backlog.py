@@ -1,5 +1,6 @@
 """How the tables `logs` and `grams` differ."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import pyarrow.compute as pc
@@ -10,6 +11,9 @@ from fleet_slip.delta import (
     TableFile,
 )
 
+BEING_WRITTEN_HOURS = 1.0
+"""A file that no commit ever knew and that is younger may belong to a job that is running."""
+
 
 @dataclass(frozen=True)
 class Backlog:
@@ -18,7 +22,7 @@ class Backlog:
     missing: tuple[TableFile, ...]
     """Log files without Gram rows of the feature set."""
     stale: frozenset[str]
-    """Paths in `grams`, of any set, that are no active log file."""
+    """Paths in `grams`, of any set, that are no active log file, and none that may become one."""
 
 
 def find_backlog(logs: Snapshot, grams: Snapshot, identity: str = PLAIN) -> Backlog:
@@ -26,6 +30,16 @@ def find_backlog(logs: Snapshot, grams: Snapshot, identity: str = PLAIN) -> Back
 
     `identity` is that of a feature set, as its Gram rows carry it.
     """
+    done, named = named_files(grams, identity)
+    active = {file.path for file in logs.files}
+    return Backlog(
+        missing=tuple(file for file in logs.files if file.path not in done),
+        stale=frozenset(named - active - _about_to_land(logs, named - active)),
+    )
+
+
+def named_files(grams: Snapshot, identity: str) -> tuple[set[str], set[str]]:
+    """Return the log files that Gram rows of a feature set name, and those that any name."""
     done: set[str] = set()
     named: set[str] = set()
     for file in grams.files:
@@ -33,8 +47,19 @@ def find_backlog(logs: Snapshot, grams: Snapshot, identity: str = PLAIN) -> Back
         named.update(rows["file"].unique().to_pylist())
         mine = rows.filter(pc.equal(rows["feature_set"], identity))
         done.update(mine["file"].unique().to_pylist())
-    active = {file.path for file in logs.files}
-    return Backlog(
-        missing=tuple(file for file in logs.files if file.path not in done),
-        stale=frozenset(named - active),
-    )
+    return done, named
+
+
+def _about_to_land(logs: Snapshot, paths: Collection[str]) -> set[str]:
+    """Return the log files among some that a job has written just now and not committed yet.
+
+    Their Gram rows land first, so that readers see a file and its Gram rows at the same moment.
+    """
+    if not paths:
+        return set()
+    written = {
+        file.path
+        for file in logs.table.folder.files()
+        if file.path in paths and file.age_hours < BEING_WRITTEN_HOURS
+    }
+    return written - logs.removed() if written else set()

@@ -94,7 +94,7 @@ def _update_once(
         new_rows = aggregate(warehouse, backlog.missing, progress, None, feature_set, executor)
         replaced = files_to_rewrite(grams, backlog.stale)
         kept = rows_to_keep(grams, replaced, backlog.stale)
-        grams.commit(
+        grams.commit_or_discard(
             Change(
                 add=write_rows(warehouse, chain(kept, [new_rows])),
                 remove=replaced,

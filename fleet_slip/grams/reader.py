@@ -2,7 +2,6 @@
 
 import contextlib
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Self
 
@@ -10,12 +9,12 @@ import duckdb
 import pyarrow as pa
 
 from fleet_slip.catalogue.features import PLAIN, features
-from fleet_slip.delta.table import Snapshot, Table
+from fleet_slip.delta.table import Snapshot
 from fleet_slip.errors import DataError
 from fleet_slip.grams.backlog import find_backlog
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.condition import Condition, asking
-from fleet_slip.warehouse.table_views import lock, open_tables
+from fleet_slip.warehouse.table_views import gram_snapshots, lock, open_tables
 from fleet_slip.warehouse.tables import Warehouse
 
 BATCH_ROWS = 2**13
@@ -70,14 +69,10 @@ class GramReader:
         Raises `DataError` if there are no Gram rows, or if those of the feature set are not
         complete.
         """
-        # The Delta library reads the log of many files on one core while DuckDB starts on another.
-        with ThreadPoolExecutor(1) as other:
-            renewing = other.submit(_newest, self._logs, self._warehouse.logs)
-            grams = _newest(self._grams, self._warehouse.grams)
-            if grams is not self._grams:
-                self._close()
-            database = self._connected(grams)
-            logs = renewing.result()
+        grams, logs = gram_snapshots(self._warehouse, self._grams, self._logs)
+        if grams is not self._grams or logs is not self._logs:
+            self._close()
+        database = self._connected(grams, logs)
         self._logs, self._grams = logs, grams
         if not grams.rows:
             raise DataError(
@@ -89,9 +84,9 @@ class GramReader:
             _require_complete(logs, grams, feature_set, identity)
         return OpenedGrams(database, identity, logs.version or 0, grams.version or 0)
 
-    def _connected(self, grams: Snapshot) -> duckdb.DuckDBPyConnection:
+    def _connected(self, grams: Snapshot, logs: Snapshot) -> duckdb.DuckDBPyConnection:
         if self._database is None:
-            self._database = open_tables(self._warehouse, {"grams"}, [grams])
+            self._database = open_tables(self._warehouse, {"grams"}, [grams, logs])
             lock(self._database, grams.paths)
         return self._database
 
@@ -109,10 +104,6 @@ def open_grams(source: Warehouse | GramReader, feature_set: str) -> Iterator[Ope
     else:
         with GramReader(source) as reader:
             yield reader.opened(feature_set)
-
-
-def _newest(before: Snapshot | None, table: Table) -> Snapshot:
-    return before.renewed() if before else table.snapshot()
 
 
 def _require_complete(logs: Snapshot, grams: Snapshot, feature_set: str, identity: str) -> None:

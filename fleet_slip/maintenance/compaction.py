@@ -1,16 +1,16 @@
 """Turns small log files of a day into large ones.
 
-The Gram rows follow by the reconciliation of the Gram job, which reads the new files: a tenth of
-the time that writing them took. Until then those of the old files stand, of the same drives.
+The Gram rows of the new files are computed from them, a tenth of the time that writing them took,
+and land before they do; those of the old files are dropped by the reconciliation of the Gram job.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import date
 
-from fleet_slip.delta import Change, Snapshot, TableFile, retry_conflicts
+from fleet_slip.delta import Snapshot, TableFile, retry_conflicts
 from fleet_slip.grams.job import reconcile
-from fleet_slip.maintenance.rewriting import read_drives
+from fleet_slip.maintenance.rewriting import Rewriting, rewrite
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -71,17 +71,12 @@ def _compact_day(warehouse: Warehouse, day: date, target_rows: int) -> int:
         snapshot = warehouse.logs.snapshot()
         packs = list(_packs(_small_files(snapshot, day, target_rows), target_rows))
         if packs:
-            actions = [
-                warehouse.logs.write_file("compact", read_drives(warehouse.logs, pack), day)
-                for pack in packs
-            ]
-            snapshot.commit(
-                Change(
-                    add=[replace(action, data_change=False) for action in actions],
-                    remove=[file for pack in packs for file in pack],
-                    note={"job": "compact", "day": day.isoformat()},
-                    data_change=False,
-                )
+            rewrite(
+                warehouse,
+                snapshot,
+                [Rewriting("compact", pack) for pack in packs],
+                note={"job": "compact", "day": day.isoformat()},
+                data_change=False,
             )
         return sum(file.rows for pack in packs for file in pack)
 

@@ -7,9 +7,9 @@ import pyarrow.compute as pc
 
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.delta import Snapshot
-from fleet_slip.maintenance.audit import Forgettable
 from fleet_slip.maintenance.old_files import rows_of
 from fleet_slip.resources import read_sql
+from fleet_slip.warehouse.audit import Forgettable
 from fleet_slip.warehouse.database import open_database, reading_files
 
 FILES_PER_QUERY = 256

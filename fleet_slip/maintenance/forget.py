@@ -2,8 +2,13 @@
 
 Their rows leave `quarantine`, `logs` and `grams`, in this order, so that an interrupted job finds
 by what is left what it still has to do. The log files concerned are written again without them,
-in one commit; the Gram rows follow by reconciliation. `fleet_slip/maintenance/audit.py` is the
+in one commit; the Gram rows follow by reconciliation. `fleet_slip/warehouse/audit.py` is the
 record of it.
+
+Jobs under way neither undo nor outlive it. The record is written first, then quarantine and logs
+are fenced: a commit that has not seen the record is a conflict. Once the logs are without the
+drives the Gram rows are fenced: a commit of Gram rows that has not seen the logs without them is
+a conflict. What such jobs have written is never committed, and deleted by them or here.
 """
 
 from collections.abc import Collection
@@ -12,17 +17,19 @@ from dataclasses import dataclass
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from fleet_slip.delta import Change, retry_conflicts
+from fleet_slip.delta import Change, retry_conflicts, rows_in
 from fleet_slip.errors import FleetSlipError, QuestionError
 from fleet_slip.grams.job import reconcile
-from fleet_slip.maintenance.audit import Audit, Forgettable
 from fleet_slip.maintenance.find_drives import Located, drives_by_file, locate
-from fleet_slip.maintenance.old_files import find_old_files, quarantined_of
-from fleet_slip.maintenance.rewriting import read_drives
+from fleet_slip.maintenance.marks import newest_versions
+from fleet_slip.maintenance.old_files import quarantined_of, remove_old_files
+from fleet_slip.maintenance.rewriting import Rewriting, rewrite
 from fleet_slip.models.manifest import TrainedOn
 from fleet_slip.models.versions import Registry
 from fleet_slip.progress import Progress, no_progress
+from fleet_slip.runs.history import runs_under_way
 from fleet_slip.views import connect
+from fleet_slip.warehouse.audit import ALLOWED, Audit, Forgettable
 from fleet_slip.warehouse.condition import asking, parse_condition
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -41,6 +48,8 @@ class ForgetReport:
     old_files_deleted: int
     old_files_left: int
     """Files with the drives that no version refers to, kept for readers of the last week."""
+    pending: tuple[str, ...] = ()
+    """Files below the root, and runs, that may still have the drives: repeat it when they ended."""
 
     @property
     def changed(self) -> bool:
@@ -70,25 +79,45 @@ def forget(
             'fleet-slip sql "SELECT drive_id, vehicle_id, day FROM drives"'
         )
     models = audit.models_of(subject)
-    if drives and state != "begun":
-        models = models_trained_on(warehouse, drives)
-        audit.begin(subject, len(drives), models)
+    if state == ALLOWED or (drives and state != "begun"):
+        models = _begin(warehouse, audit, subject, drives)
+    for table in (warehouse.quarantine, warehouse.logs):
+        if drives or state:
+            table.fence()
+    landed = _drives_of(warehouse, subject, located)
+    if not landed <= drives:  # they landed before the fence
+        drives |= landed
+        models = _begin(warehouse, audit, subject, drives)
     _forget_quarantined(warehouse, subject, drives)
     rows, rewritten, removed = _rewrite_logs(warehouse, subject, located, progress)
+    if drives or state:
+        warehouse.grams.fence()
+    uncommitted = remove_old_files(warehouse, subject, delete=False)
     reconcile(warehouse)
-    old = find_old_files(warehouse, subject)
-    deleted = sum(file.folder.remove(file) for file in old) if now else 0
-    if drives or state == "begun":
-        audit.end(subject)
+    old = remove_old_files(warehouse, subject, delete=now)
+    if drives or state in ("begun", ALLOWED):
+        audit.end(subject, warehouse.grams.snapshot().version)
+    under_way = [f"the run {run}" for run in runs_under_way(warehouse.root)] if now else []
     return ForgetReport(
         drives=len(drives),
         rows=rows,
         files_rewritten=rewritten,
         files_removed=removed,
         models=tuple(models),
-        old_files_deleted=deleted,
-        old_files_left=len(old) - deleted,
+        old_files_deleted=uncommitted.deleted + old.deleted,
+        old_files_left=old.kept,
+        pending=(*old.pending, *under_way) if drives or state else (),
     )
+
+
+def _begin(
+    warehouse: Warehouse, audit: Audit, subject: Forgettable, drives: Collection[str]
+) -> list[str]:
+    """Record what is to be forgotten; return the model versions that were trained on it."""
+    judged = newest_versions(warehouse.root)
+    models = models_trained_on(warehouse, drives)
+    audit.begin(subject, len(drives), models, judged)
+    return models
 
 
 def _drives_of(warehouse: Warehouse, subject: Forgettable, located: Located) -> frozenset[str]:
@@ -113,16 +142,16 @@ def _rewrite_logs(
         concerned = [file for file in logs.files if file.path in drives]
         if not concerned:
             return 0, 0, 0
-        actions = []
-        rows = sum(file.rows for file in concerned)
-        for file in concerned:
-            kept = read_drives(warehouse.logs, [file], without=drives[file.path])
-            if kept.num_rows:
-                actions.append(warehouse.logs.write_file("kept", kept, file.day))
-                rows -= kept.num_rows
-            progress(1, len(concerned))
-        logs.commit(Change(add=actions, remove=concerned, note={"job": "forget"}))
-        return rows, len(actions), len(concerned) - len(actions)
+        kept = rewrite(
+            warehouse,
+            logs,
+            [Rewriting("kept", [file], drives[file.path]) for file in concerned],
+            note={"job": "forget"},
+            data_change=True,
+            progress=progress,
+        )
+        rows = sum(file.rows for file in concerned) - sum(map(rows_in, kept))
+        return rows, len(kept), len(concerned) - len(kept)
 
     return retry_conflicts(attempt)
 
@@ -141,7 +170,7 @@ def _forget_quarantined(
                 if kept.num_rows:
                     add.append(warehouse.quarantine.write_file("kept", kept))
         if remove:
-            snapshot.commit(Change(add=add, remove=remove, note={"job": "forget"}))
+            snapshot.commit_or_discard(Change(add=add, remove=remove, note={"job": "forget"}))
 
     if drives:
         retry_conflicts(attempt)

@@ -26,7 +26,7 @@ import pyarrow as pa
 from deltalake import CommitProperties, DeltaTable, Field
 from deltalake.exceptions import CommitFailedError
 from deltalake.schema import Schema
-from deltalake.transaction import AddAction, RemoveAction
+from deltalake.transaction import AddAction
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import IntArray
@@ -36,6 +36,7 @@ from fleet_slip.delta.schema import SCALE, TARGET, Evolution, compare_schemas, s
 from fleet_slip.delta.sealing import NOTE, seal_note
 from fleet_slip.errors import ConflictError, RefusedError, StorageError
 from fleet_slip.files.storage_errors import storage_errors
+from fleet_slip.grams.ahead import land_ahead
 from fleet_slip.maintenance.rewriting import read_drives
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.tables import Warehouse
@@ -78,7 +79,7 @@ def migrate(warehouse: Warehouse, progress: Progress = no_progress) -> Migration
         _add_columns(table, delta, found)
     if found.rescaled:
         _announce(table, found)
-        files, rows = _rescale(table, found, progress)
+        files, rows = _rescale(warehouse, found, progress)
     elif found.migrating:
         _settle(table)
     version = _now(table).version()
@@ -131,24 +132,30 @@ def _settle(table: Table) -> None:
                 delta.alter.set_column_metadata(field.name, {TARGET: ""})
 
 
-def _rescale(table: Table, found: Evolution, progress: Progress) -> tuple[int, int]:
+def _rescale(warehouse: Warehouse, found: Evolution, progress: Progress) -> tuple[int, int]:
+    table = warehouse.logs
     delta = _now(table)
     before = Snapshot(table, delta)
     ratios = {n: Fraction(old) / Fraction(new) for n, (old, new) in found.rescaled.items()}
-    actions: list[AddAction | RemoveAction] = []
-    for file in before.files:
-        actions.append(_rewrite(table, file, ratios))
-        progress(file.rows, before.rows)
-    with storage_errors(table.folder), _conflicts(table):
-        delta.create_write_transaction(
-            actions,
-            mode="overwrite",
-            schema=table.schema,
-            partition_by=list(table.partition_by),
-            commit_properties=CommitProperties(
-                custom_metadata={NOTE: seal_note({"job": "migrate"}, actions, {})}
-            ),
-        )
+    actions: list[AddAction] = []
+    try:
+        for file in before.files:
+            actions.append(_rewrite(table, file, ratios))
+            progress(file.rows, before.rows)
+        land_ahead(warehouse, actions, before.files)
+        with storage_errors(table.folder), _conflicts(table):
+            delta.create_write_transaction(
+                list(actions),
+                mode="overwrite",
+                schema=table.schema,
+                partition_by=list(table.partition_by),
+                commit_properties=CommitProperties(
+                    custom_metadata={NOTE: seal_note({"job": "migrate"}, actions, {})}
+                ),
+            )
+    except (ConflictError, RefusedError):
+        table.discard(actions)
+        raise
     return len(actions), before.rows
 
 

@@ -1,6 +1,7 @@
 """Files on disk that no version of a table refers to any more, and the drives that they hold."""
 
 from collections.abc import Collection, Iterator
+from dataclasses import dataclass, replace
 from datetime import date
 
 import pyarrow as pa
@@ -9,39 +10,99 @@ import pyarrow.compute as pc
 from fleet_slip.delta import Snapshot
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.files.folder import StoredFile
-from fleet_slip.maintenance.audit import Forgettable
-from fleet_slip.maintenance.vacuum import find_replaced, find_unreferenced
+from fleet_slip.grams.backlog import BEING_WRITTEN_HOURS
+from fleet_slip.maintenance.vacuum import find_replaced, find_temporary_files, find_unreferenced
+from fleet_slip.warehouse.audit import Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 
-BEING_WRITTEN_HOURS = 1.0
-"""A file that no commit ever knew and that is younger may belong to a job that is running."""
+
+@dataclass(frozen=True)
+class OldFiles:
+    """What became of the files that no version refers to and that have some drives."""
+
+    deleted: int
+    kept: int
+    """Replaced files, which readers of the last week may need."""
+    pending: tuple[str, ...]
+    """Files that may be being written, and may have the drives: they are left alone."""
 
 
-def find_old_files(warehouse: Warehouse, subject: Forgettable) -> list[StoredFile]:
+def remove_old_files(warehouse: Warehouse, subject: Forgettable, *, delete: bool) -> OldFiles:
+    """Delete the files with the drives that no version refers to; `delete` the replaced ones, too.
+
+    What was never committed is deleted at once: since the fence no commit can land a row of a
+    forgotten car or drive, so that whoever wrote the file will be told. Drives before a day are not
+    barred; there a file younger than an hour is left to its writer.
+    """
+    old = find_old_files(warehouse, subject)
+    young = [one.file for one in old if one.is_young and subject.kind == "before"]
+    deleted, kept, pending = 0, 0, [str(file) for file in young]
+    for one in old:
+        if one.file in young:
+            continue
+        if one.replaced and not delete:
+            kept += 1
+        elif one.file.folder.remove(one.file):
+            deleted += 1
+        else:
+            pending.append(str(one.file))
+    gone, left = _remove_half_written(warehouse)
+    names = [name.removeprefix(f"{warehouse.root}/") for name in (*pending, *left)]
+    return OldFiles(deleted + gone, kept, tuple(names))
+
+
+def find_old_files(warehouse: Warehouse, subject: Forgettable) -> list["OldFile"]:
     """Return the files with the drives that no version refers to, in the order of deletion.
 
     The logs come last: their old files may be all that tells the drives of a car in the quarantine.
     """
     logs = list(_with_subject(warehouse.logs.snapshot(), subject))
-    drives = {drive for _, names in logs for drive in names}
+    drives = {drive for one in logs for drive in one.drives}
     old = list(_of_quarantine(warehouse.quarantine.snapshot(), subject, drives))
-    old += [file for file, _ in _with_subject(warehouse.grams.snapshot(), subject)]
-    return old + [file for file, _ in logs]
+    return [*old, *_with_subject(warehouse.grams.snapshot(), subject), *logs]
 
 
-def _readable(snapshot: Snapshot) -> Iterator[tuple[StoredFile, pa.Table]]:
-    """Yield replaced files and leftovers that are not being written, with what tells the drives."""
+def _remove_half_written(warehouse: Warehouse) -> tuple[int, list[str]]:
+    """Delete what killed writers left under temporary names, but for what may be being written."""
+    gone, left = 0, []
+    tables = {table.folder.name for table in warehouse.tables}
+    for file in find_temporary_files(warehouse):
+        table, *folders, _ = file.path.split("/")
+        if table not in tables or "_delta_log" in folders:
+            continue
+        if file.age_hours < BEING_WRITTEN_HOURS:
+            left.append(str(file))
+        else:
+            gone += file.folder.remove(file)
+    return gone, left
+
+
+@dataclass(frozen=True)
+class OldFile:
+    """A file that no version refers to: whether a commit removed it, and the drives concerned."""
+
+    file: StoredFile
+    replaced: bool
+    rows: pa.Table
+    drives: frozenset[str] = frozenset()
+
+    @property
+    def is_young(self) -> bool:
+        """Whether it may belong to a job that is running."""
+        return not self.replaced and self.file.age_hours < BEING_WRITTEN_HOURS
+
+
+def _readable(snapshot: Snapshot) -> Iterator[OldFile]:
+    """Yield replaced files and leftovers, with what tells the drives."""
     known = find_replaced(snapshot)
     wanted = {"drive_id", "vehicle_id", "day"}
     for file in find_unreferenced(snapshot.table):
-        if file.path not in known and file.age_hours < BEING_WRITTEN_HOURS:
-            continue
         try:
             names = snapshot.table.read_metadata(file.path).schema.to_arrow_schema().names
             rows = snapshot.table.read(file.path, [name for name in names if name in wanted])
         except FleetSlipError:
             continue  # half a file, or just deleted
-        yield file, _with_day(file, rows)
+        yield OldFile(file, file.path in known, _with_day(file, rows))
 
 
 def _with_day(file: StoredFile, rows: pa.Table) -> pa.Table:
@@ -52,21 +113,19 @@ def _with_day(file: StoredFile, rows: pa.Table) -> pa.Table:
     return rows.append_column("day", pa.repeat(date.fromisoformat(day), rows.num_rows))
 
 
-def _with_subject(
-    snapshot: Snapshot, subject: Forgettable
-) -> Iterator[tuple[StoredFile, frozenset[str]]]:
-    for file, rows in _readable(snapshot):
-        names = rows.filter(rows_of(rows, subject))["drive_id"].unique().to_pylist()
+def _with_subject(snapshot: Snapshot, subject: Forgettable) -> Iterator[OldFile]:
+    for one in _readable(snapshot):
+        names = one.rows.filter(rows_of(one.rows, subject))["drive_id"].unique().to_pylist()
         if names:
-            yield file, frozenset(names)
+            yield replace(one, drives=frozenset(names))
 
 
 def _of_quarantine(
     snapshot: Snapshot, subject: Forgettable, drives: Collection[str]
-) -> Iterator[StoredFile]:
-    for file, rows in _readable(snapshot):
-        if pc.any(quarantined_of(rows, subject, drives)).as_py():
-            yield file
+) -> Iterator[OldFile]:
+    for one in _readable(snapshot):
+        if pc.any(quarantined_of(one.rows, subject, drives)).as_py():
+            yield one
 
 
 def rows_of(rows: pa.Table, subject: Forgettable) -> pa.ChunkedArray:

@@ -1,7 +1,8 @@
 """Rebuilds what can be rebuilt: Gram rows from the logs, simulated logs from their campaign.
 
-Nothing is deleted that was not rebuilt. A log file is simulated again under the name that the
-Delta log knows; since the name has the file's checksum, it is the same file or it is refused.
+Nothing is deleted that was not rebuilt. A file whose bytes are there under another name is put
+back; a log file is simulated again under the name that the Delta log knows; since the name has the
+file's checksum, it is the same file or it is refused.
 """
 
 import contextlib
@@ -11,14 +12,14 @@ from datetime import date
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from fleet_slip.delta import Change, TableFile, retry_conflicts
+from fleet_slip.delta import Change, TableFile, checksum_in, checksum_of, retry_conflicts
 from fleet_slip.delta.checkpoints import (
     checkpoint_faults,
     list_dispensable,
     remove_checkpoint,
     seal_checkpoints,
 )
-from fleet_slip.errors import FleetSlipError
+from fleet_slip.errors import FleetSlipError, StorageError
 from fleet_slip.files.storage_errors import storage_errors
 from fleet_slip.grams.job import reconcile
 from fleet_slip.maintenance.verification import Verification
@@ -40,7 +41,9 @@ def repair(
     rebuilt = _sum_up_again(warehouse)
     damaged = {finding.path for finding in verification.damage if finding.kind == "file"}
     wrong = {f.path.removeprefix("logs/") for f in verification.damage if f.kind == "gram"}
-    rebuilt += _simulate_again(warehouse, damaged, campaigns)
+    found = _find_elsewhere(warehouse, damaged)
+    rebuilt += found
+    rebuilt += _simulate_again(warehouse, damaged - set(found), campaigns)
     rebuilt += _aggregate_again(warehouse, damaged, wrong)
     return rebuilt
 
@@ -59,6 +62,29 @@ def _sum_up_again(warehouse: Warehouse) -> list[str]:
                     delta.create_checkpoint()
                 seal_checkpoints(table.folder, again=f"{delta.version():020}.checkpoint.parquet")
             rebuilt.append(f"{table.folder.name}/_delta_log/{fault.name}")
+    return rebuilt
+
+
+def _find_elsewhere(warehouse: Warehouse, damaged: Collection[str]) -> list[str]:
+    """Put back the files whose very bytes are below their table under another name.
+
+    A killed job may have left them there, or a person who saved them.
+    """
+    rebuilt = []
+    for table in warehouse.tables:
+        name = table.folder.name
+        lost = [file for file in table.snapshot().files if f"{name}/{file.path}" in damaged]
+        sizes = {file.size_bytes for file in lost}
+        for other in table.folder.files() if lost else ():
+            if other.size_bytes not in sizes or other.path.startswith("_delta_log/"):
+                continue
+            with contextlib.suppress(StorageError):
+                content = table.folder.read(other.path)
+                for file in lost:
+                    if checksum_in(file.path) == checksum_of(content):
+                        table.folder.put(file.path, content)
+                        rebuilt.append(f"{name}/{file.path}")
+                lost = [file for file in lost if f"{name}/{file.path}" not in rebuilt]
     return rebuilt
 
 

@@ -7,11 +7,11 @@ from pydantic import Field
 
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import ConfigError, RefusedError
-from fleet_slip.maintenance.audit import Forgettable
 from fleet_slip.maintenance.forget import ForgetReport, forget
 from fleet_slip.maintenance.vacuum import RETENTION_HOURS, VacuumReport, vacuum
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.resources import find_config, folder
+from fleet_slip.warehouse.audit import Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 
 

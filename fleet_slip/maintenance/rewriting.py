@@ -5,14 +5,69 @@ dictionary holds only values that occur. So the bytes of a file follow from its 
 was compacted or rewritten can be simulated again and is the same file.
 """
 
-from collections.abc import Collection, Sequence
+import dataclasses
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from deltalake.transaction import AddAction
 
 from fleet_slip.arrays import IntArray
-from fleet_slip.delta import Table, TableFile
+from fleet_slip.delta import Change, Snapshot, Table, TableFile, Unit, only_used_values
+from fleet_slip.errors import FleetSlipError
+from fleet_slip.grams.ahead import land_ahead
+from fleet_slip.progress import Progress, no_progress
+from fleet_slip.warehouse.tables import Warehouse
+
+
+@dataclass(frozen=True)
+class Rewriting:
+    """Files of one day that become one, named after what is done, without some drives."""
+
+    name: str
+    files: Sequence[TableFile]
+    without: Collection[str] = ()
+
+
+def rewrite(
+    warehouse: Warehouse,
+    logs: Snapshot,
+    rewritings: Sequence[Rewriting],
+    *,
+    note: Mapping[str, Any],
+    data_change: bool,
+    progress: Progress = no_progress,
+) -> list[AddAction]:
+    """Exchange log files, and with them their Gram rows, in one commit on top of a snapshot.
+
+    Returns what was added; nothing for files without a drive that is kept. `progress` counts
+    rewritings. After a conflict the new files are deleted; raises `ConflictError` then, and
+    `StorageError`.
+    """
+    new: list[AddAction] = []
+    replaced = [file for one in rewritings for file in one.files]
+    try:
+        for one in rewritings:
+            rows = read_drives(logs.table, one.files, one.without)
+            if rows.num_rows:
+                action = logs.table.write_file(one.name, rows, one.files[0].day)
+                new.append(dataclasses.replace(action, data_change=data_change))
+            progress(1, len(rewritings))
+        land_ahead(warehouse, new, replaced)
+    except FleetSlipError:
+        logs.table.discard(new)
+        raise
+    # The Delta library takes files that were removed without a change of data for still there. Two
+    # commits that rewrite files of a day are told of each other by the unit that both land.
+    days = sorted({str(file.day) for file in replaced})
+    units = [Unit(f"rewrite/{day}", (logs.version or 0) + 1) for day in days]
+    logs.commit_or_discard(
+        Change(add=new, remove=replaced, units=units, note=note, data_change=data_change)
+    )
+    return new
 
 
 def read_drives(
@@ -27,7 +82,7 @@ def read_drives(
     order = _order(rows)
     if (np.diff(order) != 1).any():
         rows = rows.take(order)
-    return pa.table({name: _compact(rows[name].combine_chunks()) for name in rows.column_names})
+    return only_used_values(rows)
 
 
 def _read(table: Table, file: TableFile, without: Collection[str]) -> pa.Table:
@@ -57,11 +112,3 @@ def _order(rows: pa.Table) -> IntArray:
     rank = np.argsort(np.argsort(np.array(ids.dictionary.to_pylist(), dtype=object)))
     drive = rank[ids.indices.to_numpy()] if len(rank) else np.empty(0, dtype=np.int64)
     return np.lexsort((rows["tick"].to_numpy(), drive))
-
-
-def _compact(column: pa.Array) -> pa.Array:
-    """Return a dictionary column with the values that occur only, in the order they occur in."""
-    if not pa.types.is_dictionary(column.type):
-        return column
-    codes = column.indices.dictionary_encode()
-    return pa.DictionaryArray.from_arrays(codes.indices, column.dictionary.take(codes.dictionary))

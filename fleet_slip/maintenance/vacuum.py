@@ -5,14 +5,12 @@ then goes on undisturbed; and while it is younger than that, because a job may b
 it. A clock that was set back keeps files longer. Files of a table without a Delta log all stay.
 """
 
-import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from fleet_slip.delta import Snapshot, Table
 from fleet_slip.files.folder import TEMPORARY_PREFIX, StoredFile
-from fleet_slip.files.storage_errors import storage_errors
 from fleet_slip.runs.history import gather_runs
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -98,18 +96,9 @@ _OF_DELTA = re.compile(r"[^/]+/_delta_log/[^/]*#[^/]*")
 
 def find_replaced(snapshot: Snapshot) -> set[str]:
     """Return the paths of files that a commit removed from a table, ever."""
-    return set(_removed_before(snapshot, 0))
+    return snapshot.removed()
 
 
 def removed_since(snapshot: Snapshot, hours: float) -> set[str]:
     """Return the paths of files that a commit of the last hours removed from a table."""
-    return find_replaced(snapshot) - set(_removed_before(snapshot, hours))
-
-
-def _removed_before(snapshot: Snapshot, hours: float) -> Iterator[str]:
-    if snapshot.delta is None:
-        return
-    with storage_errors(snapshot.table.folder):
-        yield from snapshot.delta.vacuum(
-            math.ceil(hours), dry_run=True, enforce_retention_duration=False, full=False
-        )
+    return snapshot.removed() - snapshot.removed(hours)

@@ -1,7 +1,5 @@
 """The health of a warehouse on one page: freshness, backlog, last runs, disk, champions."""
 
-import os
-import socket
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, date, datetime, timedelta
@@ -17,7 +15,7 @@ from fleet_slip.grams.backlog import find_backlog
 from fleet_slip.models.versions import Registry
 from fleet_slip.monitoring.thresholds import StatusThresholds, thresholds
 from fleet_slip.resources import read_sql
-from fleet_slip.runs.history import lend_runs, run_source
+from fleet_slip.runs.history import lend_runs, run_source, state_of
 from fleet_slip.warehouse.database import database_errors, open_database
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -166,25 +164,7 @@ def _last_runs(root: Folder, now: datetime) -> list[dict[str, Any]]:
         runs = lend_runs(root, database, since=f"{now - REMEMBERED:%Y-%m}")
         database.execute(view.format(stored_runs=run_source(database, runs)))
         rows = database.sql(read_sql("jobs", "last_runs.sql")).to_arrow_table().to_pylist()
-    return [row | {"state": _state(row)} for row in rows]
-
-
-def _state(run: Mapping[str, Any]) -> str:
-    """Return done, failed, interrupted, running, or killed: no outcome, and its process is gone.
-
-    Of another machine's process nothing is known: it is said to be running.
-    """
-    if run["outcome"] is not None:
-        return str(run["outcome"])
-    if run["host"] != socket.gethostname():
-        return "running"
-    try:
-        os.kill(run["process"], 0)
-    except ProcessLookupError:
-        return "killed"
-    except (PermissionError, TypeError):
-        return "running"
-    return "running"
+    return [row | {"state": state_of(row)} for row in rows]
 
 
 def _champions(

@@ -9,17 +9,25 @@ whatever gatherers do at once, or are killed at, every record is there once or m
 `runs` counts a run by its name. A reader whose files are gathered meanwhile lists them again.
 """
 
+import contextlib
 import hashlib
+import json
+import os
+import socket
 from collections import defaultdict
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime, timedelta
+from typing import Any
 
 import duckdb
 
 from fleet_slip.files.folder import Folder, StoredFile
 from fleet_slip.resources import read_sql
-from fleet_slip.runs.log import FOLDER, RECORD_COLUMNS
+from fleet_slip.runs.log import FOLDER, RECORD_COLUMNS, current_run_id
 
 REMOVALS_AT_ONCE = 16
+RUNNING = "running"
 
 
 def lend_runs(root: Folder, database: duckdb.DuckDBPyConnection, since: str = "") -> list[str]:
@@ -28,6 +36,47 @@ def lend_runs(root: Folder, database: duckdb.DuckDBPyConnection, since: str = ""
     `since` is the first month that is wanted, as YYYY-MM.
     """
     return (root / FOLDER).lend(database, lambda path: _is_record(path) and path >= since)
+
+
+def runs_under_way(root: Folder) -> list[str]:
+    """Return the names of other runs that began within a day and may not have ended.
+
+    Of this machine, a run whose process is gone is over; of another machine nothing is known.
+    """
+    since = datetime.now(UTC) - timedelta(days=1)
+    begun: dict[str, Mapping[str, Any]] = {}
+    folder = root / FOLDER
+    paths = [f.path for f in folder.files() if _is_record(f.path) and f.path >= f"{since:%Y-%m}"]
+    for content in folder.read_many(paths):
+        for line in (content or b"").splitlines():
+            with contextlib.suppress(ValueError):
+                record = json.loads(line)
+                begun[record["run_id"]] = {**begun.get(record["run_id"], {}), **record}
+    return [
+        run_id
+        for run_id, run in sorted(begun.items())
+        if run_id != current_run_id()
+        and f"{run_id:.16}" >= f"{since:%Y%m%dT%H%M%S}"
+        and state_of({"outcome": None, "host": None, "process": None, **run}) == RUNNING
+    ]
+
+
+def state_of(run: Mapping[str, Any]) -> str:
+    """Return done, failed, interrupted, running, or killed: no outcome, and its process is gone.
+
+    Of another machine's process nothing is known: it is said to be running.
+    """
+    if run["outcome"] is not None:
+        return str(run["outcome"])
+    if run["host"] != socket.gethostname():
+        return RUNNING
+    try:
+        os.kill(run["process"], 0)
+    except ProcessLookupError:
+        return "killed"
+    except (PermissionError, TypeError):
+        return RUNNING
+    return RUNNING
 
 
 def gather_runs(root: Folder) -> int:

@@ -7,7 +7,7 @@ interrupted job goes on with the batches that have not landed.
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import date
 from functools import partial
 from itertools import pairwise
@@ -18,8 +18,9 @@ from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.delta import Change, Snapshot, Unit, retry_conflicts
 from fleet_slip.errors import RefusedError
 from fleet_slip.progress import Progress, no_progress
-from fleet_slip.simulation.campaign import Batch, Campaign
+from fleet_slip.simulation.campaign import Batch, Campaign, DriveSpec
 from fleet_slip.simulation.drives import simulate_batch
+from fleet_slip.warehouse.audit import Audit
 from fleet_slip.warehouse.tables import Warehouse
 
 
@@ -54,6 +55,8 @@ class SimulationReport:
     days_present: int = 0
     """Days that were complete, and so not planned."""
     drives: int = 0
+    drives_forgotten: int = 0
+    """Drives that were left out: of cars that were forgotten, or forgotten themselves."""
     rows: int = 0
     size_bytes: int = 0
     logs_version: int | None = None
@@ -68,7 +71,10 @@ class SimulationReport:
 @dataclass(frozen=True)
 class _Written:
     batch: Batch
-    action: AddAction
+    drives: tuple[DriveSpec, ...]
+    """Those of the batch that were not forgotten."""
+    action: AddAction | None
+    """What adds their file; None without drives."""
     rows: int
     simulate_s: float
     encode_s: float
@@ -161,8 +167,9 @@ def _simulate(
     report = SimulationReport()
     for _, result in run_tasks(executor, partial(_write, warehouse), backlog, _name):
         before_s = time.perf_counter()
-        if _land(warehouse, result):
-            _count(report, result)
+        landed = _land(warehouse, result)
+        if landed:
+            _count(report, landed)
         report.seconds.commit += time.perf_counter() - before_s
         progress(result.rows, backlog.expected_rows)
     report.batches_present = backlog.present
@@ -173,9 +180,10 @@ def _simulate(
 
 def _count(report: SimulationReport, result: _Written) -> None:
     report.batches_written += 1
-    report.drives += len(result.batch.drives)
+    report.drives += len(result.drives)
+    report.drives_forgotten += len(result.batch.drives) - len(result.drives)
     report.rows += result.rows
-    report.size_bytes += result.action.size
+    report.size_bytes += result.action.size if result.action else 0
     report.seconds.simulate += result.simulate_s
     report.seconds.encode += result.encode_s
     report.seconds.write += result.write_s
@@ -244,15 +252,30 @@ def _name(batch: Batch) -> str:
 
 
 def _write(warehouse: Warehouse, batch: Batch) -> _Written:
+    drives = _not_forgotten(warehouse, batch.drives)
+    if not drives:
+        return _Written(batch, (), None, 0, 0.0, 0.0, 0.0)
     times = [time.perf_counter()]
-    rows = simulate_batch(batch)
+    rows = simulate_batch(replace(batch, drives=drives))
     times.append(time.perf_counter())
     content = warehouse.logs.encode(rows)
     times.append(time.perf_counter())
     action = warehouse.logs.put(file_name(batch), content, batch.day)
     times.append(time.perf_counter())
     simulate_s, encode_s, write_s = (b - a for a, b in pairwise(times))
-    return _Written(batch, action, rows.num_rows, simulate_s, encode_s, write_s)
+    return _Written(batch, drives, action, rows.num_rows, simulate_s, encode_s, write_s)
+
+
+def _not_forgotten(warehouse: Warehouse, drives: tuple[DriveSpec, ...]) -> tuple[DriveSpec, ...]:
+    """Return the drives that were not forgotten, nor their cars."""
+    barred = Audit(warehouse.root).barred(
+        {drive.vehicle_id for drive in drives}, {drive.drive_id for drive in drives}
+    )
+    return tuple(
+        drive
+        for drive in drives
+        if drive.vehicle_id not in barred.vehicles and drive.drive_id not in barred.drives
+    )
 
 
 def file_name(batch: Batch) -> str:
@@ -260,23 +283,34 @@ def file_name(batch: Batch) -> str:
     return f"{batch.campaign}-{batch.index:04d}-{batch.digest[:12]}"
 
 
-def _land(warehouse: Warehouse, written: _Written) -> bool:
-    """Commit a batch; False if another process landed it first."""
-    change = Change(
-        add=[written.action],
-        units=[unit_of(written.batch)],
-        note={
-            "job": "simulate",
-            "campaign": written.batch.campaign,
-            "digest": written.batch.digest,
-        },
-    )
+def _land(warehouse: Warehouse, written: _Written) -> _Written | None:
+    """Commit a batch, and return what has landed; None if another process landed it first."""
 
-    def attempt() -> bool:
+    def attempt() -> _Written | None:
+        nonlocal written
         snapshot = warehouse.logs.snapshot()
-        if has_landed(snapshot, written.batch):
-            return False
-        snapshot.commit(change)
-        return True
+        landed = has_landed(snapshot, written.batch)
+        # Asked after the snapshot: who forgets a car from now on makes this commit a conflict.
+        while landed or written.drives != _not_forgotten(warehouse, written.drives):
+            warehouse.logs.discard(_files(written))
+            if landed:
+                return None
+            written = _write(warehouse, written.batch)
+        snapshot.commit(
+            Change(
+                add=_files(written),
+                units=[unit_of(written.batch)],
+                note={
+                    "job": "simulate",
+                    "campaign": written.batch.campaign,
+                    "digest": written.batch.digest,
+                },
+            )
+        )
+        return written
 
     return retry_conflicts(attempt)
+
+
+def _files(written: _Written) -> list[AddAction]:
+    return [written.action] if written.action else []

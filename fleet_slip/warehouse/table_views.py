@@ -10,6 +10,7 @@ import pyarrow as pa
 from fleet_slip.catalogue.feature_sql import with_absent
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, SignalCatalogue, catalogue
 from fleet_slip.delta import Snapshot, absent_columns
+from fleet_slip.errors import ConflictError
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.database import database_errors, open_database
 from fleet_slip.warehouse.tables import Warehouse
@@ -19,6 +20,9 @@ TABLE_VIEWS = ("log_counts", "log", "grams", "drives", "quarantine")
 
 _VIEWS_ON_VIEWS = {"log": {"log_counts"}, "drives": {"log_counts", "grams"}}
 _STORED_IN = {"log_counts": "logs", "grams": "grams", "quarantine": "quarantine"}
+
+SNAPSHOTS = 100
+"""So often two tables are looked at again that change while they are looked at."""
 
 
 def connect_tables(warehouse: Warehouse, query: str) -> duckdb.DuckDBPyConnection:
@@ -30,7 +34,7 @@ def connect_tables(warehouse: Warehouse, query: str) -> duckdb.DuckDBPyConnectio
     wanted = views_in(query)
     snapshots = table_snapshots(warehouse, wanted)
     database = open_tables(warehouse, wanted, snapshots)
-    lock(database, paths_of(snapshots))
+    lock(database, paths_of(snapshots, wanted))
     return database
 
 
@@ -47,13 +51,37 @@ def views_in(query: str, known: Iterable[str] = TABLE_VIEWS) -> frozenset[str]:
 
 def table_snapshots(warehouse: Warehouse, wanted: Iterable[str]) -> list[Snapshot]:
     """Return snapshots of the tables that some views stand on."""
-    stored = [_STORED_IN[name] for name in TABLE_VIEWS if name in wanted and name in _STORED_IN]
-    return [getattr(warehouse, table).snapshot() for table in stored]
+    stored = {_STORED_IN[name] for name in wanted if name in _STORED_IN}
+    found = [warehouse.quarantine.snapshot()] if "quarantine" in stored else []
+    if "grams" in stored:  # the log files tell which Gram rows count
+        return [*found, *gram_snapshots(warehouse)]
+    return [*found, warehouse.logs.snapshot()] if "logs" in stored else found
 
 
-def paths_of(snapshots: Iterable[Snapshot]) -> list[str]:
-    """Return the data files of snapshots, as DuckDB opens them."""
-    return [path for snapshot in snapshots for path in snapshot.paths]
+def gram_snapshots(
+    warehouse: Warehouse, grams: Snapshot | None = None, logs: Snapshot | None = None
+) -> tuple[Snapshot, Snapshot]:
+    """Return the newest `grams` and `logs` that stood beside each other at one moment.
+
+    Earlier snapshots of them are the result if nobody has committed since. Raises `ConflictError`
+    if the Gram rows change faster than they are looked at.
+    """
+    grams = grams.renewed() if grams else warehouse.grams.snapshot()
+    for _ in range(SNAPSHOTS):
+        logs = logs.renewed() if logs else warehouse.logs.snapshot()
+        again = grams.renewed()
+        if again is grams or again.version == grams.version:
+            return grams, logs
+        grams = again
+    raise ConflictError(
+        f"{warehouse.root}: other processes keep changing it. Run the same command again."
+    )
+
+
+def paths_of(snapshots: Iterable[Snapshot], wanted: Iterable[str]) -> list[str]:
+    """Return the data files of snapshots that some views read, as DuckDB opens them."""
+    read = {_STORED_IN[name] for name in wanted if name in _STORED_IN}
+    return [path for one in snapshots if one.table.folder.name in read for path in one.paths]
 
 
 def open_tables(
@@ -68,10 +96,12 @@ def open_tables(
     It is not locked yet; see `lock`.
     """
     database = open_database(threads=threads, reading=warehouse.root, spill=True)
-    sources = {
-        f"stored_{snapshot.table.folder.name}": _source(database, snapshot)
-        for snapshot in snapshots
-    }
+    tables = {snapshot.table.folder.name: snapshot for snapshot in snapshots}
+    if "grams" in tables:
+        active = [file.path for file in tables["logs"].files]
+        database.execute("SET VARIABLE active_log_files = $active", {"active": active})
+    read = {_STORED_IN[name] for name in wanted if name in _STORED_IN}
+    sources = {f"stored_{name}": _source(database, tables[name]) for name in read}
     columns = _generated_columns(warehouse.catalogue)
     with database_errors(f"opening the warehouse {warehouse.root}"):
         for view in TABLE_VIEWS:

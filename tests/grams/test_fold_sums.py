@@ -196,7 +196,7 @@ def test_a_reader_opens_anew_only_what_changed(tmp_path: Path) -> None:
         assert sum_cohort(reader, plan, "adhesion > 0.7").drive_count == 14
         assert reader.opened(PLAIN).database is opened
         assert sum_cohort(reader, plan).sums.tables == before.sums.tables
-        write_grams(warehouse, warehouse.logs.snapshot().paths[:1], 10)
+        write_grams(warehouse, [warehouse.logs.snapshot().files[0].path], 10)
         after = sum_cohort(reader, plan)
         assert after.sums.tables == sum_cohort(warehouse, plan).sums.tables
         assert after.grams_version == before.grams_version + 1

@@ -21,13 +21,13 @@ from fleet_slip.grams.aggregation import aggregate
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.job import update_grams
 from fleet_slip.ingest.job import ingest_file
-from fleet_slip.maintenance.audit import Audit, Forgettable
 from fleet_slip.maintenance.compaction import compact
 from fleet_slip.maintenance.find_drives import Located, drives_by_file, locate
 from fleet_slip.maintenance.forget import forget
 from fleet_slip.maintenance.retention import Retention, retain
 from fleet_slip.maintenance.vacuum import find_unreferenced
 from fleet_slip.regression.exact import fit
+from fleet_slip.warehouse.audit import Audit, Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand
 from tests.support.logs import land, log_rows, random_counts

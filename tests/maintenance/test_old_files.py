@@ -1,7 +1,5 @@
 """Files that no version refers to, and the drives in them."""
 
-import os
-import time
 from datetime import date
 from pathlib import Path
 
@@ -11,14 +9,14 @@ import pytest
 
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.job import update_grams
-from fleet_slip.maintenance.audit import Forgettable
 from fleet_slip.maintenance.compaction import compact
 from fleet_slip.maintenance.old_files import (
-    BEING_WRITTEN_HOURS,
     find_old_files,
     quarantined_of,
+    remove_old_files,
     rows_of,
 )
+from fleet_slip.warehouse.audit import Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import DAY, land, log_rows, path_of, random_counts
 
@@ -40,7 +38,7 @@ def compacted(warehouse: Warehouse) -> Warehouse:
 
 def found(warehouse: Warehouse, subject: Forgettable) -> list[str]:
     """Folder and name of each old file, without the checksum."""
-    old = find_old_files(warehouse, subject)
+    old = [one.file for one in find_old_files(warehouse, subject)]
     return [f"{file.folder.name}/{file.path}".rpartition("-")[0] for file in old]
 
 
@@ -57,7 +55,7 @@ def test_old_files_with_the_car_are_found_and_no_others_those_of_the_logs_last(
     assert {"logs/day=2024-05-01/alfa", "logs/day=2024-05-01/beta"} < set(everything)
     assert found(compacted, Forgettable("before", "2024-05-01")) == []
     active = {*compacted.logs.snapshot().paths, *compacted.grams.snapshot().paths}
-    paths = {str(file) for file in find_old_files(compacted, vehicle("alfa"))}
+    paths = {str(one.file) for one in find_old_files(compacted, vehicle("alfa"))}
     assert not paths & active
 
 
@@ -66,15 +64,20 @@ def test_who_is_unknown_is_in_no_file(compacted: Warehouse) -> None:
     assert found(compacted, Forgettable("drive", "alfa")) == []
 
 
-def test_a_leftover_that_may_be_under_way_is_left_alone(warehouse: Warehouse) -> None:
-    """A file that no commit ever knew: young, a job may commit it; old, nobody will."""
+def test_a_leftover_is_deleted_at_once_unless_a_job_may_commit_it(
+    warehouse: Warehouse,
+) -> None:
+    """Of a forgotten car nobody can commit it; of drives before a day the job under way may."""
     rows = log_rows("alfa-1", random_counts(np.random.default_rng(0), 30), vehicle_id="alfa")
     land(warehouse, "other", log_rows("beta-1", random_counts(np.random.default_rng(1), 30)))
     path = path_of(warehouse.logs.folder) / warehouse.logs.write_file("left", rows, DAY).path
-    assert found(warehouse, vehicle("alfa")) == []
-    aged = time.time() - 3600 * (BEING_WRITTEN_HOURS + 0.1)
-    os.utime(path, (aged, aged))
-    assert found(warehouse, vehicle("alfa")) == ["logs/day=2024-05-01/left"]
+    before = Forgettable("before", "2024-05-02")
+    assert remove_old_files(warehouse, before, delete=True).pending == (
+        f"logs/{path.relative_to(path_of(warehouse.logs.folder))}",
+    )
+    assert path.exists()
+    assert remove_old_files(warehouse, vehicle("alfa"), delete=False).deleted == 1
+    assert not path.exists()
 
 
 def test_half_a_file_is_passed_over(compacted: Warehouse) -> None:

@@ -1,0 +1,292 @@
+"""Jobs that meet: nothing is doubled or lost, and what is forgotten stays forgotten.
+
+Each is a schedule that `python -m benchmarks.interleave` found, as one test.
+"""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import fleet_slip
+from fleet_slip.delta import Change, Snapshot
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.grams import job as gram_job
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.job import update_grams
+from fleet_slip.ingest.job import ingest_file
+from fleet_slip.maintenance import compaction
+from fleet_slip.maintenance.compaction import compact
+from fleet_slip.maintenance.forget import forget
+from fleet_slip.maintenance.marks import marked_models
+from fleet_slip.maintenance.repair import repair
+from fleet_slip.maintenance.vacuum import find_expired
+from fleet_slip.maintenance.verify import verify
+from fleet_slip.runs.log import recording
+from fleet_slip.simulation.campaign import load_campaign
+from fleet_slip.simulation.job import simulate_batches
+from fleet_slip.warehouse.audit import Audit, Forgettable
+from fleet_slip.warehouse.tables import Warehouse
+from tests.maintenance.test_forget import CARS, drive, fill, mentions
+from tests.support.commands import RunCommand
+from tests.support.logs import land, path_of
+from tests.support.measured import a_mapping, csv_text, good_columns
+
+BETA = Forgettable("vehicle", "beta")
+
+
+def just_before_its_commit(
+    monkeypatch: pytest.MonkeyPatch, work: Callable[[], Any], table: str = "logs"
+) -> None:
+    """Let work be done just before the next commit to a table."""
+    commit = Snapshot.commit
+
+    def later(self: Snapshot, change: Change) -> None:
+        if self.table.folder.name == table:
+            monkeypatch.setattr(Snapshot, "commit", commit)
+            work()
+        commit(self, change)
+
+    monkeypatch.setattr(Snapshot, "commit", later)
+
+
+def cars_in(warehouse: Warehouse, view: str) -> set[str]:
+    with fleet_slip.connect(warehouse.root) as database:
+        rows = database.execute(f"SELECT DISTINCT vehicle_id FROM {view}").fetchall()
+    return {row[0] for row in rows}
+
+
+def measured(folder: Path, *cars: str) -> Path:
+    columns = {name: values * len(cars) for name, values in good_columns(50).items()}
+    columns["car"] = [car for car in cars for _ in range(50)]
+    columns["ax"][49::50] = ["broken"] * len(cars)
+    file = folder / "log.csv"
+    file.write_text(csv_text(columns))
+    return file
+
+
+def test_a_compaction_that_loses_to_an_erasure_leaves_no_file_of_the_car(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    warehouse = fill(tmp_path, *CARS)
+    just_before_its_commit(monkeypatch, lambda: forget(warehouse, BETA, now=True))
+    compact(warehouse)
+    assert not mentions(tmp_path, "beta")
+    assert cars_in(warehouse, "log") == cars_in(warehouse, "grams") == {"alfa", "gamma"}
+
+
+def test_an_erasure_that_loses_to_a_compaction_forgets_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The Delta library does not take what a compaction removes for removed."""
+    warehouse = fill(tmp_path, *CARS)
+    just_before_its_commit(monkeypatch, lambda: compact(warehouse))
+    assert forget(warehouse, BETA, now=True).drives == 3
+    assert cars_in(warehouse, "log") == cars_in(warehouse, "grams") == {"alfa", "gamma"}
+    assert warehouse.logs.snapshot().rows == 6 * 200
+    assert not mentions(tmp_path, "beta")
+
+
+def test_two_compactions_that_pack_differently_double_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    warehouse = fill(tmp_path, *CARS)
+
+    def land_and_compact() -> None:
+        land(warehouse, "z", drive("alfa", 9))
+        compact(warehouse)
+
+    just_before_its_commit(monkeypatch, land_and_compact)
+    compact(warehouse)
+    assert warehouse.logs.snapshot().rows == 10 * 200
+    assert not verify(warehouse, full=True).damage
+
+
+def test_readers_see_every_drive_once_while_files_are_exchanged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    warehouse = fill(tmp_path, *CARS)
+    seen: list[int] = []
+
+    def look(*_: Any) -> list[Any]:
+        seen.append(len(load_cohort(warehouse).drives))
+        return []
+
+    just_before_its_commit(monkeypatch, look)
+    monkeypatch.setattr(compaction, "reconcile", look)
+    compact(warehouse)
+    assert seen == [9, 9]  # before the exchange; and after it, old Gram rows not dropped yet
+    update_grams(warehouse)
+    assert len(load_cohort(warehouse).drives) == 9
+
+
+def test_an_ingest_under_way_does_not_bring_a_forgotten_car_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    warehouse = fill(tmp_path / "data", "beta")
+    mapping = a_mapping(drive={"vehicle_id": {"column": "car"}})
+    file = measured(tmp_path, "alfa", "beta")
+    just_before_its_commit(monkeypatch, lambda: forget(warehouse, BETA, now=True))
+    report = ingest_file(warehouse, file, mapping)
+    assert (report.new, report.counts.drives, report.drives_forgotten) == (True, 1, 1)
+    assert cars_in(warehouse, "log") == cars_in(warehouse, "quarantine") == {"alfa"}
+    assert not mentions(tmp_path / "data", "beta")
+
+
+def test_nor_does_a_later_ingest_until_the_car_is_allowed_again(tmp_path: Path) -> None:
+    warehouse = fill(tmp_path / "data", "alfa", "beta")
+    forget(warehouse, BETA, now=True)
+    mapping = a_mapping(drive={"vehicle_id": {"column": "car"}})
+    file = measured(tmp_path, "beta")
+    assert not ingest_file(warehouse, file, mapping).new
+    assert cars_in(warehouse, "log") == {"alfa"}
+    Audit(warehouse.root).allow(BETA)
+    assert ingest_file(warehouse, file, mapping).new
+    assert cars_in(warehouse, "log") == {"alfa", "beta"}
+    assert forget(warehouse, BETA, now=True).drives == 1
+    assert Audit(warehouse.root).state(BETA) == "done"
+
+
+def test_a_simulation_under_way_does_not_bring_a_forgotten_drive_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    warehouse = Warehouse(LocalFolder(tmp_path))
+    campaign = load_campaign("smoke")
+    batches = campaign.batches(campaign.days()[0])
+    gone = batches[0].drives[0]
+    audit = Audit(warehouse.root)
+
+    def forget_meanwhile() -> None:
+        audit.begin(Forgettable("drive", gone.drive_id), 1, [])
+        warehouse.logs.fence()
+
+    just_before_its_commit(monkeypatch, forget_meanwhile)
+    with ThreadPoolExecutor(1) as executor:
+        report = simulate_batches(warehouse, batches, executor)
+        again = simulate_batches(warehouse, batches, executor)
+    drives = {spec.drive_id for batch in batches for spec in batch.drives}
+    assert (report.drives, report.drives_forgotten) == (len(drives) - 1, 1)
+    assert not again.changed
+    with fleet_slip.connect(tmp_path) as database:
+        found = database.execute("SELECT DISTINCT drive_id FROM log").fetchall()
+    assert {row[0] for row in found} == drives - {gone.drive_id}
+    assert len(list(tmp_path.glob("logs/day=*/*.parquet"))) == len(warehouse.logs.snapshot().files)
+
+
+def test_gram_rows_of_a_forgotten_car_do_not_count_if_their_job_died_after_its_commit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    warehouse = fill(tmp_path, "alfa", "beta")
+    stale = [warehouse.grams.read(file.path) for file in warehouse.grams.snapshot().files]
+    forget(warehouse, BETA, now=True)
+    action = warehouse.grams.write_file("landed-late", stale[0])
+    warehouse.grams.snapshot().commit(Change(add=[action]))
+    assert cars_in(warehouse, "grams") == {"alfa"}
+    assert set(load_cohort(warehouse).drives["vehicle_id"].to_pylist()) == {"alfa"}
+
+
+def test_no_gram_row_of_a_forgotten_car_lands_after_the_erasure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    warehouse = fill(tmp_path, "alfa")
+    land(warehouse, "new", drive("beta", 1))
+    just_before_its_commit(monkeypatch, lambda: forget(warehouse, BETA, now=True), "grams")
+    monkeypatch.setattr(gram_job, "_require_active", lambda *_: None)  # killed before its last look
+    update_grams(warehouse)
+    assert not mentions(tmp_path, "beta")
+
+
+def test_vacuum_does_not_move_what_took_the_place_of_a_leftover(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    warehouse = Warehouse(LocalFolder(tmp_path / "data"))
+    land(warehouse, "a", drive("alfa", 1))
+    mapping = a_mapping(drive={"vehicle_id": {"column": "car"}})
+    file = measured(tmp_path, "beta")
+
+    def die(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Snapshot, "commit", die)
+        ingest_file(warehouse, file, mapping)
+    for path in (tmp_path / "data").rglob("*.parquet"):
+        os.utime(path, (0, 0))
+    listed = find_expired(warehouse, 1)
+    assert ingest_file(warehouse, file, mapping).new
+    moved: list[str] = []
+    rename = Path.rename
+
+    def told(path: Path, target: Path) -> Path:
+        moved.append(str(path))
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", told)
+    for one in listed:
+        one.folder.remove(one)
+    assert moved
+    assert not set(moved) & set(warehouse.logs.snapshot().paths)
+    assert not verify(warehouse).damage
+
+
+def test_repair_finds_a_file_by_its_checksum_under_any_name(tmp_path: Path) -> None:
+    warehouse = fill(tmp_path, "alfa")
+    path = Path(warehouse.logs.snapshot().paths[0])
+    path.rename(path.with_name(".tmp-0123"))
+    report = verify(warehouse)
+    assert report.damage
+    assert repair(warehouse, report) == [str(path.relative_to(tmp_path))]
+    assert not verify(warehouse, full=True).damage
+
+
+def test_a_version_published_from_gram_rows_before_an_erasure_counts_as_trained_on_it(
+    run_command: RunCommand, tmp_path: Path
+) -> None:
+    run_command("run", "--campaign", "smoke")
+    root = LocalFolder(tmp_path / "data")
+    audit = Audit(root)
+    audit.begin(BETA, 1, [], {"smoke": 0})  # published after the versions were judged
+    assert marked_models(root) == {"smoke@1"}
+    audit.end(BETA, grams_version=99)  # and made of rows that still had the drives
+    assert marked_models(root) == {"smoke@1"}
+    audit.begin(BETA, 1, [], {"smoke": 0})
+    audit.end(BETA, grams_version=0)
+    assert not marked_models(root)
+
+
+def test_the_command_says_what_may_be_left_and_finishes_when_it_is_repeated(
+    run_command: RunCommand, tmp_path: Path
+) -> None:
+    root = tmp_path / "data"
+    warehouse = fill(root, "alfa", "beta")
+    half = path_of(warehouse.logs.folder) / "day=2024-05-01" / ".tmp-half"
+    half.write_bytes(b"beta, half a file")
+    with recording(warehouse.root, "ingest", ["ingest"]):
+        told = run_command("forget", "--vehicle", "beta", "--now")
+        assert told.exit_code == 12
+        assert "2 may still have its rows" in told.stderr
+    assert cars_in(warehouse, "log") == {"alfa"}
+    os.utime(half, (0, 0))
+    done = run_command("forget", "--vehicle", "beta", "--now", "--json")
+    assert (done.exit_code, done.json["pending"]) == (0, [])
+    assert not half.exists()
+    assert run_command("forget", "--vehicle", "beta", "--allow").exit_code == 0
+    assert run_command("forget", "--vehicle", "gamma", "--allow").exit_code == 5
+    assert run_command("forget", "--vehicle", "beta", "--allow", "--now").exit_code == 2
+
+
+@pytest.mark.slow
+def test_commands_that_meet_at_any_point_lose_and_double_nothing() -> None:
+    """A part of what `python -m benchmarks.interleave` does; a new process, because it forks."""
+    command = [sys.executable, "-m", "benchmarks.interleave", "--schedules", "22"]
+    command += ["--first", "compact", "ingest", "--second", "forget", "compact"]
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False, cwd=Path(__file__).parents[2]
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "0 findings of 0 kinds" in done.stdout
