@@ -33,8 +33,8 @@ from pathlib import Path
 from typing import Any
 
 import fleet_slip
+from benchmarks import crash
 from benchmarks import interleave_checks as checks
-from benchmarks.crash import load_code
 from benchmarks.forking import forked
 from benchmarks.interleave_checks import Drive
 from benchmarks.interleave_roots import (
@@ -241,9 +241,9 @@ def _harm(name: str, outcome: Outcome) -> list[str]:
     return [f"ends with {outcome.exit_code}: {name}: {outcome.said[-2000:]}"]
 
 
-def _load_code(inputs: Inputs) -> None:
+def load_code(inputs: Inputs) -> None:
     """Import in this process what commands import when they are called; make hashing names fast."""
-    load_code(inputs.files)
+    crash.load_code(inputs.files)
     for found in pkgutil.walk_packages(fleet_slip.__path__, "fleet_slip."):
         with contextlib.suppress(ImportError):  # an extra that is not there
             importlib.import_module(found.name)
@@ -260,7 +260,7 @@ def schedules(pair: Pair, fates: Sequence[str]) -> Iterator[Schedule]:
 def run(options: argparse.Namespace, folder: Path, roots: Any) -> dict[str, list[Schedule]]:
     """Run schedules; return those that found something, by what they found."""
     inputs = write_inputs(folder / "inputs")
-    _load_code(inputs)
+    load_code(inputs)
     rng = random.Random(options.seed)  # noqa: S311
     found: dict[str, list[Schedule]] = defaultdict(list)
     pairs = list(itertools.product(options.first, options.second))

@@ -90,7 +90,7 @@ def write_inputs(where: Path) -> Inputs:
     mapping = MAPPING.replace(str(FIRST_DAY), str(SECOND_DAY))
     (where / "mapping.toml").write_text(mapping, encoding="utf-8")
     for name, cars in (("old", ("car-2", "car-3")), ("later", ("car-4",)), ("new", ("car-5",))):
-        _measure(where / f"{name}.csv", (CAR, *cars))
+        measure(where / f"{name}.csv", (CAR, *cars))
     days = (date.today() - SECOND_DAY).days
     retention = f"drives_days = {days}\nreplaced_files_hours = 24\n"
     (where / "retention.toml").write_text(retention, encoding="utf-8")
@@ -103,7 +103,7 @@ def write_inputs(where: Path) -> Inputs:
     return Inputs(where)
 
 
-def _measure(path: Path, cars: tuple[str, ...]) -> None:
+def measure(path: Path, cars: tuple[str, ...]) -> None:
     """Write a log in which each car's last row has to be refused."""
     rng = random.Random(path.stem)  # noqa: S311
     with path.open("w", newline="", encoding="utf-8") as file:
@@ -190,7 +190,10 @@ class StoredRoots:
                     f"{self._url}/{self._bucket}/{path}",
                     data=file.read_bytes(),
                     method="PUT",
-                    headers={"Authorization": f"AWS4-HMAC-SHA256 Credential={ACCESS_KEY}/{SCOPE}"},
+                    headers={
+                        "Authorization": f"AWS4-HMAC-SHA256 Credential={ACCESS_KEY}/{SCOPE}",
+                        "Content-Type": "application/octet-stream",
+                    },
                 )
                 urllib.request.urlopen(request).close()  # noqa: S310
         return f"s3://{self._bucket}/{self._number}"

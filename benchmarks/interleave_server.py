@@ -9,11 +9,14 @@ from typing import Any
 
 
 @contextmanager
-def serving() -> Iterator[tuple[str, str]]:
-    """Start a server, let this process find it, and return its URL and a bucket."""
+def serving(**faults: float) -> Iterator[tuple[str, str]]:
+    """Start a server, let this process find it, and return its URL and a bucket.
+
+    `faults` says how it misbehaves, as `tests.support.s3_server.Faults`.
+    """
     methods = multiprocessing.get_context("spawn")
     here, there = methods.Pipe()
-    process = methods.Process(target=_serve, args=(there,), daemon=True)
+    process = methods.Process(target=_serve, args=(there, faults), daemon=True)
     process.start()
     environment, bucket = here.recv()
     os.environ.update(environment)
@@ -22,10 +25,11 @@ def serving() -> Iterator[tuple[str, str]]:
     process.join()
 
 
-def _serve(connection: Any) -> None:
+def _serve(connection: Any, faults: dict[str, float]) -> None:
     from tests.support.s3_server import Server  # noqa: PLC0415 - flask and moto, here only
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     server = Server()
     connection.send((server.environment, server.bucket().removeprefix("s3://")))
-    signal.pause()
+    with server.misbehaving(**faults):
+        signal.pause()
