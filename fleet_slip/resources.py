@@ -1,11 +1,18 @@
-"""Finds the SQL and TOML files that ship with the package, from a wheel or from a checkout."""
+"""Finds the SQL and TOML files that ship with the package, and one's own configs laid over them."""
 
 from importlib.resources import files
 from importlib.resources.abc import Traversable
+from os import environ
 from pathlib import Path
 from typing import Literal
 
 from fleet_slip.errors import ConfigError
+
+CONFIG_VARIABLE = "FLEET_SLIP_CONFIG"
+"""Names a folder of configs that is laid over the shipped ones."""
+
+CONFIG_FILES = ("signals.toml", "features.toml", "monitor.toml", "retention.toml")
+CONFIG_FOLDERS = ("campaigns", "mappings", "models", "scenarios", "tracks", "vehicles")
 
 ShippedFolder = Literal["configs", "jobs", "warehouse"]
 
@@ -23,26 +30,72 @@ def read_sql(name: ShippedFolder, file: str) -> str:
     return (folder(name) / file).read_text(encoding="utf-8")
 
 
+def own_configs() -> Path | None:
+    """Return the folder of configs that is laid over the shipped ones, if there is one.
+
+    Raises `ConfigError` if it is no folder, or has a file that is no config.
+    """
+    chosen = environ.get(CONFIG_VARIABLE)
+    if not chosen:
+        return None
+    folder_of_own = Path(chosen)
+    if not folder_of_own.is_dir():
+        raise ConfigError(f"{chosen}: no such folder. ${CONFIG_VARIABLE} or --config names it.")
+    for file in sorted(folder_of_own.rglob("*.toml")):
+        _require_kind(file.relative_to(folder_of_own).as_posix(), file)
+    return folder_of_own
+
+
+def _require_kind(name: str, file: Path) -> None:
+    kind, _, rest = name.rpartition("/")
+    if kind not in CONFIG_FOLDERS if kind else rest not in CONFIG_FILES:
+        raise ConfigError(
+            f"{file}: no config of fleet-slip. A folder of configs has {', '.join(CONFIG_FILES)}, "
+            f"and TOML files in {', '.join(CONFIG_FOLDERS)}."
+        )
+
+
+def config_file(name: str) -> Traversable:
+    """Return a config file such as `monitor.toml`: one's own, else the shipped one."""
+    own = own_configs()
+    return own / name if own and (own / name).is_file() else folder("configs") / name
+
+
+def config_files() -> dict[str, Traversable]:
+    """Return every config file that is in force, by its name below the folder of configs."""
+    names = [
+        *CONFIG_FILES,
+        *(f"{kind}/{name}.toml" for kind in CONFIG_FOLDERS for name in config_names(kind)),
+    ]
+    return {name: config_file(name) for name in names}
+
+
 def config_names(kind: str) -> list[str]:
-    """Return the names of the shipped configs of one kind, such as `campaigns`, sorted."""
+    """Return the names of the configs of one kind, such as `campaigns`, sorted."""
+    own = own_configs()
+    folders = [folder("configs") / kind, *([own / kind] if own else [])]
     return sorted(
-        entry.name.removesuffix(".toml")
-        for entry in (folder("configs") / kind).iterdir()
-        if entry.name.endswith(".toml")
+        {
+            entry.name.removesuffix(".toml")
+            for one in folders
+            if one.is_dir()
+            for entry in one.iterdir()
+            if entry.name.endswith(".toml")
+        }
     )
 
 
 def find_config(kind: str, name_or_path: str) -> Traversable:
-    """Return a config file: a path if it looks like one, else a shipped config of that name.
+    """Return a config file: a path if it looks like one, else the config of that name.
 
-    Raises `ConfigError` if there is neither, naming the shipped ones.
+    Raises `ConfigError` if there is neither, naming those that there are.
     """
     if name_or_path.endswith(".toml") or "/" in name_or_path:
         path = Path(name_or_path)
         if _is_file(path):
             return path
         raise ConfigError(f"{path}: no such file. Give the path of a {kind} TOML file.")
-    file = folder("configs") / kind / f"{name_or_path}.toml"
+    file = config_file(f"{kind}/{name_or_path}.toml")
     if _is_file(file):
         return file
     known = ", ".join(config_names(kind))

@@ -1,10 +1,10 @@
-"""The integer SQL of features: what may stand in it, and the queries that compute it."""
+"""The integer SQL of features: what may stand in it."""
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
 
-from fleet_slip.catalogue.signals import COUNT_MAX, catalogue
+from fleet_slip.catalogue.signals import catalogue
 
 _WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _FUNCTIONS = frozenset({"abs", "sign"})
@@ -61,46 +61,3 @@ def _require(text: str, grammar: _Grammar, signals: Collection[str]) -> None:
         raise ValueError(f"{', '.join(unknown)}: not an input signal, abs or sign")
     if not grammar.characters.fullmatch(text):
         raise ValueError(f"{text!r} is not {grammar.described}")
-
-
-def with_absent(rows: str, absent: Sequence[str]) -> str:
-    """Return a table expression with signals that none of its files has, as nulls."""
-    if not absent:
-        return rows
-    nulls = ", ".join(f"NULL::SMALLINT AS {name}" for name in absent)
-    return f"(SELECT *, {nulls} FROM {rows})"
-
-
-def with_features(rows: str, definitions: Mapping[str, str]) -> str:
-    """Return a subquery: the rows with features as columns of counts, clipped to int16.
-
-    `rows` is a table expression with counts; `definitions` gives the SQL of each feature. The
-    column `clipped` says how many of the features of a row were out of range.
-    """
-    if not definitions:
-        return rows
-    separator = ",\n            "
-    computed = separator.join(f"{sql} AS {name}" for name, sql in definitions.items())
-    inside = separator.join(f"{clipped_sql(name)} AS {name}" for name in definitions)
-    outside = " + ".join(
-        f"coalesce(abs({name}) > {COUNT_MAX}, false)::INTEGER" for name in definitions
-    )
-    return f"""(
-        SELECT * REPLACE (
-            {inside}
-        ),
-            {outside} AS clipped
-        FROM (
-            SELECT *,
-            {computed}
-            FROM {rows}
-        )
-    )"""
-
-
-def clipped_sql(name: str) -> str:
-    """Return the SQL of an integer column clipped to the range of counts; null stays null."""
-    return (
-        f"CASE WHEN {name} > {COUNT_MAX} THEN {COUNT_MAX} "
-        f"WHEN {name} < -{COUNT_MAX} THEN -{COUNT_MAX} ELSE {name} END::SMALLINT"
-    )

@@ -1,24 +1,40 @@
 """Features and feature sets: `configs/features.toml` as types.
 
-A feature is an integer function of the counts of one row. A feature set is the columns of one kind
-of Gram row, and how a drive's rows are divided into several Gram rows, if they are.
+A feature is an integer function of the counts of one row; a window looks back on a signal or a
+feature over time; a factor is a column times what a car knows of itself. A feature set is the
+columns of one kind of Gram row, and how a drive's rows are divided into several, if they are.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from decimal import Decimal
 from fractions import Fraction
 from functools import cache, cached_property
 from importlib.resources.abc import Traversable
 from itertools import pairwise
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from fleet_slip.canonical import canonical_json, sha256_of
+from fleet_slip.catalogue.columns import (
+    COUNT_BITS,
+    Bits,
+    Definition,
+    limit_of,
+    with_features,
+    with_windows,
+)
 from fleet_slip.catalogue.feature_sql import integer_sql, names_in
 from fleet_slip.catalogue.signals import Identifier, Signal, SIUnit, catalogue
-from fleet_slip.config import Config, load_config
-from fleet_slip.errors import QuestionError
-from fleet_slip.resources import folder
+from fleet_slip.catalogue.windows import (
+    Factor,
+    TimeColumn,
+    Window,
+    factor_column,
+    window_column,
+)
+from fleet_slip.config import Config, faults_of, load_config, load_toml
+from fleet_slip.errors import ConfigError, QuestionError
+from fleet_slip.resources import config_file, folder
 
 PLAIN = "signals"
 """The feature set whose columns are the catalogue's inputs and label themselves."""
@@ -33,12 +49,13 @@ def lag_signals(signals: Sequence[str]) -> tuple[str, ...]:
 
 
 class Feature(Config):
-    """One feature. `physical = scale * count`, the count clipped to +-32767."""
+    """One feature. `physical = scale * count`, the count clipped to its bits: 16 are +-32767."""
 
     counts: str = Field(min_length=1)
     divided_by: str | None = None
     at_least: int | None = Field(default=None, gt=0)
     scale: Decimal = Field(gt=0)
+    bits: Bits = COUNT_BITS
     unit: SIUnit
     column: Identifier
     description: str = Field(min_length=1)
@@ -81,6 +98,11 @@ class Feature(Config):
         """Physical value of one count, exactly."""
         return Fraction(self.scale)
 
+    @property
+    def limit(self) -> int:
+        """Largest count."""
+        return limit_of(self.bits)
+
 
 class Regime(Config):
     """Bands of a signal or feature."""
@@ -110,6 +132,7 @@ class FeatureSet(Config):
     description: str = Field(min_length=1)
     signals: tuple[Identifier, ...] = Field(min_length=1)
     features: tuple[Identifier, ...] = ()
+    windows: tuple[Identifier, ...] = ()
     regimes: tuple[Identifier, ...] = ()
     row_folds: int | None = Field(default=None, ge=2, le=1000)
     lagged: bool = False
@@ -123,12 +146,14 @@ class FeatureSet(Config):
             raise ValueError("a column stands twice")
         if bool(self.regimes) + bool(self.row_folds) + self.lagged > 1:
             raise ValueError("a set has regimes, row_folds or lagged, not several of them")
+        if self.windows and (self.regimes or self.row_folds or self.lagged):
+            raise ValueError("a set with windows has no regimes, row_folds or lagged")
         return self
 
     @property
     def inputs(self) -> tuple[str, ...]:
         """What a model of this set may use."""
-        return (*self.signals, *self.features)
+        return (*self.signals, *self.features, *self.windows)
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -141,6 +166,8 @@ class FeatureCatalogue(Config):
     """All features, regimes and feature sets, in the file's order."""
 
     features: dict[Identifier, Feature]
+    windows: dict[Identifier, Window] = Field(default_factory=dict)
+    factors: dict[Identifier, Factor] = Field(default_factory=dict)
     regimes: dict[Identifier, Regime]
     sets: dict[Identifier, FeatureSet]
 
@@ -148,7 +175,9 @@ class FeatureCatalogue(Config):
     def _consistent(self) -> "FeatureCatalogue":
         signals = catalogue()
         taken = {*signals.signals, *(s.column for s in signals.signals.values()), *signals.drive}
-        names = [*self.features, *(feature.column for feature in self.features.values())]
+        columns: dict[str, Feature | TimeColumn] = {**self.features, **self.time_columns}
+        taken |= {"day", "tick", "clipped"}
+        names = [*columns, *(one.column for one in columns.values())]
         twice = sorted(name for name in names if name in taken or names.count(name) > 1)
         if twice:
             raise ValueError(f"names must differ, from those of signals too: {', '.join(twice)}")
@@ -160,18 +189,76 @@ class FeatureCatalogue(Config):
         for name, one in self.sets.items():
             unknown = [f for f in one.features if f not in self.features]
             unknown += [r for r in one.regimes if r not in self.regimes]
+            known = {*self.windows, *self.time_columns}
+            unknown += [w for w in one.windows if w not in known]
             if unknown:
                 raise ValueError(f"sets.{name}: unknown {', '.join(unknown)}")
         return self
 
+    @cached_property
+    def time_columns(self) -> Mapping[str, TimeColumn]:
+        """Every column over time: the members of the families of windows, then the factors.
+
+        Raises `ValueError` for one that looks back on nothing known, or twice the same name.
+        """
+        found: dict[str, TimeColumn] = {}
+        for family, window in self.windows.items():
+            row, scale = self._row(window.of, f"windows.{family}")
+            for name, ticks in window.members(family).items():
+                if name in found:
+                    raise ValueError(f"windows.{family}: {name} stands twice")
+                found[name] = _named(f"windows.{name}", window_column, window, ticks, row, scale)
+        for name, factor in self.factors.items():
+            if factor.of in found:
+                base, scale = found[factor.of].definition, found[factor.of].exact_scale
+            else:
+                base, scale = self._row(factor.of, f"factors.{name}")
+            if name in found:
+                raise ValueError(f"factors.{name} stands twice")
+            found[name] = _named(f"factors.{name}", factor_column, factor, base, scale)
+        return found
+
+    def _row(self, name: str, where: str) -> tuple[Definition, Fraction]:
+        """Return a signal or feature of a row as the definition of a column, and its scale."""
+        if name in self.features:
+            one = self.features[name]
+            return Definition(of=name, sql=one.sql, of_bits=one.bits), one.exact_scale
+        if name in catalogue().inputs:
+            return Definition(of=name), catalogue()[name].exact_scale
+        raise ValueError(f"{where}: {name} is no input signal or feature")
+
+    def definition(self, name: str) -> Definition | None:
+        """Return the definition of an input that is more than a signal or a feature of 16 bits."""
+        if name in self.time_columns:
+            return self.time_columns[name].definition
+        one = self.features.get(name)
+        if one is None or one.bits == COUNT_BITS:
+            return None
+        return Definition(of=name, sql=one.sql, of_bits=one.bits, bits=one.bits)
+
+    def definitions(self, name: str) -> dict[str, Definition]:
+        """Return the definitions of a set's columns over time, by name."""
+        return {w: self.time_columns[w].definition for w in self.feature_set(name).windows}
+
     def feature_set(self, name: str) -> FeatureSet:
-        """Return a feature set by name. Raises `QuestionError` for an unknown one."""
+        """Return a feature set by name. Raises `QuestionError` for an unknown one.
+
+        Families of windows are replaced by their members.
+        """
         if name == PLAIN:
             return FeatureSet(description="The logged signals", signals=catalogue().inputs)
         if name not in self.sets:
             known = ", ".join((PLAIN, *self.sets))
             raise QuestionError(f"no feature set is called {name!r}. Feature sets: {known}.")
-        return self.sets[name]
+        one = self.sets[name]
+        members = [
+            member
+            for window in one.windows
+            for member in (
+                self.windows[window].members(window) if window in self.windows else (window,)
+            )
+        ]
+        return one.model_copy(update={"windows": tuple(dict.fromkeys(members))})
 
     def identity(self, name: str) -> str:
         """Return what the Gram rows of a set carry: its name and a checksum of its definition.
@@ -190,6 +277,11 @@ class FeatureCatalogue(Config):
             "row_folds": one.row_folds,
             "lagged": one.lagged,
         }
+        if one.windows:
+            content["windows"] = {
+                w: self.time_columns[w].model_dump(mode="json", exclude={"description"})
+                for w in one.windows
+            }
         digest = sha256_of(canonical_json(content))
         return f"{name}-{digest[:12]}"
 
@@ -208,11 +300,27 @@ class FeatureCatalogue(Config):
 
     def _definition(self, name: str) -> Mapping[str, str]:
         feature = self.features[name]
-        return {"sql": feature.sql, "scale": str(feature.scale), "unit": feature.unit}
+        content = {"sql": feature.sql, "scale": str(feature.scale), "unit": feature.unit}
+        return content if feature.bits == COUNT_BITS else content | {"bits": str(feature.bits)}
 
-    def of(self, name: str) -> Signal | Feature:
-        """Return an input by name: a logged signal, or a feature."""
+    def of(self, name: str) -> Signal | Feature | TimeColumn:
+        """Return an input by name: a logged signal, a feature, or a column over time."""
+        if name in self.time_columns:
+            return self.time_columns[name]
         return self.features[name] if name in self.features else catalogue()[name]
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Everything that a model may use."""
+        return (*catalogue().inputs, *self.features, *self.time_columns)
+
+
+def _named(where: str, make: Callable[..., TimeColumn], *parts: object) -> TimeColumn:
+    """Make a column. Raises `ValueError` that says which one cannot be."""
+    try:
+        return make(*parts)
+    except ValidationError as error:
+        raise ValueError(f"{where}: {faults_of(error)}") from None
 
 
 def load_features(file: Traversable) -> FeatureCatalogue:
@@ -220,10 +328,46 @@ def load_features(file: Traversable) -> FeatureCatalogue:
     return load_config(file, FeatureCatalogue)
 
 
+def load_features_over(shipped: Traversable, own: Traversable) -> FeatureCatalogue:
+    """Read a file of features laid over another: what it names is added, or takes the place.
+
+    Raises `ConfigError`.
+    """
+    content = load_toml(shipped)
+    for kind, entries in load_toml(own).items():
+        if kind not in content or not isinstance(entries, dict):
+            raise ConfigError(f"{own}: {kind}: unknown key. Known: {', '.join(content)}.")
+        content[kind] = {**content[kind], **entries}
+    try:
+        return FeatureCatalogue.model_validate(content)
+    except ValidationError as error:
+        raise ConfigError(f"{own}, over {shipped}: {faults_of(error)}") from None
+
+
 @cache
 def features() -> FeatureCatalogue:
-    """Return the features that ship with this installation."""
-    return load_features(folder("configs") / "features.toml")
+    """Return the features that are in force: the shipped ones, and one's own over them."""
+    shipped, chosen = folder("configs") / "features.toml", config_file("features.toml")
+    if str(chosen) == str(shipped):
+        return load_features(shipped)
+    return load_features_over(shipped, chosen)
+
+
+def column_query(known: FeatureCatalogue, name: str) -> str:
+    """Return the query over the view `log_counts` that computes a feature or column over time.
+
+    Raises `QuestionError` for what is neither.
+    """
+    definition = known.definition(name)
+    if definition is not None:
+        rows = with_windows("log_counts", {}, {name: definition})
+    elif name in known.features:
+        rows = with_features("log_counts", {name: known.features[name].sql})
+    else:
+        raise QuestionError(
+            f"no feature, window or factor is called {name!r}. See: fleet-slip features"
+        )
+    return f"SELECT drive_id, tick, {name}\nFROM {rows}\nORDER BY drive_id, tick"
 
 
 @cache
@@ -231,4 +375,6 @@ def input_scales() -> Mapping[str, Fraction]:
     """Return the physical value of one count of every input signal, feature and the label."""
     signals = catalogue()
     scales = {name: signals[name].exact_scale for name in signals.gram_signals}
-    return scales | {name: one.exact_scale for name, one in features().features.items()}
+    known = features()
+    columns: dict[str, Feature | TimeColumn] = {**known.features, **known.time_columns}
+    return scales | {name: one.exact_scale for name, one in columns.items()}

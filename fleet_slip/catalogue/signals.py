@@ -13,7 +13,7 @@ from pydantic import Field, StringConstraints, model_validator
 
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import QuestionError
-from fleet_slip.resources import folder
+from fleet_slip.resources import config_file
 
 CATALOGUE_VARIABLE = "FLEET_SLIP_SIGNALS"
 """Names a signal catalogue to use instead of the shipped one: another fleet, other signals."""
@@ -153,4 +153,4 @@ def load_catalogue(file: Traversable) -> SignalCatalogue:
 def catalogue() -> SignalCatalogue:
     """Return the catalogue of `$FLEET_SLIP_SIGNALS`, else the one that ships with the package."""
     chosen = environ.get(CATALOGUE_VARIABLE)
-    return load_catalogue(Path(chosen) if chosen else folder("configs") / "signals.toml")
+    return load_catalogue(Path(chosen) if chosen else config_file("signals.toml"))

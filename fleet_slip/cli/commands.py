@@ -67,6 +67,10 @@ COMMANDS = {
         "statistics",
         "List the features and feature sets of configs/features.toml.",
     ),
+    "config": Command(
+        "configs",
+        "List the config files that are in force, and where each comes from.",
+    ),
     "what-if": Command(
         "statistics",
         "Predict a model's error with worse sensors, in closed form; nothing is simulated.",

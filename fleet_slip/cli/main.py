@@ -4,6 +4,7 @@ import logging
 import os
 import sys
 from importlib.metadata import version
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -15,6 +16,7 @@ from fleet_slip.cli.streams import Streams
 from fleet_slip.errors import FleetSlipError, StorageError
 from fleet_slip.files.data_root import ROOT_VARIABLE, data_root
 from fleet_slip.limits import require_limits
+from fleet_slip.resources import CONFIG_VARIABLE, own_configs
 
 INTERRUPTED = 130
 
@@ -58,6 +60,14 @@ def options(
             "json elsewhere.",
         ),
     ] = LogFormat.AUTO,
+    config: Annotated[
+        str | None,
+        typer.Option(
+            help="A folder of configs laid over the shipped ones (docs/configuration.md). "
+            f"Default: ${CONFIG_VARIABLE}.",
+            show_default=False,
+        ),
+    ] = None,
     _version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print it.")
     ] = False,
@@ -70,6 +80,9 @@ def options(
     Start with: **fleet-slip run --campaign smoke**
     """
     configure_logs(log)
+    if config is not None:
+        os.environ[CONFIG_VARIABLE] = str(Path(config).absolute())
+    own_configs()
     require_limits()
     from fleet_slip.warehouse.tables import Warehouse  # noqa: PLC0415 - pyarrow and Delta, not for --help
 

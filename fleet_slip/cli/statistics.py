@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from fleet_slip.catalogue.features import PLAIN, FeatureSet, features
+from fleet_slip.catalogue.features import PLAIN, FeatureSet, column_query, features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli.output import Json, print_json, print_table, stdout
@@ -37,6 +37,14 @@ def list_features(
     sets: Annotated[
         bool, typer.Option("--sets", help="List the feature sets instead of the features.")
     ] = False,
+    sql: Annotated[
+        str | None,
+        typer.Option(
+            "--sql",
+            help="Print the query over log_counts that computes this feature, window or factor.",
+            show_default=False,
+        ),
+    ] = None,
     json: Json = False,
 ) -> None:
     """List the features and feature sets of configs/features.toml.
@@ -46,9 +54,14 @@ def list_features(
     select --features NAME**
     """
     known = features()
-    if json:
+    if sql is not None:
+        typer.echo(column_query(known, sql))
+    elif json:
         print_json(
             {
+                "windows": {
+                    name: one.model_dump(mode="json") for name, one in known.time_columns.items()
+                },
                 "features": {
                     name: {**one.model_dump(mode="json"), "sql": one.sql}
                     for name, one in known.features.items()
@@ -81,6 +94,15 @@ def list_features(
             [
                 [name, one.unit, str(one.scale), " ".join(one.inputs), one.description]
                 for name, one in known.features.items()
+            ],
+            left=5,
+        )
+        print_table(
+            "\ncolumns over time",
+            ["column", "unit", "scale", "of", "description"],
+            [
+                [name, one.unit, str(one.scale), one.definition.of, one.description]
+                for name, one in known.time_columns.items()
             ],
             left=5,
         )

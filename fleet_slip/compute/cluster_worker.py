@@ -20,7 +20,7 @@ from typing import Any
 
 from fleet_slip.errors import FleetSlipError, RefusedError, StorageError
 from fleet_slip.files.folder import Folder
-from fleet_slip.resources import folder
+from fleet_slip.resources import folder, own_configs
 
 PACKAGES = (
     "fleet-slip",
@@ -116,8 +116,10 @@ def _version(package: str) -> str:
 def _sources_digest() -> str:
     """Return a checksum of programs, statements and configs: a checkout may have been edited."""
     digest = sha256()
-    package: Traversable = Path(__file__).parent
-    for entry in (package, folder("configs"), folder("jobs"), folder("warehouse")):
+    package: Traversable = Path(__file__).parent.parent
+    own = own_configs()
+    shipped = (folder("configs"), folder("jobs"), folder("warehouse"))
+    for entry in (package, *shipped, *([own] if own else [])):
         for file in _shipped(entry):
             digest.update(f"{file.name}\n".encode())
             digest.update(file.read_bytes())

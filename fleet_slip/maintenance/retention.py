@@ -10,7 +10,7 @@ from fleet_slip.errors import ConfigError, RefusedError
 from fleet_slip.maintenance.forget import ForgetReport, forget
 from fleet_slip.maintenance.vacuum import RETENTION_HOURS, VacuumReport, vacuum
 from fleet_slip.progress import Progress, no_progress
-from fleet_slip.resources import find_config, folder
+from fleet_slip.resources import config_file, find_config
 from fleet_slip.warehouse.audit import Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -33,7 +33,7 @@ class RetentionReport:
 
 def load_retention(path: str | None) -> Retention:
     """Read a retention file, the one that ships unless told otherwise. Raises `ConfigError`."""
-    file = folder("configs") / "retention.toml" if path is None else find_config("retention", path)
+    file = config_file("retention.toml") if path is None else find_config("retention", path)
     return load_config(file, Retention)
 
 

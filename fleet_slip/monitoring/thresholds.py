@@ -5,7 +5,7 @@ from functools import cache
 from pydantic import Field
 
 from fleet_slip.config import Config, load_config
-from fleet_slip.resources import folder
+from fleet_slip.resources import config_file
 
 
 class StatusThresholds(Config):
@@ -64,4 +64,4 @@ class Thresholds(Config):
 @cache
 def thresholds() -> Thresholds:
     """Return the thresholds that ship with this installation."""
-    return load_config(folder("configs") / "monitor.toml", Thresholds)
+    return load_config(config_file("monitor.toml"), Thresholds)

@@ -13,9 +13,9 @@ import pyarrow as pa
 import pytest
 
 from fleet_slip.catalogue import features as features_module
-from fleet_slip.catalogue.feature_sql import with_features
+from fleet_slip.catalogue.columns import with_features
 from fleet_slip.catalogue.features import features, lag_signals, load_features
-from fleet_slip.catalogue.signals import COUNT_MAX, catalogue
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.delta import Change, Unit
 from fleet_slip.errors import ConfigError, DataError, QuestionError
 from fleet_slip.grams import aggregation
@@ -30,6 +30,7 @@ from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import land, log_rows, random_counts
 
 RADIUS_M = Fraction(31, 100)
+TRACK_M = Fraction(155, 100)
 INPUTS = catalogue().inputs
 LABEL = catalogue().label
 
@@ -55,6 +56,16 @@ PHYSICS: dict[str, Callable[[Row], Fraction | None]] = {
     "ay_signed_square": lambda row: row["ay"] * abs(row["ay"]),
     "steer_mean": lambda row: (row["steer_fl"] + row["steer_fr"]) / 2,
     "steer_speed_squared": lambda row: (row["steer_fl"] + row["steer_fr"]) / 2 * speed(row) ** 2,
+    "course_difference": lambda row: (
+        row["ay"] / speed(row) - row["yaw_rate"] if speed(row) >= 3 else None
+    ),
+    "yaw_rate_excess": lambda row: (
+        row["yaw_rate"] - (row["wheel_rr"] - row["wheel_rl"]) * RADIUS_M / TRACK_M
+    ),
+    "ay_excess": lambda row: row["ay"] - row["yaw_rate"] * speed(row),
+    "curvature_fine": over_speed("yaw_rate"),
+    "ay_speed": lambda row: row["ay"] * speed(row),
+    "ay_ax": lambda row: row["ay"] * row["ax"],
     "wheel_difference_front": lambda row: row["wheel_fr"] - row["wheel_fl"],
     "wheel_difference_rear": lambda row: row["wheel_rr"] - row["wheel_rl"],
     "wheel_difference_axles": lambda row: (
@@ -78,10 +89,11 @@ def test_every_feature_is_its_physical_definition_rounded_and_clipped() -> None:
     for name in INPUTS:
         logged[name][200:] = (logged[name][200:] // 40) + (1500 if "wheel" in name else 0)
     definitions = {name: one.sql for name, one in features().features.items()}
+    limits = {name: one.limit for name, one in features().features.items()}
     assert set(definitions) == set(PHYSICS)
     with duckdb.connect() as database:
         database.register("log_counts", pa.table(logged))
-        query = f"SELECT * FROM {with_features('log_counts', definitions)}"
+        query = f"SELECT * FROM {with_features('log_counts', definitions, limits)}"
         found: pa.Table = database.sql(query).to_arrow_table()
     exact = {name: catalogue()[name].exact_scale for name in INPUTS}
     clipped = 0
@@ -94,8 +106,8 @@ def test_every_feature_is_its_physical_definition_rounded_and_clipped() -> None:
                 assert row[name] is None
                 continue
             count = nearest(value / features().features[name].exact_scale)
-            out_of_range += abs(count) > COUNT_MAX
-            assert row[name] == max(-COUNT_MAX, min(COUNT_MAX, count)), (name, i)
+            out_of_range += abs(count) > limits[name]
+            assert row[name] == max(-limits[name], min(limits[name], count)), (name, i)
         assert row["clipped"] == out_of_range
         clipped += out_of_range
     assert clipped > 100

@@ -1,0 +1,323 @@
+"""A column of counts over time: what it is, as types that a manifest can hold, and its SQL.
+
+A window looks back on the counts of one row, a logged signal or a feature, within its drive. One
+rule for all, in SQL, in the compiled kernel and on board:
+
+* A window of N ticks is what was logged in the last N ticks, this one included. Where a drive
+  begins, or after a hole, that is fewer values; a mean divides by as many as there are.
+* Where the looked-back value itself is missing now, the mean and the sum are missing too.
+* The value N ticks ago is missing where no such tick was logged.
+* Everything is an integer. A quotient is rounded to the nearest, halves away from zero, once; then
+  the count is clipped to its bits.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from fractions import Fraction
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, Field, StringConstraints, model_validator
+
+from fleet_slip.catalogue.arithmetic import parse
+from fleet_slip.catalogue.signals import COUNT_MAX, Identifier, catalogue
+from fleet_slip.config import Config
+from fleet_slip.errors import QuestionError
+
+Over = Literal["mean", "sum", "lag", "running_mean"]
+"""What a window makes of the values: mean or sum over the last ticks, the value so many ticks ago,
+mean since the drive began."""
+
+LONGEST_TICKS = 2**16
+"""Longest window: eleven minutes."""
+
+LARGEST_RATIO = 2**14
+"""Largest numerator and denominator of a ratio of scales: keeps every quotient below 2^53."""
+
+LARGEST_FACT = 2**16
+"""Largest size of a number that a car knows of itself."""
+
+COUNT_BITS = 16
+"""Bits of a logged count, and of a feature that does not say how many."""
+
+Bits = Annotated[int, Field(ge=16, le=20)]
+
+FactText = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_.-]{1,60}$")]
+
+NO_CAR_KNOWS = frozenset({"adhesion", "lost_control_s", "speed_factor", "saturated"})
+"""Drive columns that are known to a simulation or afterwards, and to no car while it drives."""
+
+NOT_FACTS = NO_CAR_KNOWS | {"drive_id", "vehicle_id", "source", "campaign", "track"}
+
+
+def limit_of(bits: int) -> int:
+    """Return the largest count of so many bits; the range is symmetric."""
+    return int(2 ** (bits - 1) - 1)
+
+
+def _ratio(value: Fraction) -> Fraction:
+    if not 0 < value.numerator <= LARGEST_RATIO or value.denominator > LARGEST_RATIO:
+        raise ValueError(
+            f"the scales are {value} to one: choose scales whose ratio has no numerator or "
+            f"denominator above {LARGEST_RATIO}"
+        )
+    return value
+
+
+def _integer_arithmetic(sql: str) -> str:
+    """Return the SQL of a feature. Raises `ValueError` if it is more than integer arithmetic."""
+    if not sql:
+        return sql
+    try:
+        inputs = parse(sql).inputs
+    except QuestionError as error:
+        raise ValueError(str(error)) from None
+    if unknown := set(inputs) - set(catalogue().inputs):
+        raise ValueError(f"{', '.join(sorted(unknown))}: not an input signal")
+    return sql
+
+
+def _not_unknowable(name: str) -> str:
+    if name in NOT_FACTS or name not in catalogue().drive:
+        raise ValueError(f"{name} is no fact that a car knows of itself")
+    return name
+
+
+Ratio = Annotated[Fraction, AfterValidator(_ratio)]
+
+
+class Fact(Config):
+    """What a car knows of itself, as a whole number: a factor of a column.
+
+    The number is `name` rounded, less `less`; or with `equals` 1 for cars of that value, 0 for
+    others. The column's count times that number times `ratio` is rounded and clipped again.
+    """
+
+    name: Annotated[Identifier, AfterValidator(_not_unknowable)]
+    less: Annotated[int, Field(ge=-LARGEST_FACT, le=LARGEST_FACT)] = 0
+    equals: FactText | None = None
+    ratio: Ratio = Fraction(1)
+
+    @model_validator(mode="after")
+    def _fits_its_type(self) -> "Fact":
+        text = catalogue().drive[self.name].type == "string"
+        if text != (self.equals is not None):
+            raise ValueError(f"{self.name} {'needs' if text else 'is a number without'} equals")
+        return self
+
+    def number(self, value: Any) -> int | None:
+        """Return the number for what the car knows; None where it does not know it."""
+        if value is None:
+            return None
+        if self.equals is not None:
+            return int(value == self.equals)
+        if not abs(value) <= LARGEST_FACT:
+            return None
+        return int(math.copysign(math.floor(abs(value) + 0.5), value)) - self.less
+
+    @property
+    def sql(self) -> str:
+        """The number as SQL over the drive's columns; null where the car does not know it."""
+        if self.equals is not None:
+            return f"({self.name} = '{self.equals}')::BIGINT"
+        return (
+            f"CASE WHEN abs({self.name}) <= {LARGEST_FACT} "
+            f"THEN round({self.name})::BIGINT - ({self.less}) END"
+        )
+
+
+class Definition(Config):
+    """Everything that defines a column of counts over time, whatever it is called.
+
+    Attributes:
+        of: the signal or feature that is looked back on.
+        sql: integer SQL of that feature; empty for a logged signal.
+        of_bits: to which the feature's count is clipped.
+        over, ticks: the window; ticks is 0 for all since the drive began. Without `over` it is
+            the value of this row.
+        ratio: counts of the column for one count of what is looked back on.
+        bits: to which the column's count is clipped.
+        fact: a factor, if there is one.
+    """
+
+    of: Identifier
+    sql: Annotated[str, Field(max_length=5000), AfterValidator(_integer_arithmetic)] = ""
+    of_bits: Bits = COUNT_BITS
+    over: Over | None = None
+    ticks: int = Field(default=0, ge=0, le=LONGEST_TICKS)
+    ratio: Ratio = Fraction(1)
+    bits: Bits = 20
+    fact: Fact | None = None
+
+    @model_validator(mode="after")
+    def _ticks_fit(self) -> "Definition":
+        if (self.over in {"mean", "sum", "lag"}) != bool(self.ticks):
+            raise ValueError("ticks is for mean, sum and lag, which must have it")
+        return self
+
+    @model_validator(mode="after")
+    def _of_is_known(self) -> "Definition":
+        if not self.sql and self.of not in catalogue().inputs:
+            raise ValueError(f"{self.of} is not an input signal")
+        if self.sql and self.of in {*catalogue().signals, *catalogue().drive, "tick", "day"}:
+            raise ValueError(f"{self.of} is the name of a column of the logs")
+        return self
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """The logged signals in it."""
+        return parse(self.sql).inputs if self.sql else (self.of,)
+
+    @property
+    def window(self) -> tuple[str, str]:
+        """The name and the SQL of the frame of rows that it looks back on."""
+        if self.over == "lag":
+            frame = f"BETWEEN {self.ticks} PRECEDING AND {self.ticks} PRECEDING"
+            return f"lag_{self.ticks}", frame
+        if self.over == "running_mean":
+            return "since_start", "BETWEEN UNBOUNDED PRECEDING AND CURRENT ROW"
+        return f"last_{self.ticks}", f"BETWEEN {self.ticks - 1} PRECEDING AND CURRENT ROW"
+
+    @property
+    def raw_sql(self) -> str:
+        """The count before it is clipped, as SQL over the frames and the columns of rows."""
+        frame, _ = self.window
+        if self.over is None:
+            return rounded_sql(self.of, self.ratio)
+        if self.over == "lag":
+            return rounded_sql(f"(max({self.of}) OVER {frame})", self.ratio)
+        total = f"(sum({self.of}::BIGINT) OVER {frame})::BIGINT"
+        values = f"(count({self.of}) OVER {frame})" if self.over != "sum" else "1"
+        quotient = rounded_sql(total, self.ratio, values)
+        return f"CASE WHEN {self.of} IS NOT NULL THEN {quotient} END"
+
+
+def rounded_sql(value: str, ratio: Fraction, divisor: str = "1") -> str:
+    """Return SQL of value * ratio / divisor, rounded to the nearest, halves away from zero."""
+    product = f"{value}::BIGINT * {ratio.numerator}" if ratio.numerator != 1 else f"{value}::BIGINT"
+    below = f"{ratio.denominator} * {divisor}" if divisor != "1" else f"{ratio.denominator}"
+    if below == "1":
+        return product
+    return f"(2 * {product} + sign({value}) * {below}) // (2 * {below})"
+
+
+def clipped_sql(name: str, limit: int = COUNT_MAX) -> str:
+    """Return the SQL of an integer column clipped to the range of counts; null stays null."""
+    kind = "SMALLINT" if limit == COUNT_MAX else "INTEGER"
+    return (
+        f"CASE WHEN {name} > {limit} THEN {limit} "
+        f"WHEN {name} < -{limit} THEN -{limit} ELSE {name} END::{kind}"
+    )
+
+
+def with_absent(rows: str, absent: Sequence[str]) -> str:
+    """Return a table expression with signals that none of its files has, as nulls."""
+    if not absent:
+        return rows
+    nulls = ", ".join(f"NULL::SMALLINT AS {name}" for name in absent)
+    return f"(SELECT *, {nulls} FROM {rows})"
+
+
+def with_features(
+    rows: str, definitions: Mapping[str, str], limits: Mapping[str, int] | None = None
+) -> str:
+    """Return a subquery: the rows with features as columns of counts, each clipped to its limit.
+
+    `rows` is a table expression with counts; `definitions` gives the SQL of each feature; `limits`
+    those that are not int16. The column `clipped` says how many of the features of a row were out
+    of range.
+    """
+    return _layer(rows, definitions, limits or {}) if definitions else rows
+
+
+def with_windows(
+    rows: str, features: Mapping[str, str], definitions: Mapping[str, Definition]
+) -> str:
+    """Return a subquery: the rows of a table expression with features and columns over time.
+
+    `features` gives the SQL of features of 16 bits. The column `clipped` counts what was out of
+    range, also of what is looked back on.
+    """
+    looked_at = features_behind(definitions)
+    rows = with_features(
+        rows,
+        {**features, **{name: one.sql for name, one in looked_at.items()}},
+        {name: limit_of(one.of_bits) for name, one in looked_at.items()},
+    )
+    if not definitions:
+        return rows
+    own = {name: one for name, one in definitions.items() if name not in looked_at}
+    if not features and not looked_at:
+        rows = f"(SELECT *, 0 AS clipped FROM {rows})"
+    return over_windows(rows, own) if own else rows
+
+
+def features_behind(definitions: Mapping[str, Definition]) -> dict[str, Definition]:
+    """Return a definition with the SQL of each feature that columns are made of, by its name.
+
+    Raises `QuestionError` if a column has the name of such a feature and is something else.
+    """
+    found = {one.of: one for one in definitions.values() if one.sql}
+    for name, one in definitions.items():
+        if name in found and (one.over or one.fact or one.of != name):
+            raise QuestionError(f"{name} is a column, and a feature that another looks back on.")
+        if one.sql and (one.sql, one.of_bits) != (found[one.of].sql, found[one.of].of_bits):
+            raise QuestionError(f"the feature {one.of} is defined in two ways.")
+    return found
+
+
+def over_windows(rows: str, definitions: Mapping[str, Definition]) -> str:
+    """Return the same where `rows` has what is looked back on already, and the column `clipped`."""
+    frames = dict(one.window for one in definitions.values() if one.over)
+    named = ",\n            ".join(
+        f"{name} AS (PARTITION BY drive_id ORDER BY tick RANGE {frame})"
+        for name, frame in frames.items()
+    )
+    limits = {name: limit_of(one.bits) for name, one in definitions.items()}
+    clause = f"\n            WINDOW {named}" if frames else ""
+    raw = {name: one.raw_sql for name, one in definitions.items()}
+    found = _layer(rows, raw, limits, clause=clause, counted=True)
+    times = {
+        name: rounded_sql(f"({name}::BIGINT * ({one.fact.sql}))", one.fact.ratio)
+        for name, one in definitions.items()
+        if one.fact
+    }
+    return _layer(found, times, limits, counted=True, replaced=True) if times else found
+
+
+def _layer(
+    rows: str,
+    definitions: Mapping[str, str],
+    limits: Mapping[str, int],
+    *,
+    clause: str = "",
+    counted: bool = False,
+    replaced: bool = False,
+) -> str:
+    """Return a subquery that computes columns, new ones or `replaced` ones, and clips them.
+
+    With `counted`, the rows have the column `clipped` already.
+    """
+    separator = ",\n            "
+    limit = {name: limits.get(name, COUNT_MAX) for name in definitions}
+    computed = separator.join(f"{sql} AS {name}" for name, sql in definitions.items())
+    inside = [f"{clipped_sql(name, limit[name])} AS {name}" for name in definitions]
+    outside = " + ".join(
+        f"coalesce(abs({name}) > {limit[name]}, false)::INTEGER" for name in definitions
+    )
+    if counted:
+        inside.append(f"clipped + {outside} AS clipped")
+    new = "" if counted else f",\n            {outside} AS clipped"
+    columns = (
+        f"* REPLACE (\n            {computed}\n            )"
+        if replaced
+        else f"*,\n            {computed}"
+    )
+    return f"""(
+        SELECT * REPLACE (
+            {separator.join(inside)}
+        ){new}
+        FROM (
+            SELECT {columns}
+            FROM {rows}{clause}
+        )
+    )"""

@@ -1,0 +1,115 @@
+"""Windows and factors of `configs/features.toml` as types: `[windows.NAME]`, `[factors.NAME]`."""
+
+from decimal import Decimal
+from fractions import Fraction
+
+from pydantic import Field, model_validator
+
+from fleet_slip.catalogue.columns import LONGEST_TICKS, Bits, Definition, Fact, FactText, Over
+from fleet_slip.catalogue.signals import Identifier, SIUnit
+from fleet_slip.config import Config
+
+TICKS = "{ticks}"
+"""In the column of a family of windows: the number of ticks of each."""
+
+
+class Window(Config):
+    """A family of columns that look back on one signal or feature, one for each number of ticks.
+
+    The column of N ticks is called NAME_N; the mean since the drive began is called NAME.
+    """
+
+    of: Identifier
+    over: Over
+    ticks: tuple[int, ...] = ()
+    scale: Decimal = Field(gt=0)
+    bits: Bits = 20
+    unit: SIUnit
+    column: str = Field(min_length=1, max_length=60)
+    description: str = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _ticks_fit(self) -> "Window":
+        if (self.over != "running_mean") != bool(self.ticks):
+            raise ValueError("ticks is for mean, sum and lag, which must have it")
+        if len(set(self.ticks)) < len(self.ticks):
+            raise ValueError("a number of ticks stands twice")
+        if any(not 1 <= n <= LONGEST_TICKS for n in self.ticks):
+            raise ValueError(f"ticks must lie in 1..{LONGEST_TICKS}")
+        if bool(self.ticks) != (TICKS in self.column):
+            raise ValueError(f"column must have {TICKS} in it if there are ticks, and only then")
+        return self
+
+    def members(self, name: str) -> dict[str, int]:
+        """Return the names of the family's columns, and the ticks of each."""
+        return {f"{name}_{n}": n for n in self.ticks} or {name: 0}
+
+
+class Factor(Config):
+    """A column times what a car knows of itself: a number less `less`, or whether it `equals`."""
+
+    of: Identifier
+    fact: Identifier
+    less: int = 0
+    equals: FactText | None = None
+    scale: Decimal = Field(gt=0)
+    unit: SIUnit
+    column: Identifier
+    description: str = Field(min_length=1)
+
+
+class TimeColumn(Config):
+    """One column over time: how it is defined, and what a count of it is worth."""
+
+    definition: Definition
+    scale: Decimal
+    unit: SIUnit
+    column: Identifier
+    description: str
+
+    @property
+    def exact_scale(self) -> Fraction:
+        """Physical value of one count, exactly."""
+        return Fraction(self.scale)
+
+
+def window_column(window: Window, ticks: int, row: Definition, scale: Fraction) -> TimeColumn:
+    """Return a member of a family, given what it looks back on and that one's scale."""
+    definition = Definition(
+        of=row.of,
+        sql=row.sql,
+        of_bits=row.of_bits,
+        over=window.over,
+        ticks=ticks,
+        ratio=scale / Fraction(window.scale),
+        bits=window.bits,
+    )
+    return TimeColumn(
+        definition=definition,
+        scale=window.scale,
+        unit=window.unit,
+        column=window.column.replace(TICKS, str(ticks)),
+        description=window.description + (f", over {ticks} ticks" if ticks else ""),
+    )
+
+
+def factor_column(factor: Factor, base: Definition, scale: Fraction) -> TimeColumn:
+    """Return a column times a fact, given the column without it and that one's scale.
+
+    Raises `ValueError` if the column has a factor already.
+    """
+    if base.fact is not None:
+        raise ValueError(f"{factor.of} has a factor already")
+    fact = Fact(
+        name=factor.fact,
+        less=factor.less,
+        equals=factor.equals,
+        ratio=scale / Fraction(factor.scale),
+    )
+    return TimeColumn(
+        definition=base.model_copy(update={"fact": fact}),
+        scale=factor.scale,
+        unit=factor.unit,
+        column=factor.column,
+        description=factor.description,
+    )
