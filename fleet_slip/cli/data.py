@@ -17,8 +17,10 @@ from fleet_slip.cli.workers import Cluster, Threads, unless_local, workers
 from fleet_slip.errors import ConfigError
 from fleet_slip.grams.check import check_grams
 from fleet_slip.grams.job import GramReport, update_grams
+from fleet_slip.grams.reader import cohort_files
 from fleet_slip.grams.statement import gram_statement
 from fleet_slip.runs.log import step
+from fleet_slip.warehouse.condition import parse_condition
 from fleet_slip.warehouse.tables import Warehouse
 
 if TYPE_CHECKING:
@@ -82,10 +84,16 @@ def run_simulation(
     return report
 
 
-def run_gram(warehouse: Warehouse, executor: Executor, feature_set: str = PLAIN) -> GramReport:
-    """Run the Gram job for a feature set with a progress bar."""
+def run_gram(
+    warehouse: Warehouse,
+    executor: Executor,
+    feature_set: str = PLAIN,
+    cohort: str | None = None,
+) -> GramReport:
+    """Run the Gram job for a feature set with a progress bar; for the files of a cohort, or all."""
+    among = cohort_files(warehouse, parse_condition(cohort)) if cohort else None
     with step("gram") as figures, progress(f"gram {feature_set}", "rows", executor) as advance:
-        report = update_grams(warehouse, advance, feature_set, unless_local(executor))
+        report = update_grams(warehouse, advance, feature_set, unless_local(executor), among)
         figures.rows = report.rows_read
     return report
 
@@ -210,6 +218,14 @@ def gram(
             "themselves, all is every set.",
         ),
     ] = PLAIN,
+    cohort: Annotated[
+        str | None,
+        typer.Option(
+            help="Read only the log files that have a drive of this cohort, an SQL condition on "
+            "the view drives. Default: all.",
+            show_default=False,
+        ),
+    ] = None,
     sql: Annotated[bool, typer.Option("--sql", help="Print the statement and do nothing.")] = False,
     cluster: Cluster = None,
     json: Json = False,
@@ -225,7 +241,9 @@ def gram(
             typer.echo(gram_statement(catalogue(), name))
         return
     with workers(context, cluster) as (warehouse, executor):
-        reports = [run_gram(warehouse, executor, name) for name in names]
+        if cohort:  # which files have its drives is known from the logged signals' Gram rows
+            run_gram(warehouse, executor)
+        reports = [run_gram(warehouse, executor, name, cohort) for name in names]
     if json:
         documents = [asdict(report) for report in reports]
         print_json(documents if feature_set == ALL_SETS else documents[0])
@@ -264,6 +282,7 @@ def check(
     if json:
         print_json(asdict(report))
     else:
+        wide = [f"{report.wide_drives}"]
         print_table(
             "",
             ["way", "drives", "equal"],
@@ -271,5 +290,10 @@ def check(
                 ["SQL against stored Gram rows", f"{report.drives}", "yes"],
                 ["SQL against float64 blocks", f"{report.drives}", "yes"],
                 ["SQL against Python integers", f"{report.drives_by_integers}", "yes"],
+                *(
+                    [[f"SQL against the kernel: {', '.join(report.wide_sets)}", *wide, "yes"]]
+                    if report.wide_sets
+                    else []
+                ),
             ],
         )

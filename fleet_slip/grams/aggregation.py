@@ -1,20 +1,20 @@
-"""Runs `jobs/gram.sql` over log files: in this process, or as tasks of an executor."""
+"""Computes the Gram rows of log files: plain sets by `jobs/gram.sql`, windows by the kernel."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
+from contextlib import nullcontext
 from functools import partial
 from math import ceil
+from os import cpu_count
 
 import duckdb
 import pyarrow as pa
 
 from fleet_slip.catalogue.features import PLAIN, features
-from fleet_slip.compute.tasks import in_flight, run_tasks
-from fleet_slip.delta import (
-    TableFile,
-    absent_columns,
-)
+from fleet_slip.compute.tasks import LocalThreads, in_flight, run_tasks
+from fleet_slip.delta import TableFile, absent_columns
 from fleet_slip.grams.statement import gram_statement
+from fleet_slip.grams.wide import wide_grams
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.database import open_database, reading_files
 from fleet_slip.warehouse.tables import Warehouse
@@ -34,28 +34,62 @@ def aggregate(
     feature_set: str = PLAIN,
     executor: Executor | None = None,
 ) -> pa.Table:
-    """Return the Gram rows of log files, in the schema of `grams`, sorted by file and drive.
+    """Return the Gram rows of log files, in the schema of `grams`, sorted by file and drive."""
+    empty = warehouse.grams.schema.empty_table()
+    return pa.concat_tables(
+        [empty, *compute_grams(warehouse, files, progress, threads, feature_set, executor)]
+    )
 
-    The query runs in this process, on all of its cores unless `threads` says how many; or, with an
-    executor of other processes, as tasks of some files and one thread each.
+
+def compute_grams(
+    warehouse: Warehouse,
+    files: Sequence[TableFile],
+    progress: Progress = no_progress,
+    threads: int | None = None,
+    feature_set: str = PLAIN,
+    executor: Executor | None = None,
+) -> Iterator[pa.Table]:
+    """Yield the Gram rows of some log files after the other, in the schema of `grams`.
+
+    In this process, on all of its cores unless `threads` says how many; or, with an executor of
+    other processes, as tasks of some files and one thread each.
     """
-    lagged = features().feature_set(feature_set).lagged
-    step = LAGGED_FILES_PER_QUERY if lagged else FILES_PER_QUERY
+    if features().feature_set(feature_set).windows:
+        own = LocalThreads(threads or cpu_count() or 1) if executor is None else None
+        with own or nullcontext():
+            task = partial(wide_grams, warehouse, feature_set=feature_set)
+            yield from _by_tasks(executor or own, task, _groups(files, 1), progress)
+        return
+    step = LAGGED_FILES_PER_QUERY if features().feature_set(feature_set).lagged else FILES_PER_QUERY
+    if executor is not None:
+        groups = _groups(files, min(step, max(1, ceil(len(files) / in_flight(executor)))))
+        task = partial(_aggregate_group, warehouse, feature_set)
+        yield from _by_tasks(executor, task, groups, progress)
+        return
     total = sum(file.rows for file in files)
-    parts = [warehouse.grams.schema.empty_table()]
-    if executor is None:
-        with open_database(reading=warehouse.logs.folder, threads=threads) as database:
-            for group in _groups(files, step):
-                parts.append(_query(database, warehouse, group, feature_set))
-                progress(sum(file.rows for file in group), total)
-        return pa.concat_tables(parts)
-    groups = _groups(files, min(step, max(1, ceil(len(files) / in_flight(executor)))))
-    task = partial(_aggregate_group, warehouse, feature_set)
+    with open_database(reading=warehouse.logs.folder, threads=threads) as database:
+        for group in _groups(files, step):
+            yield _query(database, warehouse, group, feature_set)
+            progress(sum(file.rows for file in group), total)
+
+
+def _by_tasks(
+    executor: Executor | None,
+    task: Callable[[Sequence[TableFile]], pa.Table],
+    groups: list[Sequence[TableFile]],
+    progress: Progress,
+) -> Iterator[pa.Table]:
+    """Yield the results of tasks in the order of their files; those that are early wait."""
+    total = sum(file.rows for group in groups for file in group)
     done: dict[str, pa.Table] = {}
+    following = iter(groups)
+    awaited = next(following, None)
     for group, rows in run_tasks(executor, task, groups, _group_name):
         done[group[0].path] = rows
         progress(sum(file.rows for file in group), total)
-    return pa.concat_tables([*parts, *(done[group[0].path] for group in groups)])
+        while awaited is not None and awaited[0].path in done:
+            yield done.pop(awaited[0].path)
+            awaited = next(following, None)
 
 
 def _groups(files: Sequence[TableFile], step: int) -> list[Sequence[TableFile]]:
@@ -70,6 +104,12 @@ def _aggregate_group(
     warehouse: Warehouse, feature_set: str, files: Sequence[TableFile]
 ) -> pa.Table:
     with open_database(reading=warehouse.logs.folder, threads=1) as database:
+        return _query(database, warehouse, files, feature_set)
+
+
+def by_sql(warehouse: Warehouse, files: Sequence[TableFile], feature_set: str) -> pa.Table:
+    """Return the Gram rows of log files as `jobs/gram.sql` defines them, of any feature set."""
+    with open_database(reading=warehouse.logs.folder) as database:
         return _query(database, warehouse, files, feature_set)
 
 

@@ -10,13 +10,19 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.delta import TableFile
 from fleet_slip.errors import DataError, StorageError
-from fleet_slip.grams.aggregation import aggregate
+from fleet_slip.grams.aggregation import aggregate, by_sql
+from fleet_slip.grams.backlog import find_backlog
+from fleet_slip.grams.job import unit_name
+from fleet_slip.grams.wide import wide_grams
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.regression.gram import Gram
 from fleet_slip.warehouse.tables import Warehouse
+
+SQL_COSTS = 4
+"""The SQL of windows takes minutes for a file: one of so many files is checked."""
 
 INTEGER_ROWS = 5_000
 """Rows of a drive that are also summed by Python integers, which take 50 us a row."""
@@ -30,6 +36,8 @@ class CheckReport:
     rows: int
     drives: int
     drives_by_integers: int
+    wide_sets: tuple[str, ...] = ()
+    wide_drives: int = 0
 
 
 def check_grams(
@@ -48,7 +56,8 @@ def check_grams(
     step = max(1, len(logs.files) // count)
     chosen = logs.files[::step][:count]
     stored = stored_grams(warehouse)
-    drives = by_integers = rows = 0
+    drives = by_integers = rows = wide_drives = 0
+    wide = _computed_wide_sets(warehouse)
     for file in chosen:
         from_sql = grams_of(aggregate(warehouse, [file]))
         _compare(file, "the stored Gram rows", from_sql, stored.get(file.path, {}))
@@ -58,7 +67,51 @@ def check_grams(
         drives += len(from_sql)
         rows += file.rows
         progress(1, len(chosen))
-    return CheckReport(len(chosen), rows, drives, by_integers)
+    for name in wide:
+        missing = find_backlog(logs, warehouse.grams.snapshot(), features().identity(name)).missing
+        computed = [file for file in logs.files if file not in missing]
+        every = max(1, len(computed) // count)
+        wide_drives += sum(
+            _check_wide(warehouse, f, name) for f in computed[::every][: max(1, count // SQL_COSTS)]
+        )
+    return CheckReport(len(chosen), rows, drives, by_integers, wide, wide_drives)
+
+
+def _computed_wide_sets(warehouse: Warehouse) -> tuple[str, ...]:
+    """Return the feature sets with windows that Gram rows were computed of."""
+    known, grams = features(), warehouse.grams.snapshot()
+    return tuple(
+        name
+        for name in known.sets
+        if known.feature_set(name).windows
+        and grams.landed(unit_name(known.identity(name))) is not None
+    )
+
+
+def _check_wide(warehouse: Warehouse, file: TableFile, feature_set: str) -> int:
+    """Compare the kernel with the SQL that defines it, and with what is stored; count drives.
+
+    A file that the set was not computed for has nothing to compare.
+    """
+    identity = features().identity(feature_set)
+    kept = grams_of_file(warehouse, file, identity)
+    if not kept:
+        return 0
+    from_sql = grams_of(by_sql(warehouse, [file], feature_set))
+    _compare(file, "the kernel", from_sql, grams_of(wide_grams(warehouse, [file], feature_set)))
+    _compare(file, f"the stored Gram rows of {feature_set}", from_sql, kept)
+    return len({drive for drive, _ in from_sql})
+
+
+def grams_of_file(warehouse: Warehouse, file: TableFile, identity: str) -> "DriveGrams":
+    """Return the stored Gram rows of a log file and a feature set, as its rows carry it."""
+    found: DriveGrams = {}
+    for gram_file in warehouse.grams.snapshot().files:
+        names = warehouse.grams.read(gram_file.path, ["feature_set", "file"])
+        here = pc.and_(pc.equal(names["feature_set"], identity), pc.equal(names["file"], file.path))
+        if pc.any(here).as_py():
+            found |= grams_of(warehouse.grams.read(gram_file.path).filter(here))
+    return found
 
 
 DriveGrams = dict[tuple[str, tuple[str, ...]], Gram]

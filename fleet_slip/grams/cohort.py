@@ -197,7 +197,7 @@ def load_cohort(
     `RefusedError` if a drive of an evaluation scenario satisfies it.
     """
     condition = parse_condition(condition)
-    with open_grams(warehouse, feature_set) as opened:
+    with open_grams(warehouse, feature_set, condition) as opened:
         statement = opened.statement("cohort.sql", condition)
         with asking(opened.database, condition):
             rows = opened.database.sql(statement).to_arrow_table()

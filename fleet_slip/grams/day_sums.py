@@ -44,7 +44,7 @@ def sum_days(
     drives: dict[date, list[NDArray[np.uint64]]] = {}
     found = False
     condition = parse_condition(condition)
-    with open_grams(source, feature_set) as opened:
+    with open_grams(source, feature_set, condition) as opened:
         for batch in opened.batches(condition):
             found = True
             require_training(batch["source"].unique().to_pylist(), condition)

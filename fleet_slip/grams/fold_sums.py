@@ -90,7 +90,7 @@ def sum_cohort(
     condition = parse_condition(condition)
     if folding.by == ROW_FOLDS:
         require_row_folds(feature_set, folding.count)
-    with open_grams(warehouse, feature_set) as opened:
+    with open_grams(warehouse, feature_set, condition) as opened:
         names, fold_of = _folding(opened, folding, condition)
         sums = _Sums(len(names), fold_of)
         for batch in opened.batches(condition):

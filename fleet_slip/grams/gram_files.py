@@ -1,7 +1,4 @@
-"""The files of the table `grams`: what is written, and which are written again.
-
-A file holds the Gram rows of one feature set, so that reading one set reads no other.
-"""
+"""Writes Gram rows to files: of one feature set each, neither too many nor too large."""
 
 import hashlib
 from collections.abc import Iterable, Iterator, Sequence
@@ -11,28 +8,30 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from deltalake.transaction import AddAction
 
-from fleet_slip.delta import (
-    Snapshot,
-    TableFile,
-)
+from fleet_slip.delta import Snapshot, TableFile
 from fleet_slip.warehouse.tables import Warehouse
 
 FILE_ROWS = 100_000
 """Gram rows of a file, some 700 bytes each; a file with fewer is small. Rewriting takes the memory
 of a few files, however many Gram rows there are."""
 
+FILE_BYTES = 2**28
+"""Most bytes of the Gram rows of a file; a row of 200 columns has 160,000."""
+
 SMALL_FILES_MAX = 32
 """So many small Gram files may stand side by side before a commit merges some."""
 
 
 def write_rows(warehouse: Warehouse, parts: Iterable[pa.Table]) -> list[AddAction]:
-    """Write Gram rows as files that no commit names yet; return what adds them."""
+    """Write Gram rows part by part; return the actions that add the files."""
     actions: list[AddAction] = []
     waiting: list[pa.Table] = []
     for part in parts:
-        for first in range(0, part.num_rows, FILE_ROWS):
-            waiting.append(part.slice(first, FILE_ROWS))
-            if sum(rows.num_rows for rows in waiting) >= FILE_ROWS:
+        step = max(1, min(FILE_ROWS, FILE_BYTES * len(part) // max(1, part.nbytes)))
+        for first in range(0, part.num_rows, step):
+            waiting.append(part.slice(first, step))
+            rows = sum(some.num_rows for some in waiting)
+            if rows >= FILE_ROWS or sum(some.nbytes for some in waiting) >= FILE_BYTES:
                 actions += _write_files(warehouse, pa.concat_tables(waiting))
                 waiting.clear()
     return actions + (_write_files(warehouse, pa.concat_tables(waiting)) if waiting else [])
@@ -48,7 +47,7 @@ def _write_files(warehouse: Warehouse, rows: pa.Table) -> list[AddAction]:
 
 
 def files_to_rewrite(grams: Snapshot, stale: frozenset[str]) -> list[TableFile]:
-    """Return the Gram files with rows of stale log files, and small ones that are to be merged."""
+    """Return the Gram files that name stale log files, and small ones to merge, if too many."""
     merged = _files_to_merge(grams)
     return [
         file
@@ -62,11 +61,16 @@ def _files_to_merge(grams: Snapshot) -> set[str]:
 
     Each night merges a few, so that none has to merge all.
     """
-    small = sorted((file.rows, file.path) for file in grams.files if file.rows < FILE_ROWS)
+    small = sorted((_fullness(file), file.path) for file in grams.files if _fullness(file) < 1)
     if len(small) <= SMALL_FILES_MAX:
         return set()
-    rows = list(accumulate(rows for rows, _ in small))
-    return {path for (_, path), so_far in zip(small, rows, strict=True) if so_far <= 2 * FILE_ROWS}
+    full = list(accumulate(fullness for fullness, _ in small))
+    return {path for (_, path), so_far in zip(small, full, strict=True) if so_far <= 2}
+
+
+def _fullness(file: TableFile) -> float:
+    """Return how full a file is; encoded, Gram rows take down to a quarter of their memory."""
+    return max(file.rows / FILE_ROWS, file.size_bytes / (FILE_BYTES / 4))
 
 
 def _log_files_of(grams: Snapshot, file: TableFile) -> set[str]:
@@ -76,7 +80,7 @@ def _log_files_of(grams: Snapshot, file: TableFile) -> set[str]:
 def rows_to_keep(
     grams: Snapshot, files: Sequence[TableFile], stale: frozenset[str]
 ) -> Iterator[pa.Table]:
-    """Yield the Gram rows of files, without those of stale log files."""
+    """Yield the Gram rows of files without those of stale log files."""
     dropped = pa.array(sorted(stale), pa.string())
     for file in files:
         schema = grams.table.schema

@@ -1,26 +1,22 @@
 """Makes the table `grams` agree with the active files of `logs`.
 
-Log files without Gram rows of a feature set are aggregated by `jobs/gram.sql`; Gram rows of any set
+Log files without Gram rows of a feature set are aggregated; Gram rows of any set
 whose file is no longer active are dropped; both in one commit. That one rule covers new days,
 interrupted runs, repeated runs, deletions and compaction.
 """
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from itertools import chain
 
+import pyarrow.compute as pc
+
 from fleet_slip.catalogue.features import PLAIN, features
-from fleet_slip.delta import (
-    Change,
-    Snapshot,
-    TableFile,
-    Unit,
-    retry_conflicts,
-)
+from fleet_slip.delta import Change, Snapshot, TableFile, Unit, retry_conflicts
 from fleet_slip.errors import ConflictError, StorageError
-from fleet_slip.grams.aggregation import aggregate
-from fleet_slip.grams.backlog import find_backlog
+from fleet_slip.grams.aggregation import compute_grams
+from fleet_slip.grams.backlog import Backlog, find_backlog
 from fleet_slip.grams.gram_files import files_to_rewrite, rows_to_keep, write_rows
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.tables import Warehouse
@@ -49,24 +45,57 @@ def update_grams(
     progress: Progress = no_progress,
     feature_set: str = PLAIN,
     executor: Executor | None = None,
+    among: Collection[str] | None = None,
 ) -> GramReport:
     """Bring the Gram rows of a feature set up to date. Running it again does nothing.
 
-    An executor runs the queries elsewhere; see `aggregate`. Raises `QuestionError` for an
-    unknown set, `StorageError`, `ConflictError` if other processes keep changing the table, or
+    An executor runs the queries elsewhere; see `compute_grams`. With `among`, only log files of
+    these paths are read. Raises `QuestionError` for an unknown
+    set, `StorageError`, `ConflictError` if other processes keep changing the table, or
     `ClusterError`.
     """
-    return retry_conflicts(lambda: _update_once(warehouse, progress, feature_set, executor))
+    return retry_conflicts(lambda: _update_once(warehouse, progress, feature_set, executor, among))
 
 
 def reconcile(warehouse: Warehouse, progress: Progress = no_progress) -> list[GramReport]:
-    """Bring the Gram rows of every feature set up to date that was ever computed here."""
+    """Bring the Gram rows of every feature set up to date that was ever computed here.
+
+    A set that was computed for some drives only is brought up to date for the files of these.
+    """
     grams = warehouse.grams.snapshot()
-    known = (PLAIN, *features().sets)
-    used = [
-        name for name in known if grams.landed(unit_name(features().identity(name))) is not None
-    ]
-    return [update_grams(warehouse, progress, name) for name in used]
+    identities = {name: features().identity(name) for name in (PLAIN, *features().sets)}
+    used = [n for n, i in identities.items() if grams.landed(unit_name(i)) is not None]
+    over_time = [name for name in used if features().feature_set(name).windows]
+    drives = {name: _drives_of(grams, identities[name]) for name in over_time}
+    reports = []
+    for name in used:
+        among = None
+        if name in drives:
+            among = _files_of(warehouse.grams.snapshot(), drives[name])
+        reports.append(update_grams(warehouse, progress, name, among=among))
+    return reports
+
+
+def _drives_of(grams: Snapshot, identity: str) -> set[str]:
+    """Return the drives that have Gram rows of a feature set."""
+    found: set[str] = set()
+    for file in grams.files:
+        rows = grams.table.read(file.path, ["feature_set", "drive_id"])
+        mine = rows.filter(pc.equal(rows["feature_set"], identity))
+        found.update(mine["drive_id"].unique().to_pylist())
+    return found
+
+
+def _files_of(grams: Snapshot, drives: Collection[str]) -> set[str]:
+    """Return the log files that have one of some drives, by the Gram rows of the plain set."""
+    found: set[str] = set()
+    for file in grams.files:
+        rows = grams.table.read(file.path, ["feature_set", "drive_id", "file"])
+        plain = rows.filter(pc.equal(rows["feature_set"], PLAIN)).select(["drive_id", "file"])
+        for row in plain.to_pylist():
+            if row["drive_id"] in drives:
+                found.add(row["file"])
+    return found
 
 
 def unit_name(identity: str) -> str:
@@ -75,7 +104,11 @@ def unit_name(identity: str) -> str:
 
 
 def _update_once(
-    warehouse: Warehouse, progress: Progress, feature_set: str, executor: Executor | None
+    warehouse: Warehouse,
+    progress: Progress,
+    feature_set: str,
+    executor: Executor | None,
+    among: Collection[str] | None,
 ) -> GramReport:
     # The logs are looked at last: if they lose a drive from now on, whoever removed it changes its
     # Gram rows after this snapshot of them, and this job's commit is a conflict.
@@ -88,15 +121,18 @@ def _update_once(
         )
     identity = features().identity(feature_set)
     backlog = find_backlog(logs, grams, identity)
+    if among is not None:
+        chosen = tuple(file for file in backlog.missing if file.path in among)
+        backlog = Backlog(chosen, backlog.stale)
     version, gram_rows = grams.version, grams.rows
     logs_version = logs.version
     if backlog.missing or backlog.stale:
-        new_rows = aggregate(warehouse, backlog.missing, progress, None, feature_set, executor)
+        new_rows = compute_grams(warehouse, backlog.missing, progress, None, feature_set, executor)
         replaced = files_to_rewrite(grams, backlog.stale)
         kept = rows_to_keep(grams, replaced, backlog.stale)
         grams.commit_or_discard(
             Change(
-                add=write_rows(warehouse, chain(kept, [new_rows])),
+                add=write_rows(warehouse, chain(kept, new_rows)),
                 remove=replaced,
                 units=[Unit(unit_name(identity), logs_version or 0)],
                 note={

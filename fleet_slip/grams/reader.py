@@ -1,6 +1,7 @@
 """Opens the Gram rows of a warehouse, once for cohort after cohort."""
 
 import contextlib
+import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Self
@@ -9,9 +10,11 @@ import duckdb
 import pyarrow as pa
 
 from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.catalogue.sources import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.delta.table import Snapshot
 from fleet_slip.errors import DataError
 from fleet_slip.grams.backlog import find_backlog
+from fleet_slip.regression.gram import packed_size
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.condition import Condition, asking
 from fleet_slip.warehouse.table_views import gram_snapshots, lock, open_tables
@@ -19,6 +22,9 @@ from fleet_slip.warehouse.tables import Warehouse
 
 BATCH_ROWS = 2**13
 """Gram rows of one batch: some 700 bytes each."""
+
+BATCH_NUMBERS = 2**20
+"""Most sums and products of one batch: wide rows come in smaller ones."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +44,19 @@ class OpenedGrams:
         """Yield the Gram rows of a cohort in any order, with what their fold is told from."""
         statement = self.statement("cohort_sums.sql", condition)
         with asking(self.database, condition):
-            yield from self.database.sql(statement).to_arrow_reader(BATCH_ROWS)
+            yield from self.database.sql(statement).to_arrow_reader(self._batch_rows)
+
+    def files(self, condition: Condition) -> set[str]:
+        """Return the log files that have a drive of a cohort."""
+        statement = self.statement("cohort_files.sql", condition)
+        with asking(self.database, condition):
+            return {file for (file,) in self.database.sql(statement).fetchall()}
+
+    @property
+    def _batch_rows(self) -> int:
+        name = features().name_of(self.identity)
+        numbers = packed_size(len(features().feature_set(name).columns))
+        return max(1, min(BATCH_ROWS, BATCH_NUMBERS // numbers))
 
 
 class GramReader:
@@ -63,11 +81,11 @@ class GramReader:
         """Close the connection."""
         self._close()
 
-    def opened(self, feature_set: str) -> OpenedGrams:
+    def opened(self, feature_set: str, condition: Condition) -> OpenedGrams:
         """Return the Gram rows of a feature set, until the next call.
 
         Raises `DataError` if there are no Gram rows, or if those of the feature set are not
-        complete.
+        complete for a cohort.
         """
         grams, logs = gram_snapshots(self._warehouse, self._grams, self._logs)
         if grams is not self._grams or logs is not self._logs:
@@ -80,9 +98,10 @@ class GramReader:
                 "CAMPAIGN (or fleet-slip ingest FILE --mapping M), then fleet-slip gram."
             )
         identity = features().identity(feature_set)
+        opened = OpenedGrams(database, identity, logs.version or 0, grams.version or 0)
         if feature_set != PLAIN:
-            _require_complete(logs, grams, feature_set, identity)
-        return OpenedGrams(database, identity, logs.version or 0, grams.version or 0)
+            _require_complete(logs, grams, opened, feature_set, condition)
+        return opened
 
     def _connected(self, grams: Snapshot, logs: Snapshot) -> duckdb.DuckDBPyConnection:
         if self._database is None:
@@ -97,20 +116,42 @@ class GramReader:
 
 
 @contextlib.contextmanager
-def open_grams(source: Warehouse | GramReader, feature_set: str) -> Iterator[OpenedGrams]:
+def open_grams(
+    source: Warehouse | GramReader, feature_set: str, condition: Condition
+) -> Iterator[OpenedGrams]:
     """Open the Gram rows of a feature set, anew unless by a reader. Raises like `opened`."""
     if isinstance(source, GramReader):
-        yield source.opened(feature_set)
+        yield source.opened(feature_set, condition)
     else:
         with GramReader(source) as reader:
-            yield reader.opened(feature_set)
+            yield reader.opened(feature_set, condition)
 
 
-def _require_complete(logs: Snapshot, grams: Snapshot, feature_set: str, identity: str) -> None:
-    backlog = find_backlog(logs, grams, identity)
-    if backlog.missing or backlog.stale:
+def _require_complete(
+    logs: Snapshot, grams: Snapshot, opened: OpenedGrams, feature_set: str, condition: Condition
+) -> None:
+    backlog = find_backlog(logs, grams, opened.identity)
+    if not backlog.missing and not backlog.stale:
+        return
+    files = opened.files(condition)
+    missing = [file for file in backlog.missing if file.path in files]
+    if missing or backlog.stale & files:
+        everything = condition.text in {ALL_DRIVES, TRAINING_DRIVES}
+        cohort = "" if everything else f" --cohort {shlex.quote(condition.text)}"
         raise DataError(
             f"the feature set {feature_set}, as it is defined now, has not been computed for "
-            f"{len(backlog.missing)} of {len(logs.files)} log files. Run: fleet-slip gram "
-            f"--features {feature_set}"
+            f"{len(missing)} of {len(files)} log files of the cohort. Run: fleet-slip gram "
+            f"--features {feature_set}{cohort}"
         )
+
+
+def cohort_files(source: Warehouse | GramReader, condition: Condition) -> set[str]:
+    """Return the log files that have a drive of a cohort, by the Gram rows of the logged signals.
+
+    Raises `DataError` if no drive satisfies the condition.
+    """
+    with open_grams(source, PLAIN, condition) as opened:
+        found = opened.files(condition)
+    if not found:
+        raise DataError(f"no drive satisfies {condition.text!r}.")
+    return found

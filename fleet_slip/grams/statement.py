@@ -5,14 +5,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
-from fleet_slip.catalogue.feature_sql import with_absent, with_features
+from fleet_slip.catalogue.columns import over_windows, with_absent, with_features
 from fleet_slip.catalogue.features import LAG, PLAIN, FeatureCatalogue, Regime, features
-from fleet_slip.catalogue.signals import SignalCatalogue
+from fleet_slip.catalogue.signals import COUNT_MAX, SignalCatalogue
 from fleet_slip.resources import read_sql
 
 LOGS = "read_parquet(getvariable('log_files'), union_by_name => true, hive_partitioning => false)"
 
 _SEPARATOR = ",\n            "
+
+BITS = 63
+"""Bits of a BIGINT that are no sign."""
 
 UNKNOWN_PART = "unknown"
 """Part of the rows whose regime is not known because a signal is absent."""
@@ -43,23 +46,33 @@ def gram_statement(
     one = known.feature_set(feature_set)
     names = one.columns
     regimes = [known.regimes[name] for name in one.regimes]
-    definitions = {
-        name: known.features[name].sql
-        for name in dict.fromkeys([*one.features, *(regime.of for regime in regimes)])
+    windows = known.definitions(feature_set)
+    looked_at = [*(regime.of for regime in regimes), *(window.of for window in windows.values())]
+    used = {
+        name: known.features[name]
+        for name in dict.fromkeys([*one.features, *looked_at])
         if name in known.features
     }
+    definitions = {name: feature.sql for name, feature in used.items()}
     logs = with_absent(LOGS, absent)
-    rows = _lagged(names, logs) if one.lagged else with_features(logs, definitions)
+    if one.lagged:
+        rows = _lagged(names, logs)
+    else:
+        rows = with_features(logs, definitions, {n: feature.limit for n, feature in used.items()})
+    if windows:
+        rows = over_windows(rows if used else f"(SELECT *, 0 AS clipped FROM {logs})", windows)
+    wide = windows or any(feature.limit > COUNT_MAX for feature in used.values())
+    kind = "BIGINT" if wide else "INTEGER"
     parts = _row_folds(one.row_folds) if one.row_folds else _regime_parts(regimes, known)
     return read_sql("jobs", "gram.sql").format(
         drive_columns=", ".join(signals.drive),
         qualified_drive_columns=", ".join(f"drive.{name}" for name in signals.drive),
         absent="0" if whole else _absent(names),
         part=parts.number if parts else "NULL",
-        clipped="sum(clipped)::BIGINT" if definitions else "0",
+        clipped="sum(clipped)::BIGINT" if definitions or windows else "0",
         sums=_SEPARATOR.join(f"sum({name})" for name in names),
         products=_SEPARATOR.join(
-            f"sum({a}::INTEGER * {b}::INTEGER)" for i, a in enumerate(names) for b in names[: i + 1]
+            f"sum({a}::{kind} * {b}::{kind})" for i, a in enumerate(names) for b in names[: i + 1]
         ),
         counts=rows,
         group=", ".join(_group(whole=whole, divided=parts is not None)),
@@ -75,8 +88,13 @@ def _group(*, whole: bool, divided: bool) -> list[str]:
 
 
 def _absent(names: Sequence[str]) -> str:
-    kind = "INTEGER" if len(names) < 32 else "BIGINT"
-    return " + ".join(f"({name} IS NULL)::{kind} * {1 << i}" for i, name in enumerate(names))
+    """Return SQL of a number with a bit for each column that a row lacks; of many, a list."""
+    if len(names) < BITS:
+        kind = "INTEGER" if len(names) < 32 else "BIGINT"
+        return " + ".join(f"({name} IS NULL)::{kind} * {1 << i}" for i, name in enumerate(names))
+    parts = [_absent(names[first : first + BITS - 1]) for first in range(0, len(names), BITS - 1)]
+    # The last columns come first, so that lists sort as the one large number would.
+    return f"[{', '.join(f'({part})::BIGINT' for part in reversed(parts))}]"
 
 
 def _part_name(parts: Parts) -> str:

@@ -85,7 +85,7 @@ def examine_drives(
 
 def _vehicle_models(reader: GramReader, condition: Condition) -> list[Condition]:
     """Return, for each vehicle model of a cohort, the condition that a drive is of it."""
-    opened = reader.opened(PLAIN)
+    opened = reader.opened(PLAIN, condition)
     cohort = opened.statement("cohort.sql", condition)
     with asking(opened.database, condition):
         statement = f"SELECT DISTINCT vehicle_model, source FROM ({cohort}\n)"

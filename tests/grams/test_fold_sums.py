@@ -21,6 +21,7 @@ from fleet_slip.selection.compare import select
 from fleet_slip.selection.model_list import load_model_list
 from fleet_slip.selection.request import SelectionRequest, answer_request
 from fleet_slip.views import VIEWS, connect, needed_views
+from fleet_slip.warehouse.condition import parse_condition
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.growth_history import write_fleet, write_grams
 from tests.support.logs import DAY, land, log_rows, random_counts
@@ -192,9 +193,9 @@ def test_a_reader_opens_anew_only_what_changed(tmp_path: Path) -> None:
     plan = Folding(count=3)
     with GramReader(warehouse) as reader:
         before = sum_cohort(reader, plan)
-        opened = reader.opened(PLAIN).database
+        opened = reader.opened(PLAIN, parse_condition("true")).database
         assert sum_cohort(reader, plan, "adhesion > 0.7").drive_count == 14
-        assert reader.opened(PLAIN).database is opened
+        assert reader.opened(PLAIN, parse_condition("true")).database is opened
         assert sum_cohort(reader, plan).sums.tables == before.sums.tables
         write_grams(warehouse, [warehouse.logs.snapshot().files[0].path], 10)
         after = sum_cohort(reader, plan)

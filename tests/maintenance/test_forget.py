@@ -17,7 +17,7 @@ from fleet_slip.delta import Change
 from fleet_slip.errors import QuestionError, RefusedError, StorageError
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams import job as gram_job
-from fleet_slip.grams.aggregation import aggregate
+from fleet_slip.grams.aggregation import compute_grams
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.job import update_grams
 from fleet_slip.ingest.job import ingest_file
@@ -84,7 +84,7 @@ def test_afterwards_every_coefficient_is_that_of_a_world_where_the_car_never_dro
         assert one.execute(logs).fetchall() == two.execute(logs).fetchall()
 
 
-def test_a_car_is_found_in_files_with_and_without_gram_rows_and_no_other_is_opened(
+def test_a_car_is_found_in_files_with_and_without_compute_grams_and_no_other_is_opened(
     tmp_path: Path,
 ) -> None:
     warehouse = fill(tmp_path, "alfa", "beta")
@@ -151,13 +151,13 @@ def test_a_gram_job_under_way_does_not_bring_a_forgotten_drive_back(
     warehouse = fill(tmp_path, "alfa")
     land(warehouse, "new", drive("beta", 1))
 
-    def overtaken(*arguments: Any) -> pa.Table:
-        rows = aggregate(*arguments)
+    def overtaken(*arguments: Any) -> list[pa.Table]:
+        rows = list(compute_grams(*arguments))
         monkeypatch.undo()
         forget(warehouse, Forgettable("vehicle", "beta"))
         return rows
 
-    monkeypatch.setattr(gram_job, "aggregate", overtaken)
+    monkeypatch.setattr(gram_job, "compute_grams", overtaken)
     update_grams(warehouse)
     with fleet_slip.connect(warehouse.root) as database:
         cars = database.execute("SELECT DISTINCT vehicle_id FROM grams").fetchall()

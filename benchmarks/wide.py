@@ -1,0 +1,126 @@
+"""Gram rows of sets with windows: the compiled kernel against the SQL that defines them.
+
+    python -m benchmarks.wide ROOT [--threads 2] [--rounds 3] [--sql-files 1]
+
+For 12, 52, 100 and 200 columns of the logs below ROOT: whether both give the same bits, and how
+many rows a second each computes, Parquet reading included. The kernel reads all files of the
+campaign `waterford`, SQL as many as are asked for. The best of some rounds; columns that are no
+windows are signals and the label.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from typing import Any
+from unittest.mock import patch
+
+import pyarrow as pa
+
+from fleet_slip.catalogue import features as features_module
+from fleet_slip.catalogue.features import PLAIN, FeatureCatalogue, FeatureSet, features
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalogue.windows import Window
+from fleet_slip.files.data_root import data_root
+from fleet_slip.grams import aggregation, statement, wide
+from fleet_slip.grams.aggregation import aggregate, by_sql
+from fleet_slip.warehouse.tables import Warehouse
+
+COLUMNS = (12, 52, 100, 200)
+TICKS = tuple(range(4, 4 + 24 * 16, 16))
+SET = "bench"
+
+
+def catalogue_with(columns: int) -> FeatureCatalogue:
+    """Return the shipped features with a set of so many columns, most of them windows.
+
+    Twelve columns are the ten signals, one window and the label.
+    """
+    known = features()
+    inputs = catalogue().inputs
+    means = {
+        name: one.model_copy(update={"ticks": TICKS})
+        for name, one in known.windows.items()
+        if one.over != "running_mean"
+    }
+    names = [
+        member
+        for ticks in TICKS
+        for family, window in means.items()
+        for member in Window.members(window.model_copy(update={"ticks": (ticks,)}), family)
+    ]
+    chosen = FeatureSet(
+        description="benchmark",
+        signals=inputs,
+        windows=tuple(names[: columns - len(inputs) - 1]),
+    )
+    windows = {**known.windows, **means}
+    return known.model_copy(update={"windows": windows, "factors": {}, "sets": {SET: chosen}})
+
+
+def best_rate(rows: int, rounds: int, work: Callable[[], pa.Table]) -> tuple[float, pa.Table]:
+    """Return millions of rows a second of the best round, and the result."""
+    seconds = []
+    for _ in range(rounds):
+        started = time.perf_counter()
+        found = work()
+        seconds.append(time.perf_counter() - started)
+    return rows / min(seconds) / 1e6, found
+
+
+def measure(warehouse: Warehouse, columns: int, options: Any) -> dict[str, Any]:
+    """Return rates and whether the bits are the same, for so many columns."""
+    files = [f for f in warehouse.logs.snapshot().files if "waterford-" in f.path]
+    few = files[: options.sql_files]
+    known = catalogue_with(columns)
+    # A copy keeps what was computed of the original.
+    known.__dict__.pop("time_columns", None)
+    with (
+        patch.object(features_module, "features", lambda: known),
+        patch.object(aggregation, "features", lambda: known),
+        patch.object(statement, "features", lambda: known),
+        patch.object(wide, "features", lambda: known),
+    ):
+        aggregate(warehouse, few, threads=1, feature_set=SET)  # compiles the kernel
+        rows = sum(file.rows for file in files)
+        rate, _ = best_rate(
+            rows,
+            options.rounds,
+            lambda: aggregate(warehouse, files, threads=options.threads, feature_set=SET),
+        )
+        few_rows = sum(file.rows for file in few)
+        sql_rate, defined = best_rate(few_rows, 1, lambda: by_sql(warehouse, few, SET))
+        kernel = aggregate(warehouse, few, threads=options.threads, feature_set=SET)
+    return {
+        "columns": columns,
+        "windows": len(known.feature_set(SET).windows),
+        "rows": rows,
+        "threads": options.threads,
+        "kernel_million_rows_s": round(rate, 2),
+        "sql_million_rows_s": round(sql_rate, 3),
+        "same_bits": kernel.equals(defined.cast(kernel.schema)),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("root")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--sql-files", type=int, default=1)
+    parser.add_argument("--columns", type=int, nargs="*", default=COLUMNS)
+    options = parser.parse_args()
+    warehouse = Warehouse(data_root(options.root))
+    files = [f for f in warehouse.logs.snapshot().files if "waterford-" in f.path]
+    plain, _ = best_rate(
+        sum(file.rows for file in files),
+        options.rounds,
+        lambda: aggregate(warehouse, files, threads=options.threads, feature_set=PLAIN),
+    )
+    print(json.dumps({"plain_sql_million_rows_s": round(plain, 2)}), flush=True)
+    for columns in options.columns:
+        print(json.dumps(measure(warehouse, columns, options)), flush=True)
+
+
+if __name__ == "__main__":
+    main()

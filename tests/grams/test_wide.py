@@ -1,0 +1,226 @@
+"""Columns over time by the kernel, by SQL and by plain integers: the same, on hostile drives."""
+
+from fractions import Fraction
+from math import ceil, floor
+from typing import Any
+
+import duckdb
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fleet_slip.catalogue.columns import Definition, Fact, limit_of, with_windows
+from fleet_slip.catalogue.features import features
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.errors import DataError
+from fleet_slip.grams.aggregation import aggregate, by_sql
+from fleet_slip.grams.check import grams_of
+from fleet_slip.grams.columns import ColumnPlan, DriveColumns, DriveCounts
+from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.wide import wide_grams
+from fleet_slip.warehouse.tables import Warehouse
+from tests.support.logs import land, log_rows, random_counts
+
+COURSE = features().features["course_difference"]
+
+DEFINITIONS = {
+    "mean_3": Definition(of="ay", over="mean", ticks=3, ratio=Fraction(16)),
+    "mean_5": Definition(of="ay", over="mean", ticks=5, ratio=Fraction(1, 7), bits=16),
+    "sum_4": Definition(of="ax", over="sum", ticks=4, ratio=Fraction(3, 2), bits=17),
+    "lag_2": Definition(of="yaw_rate", over="lag", ticks=2),
+    "ever": Definition(of="ay", over="running_mean", ratio=Fraction(16)),
+    "course": Definition(
+        of="change", sql=COURSE.sql, of_bits=18, over="mean", ticks=2, ratio=Fraction(5)
+    ),
+    "heavy": Definition(
+        of="ay",
+        over="mean",
+        ticks=2,
+        fact=Fact(name="mass_kg", less=1320, ratio=Fraction(1, 100)),
+        bits=18,
+    ),
+    "of_suv": Definition(of="ax", fact=Fact(name="vehicle_model", equals="suv")),
+}
+
+COUNT = st.one_of(
+    st.none(), st.sampled_from([-32768, -32767, -1, 0, 1, 32767]), st.integers(-2000, 2000)
+)
+SIGNALS = ("ax", "ay", "yaw_rate", "wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")
+
+
+@st.composite
+def drives(draw: st.DrawFn) -> pa.Table:
+    """A drive with holes, missing values and extremes, perhaps of one row."""
+    rows = draw(st.integers(1, 12))
+    steps = draw(st.lists(st.sampled_from([1, 1, 1, 2, 5]), min_size=rows, max_size=rows))
+    counts = {
+        name: pa.array(draw(st.lists(COUNT, min_size=rows, max_size=rows)), pa.int16())
+        for name in SIGNALS
+    }
+    mass = draw(st.sampled_from([None, 1320.0, 1320.5, 1999.4, 900.0, 1e9, float("nan")]))
+    table = log_rows("d", counts, mass_kg=mass, vehicle_model=draw(st.sampled_from(["suv", "van"])))
+    ticks = pa.array(np.cumsum([0, *steps[1:]]).astype(np.int32))
+    return table.set_column(table.schema.get_field_index("tick"), "tick", ticks)
+
+
+def nearest(value: Fraction) -> int:
+    """Round to the nearest integer, halves away from zero."""
+    return floor(value + Fraction(1, 2)) if value >= 0 else ceil(value - Fraction(1, 2))
+
+
+def clip(value: int, bits: int) -> int:
+    return max(-limit_of(bits), min(limit_of(bits), value))
+
+
+def by_integers(rows: list[dict[str, Any]], one: Definition) -> list[int | None]:
+    """The rule of the windows, in words of plain Python."""
+    found: list[int | None] = []
+    for row in rows:
+        now = looked_at(row, one)
+        if one.over == "lag":
+            past = [looked_at(r, one) for r in rows if r["tick"] == row["tick"] - one.ticks]
+            value = Fraction(past[0]) if past and past[0] is not None else None
+        elif now is None:
+            value = None
+        elif one.over is None:
+            value = Fraction(now)
+        else:
+            first = row["tick"] - one.ticks + 1 if one.ticks else 0
+            there = [looked_at(r, one) for r in rows if first <= r["tick"] <= row["tick"]]
+            present = [v for v in there if v is not None]
+            value = Fraction(sum(present), 1 if one.over == "sum" else len(present))
+        count = None if value is None else clip(nearest(value * one.ratio), one.bits)
+        if one.fact and count is not None:
+            number = fact(row, one)
+            times = None if number is None else nearest(count * number * one.fact.ratio)
+            count = None if times is None else clip(times, one.bits)
+        found.append(count)
+    return found
+
+
+def fact(row: dict[str, Any], one: Definition) -> int | None:
+    assert one.fact is not None
+    if one.fact.equals:
+        return int(row["vehicle_model"] == one.fact.equals)
+    mass = row["mass_kg"]
+    if mass is None or not abs(mass) <= 65536:
+        return None
+    return nearest(Fraction(mass)) - one.fact.less
+
+
+def looked_at(row: dict[str, Any], one: Definition) -> int | None:
+    if not one.sql:
+        count: int | None = row[one.of]
+        return count
+    values = [row[name] for name in SIGNALS[1:]]
+    if None in values:
+        return None
+    ay, yaw_rate, *wheels = values
+    if 31 * sum(wheels) < 120_000:
+        return None
+    quotient = Fraction(4_000_000 * ay - 310 * yaw_rate * sum(wheels), 31 * sum(wheels))
+    return clip(nearest(quotient), one.of_bits)
+
+
+def counts_of_table(table: pa.Table) -> DriveCounts:
+    present = {n: table[n].is_valid().to_numpy(zero_copy_only=False) for n in SIGNALS}
+    counts = {n: table[n].fill_null(0).to_numpy() for n in SIGNALS}
+    facts = {name: table[name][0].as_py() for name in ("mass_kg", "vehicle_model")}
+    return DriveCounts(table["tick"].to_numpy(), counts, present, facts)
+
+
+@settings(max_examples=150)
+@given(drives())
+def test_kernel_sql_and_plain_integers_agree_on_hostile_drives(table: pa.Table) -> None:
+    plan = ColumnPlan.of(list(DEFINITIONS), {}, DEFINITIONS)
+    columns = DriveColumns(plan, counts_of_table(table))
+    kernel = columns.compute()
+    with duckdb.connect() as database:
+        database.register("log_counts", table.drop_columns(["day"]))
+        rows = with_windows("log_counts", {}, DEFINITIONS)
+        query = f"SELECT {', '.join(DEFINITIONS)}, clipped FROM {rows} ORDER BY tick"
+        sql: pa.Table = database.sql(query).to_arrow_table()
+    logged = table.to_pylist()
+    for number, (name, one) in enumerate(DEFINITIONS.items()):
+        expected = by_integers(logged, one)
+        assert sql[name].to_pylist() == expected, name
+        assert [None if np.isnan(v) else int(v) for v in kernel[number]] == expected, name
+    assert sql["clipped"].to_pylist() == columns.clipped.astype(int).tolist()
+
+
+def test_a_whole_drive_takes_the_fast_loop_to_the_same_integers() -> None:
+    """The loop for drives without holes, against the one for all drives."""
+    rng = np.random.default_rng(5)
+    counts = {n: rng.integers(-32768, 32768, 9000).astype(np.int16) for n in SIGNALS}
+    counts["wheel_fl"][:] = 9000
+    plan = ColumnPlan.of(list(DEFINITIONS), {}, DEFINITIONS)
+    facts = {"mass_kg": 1400.0, "vehicle_model": "suv"}
+    ticks = np.arange(9000)
+    fast = DriveColumns(plan, DriveCounts(ticks, counts, {}, facts)).compute()
+    ticks = np.append(ticks[:-1], 9001)  # a hole before the last row alone
+    slow = DriveColumns(plan, DriveCounts(ticks, counts, {}, facts)).compute()
+    np.testing.assert_array_equal(fast[:, :-1], slow[:, :-1])
+
+
+def hostile_drive(name: str, rows: int, seed: int, *, null: float = 0.1) -> pa.Table:
+    rng = np.random.default_rng(seed)
+    counts: dict[str, Any] = random_counts(rng, rows)
+    for wheel in ("fl", "fr", "rl", "rr"):
+        counts[f"wheel_{wheel}"] = rng.integers(0, 12_000, rows).astype(np.int16)
+    for signal in ("ay", "wheel_rl", "sideslip"):
+        counts[signal] = pa.array(counts[signal], mask=rng.random(rows) < null)
+    table = log_rows(name, counts)
+    ticks = np.cumsum(rng.choice([1, 1, 1, 300], rows)).astype(np.int32)
+    ticks -= ticks[0]
+    at = table.schema.get_field_index("tick")
+    return table.set_column(at, "tick", pa.array(ticks))
+
+
+def test_gram_rows_of_the_kernel_are_those_of_the_statement(warehouse: Warehouse) -> None:
+    whole = log_rows("whole", random_counts(np.random.default_rng(3), 700))
+    land(warehouse, "one", hostile_drive("b", 400, 1), hostile_drive("a", 2, 2).slice(0, 1), whole)
+    land(warehouse, "two", hostile_drive("c", 5000, 4, null=0.001))
+    files = warehouse.logs.snapshot().files
+    kernel = wide_grams(warehouse, files, "windows")
+    defined = by_sql(warehouse, files, "windows").cast(kernel.schema)
+    assert kernel.num_rows > 8
+    assert grams_of(kernel) == grams_of(defined)
+    assert kernel.sort_by("drive_id").drop_columns(["sums", "products"]).num_rows
+    for name in kernel.column_names:
+        assert kernel[name].to_pylist() == defined[name].to_pylist(), name
+    assert aggregate(warehouse, files, feature_set="windows").equals(kernel)
+
+
+def test_a_drive_that_goes_back_in_time_is_refused(warehouse: Warehouse) -> None:
+    table = log_rows("d", random_counts(np.random.default_rng(1), 4))
+    at = table.schema.get_field_index("tick")
+    ticks = pa.array([0, 1, 1, 2], pa.int32())
+    land(warehouse, "one", table.set_column(at, "tick", ticks))
+    with pytest.raises(DataError, match=r"drive d: .*ticks of a drive do not rise"):
+        update_grams(warehouse, feature_set="windows")
+
+
+def test_the_order_of_rows_in_a_file_does_not_matter(warehouse: Warehouse) -> None:
+    table = pa.concat_tables([hostile_drive("a", 50, 1), hostile_drive("b", 50, 2)])
+    land(warehouse, "sorted", table)
+    (first,) = warehouse.logs.snapshot().files
+    before = grams_of(wide_grams(warehouse, [first], "windows"))
+    order = np.random.default_rng(0).permutation(100)
+    land(warehouse, "mixed", table.take(pa.array(order)))
+    other = next(f for f in warehouse.logs.snapshot().files if f.path != first.path)
+    assert grams_of(wide_grams(warehouse, [other], "windows")) == before
+
+
+def test_the_label_is_no_column_to_look_back_on() -> None:
+    label = catalogue().label
+    with pytest.raises(ValueError, match="not an input signal"):
+        Definition(of=label, over="mean", ticks=4)
+    with pytest.raises(ValueError, match="not an input signal"):
+        Definition(of="x", sql=f"{label}::BIGINT", over="mean", ticks=4)
+
+
+def test_adhesion_is_no_fact() -> None:
+    with pytest.raises(ValueError, match="adhesion is no fact that a car knows"):
+        Fact(name="adhesion")
