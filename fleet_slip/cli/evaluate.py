@@ -41,6 +41,10 @@ Scenarios = Annotated[
 ]
 
 
+PLACES = ("inside", "outside")
+"""Of an unstable section."""
+
+
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
     app.command()(score)
@@ -135,7 +139,7 @@ def print_evaluation(content: dict[str, Any]) -> None:
 
 def _print_group(content: dict[str, Any], group: str, names: Sequence[str]) -> None:
     print_table(
-        f"\n{group}: standard deviation and mean of the error in deg, and correlation",
+        f"\n{group}: RMSE, standard deviation and mean of the error in deg, and correlation",
         ["scenario", "side-slip std", *(name.removeprefix(f"{group}/") for name in names)],
         [
             [
@@ -151,7 +155,9 @@ def _print_group(content: dict[str, Any], group: str, names: Sequence[str]) -> N
 def _cell(result: dict[str, Any]) -> str:
     if result["error_std_deg"] is None:
         return "no estimate"
-    figures = f"{result['error_std_deg']:.3f} {result['error_mean_deg']:+.3f}"
+    figures = (
+        f"{result['rmse_deg']:.3f} {result['error_std_deg']:.3f} {result['error_mean_deg']:+.3f}"
+    )
     if result["correlation"] is not None:
         figures += f" {result['correlation']:.3f}"
     covered = result["coverage"]
@@ -168,14 +174,17 @@ def _print_sections(content: dict[str, Any]) -> None:
             )
             print_table(
                 f"\n{one['name']}: unstable at {where}: {section['criterion']}",
-                ["estimator", "std inside", "std outside", "corr. inside", "corr. outside"],
+                [
+                    "estimator",
+                    *(f"{name} {at}" for name in ("RMSE", "std", "corr.") for at in PLACES),
+                ],
                 [
                     [
                         name,
                         *(
                             _figure(result[place]["unstable"][figure])
-                            for figure in ("error_std_deg", "correlation")
-                            for place in ("inside", "outside")
+                            for figure in ("rmse_deg", "error_std_deg", "correlation")
+                            for place in PLACES
                         ),
                     ]
                     for name, result in one["results"].items()

@@ -10,7 +10,7 @@ from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.signing import signing_key
 from fleet_slip.maintenance.marks import marked_models
 from fleet_slip.models.aliases import CHAMPION
-from fleet_slip.models.manifest import require_model_name
+from fleet_slip.models.manifest import ModelTerm, require_model_name
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.versions import Registry
 from fleet_slip.warehouse.tables import Warehouse
@@ -58,7 +58,17 @@ def models(
         return
     print_table(
         "",
-        ["model", "aliases", "signals", "published", "correlation", "std deg", "drives", "rows"],
+        [
+            "model",
+            "aliases",
+            "signals",
+            "published",
+            "correlation",
+            "RMSE deg",
+            "std deg",
+            "drives",
+            "rows",
+        ],
         [
             [
                 f"{row['name']}@{row['version']}",
@@ -66,6 +76,7 @@ def models(
                 row["signals"].replace(",", " "),
                 f"{row['published_at']:%Y-%m-%d %H:%M}" if row["published_at"] else "",
                 f"{row['correlation']:.4f}",
+                f"{row['rmse_deg']:.4f}",
                 f"{row['error_std_deg']:.4f}",
                 f"{row['drives']:,}",
                 f"{row['rows']:,}",
@@ -99,6 +110,23 @@ def show(context: typer.Context, reference: Reference, json: Json = False) -> No
         _print_version(version)
 
 
+def _definition_row(term: ModelTerm) -> list[str]:
+    one = term.definition
+    if one is None:
+        return []
+    ticks = str(one.ticks) if one.ticks else ""
+    about = one.fact.name if one.fact else ""
+    return [
+        term.signal,
+        f"{term.scale} {term.unit}",
+        one.of,
+        one.over or "",
+        ticks,
+        str(one.bits),
+        about,
+    ]
+
+
 def _print_version(version: ModelVersion) -> None:
     manifest = version.manifest
     figures, trained = manifest.cross_validation, manifest.trained_on
@@ -127,6 +155,13 @@ def _print_version(version: ModelVersion) -> None:
             [[t.signal, f"{t.scale} {t.unit}", t.sql] for t in manifest.terms if t.sql],
             left=3,
         )
+    if manifest.definitions:
+        print_table(
+            "\ncolumns over time (docs/memory.md): counts, times the scale",
+            ["column", "scale", "of", "over", "ticks", "bits", "a fact"],
+            [_definition_row(term) for term in manifest.terms if term.definition],
+            left=4,
+        )
     print_table(
         "",
         ["", ""],
@@ -135,6 +170,7 @@ def _print_version(version: ModelVersion) -> None:
                 "correlation",
                 f"{figures.correlation:.4f} (s.e. {figures.correlation_standard_error:.2g})",
             ],
+            ["RMSE", f"{figures.rmse_deg:.4f} deg"],
             ["error std", f"{figures.error_std_deg:.4f} deg"],
             ["error mean", f"{figures.error_mean_deg:+.4f} deg"],
             ["cross-validation", f"{figures.folds} folds by {figures.folds_by}"],

@@ -119,13 +119,14 @@ def _print_chart(chart: Chart) -> None:
     print_table(
         f"{chart.model}, drives where {chart.cohort}; limits from the training days: "
         f"mean {mean.lower:+.4f} to {mean.upper:+.4f}, std up to {std.upper:.4f} deg",
-        ["day", "", "drives", "rows", "mean deg", "std deg"],
+        ["day", "", "drives", "rows", "RMSE deg", "mean deg", "std deg"],
         [
             [
                 str(day.day),
                 "training" if day.training else "new, alarm" if day.alarms else "new",
                 f"{day.drives:,}",
                 f"{day.rows:,}",
+                f"{day.rmse_deg:.4f}",
                 f"{day.error_mean_deg:+.4f}" + ("*" if "mean" in day.alarms else ""),
                 f"{day.error_std_deg:.4f}" + ("*" if "std" in day.alarms else ""),
             ]

@@ -1,17 +1,18 @@
 """What is evaluated: anything that turns a drive's signals into side-slip angles."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.columns import DriveCounts
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.models.predictor import Predictor
 from fleet_slip.regression.exact import LinearModel
 from fleet_slip.selection.compare import Selection, select
 from fleet_slip.selection.model_list import load_model_list
@@ -45,16 +46,7 @@ class LinearEstimate:
 
     @classmethod
     def published(cls, manifest: Manifest) -> "LinearEstimate":
-        """Return the estimator that a manifest publishes.
-
-        Raises `QuestionError` for a model with features, which are SQL and not signals.
-        """
-        features = [term.signal for term in manifest.terms if term.sql]
-        if features:
-            raise QuestionError(
-                f"{manifest.name} uses the features {', '.join(features)}, and test drives are "
-                "evaluated on signals alone. Use: fleet-slip score"
-            )
+        """Return the estimator that a manifest of logged signals publishes."""
         return cls(manifest.intercept, {term.column: term.coefficient for term in manifest.terms})
 
     def __call__(self, signals: Signals) -> FloatArray:
@@ -66,6 +58,59 @@ class LinearEstimate:
     def as_dict(self) -> dict[str, Any]:
         """Return what a JSON document needs to compute the same estimates."""
         return {"intercept": self.intercept, "coefficients": dict(self.coefficients)}
+
+
+@dataclass(frozen=True)
+class ColumnEstimate:
+    """A published model with features or columns over time, sample by sample as a car drives.
+
+    It sees counts, as an ECU does: the columns are the integers that its Gram rows are made of.
+
+    Attributes:
+        manifest: what was published.
+        predictor: what computes it.
+        facts: what the car knows of itself.
+    """
+
+    manifest: Manifest
+    predictor: Predictor
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+    def in_car(self, facts: Mapping[str, Any]) -> "ColumnEstimate":
+        """Return the estimator in a car that knows its facts."""
+        return replace(self, facts=facts)
+
+    def __call__(self, signals: Signals) -> FloatArray:
+        """Return the estimate at each tick; there is one row for every tick."""
+        counts, present = {}, {}
+        for name in self.predictor.plan.signals:
+            values = signals[catalogue()[name].column]
+            present[name] = np.isfinite(values)
+            scaled = np.where(present[name], values, 0.0) / float(catalogue()[name].scale)
+            counts[name] = np.rint(scaled).astype(np.int64)
+        ticks = np.arange(len(next(iter(counts.values()))))
+        return self.predictor(DriveCounts(ticks, counts, present, self.facts))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what a JSON document needs to compute the same estimates."""
+        return {
+            "intercept": self.manifest.intercept,
+            "coefficients": {term.column: term.coefficient for term in self.manifest.terms},
+            "columns": {
+                term.signal: term.definition.model_dump(mode="json")
+                if term.definition
+                else term.sql
+                for term in self.manifest.terms
+                if not term.logged
+            },
+        }
+
+
+def published_estimate(manifest: Manifest) -> LinearEstimate | ColumnEstimate:
+    """Return the estimator that a manifest publishes. Raises `RefusedError` if counts changed."""
+    if all(term.logged for term in manifest.terms):
+        return LinearEstimate.published(manifest)
+    return ColumnEstimate(manifest, Predictor.of(manifest))
 
 
 @dataclass(frozen=True)
@@ -82,15 +127,18 @@ class TrainedModels:
             model.name: f"{self.version.reference}/{model.name}" for model in self.selection.models
         }
 
-    def estimators(self) -> dict[str, LinearEstimate]:
-        """Return the models of Table I, then the published one, by name."""
-        fitted = {
+    def linear_estimators(self) -> dict[str, LinearEstimate]:
+        """Return the models of Table I by name."""
+        return {
             self.table_one[model.name]: LinearEstimate.of(model.model)
             for model in self.selection.models
         }
+
+    def estimators(self) -> dict[str, LinearEstimate | ColumnEstimate]:
+        """Return the models of Table I, then the published one, by name."""
         return {
-            **fitted,
-            self.version.reference: LinearEstimate.published(self.version.manifest),
+            **self.linear_estimators(),
+            self.version.reference: published_estimate(self.version.manifest),
         }
 
     def descriptions(self) -> dict[str, dict[str, Any]]:

@@ -120,7 +120,7 @@ def evaluate(
         competitors=competitors,
         runs=runs,
         checks=(
-            *check_targets(runs, first.table_one, first.estimators()),
+            *check_targets(runs, first.table_one, first.linear_estimators()),
             *check_filter_targets(runs, first.table_one),
         ),
         comparisons=tuple(

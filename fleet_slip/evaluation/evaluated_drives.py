@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -46,6 +47,15 @@ class EvaluatedDrive:
     station_m: FloatArray
     lateral_offset_m: FloatArray
     lost_control_s: float | None
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What the car knows of itself: its model and its stated mass, by drive column."""
+        scenario = self.scenario
+        return {
+            "vehicle_model": scenario.vehicle.name,
+            "mass_kg": scenario.car.body.sprung_mass_kg,
+        }
 
     @cached_property
     def sideslip_rad(self) -> FloatArray:

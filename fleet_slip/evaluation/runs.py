@@ -9,7 +9,7 @@ import numpy as np
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.evaluation.errors import ErrorFigures, error_figures
-from fleet_slip.evaluation.estimators import Estimate
+from fleet_slip.evaluation.estimators import ColumnEstimate, Estimate
 from fleet_slip.evaluation.evaluated_drives import EvaluatedDrive, load_drives
 from fleet_slip.evaluation.stability import CRITERION, find_unstable
 from fleet_slip.grams.job import update_grams
@@ -91,6 +91,8 @@ def run(drive: EvaluatedDrive, estimators: Mapping[str, Estimate]) -> EvaluatedS
 def _estimates(drive: EvaluatedDrive, estimate: Estimate) -> FloatArray:
     """Return the estimates; none where the drive lacks what the estimator needs to begin."""
     try:
+        if isinstance(estimate, ColumnEstimate):
+            estimate = estimate.in_car(drive.facts)
         return estimate(drive.signals)
     except (DataError, QuestionError):
         return np.full(len(drive.time_s), np.nan)

@@ -9,12 +9,22 @@ from decimal import Decimal
 from fractions import Fraction
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, FiniteFloat, PlainSerializer, PlainValidator
+from pydantic import (
+    AfterValidator,
+    Field,
+    FiniteFloat,
+    PlainSerializer,
+    PlainValidator,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+    model_validator,
+)
 
+from fleet_slip.catalogue.columns import Definition
 from fleet_slip.catalogue.feature_sql import names_in, require_integer_sql
 from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN, Identifier, catalogue
 from fleet_slip.config import Config
-from fleet_slip.errors import ConfigError
+from fleet_slip.errors import ConfigError, RefusedError
 
 _FRACTION = re.compile(r"-?[0-9]{1,4000}/[0-9]{1,4000}")
 
@@ -46,7 +56,9 @@ class ModelTerm(Config):
     """One signal of a model: `label = intercept + sum(coefficient * signal)`, in SI units.
 
     `sql` is empty for a logged signal. For a feature it computes the count from the counts of
-    signals; the count is clipped to +-32767, and times `scale` it is the physical value.
+    signals; the count is clipped to +-32767, and times `scale` it is the physical value. A column
+    over time has a `definition` instead, and so has a feature of more than 16 bits; then
+    `signal_scales` are those of the signals in it when it was published.
     """
 
     signal: Identifier
@@ -54,8 +66,30 @@ class ModelTerm(Config):
     unit: str
     scale: Scale
     sql: Annotated[str, AfterValidator(require_integer_sql)] = ""
+    definition: Definition | None = None
+    signal_scales: dict[Identifier, Scale] | None = None
     coefficient: FiniteFloat
     coefficient_exact: ExactFraction
+
+    @model_validator(mode="after")
+    def _defined_once(self) -> "ModelTerm":
+        if self.sql and self.definition:
+            raise ValueError("a term has sql or a definition, not both")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_nothing(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out what a term has not, so that a manifest is what it was before there was any."""
+        content: dict[str, Any] = handler(self)
+        for name in ("definition", "signal_scales"):
+            if getattr(self, name) is None:
+                del content[name]
+        return content
+
+    @property
+    def logged(self) -> bool:
+        """Whether it is a logged signal, rather than computed."""
+        return not self.sql and self.definition is None
 
     @property
     def scale_exact(self) -> Fraction:
@@ -65,6 +99,8 @@ class ModelTerm(Config):
     @property
     def inputs(self) -> tuple[str, ...]:
         """The logged signals that it is computed from: itself, or what its SQL names."""
+        if self.definition is not None:
+            return self.definition.signals
         if not self.sql:
             return (self.signal,)
         words = names_in(self.sql)
@@ -140,7 +176,7 @@ class Manifest(Config):
             column
             for term in self.terms
             for column in (
-                [signals[name].column for name in term.inputs] if term.sql else [term.column]
+                [term.column] if term.logged else [signals[name].column for name in term.inputs]
             )
         )
         return tuple(dict.fromkeys(needed))
@@ -149,6 +185,21 @@ class Manifest(Config):
     def features(self) -> dict[str, str]:
         """SQL of each input that is a feature."""
         return {term.signal: term.sql for term in self.terms if term.sql}
+
+    def require_same_counts(self) -> None:
+        """Raise `RefusedError` if counts that a column looks back on mean something else now."""
+        for term in self.terms:
+            for name, scale in (term.signal_scales or {}).items():
+                if name not in catalogue().signals or catalogue()[name].scale != scale:
+                    raise RefusedError(
+                        f"{self.name}: {term.signal} was defined when a count of {name} was worth "
+                        f"{scale}, and the signal catalogue says otherwise. Publish it again."
+                    )
+
+    @property
+    def definitions(self) -> dict[str, Definition]:
+        """Definition of each input that has one: columns over time."""
+        return {term.signal: term.definition for term in self.terms if term.definition}
 
     def same_estimator(self, other: "Manifest") -> bool:
         """Whether both are the same numbers from the same rows."""

@@ -73,12 +73,19 @@ def manifest_of(
 def _term(name: str, coefficient: Fraction) -> ModelTerm:
     known = features()
     one = known.of(name)
+    definition = known.definition(name)
     return ModelTerm(
         signal=name,
         column=one.column,
         unit=one.unit,
         scale=one.scale,
-        sql=known.features[name].sql if name in known.features else "",
+        sql=known.features[name].sql if name in known.features and not definition else "",
+        definition=definition,
+        signal_scales=(
+            {signal: catalogue()[signal].scale for signal in definition.signals}
+            if definition
+            else None
+        ),
         coefficient=float(coefficient),
         coefficient_exact=coefficient,
     )
@@ -116,6 +123,12 @@ def _why_publish(
     if champion is None:
         return "It is the first version."
     challenger = selection.winner.model
+    if selection.searched is not None:
+        # The columns of both are given now: neither is searched for in every fold again.
+        folds = selection.cohort.folds(selection.folds.by, selection.folds.count)
+        challenger = validate(
+            CandidateModel(name=challenger.name, signals=challenger.signals), folds
+        )
     incumbent = _revalidate(champion, selection)
     comparison = (
         f"cross-validated correlation {challenger.correlation:.6f}, and "
@@ -144,10 +157,13 @@ def _revalidate(champion: ModelVersion, selection: Selection[Any]) -> CrossValid
 
 
 def _require_same_features(champion: ModelVersion) -> None:
-    known = features().features
+    known, known_names = features().features, features().inputs
     for name, sql in champion.manifest.features.items():
         if name not in known or known[name].sql != sql:
             raise DataError(f"its feature {name} is not defined as it was then.")
+    for name, definition in champion.manifest.definitions.items():
+        if name not in known_names or features().definition(name) != definition:
+            raise DataError(f"its column {name} is not defined as it was then.")
 
 
 def _cross_validated(winner: CrossValidation, selection: Selection[Any]) -> CrossValidated:

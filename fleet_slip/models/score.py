@@ -1,16 +1,27 @@
 """Evaluates a published model on the rows of a cohort, in SQL."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from fleet_slip.catalogue.feature_sql import with_features
-from fleet_slip.catalogue.signals import catalogue
+import numpy as np
+
+from fleet_slip.arrays import FloatArray
+from fleet_slip.catalogue.columns import with_windows
+from fleet_slip.catalogue.features import input_scales
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.errors import DataError
+from fleet_slip.grams.drive_rows import counts_of, drives_of_stream
 from fleet_slip.models.manifest import Manifest
+from fleet_slip.models.predictor import Predictor
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.condition import Condition, asking, parse_condition, row_columns
 from fleet_slip.warehouse.table_views import connect_tables
 from fleet_slip.warehouse.tables import Warehouse
+
+BATCH_ROWS = 2**17
+"""Rows that are read at a time."""
 
 
 @dataclass(frozen=True)
@@ -52,38 +63,108 @@ def score_statement(manifest: Manifest, condition: str | Condition) -> str:
 
 def _rows(manifest: Manifest) -> str:
     """Return the view `log`, or for a model with features a subquery with their columns too."""
-    if not manifest.features:
+    if not manifest.features and not manifest.definitions:
         return "log"
+    computed = [
+        f"{t.signal} * {t.scale}::DOUBLE AS {t.column}" for t in manifest.terms if not t.logged
+    ]
+    rows = with_windows("log_counts", manifest.features, manifest.definitions)
+    return _si_rows(rows, computed)
+
+
+def _si_rows(rows: str, computed: Sequence[str] = ()) -> str:
+    """Return a subquery: rows of counts with the columns of the view `log`, and further ones."""
     columns = [
+        f"tick / {int(1 / SAMPLE_TIME_S)}::DOUBLE AS time_s",
         *(f"{name} * {s.scale}::DOUBLE AS {s.column}" for name, s in catalogue().signals.items()),
-        *(f"{t.signal} * {t.scale}::DOUBLE AS {t.column}" for t in manifest.terms if t.sql),
+        *computed,
     ]
     separator = ",\n            "
     return f"""(
         SELECT
             *,
             {separator.join(columns)}
-        FROM {with_features("log_counts", manifest.features)}
+        FROM {rows}
     )"""
 
 
 def score(warehouse: Warehouse, manifest: Manifest, condition: str | Condition) -> Score:
     """Score a model on the rows of `log` that satisfy a condition.
 
-    Raises like `score_statement`, and `DataError` if no such row has the model's signals.
+    Raises like `score_statement`, and `DataError` if no such row has the model's signals. A model
+    with columns over time is scored drive by drive, in the order of time.
     """
     condition = parse_condition(condition, row_columns())
+    manifest.require_same_counts()
+    found = (
+        _score_over_time(warehouse, manifest, condition)
+        if manifest.definitions
+        else _score_by_sql(warehouse, manifest, condition)
+    )
+    if found is None:
+        raise DataError(
+            f"no row of the cohort {condition.text!r} has {', '.join(manifest.signals)} and "
+            f"{manifest.label.signal}. Choose another cohort, or a model with fewer signals."
+        )
+    return found
+
+
+def _score_by_sql(warehouse: Warehouse, manifest: Manifest, condition: Condition) -> Score | None:
     statement = score_statement(manifest, condition)
     with connect_tables(warehouse, statement) as database, asking(database, condition):
         result = database.execute(statement)
         names = [column[0] for column in result.description or ()]
         row = result.fetchone()
     if row is None or not row[0]:
-        raise DataError(
-            f"no row of the cohort {condition.text!r} has {', '.join(manifest.signals)} and "
-            f"{manifest.label.signal}. Choose another cohort, or a model with fewer signals."
-        )
+        return None
     figures = dict(zip(names, row, strict=True))
     percentiles = figures.pop("error_percentiles_deg")
     median, p95, p99 = percentiles
     return Score(**figures, error_median_deg=median, error_p95_deg=p95, error_p99_deg=p99)
+
+
+def _score_over_time(
+    warehouse: Warehouse, manifest: Manifest, condition: Condition
+) -> Score | None:
+    """Estimate the drives that have rows of the cohort, whole; score the rows of the cohort."""
+    predictor = Predictor.of(manifest)
+    label = manifest.label.signal
+    counts = ", ".join(dict.fromkeys([*predictor.plan.signals, label, *predictor.plan.facts]))
+    text = read_sql("jobs", "drives_in_time.sql").format(
+        columns=counts, rows=_si_rows("log_counts"), condition=condition.sql
+    )
+    estimates: list[FloatArray] = []
+    truths: list[FloatArray] = []
+    unit = float(input_scales()[label])
+    with connect_tables(warehouse, text) as database, asking(database, condition):
+        stream = database.sql(text).to_arrow_reader(BATCH_ROWS)
+        for rows in drives_of_stream(stream):
+            estimate = predictor(counts_of(rows, predictor.plan))
+            truth = rows[label].to_numpy(zero_copy_only=False).astype(np.float64) * unit
+            chosen = rows["chosen"].to_numpy(zero_copy_only=False).astype(np.bool_)
+            given = chosen & np.isfinite(estimate) & np.isfinite(truth)
+            estimates.append(estimate[given])
+            truths.append(truth[given])
+    if not sum(map(len, truths)):
+        return None
+    return _figures(np.concatenate(estimates), np.concatenate(truths))
+
+
+def _figures(estimate_rad: FloatArray, truth_rad: FloatArray) -> Score:
+    error = np.degrees(estimate_rad - truth_rad)
+    size = np.abs(error)
+    several = len(error) > 1
+    constant = not np.ptp(estimate_rad) or not np.ptp(truth_rad)
+    median, p95, p99 = np.quantile(size, [0.5, 0.95, 0.99]).tolist()
+    return Score(
+        rows=len(error),
+        correlation=None if constant else float(np.corrcoef(estimate_rad, truth_rad)[0, 1]),
+        rmse_deg=float(np.sqrt(np.mean(error**2))),
+        error_mean_deg=float(error.mean()),
+        error_std_deg=float(error.std(ddof=1)) if several else math.nan,
+        error_mean_absolute_deg=float(size.mean()),
+        error_median_deg=median,
+        error_p95_deg=p95,
+        error_p99_deg=p99,
+        error_max_deg=float(size.max()),
+    )

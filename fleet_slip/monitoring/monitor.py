@@ -16,7 +16,7 @@ from datetime import date
 from statistics import fmean, stdev
 from typing import Any
 
-from fleet_slip.catalogue.features import input_scales
+from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.errors import DataError, StorageError
 from fleet_slip.grams.day_sums import sum_days
 from fleet_slip.models.counts_model import counts_model
@@ -74,6 +74,7 @@ class Day:
     rows: int
     error_mean_deg: float
     error_std_deg: float
+    rmse_deg: float
     training: bool
     alarms: tuple[str, ...] = ()
 
@@ -114,7 +115,8 @@ def monitor(
     limits = limits or thresholds().monitor
     manifest = version.manifest
     condition = parse_condition(condition or manifest.trained_on.cohort)
-    sums = sum_days(warehouse, manifest.signals, condition, manifest.trained_on.feature_set)
+    feature_set = features().name_of(manifest.trained_on.feature_set)
+    sums = sum_days(warehouse, manifest.signals, condition, feature_set)
     days, grams = sums.days, sums.grams
     last = _last_training_day(warehouse, version) if since is None else None
     training = [day < since if since else last is not None and day <= last for day in days]
@@ -153,7 +155,8 @@ def _models(
 
 def _day(day: date, gram: Gram, drives: int, model: LinearModel, training: bool) -> Day:
     figures = error_sums(model, gram).figures(input_scales()[model.label])
-    return Day(day, drives, gram.n, figures.error_mean_deg, figures.error_std_deg, training)
+    mean, std, rmse = figures.error_mean_deg, figures.error_std_deg, figures.rmse_deg
+    return Day(day, drives, gram.n, mean, std, rmse, training)
 
 
 def _judged(day: Day, mean: Limits, std: Limits) -> Day:

@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.grams.cohort import Cohort
 from fleet_slip.regression.drive_moments import DriveMoments
@@ -58,19 +59,18 @@ def coefficient_table(cohort: Cohort, model: str, inputs: Sequence[str]) -> Coef
 
     Raises `DataError` if no drive has them, or there is one only.
     """
-    signals = catalogue()
-    label = signals.label
+    label = catalogue().label
     served = cohort.serving(inputs)
     moments = DriveMoments.of(served.table)
     fitted = fit(served.table.total(), inputs, label)
-    scales = {name: signals[name].exact_scale for name in (*inputs, label)}
+    scales = input_scales()
     robust, naive = infer_by_drives(fitted, moments, scales), infer_classically(fitted, scales)
     inflation = variance_inflation(fitted.gram, inputs)
     spread = dict(zip(moments.signals, moments.spread.tolist(), strict=True))
     rows = []
     for estimate, other in zip(robust.estimates, naive.estimates, strict=True):
         constant = estimate.name == INTERCEPT
-        unit = "rad" if constant else f"rad per {signals[estimate.name].unit}"
+        unit = "rad" if constant else f"rad per {features().of(estimate.name).unit}"
         share = None
         if not constant:
             deviation = spread[estimate.name] * float(scales[estimate.name])

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from fleet_slip.canonical import canonical_json, sha256_of
+from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.sources import SCENARIO
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation.estimators import (
@@ -18,12 +19,13 @@ from fleet_slip.evaluation.estimators import (
 from fleet_slip.evaluation.filters import FILTERS, bound
 from fleet_slip.evaluation.runs import EvaluatedScenario, run_all
 from fleet_slip.evaluation.targets import THE_PAPERS_CHOICE
+from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.report.coefficients import Coefficients, coefficient_table
 from fleet_slip.report.evaluated import Evaluated, latest_of
 from fleet_slip.report.histogram import Histogram, held_out_histogram
 from fleet_slip.report.ordering import Ordering, compare_orders
-from fleet_slip.resources import folder
+from fleet_slip.resources import config_file
 from fleet_slip.selection.model_list import load_model_list
 from fleet_slip.simulation.scenario import Scenario, load_scenario, shipped_scenarios
 from fleet_slip.views import connect
@@ -128,7 +130,7 @@ def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
         evaluated=evaluated,
         trained=trained,
         runs=runs,
-        coefficients=_coefficients(trained),
+        coefficients=_coefficients(warehouse, trained),
         histogram=held_out_histogram(warehouse, trained.selection, choice),
         ordering=compare_orders(cohort, tuple(dict.fromkeys(models[-1].signals))),
         tables=_tables(warehouse),
@@ -160,7 +162,7 @@ def _same_models(evaluated: Evaluated, trained: TrainedModels) -> None:
     now = {name: model.as_dict() for name, model in trained.estimators().items()}
     for name in evaluated.models.values():
         kept = evaluated.estimators[name]
-        if now.get(name) != {key: kept[key] for key in ("intercept", "coefficients")}:
+        if name not in now or now[name] != {key: kept.get(key) for key in now[name]}:
             raise DataError(_changed(evaluated, f"the cohort of {evaluated.group}"))
 
 
@@ -186,12 +188,15 @@ def _changed(evaluated: Evaluated, what: str) -> str:
     )
 
 
-def _coefficients(trained: TrainedModels) -> tuple[Coefficients, ...]:
+def _coefficients(warehouse: Warehouse, trained: TrainedModels) -> tuple[Coefficients, ...]:
     cohort, published = trained.selection.cohort, trained.version
     choice = next(m for m in trained.selection.models if m.name == THE_PAPERS_CHOICE)
     tables = [coefficient_table(cohort, f"model {choice.name}", choice.signals)]
     if set(published.manifest.signals) != set(choice.signals):
-        tables.append(coefficient_table(cohort, published.reference, published.manifest.signals))
+        manifest = published.manifest
+        name = features().name_of(manifest.trained_on.feature_set)
+        own = cohort if name == PLAIN else load_cohort(warehouse, cohort.condition, name)
+        tables.append(coefficient_table(own, published.reference, manifest.signals))
     return tuple(tables)
 
 
@@ -218,7 +223,7 @@ def _tables(warehouse: Warehouse) -> tuple[TableSize, ...]:
 
 
 def _configs(scenarios: list[Scenario]) -> tuple[ConfigHash, ...]:
-    signals = (folder("configs") / "signals.toml").read_bytes()
+    signals = config_file("signals.toml").read_bytes()
     hashes = [
         ConfigHash("configs/signals.toml", hashlib.sha256(signals).hexdigest()),
         ConfigHash(f"configs/models/{TABLE_ONE}.toml", load_model_list(TABLE_ONE).sha256),
