@@ -16,9 +16,11 @@ from fleet_slip.cli.selecting import (
     FoldBy,
     FoldCount,
     Models,
+    Most,
     Naive,
     Nested,
     Rank,
+    SearchMethod,
     WorthOption,
     print_selection,
 )
@@ -50,6 +52,8 @@ def publish(
     worth: WorthOption = WORTH,
     all_subsets: AllSubsets = False,
     naive: Naive = False,
+    search: SearchMethod = None,
+    most: Most = None,
     force: Annotated[
         bool, typer.Option("--force", help="Publish even what is worse than the champion.")
     ] = False,
@@ -73,6 +77,8 @@ def publish(
         worth=parse_worth(worth),
         all_subsets=all_subsets,
         naive=naive,
+        search=search,
+        most=most,
     )
     with step("select"):
         answer = answer_request(context.obj, request)

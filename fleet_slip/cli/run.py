@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
+from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.cli.data import Days, Through, chosen_days, run_gram, run_simulation
 from fleet_slip.cli.models import registry_of
 from fleet_slip.cli.output import Json, print_json, say
@@ -19,6 +20,7 @@ from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.publish import Publication, manifest_of, publish
 from fleet_slip.runs.log import step
 from fleet_slip.selection.compare import Selection
+from fleet_slip.selection.model_list import load_model_list
 from fleet_slip.selection.request import (
     WORTH,
     RequestedSelection,
@@ -28,6 +30,9 @@ from fleet_slip.selection.request import (
 )
 
 DEFAULT_CAMPAIGN = "waterford"
+
+RUN_MODELS = "estimator"
+"""The model list that a run chooses from."""
 
 
 def register(app: typer.Typer) -> None:
@@ -47,8 +52,8 @@ def run(
         str | None, typer.Option(help="Name of the model. Default: the campaign's.")
     ] = None,
     models: Annotated[
-        str | None, typer.Option(help="A model list of configs/models, or a TOML file.")
-    ] = None,
+        str, typer.Option(help="A model list of configs/models, or a TOML file.")
+    ] = RUN_MODELS,
     worth: WorthOption = WORTH,
     threads: Threads = None,
     cluster: Cluster = None,
@@ -70,7 +75,11 @@ def run(
         with workers(context, cluster, threads) as (warehouse, executor):
             simulation = run_simulation(warehouse, plan, chosen_days(plan, days, through), executor)
             gram = run_gram(warehouse, executor)
-        condition = f"campaign = '{plan.name}'"
+            condition = f"campaign = '{plan.name}'"
+            feature_set = load_model_list(models).features
+            wide = None
+            if feature_set != PLAIN:
+                wide = run_gram(warehouse, executor, feature_set, condition)
         with step("select"):
             answer = answer_request(
                 context.obj,
@@ -79,12 +88,14 @@ def run(
         selection = answer.selection
         with step("publish"):
             publication, refusal = _publish(context, answer, model_name)
-    changed = simulation.changed or gram.changed or (publication is not None and publication.new)
+    changed = simulation.changed or gram.changed or bool(wide and wide.changed)
+    changed = changed or (publication is not None and publication.new)
     summary = {
         "campaign": plan.name,
         "changed": changed,
         "simulate": asdict(simulation),
         "gram": asdict(gram),
+        **({"gram_features": asdict(wide)} if wide else {}),
         "select": selection.as_dict(),
         "publish": published(publication) if publication else {"new": False, "reason": refusal},
         "seconds": round(time.monotonic() - started, 3),
@@ -123,6 +134,9 @@ def _print_summary(
         return
     say(f"simulated {simulated['drives']} drives, {simulated['rows']:,} rows")
     say(f"gram: {gram['rows_read']:,} rows read, {gram['gram_rows']:,} Gram rows")
+    if wide := summary.get("gram_features"):
+        name = wide["feature_set"]
+        say(f"gram {name}: {wide['rows_read']:,} rows read, {wide['gram_rows']:,} Gram rows")
     print_selection(selection)
     if publication:
         print_publication(publication)

@@ -12,7 +12,9 @@ from fleet_slip.regression.criteria import CRITERIA
 from fleet_slip.regression.crossval import CrossValidation
 from fleet_slip.regression.nested_choice import CROSS_VALIDATION, NestedChoice
 from fleet_slip.regression.ranking import RANKINGS
+from fleet_slip.regression.stepwise import METHODS
 from fleet_slip.selection.compare import Selection
+from fleet_slip.selection.model_list import DEFAULT_MOST
 from fleet_slip.selection.request import (
     DEFAULT_MODELS,
     WORTH,
@@ -94,6 +96,19 @@ AllSubsets = Annotated[
         "--all-subsets", help="Search all subsets of the inputs of --nested instead of an order."
     ),
 ]
+SearchMethod = Annotated[
+    str | None,
+    typer.Option(
+        "--search",
+        help=f"Search among the inputs of --nested, or all: {', '.join(METHODS)}; the search is "
+        "made again in every fold. Adds its models of 1, 2, ... columns.",
+        show_default=False,
+    ),
+]
+Most = Annotated[
+    int | None,
+    typer.Option(min=1, max=200, help=f"Most columns of --search. Default: {DEFAULT_MOST}."),
+]
 Naive = Annotated[
     bool,
     typer.Option(
@@ -136,6 +151,8 @@ def select(
     worth: WorthOption = WORTH,
     all_subsets: AllSubsets = False,
     naive: Naive = False,
+    search: SearchMethod = None,
+    most: Most = None,
     repeat: Repeat = None,
     bootstrap: Bootstrap = None,
     json: Json = False,
@@ -145,6 +162,8 @@ def select(
     Compare a list of models: **fleet-slip select --models table1**
 
     Find an order and a place to stop: **fleet-slip select --rank backward --criterion bic**
+
+    Choose among many columns: **fleet-slip select --features windows --search exchange --most 12**
 
     Search all subsets: **fleet-slip select --all-subsets --criterion cv --bootstrap 1000**
     """
@@ -160,6 +179,8 @@ def select(
         worth=parse_worth(worth),
         all_subsets=all_subsets,
         naive=naive,
+        search=search,
+        most=most,
         repeat=repeat,
         bootstrap=bootstrap,
     )
@@ -183,7 +204,7 @@ def print_selection(selection: Selection[Any]) -> None:
         + f"; {len(selection.models[0].folds)} folds by {selection.folds.by}",
         ["model", *(["signals"] if listed else []), *FIGURES],
         [
-            [model.name, *([" ".join(model.signals)] if listed else []), *_figures(model)]
+            [model.name, *([_columns_of(model, selection)] if listed else []), *_figures(model)]
             for model in selection.models
         ],
         left=1 + listed,
@@ -202,6 +223,17 @@ def print_selection(selection: Selection[Any]) -> None:
         _print_honest(selection.choice.honest)
     if selection.uncertainty is not None:
         _print_uncertainty(selection.uncertainty)
+
+
+def _columns_of(model: CrossValidation, selection: Selection[Any]) -> str:
+    """Return a model's signals; of one that a search found, what its size changed."""
+    found = selection.searched.models if selection.searched else ()
+    if model not in found or model is selection.winner.model:
+        return " ".join(model.signals)
+    before = found[len(model.signals) - 2].signals if len(model.signals) > 1 else ()
+    added = [f"+{name}" for name in model.signals if name not in before]
+    removed = [f"-{name}" for name in before if name not in model.signals]
+    return " ".join([*added, *removed])
 
 
 def _figures(model: CrossValidation) -> list[str]:

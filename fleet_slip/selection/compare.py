@@ -14,9 +14,10 @@ from fleet_slip.grams.fold_sums import SummedCohort
 from fleet_slip.grams.folding import ROW_FOLDS, Folding
 from fleet_slip.regression.crossval import CrossValidation, cross_validate_inputs
 from fleet_slip.regression.folds import CohortFolds
-from fleet_slip.regression.winner import DEFAULT_WORTH, Winner, Worth, choose
-from fleet_slip.selection.model_list import CandidateModel
+from fleet_slip.regression.winner import DEFAULT_WORTH, Winner, Worth
+from fleet_slip.selection.model_list import CandidateModel, Search
 from fleet_slip.selection.search import SearchChoice
+from fleet_slip.selection.stepwise import SearchedModels, choose_by, search_models
 from fleet_slip.selection.uncertainty import Uncertainty
 
 AnyCohort = TypeVar("AnyCohort", bound=Cohort | SummedCohort, default=Cohort)
@@ -33,6 +34,7 @@ class Selection(Generic[AnyCohort]):
         winner: the chosen one and why.
         skipped: candidates that the cohort cannot serve, with the reason.
         choice: how an order or a subset was chosen; None for a list of models.
+        searched: the models of a search, which are among `models`; None without one.
         uncertainty: how sure the winner's figures are, if that was asked for.
     """
 
@@ -42,6 +44,7 @@ class Selection(Generic[AnyCohort]):
     winner: Winner
     skipped: dict[str, str]
     choice: SearchChoice | None = None
+    searched: SearchedModels | None = None
     uncertainty: Uncertainty | None = None
 
     def as_dict(self) -> dict[str, Any]:
@@ -68,6 +71,8 @@ class Selection(Generic[AnyCohort]):
             model["shortfall"] = shortfall.as_dict()
         if self.choice is not None:
             document["choice"] = self.choice.as_dict()
+        if self.searched is not None:
+            document["search"] = self.searched.as_dict()
         if self.uncertainty is not None:
             document["uncertainty"] = self.uncertainty.as_dict()
         return document
@@ -78,8 +83,10 @@ def select(
     candidates: Sequence[CandidateModel],
     folds: Folding,
     worth: Worth = DEFAULT_WORTH,
+    search: Search | None = None,
+    inputs: Sequence[str] = (),
 ) -> Selection[AnyCohort]:
-    """Cross-validate each candidate and choose the winner.
+    """Cross-validate each candidate, and what a search finds among inputs; choose the winner.
 
     A candidate that needs signals which no drive of the cohort has, or whose signals are linearly
     dependent, is skipped with the reason. Raises `DataError` if none is left.
@@ -92,10 +99,14 @@ def select(
             models.append(validate(candidate, divided))
         except (DataError, QuestionError) as error:
             skipped[candidate.name] = str(error)
+    searched = search_models(cohort, inputs, folds, search) if search else None
+    if searched is not None:
+        models += searched.models
     if not models:
         reasons = "; ".join(f"model {name}: {reason}" for name, reason in skipped.items())
         raise DataError(f"no candidate can be fitted on the cohort. {reasons}")
-    return Selection(cohort, folds, tuple(models), choose(models, worth), skipped)
+    winner = choose_by(search, models, worth)
+    return Selection(cohort, folds, tuple(models), winner, skipped, searched=searched)
 
 
 def validate(candidate: CandidateModel, folds: CohortFolds) -> CrossValidation:

@@ -1,12 +1,13 @@
 """Model lists: the candidates that a selection compares, read from `configs/models/*.toml`."""
 
 from collections.abc import Sequence
+from typing import Literal
 
 from pydantic import Field, model_validator
 
 from fleet_slip.canonical import canonical_json, sha256_of
 from fleet_slip.catalogue.features import PLAIN, features
-from fleet_slip.catalogue.signals import Identifier, catalogue
+from fleet_slip.catalogue.signals import Identifier
 from fleet_slip.config import Config, load_config
 from fleet_slip.grams.folding import Folding
 from fleet_slip.resources import find_config
@@ -20,7 +21,7 @@ class CandidateModel(Config):
 
     @model_validator(mode="after")
     def _signals_are_inputs(self) -> "CandidateModel":
-        inputs = (*catalogue().inputs, *features().features)
+        inputs = features().inputs
         for name in self.signals:
             if name not in inputs:
                 raise ValueError(
@@ -31,13 +32,36 @@ class CandidateModel(Config):
         return self
 
 
+DEFAULT_MOST = 24
+
+
+class Search(Config):
+    """How to choose among many inputs.
+
+    Attributes:
+        method: forward, backward, exchange or lars.
+        most: largest number of columns that a model may have.
+        rule: `best` takes the best cross-validated correlation; `worth` the fewest columns whose
+            error is negligibly larger, see `fleet_slip.regression.winner`.
+    """
+
+    method: Literal["forward", "backward", "exchange", "lars"] = "forward"
+    most: int = Field(default=DEFAULT_MOST, ge=1, le=200)
+    rule: Literal["best", "worth"] = "worth"
+
+
 class ModelList(Config):
-    """Candidates in their declared order, the feature set and the folds to compare them on."""
+    """Candidates in their declared order, the feature set and the folds to compare them on.
+
+    With a `search`, the models that it finds among the inputs of the feature set are candidates
+    too, and its rule decides.
+    """
 
     description: str = Field(min_length=1)
     features: Identifier = PLAIN
     folds: Folding = Folding()
     model: tuple[CandidateModel, ...] = Field(min_length=1)
+    search: Search | None = None
 
     @model_validator(mode="after")
     def _names_differ(self) -> "ModelList":

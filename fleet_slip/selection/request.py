@@ -9,16 +9,18 @@ from typing import Any
 from fleet_slip.canonical import canonical_json, sha256_of
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.errors import ConfigError
+from fleet_slip.errors import ConfigError, QuestionError
 from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.grams.fold_sums import SummedCohort, sum_cohort
 from fleet_slip.grams.folding import EACH, ROW_FOLDS, Folding, FoldKey, make_folding
 from fleet_slip.regression.nested_choice import Rule
+from fleet_slip.regression.stepwise import METHODS
 from fleet_slip.regression.winner import DEFAULT_WORTH, Worth
 from fleet_slip.selection.compare import Selection, select
 from fleet_slip.selection.model_list import (
     CandidateModel,
     ModelList,
+    Search,
     load_model_list,
     nested_models,
 )
@@ -64,6 +66,7 @@ class SelectionRequest:
         all_subsets: choose among the best subsets of `nested` instead of an order's.
         worth: what a signal must gain for cross-validation to keep it.
         naive: take rows for independent instead of drives.
+        search, most: search among the inputs of `nested`, or all, for models of up to so many.
         bootstrap, repeat: how often to resample the winner's figures.
     """
 
@@ -78,6 +81,8 @@ class SelectionRequest:
     worth: Worth = DEFAULT_WORTH
     all_subsets: bool = False
     naive: bool = False
+    search: str | None = None
+    most: int | None = None
     bootstrap: int | None = None
     repeat: int | None = None
 
@@ -111,7 +116,15 @@ def answer_request(warehouse: Warehouse, request: SelectionRequest) -> Requested
         )
     if request.rank and request.all_subsets:
         raise ConfigError("--all-subsets needs no order: leave out --rank.")
-    name = request.models or (None if request.nested or request.ordered else DEFAULT_MODELS)
+    if request.most and not request.search:
+        raise ConfigError("--most is for --search: say how to search.")
+    if request.search and request.ordered:
+        raise ConfigError(
+            "--search makes the whole search again in every fold, and looks at folds alone: leave "
+            "out --rank, --criterion, --all-subsets and --naive."
+        )
+    named = request.nested or request.ordered or request.search
+    name = request.models or (None if named else DEFAULT_MODELS)
     model_list = load_model_list(name) if name else None
     folds = _folding(request, model_list)
     feature_set = _feature_set(request, model_list)
@@ -159,18 +172,37 @@ def _compare_listed(
     folds: Folding,
 ) -> RequestedSelection:
     listed = model_list.model if model_list else ()
-    nested = nested_models(inputs_of(cohort, request.nested)) if request.nested else ()
+    search = _search_of(request, model_list)
+    inputs = inputs_of(cohort, request.nested or WHOLE_SET) if search else ()
+    nested = (
+        nested_models(inputs_of(cohort, request.nested)) if request.nested and not search else ()
+    )
+    if search and not listed:
+        selection = select(cohort, (), folds, request.worth, search, inputs)
+        content = {"inputs": list(inputs), **search.model_dump()}
+        label = f"search:{search.method} {search.most}"
+        return RequestedSelection(selection, label, sha256_of(canonical_json(content)))
     described = ModelList(
         description=model_list.description if model_list else "Nested models of an order",
         features=cohort.feature_set,
         folds=folds,
         model=(*listed, *nested),
+        search=search,
     )
     name = request.models or (DEFAULT_MODELS if listed else None)
     label = "+".join(filter(None, [name, f"nested:{request.nested}" if nested else None]))
-    return RequestedSelection(
-        select(cohort, described.model, folds, request.worth), label, described.sha256
-    )
+    selection = select(cohort, described.model, folds, request.worth, search, inputs)
+    return RequestedSelection(selection, label, described.sha256)
+
+
+def _search_of(request: SelectionRequest, model_list: ModelList | None) -> Search | None:
+    """Return how to search: as asked for, else as the list says, if at all."""
+    if request.search:
+        if request.search not in METHODS:
+            raise QuestionError(f"unknown search {request.search!r}. Known: {', '.join(METHODS)}.")
+        asked = {"method": request.search, **({"most": request.most} if request.most else {})}
+        return Search.model_validate(asked)
+    return model_list.search if model_list else None
 
 
 def _search(cohort: Cohort, request: SelectionRequest, folds: Folding) -> RequestedSelection:

@@ -35,7 +35,8 @@ def test_the_bits_are_those_of_other_machines(smoke_root: Path) -> None:
         files = [table.read(file.path) for file in table.snapshot().files]
         rows = pa.concat_tables(files)
         rows = rows.drop_columns([name for name in rows.column_names if name == "file"])
-        lines = sorted(rows.to_pylist(), key=lambda row: (row["drive_id"], row.get("tick", 0)))
+        order = ("drive_id", "tick", "feature_set")
+        lines = sorted(rows.to_pylist(), key=lambda row: [row.get(name, 0) for name in order])
         digests[table.folder.name] = sha256(str(lines).encode()).hexdigest()
     manifest = Registry(LocalFolder(smoke_root / "models")).resolve("smoke").manifest
     content = manifest.model_dump(mode="json", exclude={"package_version"})
