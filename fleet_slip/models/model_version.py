@@ -69,6 +69,9 @@ class ModelVersion:
         | `pyarrow.Table`, a DuckDB relation, any Arrow stream | `pyarrow.ChunkedArray` | null |
         | mapping of names to arrays of shape (rows,) | `numpy.ndarray` of shape (rows,) | NaN |
 
+        A model that looks back does so within a drive: by the columns `drive_id` and `tick` or
+        `time_s`, if the frame has them; else its rows are the ticks of one drive, in their order.
+
         There is no angle where an input is null or NaN, or a feature has no value, such as a
         curvature at standstill.
 

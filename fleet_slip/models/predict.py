@@ -3,7 +3,8 @@
 The angle is `intercept + sum(coefficient * signal)`, added up from left to right as `score` does in
 SQL, so that both give the same bits. A feature is a function of counts: the signals that it is
 made of are rounded to counts as the sensors round them, and its SQL is run as it stands in the
-manifest. A model with columns over time takes the rows for the ticks of one drive, in their order.
+manifest. A model with columns over time looks back within a drive: by `drive_id` and `tick` or
+`time_s` of the frame; a frame without them is one drive with a row for each tick.
 """
 
 from typing import Any
@@ -11,13 +12,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from fleet_slip.arrays import FloatArray
+from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.catalogue.columns import with_features
 from fleet_slip.catalogue.counts import round_to_counts
-from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.errors import DataError
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
+from fleet_slip.errors import DataError, InputError
 from fleet_slip.grams.drive_rows import counts_of
-from fleet_slip.models.frames import open_frame
+from fleet_slip.models.frames import Frame, open_frame
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predictor import Predictor
 from fleet_slip.warehouse.database import database_errors, open_database
@@ -28,7 +29,7 @@ def predict(manifest: Manifest, frame: Any) -> Any:
     opened = open_frame(frame)
     columns = opened.numbers(manifest.columns, f"the model {manifest.name}")
     if manifest.definitions:
-        angle = _over_time(manifest, columns)
+        angle = _over_time(manifest, opened, columns)
         return opened.wrap(pa.array(angle, from_pandas=True), manifest.label.column)
     physical = columns | _features(manifest, columns)
     angle = np.asarray(manifest.intercept)
@@ -38,19 +39,57 @@ def predict(manifest: Manifest, frame: Any) -> Any:
     return opened.wrap(pa.array(angle, from_pandas=True), manifest.label.column)
 
 
-def _over_time(manifest: Manifest, columns: dict[str, FloatArray]) -> FloatArray:
-    """Return the angles of a model that looks back; the rows are the ticks of one drive."""
+def _over_time(manifest: Manifest, frame: Frame, columns: dict[str, FloatArray]) -> FloatArray:
+    """Return the angles of a model that looks back: of each drive by itself, in the order of time.
+
+    Raises `DataError` if time does not rise within a drive, and `InputError` for a fact that the
+    frame lacks.
+    """
     predictor = Predictor.of(manifest)
-    if predictor.plan.facts:
-        raise DataError(
-            f"{manifest.name} needs what the car knows of itself, {', '.join(predictor.plan.facts)}"
-            ", which a frame of signals does not say. Use: fleet-slip score"
-        )
     signals = catalogue()
-    used = predictor.plan.signals
-    counts = {name: round_to_counts(columns[signals[name].column], signals[name]) for name in used}
-    rows = pa.table({"tick": np.arange(len(next(iter(counts.values())))), **counts})
-    return predictor(counts_of(rows, predictor.plan, {}))
+    counts = {
+        name: round_to_counts(columns[signals[name].column], signals[name])
+        for name in predictor.plan.signals
+    }
+    if missing := [name for name in predictor.plan.facts if name not in frame.names]:
+        raise InputError(f"{manifest.name} needs what the car knows: {', '.join(missing)}.")
+    facts = {name: _column(frame, name) for name in predictor.plan.facts}
+    ticks, drives = _ticks(frame, len(next(iter(counts.values())))), _drives(frame)
+    rows = pa.table({"tick": ticks, **counts, **facts})
+    if drives is None:
+        return predictor(counts_of(rows, predictor.plan)) if len(rows) else np.empty(0)
+    angle = np.full(len(rows), np.nan)
+    for drive in np.unique(drives):
+        at = np.flatnonzero(drives == drive)
+        angle[at] = predictor(counts_of(rows.take(at), predictor.plan))
+    return angle
+
+
+def _column(frame: Frame, name: str) -> pa.Array:
+    column = frame.column(name)
+    return column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
+
+
+def _ticks(frame: Frame, rows: int) -> IntArray:
+    """Return the tick of each row: by `tick` or `time_s`, else one row is one tick."""
+    for name, per_tick in (("tick", 1), ("time_s", int(1 / SAMPLE_TIME_S))):
+        if name in frame.names:
+            values = frame.numbers([name], "a model that looks back")[name]
+            if np.isnan(values).any():
+                raise InputError(f"the column {name} has missing values.")
+            return np.rint(values * per_tick).astype(np.int64)
+    return np.arange(rows)
+
+
+def _drives(frame: Frame) -> IntArray | None:
+    """Return a number for each row's drive; None if the frame is of one."""
+    if "drive_id" not in frame.names:
+        return None
+    ids = _column(frame, "drive_id")
+    if not pa.types.is_dictionary(ids.type):
+        ids = ids.dictionary_encode()
+    numbers: IntArray = ids.indices.fill_null(-1).to_numpy(zero_copy_only=False)
+    return numbers
 
 
 def _features(manifest: Manifest, columns: dict[str, FloatArray]) -> dict[str, FloatArray]:

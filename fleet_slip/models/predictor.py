@@ -6,9 +6,8 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.arithmetic import parse
-from fleet_slip.catalogue.features import input_scales
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.grams.columns import ColumnPlan, DriveColumns, DriveCounts, RowColumn
-from fleet_slip.models.counts_model import counts_model
 from fleet_slip.models.manifest import Manifest
 
 
@@ -19,12 +18,14 @@ class Predictor:
     Attributes:
         plan: the columns, those of the Gram rows that it was made of.
         intercept: rad.
-        weights: rad per count of each column, shape (columns,).
+        coefficients: rad per physical value of each column.
+        scales: physical value of a count of each column.
     """
 
     plan: ColumnPlan
     intercept: float
-    weights: FloatArray
+    coefficients: tuple[float, ...]
+    scales: tuple[float, ...]
 
     @classmethod
     def of(cls, manifest: Manifest) -> "Predictor":
@@ -34,16 +35,23 @@ class Predictor:
         counts mean something else now.
         """
         features = {name: RowColumn(name, parse(sql)) for name, sql in manifest.features.items()}
-        unit = input_scales()[manifest.label.signal]
-        weights = [float(coefficient * unit) for coefficient in counts_model(manifest).coefficients]
+        manifest.require_same_counts()
+        coefficients = tuple(term.coefficient for term in manifest.terms)
+        scales = tuple(
+            float(catalogue()[term.signal].scale if term.logged else term.scale)
+            for term in manifest.terms
+        )
         plan = ColumnPlan.of(manifest.signals, features, manifest.definitions)
-        return cls(plan, manifest.intercept, np.array(weights))
+        return cls(plan, manifest.intercept, coefficients, scales)
 
     def __call__(self, drive: DriveCounts) -> FloatArray:
         """Return the estimate at each row in rad, shape (rows,); NaN where a column is missing.
 
+        Added up from left to right, as `score --sql` does, to the same bits on every machine.
         Raises `DataError` for a drive that cannot be looked back on.
         """
-        columns: FloatArray = DriveColumns(self.plan, drive).compute()
-        estimates: FloatArray = self.intercept + self.weights @ columns
-        return estimates
+        columns = DriveColumns(self.plan, drive).compute()
+        estimate: FloatArray = np.full(columns.shape[1], self.intercept)
+        for column, coefficient, scale in zip(columns, self.coefficients, self.scales, strict=True):
+            estimate += coefficient * (column * scale)
+        return estimate

@@ -69,6 +69,11 @@ def lasso_path_of_moments(
     return _follow(_LassoWalk(matrix, target), inputs)
 
 
+def lars_path_of_moments(matrix: FloatArray, target: FloatArray, inputs: Sequence[str]) -> LarsPath:
+    """Return the least-angle path for moments X'X, shape (k, k), and X'y, shape (k,)."""
+    return _follow(_Walk(matrix, target), inputs)
+
+
 def _correlations(gram: Gram, inputs: Sequence[str], label: str) -> tuple[FloatArray, FloatArray]:
     matrix = correlation_matrix(gram.restrict([*inputs, label]))
     constant = [name for i, name in enumerate([*inputs, label]) if matrix[i, i] == 0]

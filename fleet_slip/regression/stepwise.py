@@ -22,7 +22,7 @@ from fleet_slip.errors import QuestionError
 from fleet_slip.regression.elimination import eliminate
 from fleet_slip.regression.exact import moments
 from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.lars import path_of_moments
+from fleet_slip.regression.lars import lars_path_of_moments
 
 LongArray = NDArray[np.longdouble]
 
@@ -138,7 +138,7 @@ class _Search:
         matrix = self.matrix[np.ix_(at, at)].astype(np.float64)
         target = self.matrix[at, -1].astype(np.float64)
         names = [str(i) for i in at]
-        order = [int(name) for name in path_of_moments(matrix, target, names, lasso=False).order]
+        order = [int(name) for name in lars_path_of_moments(matrix, target, names).order]
         return [order[:size] for size in range(1, min(most, len(order)) + 1)]
 
     def _best_entry(self, work: LongArray, chosen: Sequence[int]) -> int | None:

@@ -143,12 +143,17 @@ def test_sql_only_reads_the_warehouse(
 
 def test_publish_show_score_promote_and_roll_back(run_command: RunCommand, tmp_path: Path) -> None:
     run_command("run", "--campaign", "smoke")
-    again = run_command("publish", "smoke", "--cohort", "campaign = 'smoke'", "--json").json
+    same = ("--models", "estimator", "--cohort", "campaign = 'smoke'")
+    again = run_command("publish", "smoke", *same, "--json").json
     assert (again["version"], again["new"]) == (1, False)
-    worse = run_command("publish", "smoke", "--nested", "ax")
+    alone = ("--features", "windows", "--nested", "ax")
+    worse = run_command("publish", "smoke", *alone)
     assert worse.exit_code == 7
     assert "worse than the champion" in worse.stderr
-    forced = run_command("publish", "smoke", "--nested", "ax", "--force", "--json").json
+    other = run_command("publish", "smoke", "--nested", "ax")
+    assert other.exit_code == 7
+    assert "cannot be compared on this cohort" in other.stderr
+    forced = run_command("publish", "smoke", *alone, "--force", "--json").json
     assert (forced["version"], forced["new"]) == (2, True)
     assert run_command("show", "smoke", "--json").json["version"] == 2
     assert run_command("rollback", "smoke").exit_code == 0
