@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from hypothesis import Phase, settings
+from hypothesis import HealthCheck, Phase, settings
 
 PROJECT = Path(__file__).parents[1]
 TESTED_BY = {
@@ -191,7 +191,11 @@ def load_libraries() -> None:
     for name in LIBRARIES:
         importlib.import_module(name)
     settings.register_profile(
-        "mutants", derandomize=True, deadline=None, phases=[Phase.explicit, Phase.generate]
+        "mutants",
+        derandomize=True,
+        deadline=None,
+        phases=[Phase.explicit, Phase.generate],
+        suppress_health_check=[HealthCheck.too_slow],
     )
 
 
