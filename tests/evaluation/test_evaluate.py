@@ -44,9 +44,9 @@ def evaluate(root: Path, *scenarios: str) -> Any:
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("data")
-    call(folder, "run", "--campaign", "smoke")
+def root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Path:
+    folder = tmp_path_factory.mktemp("evaluated") / "data"
+    shutil.copytree(smoke_root, folder)
     evaluate(folder, *SCENARIOS)
     return folder
 

@@ -1,6 +1,7 @@
 """Forgetting: nothing of the drives is left, and the models are those of a world without them."""
 
 import json
+import shutil
 from datetime import date
 from fractions import Fraction
 from pathlib import Path
@@ -229,9 +230,9 @@ def test_retention_forgets_by_age_and_refuses_to_leave_nothing(tmp_path: Path) -
 
 @pytest.mark.slow
 def test_models_are_marked_and_run_trains_again_without_bringing_the_drive_back(
-    run_command: RunCommand,
+    run_command: RunCommand, smoke_root: Path, tmp_path: Path
 ) -> None:
-    run_command("run", "--campaign", "smoke")
+    shutil.copytree(smoke_root, tmp_path / "data")
     run_command("publish", "other", "--cohort", "day = '2024-05-02'")
     report = run_command("forget", "--drive", "smoke-2024-05-01-0001", "--now", "--json").json
     assert report["models"] == ["smoke@1"]

@@ -31,11 +31,9 @@ def by_module(server: Server) -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def local(tmp_path_factory: pytest.TempPathFactory) -> Folder:
+def local(smoke_root: Path) -> Folder:
     """What the commands make in a folder."""
-    root = tmp_path_factory.mktemp("local") / "data"
-    assert command_on(root, "run", "--campaign", "smoke").exit_code == 0
-    return LocalFolder(root)
+    return LocalFolder(smoke_root)
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +42,15 @@ def filled(server: Server, by_module: None) -> Folder:
     root = data_root(f"{server.bucket()}/some/data")
     done = command_on(root, "run", "--campaign", "smoke")
     assert done.exit_code == 0, done.stderr
+    return root
+
+
+@pytest.fixture
+def copied(server: Server, by_module: None, filled: Folder) -> Folder:
+    """A copy of that, to be changed."""
+    root = data_root(f"{server.bucket()}/data")
+    for file in filled.files():
+        root.put(file.path, filled.read(file.path))
     return root
 
 
@@ -72,9 +79,8 @@ def test_questions_are_answered_as_in_a_folder(filled: Folder, local: Folder) ->
 
 
 @pytest.mark.slow
-def test_what_is_damaged_is_found_and_made_again(server: Server, by_module: None) -> None:
-    root = data_root(f"{server.bucket()}/data")
-    assert command_on(root, "run", "--campaign", "smoke").exit_code == 0
+def test_what_is_damaged_is_found_and_made_again(copied: Folder) -> None:
+    root = copied
     victim = next(file for file in root.files() if file.path.startswith("logs/day="))
     whole = root.read(victim.path)
     root.put(victim.path, whole[:-1] + b"?")
@@ -86,10 +92,8 @@ def test_what_is_damaged_is_found_and_made_again(server: Server, by_module: None
 
 
 @pytest.mark.slow
-def test_a_car_is_forgotten_and_its_files_are_gone(server: Server, by_module: None) -> None:
-    root = data_root(f"{server.bucket()}/data")
-    assert command_on(root, "simulate", "smoke").exit_code == 0
-    assert command_on(root, "gram").exit_code == 0
+def test_a_car_is_forgotten_and_its_files_are_gone(copied: Folder) -> None:
+    root = copied
     before = stored(root)
     drive = command_on(root, "sql", "--json", "SELECT min(drive_id) AS d FROM drives").json[0]["d"]
     assert command_on(root, "forget", "--drive", drive, "--now").exit_code == 0

@@ -27,12 +27,19 @@ def test_commands_that_are_killed_and_repeated_end_in_the_same_bits() -> None:
     assert f"{KILLS} kills survived" in done.stdout
 
 
+@pytest.fixture
+def simulated(smoke_root: Path, tmp_path: Path) -> Path:
+    """A data root after `simulate smoke`, and no more."""
+    root = tmp_path / "data"
+    shutil.copytree(smoke_root, root, ignore=shutil.ignore_patterns("grams", "models", "runs"))
+    return root
+
+
 def test_leftovers_of_a_kill_are_not_part_of_any_table(
-    run_command: RunCommand, tmp_path: Path
+    run_command: RunCommand, simulated: Path
 ) -> None:
-    run_command("simulate", "smoke")
     rows = run_command("sql", "SELECT count(*) AS n FROM log", "--json").json
-    day = tmp_path / "data" / "logs" / "day=2024-05-01"
+    day = simulated / "logs" / "day=2024-05-01"
     (day / f"{TEMPORARY_PREFIX}0.parquet").write_bytes(b"half a file")
     (day / "smoke-9999-uncommitted.parquet").write_bytes(b"written, not committed")
     assert run_command("sql", "SELECT count(*) AS n FROM log", "--json").json == rows
@@ -56,7 +63,7 @@ def small_disk(tmp_path: Path) -> Any:
 
 
 def test_a_full_disk_is_told_and_the_same_command_goes_on_after_it(
-    run_command: RunCommand, small_disk: Any, tmp_path: Path
+    run_command: RunCommand, small_disk: Any, smoke_root: Path
 ) -> None:
     root = small_disk("size=300k")
     full = run_command(*JOB, root=root)
@@ -65,15 +72,14 @@ def test_a_full_disk_is_told_and_the_same_command_goes_on_after_it(
     assert not list(root.rglob(f"{TEMPORARY_PREFIX}*"))
     assert not run(["mount", "-o", "remount,size=20m", str(root.parent)]).exit_code
     assert run_command(*JOB, root=root).exit_code == 0
-    assert run_command(*JOB, root=tmp_path / "fresh").exit_code == 0
-    assert state(root) == state(tmp_path / "fresh")
+    assert state(root) == state(smoke_root)
 
 
 def test_a_read_only_root_is_told_and_can_be_queried(
-    run_command: RunCommand, small_disk: Any
+    run_command: RunCommand, small_disk: Any, smoke_root: Path
 ) -> None:
     root = small_disk("size=20m")
-    assert run_command(*JOB, root=root).exit_code == 0
+    shutil.copytree(smoke_root, root)
     assert not run(["mount", "-o", "remount,ro", str(root.parent)]).exit_code
     for command in (["simulate", "waterford", "--days", "1"], ["publish", "other"]):
         refused = run_command(*command, root=root)
@@ -83,9 +89,8 @@ def test_a_read_only_root_is_told_and_can_be_queried(
     assert run_command(*JOB, "--json", root=root).json["changed"] is False
 
 
-def test_a_damaged_log_file_is_named(run_command: RunCommand, tmp_path: Path) -> None:
-    run_command("simulate", "smoke")
-    file = next((tmp_path / "data" / "logs").rglob("smoke-0000*.parquet"))
+def test_a_damaged_log_file_is_named(run_command: RunCommand, simulated: Path) -> None:
+    file = next((simulated / "logs").rglob("smoke-0000*.parquet"))
     whole = file.read_bytes()
     for damaged in (whole[:1000], b"", b"x" * len(whole)):
         file.write_bytes(damaged)
