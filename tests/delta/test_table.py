@@ -146,9 +146,12 @@ def test_a_conflict_is_retried_and_the_last_one_is_told(monkeypatch: pytest.Monk
 
     assert retry_conflicts(attempt) == "done"
     assert len(waits) == 2
+    waits.clear()
+    monkeypatch.setattr("fleet_slip.delta.conflicts.random.uniform", lambda _, longest: longest)
     with pytest.raises(ConflictError, match="always"):
         retry_conflicts(attempt)
-    assert max(waits) <= 5
+    doubled = [0.02, 0.04, 0.08, 0.16, 0.32, 0.64, 1.28, 2.56]
+    assert waits == pytest.approx([*doubled, 5, 5, 5])
 
 
 def test_a_removal_conflicts_with_a_removal_of_the_same_file(warehouse: Warehouse) -> None:
