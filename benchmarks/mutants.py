@@ -69,7 +69,9 @@ class Mutant:
 
 
 def sites(tree: ast.AST) -> Iterator[ast.AST]:
-    """Yield what may change: neither annotations nor messages of errors, nor docstrings."""
+    """Yield what may change: no annotation, message of an error, or `strict` of a `zip`."""
+    if isinstance(tree, ast.keyword) and tree.arg == "strict":
+        return
     for name, value in ast.iter_fields(tree):
         if name in {"annotation", "returns", "decorator_list", "type_comment"}:
             continue

@@ -204,6 +204,20 @@ def test_greedy_orders_equal_their_definition(seed: int) -> None:
     for size, chosen in enumerate(replacement_sets(gram, inputs, "y"), start=1):
         assert rss(tuple(chosen)) <= rss(added[:size])
         assert rss(tuple(chosen)) >= rss(tuple(best[size]))
+        for one in chosen:  # no exchange of one signal is better
+            for other in set(inputs) - chosen:
+                assert rss((*(chosen - {one}), other)) >= rss(tuple(chosen))
+
+
+def test_replacement_gives_up_what_was_best_alone() -> None:
+    """x1 is nearly x2 + x3, as is y: best alone, and of no use beside the other two."""
+    rng = np.random.default_rng(0)
+    u, v = rng.integers(-1000, 1000, (2, 300))
+    proxy, y = (u + v + rng.integers(-100, 101, 300), u + v + rng.integers(-5, 6, 300))
+    gram = gram_of(np.column_stack([proxy, u, v, y]))
+    inputs = names(3)[:-1]
+    assert rank("forward", gram, inputs, "y")[0] == "x1"
+    assert replacement_sets(gram, inputs, "y") == [{"x1"}, {"x2", "x3"}, {"x1", "x2", "x3"}]
 
 
 @pytest.mark.parametrize("name", RANKINGS)

@@ -191,4 +191,6 @@ def test_pace_needs_no_row_and_names_its_mistakes() -> None:
     with pytest.raises(DataError, match="no noise"):
         shrink(exact, ["x1"], "y", ESTIMATORS["eb"])
     assert (james_stein(np.array([0.1, 0.1, 0.1])) == 0).all()
+    assert james_stein(np.array([3.0, 4.0, 0.0])) == pytest.approx([2.88, 3.84, 0])  # 1 - 1/25
+    assert james_stein(np.array([3.0, 4.0])) == pytest.approx([3, 4])  # nothing to gain from two
     assert (threshold(4.0)(np.array([1.9, -2.1])) == [0, -2.1]).all()
