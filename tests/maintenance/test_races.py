@@ -4,7 +4,6 @@ Each is a schedule that `python -m benchmarks.interleave` found, as one test.
 """
 
 import os
-import subprocess
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -33,7 +32,7 @@ from fleet_slip.simulation.job import simulate_batches
 from fleet_slip.warehouse.audit import Audit, Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 from tests.maintenance.test_forget import CARS, drive, fill, mentions
-from tests.support.commands import RunCommand
+from tests.support.commands import RunCommand, run
 from tests.support.logs import land, path_of
 from tests.support.measured import a_mapping, csv_text, good_columns
 
@@ -285,8 +284,6 @@ def test_commands_that_meet_at_any_point_lose_and_double_nothing() -> None:
     """A part of what `python -m benchmarks.interleave` does; a new process, because it forks."""
     command = [sys.executable, "-m", "benchmarks.interleave", "--schedules", "10"]
     command += ["--first", "compact", "ingest", "--second", "forget"]
-    done = subprocess.run(
-        command, capture_output=True, text=True, check=False, cwd=Path(__file__).parents[2]
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+    done = run(command, cwd=Path(__file__).parents[2])
+    assert done.exit_code == 0, done.stdout + done.stderr
     assert "0 findings of 0 kinds" in done.stdout
