@@ -43,6 +43,7 @@ from benchmarks.interleave_roots import (
     Inputs,
     LocalRoots,
     StoredRoots,
+    let_temporary_files_age,
     prepare,
     write_inputs,
 )
@@ -168,6 +169,7 @@ def _repeat(
     root: str, given: Sequence[tuple[str, tuple[str, ...]]], environment: Environment
 ) -> tuple[int, str]:
     failed: dict[str, int] = {}
+    let_temporary_files_age(root)
     for _ in range(ROUNDS):
         codes = {name: command(root, arguments, environment) for name, arguments in given}
         failed = {name: code for name, code in codes.items() if code}

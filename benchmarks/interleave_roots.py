@@ -2,6 +2,7 @@
 
 import csv
 import math
+import os
 import random
 import shutil
 import urllib.request
@@ -13,6 +14,7 @@ from pathlib import Path
 from benchmarks.crash_commands import MAPPING, let_time_pass
 from benchmarks.interleave_stops import Environment, Running
 from fleet_slip.catalogue.signals import CATALOGUE_VARIABLE
+from fleet_slip.files.folder import TEMPORARY_PREFIX
 from fleet_slip.resources import find_config, folder
 
 CAR = "mini-0000"
@@ -156,6 +158,12 @@ def _lose_files(root: Path) -> None:
     """Delete a simulated log file, of the second day, and a Gram file."""
     next(iter(sorted(root.glob(f"logs/day={SECOND_DAY}/mini-*.parquet")))).unlink()
     next(iter(sorted(root.glob("grams/*.parquet")))).unlink()
+
+
+def let_temporary_files_age(root: str) -> None:
+    """Let an hour go by for what killed writers left half written; a store has no such files."""
+    for file in Path(root).rglob(f"{TEMPORARY_PREFIX}*"):
+        os.utime(file, (0, 0))
 
 
 class LocalRoots:

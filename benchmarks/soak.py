@@ -28,10 +28,15 @@ from typing import Any
 from benchmarks import interleave_checks as checks
 from benchmarks.forking import forked
 from benchmarks.interleave import load_code
-from benchmarks.interleave_roots import PUBLISH, Inputs, measure, write_inputs
+from benchmarks.interleave_roots import (
+    PUBLISH,
+    Inputs,
+    let_temporary_files_age,
+    measure,
+    write_inputs,
+)
 from benchmarks.interleave_server import serving
 from benchmarks.interleave_stops import POINTS, Environment, command, use
-from fleet_slip.files.folder import TEMPORARY_PREFIX
 
 KILLED, FAILED = 0.15, 0.15
 """Shares of the commands that are killed, and in which a call fails."""
@@ -132,8 +137,7 @@ def settle(soak: Soak) -> list[str]:
     cars = sorted({f"gone-{n // 4}" for n in range(1, 10_000)} & _cars(soak.inputs))
     given: list[Arguments] = [("compact",), ("gram",)]
     given += [("forget", "--vehicle", car, "--now") for car in cars]
-    for file in Path(soak.root).rglob(f"{TEMPORARY_PREFIX}*"):
-        os.utime(file, (0, 0))  # an hour goes by
+    let_temporary_files_age(soak.root)
     for _ in range(SETTLING):
         codes = [command(soak.root, arguments, soak.environment) for arguments in given]
         if not set(codes) - {0, 5}:
