@@ -54,7 +54,20 @@ COMMANDS = {
         "models",
         "Point an alias, the champion unless told otherwise, at a version.",
     ),
-    "rollback": Command("models", "Point an alias back at the version that it had before."),
+    "rollback": Command(
+        "models",
+        "Point an alias back at the version that it had before; no publication moves it from "
+        "there.",
+    ),
+    "pin": Command(
+        "models",
+        "Keep an alias where it is: publications become candidates, until promote or unpin.",
+    ),
+    "unpin": Command("models", "Let publications move an alias again, after pin or rollback."),
+    "diff": Command(
+        "comparing",
+        "Tell two model versions apart: their data, signals, coefficients and figures.",
+    ),
     "score": Command(
         "evaluate",
         "Evaluate a model on the rows of a cohort: also the largest error and percentiles.",

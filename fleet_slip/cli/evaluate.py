@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from fleet_slip.catalogue.sources import ALL_DRIVES
+from fleet_slip.cli.comparing import score_against
 from fleet_slip.cli.models import Reference, registry_of
 from fleet_slip.cli.output import Json, print_json, print_table, progress, say, stdout
 from fleet_slip.cli.recorded import record_run
@@ -56,12 +57,20 @@ def score(
     reference: Reference,
     cohort: Cohort = ALL_DRIVES,
     sql: Annotated[bool, typer.Option("--sql", help="Print the statement and do nothing.")] = False,
+    against: Annotated[
+        str | None,
+        typer.Option(help="Another version of the model, such as champion, on the same rows."),
+    ] = None,
     json: Json = False,
 ) -> None:
     """Evaluate a model on the rows of a cohort: also the largest error and percentiles."""
     version = registry_of(context.obj).resolve(reference)
     if sql:
         typer.echo(score_statement(version.manifest, cohort))
+        return
+    if against is not None:
+        name = against if "@" in against else f"{version.manifest.name}@{against}"
+        score_against(context.obj, version, registry_of(context.obj).resolve(name), cohort, json)
         return
     result = score_rows(context.obj, version.manifest, cohort).as_dict()
     if json:

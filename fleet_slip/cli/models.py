@@ -1,4 +1,4 @@
-"""Commands that serve models: models, show, promote, rollback."""
+"""Commands that serve models: models, show, promote, rollback, pin, unpin."""
 
 from pathlib import Path
 from typing import Annotated
@@ -23,7 +23,7 @@ Alias = Annotated[str, typer.Option(help="The alias to move.")]
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
-    for command in (models, show, promote, rollback):
+    for command in (models, show, promote, rollback, pin, unpin):
         app.command()(command)
 
 
@@ -174,7 +174,12 @@ def _print_version(version: ModelVersion) -> None:
             ["error std", f"{figures.error_std_deg:.4f} deg"],
             ["error mean", f"{figures.error_mean_deg:+.4f} deg"],
             ["cross-validation", f"{figures.folds} folds by {figures.folds_by}"],
-            ["cohort", f"{trained.cohort}: {trained.drives:,} drives, {trained.rows:,} rows"],
+            [
+                "cohort",
+                f"{trained.cohort}: {trained.drives:,} drives"
+                + (f" of {trained.vehicles:,} cars" if trained.vehicles is not None else "")
+                + f", {trained.rows:,} rows",
+            ],
             ["tables", f"logs version {trained.logs_version}, grams {trained.grams_version}"],
             [
                 "selected",
@@ -207,6 +212,34 @@ def rollback(
     name: Annotated[str, typer.Argument(help="Name of the model.")],
     alias: Alias = CHAMPION,
 ) -> None:
-    """Point an alias back at the version that it had before."""
+    """Point an alias back at the version that it had before; no publication moves it from there.
+
+    Until promote or unpin.
+    """
     version = registry_of(context.obj).rollback(name, alias)
-    say(f"{name}@{alias} is version {version} again")
+    say(
+        f"{name}@{alias} is version {version} again, and stays so until: fleet-slip promote, or "
+        f"fleet-slip unpin {name}"
+    )
+
+
+@record_run
+def pin(
+    context: typer.Context,
+    name: Annotated[str, typer.Argument(help="Name of the model.")],
+    alias: Alias = CHAMPION,
+) -> None:
+    """Keep an alias where it is: publications become candidates, until promote or unpin."""
+    version = registry_of(context.obj).hold(name, alias, "pin")
+    say(f"{name}@{alias} is pinned to version {version}")
+
+
+@record_run
+def unpin(
+    context: typer.Context,
+    name: Annotated[str, typer.Argument(help="Name of the model.")],
+    alias: Alias = CHAMPION,
+) -> None:
+    """Let publications move an alias again, after pin or rollback."""
+    version = registry_of(context.obj).hold(name, alias, "unpin")
+    say(f"{name}@{alias} is version {version}; the next publication may move it")

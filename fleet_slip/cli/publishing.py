@@ -57,6 +57,12 @@ def publish(
     force: Annotated[
         bool, typer.Option("--force", help="Publish even what is worse than the champion.")
     ] = False,
+    candidate: Annotated[
+        bool,
+        typer.Option(
+            "--candidate", help="Publish as a candidate, which becomes champion by promote."
+        ),
+    ] = False,
     sign_key: SignKey = None,
     json: Json = False,
 ) -> None:
@@ -85,7 +91,7 @@ def publish(
     selection = answer.selection
     manifest = manifest_of(selection, name, answer.label, answer.config_sha256)
     registry = registry_of(context.obj, sign_key)
-    publication = publish_selection(registry, manifest, selection, force=force)
+    publication = publish_selection(registry, manifest, selection, force=force, candidate=candidate)
     if json:
         print_json(published(publication))
     else:
@@ -100,6 +106,7 @@ def published(publication: Publication) -> dict[str, Any]:
         "model": version.manifest.name,
         "version": version.version,
         "new": publication.new,
+        "candidate": publication.candidate,
         "reason": publication.reason,
         "sha256": version.sha256,
     }

@@ -55,7 +55,7 @@ class DocumentFolder:
         file = self.file(number)
         text = self.folder.read(file_name(number))
         try:
-            envelope = json.loads(text)
+            envelope = json.loads(text, object_pairs_hook=_object_of_different_keys)
             content, stated = envelope["content"], envelope["sha256"]
             found = checksum(content)
         except (ValueError, KeyError, TypeError, RecursionError):
@@ -109,6 +109,14 @@ class DocumentFolder:
     def file(self, number: int) -> str:
         """Return where a document of this number is."""
         return f"{self.folder}/{file_name(number)}"
+
+
+def _object_of_different_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a JSON object. Raises `ValueError` for a key that stands twice: who reads which?"""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise ValueError("a key stands twice")
+    return found
 
 
 def file_name(number: int) -> str:

@@ -16,6 +16,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import SCENARIO, TRAINING_DRIVES
 from fleet_slip.errors import DataError, QuestionError, RefusedError
 from fleet_slip.grams.folding import EACH, FOLD_KEYS, ROW_FOLDS, FoldCount
+from fleet_slip.grams.members import Members, hash_numbers
 from fleet_slip.grams.reader import GramReader, open_grams
 from fleet_slip.regression.drive_moments import serving_drives
 from fleet_slip.regression.folds import CohortFolds, FoldAssignment, by_hash, by_value
@@ -75,6 +76,15 @@ class Cohort:
     def drive_count(self) -> int:
         """Number of drives."""
         return int(self.drive_numbers.max()) + 1
+
+    @property
+    def members(self) -> Members:
+        """Which drives and cars the Gram rows are of."""
+        hashes, cars = (hash_numbers(self.drives[name]) for name in ("drive_id", "vehicle_id"))
+        stops = np.cumsum([len(table) for table in self.tables])[:-1]
+        names = [",".join(table.signals) for table in self.tables]
+        drives = dict(zip(names, np.split(hashes, stops), strict=True))
+        return Members(drives, dict(zip(names, np.split(cars, stops), strict=True)))
 
     @property
     def inputs(self) -> tuple[str, ...]:

@@ -11,7 +11,8 @@ from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.grams.cohort import empty_cohort_error, gram_table, require_training
-from fleet_slip.grams.fold_sums import by_signals, hash_numbers
+from fleet_slip.grams.fold_sums import by_signals
+from fleet_slip.grams.members import hash_numbers
 from fleet_slip.grams.reader import GramReader, open_grams
 from fleet_slip.regression.drive_moments import missing_signals_error
 from fleet_slip.regression.gram import Gram

@@ -25,8 +25,9 @@ from fleet_slip.grams.cohort import (
     require_training,
 )
 from fleet_slip.grams.folding import EACH, FOLD_KEYS, ROW_FOLDS, FoldCount, Folding
+from fleet_slip.grams.members import Members, hash_numbers
 from fleet_slip.grams.reader import GramReader, OpenedGrams, open_grams
-from fleet_slip.regression.folds import CohortFolds, hash_number
+from fleet_slip.regression.folds import CohortFolds
 from fleet_slip.regression.gram import Gram
 from fleet_slip.warehouse.condition import Condition, asking, parse_condition
 from fleet_slip.warehouse.tables import Warehouse
@@ -45,6 +46,7 @@ class SummedCohort:
         sums: the Gram of each fold.
         rows, drive_count: number of rows of the logs, and of drives, behind the cohort.
         logs_version, grams_version: versions of the Delta tables that were read.
+        members: which drives and cars the Gram rows are of.
         feature_set: which Gram rows were read.
     """
 
@@ -55,6 +57,7 @@ class SummedCohort:
     drive_count: int
     logs_version: int
     grams_version: int
+    members: Members
     feature_set: str = PLAIN
 
     @property
@@ -106,6 +109,7 @@ def sum_cohort(
         drive_count=sums.drive_count,
         logs_version=opened.logs_version,
         grams_version=opened.grams_version,
+        members=sums.members,
         feature_set=feature_set,
     )
 
@@ -134,11 +138,6 @@ def _folding(
     return list(assignment.names), fold_of
 
 
-def hash_numbers(ids: pa.Array) -> NDArray[np.uint64]:
-    """Return the hash of each drive's id: what tells it from others, in 8 bytes."""
-    return np.fromiter(map(hash_number, ids.to_pylist()), dtype=np.uint64, count=len(ids))
-
-
 def by_signals(batch: pa.RecordBatch) -> Iterator[tuple[str, pa.RecordBatch, BoolArray]]:
     """Yield each set of signals in a batch of Gram rows, its rows, and which those are."""
     names = batch["signals"].unique().to_pylist()
@@ -158,6 +157,7 @@ class _Sums:
     fold_of: FoldOf
     tables: dict[str, list[Gram]] = field(default_factory=dict)
     drives: dict[str, list[NDArray[np.uint64]]] = field(default_factory=dict)
+    vehicles: dict[str, list[NDArray[np.uint64]]] = field(default_factory=dict)
     used: set[int] = field(default_factory=set)
     divided: bool = False
     """Whether a drive may have several Gram rows of the same signals."""
@@ -175,11 +175,20 @@ class _Sums:
                 [a + b for a, b in zip(known, totals, strict=True)] if known else totals
             )
             self.drives.setdefault(signals, []).append(drives[here])
+            cars = hash_numbers(rows["vehicle_id"].unique())
+            self.vehicles.setdefault(signals, []).append(cars)
 
     @property
     def _one_each(self) -> bool:
         """Whether every Gram row is of a drive of its own: then nothing must be sorted to tell."""
         return len(self.tables) == 1 and not self.divided
+
+    @property
+    def members(self) -> Members:
+        """Which drives and cars the Gram rows are of."""
+        drives = {signals: np.concatenate(parts) for signals, parts in self.drives.items()}
+        cars = {signals: np.concatenate(parts) for signals, parts in self.vehicles.items()}
+        return Members(drives, cars)
 
     @property
     def drive_count(self) -> int:

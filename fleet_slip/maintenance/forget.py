@@ -11,7 +11,7 @@ drives the Gram rows are fenced: a commit of Gram rows that has not seen the log
 a conflict. What such jobs have written is never committed, and deleted by them or here.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import pyarrow as pa
@@ -25,6 +25,7 @@ from fleet_slip.maintenance.marks import newest_versions
 from fleet_slip.maintenance.old_files import quarantined_of, remove_old_files
 from fleet_slip.maintenance.rewriting import Rewriting, rewrite
 from fleet_slip.models.manifest import TrainedOn
+from fleet_slip.models.trained_drives import hash_drives, read_trained_drives
 from fleet_slip.models.versions import Registry
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.runs.history import runs_under_way
@@ -177,32 +178,43 @@ def _forget_quarantined(
 
 
 def models_trained_on(warehouse: Warehouse, drives: Collection[str]) -> list[str]:
-    """Return the model versions whose cohort has one of the drives, among those that it could see.
+    """Return the model versions that were trained on one of the drives.
 
-    Where that can no longer be told, because the Gram rows of that time are gone or the manifest
-    is damaged, the version counts as trained on them.
+    Each keeps which drives those were. Of one from before that was kept, the question of its cohort
+    is asked again, of the Gram rows that it could see. Where it cannot be told, because they are
+    gone or the version is damaged, it counts as trained on them.
     """
     registry = Registry(warehouse.root / "models")
-    versions = {
-        f"{name}@{number}": _trained_on(registry, name, number)
-        for name in registry.names()
-        for number in registry.versions(name)
-    }
-    cohorts = {trained.cohort for trained in versions.values() if trained}
+    versions: dict[str, TrainedOn] = {}
+    known: list[str] = []
+    for name in registry.names():
+        hashed = hash_drives(name, drives)
+        for number in registry.versions(name):
+            reference = f"{name}@{number}"
+            try:
+                manifest = registry.load(name, number).manifest
+                kept = read_trained_drives(registry.folder_of(name), manifest)
+            except FleetSlipError:
+                known.append(reference)
+                continue
+            if kept is None:
+                versions[reference] = manifest.trained_on
+            elif not kept.isdisjoint(hashed):
+                known.append(reference)
+    return sorted([*known, *_asked_again(warehouse, versions, drives)])
+
+
+def _asked_again(
+    warehouse: Warehouse, versions: Mapping[str, TrainedOn], drives: Collection[str]
+) -> list[str]:
+    cohorts = {trained.cohort for trained in versions.values()}
     chosen = _in_cohorts(warehouse, cohorts, drives)
     seen = _Seen(warehouse, drives)
     return [
         reference
         for reference, trained in versions.items()
-        if trained is None or seen.any(chosen[trained.cohort], trained.grams_version)
+        if seen.any(chosen[trained.cohort], trained.grams_version)
     ]
-
-
-def _trained_on(registry: Registry, name: str, number: int) -> TrainedOn | None:
-    try:
-        return registry.load(name, number).manifest.trained_on
-    except FleetSlipError:
-        return None
 
 
 def _in_cohorts(

@@ -5,6 +5,7 @@ from fleet_slip.errors import DataError, FleetSlipError, QuestionError, RefusedE
 from fleet_slip.files.documents import DocumentFolder
 from fleet_slip.files.folder import Folder, StoredFile
 from fleet_slip.maintenance.verification import Damage, Verification
+from fleet_slip.models.trained_drives import read_trained_drives
 from fleet_slip.models.versions import Registry
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -39,12 +40,16 @@ def verify_models(
         numbers = registry.versions(name)
         for number in numbers:
             try:
-                trained = registry.load(name, number).manifest.trained_on
+                manifest = registry.load(name, number).manifest
+                read_trained_drives(registry.folder_of(name), manifest)
             except RefusedError as error:  # its signature
                 report.findings.append(Damage("model", f"{name}@{number}", str(error)))
                 continue
-            except (StorageError, DataError, QuestionError):
-                continue  # told as a document
+            except (StorageError, DataError, QuestionError) as error:
+                if "drives-" in str(error):  # anything else is told as a document
+                    report.findings.append(Damage("model", f"{name}@{number}", str(error)))
+                continue
+            trained = manifest.trained_on
             made_of = {"logs": trained.logs_version, "grams": trained.grams_version}
             for table, version in made_of.items():
                 latest = snapshots[table].version if table in snapshots else None

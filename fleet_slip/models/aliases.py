@@ -20,7 +20,15 @@ from fleet_slip.files.documents import MAX_DIGITS, DocumentFolder
 CHAMPION = "champion"
 """The alias of the version in use."""
 
-Command = Literal["publish", "promote", "rollback"]
+CANDIDATE = "candidate"
+"""The alias of the version that waits for somebody to look at it."""
+
+Command = Literal["publish", "promote", "rollback", "pin", "unpin"]
+
+HOLDING: frozenset[Command] = frozenset({"rollback", "pin"})
+"""After these no publication moves the alias, until a person lets it go."""
+
+RELEASING: frozenset[Command] = frozenset({"promote", "unpin"})
 
 T = TypeVar("T")
 
@@ -69,7 +77,7 @@ class AliasHistory:
         trail: list[int] = []
         for move in self.moves():
             if move.alias == alias:
-                trail = trail[:-1] if move.command == "rollback" else [*trail, move.version]
+                trail = _after(trail, move)
         return trail[-2] if len(trail) > 1 else None
 
     def published_at(self, version: int) -> datetime | None:
@@ -77,6 +85,12 @@ class AliasHistory:
         moves = self.latest_moves()
         published = (m.at for m in moves if m.version == version and m.command == "publish")
         return next(published, None)
+
+    def held_by(self, alias: str) -> AliasMove | None:
+        """Return the move since which no publication may move an alias; None if one may."""
+        moves = (move for move in self.latest_moves() if move.alias == alias)
+        last = next((move for move in moves if move.command in HOLDING | RELEASING), None)
+        return last if last is not None and last.command in HOLDING else None
 
     def aliases(self) -> dict[str, int]:
         """Return each alias and the version that it points at."""
@@ -99,3 +113,14 @@ class AliasHistory:
             )
         move = AliasMove(alias=alias, version=version, command=command, at=datetime.now(UTC))
         return self.documents.create(after + 1, move.model_dump(mode="json")) is not None
+
+
+def _after(trail: list[int], move: AliasMove) -> list[int]:
+    """Return the versions that an alias was led through, after one more move."""
+    match move.command:
+        case "rollback":
+            return trail[:-1]
+        case "pin" | "unpin":
+            return trail
+        case _:
+            return [*trail, move.version]

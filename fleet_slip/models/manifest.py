@@ -4,6 +4,7 @@ A manifest is a function of data, configuration and program alone. It may come f
 that every text and number in it is bounded, and the one text that becomes SQL is arithmetic.
 """
 
+import math
 import re
 from decimal import Decimal
 from fractions import Fraction
@@ -49,7 +50,19 @@ ExactFraction = Annotated[
 
 Scale = Annotated[Decimal, Field(ge=Decimal("1e-12"), le=Decimal("1e12"), allow_inf_nan=False)]
 
+Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+
 Count = Annotated[int, Field(ge=0, lt=2**63)]
+
+
+def _require_rounded(value: float, exact: Fraction) -> None:
+    """Raise `ValueError` if a number is not its exact fraction, rounded once."""
+    try:
+        rounded = float(exact)
+    except OverflowError:
+        rounded = math.inf
+    if value != rounded:
+        raise ValueError(f"says {value!r}, but its exact fraction is {rounded!r}")
 
 
 class ModelTerm(Config):
@@ -75,6 +88,11 @@ class ModelTerm(Config):
     def _defined_once(self) -> "ModelTerm":
         if self.sql and self.definition:
             raise ValueError("a term has sql or a definition, not both")
+        return self
+
+    @model_validator(mode="after")
+    def _agrees(self) -> "ModelTerm":
+        _require_rounded(self.coefficient, self.coefficient_exact)
         return self
 
     @model_serializer(mode="wrap")
@@ -130,14 +148,20 @@ class CrossValidated(Config):
 
 
 class TrainedOn(Config):
-    """The data that made a model."""
+    """The data that made a model.
+
+    `vehicles` and `drives_sha256`, which names the file of exactly these drives
+    (`fleet_slip.models.trained_drives`), are None in versions from before they were kept.
+    """
 
     cohort: str
     feature_set: str = "signals"
     drives: Count
+    vehicles: Count | None = None
     rows: Count
     logs_version: Count
     grams_version: Count
+    drives_sha256: Sha256 | None = None
 
 
 class SelectedBy(Config):
@@ -162,6 +186,11 @@ class Manifest(Config):
     trained_on: TrainedOn
     selected_by: SelectedBy
     package_version: str
+
+    @model_validator(mode="after")
+    def _agrees(self) -> "Manifest":
+        _require_rounded(self.intercept, self.intercept_exact)
+        return self
 
     @property
     def signals(self) -> tuple[str, ...]:

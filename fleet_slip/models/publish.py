@@ -9,6 +9,8 @@ from typing import Any
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError, RefusedError
+from fleet_slip.models.aliases import CANDIDATE, CHAMPION, AliasMove
+from fleet_slip.models.gate import compare, faults
 from fleet_slip.models.manifest import (
     CrossValidated,
     Manifest,
@@ -18,10 +20,10 @@ from fleet_slip.models.manifest import (
     TrainedOn,
 )
 from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.models.trained_drives import checksum_of_drives, pack_drives
 from fleet_slip.models.versions import Registry
 from fleet_slip.regression.crossval import CrossValidation
-from fleet_slip.selection.compare import Selection, validate
-from fleet_slip.selection.model_list import CandidateModel
+from fleet_slip.selection.compare import Selection
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,8 @@ class Publication:
     version: ModelVersion
     new: bool
     reason: str
+    candidate: bool = False
+    """Whether it waits for somebody to promote it."""
 
 
 def manifest_of(
@@ -40,6 +44,7 @@ def manifest_of(
     signals = catalogue()
     winner = selection.winner.model
     label = signals[signals.label]
+    wanted = (*winner.signals, signals.label)
     return Manifest(
         name=name,
         label=ModelLabel(
@@ -56,9 +61,11 @@ def manifest_of(
             cohort=selection.cohort.condition.text,
             feature_set=features().identity(selection.cohort.feature_set),
             drives=winner.drives,
+            vehicles=selection.cohort.members.count_vehicles_with(wanted),
             rows=winner.pooled.rows,
             logs_version=selection.cohort.logs_version,
             grams_version=selection.cohort.grams_version,
+            drives_sha256=checksum_of_drives(drives_of(selection, name)),
         ),
         selected_by=SelectedBy(
             model_list=model_list,
@@ -92,78 +99,101 @@ def _term(name: str, coefficient: Fraction) -> ModelTerm:
 
 
 def publish(
-    registry: Registry, manifest: Manifest, selection: Selection[Any], *, force: bool = False
+    registry: Registry,
+    manifest: Manifest,
+    selection: Selection[Any],
+    *,
+    force: bool = False,
+    candidate: bool = False,
 ) -> Publication:
-    """Make the winner the next version and champion of its model.
+    """Make the winner the next version of its model, and its champion.
 
-    The champion's signals are cross-validated on the same cohort and folds; a challenger with a
-    lower correlation is refused (`RefusedError`) unless forced. A challenger that is the same
-    estimator from the same rows changes nothing. If the champion changes meanwhile, all is decided
-    again.
+    It must be above the floor and no worse than the champion (`fleet_slip.models.gate`), else it is
+    refused (`RefusedError`) unless forced. A `candidate` waits for somebody to promote it, and so
+    does whatever is published while the champion is held by `rollback` or `pin`. A challenger that
+    is the same estimator from the same rows changes nothing. If the champion changes meanwhile, all
+    is decided again.
     """
+    history = registry.history(manifest.name)
 
     @functools.cache
     def added() -> ModelVersion:
-        return registry.add(manifest)
+        return registry.add(manifest, drives_of(selection, manifest.name))
 
     def decision(newest_move: int) -> Publication | None:
         champion = registry.champion(manifest.name)
         if champion and champion.manifest.same_estimator(manifest):
             return Publication(champion, False, "The champion is this very model.")
-        reason = _why_publish(champion, manifest, selection, force=force)
+        held = history.held_by(CHAMPION)
+        if candidate:
+            reason = _describe(champion, manifest, selection)
+        else:
+            reason = _why_publish(champion, manifest, selection, force=force)
+        if candidate or held:
+            return _wait(registry, added(), newest_move, reason, held)
         published = registry.make_champion(added(), after=newest_move)
         return Publication(added(), True, reason) if published else None
 
-    return registry.history(manifest.name).decide(decision)
+    return history.decide(decision)
+
+
+def _wait(
+    registry: Registry, version: ModelVersion, newest: int, reason: str, held: AliasMove | None
+) -> Publication | None:
+    """Make a version the candidate; return None if an alias moved after the move given."""
+    name = version.manifest.name
+    history = registry.history(name)
+    there = history.pointed_at(CANDIDATE) == version.version
+    if not there and not history.move(CANDIDATE, version.version, "publish", after=newest):
+        return None
+    why = (
+        f"{name}@{held.version} stays champion since it was {_DONE[held.command]} on "
+        f"{held.at:%Y-%m-%d %H:%M} UTC"
+        if held
+        else "It is a candidate"
+    )
+    reason = f"{reason} {why}, until: fleet-slip promote {version.reference}"
+    return Publication(version, not there, reason, candidate=True)
+
+
+_DONE = {"rollback": "rolled back to", "pin": "pinned"}
+
+
+def drives_of(selection: Selection[Any], name: str) -> bytes:
+    """Return the content of the file about the drives that a selection's winner was trained on."""
+    signals = (*selection.winner.model.signals, catalogue().label)
+    return pack_drives(name, selection.cohort.members.drives_with(signals))
 
 
 def _why_publish(
     champion: ModelVersion | None, manifest: Manifest, selection: Selection[Any], *, force: bool
 ) -> str:
-    if champion is None:
-        return "It is the first version."
-    challenger = selection.winner.model
-    if selection.searched is not None:
-        # The columns of both are given now: neither is searched for in every fold again.
-        folds = selection.cohort.folds(selection.folds.by, selection.folds.count)
-        challenger = validate(
-            CandidateModel(name=challenger.name, signals=challenger.signals), folds
-        )
-    incumbent = _revalidate(champion, selection)
-    comparison = (
-        f"cross-validated correlation {challenger.correlation:.6f}, and "
-        f"{incumbent.correlation:.6f} with the signals of {champion.reference}, on the same cohort "
-        f"and folds"
-    )
-    if incumbent.sums.signed_r_squared > challenger.sums.signed_r_squared and not force:
+    problems = faults(manifest, champion.manifest if champion else None)
+    compared = "It is the first version"
+    if champion is not None:
+        try:
+            comparison = compare(selection, champion)
+        except (DataError, QuestionError) as error:
+            problems.append(f"the champion {champion.reference} cannot be compared ({error})")
+        else:
+            compared = str(comparison)
+            if not comparison.shortfall.negligible:
+                problems.append(f"it is worse than the champion: {comparison}")
+    if problems and not force:
         raise RefusedError(
-            f"{manifest.name} was not published: it is worse than the champion ({comparison}). "
-            "Use --force to publish it all the same."
+            f"{manifest.name} was not published: {'; '.join(problems)}. Look at the data, or use "
+            "--force to publish it all the same."
         )
-    return f"It has a {comparison}."
+    return f"{_capitalised('; '.join(problems) or compared)}."
 
 
-def _revalidate(champion: ModelVersion, selection: Selection[Any]) -> CrossValidation:
-    folds = selection.cohort.folds(selection.folds.by, selection.folds.count)
-    try:
-        _require_same_features(champion)
-        candidate = CandidateModel(name=champion.reference, signals=champion.manifest.signals)
-        return validate(candidate, folds)
-    except (DataError, QuestionError) as error:
-        raise RefusedError(
-            f"{champion.manifest.name} was not published: the champion {champion.reference} cannot "
-            f"be compared on this cohort ({error}) Use --force to publish all the same."
-        ) from None
+def _describe(champion: ModelVersion | None, manifest: Manifest, selection: Selection[Any]) -> str:
+    """Return what the gate says of a candidate, which passes it all the same."""
+    return _why_publish(champion, manifest, selection, force=True)
 
 
-def _require_same_features(champion: ModelVersion) -> None:
-    known, known_names = features().features, features().inputs
-    for name, sql in champion.manifest.features.items():
-        if name not in known or known[name].sql != sql:
-            raise DataError(f"its feature {name} is not defined as it was then.")
-    for name, definition in champion.manifest.definitions.items():
-        if name not in known_names or features().definition(name) != definition:
-            raise DataError(f"its column {name} is not defined as it was then.")
+def _capitalised(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
 def _cross_validated(winner: CrossValidation, selection: Selection[Any]) -> CrossValidated:

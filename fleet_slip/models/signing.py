@@ -62,8 +62,14 @@ def require_signature(folder: Folder, number: int, name: str, sha256: str) -> No
 
     The environment is read here, not by the callers, so that none of them can forget to ask.
     """
-    if not (configured := os.environ.get(VERIFY_VARIABLE)):
+    configured = os.environ.get(VERIFY_VARIABLE)
+    if configured is None:
         return
+    if not configured.strip():
+        raise ConfigError(
+            f"${VERIFY_VARIABLE} is set and empty. Name the public key, or unset it: an empty name "
+            "does not switch verification off."
+        )
     public = _read_key(Path(configured))[0]
     shown, file = f"{name}@{number}", f"{number}.sig"
     if file not in folder.names():

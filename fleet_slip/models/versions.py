@@ -10,7 +10,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pyarrow as pa
 from pydantic import ValidationError
@@ -24,6 +24,7 @@ from fleet_slip.models.aliases import CHAMPION, AliasHistory
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.signing import require_signature, require_signing_key, sign
+from fleet_slip.models.trained_drives import keep_drives
 
 _IDENTIFIER = re.compile(IDENTIFIER_PATTERN)
 
@@ -114,6 +115,10 @@ class Registry:
             )
         return self.load(name, version)
 
+    def folder_of(self, name: str) -> Folder:
+        """Return the folder of a model's versions."""
+        return self._versions(name).folder
+
     def champion(self, name: str) -> ModelVersion | None:
         """Return the version in use, or None before the first."""
         version = self.history(name).pointed_at(CHAMPION)
@@ -123,15 +128,18 @@ class Registry:
         """Return the moves of a model's aliases."""
         return AliasHistory(DocumentFolder(self.folder / name / "history"))
 
-    def add(self, manifest: Manifest) -> ModelVersion:
+    def add(self, manifest: Manifest, drives: bytes | None = None) -> ModelVersion:
         """Make a manifest the next version of its model, to which nothing points yet.
 
-        If the latest version is the same estimator from the same rows, that one is used: another
-        process added it just now, or was interrupted.
+        `drives` is the content of the file about its drives, which is written first. If the latest
+        version is the same estimator from the same rows, that one is used: another process added it
+        just now, or was interrupted.
         """
         if self.signing_key is not None:
             require_signing_key(self.signing_key)  # before anything is written
         name, versions = manifest.name, self._versions(manifest.name)
+        if drives is not None:
+            keep_drives(versions.folder, drives)
 
         def next_version(latest: int) -> int | None:
             if latest and self._read(name, latest).manifest.same_estimator(manifest):
@@ -159,11 +167,26 @@ class Registry:
         history = self.history(name)
 
         def move(newest: int) -> int | None:
-            there = history.pointed_at(alias) == version
+            there = history.pointed_at(alias) == version and not history.held_by(alias)
             moved = there or history.move(alias, version, "promote", after=newest)
             return version if moved else None
 
         history.decide(move)
+
+    def hold(self, name: str, alias: str, command: Literal["pin", "unpin"]) -> int:
+        """Pin an alias to the version that it points at, or unpin it; return that version.
+
+        Raises `QuestionError` if it points at none.
+        """
+        version = self.resolve(f"{name}@{alias}").version
+        history = self.history(name)
+
+        def move(newest: int) -> int | None:
+            there = bool(history.held_by(alias)) == (command == "pin")
+            moved = there or history.move(alias, version, command, after=newest)
+            return version if moved else None
+
+        return history.decide(move)
 
     def rollback(self, name: str, alias: str) -> int:
         """Point an alias back at the version it had before; return that version.

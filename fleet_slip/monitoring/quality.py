@@ -16,6 +16,7 @@ from fleet_slip.grams.reader import GramReader
 from fleet_slip.monitoring.moments import DriveBatches
 from fleet_slip.monitoring.peers import settle
 from fleet_slip.monitoring.plausibility import Fault, find_implausible
+from fleet_slip.monitoring.reversed_label import find_reversed_labels
 from fleet_slip.monitoring.thresholds import QualityThresholds, thresholds
 from fleet_slip.regression.gram_table import GramTable
 from fleet_slip.warehouse.condition import Condition, asking, parse_condition
@@ -122,6 +123,10 @@ def examine(cohort: Cohort, limits: QualityThresholds | None = None) -> QualityR
         in_order = np.array([drive not in faults for drive in range(len(table))])
         if in_order.sum() >= limits.min_drives:
             compared += len(table)
+            turned = find_reversed_labels(table, in_order, catalogue().label)
+            in_order[list(turned)] = False
+            faults |= turned
+        if in_order.sum() >= limits.min_drives:
             faults |= _unlike_peers(table, in_order, limits)
         drives += len(table)
         findings += _findings(metadata, faults)

@@ -103,7 +103,7 @@ def choose(models: Sequence[CrossValidation], worth: Worth = DEFAULT_WORTH) -> W
     if not models:
         raise QuestionError("no model to choose from: the list of models is empty.")
     best = max(models, key=lambda model: model.sums.signed_r_squared)
-    shortfalls = tuple(_shortfall(model, best, worth) for model in models)
+    shortfalls = tuple(fall_short(model, best, worth) for model in models)
     near = [one for one in shortfalls if one.model is best or one.negligible]
     fewest = min(len(one.model.signals) for one in near)
     smallest = [one for one in near if len(one.model.signals) == fewest]
@@ -112,7 +112,8 @@ def choose(models: Sequence[CrossValidation], worth: Worth = DEFAULT_WORTH) -> W
     return Winner(winner.model, best, reason, shortfalls)
 
 
-def _shortfall(model: CrossValidation, best: CrossValidation, worth: Worth) -> Shortfall:
+def fall_short(model: CrossValidation, best: CrossValidation, worth: Worth) -> Shortfall:
+    """Return how much larger a model's RMSE is than another's, over the same folds."""
     difference = model.pooled.rmse - best.pooled.rmse
     worthless = difference < worth.of(best.pooled.rmse)
     return Shortfall(model, difference, _standard_error(model, best), worthless)

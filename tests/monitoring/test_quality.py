@@ -86,6 +86,25 @@ def test_what_is_broken_is_named(
     assert (fault.kind, fault.signals) == (kind, signals)
 
 
+@pytest.mark.parametrize("turned", [1, 12, 30])
+def test_a_label_that_is_reversed_for_one_car_is_found(warehouse: Warehouse, turned: int) -> None:
+    rng = np.random.default_rng(5)
+    one = [log_rows(f"a{i:02d}", counts(drive(rng))) for i in range(DRIVES)]
+    other = [
+        log_rows(f"b{i:02d}", counts(broken(drive(rng), multiply("sideslip", -1))), vehicle_id="b")
+        for i in range(turned)
+    ]
+    land(warehouse, "all", *one, *other)
+    update_grams(warehouse)
+    findings = examine(load_cohort(warehouse)).findings
+    assert [(one.drive_id, one.vehicle_id) for one in findings] == [
+        (f"b{i:02d}", "b") for i in range(turned)
+    ]
+    assert {(one.fault.kind, one.fault.signals) for one in findings} == {
+        ("reversed", ("sideslip",))
+    }
+
+
 def test_drives_in_order_raise_no_alarm(warehouse: Warehouse) -> None:
     fleet(warehouse, lambda _: None)
     report = examine(load_cohort(warehouse))

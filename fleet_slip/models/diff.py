@@ -1,0 +1,105 @@
+"""Tells two model versions apart: what each was made of, and what it came to."""
+
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+from fleet_slip.models.manifest import Manifest
+from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.models.trained_drives import read_trained_drives
+from fleet_slip.models.versions import Registry
+
+
+@dataclass(frozen=True)
+class CommonDrives:
+    """How many drives made the one version, the other, and both."""
+
+    only_one: int
+    only_other: int
+    both: int
+
+
+@dataclass(frozen=True)
+class Term:
+    """A coefficient of two versions, in SI units; None where a model does not have the signal."""
+
+    signal: str
+    unit: str
+    one: float | None
+    other: float | None
+    same: bool
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Two versions beside each other.
+
+    Attributes:
+        drives: which drives they share; None between models, or where a version does not keep it.
+        facts: data, reason and figures that differ, by what they are called in the manifest.
+        terms: the intercept and every signal of either.
+    """
+
+    one: ModelVersion
+    other: ModelVersion
+    drives: CommonDrives | None
+    facts: dict[str, tuple[Any, Any]]
+    terms: tuple[Term, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `diff --json` prints."""
+        shared = self.drives
+        return {
+            "one": self.one.reference,
+            "other": self.other.reference,
+            "drives": vars(shared) if shared else None,
+            "facts": {name: {"one": a, "other": b} for name, (a, b) in self.facts.items()},
+            "terms": [vars(term) for term in self.terms],
+        }
+
+
+def compare_versions(registry: Registry, one: ModelVersion, other: ModelVersion) -> Difference:
+    """Compare two versions. Raises `StorageError` if what one keeps of its drives is damaged."""
+    return Difference(
+        one, other, _drives(registry, one, other), _facts(one, other), tuple(_terms(one, other))
+    )
+
+
+def _drives(registry: Registry, one: ModelVersion, other: ModelVersion) -> CommonDrives | None:
+    if one.manifest.name != other.manifest.name:  # their hashes are salted differently
+        return None
+    folder = registry.folder_of(one.manifest.name)
+    a, b = (read_trained_drives(folder, version.manifest) for version in (one, other))
+    if a is None or b is None:
+        return None
+    return CommonDrives(len(a - b), len(b - a), len(a & b))
+
+
+def _facts(one: ModelVersion, other: ModelVersion) -> dict[str, tuple[Any, Any]]:
+    a, b = (_flat(version.manifest) for version in (one, other))
+    return {name: (a[name], b[name]) for name in a if a[name] != b[name]}
+
+
+def _flat(manifest: Manifest) -> dict[str, Any]:
+    parts = manifest.model_dump(
+        mode="json", include={"trained_on", "cross_validation", "selected_by"}
+    )
+    inner = {f"{part}.{name}": value for part in parts for name, value in parts[part].items()}
+    return {"package_version": manifest.package_version, **inner}
+
+
+def _terms(one: ModelVersion, other: ModelVersion) -> list[Term]:
+    a, b = (_coefficients(version.manifest) for version in (one, other))
+    found = []
+    for signal in dict.fromkeys([*a, *b]):
+        exact, unit = zip(*(side[signal] for side in (a, b) if signal in side), strict=True)
+        values = [float(side[signal][0]) if signal in side else None for side in (a, b)]
+        same = len(exact) == 2 and exact[0] == exact[1]
+        found.append(Term(signal, unit[0], values[0], values[1], same))
+    return found
+
+
+def _coefficients(manifest: Manifest) -> dict[str, tuple[Fraction, str]]:
+    label = manifest.label
+    terms = {term.column: (term.coefficient_exact, term.unit) for term in manifest.terms}
+    return {"intercept": (manifest.intercept_exact, label.unit), **terms}

@@ -1,0 +1,143 @@
+"""What a model must be before it becomes champion: above a floor, and no worse than the champion.
+
+Both are asked of rows that the challenger was not fitted on. The champion is what cars have: its
+own coefficients, not its signals fitted anew. It is compared on the same held-out drives, so that
+the error that counts is that of the difference over the folds.
+"""
+
+import math
+import os
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field
+
+from fleet_slip.catalogue.features import features, input_scales
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.config import Config, load_config
+from fleet_slip.errors import DataError
+from fleet_slip.models.counts_model import counts_model
+from fleet_slip.models.manifest import Manifest
+from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.regression.crossval import (
+    CrossValidation,
+    assemble,
+    cross_validate,
+    least_squares,
+)
+from fleet_slip.regression.figures import error_sums
+from fleet_slip.regression.folds import Folds
+from fleet_slip.regression.winner import Shortfall, Worth, fall_short
+from fleet_slip.resources import folder
+from fleet_slip.selection.compare import Selection
+
+FLOOR_VARIABLE = "FLEET_SLIP_PUBLISH"
+"""Environment variable: path of a TOML file that takes the place of configs/publish.toml."""
+
+
+class Floor(Config):
+    """What a person asks of every champion; `configs/publish.toml` says what each means."""
+
+    min_correlation: float = Field(gt=-1, lt=1)
+    max_rmse_deg: float = Field(gt=0)
+    min_drives: int = Field(ge=1)
+    min_vehicles: int = Field(ge=1)
+    min_part_of_champion: float = Field(ge=0, le=1)
+    worth_deg: float = Field(ge=0)
+
+
+@cache
+def floor() -> Floor:
+    """Return the floor of `$FLEET_SLIP_PUBLISH`, else the one that ships with the package."""
+    chosen = os.environ.get(FLOOR_VARIABLE)
+    return load_config(Path(chosen) if chosen else folder("configs") / "publish.toml", Floor)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A challenger and the champion's own coefficients on the same held-out rows."""
+
+    challenger: CrossValidation
+    champion: CrossValidation
+    shortfall: Shortfall
+
+    def __str__(self) -> str:
+        """Return what was compared, with its figures."""
+        challenger, champion = self.challenger.pooled, self.champion.pooled
+        return (
+            f"on the same {challenger.rows:,} rows of {self.challenger.drives:,} drives, held out "
+            f"in {len(self.challenger.folds)} folds, it has RMSE {challenger.rmse_deg:.4f} deg and "
+            f"correlation {challenger.correlation:.4f}; the coefficients of "
+            f"{self.champion.name} have {champion.rmse_deg:.4f} deg and "
+            f"{champion.correlation:.4f}; difference {self.shortfall}"
+        )
+
+
+def compare(selection: Selection[Any], champion: ModelVersion) -> Comparison:
+    """Compare a selection's winner with the champion's own coefficients, fold by fold.
+
+    Over the drives that have the signals of both. Raises `DataError` or `QuestionError` if there
+    are none, or the champion's features are not defined as they were.
+    """
+    _require_same_features(champion.manifest)
+    label, inputs = catalogue().label, selection.winner.model.signals
+    both = tuple(dict.fromkeys((*inputs, *champion.manifest.signals)))
+    divided = selection.cohort.folds(selection.folds.by, selection.folds.count)
+    folds = divided.serving(both, label)
+    challenger = cross_validate(
+        selection.winner.model.name, folds, least_squares(inputs, label), input_scales()
+    )
+    incumbent = _as_it_is(champion, folds)
+    worth = Worth(math.radians(floor().worth_deg))
+    return Comparison(challenger, incumbent, fall_short(challenger, incumbent, worth))
+
+
+def _as_it_is(version: ModelVersion, folds: Folds) -> CrossValidation:
+    """Return the figures of a published model over folds, none of which it is fitted to again."""
+    model = counts_model(version.manifest)
+    tests = [error_sums(model, test) for test in folds.grams]
+    return assemble(version.reference, folds, tests, model, input_scales())
+
+
+def faults(manifest: Manifest, champion: Manifest | None) -> list[str]:
+    """Return in what a manifest is below the floor, and what it must be."""
+    least, figures, trained = floor(), manifest.cross_validation, manifest.trained_on
+    found = []
+    if figures.correlation < least.min_correlation:
+        found.append(f"its correlation is {figures.correlation:.4f}, below {least.min_correlation}")
+    if figures.rmse_deg > least.max_rmse_deg:
+        found.append(f"its RMSE is {figures.rmse_deg:.4f} deg, above {least.max_rmse_deg} deg")
+    if trained.drives < least.min_drives:
+        found.append(f"it was trained on {trained.drives:,} drives, fewer than {least.min_drives}")
+    if trained.vehicles is not None and trained.vehicles < least.min_vehicles:
+        found.append(
+            f"it was trained on {trained.vehicles:,} cars, fewer than {least.min_vehicles}"
+        )
+    if champion is not None:
+        found += _shrunk(manifest, champion, least.min_part_of_champion)
+    return found
+
+
+def _shrunk(manifest: Manifest, champion: Manifest, part: float) -> list[str]:
+    """Return of what a model was trained on too little beside the champion."""
+    pairs = (
+        ("drives", manifest.trained_on.drives, champion.trained_on.drives),
+        ("cars", manifest.trained_on.vehicles, champion.trained_on.vehicles),
+    )
+    return [
+        f"it was trained on {own:,} {what}, less than {part:.0%} of the champion's {other:,}"
+        for what, own, other in pairs
+        if own is not None and other is not None and own < part * other
+    ]
+
+
+def _require_same_features(champion: Manifest) -> None:
+    known = features()
+    for name, sql in champion.features.items():
+        if name not in known.features or known.features[name].sql != sql:
+            raise DataError(f"its feature {name} is not defined as it was then.")
+    for name, definition in champion.definitions.items():
+        if name not in known.inputs or known.definition(name) != definition:
+            raise DataError(f"its column {name} is not defined as it was then.")

@@ -1,0 +1,74 @@
+"""Exactly which drives a model version was trained on, for ever, without their names.
+
+    models/<name>/versions/drives-CHECKSUM.bin   a hash of 8 bytes for each drive, sorted
+
+What a condition chose is told by the data of that day, which may be gone tomorrow. So each version
+keeps a hash of every drive: that a drive was among them can be told by who knows its name, after
+the drive is forgotten, too. The hashes are salted with the model's name, so that they are the same
+for versions of a model and differ between models. A manifest names the file by its SHA-256.
+"""
+
+import hashlib
+from collections.abc import Collection
+
+import numpy as np
+
+from fleet_slip.errors import StorageError
+from fleet_slip.files.folder import Folder
+from fleet_slip.grams.members import Hashes
+from fleet_slip.models.manifest import Manifest
+from fleet_slip.regression.folds import hash_number
+
+_SALT = b"fleet-slip trained drives\n"
+
+
+def pack_drives(name: str, drives: Hashes) -> bytes:
+    """Return the content of the file about the drives that a model was trained on."""
+    return np.sort(_salted(name, drives)).astype(">u8").tobytes()
+
+
+def checksum_of_drives(content: bytes) -> str:
+    """Return the SHA-256 by which a manifest names the file of its drives."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def keep_drives(versions: Folder, content: bytes) -> None:
+    """Write the file of drives, durably; nothing if it is there."""
+    versions.create(_file_name(checksum_of_drives(content)), content)
+
+
+def read_trained_drives(versions: Folder, manifest: Manifest) -> frozenset[int] | None:
+    """Return the salted hashes of a version's drives; None if it is from before they were kept.
+
+    Raises `StorageError` if they are gone or damaged.
+    """
+    expected = manifest.trained_on.drives_sha256
+    if expected is None:
+        return None
+    content = versions.read(_file_name(expected))
+    if checksum_of_drives(content) != expected:
+        raise StorageError(
+            f"{versions}/{_file_name(expected)}: its bytes do not match the checksum in its name. "
+            "Restore the file from a backup."
+        )
+    return frozenset(np.frombuffer(content, dtype=">u8").tolist())
+
+
+def hash_drives(name: str, drives: Collection[str]) -> frozenset[int]:
+    """Return the salted hashes of drives that are known by their names."""
+    numbers = np.array([hash_number(drive) for drive in drives], dtype=np.uint64)
+    return frozenset(_salted(name, numbers).tolist())
+
+
+def _salted(name: str, drives: Hashes) -> Hashes:
+    salt = hashlib.sha256(_SALT + name.encode())
+    hashed = np.empty(len(drives), dtype=np.uint64)
+    for i, number in enumerate(drives.astype(">u8")):
+        one = salt.copy()
+        one.update(number.tobytes())
+        hashed[i] = int.from_bytes(one.digest()[:8], "big")
+    return hashed
+
+
+def _file_name(sha256: str) -> str:
+    return f"drives-{sha256}.bin"

@@ -1,0 +1,228 @@
+"""What may become champion: above the floor, no worse than the champion itself, and by people."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fleet_slip.errors import ConfigError, RefusedError
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.grams.job import update_grams
+from fleet_slip.maintenance.forget import forget, models_trained_on
+from fleet_slip.models import gate
+from fleet_slip.models.aliases import CANDIDATE
+from fleet_slip.models.counts_model import counts_model
+from fleet_slip.models.diff import compare_versions
+from fleet_slip.models.publish import Publication, manifest_of, publish
+from fleet_slip.models.versions import Registry
+from fleet_slip.selection.request import SelectionRequest, answer_request
+from fleet_slip.warehouse.audit import Forgettable
+from fleet_slip.warehouse.tables import Warehouse
+from tests.support.logs import land, log_rows
+
+ROWS = 200
+
+
+def counts(rng: np.random.Generator, label: float = 1.0, noise: float = 20.0) -> dict[str, Any]:
+    """Counts of a drive whose label is a sum of two signals, times a factor, and noise."""
+    ay, yaw_rate = rng.normal(0, 1000, (2, ROWS))
+    sideslip = label * (0.3 * ay + 0.2 * yaw_rate) + rng.normal(0, noise, ROWS)
+    found = {"ay": ay, "yaw_rate": yaw_rate, "sideslip": sideslip}
+    return {name: np.rint(values).astype(np.int16) for name, values in found.items()}
+
+
+def write(warehouse: Warehouse, name: str, drives: int, label: float = 1.0, **about: Any) -> None:
+    """Land drives of eight cars and reduce them."""
+    rng = np.random.default_rng([*name.encode()])
+    rows = [
+        log_rows(f"{name}-{i}", counts(rng, label), vehicle_id=f"car-{i % 8}", **about)
+        for i in range(drives)
+    ]
+    land(warehouse, name, *rows)
+    update_grams(warehouse)
+
+
+def publish_from(
+    warehouse: Warehouse, cohort: str = "true", signals: str = "ay,yaw_rate", **options: Any
+) -> Publication:
+    """Select on a cohort and publish the winner."""
+    answer = answer_request(warehouse, SelectionRequest(cohort=cohort, nested=signals))
+    manifest = manifest_of(answer.selection, "beta", answer.label, answer.config_sha256)
+    return publish(registry_of(warehouse), manifest, answer.selection, **options)
+
+
+def registry_of(warehouse: Warehouse) -> Registry:
+    return Registry(warehouse.root / "models")
+
+
+@pytest.fixture
+def champion(warehouse: Warehouse) -> Warehouse:
+    """A warehouse of 48 drives, and a champion of all of them."""
+    write(warehouse, "good", 48)
+    assert publish_from(warehouse).version.version == 1
+    return warehouse
+
+
+def test_a_reversed_label_is_no_champion(champion: Warehouse) -> None:
+    write(champion, "reversed", 48, label=-1.0)
+    with pytest.raises(RefusedError, match=r"its correlation is .*, below 0\.5"):
+        publish_from(champion)
+    assert registry_of(champion).versions("beta") == [1]
+
+
+def test_what_the_floor_lets_pass_must_still_be_as_good_as_the_champions_own_coefficients(
+    champion: Warehouse,
+) -> None:
+    write(champion, "again", 48)
+    with pytest.raises(RefusedError, match=r"the coefficients of beta@1 have"):
+        publish_from(champion, "drive_id LIKE 'again%' OR drive_id LIKE 'good%'", "ay")
+
+
+def test_few_drives_are_no_reason_to_replace_a_champion_of_many(champion: Warehouse) -> None:
+    few = "drive_id IN ('good-0','good-1','good-2','good-3','good-4','good-5','good-6','good-9')"
+    with pytest.raises(RefusedError, match="on 8 drives, less than 50% of the champion's 48"):
+        publish_from(champion, few)
+    assert publish_from(champion, few, force=True).new
+
+
+def test_more_data_of_the_same_replaces_the_champion_and_says_what_was_compared(
+    champion: Warehouse,
+) -> None:
+    write(champion, "more", 48)
+    done = publish_from(champion)
+    assert done.version.version == 2
+    assert "On the same 19,200 rows of 96 drives, held out in 5 folds" in done.reason
+    assert "the coefficients of beta@1 have" in done.reason
+
+
+def test_the_champion_is_compared_as_it_is_not_fitted_anew(champion: Warehouse) -> None:
+    write(champion, "more", 48)
+    version = registry_of(champion).load("beta", 1)
+    request = SelectionRequest(cohort="drive_id LIKE 'more%'", nested="ay,yaw_rate")
+    comparison = gate.compare(answer_request(champion, request).selection, version)
+    model = comparison.champion.counts
+    assert model.coefficients == counts_model(version.manifest).coefficients
+    assert comparison.champion.pooled.rows == comparison.challenger.pooled.rows == 48 * ROWS
+
+
+@pytest.mark.parametrize(
+    ("floor", "problem"),
+    [
+        ("max_rmse_deg = 0.01", "above 0.01 deg"),
+        ("min_drives = 49", "on 48 drives, fewer than 49"),
+        ("min_vehicles = 9", "on 8 cars, fewer than 9"),
+        ("min_correlation = 0.99999", "below 0.99999"),
+    ],
+)
+def test_a_person_sets_the_floor(
+    warehouse: Warehouse,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    floor: str,
+    problem: str,
+) -> None:
+    usual = (Path(__file__).parents[2] / "configs" / "publish.toml").read_text()
+    name = floor.partition(" ")[0]
+    kept = "\n".join(line for line in usual.splitlines() if not line.startswith(name))
+    (tmp_path / "floor.toml").write_text(f"{kept}\n{floor}\n")
+    monkeypatch.setenv(gate.FLOOR_VARIABLE, str(tmp_path / "floor.toml"))
+    gate.floor.cache_clear()
+    write(warehouse, "good", 48)
+    try:
+        with pytest.raises(RefusedError, match=problem):
+            publish_from(warehouse)
+    finally:
+        gate.floor.cache_clear()
+
+
+def test_a_floor_that_cannot_be_read_lets_nothing_pass(
+    champion: Warehouse, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write(champion, "more", 48)
+    monkeypatch.setenv(gate.FLOOR_VARIABLE, "absent.toml")
+    gate.floor.cache_clear()
+    try:
+        with pytest.raises(ConfigError, match=r"absent\.toml"):
+            publish_from(champion, force=True)
+    finally:
+        gate.floor.cache_clear()
+
+
+def hold_by_rollback(registry: Registry) -> None:
+    registry.rollback("beta", "champion")
+
+
+def hold_by_pin(registry: Registry) -> None:
+    registry.promote("beta", 1, "champion")
+    registry.hold("beta", "champion", "pin")
+
+
+@pytest.mark.parametrize("hold", [hold_by_rollback, hold_by_pin])
+def test_a_champion_that_people_chose_stays(
+    champion: Warehouse, hold: Callable[[Registry], None]
+) -> None:
+    registry = registry_of(champion)
+    write(champion, "more", 48)
+    assert publish_from(champion).version.version == 2
+    hold(registry)
+    for _ in range(2):  # every night
+        done = publish_from(champion)
+        assert (done.version.version, done.candidate) == (2, True)
+        assert "stays champion" in done.reason
+    assert registry.resolve("beta").version == 1
+    assert registry.resolve(f"beta@{CANDIDATE}").version == 2
+    registry.hold("beta", "champion", "unpin")
+    assert not publish_from(champion).candidate
+    assert registry.resolve("beta").version == 2
+
+
+def test_a_candidate_becomes_champion_by_promote_only(champion: Warehouse) -> None:
+    registry = registry_of(champion)
+    write(champion, "more", 48)
+    assert publish_from(champion, candidate=True).candidate
+    assert registry.resolve("beta").version == 1
+    registry.promote("beta", registry.resolve("beta@candidate").version, "champion")
+    assert registry.resolve("beta").version == 2
+
+
+def test_pins_are_no_steps_that_a_rollback_goes_back(champion: Warehouse) -> None:
+    registry = registry_of(champion)
+    write(champion, "more", 48)
+    publish_from(champion)
+    registry.hold("beta", "champion", "pin")
+    registry.hold("beta", "champion", "unpin")
+    assert registry.rollback("beta", "champion") == 1
+
+
+def test_a_version_keeps_which_drives_made_it(champion: Warehouse) -> None:
+    registry = registry_of(champion)
+    write(champion, "more", 48, adhesion=0.4)
+    publish_from(champion, "adhesion < 0.5", force=True)
+    assert models_trained_on(champion, ["good-3"]) == ["beta@1"]
+    assert models_trained_on(champion, ["more-3", "unknown"]) == ["beta@2"]
+    found = compare_versions(registry, registry.load("beta", 1), registry.load("beta", 2))
+    assert found.drives is not None
+    assert (found.drives.only_one, found.drives.only_other, found.drives.both) == (48, 48, 0)
+    assert found.facts["trained_on.cohort"] == ("true", "adhesion < 0.5")
+    # The question of the first cohort, asked anew, would now have the other drives, too.
+    assert forget(champion, Forgettable("drive", "more-3")).models == ("beta@2",)
+
+
+def test_drives_that_are_gone_or_damaged_count_as_trained_on(champion: Warehouse) -> None:
+    folder = Path(str(registry_of(champion).folder_of("beta")))
+    (kept,) = folder.glob("drives-*.bin")
+    content = bytearray(kept.read_bytes())
+    assert len(content) == 48 * 8
+    content[3] ^= 1
+    kept.write_bytes(content)
+    assert models_trained_on(champion, ["unknown"]) == ["beta@1"]
+    kept.unlink()
+    assert models_trained_on(champion, ["unknown"]) == ["beta@1"]
+
+
+def test_nothing_about_a_drives_name_stands_in_what_is_kept(champion: Warehouse) -> None:
+    for file in Path(str(champion.root / "models")).rglob("*"):
+        assert file.is_dir() or b"good-" not in file.read_bytes()
+        assert LocalFolder(file.parent).name
