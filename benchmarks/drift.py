@@ -76,8 +76,8 @@ def land(warehouse: Warehouse, campaign: Campaign) -> None:
 
 def train(warehouse: Warehouse) -> None:
     planned = answer_request(warehouse, SelectionRequest(cohort=COHORT))
-    manifest = manifest_of(planned.selection, "sideslip", planned.label, planned.config_sha256)
-    publish(Registry(warehouse.root / "models"), manifest, planned.selection)
+    manifest = manifest_of(planned, "sideslip")
+    publish(Registry(warehouse.root / "models"), manifest, planned)
 
 
 def tell(name: str, chart: Chart) -> None:

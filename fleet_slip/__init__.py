@@ -7,14 +7,18 @@ numbered model version, which is one dot product.
     import fleet_slip
 
     fleet = fleet_slip.open("data")
+    fleet.simulate("smoke")
+    fleet.gram()
+    selection = fleet.cohort("adhesion > 0.8").select(models="table1")
+    fleet.publish("dry", selection)
     log = fleet.sql("SELECT * FROM log WHERE day = '2024-05-01'").pl()
-    model = fleet.model("wet@1")
+    model = fleet.model("dry@1")
     beta_rad = model.predict(log)
 
 `open` returns a `Fleet`, whose methods are the commands of `fleet-slip`; `connect` returns a DuckDB
-connection with the views alone. Physical values are in SI units, and the columns carry them:
-`ax_mps2`, `yaw_rate_rad_s`, `sideslip_rad`. Axes and signs are those of ISO 8855. Every error that
-can be expected is a `FleetSlipError`, and says what to do next.
+connection with the views alone. Physical values are in SI units, and names carry them: `ax_mps2`,
+`yaw_rate_rad_s`, `sideslip_rad`. Axes and signs are those of ISO 8855. Every error that can be
+expected is a `FleetSlipError`, and says what to do next.
 """
 
 from importlib import import_module
@@ -22,16 +26,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from fleet_slip.api.cohort import FleetCohort
     from fleet_slip.api.fleet import Fleet
     from fleet_slip.errors import FleetSlipError
     from fleet_slip.files.folder import Folder
     from fleet_slip.models.model_version import ModelVersion
     from fleet_slip.views import connect
 
-__all__ = ["Fleet", "FleetSlipError", "ModelVersion", "connect", "open"]
+__all__ = ["Fleet", "FleetCohort", "FleetSlipError", "ModelVersion", "connect", "open"]
 
 _HOMES = {
     "Fleet": "fleet_slip.api.fleet",
+    "FleetCohort": "fleet_slip.api.cohort",
     "FleetSlipError": "fleet_slip.errors",
     "ModelVersion": "fleet_slip.models.model_version",
     "connect": "fleet_slip.views",

@@ -1,16 +1,43 @@
 """A fleet's warehouse in Python."""
 
+import time
+from collections.abc import Callable
+from datetime import date
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fleet_slip.api.serving import Serving
-from fleet_slip.errors import QuestionError
+from fleet_slip.api.calls import Workers, open_workers, record_call
+from fleet_slip.api.cohort import FleetCohort
+from fleet_slip.api.filling import Filling
+from fleet_slip.api.tending import Tending
+from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalogue.sources import TRAINING_DRIVES
+from fleet_slip.errors import QuestionError, RefusedError
+from fleet_slip.models.manifest import require_model_name
+from fleet_slip.runs.log import step
 
 if TYPE_CHECKING:
     import duckdb
 
+    from fleet_slip.api.run_report import RunReport
+    from fleet_slip.models.publish import Publication
+    from fleet_slip.selection.request import RequestedSelection
+    from fleet_slip.simulation.campaign import Campaign
 
-class Fleet(Serving):
-    """All that can be asked of a data root, and done to it; `fleet_slip.open` makes one."""
+RUN_MODELS = "estimator"
+"""The model list that a run chooses from."""
+
+ShowStep = Callable[[str, int, int], None]
+"""Like `ShowProgress`, with the name of the step first."""
+
+
+class Fleet(Filling, Tending):
+    """All that can be asked of a data root, and done to it; `fleet_slip.open` makes one.
+
+    A fleet holds no connection and no file open, and threads may share it. What changes the
+    warehouse leaves a record in the view `runs`, as commands do. Beside what is listed, every call
+    raises `StorageError` where the data root cannot be read or written.
+    """
 
     def sql(self, query: str, *, threads: int | None = None) -> "duckdb.DuckDBPyRelation":
         """Return the answer to an SQL query on the views as a DuckDB relation.
@@ -34,3 +61,101 @@ class Fleet(Serving):
         if relation is None:
             raise QuestionError("the query has no result.")
         return relation
+
+    def cohort(self, condition: str = TRAINING_DRIVES) -> FleetCohort:
+        """Return the drives that satisfy an SQL condition on the view `drives`.
+
+        Such as `adhesion < 0.8`. By default all but those of evaluation scenarios. Nothing is read
+        before it is asked something.
+        """
+        return FleetCohort(self.warehouse, condition)
+
+    @record_call
+    def run(
+        self,
+        campaign: "str | Campaign" = "waterford",
+        *,
+        days: int | None = None,
+        through: date | None = None,
+        name: str | None = None,
+        models: str = RUN_MODELS,
+        worth: str = "0.005deg",
+        sign_key: Path | None = None,
+        workers: Workers = None,
+        progress: ShowStep | None = None,
+        waiting: Callable[[], None] = lambda: None,
+    ) -> "RunReport":
+        """Do the whole job: simulate what is missing, gram, select, publish if it is not worse.
+
+        It can be repeated at any time, and after any interruption: what is done is not done again.
+        A second run of the campaign on this machine at the same time waits for the first; `waiting`
+        is called once before. `name` is that of the model, by default the campaign's; `models` the
+        model list that is compared; `worth` the smallest gain in RMSE that is worth a signal;
+        `sign_key` the private key that signs the version. A winner that is worse than the champion
+        is no error: the report says so. Progress is in rows of each step.
+
+        Raises what `simulate`, `gram`, `FleetCohort.select` and `publish` raise.
+        """
+        from fleet_slip.api.run_report import RunReport
+        from fleet_slip.selection.model_list import load_model_list
+        from fleet_slip.selection.request import parse_worth
+        from fleet_slip.simulation.campaign import load_campaign
+
+        begun = time.monotonic()
+        chosen = load_campaign(campaign) if isinstance(campaign, str) else campaign
+        model_name = require_model_name(name or chosen.name)
+        parse_worth(worth)  # before anything is written
+        condition = f"campaign = '{chosen.name}'"
+        with self.root.exclusive(f".run-{chosen.name}.lock", waiting):
+            with open_workers(self.root, workers) as executor:
+                simulation = self.simulate(
+                    chosen,
+                    days=days,
+                    through=through,
+                    workers=executor,
+                    progress=_of_step(progress, "simulate"),
+                )
+                gram = self.gram(workers=executor, progress=_of_step(progress, "gram"))
+                feature_set = load_model_list(models).features
+                wide = None
+                if feature_set != PLAIN:
+                    wide = self.gram(
+                        feature_set,
+                        cohort=condition,
+                        workers=executor,
+                        progress=_of_step(progress, f"gram {feature_set}"),
+                    )
+            with step("select"):
+                selection = self.cohort(condition).select(models=models, worth=worth)
+            with step("publish"):
+                publication, refusal = self._publish_if_not_worse(model_name, selection, sign_key)
+        return RunReport(
+            campaign=chosen.name,
+            simulation=simulation,
+            gram=gram,
+            gram_features=wide,
+            selection=selection,
+            publication=publication,
+            refusal=refusal,
+            seconds=round(time.monotonic() - begun, 3),
+        )
+
+    def _publish_if_not_worse(
+        self, name: str, selection: "RequestedSelection", sign_key: Path | None
+    ) -> "tuple[Publication | None, str]":
+        from fleet_slip.maintenance.marks import marked_models
+
+        champion = self.registry().champion(name)
+        # What was trained on forgotten drives is replaced, even if the new model is worse.
+        tainted = champion and champion.reference in marked_models(self.root)
+        try:
+            published = self.publish(name, selection, force=bool(tainted), sign_key=sign_key)
+        except RefusedError as error:
+            return None, str(error)
+        return published, ""
+
+
+def _of_step(progress: ShowStep | None, name: str) -> Callable[[int, int], None] | None:
+    if progress is None:
+        return None
+    return lambda done, total: progress(name, done, total)

@@ -1,18 +1,33 @@
-"""The part of a `Fleet` that serves published models."""
+"""The part of a `Fleet` that publishes models, serves them and evaluates them."""
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from fleet_slip.api.calls import ShowProgress, count_from_start, open_workers, record_call
+from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.root import Rooted
+from fleet_slip.catalogue.sources import ALL_DRIVES
+from fleet_slip.errors import ConfigError
+from fleet_slip.models.aliases import CHAMPION
+from fleet_slip.models.manifest import require_model_name
+from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.versions import Registry
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from fleet_slip.models.model_version import ModelVersion
+    from fleet_slip.evaluation.evaluate import TrainRivals
+    from fleet_slip.files.documents import Document
+    from fleet_slip.models.diff import Difference
+    from fleet_slip.models.publish import Publication
+    from fleet_slip.models.score import Score
+    from fleet_slip.report.write import Written
+    from fleet_slip.selection.request import RequestedSelection
 
 
 class Serving(Rooted):
-    """Published models: which there are, and each of them."""
+    """Published models. A reference is `NAME@VERSION`, `NAME@ALIAS`, or `NAME` for its champion."""
 
     def models(self, name: str | None = None) -> "pa.Table":
         """Return all published versions, or those of one model, one row each.
@@ -24,7 +39,7 @@ class Serving(Rooted):
         from fleet_slip.maintenance.marks import marked_models
 
         self.warehouse.require()
-        registry = self._registry()
+        registry = self.registry()
         if name is not None:
             registry.require(name)
         found = registry.as_table(name)
@@ -34,14 +49,174 @@ class Serving(Rooted):
             "trained_on_forgotten", [[f"{name}@{version}" in marked for name, version in pairs]]
         )
 
-    def model(self, reference: str) -> "ModelVersion":
-        """Return the version that `NAME`, `NAME@VERSION` or `NAME@ALIAS` names.
+    def model(self, reference: str) -> ModelVersion:
+        """Return the version that a reference names.
 
-        `NAME` alone is its champion. Raises `QuestionError` for an unknown one, `StorageError` for
-        one that was changed after it was published, and `RefusedError` for one without the
-        signature that is asked for.
+        Raises `QuestionError` for an unknown one, `StorageError` for one that was changed after it
+        was published, and `RefusedError` for one without the signature that is asked for.
         """
-        return self._registry().resolve(reference)
+        return self.registry().resolve(reference)
 
-    def _registry(self) -> Registry:
-        return Registry(self.root / "models")
+    @record_call
+    def publish(
+        self,
+        name: str,
+        choice: "RequestedSelection | FleetCohort",
+        *,
+        force: bool = False,
+        candidate: bool = False,
+        sign_key: Path | None = None,
+    ) -> "Publication":
+        """Make a selection's winner the next version of a model, and its champion.
+
+        `choice` is what `FleetCohort.select` returned, or a cohort, on which the models of Table I
+        are then compared. A winner that is worse than the champion on the same cohort and folds is
+        published only with `force`. A `candidate` waits for somebody to `promote` it, and so does
+        whatever is published while the champion is held by `rollback` or `pin`. `sign_key` is the
+        private key that signs the version.
+
+        Raises `RefusedError` for a worse winner, `ConfigError` for a name or key that cannot be
+        used, and what `FleetCohort.select` raises.
+        """
+        from fleet_slip.models.publish import manifest_of, publish
+
+        require_model_name(name)
+        selection = choice.select() if isinstance(choice, FleetCohort) else choice
+        manifest = manifest_of(selection, name)
+        registry = self.registry(sign_key)
+        return publish(registry, manifest, selection, force=force, candidate=candidate)
+
+    @record_call
+    def promote(self, reference: str, alias: str = CHAMPION) -> ModelVersion:
+        """Point an alias, the champion unless told otherwise, at a version; return the version.
+
+        Raises `ConfigError` for a name that no alias may have, and what `model` raises.
+        """
+        require_model_name(alias)
+        version = self.model(reference)
+        self.registry().promote(version.manifest.name, version.version, alias)
+        return version
+
+    @record_call
+    def rollback(self, name: str, alias: str = CHAMPION) -> ModelVersion:
+        """Point an alias back at the version that it had before; return that version.
+
+        No publication moves it from there until `promote` or `unpin`.
+
+        Raises `RefusedError` if it never had another, and what `model` raises.
+        """
+        registry = self.registry()
+        return registry.load(name, registry.rollback(name, alias))
+
+    @record_call
+    def pin(self, name: str, alias: str = CHAMPION) -> ModelVersion:
+        """Keep an alias where it is; return its version.
+
+        Publications become candidates, until `promote` or `unpin`. Raises what `model` raises.
+        """
+        registry = self.registry()
+        return registry.load(name, registry.hold(name, alias, "pin"))
+
+    @record_call
+    def unpin(self, name: str, alias: str = CHAMPION) -> ModelVersion:
+        """Let publications move an alias again, after `pin` or `rollback`; return its version.
+
+        Raises what `model` raises.
+        """
+        registry = self.registry()
+        return registry.load(name, registry.hold(name, alias, "unpin"))
+
+    def diff(self, one: str | ModelVersion, other: str | ModelVersion) -> "Difference":
+        """Tell two model versions apart: their data, signals, coefficients and figures.
+
+        Raises what `model` raises.
+        """
+        from fleet_slip.models.diff import compare_versions
+
+        return compare_versions(self.registry(), self.resolve(one), self.resolve(other))
+
+    def sign(self, reference: str, key: Path) -> ModelVersion:
+        """Sign a version that was published without a signature; return it.
+
+        `reference` is `NAME@VERSION`. Raises `ConfigError` for another or for a key that cannot be
+        used, and what `model` raises.
+        """
+        name, _, version = reference.partition("@")
+        if not (version.isascii() and version.isdigit() and len(version) < 10):
+            raise ConfigError(f"{reference!r}: name one version, such as sideslip@3.")
+        registry = self.registry(key)
+        registry.sign(name, int(version))
+        return registry.load(name, int(version))
+
+    def score(self, model: str | ModelVersion, cohort: str = ALL_DRIVES) -> "Score":
+        """Evaluate a model on the rows of a cohort; angles are in degrees.
+
+        `cohort` is an SQL condition on the view `drives`. Raises `DataError` if no row of the
+        cohort has the model's signals, `QuestionError` for a condition that is not valid, and what
+        `model` raises.
+        """
+        from fleet_slip.models.score import score
+
+        return score(self.warehouse, self.resolve(model).manifest, cohort)
+
+    @record_call
+    def evaluate(
+        self,
+        model: str | ModelVersion,
+        others: Sequence[str | ModelVersion] = (),
+        *,
+        scenarios: Sequence[str] = (),
+        rivals: bool = False,
+        threads: int | None = None,
+        progress: ShowProgress | None = None,
+    ) -> "Document":
+        """Evaluate models on the paper's test drives and on others; simulate those missing.
+
+        The models of Table I are fitted on the cohort of each and evaluated beside it. `scenarios`
+        are names of those that ship or paths of TOML files, by default all that ship. `rivals`
+        trains neural networks and trees as well, with scikit-learn. Progress is in simulated rows.
+        Returns the document that is kept below `evaluations/`.
+
+        Raises `ConfigError` for a scenario that is not valid, `DataError`, `RefusedError` for a
+        scenario that was changed since its drive was simulated, and what `model` raises.
+        """
+        from fleet_slip.evaluation.evaluate import evaluate
+        from fleet_slip.evaluation.results import keep
+        from fleet_slip.evaluation.runs import simulate_scenarios
+        from fleet_slip.files.documents import Document
+        from fleet_slip.simulation.scenario import load_scenario, shipped_scenarios
+
+        train_rivals: TrainRivals | None = None
+        if rivals:
+            from fleet_slip.rivals import compare  # an optional extra
+
+            train_rivals = compare.train_rivals
+        chosen = tuple(map(load_scenario, scenarios)) if scenarios else shipped_scenarios()
+        first, *rest = [self.resolve(one) for one in (model, *others)]
+        with open_workers(self.root, threads) as executor:
+            told = count_from_start(progress)
+            simulate_scenarios(self.warehouse, chosen, executor, told)
+            found = evaluate(self.warehouse, chosen, first, rest, executor, train_rivals)
+        content = found.as_dict()
+        kept = keep(self.warehouse, content)
+        return Document(kept.number, content, kept.sha256)
+
+    def report(self, model: str | ModelVersion, output: Path | None = None) -> "Written":
+        """Write one page that lays our figures beside the paper's, from the latest evaluation.
+
+        `output` is a folder, by default `report` in the data root. Raises `DataError` if the model
+        has not been evaluated, or not on today's data, and what `model` raises.
+        """
+        from fleet_slip.files.local_folder import LocalFolder
+        from fleet_slip.report.write import write_report
+
+        folder = LocalFolder(output) if output else self.root / "report"
+        return write_report(self.warehouse, self.resolve(model), folder)
+
+    def registry(self, sign_key: Path | None = None) -> Registry:
+        """Return the registry of models; it signs new versions with a private key, if given one."""
+        return Registry(self.root / "models", sign_key)
+
+    def resolve(self, model: str | ModelVersion) -> ModelVersion:
+        """Return the version that a reference names; a version is returned as it is."""
+        return model if isinstance(model, ModelVersion) else self.model(model)

@@ -4,24 +4,18 @@ from typing import Any
 
 import typer
 
-from fleet_slip.cli.models import Reference, registry_of
+from fleet_slip.cli.models import Reference
 from fleet_slip.cli.output import Json, print_json, print_table, say
-from fleet_slip.models.diff import Difference, compare_versions
+from fleet_slip.models.diff import Difference
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.score import score as score_rows
 from fleet_slip.warehouse.condition import parse_condition, row_columns
 from fleet_slip.warehouse.tables import Warehouse
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command of this module."""
-    app.command()(diff)
-
-
 def diff(context: typer.Context, one: Reference, other: Reference, json: Json = False) -> None:
     """Tell two model versions apart: their data, signals, coefficients and figures."""
-    registry = registry_of(context.obj)
-    found = compare_versions(registry, registry.resolve(one), registry.resolve(other))
+    found = context.obj.diff(one, other)
     if json:
         print_json(found.as_dict())
     else:

@@ -1,7 +1,5 @@
 """The command that shows which config files are in force."""
 
-import typer
-
 from fleet_slip.canonical import sha256_of
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
@@ -9,12 +7,7 @@ from fleet_slip.cli.output import Json, print_json, print_table
 from fleet_slip.resources import config_files, own_configs
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command of this module."""
-    app.command("config")(show_config)
-
-
-def show_config(json: Json = False) -> None:
+def config(json: Json = False) -> None:
     """List the config files that are in force, and where each comes from.
 
     A folder given with --config or $FLEET_SLIP_CONFIG is laid over the shipped one: its files take

@@ -9,22 +9,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.api.calls import open_workers
+from fleet_slip.api.fleet import Fleet
+from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalogue.features import features as known_features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.cli.output import Json, print_json, print_table, progress, say
 from fleet_slip.cli.recorded import record_run
-from fleet_slip.cli.workers import Cluster, Threads, unless_local, workers
+from fleet_slip.cli.workers import Cluster, Threads
 from fleet_slip.errors import ConfigError
-from fleet_slip.grams.check import check_grams
-from fleet_slip.grams.job import GramReport, update_grams
-from fleet_slip.grams.reader import cohort_files
 from fleet_slip.grams.statement import gram_statement
-from fleet_slip.runs.log import step
-from fleet_slip.warehouse.condition import parse_condition
-from fleet_slip.warehouse.tables import Warehouse
 
 if TYPE_CHECKING:
-    from fleet_slip.simulation.campaign import Campaign
+    from fleet_slip.grams.job import GramReport
+    from fleet_slip.ingest.job import IngestReport
     from fleet_slip.simulation.job import SimulationReport
 
 ALL_SETS = "all"
@@ -42,60 +40,16 @@ Days = Annotated[
 ]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    app.command()(simulate)
-    app.command()(ingest)
-    app.command()(gram)
-    app.command()(check)
-
-
-def chosen_days(campaign: "Campaign", days: int | None, through: str | None) -> tuple[date, ...]:
-    """Return the days of a campaign that the options ask for. Raises `ConfigError`."""
+def last_day(through: str | None) -> date | None:
+    """Return the day that --through names. Raises `ConfigError` for what is none."""
+    if through is None or through == "today":
+        return None if through is None else date.today()
     try:
-        last = _date(through) if through else date.max
+        return date.fromisoformat(through)
     except ValueError:
         raise ConfigError(
             f"--through {through}: not a date; write it as 2024-05-01, or today."
         ) from None
-    chosen = tuple(day for day in campaign.days()[:days] if day <= last)
-    if not chosen:
-        first, end = campaign.days()[0], campaign.days()[-1]
-        raise ConfigError(f"--through {through}: {campaign.name} lasts from {first} to {end}.")
-    return chosen
-
-
-def _date(text: str) -> date:
-    return date.today() if text == "today" else date.fromisoformat(text)
-
-
-def run_simulation(
-    warehouse: Warehouse, campaign: "Campaign", days: tuple[date, ...], executor: Executor
-) -> "SimulationReport":
-    """Simulate with a progress bar."""
-    from fleet_slip.simulation.job import simulate_campaign  # noqa: PLC0415 - the simulator
-
-    with (
-        step("simulate") as figures,
-        progress(f"simulate {campaign.name}", "rows", executor) as advance,
-    ):
-        report = simulate_campaign(warehouse, campaign, days, executor, advance)
-        figures.rows, figures.size_bytes = report.rows, report.size_bytes
-    return report
-
-
-def run_gram(
-    warehouse: Warehouse,
-    executor: Executor,
-    feature_set: str = PLAIN,
-    cohort: str | None = None,
-) -> GramReport:
-    """Run the Gram job for a feature set with a progress bar; for the files of a cohort, or all."""
-    among = cohort_files(warehouse, parse_condition(cohort)) if cohort else None
-    with step("gram") as figures, progress(f"gram {feature_set}", "rows", executor) as advance:
-        report = update_grams(warehouse, advance, feature_set, unless_local(executor), among)
-        figures.rows = report.rows_read
-    return report
 
 
 @record_run
@@ -111,10 +65,13 @@ def simulate(
     """Simulate what is missing of a campaign and write it to the logs."""
     from fleet_slip.simulation.campaign import load_campaign  # noqa: PLC0415 - takes a while
 
-    plan = load_campaign(campaign)
-    chosen = chosen_days(plan, days, through)
-    with workers(context, cluster, threads) as (warehouse, executor):
-        report = run_simulation(warehouse, plan, chosen, executor)
+    fleet: Fleet = context.obj
+    plan, last = load_campaign(campaign), last_day(through)
+    with (
+        open_workers(fleet.root, cluster or threads) as executor,
+        progress(f"simulate {plan.name}", "rows", executor) as show,
+    ):
+        report = fleet.simulate(plan, days=days, through=last, workers=executor, progress=show)
     if json:
         print_json(asdict(report))
     elif report.changed:
@@ -125,6 +82,7 @@ def simulate(
         )
         say(_where_the_time_went(report))
     else:
+        chosen = plan.chosen_days(days, last)
         say(f"{plan.name}: nothing to do, all {len(chosen)} days are there")
 
 
@@ -165,27 +123,22 @@ def ingest(
 
     Rows that cannot be used go to the quarantine with a reason: fleet-slip sql "FROM quarantine"
     """
-    from fleet_slip.ingest.job import ingest_files  # noqa: PLC0415
-    from fleet_slip.ingest.mapping import load_mapping  # noqa: PLC0415 - Polars takes a while
-
-    plan = load_mapping(mapping)
-    reports = {}
-    if cluster:  # a worker has a working directory of its own
-        files = [file.absolute() for file in files]
-    with (
-        workers(context, cluster) as (warehouse, executor),
-        step("ingest") as figures,
-    ):
-        figures.rows = 0
-        for done in ingest_files(warehouse, files, plan, unless_local(executor)):
-            report = reports[done.file] = done.as_dict()
-            figures.rows += report["ticks"] if report["new"] else 0
-            if not json:
-                say(_ingested(report))
-            for names in done.look_alikes:
-                say(_look_alike(done.file, names), logging.WARNING)
+    fleet: Fleet = context.obj
+    reports = fleet.ingest(
+        files, mapping, workers=cluster, each=_warn_of_look_alikes if json else _say_ingested
+    )
     if json:
-        print_json([reports[str(file)] for file in files])
+        print_json([report.as_dict() for report in reports])
+
+
+def _say_ingested(report: "IngestReport") -> None:
+    say(_ingested(report.as_dict()))
+    _warn_of_look_alikes(report)
+
+
+def _warn_of_look_alikes(report: "IngestReport") -> None:
+    for names in report.look_alikes:
+        say(_look_alike(report.file, names), logging.WARNING)
 
 
 def _look_alike(file: str, names: tuple[str, ...]) -> str:
@@ -235,15 +188,16 @@ def gram(
     A feature set that is asked for the first time costs one pass over the logs; from then on only
     new files are read.
     """
-    names = (PLAIN, *features().sets) if feature_set == ALL_SETS else (feature_set,)
+    names = (PLAIN, *known_features().sets) if feature_set == ALL_SETS else (feature_set,)
     if sql:
         for name in names:
             typer.echo(gram_statement(catalogue(), name))
         return
-    with workers(context, cluster) as (warehouse, executor):
+    fleet: Fleet = context.obj
+    with open_workers(fleet.root, cluster) as executor:
         if cohort:  # which files have its drives is known from the logged signals' Gram rows
-            run_gram(warehouse, executor)
-        reports = [run_gram(warehouse, executor, name, cohort) for name in names]
+            _run_gram(fleet, executor, PLAIN, None)
+        reports = [_run_gram(fleet, executor, name, cohort) for name in names]
     if json:
         documents = [asdict(report) for report in reports]
         print_json(documents if feature_set == ALL_SETS else documents[0])
@@ -252,7 +206,14 @@ def gram(
         _say_gram(report)
 
 
-def _say_gram(report: GramReport) -> None:
+def _run_gram(
+    fleet: Fleet, executor: Executor, feature_set: str, cohort: str | None
+) -> "GramReport":
+    with progress(f"gram {feature_set}", "rows", executor) as show:
+        return fleet.gram(feature_set, cohort=cohort, workers=executor, progress=show)
+
+
+def _say_gram(report: "GramReport") -> None:
     if report.changed:
         say(
             f"gram {report.feature_set}: {report.files_read} new files, {report.rows_read:,} rows "
@@ -277,8 +238,8 @@ def check(
     By the SQL statement, by float64 matrix products on blocks in which every partial sum is an
     exact integer, and (for one drive of each file) by Python integers; and with the stored rows.
     """
-    with progress("check", "files") as advance:
-        report = check_grams(context.obj, files, advance)
+    with progress("check", "files") as show:
+        report = context.obj.check(files, progress=show)
     if json:
         print_json(asdict(report))
     else:

@@ -7,18 +7,11 @@ import typer
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
+from fleet_slip.cli.options import Cohort
 from fleet_slip.cli.output import Json, print_json, print_table, say, stdout
-from fleet_slip.cli.selecting import Cohort
-from fleet_slip.cli.subject import FeatureSetOption, Model, Signals, quantities, subject_of
-from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.cli.subject import FeatureSetOption, Model, Signals, quantities
 from fleet_slip.regression.inference import INTERCEPT, Estimate
 from fleet_slip.selection.diagnostics import CohortComparison, Diagnosis
-from fleet_slip.selection.diagnostics import diagnose as diagnose_fit
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command of this module."""
-    app.command()(diagnose)
 
 
 def diagnose(
@@ -53,23 +46,18 @@ def diagnose(
     Standard errors by drives are the ones to believe: at 100 Hz a row says little that the one
     before did not say.
     """
-    subject = subject_of(context.obj, model, signals, feature_set)
-    inputs = subject.inputs(context.obj, cohort)
-    result = diagnose_fit(
-        load_cohort(context.obj, cohort, subject.feature_set),
-        inputs,
-        lagged=load_cohort(context.obj, cohort, _lagged_set()) if serial else None,
-        against=load_cohort(context.obj, against, subject.feature_set) if against else None,
+    result = context.obj.cohort(cohort).diagnose(
+        model,
+        signals=signals,
+        features=feature_set,
+        against=against,
+        serial=serial,
         sensor_noise=quantities(sensor_noise, "--sensor-noise"),
     )
     if json:
         print_json({"cohort": cohort, **result.as_dict()})
     else:
         _print_diagnosis(result)
-
-
-def _lagged_set() -> str:
-    return next(name for name, one in features().sets.items() if one.lagged)
 
 
 def _print_diagnosis(result: Diagnosis) -> None:

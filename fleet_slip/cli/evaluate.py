@@ -1,25 +1,19 @@
 """Commands that evaluate: score on the rows of a cohort, evaluate on test drives."""
 
-import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from fleet_slip.catalogue.sources import ALL_DRIVES
 from fleet_slip.cli.comparing import score_against
-from fleet_slip.cli.models import Reference, registry_of
+from fleet_slip.cli.models import Reference
+from fleet_slip.cli.options import Cohort
 from fleet_slip.cli.output import Json, print_json, print_table, progress, say, stdout
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.run import DEFAULT_CAMPAIGN
-from fleet_slip.cli.selecting import Cohort
 from fleet_slip.cli.workers import Threads
-from fleet_slip.models.score import score as score_rows
 from fleet_slip.models.score import score_statement
-
-if TYPE_CHECKING:
-    from fleet_slip.evaluation.evaluate import TrainRivals
 
 OneCar = Annotated[
     str,
@@ -46,12 +40,6 @@ PLACES = ("inside", "outside")
 """Of an unstable section."""
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    app.command()(score)
-    app.command()(evaluate)
-
-
 def score(
     context: typer.Context,
     reference: Reference,
@@ -64,15 +52,16 @@ def score(
     json: Json = False,
 ) -> None:
     """Evaluate a model on the rows of a cohort: also the largest error and percentiles."""
-    version = registry_of(context.obj).resolve(reference)
+    version = context.obj.model(reference)
     if sql:
         typer.echo(score_statement(version.manifest, cohort))
         return
     if against is not None:
         name = against if "@" in against else f"{version.manifest.name}@{against}"
-        score_against(context.obj, version, registry_of(context.obj).resolve(name), cohort, json)
+        other = context.obj.model(name)
+        score_against(context.obj.warehouse, version, other, cohort, json)
         return
-    result = score_rows(context.obj, version.manifest, cohort).as_dict()
+    result = context.obj.score(version, cohort).as_dict()
     if json:
         print_json({"model": version.reference, "cohort": cohort, **result})
         return
@@ -104,28 +93,16 @@ def evaluate(
 
     The results are kept as a JSON document below evaluations/ in the data root.
     """
-    from fleet_slip.evaluation.evaluate import evaluate as evaluate_models  # noqa: PLC0415
-    from fleet_slip.evaluation.results import keep  # noqa: PLC0415
-    from fleet_slip.evaluation.runs import simulate_scenarios  # noqa: PLC0415
-    from fleet_slip.simulation.scenario import load_scenario, shipped_scenarios  # noqa: PLC0415
-
-    train_rivals: TrainRivals | None = None
-    if rivals:
-        from fleet_slip.rivals import compare  # noqa: PLC0415 - an optional extra
-
-        train_rivals = compare.train_rivals
-    scenarios = tuple(map(load_scenario, scenario)) if scenario else shipped_scenarios()
-    versions = [registry_of(context.obj).resolve(name) for name in (one_car, *(fleet or ()))]
-    with (
-        ThreadPoolExecutor(threads or os.cpu_count()) as executor,
-        progress("simulate scenarios", "rows") as advance,
-    ):
-        simulate_scenarios(context.obj, scenarios, executor, advance)
-        found = evaluate_models(
-            context.obj, scenarios, versions[0], versions[1:], executor, train_rivals
+    with progress("simulate scenarios", "rows") as show:
+        kept = context.obj.evaluate(
+            one_car,
+            fleet or (),
+            scenarios=scenario or (),
+            rivals=rivals,
+            threads=threads,
+            progress=show,
         )
-    content = found.as_dict()
-    kept = keep(context.obj, content)
+    content = dict(kept.content)
     if json:
         print_json({"number": kept.number, "sha256": kept.sha256, **content})
     else:

@@ -9,12 +9,13 @@ from typing import Annotated
 
 import typer
 
+import fleet_slip
 from fleet_slip.cli.commands import MARKUP, CommandGroup
 from fleet_slip.cli.logs import LOG_VARIABLE, LogFormat, configure_logs
 from fleet_slip.cli.output import say
 from fleet_slip.cli.streams import Streams
 from fleet_slip.errors import FleetSlipError, StorageError
-from fleet_slip.files.data_root import ROOT_VARIABLE, data_root
+from fleet_slip.files.data_root import ROOT_VARIABLE
 from fleet_slip.limits import require_limits
 from fleet_slip.resources import CONFIG_VARIABLE, own_configs
 
@@ -84,9 +85,7 @@ def options(
         os.environ[CONFIG_VARIABLE] = str(Path(config).absolute())
     own_configs()
     require_limits()
-    from fleet_slip.warehouse.tables import Warehouse  # noqa: PLC0415 - pyarrow and Delta, not for --help
-
-    context.obj = Warehouse(data_root(root))
+    context.obj = fleet_slip.open(root)
 
 
 def main() -> None:

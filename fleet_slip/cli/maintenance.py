@@ -4,37 +4,24 @@ import sys
 from concurrent.futures import Executor
 from contextlib import nullcontext
 from dataclasses import asdict
-from datetime import date
 from typing import Annotated, Any
 
 import typer
 
+from fleet_slip.api.calls import open_workers
+from fleet_slip.api.fleet import Fleet
 from fleet_slip.cli.output import Json, print_json, print_table, progress, say
 from fleet_slip.cli.recorded import record_run
-from fleet_slip.cli.workers import Cluster, unless_local, workers
-from fleet_slip.errors import DamageError, PendingError, QuestionError, RefusedError
+from fleet_slip.cli.workers import Cluster
+from fleet_slip.errors import DamageError, PendingError
 from fleet_slip.maintenance.compaction import TARGET_ROWS
-from fleet_slip.maintenance.compaction import compact as compact_logs
 from fleet_slip.maintenance.forget import ForgetReport
-from fleet_slip.maintenance.forget import forget as forget_drives
-from fleet_slip.maintenance.retention import load_retention
-from fleet_slip.maintenance.retention import retain as apply_retention
-from fleet_slip.maintenance.vacuum import RETENTION_HOURS, VacuumReport, preview_vacuum
-from fleet_slip.maintenance.vacuum import vacuum as remove_expired
+from fleet_slip.maintenance.vacuum import RETENTION_HOURS, VacuumReport
 from fleet_slip.maintenance.verification import Damage, Verification
-from fleet_slip.maintenance.verify import verify as verify_root
-from fleet_slip.runs.log import recording, step
-from fleet_slip.warehouse.audit import ALLOWED, Audit, Forgettable
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.runs.log import recording
 
 PENDING_SHOWN = 5
 """So many are named on a line; --json names all."""
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    for command in (verify, compact, vacuum, forget, retain):
-        app.command()(command)
 
 
 def verify(
@@ -59,16 +46,15 @@ def verify(
 
     Exits with 9 if there is damage that was not repaired.
     """
+    fleet: Fleet = context.obj
     # What repairs changes the warehouse; what only looks leaves no record.
-    recorded = recording(context.obj.root, "verify", sys.argv[1:]) if repair else nullcontext()
-    with recorded, workers(context, cluster) as (warehouse, executor):
-        report = _verify(warehouse, executor, full=full)
+    recorded = recording(fleet.root, "verify", sys.argv[1:]) if repair else nullcontext()
+    with recorded, open_workers(fleet.root, cluster) as executor:
+        report = _verify(fleet, executor, full=full)
         rebuilt: list[str] = []
         if repair:
-            from fleet_slip.maintenance.repair import repair as rebuild  # noqa: PLC0415 - the simulator
-
-            rebuilt = rebuild(warehouse, report, campaign or ())
-            report = _verify(warehouse, executor, full=full)
+            rebuilt = fleet.repair(report, campaign or ())
+            report = _verify(fleet, executor, full=full)
     if json:
         print_json(_verified(report, rebuilt))
     else:
@@ -82,9 +68,9 @@ def verify(
         raise DamageError(f"{context.obj.root}: {len(report.damage)} damaged. {advice}")
 
 
-def _verify(warehouse: Warehouse, executor: Executor, *, full: bool) -> Verification:
-    with progress("verify", "bytes", executor) as advance:
-        return verify_root(warehouse, full=full, progress=advance, executor=unless_local(executor))
+def _verify(fleet: Fleet, executor: Executor, *, full: bool) -> Verification:
+    with progress("verify", "bytes", executor) as show:
+        return fleet.verify(full=full, workers=executor, progress=show)
 
 
 def _verified(report: Verification, rebuilt: list[str]) -> dict[str, Any]:
@@ -125,9 +111,8 @@ def compact(
     json: Json = False,
 ) -> None:
     """Turn the small log files of each day into large ones. Readers and jobs are not disturbed."""
-    with step("compact") as figures, progress("compact", "days") as advance:
-        report = compact_logs(context.obj, target_rows, advance)
-        figures.rows, figures.size_bytes = report.rows_rewritten, report.size_bytes_after
+    with progress("compact", "days") as show:
+        report = context.obj.compact(target_rows, progress=show)
     if json:
         print_json(asdict(report))
     elif report.changed:
@@ -155,9 +140,7 @@ def vacuum(
     json: Json = False,
 ) -> None:
     """Remove replaced files and leftovers of killed jobs when they are old enough."""
-    with step("vacuum") as figures:
-        report = (preview_vacuum if dry_run else remove_expired)(context.obj, retention_hours)
-        figures.size_bytes = report.size_bytes
+    report = context.obj.vacuum(retention_hours, dry_run=dry_run)
     if json:
         print_json(asdict(report))
         return
@@ -195,13 +178,16 @@ def forget(
         raise typer.BadParameter("give one of --vehicle and --drive.")
     if allow and now:
         raise typer.BadParameter("give one of --allow and --now.")
-    subject = Forgettable("drive", drive) if drive else Forgettable("vehicle", vehicle or "")
+    fleet: Fleet = context.obj
     if allow:
-        _allow(context.obj, subject, json=json)
+        changed = fleet.allow(vehicle=vehicle, drive=drive)
+        if json:
+            print_json({"allowed": True, "changed": changed})
+        else:
+            say("its new rows are landed again from now on; what was forgotten stays forgotten")
         return
-    with step("forget") as figures, progress("forget", "files") as advance:
-        report = forget_drives(context.obj, subject, now=now, progress=advance)
-        figures.rows = report.rows
+    with progress("forget", "files") as show:
+        report = fleet.forget(vehicle=vehicle, drive=drive, now=now, progress=show)
     if json:
         print_json(asdict(report))
     else:
@@ -212,25 +198,6 @@ def forget(
             f"{', '.join(report.pending[:PENDING_SHOWN])}. Repeat this command when they have "
             "ended, or for files of killed jobs after an hour."
         )
-
-
-def _allow(warehouse: Warehouse, subject: Forgettable, *, json: bool) -> None:
-    audit = Audit(warehouse.root)
-    warehouse.require()
-    state = audit.state(subject)
-    if state is None:
-        raise QuestionError(f"{subject.kind} {subject.value!r} was never forgotten.")
-    if state == "begun":
-        raise RefusedError(
-            f"{subject.kind} {subject.value!r} is being forgotten. Give the command that forgets "
-            "it again, until it is done; then allow it."
-        )
-    if state != ALLOWED:
-        audit.allow(subject)
-    if json:
-        print_json({"allowed": True, "changed": state != ALLOWED})
-    else:
-        say("its new rows are landed again from now on; what was forgotten stays forgotten")
 
 
 def _say_forgotten(report: ForgetReport) -> None:
@@ -262,9 +229,8 @@ def retain(
     json: Json = False,
 ) -> None:
     """Forget drives that are older than the retention says, then vacuum. For a schedule."""
-    with step("retain") as figures, progress("retain", "files") as advance:
-        report = apply_retention(context.obj, load_retention(config), date.today(), advance)
-        figures.rows, figures.size_bytes = report.forgotten.rows, report.vacuumed.size_bytes
+    with progress("retain", "files") as show:
+        report = context.obj.retain(config, progress=show)
     if json:
         print_json(asdict(report))
         return

@@ -1,35 +1,20 @@
 """Commands that serve models: models, show, promote, rollback, pin, unpin."""
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from fleet_slip.api.fleet import Fleet
 from fleet_slip.cli.output import Json, print_json, print_table, say
 from fleet_slip.cli.recorded import record_run
-from fleet_slip.cli.signing import signing_key
-from fleet_slip.maintenance.marks import marked_models
 from fleet_slip.models.aliases import CHAMPION
-from fleet_slip.models.manifest import ModelTerm, require_model_name
+from fleet_slip.models.manifest import ModelTerm
 from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.models.versions import Registry
-from fleet_slip.warehouse.tables import Warehouse
 
 Reference = Annotated[
     str, typer.Argument(help="NAME, NAME@VERSION or NAME@ALIAS. NAME alone is its champion.")
 ]
 Alias = Annotated[str, typer.Option(help="The alias to move.")]
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    for command in (models, show, promote, rollback, pin, unpin):
-        app.command()(command)
-
-
-def registry_of(warehouse: Warehouse, sign_key: Path | None = None) -> Registry:
-    """Return the registry of a data root; it signs new versions if a key is configured."""
-    return Registry(warehouse.root / "models", signing_key(sign_key))
 
 
 def models(
@@ -40,16 +25,8 @@ def models(
     json: Json = False,
 ) -> None:
     """List the published model versions."""
-    context.obj.require()
-    registry = registry_of(context.obj)
-    marked = marked_models(context.obj.root)
-    rows = [
-        {**row, "trained_on_forgotten": f"{row['name']}@{row['version']}" in marked}
-        for row in registry.as_table().to_pylist()
-        if name in (None, row["name"])
-    ]
-    if name and not rows:
-        registry.resolve(name)
+    fleet: Fleet = context.obj
+    rows = fleet.models(name).to_pylist()
     if json:
         print_json(rows)
         return
@@ -94,7 +71,7 @@ def models(
             ["at", "command", "alias", "version"],
             [
                 [f"{move.at:%Y-%m-%d %H:%M:%S}", move.command, move.alias, str(move.version)]
-                for move in registry.history(name).moves()
+                for move in fleet.registry().history(name).moves()
             ],
             left=3,
         )
@@ -102,7 +79,7 @@ def models(
 
 def show(context: typer.Context, reference: Reference, json: Json = False) -> None:
     """Show one model version: coefficients, figures, and the data that made it."""
-    version = registry_of(context.obj).resolve(reference)
+    version: ModelVersion = context.obj.model(reference)
     if json:
         content = version.manifest.model_dump(mode="json")
         print_json({"version": version.version, "sha256": version.sha256, **content})
@@ -199,10 +176,7 @@ def promote(
     alias: Alias = CHAMPION,
 ) -> None:
     """Point an alias, the champion unless told otherwise, at a version."""
-    require_model_name(alias)
-    registry = registry_of(context.obj)
-    version = registry.resolve(reference)
-    registry.promote(version.manifest.name, version.version, alias)
+    version = context.obj.promote(reference, alias)
     say(f"{version.manifest.name}@{alias} is now version {version.version}")
 
 
@@ -216,10 +190,10 @@ def rollback(
 
     Until promote or unpin.
     """
-    version = registry_of(context.obj).rollback(name, alias)
+    version = context.obj.rollback(name, alias)
     say(
-        f"{name}@{alias} is version {version} again, and stays so until: fleet-slip promote, or "
-        f"fleet-slip unpin {name}"
+        f"{name}@{alias} is version {version.version} again, and stays so until: fleet-slip "
+        f"promote, or fleet-slip unpin {name}"
     )
 
 
@@ -230,8 +204,8 @@ def pin(
     alias: Alias = CHAMPION,
 ) -> None:
     """Keep an alias where it is: publications become candidates, until promote or unpin."""
-    version = registry_of(context.obj).hold(name, alias, "pin")
-    say(f"{name}@{alias} is pinned to version {version}")
+    version = context.obj.pin(name, alias)
+    say(f"{name}@{alias} is pinned to version {version.version}")
 
 
 @record_run
@@ -241,5 +215,5 @@ def unpin(
     alias: Alias = CHAMPION,
 ) -> None:
     """Let publications move an alias again, after pin or rollback."""
-    version = registry_of(context.obj).hold(name, alias, "unpin")
-    say(f"{name}@{alias} is version {version}; the next publication may move it")
+    version = context.obj.unpin(name, alias)
+    say(f"{name}@{alias} is version {version.version}; the next publication may move it")

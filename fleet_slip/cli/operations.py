@@ -8,23 +8,13 @@ from typing import Annotated
 import typer
 
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.cli.models import Reference, registry_of
+from fleet_slip.cli.models import Reference
 from fleet_slip.cli.output import Json, print_json, print_table, progress, say
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.run import DEFAULT_CAMPAIGN
 from fleet_slip.errors import AlarmError, ConfigError
-from fleet_slip.maintenance.migration import migrate as migrate_logs
 from fleet_slip.monitoring.monitor import Chart
-from fleet_slip.monitoring.monitor import monitor as chart_errors
-from fleet_slip.monitoring.quality import QualityReport, examine_drives
-from fleet_slip.runs.log import step
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    app.command()(quality)
-    app.command()(monitor)
-    app.command()(migrate)
+from fleet_slip.monitoring.quality import QualityReport
 
 
 def quality(
@@ -39,7 +29,7 @@ def quality(
 
     Reads Gram rows only. Exit code 10 if a drive's sensors are not in order.
     """
-    found = examine_drives(context.obj, cohort)
+    found: QualityReport = context.obj.quality(cohort)
     if json:
         print_json(found.as_dict())
     else:
@@ -92,8 +82,7 @@ def monitor(
 
     Reads Gram rows only. Exit code 10 if a new day is beyond the limits.
     """
-    version = registry_of(context.obj).resolve(reference)
-    chart = chart_errors(context.obj, version, cohort, _first_new_day(since))
+    chart: Chart = context.obj.monitor(reference, cohort, since=_first_new_day(since))
     if plot:
         from fleet_slip.monitoring.chart import draw  # noqa: PLC0415 - an optional dependency
 
@@ -142,9 +131,8 @@ def migrate(context: typer.Context, json: Json = False) -> None:
 
     See docs/schema.md before widening a scale. It can be repeated after any interruption.
     """
-    with step("migrate") as figures, progress("migrate", "rows") as advance:
-        report = migrate_logs(context.obj, advance)
-        figures.rows = report.rows_rewritten
+    with progress("migrate", "rows") as show:
+        report = context.obj.migrate(progress=show)
     if json:
         print_json(asdict(report))
         return

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from decimal import Decimal
+from functools import partial
 from typing import Annotated, Any
 
 import typer
@@ -19,6 +20,7 @@ from rich.progress import (
     Progress,
     ProgressColumn,
     Task,
+    TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
@@ -116,10 +118,20 @@ def _short(value: float) -> str:
 def progress(
     doing: str, unit: str, executor: Executor | None = None
 ) -> Iterator[Callable[[int, int], None]]:
-    """Show a bar with rate and time left on stderr while a job runs, if a person watches.
+    """Show a bar while one thing is done; see `progress_of_steps`."""
+    with progress_of_steps(unit, executor, doing) as show:
+        yield partial(show, doing)
+
+
+@contextmanager
+def progress_of_steps(
+    unit: str, executor: Executor | None = None, first: str | None = None
+) -> Iterator[Callable[[str, int, int], None]]:
+    """Show bars with rate and time left on stderr while steps are done, if a person watches.
 
     And the number of workers, if the executor is of a cluster. Machines are told by an event now
-    and then. Yields the callback that jobs take: how much more is done, and how much there is.
+    and then. Yields the callback: what is being done, how much is done, and how much there is. The
+    bar of the first step is there before it is called.
     """
     console = stderr()
     bar = Progress(
@@ -134,20 +146,26 @@ def progress(
         transient=True,
         disable=not (console.is_terminal and for_people()) or bool(os.environ.get("CI")),
     )
-    with bar:
+    begun: dict[str, tuple[TaskID, float]] = {}
+    told = time.monotonic()
+
+    def begin(doing: str) -> tuple[TaskID, float]:
         task = bar.add_task(doing, total=None, unit=unit, executor=executor)
+        return task, time.monotonic()
 
-        begun = told = time.monotonic()
-        done = 0
+    def show(doing: str, done: int, total: int) -> None:
+        nonlocal told
+        if doing not in begun:
+            begun[doing] = begin(doing)
+        task, since = begun[doing]
+        bar.update(task, completed=done, total=total)
+        if (now := time.monotonic()) - told > TOLD_EVERY_S:
+            told = now
+            rate = {f"{unit}_per_s": round(done / (now - since))}
+            workers = getattr(executor, "workers", None)
+            log_event("progress", doing=doing, done=done, total=total, workers=workers, **rate)
 
-        def advance(more: int, total: int) -> None:
-            nonlocal told, done
-            bar.update(task, advance=more, total=total)
-            done += more
-            if (now := time.monotonic()) - told > TOLD_EVERY_S:
-                told = now
-                rate = {f"{unit}_per_s": round(done / (now - begun))}
-                workers = getattr(executor, "workers", None)
-                log_event("progress", doing=doing, done=done, total=total, workers=workers, **rate)
-
-        yield advance
+    with bar:
+        if first is not None:
+            begun[first] = begin(first)
+        yield show

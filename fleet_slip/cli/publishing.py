@@ -1,59 +1,26 @@
 """The command that publishes the model that a selection chose."""
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.cli.models import registry_of
+from fleet_slip.cli.options import RESAMPLING, selection_options
 from fleet_slip.cli.output import Json, print_json, say
 from fleet_slip.cli.recorded import record_run
-from fleet_slip.cli.selecting import (
-    AllSubsets,
-    Cohort,
-    Criterion,
-    Features,
-    FoldBy,
-    FoldCount,
-    Models,
-    Most,
-    Naive,
-    Nested,
-    Rank,
-    SearchMethod,
-    WorthOption,
-    print_selection,
-)
-from fleet_slip.cli.signing import SignKey
+from fleet_slip.cli.selecting import answer, print_selection
+from fleet_slip.cli.signing import SignKey, signing_key
 from fleet_slip.models.manifest import require_model_name
-from fleet_slip.models.publish import Publication, manifest_of
-from fleet_slip.models.publish import publish as publish_selection
+from fleet_slip.models.publish import Publication
 from fleet_slip.runs.log import step
-from fleet_slip.selection.request import WORTH, SelectionRequest, answer_request, parse_worth
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command of this module."""
-    app.command()(publish)
+from fleet_slip.selection.request import SelectionRequest
 
 
 @record_run
+@selection_options(without=RESAMPLING)
 def publish(
     context: typer.Context,
     name: Annotated[str, typer.Argument(help="Name of the model, such as sideslip.")],
-    cohort: Cohort = TRAINING_DRIVES,
-    models: Models = None,
-    nested: Nested = None,
-    features: Features = None,
-    by: FoldBy = None,
-    folds: FoldCount = None,
-    rank: Rank = None,
-    criterion: Criterion = None,
-    worth: WorthOption = WORTH,
-    all_subsets: AllSubsets = False,
-    naive: Naive = False,
-    search: SearchMethod = None,
-    most: Most = None,
+    request: SelectionRequest,
     force: Annotated[
         bool, typer.Option("--force", help="Publish even what is worse than the champion.")
     ] = False,
@@ -71,45 +38,16 @@ def publish(
     The options are those of select.
     """
     require_model_name(name)
-    request = SelectionRequest(
-        cohort=cohort,
-        models=models,
-        nested=nested,
-        features=features,
-        by=by,
-        folds=folds,
-        rank=rank,
-        criterion=criterion,
-        worth=parse_worth(worth),
-        all_subsets=all_subsets,
-        naive=naive,
-        search=search,
-        most=most,
-    )
     with step("select"):
-        answer = answer_request(context.obj, request)
-    selection = answer.selection
-    manifest = manifest_of(selection, name, answer.label, answer.config_sha256)
-    registry = registry_of(context.obj, sign_key)
-    publication = publish_selection(registry, manifest, selection, force=force, candidate=candidate)
+        selection = answer(context.obj, request)
+    publication = context.obj.publish(
+        name, selection, force=force, candidate=candidate, sign_key=signing_key(sign_key)
+    )
     if json:
-        print_json(published(publication))
+        print_json(publication.as_dict())
     else:
         print_selection(selection)
         print_publication(publication)
-
-
-def published(publication: Publication) -> dict[str, Any]:
-    """Return what `publish --json` prints."""
-    version = publication.version
-    return {
-        "model": version.manifest.name,
-        "version": version.version,
-        "new": publication.new,
-        "candidate": publication.candidate,
-        "reason": publication.reason,
-        "sha256": version.sha256,
-    }
 
 
 def print_publication(publication: Publication) -> None:

@@ -30,12 +30,6 @@ FORMULA = "^[=+@\\t\\r\\n＝＋－＠-]"
 """What a text begins with that a spreadsheet executes."""
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    app.command()(sql)
-    app.command()(shell)
-
-
 def sql(
     context: typer.Context,
     query: Annotated[

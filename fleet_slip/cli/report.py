@@ -6,15 +6,8 @@ from typing import Annotated
 
 import typer
 
-from fleet_slip.cli.models import registry_of
 from fleet_slip.cli.output import Json, print_json, say
 from fleet_slip.cli.run import DEFAULT_CAMPAIGN
-from fleet_slip.files.local_folder import LocalFolder
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command of this module."""
-    app.command()(report)
 
 
 def report(
@@ -32,14 +25,11 @@ def report(
 
     The page needs nothing but itself; the same figures stand beside it as SVG and PNG files.
     """
-    from fleet_slip.report.write import FIGURES, write_report  # noqa: PLC0415 - takes a while
-
-    folder = LocalFolder(output) if output else context.obj.root / "report"
-    written = write_report(context.obj, registry_of(context.obj).resolve(model), folder)
+    written = context.obj.report(model, output)
     if json:
         print_json(asdict(written))
     else:
         say(
             f"{written.page}: {written.size_bytes / 1e6:.1f} MB, {written.figures} figures, "
-            f"which are in {folder / FIGURES} too"
+            f"which are in {written.figures_folder} too"
         )

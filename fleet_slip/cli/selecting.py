@@ -1,162 +1,28 @@
-"""Selecting: the command select, its options, and how a selection is printed."""
+"""Selecting: the command select, and how a selection is printed."""
 
 from collections.abc import Iterator
-from typing import Annotated, Any
+from dataclasses import asdict
+from typing import Any
 
 import typer
 
+from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
+from fleet_slip.cli.options import selection_options
 from fleet_slip.cli.output import Json, print_json, print_table, say, stdout
-from fleet_slip.grams.folding import ROW_FOLDS, FoldKey
-from fleet_slip.regression.criteria import CRITERIA
+from fleet_slip.grams.folding import ROW_FOLDS
 from fleet_slip.regression.crossval import CrossValidation
 from fleet_slip.regression.nested_choice import CROSS_VALIDATION, NestedChoice
-from fleet_slip.regression.ranking import RANKINGS
-from fleet_slip.regression.stepwise import METHODS
 from fleet_slip.selection.compare import Selection
-from fleet_slip.selection.model_list import DEFAULT_MOST
-from fleet_slip.selection.request import (
-    DEFAULT_MODELS,
-    WORTH,
-    SelectionRequest,
-    answer_request,
-    parse_worth,
-)
+from fleet_slip.selection.request import RequestedSelection, SelectionRequest
 from fleet_slip.selection.search import SearchChoice
 from fleet_slip.selection.uncertainty import Uncertainty
-
-Cohort = Annotated[
-    str,
-    typer.Option(help="SQL condition on the view drives, such as \"track = 'waterford_hills'\"."),
-]
-Models = Annotated[
-    str | None,
-    typer.Option(
-        help=f"A model list of configs/models, or a TOML file. Default: {DEFAULT_MODELS}, unless "
-        "--nested or an option that searches is given.",
-        show_default=False,
-    ),
-]
-Nested = Annotated[
-    str | None,
-    typer.Option(
-        help="Add the nested models of an order of signals, separated by commas; 'catalogue' is "
-        "all inputs in the order of configs/signals.toml."
-    ),
-]
-Features = Annotated[
-    str | None,
-    typer.Option(
-        help="Feature set of configs/features.toml, computed before with: fleet-slip gram "
-        "--features NAME. Default: what the list says, else the logged signals."
-    ),
-]
-FoldBy = Annotated[
-    FoldKey | None,
-    typer.Option(
-        help="What a fold is made of. Default: what the list says. By row is WEKA's way and leaks."
-    ),
-]
-FoldCount = Annotated[
-    str | None,
-    typer.Option(
-        "--folds",
-        metavar="NUMBER|each",
-        help="Number of folds, or each: every drive, or whatever folds are made of, is a fold of "
-        "its own. Default: what the list says.",
-    ),
-]
-Rank = Annotated[
-    str | None,
-    typer.Option(
-        help=f"Rank the inputs of --nested first: {', '.join(RANKINGS)}. Default: declared.",
-        show_default=False,
-    ),
-]
-Criterion = Annotated[
-    str | None,
-    typer.Option(
-        help="What decides how many of the ranked inputs are kept: cv (the smallest model that "
-        f"falls negligibly short of the best; see --worth), {', '.join(CRITERIA)}. Default: cv.",
-        show_default=False,
-    ),
-]
-WorthOption = Annotated[
-    str,
-    typer.Option(
-        "--worth",
-        help="The smallest gain in RMSE that is worth a signal, such as 0.005deg or 2%. Of the "
-        "models that fall less short of the best, or by no more than one standard error of the "
-        "difference, that with the fewest signals wins.",
-    ),
-]
-AllSubsets = Annotated[
-    bool,
-    typer.Option(
-        "--all-subsets", help="Search all subsets of the inputs of --nested instead of an order."
-    ),
-]
-SearchMethod = Annotated[
-    str | None,
-    typer.Option(
-        "--search",
-        help=f"Search among the inputs of --nested, or all: {', '.join(METHODS)}; the search is "
-        "made again in every fold. Adds its models of 1, 2, ... columns.",
-        show_default=False,
-    ),
-]
-Most = Annotated[
-    int | None,
-    typer.Option(min=1, max=200, help=f"Most columns of --search. Default: {DEFAULT_MOST}."),
-]
-Naive = Annotated[
-    bool,
-    typer.Option(
-        "--naive",
-        help="Take rows for independent evidence, not drives. At 100 Hz they are not: then every "
-        "criterion keeps nearly everything.",
-    ),
-]
-Repeat = Annotated[
-    int | None,
-    typer.Option(min=2, help="Cross-validate the winner again with so many other deals of folds."),
-]
-Bootstrap = Annotated[
-    int | None,
-    typer.Option(
-        min=100,
-        help="Confidence interval of the winner's correlation by drawing the drives so many times.",
-    ),
-]
-
 
 FIGURES = ("drives", "correlation", "RMSE deg", "mean deg", "std deg", "condition")
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command of this module."""
-    app.command()(select)
-
-
-def select(
-    context: typer.Context,
-    cohort: Cohort = TRAINING_DRIVES,
-    models: Models = None,
-    nested: Nested = None,
-    features: Features = None,
-    by: FoldBy = None,
-    folds: FoldCount = None,
-    rank: Rank = None,
-    criterion: Criterion = None,
-    worth: WorthOption = WORTH,
-    all_subsets: AllSubsets = False,
-    naive: Naive = False,
-    search: SearchMethod = None,
-    most: Most = None,
-    repeat: Repeat = None,
-    bootstrap: Bootstrap = None,
-    json: Json = False,
-) -> None:
+@selection_options()
+def select(context: typer.Context, request: SelectionRequest, json: Json = False) -> None:
     """Compare models on a cohort by cross-validation and choose one. Reads Gram rows only.
 
     Compare a list of models: **fleet-slip select --models table1**
@@ -167,28 +33,17 @@ def select(
 
     Search all subsets: **fleet-slip select --all-subsets --criterion cv --bootstrap 1000**
     """
-    request = SelectionRequest(
-        cohort=cohort,
-        models=models,
-        nested=nested,
-        features=features,
-        by=by,
-        folds=folds,
-        rank=rank,
-        criterion=criterion,
-        worth=parse_worth(worth),
-        all_subsets=all_subsets,
-        naive=naive,
-        search=search,
-        most=most,
-        repeat=repeat,
-        bootstrap=bootstrap,
-    )
-    selection = answer_request(context.obj, request).selection
+    selection = answer(context.obj, request)
     if json:
         print_json(selection.as_dict())
     else:
         print_selection(selection)
+
+
+def answer(fleet: Fleet, request: SelectionRequest) -> RequestedSelection:
+    """Select as asked on the command line."""
+    options = asdict(request)
+    return fleet.cohort(options.pop("cohort")).select(**options)
 
 
 def print_selection(selection: Selection[Any]) -> None:

@@ -9,7 +9,6 @@ import typer
 from fleet_slip.cli.output import say
 from fleet_slip.errors import ConfigError
 from fleet_slip.models.signing import SIGNING_VARIABLE, VERIFY_VARIABLE, make_keys
-from fleet_slip.models.versions import Registry
 
 SignKey = Annotated[
     Path | None,
@@ -19,12 +18,6 @@ SignKey = Annotated[
         show_default=False,
     ),
 ]
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    app.command()(keygen)
-    app.command()(sign)
 
 
 def signing_key(given: Path | None) -> Path | None:
@@ -50,9 +43,5 @@ def sign(
     key = signing_key(sign_key)
     if key is None:
         raise ConfigError(f"no key to sign with. Give --sign-key FILE, or set ${SIGNING_VARIABLE}.")
-    registry = Registry(context.obj.root / "models", key)
-    name, _, version = reference.partition("@")
-    if not (version.isascii() and version.isdigit() and len(version) < 10):
-        raise ConfigError(f"{reference!r}: name one version, such as sideslip@3.")
-    registry.sign(name, int(version))
-    say(f"{name}@{int(version)} is signed")
+    version = context.obj.sign(reference, key)
+    say(f"{version.reference} is signed")

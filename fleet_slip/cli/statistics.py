@@ -4,36 +4,23 @@ from typing import Annotated
 
 import typer
 
-from fleet_slip.catalogue.features import PLAIN, FeatureSet, column_query, features
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.api.cohort import FleetCohort
+from fleet_slip.catalogue.features import PLAIN, FeatureSet, column_query
+from fleet_slip.catalogue.features import features as known_features
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
+from fleet_slip.cli.options import Cohort, FoldCount, Naive
 from fleet_slip.cli.output import Json, print_json, print_table, stdout
-from fleet_slip.cli.selecting import Cohort, FoldCount, Naive
-from fleet_slip.cli.subject import FeatureSetOption, Model, Signals, quantities, subject_of
-from fleet_slip.errors import ConfigError
-from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.grams.folding import Folding, FoldKey, make_folding
-from fleet_slip.models.counts_model import counts_model
-from fleet_slip.regression.exact import fit
+from fleet_slip.cli.subject import FeatureSetOption, Model, Signals, quantities
+from fleet_slip.grams.folding import FoldKey
 from fleet_slip.regression.figures import Figures
 from fleet_slip.regression.inference import INTERCEPT
-from fleet_slip.selection.regimes import RegimeComparison, compare_regimes
-from fleet_slip.selection.request import WHOLE_SET, inputs_of
-from fleet_slip.selection.shrinkage import compare_shrinkage
-from fleet_slip.selection.what_if import WhatIf, what_if
+from fleet_slip.selection.regimes import RegimeComparison
+from fleet_slip.selection.what_if import WhatIf
 
 By = Annotated[FoldKey, typer.Option(help="What a fold is made of.")]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    app.command("features")(list_features)
-    app.command("what-if")(what_if_sensors)
-    app.command("regimes")(regimes)
-    app.command("shrink")(shrink)
-
-
-def list_features(
+def features(
     sets: Annotated[
         bool, typer.Option("--sets", help="List the feature sets instead of the features.")
     ] = False,
@@ -53,7 +40,7 @@ def list_features(
     Gram rows of a set with: **fleet-slip gram --features NAME**, then use it with: **fleet-slip
     select --features NAME**
     """
-    known = features()
+    known = known_features()
     if sql is not None:
         typer.echo(column_query(known, sql))
     elif json:
@@ -116,7 +103,7 @@ def _parts(one: FeatureSet) -> str:
     return "with the one before" if one.lagged else "together"
 
 
-def what_if_sensors(
+def what_if(
     context: typer.Context,
     model: Model = None,
     noise: Annotated[
@@ -142,20 +129,18 @@ def what_if_sensors(
     **fleet-slip what-if waterford --noise ay=0.2 --bias yaw_rate=0.02**
     """
     noises, biases = quantities(noise, "--noise"), quantities(bias, "--bias")
-    if not noises and not biases:
-        raise ConfigError("say what is added: --noise ay=0.2 or --bias yaw_rate=0.02.")
-    subject = subject_of(context.obj, model, signals, feature_set)
-    drives = load_cohort(context.obj, cohort, subject.feature_set)
-    if subject.version is not None:
-        one = counts_model(subject.version.manifest)
-    else:
-        inputs = inputs_of(drives, subject.named or WHOLE_SET)
-        one = fit(drives.serving(inputs).table.total(), inputs, catalogue().label).model
-    result = what_if(drives, one, bias=biases, noise=noises)
+    result = _cohort(context, cohort).what_if(
+        model, noise=noises, bias=biases, signals=signals, features=feature_set
+    )
     if json:
         print_json({"cohort": cohort, "noise": noises, "bias": biases, **result.as_dict()})
     else:
         _print_what_if(result)
+
+
+def _cohort(context: typer.Context, condition: str) -> FleetCohort:
+    cohort: FleetCohort = context.obj.cohort(condition)
+    return cohort
 
 
 def _print_what_if(result: WhatIf) -> None:
@@ -208,11 +193,10 @@ def regimes(
     One model for all rows is cross-validated against one for each regime. Needs Gram rows by
     regime: **fleet-slip gram --features regimes**
     """
-    folding = make_folding(by, folds or Folding().count)
-    drives = load_cohort(context.obj, cohort, feature_set)
-    inputs = inputs_of(drives, signals or WHOLE_SET)
     divided_by = [name.strip() for name in over.split(",")] if over else []
-    result = compare_regimes(drives, inputs, folding, divided_by)
+    result = _cohort(context, cohort).regimes(
+        signals, over=divided_by, features=feature_set, by=by, folds=folds
+    )
     if json:
         print_json({"cohort": cohort, **result.as_dict()})
     else:
@@ -262,10 +246,10 @@ def shrink(
     Penalties are chosen by cross-validation inside each training fold. With many drives for each
     signal there is little to shrink; with few drives, or many features, it shows here.
     """
-    folding = make_folding(by, folds or Folding().count)
-    drives = load_cohort(context.obj, cohort, feature_set or PLAIN)
-    inputs = inputs_of(drives, signals or WHOLE_SET)
-    found = compare_shrinkage(drives, inputs, folding, naive=naive)
+    found = _cohort(context, cohort).shrink(
+        signals, features=feature_set or PLAIN, by=by, folds=folds, naive=naive
+    )
+    inputs = found[0].cross_validation.signals  # least squares keeps all
     if json:
         print_json({"cohort": cohort, "methods": [one.as_dict() for one in found]})
         return

@@ -6,12 +6,7 @@ import typer
 
 from fleet_slip.cli.output import Json, print_json, print_table
 from fleet_slip.errors import AlarmError
-from fleet_slip.monitoring.status import Status, status_of
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command of this module."""
-    app.command()(status)
+from fleet_slip.monitoring.status import Status
 
 
 def status(
@@ -26,7 +21,7 @@ def status(
 
     Exit code 10 if something calls for attention.
     """
-    found = status_of(context.obj, max_age_hours)
+    found: Status = context.obj.status(max_age_hours)
     if json:
         print_json(found.as_dict())
     else:

@@ -24,6 +24,7 @@ from fleet_slip.models.trained_drives import checksum_of_drives, pack_drives
 from fleet_slip.models.versions import Registry
 from fleet_slip.regression.crossval import CrossValidation
 from fleet_slip.selection.compare import Selection
+from fleet_slip.selection.request import RequestedSelection
 
 
 @dataclass(frozen=True)
@@ -36,10 +37,19 @@ class Publication:
     candidate: bool = False
     """Whether it waits for somebody to promote it."""
 
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `publish --json` prints."""
+        return {
+            "model": self.version.manifest.name,
+            "version": self.version.version,
+            "new": self.new,
+            "candidate": self.candidate,
+            "reason": self.reason,
+            "sha256": self.version.sha256,
+        }
 
-def manifest_of(
-    selection: Selection[Any], name: str, model_list: str, config_sha256: str
-) -> Manifest:
+
+def manifest_of(selection: RequestedSelection, name: str) -> Manifest:
     """Describe the winner of a selection as a manifest."""
     signals = catalogue()
     winner = selection.winner.model
@@ -68,10 +78,10 @@ def manifest_of(
             drives_sha256=checksum_of_drives(drives_of(selection, name)),
         ),
         selected_by=SelectedBy(
-            model_list=model_list,
+            model_list=selection.model_list,
             model=winner.name,
             reason=selection.winner.reason,
-            config_sha256=config_sha256,
+            config_sha256=selection.config_sha256,
         ),
         package_version=package_version("fleet-slip"),
     )

@@ -22,6 +22,11 @@ class Written:
     size_bytes: int
     figures: int
 
+    @property
+    def figures_folder(self) -> str:
+        """Where the figures are as files."""
+        return f"{self.page.removesuffix(PAGE)}{FIGURES}"
+
 
 def write_report(warehouse: Warehouse, version: ModelVersion, output: Folder) -> Written:
     """Write the report about a model version into a folder.

@@ -15,7 +15,7 @@ from fleet_slip.grams.fold_sums import SummedCohort, sum_cohort
 from fleet_slip.grams.folding import EACH, ROW_FOLDS, Folding, FoldKey, make_folding
 from fleet_slip.regression.nested_choice import Rule
 from fleet_slip.regression.stepwise import METHODS
-from fleet_slip.regression.winner import DEFAULT_WORTH, Worth
+from fleet_slip.regression.winner import Worth
 from fleet_slip.selection.compare import Selection, select
 from fleet_slip.selection.model_list import (
     CandidateModel,
@@ -35,7 +35,7 @@ WHOLE_SET = "catalogue"
 
 
 WORTH = "0.005deg"
-"""`DEFAULT_WORTH` as it is asked for."""
+"""`fleet_slip.regression.winner.DEFAULT_WORTH` as it is asked for."""
 
 _WORTH = re.compile(r"(\d+(?:\.\d*)?|\.\d+) ?(deg|%)")
 
@@ -52,7 +52,7 @@ def parse_worth(text: str) -> Worth:
     return Worth(amount / 100, relative=True) if found[2] == "%" else Worth(math.radians(amount))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SelectionRequest:
     """What to select.
 
@@ -64,7 +64,7 @@ class SelectionRequest:
         by, folds: how to fold; by default what the list says.
         rank, criterion: rank the inputs of `nested` first; choose by a criterion.
         all_subsets: choose among the best subsets of `nested` instead of an order's.
-        worth: what a signal must gain for cross-validation to keep it.
+        worth: gain in RMSE for which cross-validation keeps a signal, such as `0.005deg` or `2%`.
         naive: take rows for independent instead of drives.
         search, most: search among the inputs of `nested`, or all, for models of up to so many.
         bootstrap, repeat: how often to resample the winner's figures.
@@ -78,13 +78,13 @@ class SelectionRequest:
     folds: int | str | None = None
     rank: str | None = None
     criterion: str | None = None
-    worth: Worth = DEFAULT_WORTH
+    worth: str = WORTH
     all_subsets: bool = False
     naive: bool = False
     search: str | None = None
     most: int | None = None
-    bootstrap: int | None = None
     repeat: int | None = None
+    bootstrap: int | None = None
 
     @property
     def ordered(self) -> bool:
@@ -97,17 +97,29 @@ class SelectionRequest:
         return bool(self.bootstrap or self.repeat)
 
 
-@dataclass(frozen=True)
-class RequestedSelection:
-    """A selection, what it was made from, and a checksum of that."""
+@dataclass(frozen=True, kw_only=True)
+class RequestedSelection(Selection[Any]):
+    """A selection that can be published: it tells what it was made from.
 
-    selection: Selection[Any]
-    label: str
+    Attributes:
+        model_list: what was compared, such as `table1`.
+        config_sha256: checksum of all that says what to compare.
+    """
+
+    model_list: str
     config_sha256: str
+
+    @classmethod
+    def of(
+        cls, selection: Selection[Any], model_list: str, config_sha256: str
+    ) -> "RequestedSelection":
+        """Return a selection with what it was made from."""
+        return cls(**vars(selection), model_list=model_list, config_sha256=config_sha256)
 
 
 def answer_request(warehouse: Warehouse, request: SelectionRequest) -> RequestedSelection:
     """Select as asked. Raises `ConfigError` for options that do not go together."""
+    parse_worth(request.worth)  # before anything is read
     if request.ordered and request.models:
         raise ConfigError(
             "a list of models is compared by cross-validation as it stands: leave out --models, or "
@@ -142,12 +154,12 @@ def answer_request(warehouse: Warehouse, request: SelectionRequest) -> Requested
         return answer
     figures = estimate_uncertainty(
         cohort,
-        answer.selection.winner.model,
+        answer.winner.model,
         folds,
         bootstrap=request.bootstrap,
         repeat=request.repeat,
     )
-    return replace(answer, selection=replace(answer.selection, uncertainty=figures))
+    return replace(answer, uncertainty=figures)
 
 
 def _folding(request: SelectionRequest, model_list: ModelList | None) -> Folding:
@@ -178,10 +190,10 @@ def _compare_listed(
         nested_models(inputs_of(cohort, request.nested)) if request.nested and not search else ()
     )
     if search and not listed:
-        selection = select(cohort, (), folds, request.worth, search, inputs)
+        selection = select(cohort, (), folds, parse_worth(request.worth), search, inputs)
         content = {"inputs": list(inputs), **search.model_dump()}
         label = f"search:{search.method} {search.most}"
-        return RequestedSelection(selection, label, sha256_of(canonical_json(content)))
+        return RequestedSelection.of(selection, label, sha256_of(canonical_json(content)))
     described = ModelList(
         description=model_list.description if model_list else "Nested models of an order",
         features=cohort.feature_set,
@@ -191,8 +203,8 @@ def _compare_listed(
     )
     name = request.models or (DEFAULT_MODELS if listed else None)
     label = "+".join(filter(None, [name, f"nested:{request.nested}" if nested else None]))
-    selection = select(cohort, described.model, folds, request.worth, search, inputs)
-    return RequestedSelection(selection, label, described.sha256)
+    selection = select(cohort, described.model, folds, parse_worth(request.worth), search, inputs)
+    return RequestedSelection.of(selection, label, described.sha256)
 
 
 def _search_of(request: SelectionRequest, model_list: ModelList | None) -> Search | None:
@@ -209,7 +221,7 @@ def _search(cohort: Cohort, request: SelectionRequest, folds: Folding) -> Reques
     nested = request.nested or WHOLE_SET
     inputs = inputs_of(cohort, nested)
     criterion = require_criterion(request.criterion or "cv")
-    rule = Rule(request.rank or "declared", criterion, request.worth)
+    rule = Rule(request.rank or "declared", criterion, parse_worth(request.worth))
     if request.all_subsets:
         found = select_subsets(cohort, inputs, folds, rule, naive=request.naive)
     else:
@@ -223,7 +235,7 @@ def _search(cohort: Cohort, request: SelectionRequest, folds: Folding) -> Reques
     )
     content = {"inputs": described.sha256, "ranking": rule.ranking, "criterion": rule.criterion}
     content |= {"evidence": found.choice.evidence.kind}
-    return RequestedSelection(
+    return RequestedSelection.of(
         Selection(cohort, folds, found.models, found.winner, {}, choice=found.choice),
         f"nested:{nested} {rule.ranking} {rule.criterion}",
         sha256_of(canonical_json(content)),

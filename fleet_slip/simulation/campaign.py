@@ -115,6 +115,20 @@ class Campaign(Config):
         """Return all days, in order."""
         return tuple(self.first_day + timedelta(days=day) for day in range(self.number_of_days))
 
+    def chosen_days(self, count: int | None, through: date | None) -> tuple[date, ...]:
+        """Return the first days, as many as asked for and up to a day. Raises `ConfigError`."""
+        days = self.days()
+        chosen = tuple(
+            day
+            for day in days[: None if count is None else max(count, 0)]
+            if through is None or day <= through
+        )
+        if not chosen:
+            raise ConfigError(
+                f"no day is asked for: {self.name} lasts from {days[0]} to {days[-1]}."
+            )
+        return chosen
+
     def drives(self, day: date) -> tuple[DriveSpec, ...]:
         """Return the drives of one day, in the order of their names.
 

@@ -43,6 +43,8 @@ def open_database(
     if threads is not None:
         config["threads"] = threads
     database = duckdb.connect(":memory:", config=config)
+    # Where no script is running, in a notebook say, DuckDB prints a bar on stdout.
+    database.execute("SET enable_progress_bar = false")
     if reading:
         reading.let_read(database)
         database.execute("CALL enable_logging('FileSystem')")  # see `reading_files`

@@ -42,6 +42,15 @@ def test_help_shows_every_exported_name() -> None:
         _ = fleet_slip.nothing
 
 
+def test_the_lines_that_help_shows_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    lines = [line[4:] for line in fleet_slip.__doc__.splitlines() if line.startswith("    ")]
+    assert len(lines) == 9
+    known: dict[str, object] = {}
+    exec("\n".join(lines), known)  # noqa: S102
+    assert len(known["beta_rad"]) == len(known["log"])  # type: ignore[arg-type]
+
+
 def test_a_relation_keeps_its_connection(fleet: Fleet) -> None:
     relation = fleet.sql("SELECT drive_id, ax_mps2 FROM log").filter("ax_mps2 > 0")
     gc.collect()
@@ -59,6 +68,14 @@ def test_answers_come_as_frames_of_any_library(fleet: Fleet) -> None:
     tables = relation.pl().to_arrow(), relation.to_arrow_table(), relation.arrow().read_all()
     assert {table.num_rows for table in tables} == {5}
     assert relation.df().shape == (5, 2)
+
+
+def test_a_long_query_of_an_interactive_python_prints_nothing(fleet: Fleet) -> None:
+    program = (  # run with -c, as DuckDB tells that nobody runs a script
+        f"import fleet_slip; fleet = fleet_slip.open({str(fleet.root)!r});"
+        "print(fleet.sql(\"SELECT current_setting('enable_progress_bar')\").fetchall())"
+    )
+    assert run([sys.executable, "-c", program]).stdout == "[(False,)]\n"
 
 
 @pytest.mark.parametrize(

@@ -8,11 +8,16 @@ import polars as pl
 from numpy.typing import NDArray
 
 import fleet_slip
-from fleet_slip import Fleet, ModelVersion
+from fleet_slip import Fleet, FleetCohort, ModelVersion
+from fleet_slip.selection.request import RequestedSelection
 
 
 def test_a_users_lines_are_typed(fleet: Fleet) -> None:
     assert_type(fleet_slip.open("data"), Fleet)
+    cohort = assert_type(fleet.cohort("adhesion > 0.9"), FleetCohort)
+    selection = assert_type(cohort.select(models="table1", folds=3), RequestedSelection)
+    assert_type(selection.winner.model.correlation, float)
+    assert_type(fleet.status().problems, tuple[str, ...])
     log = assert_type(fleet.sql("FROM log LIMIT 10"), duckdb.DuckDBPyRelation).pl()
     model = assert_type(fleet.model("smoke@1"), ModelVersion)
     frame = pl.DataFrame(log)

@@ -1,12 +1,17 @@
 """Starting the program: a command imports what it needs, and the list of commands is true."""
 
+import inspect
 import json
 import sys
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
-from fleet_slip.cli.commands import COMMANDS, Command, load_commands
+from fleet_slip.api.cohort import FleetCohort
+from fleet_slip.cli.commands import COMMANDS, MARKUP, CommandGroup, load_command
+from fleet_slip.cli.options import RESAMPLING, SELECTION
+from fleet_slip.selection.request import SelectionRequest
 from tests.support.commands import run
 
 TABLES = {"deltalake", "numpy", "pyarrow"}
@@ -43,12 +48,30 @@ def test_a_command_does_not_wait_for_what_it_does_not_need(
 
 
 def test_every_command_is_listed_in_its_own_words() -> None:
-    modules = {
-        module: load_commands(module) for module in {one.module for one in COMMANDS.values()}
-    }
-    found = {
-        name: Command(module, " ".join(command.help.partition("\n\n")[0].split()))
-        for module, commands in modules.items()
-        for name, command in commands.items()
-    }
-    assert found == COMMANDS
+    listed = CommandGroup(rich_markup_mode=MARKUP).commands
+    assert list(listed) == list(COMMANDS)
+    for name, entry in listed.items():
+        command = load_command(name)
+        assert command.name == name
+        assert command.help == entry.help
+        assert (entry.help or "").strip()
+
+
+def test_summaries_are_read_without_running_a_module() -> None:
+    program = (
+        "import sys; from fleet_slip.cli.commands import COMMANDS, docstrings;"
+        "[docstrings(module) for module in COMMANDS.values()]; print(*sys.modules)"
+    )
+    done = run([sys.executable, "-c", program])
+    loaded = {name for name in done.stdout.split() if name.startswith("fleet_slip.cli.")}
+    assert loaded == {"fleet_slip.cli.commands"}
+
+
+def test_a_selections_options_stand_once_and_are_those_of_the_api() -> None:
+    options = {field.name for field in fields(SelectionRequest)}
+    assert set(SELECTION) == options
+    in_python = set(inspect.signature(FleetCohort.select).parameters) - {"self"}
+    assert in_python | {"cohort"} == options
+    taken = {name: {one.name for one in load_command(name).params} for name in COMMANDS}
+    assert taken["select"] - {"json"} == options
+    assert taken["publish"] & options == options - set(RESAMPLING)

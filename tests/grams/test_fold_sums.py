@@ -104,7 +104,7 @@ def test_days_add_up_to_those_of_the_drives(
 
 def test_a_listed_selection_is_the_same_either_way(fleet: Warehouse) -> None:
     whole = select(load_cohort(fleet), MODELS.model, MODELS.folds)
-    planned = answer_request(fleet, SelectionRequest()).selection
+    planned = answer_request(fleet, SelectionRequest())
     assert planned.as_dict() == whole.as_dict()
 
 
@@ -159,7 +159,7 @@ def test_a_query_of_gram_rows_needs_no_log_file(tmp_path: Path) -> None:
     query = "SELECT count(*) FROM grams"
     with connect(tmp_path, query=query) as database:
         assert database.execute(query).fetchone() == (20,)
-    assert answer_request(warehouse, SelectionRequest()).selection.cohort.drive_count == 20
+    assert answer_request(warehouse, SelectionRequest()).cohort.drive_count == 20
 
 
 def test_a_query_of_a_day_needs_the_files_of_that_day(tmp_path: Path) -> None:

@@ -49,8 +49,8 @@ def publish_from(
 ) -> Publication:
     """Select on a cohort and publish the winner."""
     answer = answer_request(warehouse, SelectionRequest(cohort=cohort, nested=signals))
-    manifest = manifest_of(answer.selection, "beta", answer.label, answer.config_sha256)
-    return publish(registry_of(warehouse), manifest, answer.selection, **options)
+    manifest = manifest_of(answer, "beta")
+    return publish(registry_of(warehouse), manifest, answer, **options)
 
 
 def registry_of(warehouse: Warehouse) -> Registry:
@@ -101,7 +101,7 @@ def test_the_champion_is_compared_as_it_is_not_fitted_anew(champion: Warehouse) 
     write(champion, "more", 48)
     version = registry_of(champion).load("beta", 1)
     request = SelectionRequest(cohort="drive_id LIKE 'more%'", nested="ay,yaw_rate")
-    comparison = gate.compare(answer_request(champion, request).selection, version)
+    comparison = gate.compare(answer_request(champion, request), version)
     model = comparison.champion.counts
     assert model.coefficients == counts_model(version.manifest).coefficients
     assert comparison.champion.pooled.rows == comparison.challenger.pooled.rows == 48 * ROWS

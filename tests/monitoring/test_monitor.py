@@ -45,9 +45,9 @@ def add_days(warehouse: Warehouse, first: int, number: int, bias_rad: float = 0)
 def trained(warehouse: Warehouse) -> tuple[Warehouse, ModelVersion]:
     add_days(warehouse, 0, TRAINING_DAYS)
     planned = answer_request(warehouse, SelectionRequest())
-    manifest = manifest_of(planned.selection, "m", planned.label, planned.config_sha256)
+    manifest = manifest_of(planned, "m")
     registry = Registry(warehouse.root / "models")
-    return warehouse, publish(registry, manifest, planned.selection).version
+    return warehouse, publish(registry, manifest, planned).version
 
 
 def new_days(chart: Chart) -> list[tuple[date, tuple[str, ...]]]:
@@ -78,7 +78,7 @@ def test_a_training_day_is_judged_by_a_model_that_it_did_not_make(
     first = monitor(warehouse, version).days[0]
     signals = ",".join(version.manifest.signals)
     plan = SelectionRequest(cohort=f"day > '{DAY}'", nested=signals)
-    without = answer_request(warehouse, plan).selection
+    without = answer_request(warehouse, plan)
     model = next(m for m in without.models if m.signals == version.manifest.signals)
     estimate = " + ".join(
         f"{float(b)!r} * {term.column}"

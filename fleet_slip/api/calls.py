@@ -1,0 +1,128 @@
+"""What calls of a `Fleet` share: their record, their progress, and where their tasks run."""
+
+import functools
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
+from datetime import date
+from pathlib import Path
+from typing import Any, Concatenate, ParamSpec, TypeVar
+
+from fleet_slip.api.root import Rooted
+from fleet_slip.compute.tasks import LocalThreads
+from fleet_slip.errors import ConfigError
+from fleet_slip.files.folder import Folder
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.progress import Progress, no_progress
+from fleet_slip.runs.log import current_run_id, recording
+from fleet_slip.warehouse.tables import Warehouse
+
+ShowProgress = Callable[[int, int], None]
+"""Called now and then with the units done so far and the units to do in all: rows, bytes, files."""
+
+Workers = int | str | Executor | None
+"""Where the tasks of a call run; the result is the same. A number of threads of this process (None
+is one for each core), the address of a Dask scheduler such as `tcp://10.0.0.1:8786`, or an
+executor."""
+
+S = TypeVar("S", bound=Rooted)
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def record_call(method: Callable[Concatenate[S, P], R]) -> Callable[Concatenate[S, P], R]:
+    """Return the method so that each call leaves a record in the history of runs.
+
+    A command line that calls it has its own.
+    """
+
+    @functools.wraps(method)
+    def call(self: S, /, *arguments: P.args, **options: P.kwargs) -> R:
+        if current_run_id() is not None:
+            return method(self, *arguments, **options)
+        with recording(self.root, method.__name__, _as_typed(arguments, options)):
+            return method(self, *arguments, **options)
+
+    return call
+
+
+def _as_typed(arguments: Sequence[object], options: Mapping[str, object]) -> list[str]:
+    """Return the arguments of a call as one would type them after a command.
+
+    So the history leaves out of them what it leaves out of a command line.
+    """
+    typed = [text for argument in arguments for text in _texts(argument)]
+    for name, value in options.items():
+        option = f"--{name.replace('_', '-')}"
+        typed += [option] if value is True else [f"{option}={text}" for text in _texts(value)]
+    return typed
+
+
+def _texts(value: object) -> list[str]:
+    match value:
+        case None | bool():
+            return []
+        case str() | int() | float() | Path() | date():
+            return [str(value)]
+        case list() | tuple():
+            return [text for item in value for text in _texts(item)]
+        case _:
+            return [str(name)] if (name := getattr(value, "name", None)) else []
+
+
+def count_from_start(show: ShowProgress | None) -> Progress:
+    """Return what a job calls with what is newly done; it shows what is done since the start."""
+    if show is None:
+        return no_progress
+    done = 0
+
+    def progress(more: int, total: int) -> None:
+        nonlocal done
+        done += more
+        show(done, total)
+
+    return progress
+
+
+@contextmanager
+def open_workers(root: Folder, workers: Workers) -> Iterator[Executor]:
+    """Yield the executor that `workers` means; one that is given is not closed.
+
+    Raises `ConfigError` if a cluster is wanted and Dask is not installed, and what
+    `cluster_executor` raises.
+    """
+    context: Any
+    if isinstance(workers, Executor):
+        context = nullcontext(workers)
+    elif isinstance(workers, str):
+        context = _cluster(workers, root)
+    else:
+        context = LocalThreads(workers or os.cpu_count() or 1)
+    with context as executor:
+        yield executor
+
+
+def _cluster(address: str, root: Folder) -> Any:
+    try:
+        from fleet_slip.compute.cluster import cluster_executor  # an extra, and slow
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"a cluster needs the package {error.name}: pip install 'fleet-slip[cluster]'"
+        ) from None
+    return cluster_executor(address, absolute(root))
+
+
+def absolute(root: Folder) -> Folder:
+    """Return a root that means the same in other working directories, such as a worker's."""
+    return LocalFolder(root.path.absolute()) if isinstance(root, LocalFolder) else root
+
+
+def unless_local(executor: Executor) -> Executor | None:
+    """Return the executor if it is of other processes, for what uses all cores of its own."""
+    return None if isinstance(executor, ThreadPoolExecutor) else executor
+
+
+def within_reach(warehouse: Warehouse, executor: Executor) -> Warehouse:
+    """Return the warehouse as the workers of an executor find it."""
+    return warehouse if unless_local(executor) is None else Warehouse(absolute(warehouse.root))

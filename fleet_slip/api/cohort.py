@@ -1,0 +1,239 @@
+"""Drives that satisfy a condition, and what Gram rows tell of them."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from fleet_slip.api.root import Rooted
+from fleet_slip.errors import ConfigError
+from fleet_slip.warehouse.tables import Warehouse
+
+if TYPE_CHECKING:
+    from fleet_slip.api.subject import Examined
+    from fleet_slip.grams.cohort import Cohort
+    from fleet_slip.grams.folding import Folding, FoldKey
+    from fleet_slip.models.model_version import ModelVersion
+    from fleet_slip.selection.diagnostics import Diagnosis
+    from fleet_slip.selection.regimes import RegimeComparison
+    from fleet_slip.selection.request import RequestedSelection
+    from fleet_slip.selection.shrinkage import Shrunk
+    from fleet_slip.selection.what_if import WhatIf
+
+
+class FleetCohort(Rooted):
+    """The drives that satisfy an SQL condition on the view `drives`; `Fleet.cohort` makes one.
+
+    Nothing but Gram rows is read, of the newest commits at the time of each call. Every call raises
+    `QuestionError` for a condition that is not valid SQL, an unknown feature set or input;
+    `DataError` if no drive satisfies the condition or the feature set has not been computed (see
+    `Fleet.gram`); and `RefusedError` if a drive of an evaluation scenario satisfies it.
+    """
+
+    def __init__(self, warehouse: Warehouse, condition: str) -> None:
+        """Take the tables and the condition."""
+        super().__init__(warehouse)
+        self.condition = condition
+
+    def __repr__(self) -> str:
+        """Return the data root and the condition."""
+        return f"{type(self).__name__}({str(self.root)!r}, {self.condition!r})"
+
+    def select(
+        self,
+        *,
+        models: str | None = None,
+        nested: str | None = None,
+        features: str | None = None,
+        by: "FoldKey | None" = None,
+        folds: int | str | None = None,
+        rank: str | None = None,
+        criterion: str | None = None,
+        worth: str = "0.005deg",
+        all_subsets: bool = False,
+        naive: bool = False,
+        search: str | None = None,
+        most: int | None = None,
+        bootstrap: int | None = None,
+        repeat: int | None = None,
+    ) -> "RequestedSelection":
+        """Compare models by cross-validation and choose one; `Fleet.publish` takes the answer.
+
+        Without options the models of Table I are compared.
+
+        Args:
+            models: a model list of `configs/models`, or the path of a TOML file.
+            nested: an order of inputs, separated by commas, or `catalogue` for all inputs; adds the
+                nested models of its first 1, 2 ... inputs.
+            features: a feature set; by default what the list says, else the logged signals.
+            by: what a fold is made of; by default what the list says. By `row` leaks.
+            folds: how many folds, or `each`: every drive, or whatever folds are made of, is one.
+            rank: ranks the inputs of `nested` first, such as `backward`.
+            criterion: what decides how many of the ranked inputs are kept: `cv`, `bic` ...
+            worth: the smallest gain in RMSE that is worth a signal, such as `0.005deg` or `2%`.
+            all_subsets: search all subsets of the inputs of `nested` instead of an order.
+            naive: take rows for independent evidence, not drives.
+            search: search among the inputs of `nested`, or all, in every fold, as by `exchange`.
+            most: the most columns of `search`.
+            bootstrap: draw the drives so many times for an interval of the winner's correlation.
+            repeat: cross-validate the winner again with so many other deals of folds.
+
+        Raises `ConfigError` for options that do not go together or a list that is not valid, and
+        `DataError` if no model can be fitted.
+        """
+        from fleet_slip.selection.request import SelectionRequest, answer_request
+
+        request = SelectionRequest(
+            cohort=self.condition,
+            models=models,
+            nested=nested,
+            features=features,
+            by=by,
+            folds=folds,
+            rank=rank,
+            criterion=criterion,
+            worth=worth,
+            all_subsets=all_subsets,
+            naive=naive,
+            search=search,
+            most=most,
+            bootstrap=bootstrap,
+            repeat=repeat,
+        )
+        return answer_request(self.warehouse, request)
+
+    def diagnose(
+        self,
+        model: "str | ModelVersion | None" = None,
+        *,
+        signals: str | None = None,
+        features: str | None = None,
+        against: str | None = None,
+        serial: bool = False,
+        sensor_noise: Mapping[str, float] | None = None,
+    ) -> "Diagnosis":
+        """Fit a model's signals to the cohort and examine the fit.
+
+        Args:
+            model: a published model, by default the only one that there is.
+            signals: instead of a model, inputs separated by commas, or `catalogue` for all.
+            features: the feature set that `signals` are of.
+            against: condition of another cohort: does it have the same coefficients?
+            serial: Durbin-Watson and AR(1) generalised least squares, from lagged Gram rows, which
+                `fleet.gram("lags")` makes.
+            sensor_noise: noise that the logs already have, as standard deviations in SI units by
+                signal: shows the coefficients without it (errors in variables).
+
+        Raises `ConfigError` if both a model and signals are named, and what `Fleet.model` raises.
+        """
+        from fleet_slip.catalogue.features import features as known
+        from fleet_slip.selection.diagnostics import diagnose
+
+        examined = self._examined(model, signals, features)
+        cohort = self._load(examined.feature_set)
+        lagged = next(name for name, one in known().sets.items() if one.lagged)
+        return diagnose(
+            cohort,
+            examined.inputs(cohort),
+            lagged=self._load(lagged) if serial else None,
+            against=self._load(examined.feature_set, against) if against else None,
+            sensor_noise=sensor_noise,
+        )
+
+    def what_if(
+        self,
+        model: "str | ModelVersion | None" = None,
+        *,
+        noise: Mapping[str, float] | None = None,
+        bias: Mapping[str, float] | None = None,
+        signals: str | None = None,
+        features: str | None = None,
+    ) -> "WhatIf":
+        """Predict a model's error with worse sensors, in closed form; nothing is simulated.
+
+        `noise` is the standard deviation of white noise and `bias` a constant, in SI units by
+        signal, which come on top of what the logs have. `model`, `signals` and `features` are those
+        of `diagnose`. Shown too: the best model for such sensors.
+
+        Raises `ConfigError` if nothing is added or both a model and signals are named,
+        `QuestionError` for a signal that enters the model through a feature, and what `Fleet.model`
+        raises.
+        """
+        from fleet_slip.catalogue.signals import catalogue
+        from fleet_slip.models.counts_model import counts_model
+        from fleet_slip.regression.exact import fit
+        from fleet_slip.selection.what_if import what_if
+
+        if not noise and not bias:
+            raise ConfigError("say what is added: --noise ay=0.2 or --bias yaw_rate=0.02.")
+        examined = self._examined(model, signals, features)
+        cohort = self._load(examined.feature_set)
+        if examined.version is not None:
+            one = counts_model(examined.version.manifest)
+        else:
+            inputs = examined.inputs(cohort)
+            one = fit(cohort.serving(inputs).table.total(), inputs, catalogue().label).model
+        return what_if(cohort, one, bias=bias or {}, noise=noise or {})
+
+    def regimes(
+        self,
+        signals: str | None = None,
+        *,
+        over: Sequence[str] = (),
+        features: str = "regimes",
+        by: "FoldKey" = "drive",
+        folds: int | str | None = None,
+    ) -> "RegimeComparison":
+        """Return a model's error by speed and lateral acceleration, and whether to split it there.
+
+        One model for all rows is cross-validated against one for each regime. `signals` are inputs
+        separated by commas, by default all; `over` the regimes to divide by, by default all of the
+        feature set `features`, whose Gram rows `fleet.gram("regimes")` makes.
+
+        Raises `DataError` for a feature set without such regimes.
+        """
+        from fleet_slip.selection.regimes import compare_regimes
+        from fleet_slip.selection.request import WHOLE_SET, inputs_of
+
+        folding, cohort = _folding(by, folds), self._load(features)
+        inputs = inputs_of(cohort, signals or WHOLE_SET)
+        return compare_regimes(cohort, inputs, folding, over)
+
+    def shrink(
+        self,
+        signals: str | None = None,
+        *,
+        features: str = "signals",
+        by: "FoldKey" = "drive",
+        folds: int | str | None = None,
+        naive: bool = False,
+    ) -> "tuple[Shrunk, ...]":
+        """Compare least squares with ridge, lasso, James-Stein and Pace regression.
+
+        Penalties are chosen by cross-validation inside each training fold. `signals` are inputs of
+        the feature set `features` separated by commas, by default all; with `naive` rows are
+        independent evidence, not drives.
+        """
+        from fleet_slip.selection.request import WHOLE_SET, inputs_of
+        from fleet_slip.selection.shrinkage import compare_shrinkage
+
+        folding, cohort = _folding(by, folds), self._load(features)
+        inputs = inputs_of(cohort, signals or WHOLE_SET)
+        return compare_shrinkage(cohort, inputs, folding, naive=naive)
+
+    def _load(self, feature_set: str, condition: str | None = None) -> "Cohort":
+        from fleet_slip.grams.cohort import load_cohort
+
+        return load_cohort(self.warehouse, condition or self.condition, feature_set)
+
+    def _examined(
+        self, model: "str | ModelVersion | None", signals: str | None, features: str | None
+    ) -> "Examined":
+        from fleet_slip.api.subject import subject_of
+        from fleet_slip.models.versions import Registry
+
+        return subject_of(Registry(self.root / "models"), model, signals, features)
+
+
+def _folding(by: "FoldKey", count: int | str | None) -> "Folding":
+    from fleet_slip.grams.folding import Folding, make_folding
+
+    return Folding(by=by) if count is None else make_folding(by, count)

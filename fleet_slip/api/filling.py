@@ -1,0 +1,170 @@
+"""The part of a `Fleet` that fills the warehouse: logs, and Gram rows made of them."""
+
+from collections.abc import Callable, Iterable
+from datetime import date
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fleet_slip.api.calls import (
+    ShowProgress,
+    Workers,
+    count_from_start,
+    open_workers,
+    record_call,
+    unless_local,
+    within_reach,
+)
+from fleet_slip.api.root import Rooted
+from fleet_slip.runs.log import step
+
+if TYPE_CHECKING:
+    from fleet_slip.grams.check import CheckReport
+    from fleet_slip.grams.job import GramReport
+    from fleet_slip.ingest.job import IngestReport
+    from fleet_slip.ingest.mapping import Mapping
+    from fleet_slip.maintenance.migration import MigrationReport
+    from fleet_slip.simulation.campaign import Campaign
+    from fleet_slip.simulation.job import SimulationReport
+
+
+class Filling(Rooted):
+    """Simulated and measured logs, and Gram rows. Whatever was done is not done again."""
+
+    @record_call
+    def simulate(
+        self,
+        campaign: "str | Campaign",
+        *,
+        days: int | None = None,
+        through: date | None = None,
+        workers: Workers = None,
+        progress: ShowProgress | None = None,
+    ) -> "SimulationReport":
+        """Simulate what is missing of a campaign and write it to the logs.
+
+        `campaign` is the name of one that ships, the path of a TOML file, or a `Campaign`. Of its
+        days the first `days` are simulated, up to the day `through`. Progress is in rows.
+
+        Raises `ConfigError` for a campaign that is not valid or has no such days, `RefusedError`
+        for one that was changed since its drives were written, and `ClusterError`.
+        """
+        from fleet_slip.simulation.campaign import load_campaign
+        from fleet_slip.simulation.job import simulate_campaign
+
+        chosen = load_campaign(campaign) if isinstance(campaign, str) else campaign
+        wanted = chosen.chosen_days(days, through)
+        with open_workers(self.root, workers) as executor, step("simulate") as figures:
+            report = simulate_campaign(
+                within_reach(self.warehouse, executor),
+                chosen,
+                wanted,
+                executor,
+                count_from_start(progress),
+            )
+            figures.rows, figures.size_bytes = report.rows, report.size_bytes
+        return report
+
+    @record_call
+    def ingest(
+        self,
+        files: Iterable[Path | str] | Path | str,
+        mapping: "str | Mapping",
+        *,
+        workers: Workers = None,
+        each: "Callable[[IngestReport], None] | None" = None,
+        progress: ShowProgress | None = None,
+    ) -> "list[IngestReport]":
+        """Bring measured CSV or Parquet files in through a mapping of columns, units and axes.
+
+        `mapping` is the name of one that ships, the path of a TOML file, or a `Mapping`. Rows that
+        cannot be used go to the view `quarantine` with a reason. Returns a report of each file, in
+        the order given; `each` is called with it once the file is committed. Progress is in files.
+        Without a cluster the files are read one after the other.
+
+        Raises `ConfigError` for a mapping that is not valid and `InputError` for a file that cannot
+        be read, of which then nothing is written; `StorageError` and `ClusterError`.
+        """
+        from fleet_slip.ingest.job import ingest_files
+        from fleet_slip.ingest.mapping import load_mapping
+
+        plan = load_mapping(mapping) if isinstance(mapping, str) else mapping
+        paths = [Path(files)] if isinstance(files, Path | str) else [Path(file) for file in files]
+        told = count_from_start(progress)
+        reports = {}
+        with open_workers(self.root, workers) as executor, step("ingest") as figures:
+            elsewhere = unless_local(executor)
+            if elsewhere:  # a worker has a working directory of its own
+                paths = [path.absolute() for path in paths]
+            figures.rows = 0
+            warehouse = within_reach(self.warehouse, executor)
+            for report in ingest_files(warehouse, paths, plan, elsewhere):
+                reports[report.file] = report
+                figures.rows += report.counts.ticks if report.new else 0
+                if each is not None:
+                    each(report)
+                told(1, len(paths))
+        return [reports[str(path)] for path in paths]
+
+    @record_call
+    def gram(
+        self,
+        features: str = "signals",
+        *,
+        cohort: str | None = None,
+        workers: Workers = None,
+        progress: ShowProgress | None = None,
+    ) -> "GramReport":
+        """Reduce new log files to Gram rows, and drop the rows of files that are gone.
+
+        `features` is a feature set of `configs/features.toml`; `signals` is the logged signals
+        themselves. A set that is asked for the first time costs one pass over the logs; from then
+        on only new files are read. With a `cohort`, an SQL condition on the view `drives`, only
+        files are read that have a drive of it, as the Gram rows of `signals` tell. Progress is in
+        rows.
+
+        Raises `QuestionError` for an unknown set, `StorageError`, `ConflictError` and
+        `ClusterError`.
+        """
+        from fleet_slip.grams.job import update_grams
+        from fleet_slip.grams.reader import cohort_files
+        from fleet_slip.warehouse.condition import parse_condition
+
+        among = cohort_files(self.warehouse, parse_condition(cohort)) if cohort else None
+        with open_workers(self.root, workers) as executor, step("gram") as figures:
+            report = update_grams(
+                within_reach(self.warehouse, executor),
+                count_from_start(progress),
+                features,
+                unless_local(executor),
+                among,
+            )
+            figures.rows = report.rows_read
+        return report
+
+    def check(self, files: int = 4, *, progress: ShowProgress | None = None) -> "CheckReport":
+        """Compute the Gram rows of some log files three ways and compare them, bit for bit.
+
+        By the SQL statement, by float64 matrix products in which every partial sum is an exact
+        integer, and by Python integers; and with the stored rows. Progress is in files.
+
+        Raises `StorageError` naming the first drive whose Gram rows differ, and `DataError` if
+        there is nothing to check.
+        """
+        from fleet_slip.grams.check import check_grams
+
+        return check_grams(self.warehouse, files, count_from_start(progress))
+
+    @record_call
+    def migrate(self, *, progress: ShowProgress | None = None) -> "MigrationReport":
+        """Bring the logs to the signal catalogue: add columns, convert counts to other scales.
+
+        See `docs/operations.md` before widening a scale. Progress is in rows.
+
+        Raises `RefusedError` if counts would not fit a new scale, and `ConflictError`.
+        """
+        from fleet_slip.maintenance.migration import migrate
+
+        with step("migrate") as figures:
+            report = migrate(self.warehouse, count_from_start(progress))
+            figures.rows = report.rows_rewritten
+        return report

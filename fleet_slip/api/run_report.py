@@ -1,0 +1,48 @@
+"""What `Fleet.run` did."""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from fleet_slip.grams.job import GramReport
+from fleet_slip.models.publish import Publication
+from fleet_slip.selection.request import RequestedSelection
+from fleet_slip.simulation.job import SimulationReport
+
+
+@dataclass(frozen=True)
+class RunReport:
+    """The report of each step.
+
+    `gram_features` is of the feature set of the model list, if that is not the logged signals.
+    There is no publication where it was refused, with the reason.
+    """
+
+    campaign: str
+    simulation: SimulationReport
+    gram: GramReport
+    gram_features: GramReport | None
+    selection: RequestedSelection
+    publication: Publication | None
+    refusal: str
+    seconds: float
+
+    @property
+    def changed(self) -> bool:
+        """Whether there was anything to do."""
+        published = self.publication is not None and self.publication.new
+        steps = (self.simulation, self.gram, self.gram_features)
+        return published or any(one.changed for one in steps if one)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `run --json` prints."""
+        refused = {"new": False, "reason": self.refusal}
+        return {
+            "campaign": self.campaign,
+            "changed": self.changed,
+            "simulate": asdict(self.simulation),
+            "gram": asdict(self.gram),
+            **({"gram_features": asdict(self.gram_features)} if self.gram_features else {}),
+            "select": self.selection.as_dict(),
+            "publish": self.publication.as_dict() if self.publication else refused,
+            "seconds": self.seconds,
+        }

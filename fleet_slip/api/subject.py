@@ -1,0 +1,56 @@
+"""What is examined: a published model, or signals that are named."""
+
+from dataclasses import dataclass
+
+from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.errors import ConfigError, QuestionError
+from fleet_slip.grams.cohort import Cohort
+from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.models.versions import Registry
+from fleet_slip.selection.request import WHOLE_SET, inputs_of
+
+
+@dataclass(frozen=True)
+class Examined:
+    """The inputs of a published model, or named ones."""
+
+    feature_set: str
+    named: str | None
+    version: ModelVersion | None
+
+    def inputs(self, cohort: Cohort) -> tuple[str, ...]:
+        """Return the inputs; all that the cohort has, if that was asked for."""
+        if self.version is not None:
+            return self.version.manifest.signals
+        return inputs_of(cohort, self.named or WHOLE_SET)
+
+
+def subject_of(
+    registry: Registry,
+    model: str | ModelVersion | None,
+    signals: str | None,
+    feature_set: str | None,
+) -> Examined:
+    """Return what is to be examined; by default the only model that there is.
+
+    Raises `ConfigError` if a model and signals are named.
+    """
+    if signals is not None or feature_set is not None:
+        if model is not None:
+            raise ConfigError("name a published model or --signals (of --features), not both.")
+        return Examined(feature_set or PLAIN, signals, None)
+    version = (
+        model
+        if isinstance(model, ModelVersion)
+        else registry.resolve(model or _only_model(registry))
+    )
+    identity = version.manifest.trained_on.feature_set
+    return Examined(features().name_of(identity), None, version)
+
+
+def _only_model(registry: Registry) -> str:
+    names = registry.names()
+    if len(names) == 1:
+        return names[0]
+    known = ", ".join(names) or "none"
+    raise QuestionError(f"name a published model, or --signals. Published: {known}.")

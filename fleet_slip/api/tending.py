@@ -1,0 +1,220 @@
+"""The part of a `Fleet` that watches the warehouse and looks after it."""
+
+from collections.abc import Sequence
+from datetime import date
+from typing import TYPE_CHECKING
+
+from fleet_slip.api.calls import (
+    ShowProgress,
+    Workers,
+    count_from_start,
+    open_workers,
+    record_call,
+    unless_local,
+    within_reach,
+)
+from fleet_slip.api.serving import Serving
+from fleet_slip.catalogue.sources import TRAINING_DRIVES
+from fleet_slip.errors import ConfigError, QuestionError, RefusedError
+from fleet_slip.runs.log import step
+
+if TYPE_CHECKING:
+    from fleet_slip.maintenance.compaction import CompactionReport
+    from fleet_slip.maintenance.forget import ForgetReport
+    from fleet_slip.maintenance.retention import RetentionReport
+    from fleet_slip.maintenance.vacuum import VacuumReport
+    from fleet_slip.maintenance.verification import Verification
+    from fleet_slip.models.model_version import ModelVersion
+    from fleet_slip.monitoring.monitor import Chart
+    from fleet_slip.monitoring.quality import QualityReport
+    from fleet_slip.monitoring.status import Status
+    from fleet_slip.warehouse.audit import Forgettable
+
+
+class Tending(Serving):
+    """Health, quality and drift; checking, compacting and forgetting.
+
+    Nothing here raises `AlarmError` or `DamageError`: the answers say what calls for attention.
+    """
+
+    def status(self, max_age_hours: float | None = None) -> "Status":
+        """Return the warehouse's health: freshness, backlog, last runs, disk, champions.
+
+        Data, or a backlog, older than `max_age_hours` is among its `problems`. Raises
+        `StorageError` without a data root.
+        """
+        from fleet_slip.monitoring.status import status_of
+
+        return status_of(self.warehouse, max_age_hours)
+
+    def quality(self, cohort: str = TRAINING_DRIVES) -> "QualityReport":
+        """Find stuck, saturated, biased, noisy, scaled, reversed and swapped sensors by drive.
+
+        `cohort` is an SQL condition on the view `drives`: which drives to compare with each other.
+        Reads Gram rows only. The `findings` are the drives that are not in order. Raises what
+        `FleetCohort` raises.
+        """
+        from fleet_slip.monitoring.quality import examine_drives
+
+        return examine_drives(self.warehouse, cohort)
+
+    def monitor(
+        self,
+        model: "str | ModelVersion",
+        cohort: str | None = None,
+        *,
+        since: date | None = None,
+    ) -> "Chart":
+        """Chart a model's error on each day since it was trained, with control limits, in degrees.
+
+        `cohort` is an SQL condition on the view `drives`, by default that of its training. `since`
+        is the first new day, by default the one after the days that it was trained on. Reads Gram
+        rows only. The `alarms` are the new days beyond the limits. Raises `DataError` if there are
+        too few training days, and what `Fleet.model` raises.
+        """
+        from fleet_slip.monitoring.monitor import monitor
+
+        return monitor(self.warehouse, self.resolve(model), cohort, since)
+
+    def verify(
+        self,
+        *,
+        full: bool = False,
+        workers: Workers = None,
+        progress: ShowProgress | None = None,
+    ) -> "Verification":
+        """Verify every byte against its checksum, and everything against everything else.
+
+        `full` computes the Gram rows of all log files again. Progress is in bytes. The `damage` of
+        the answer is what is wrong. Raises `StorageError` without a data root, and `ClusterError`.
+        """
+        from fleet_slip.maintenance.verify import verify
+
+        with open_workers(self.root, workers) as executor:
+            return verify(
+                within_reach(self.warehouse, executor),
+                full=full,
+                progress=count_from_start(progress),
+                executor=unless_local(executor),
+            )
+
+    @record_call
+    def repair(self, found: "Verification", campaigns: Sequence[str] = ()) -> list[str]:
+        """Rebuild what `verify` found damaged: Gram rows from logs, simulated logs from campaigns.
+
+        `campaigns` names campaign files besides those that ship. Returns the paths that were
+        rebuilt, below the data root; verify again to see what is left.
+        """
+        from fleet_slip.maintenance.repair import repair
+
+        return repair(self.warehouse, found, campaigns)
+
+    @record_call
+    def compact(
+        self, target_rows: int | None = None, *, progress: ShowProgress | None = None
+    ) -> "CompactionReport":
+        """Turn the small log files of each day into large ones, of `target_rows` or fewer.
+
+        Readers and jobs are not disturbed. Progress is in days. Raises `StorageError`, and
+        `ConflictError` if other processes keep changing the same files.
+        """
+        from fleet_slip.maintenance.compaction import TARGET_ROWS, compact
+
+        told = count_from_start(progress)
+        with step("compact") as figures:
+            report = compact(self.warehouse, target_rows or TARGET_ROWS, told)
+            figures.rows, figures.size_bytes = report.rows_rewritten, report.size_bytes_after
+        return report
+
+    @record_call
+    def vacuum(
+        self, retention_hours: float | None = None, *, dry_run: bool = False
+    ) -> "VacuumReport":
+        """Remove replaced files and leftovers of killed jobs when they are old enough.
+
+        What a version of the last `retention_hours` refers to is kept, by default of a week. With
+        `dry_run` nothing is removed. Raises `StorageError`.
+        """
+        from fleet_slip.maintenance.vacuum import RETENTION_HOURS, preview_vacuum, vacuum
+
+        hours = RETENTION_HOURS if retention_hours is None else retention_hours
+        with step("vacuum") as figures:
+            report = (preview_vacuum if dry_run else vacuum)(self.warehouse, hours)
+            figures.size_bytes = report.size_bytes
+        return report
+
+    @record_call
+    def forget(
+        self,
+        *,
+        vehicle: str | None = None,
+        drive: str | None = None,
+        now: bool = False,
+        progress: ShowProgress | None = None,
+    ) -> "ForgetReport":
+        """Forget a vehicle or a drive in logs, Gram rows and quarantine; mark its models.
+
+        No job brings it back, nor one that is under way: its rows are left out, until `allow`.
+        With `now` the old files are deleted at once, not when vacuum is due; while anything
+        is `pending` in the report, repeat it. Progress is in files.
+
+        Raises `ConfigError` unless one of `vehicle` and `drive` is given, `QuestionError` if there
+        never was such a drive, `StorageError` and `ConflictError`.
+        """
+        from fleet_slip.maintenance.forget import forget
+
+        subject = _forgettable(vehicle, drive)
+        told = count_from_start(progress)
+        with step("forget") as figures:
+            report = forget(self.warehouse, subject, now=now, progress=told)
+            figures.rows = report.rows
+        return report
+
+    @record_call
+    def allow(self, *, vehicle: str | None = None, drive: str | None = None) -> bool:
+        """Let a forgotten vehicle or drive come back: land its new rows again from now on.
+
+        What was forgotten stays forgotten. Returns whether that is new. Raises `ConfigError` unless
+        one of `vehicle` and `drive` is given, `QuestionError` if it was never forgotten, and
+        `RefusedError` while it is being forgotten.
+        """
+        from fleet_slip.warehouse.audit import ALLOWED, Audit
+
+        subject, audit = _forgettable(vehicle, drive), Audit(self.root)
+        self.warehouse.require()
+        state = audit.state(subject)
+        if state is None:
+            raise QuestionError(f"{subject.kind} {subject.value!r} was never forgotten.")
+        if state == "begun":
+            raise RefusedError(
+                f"{subject.kind} {subject.value!r} is being forgotten. Give the command that "
+                "forgets it again, until it is done; then allow it."
+            )
+        if state != ALLOWED:
+            audit.allow(subject)
+        return state != ALLOWED
+
+    @record_call
+    def retain(
+        self, config: str | None = None, *, progress: ShowProgress | None = None
+    ) -> "RetentionReport":
+        """Forget drives that are older than a retention says, then vacuum.
+
+        `config` is the path of a retention file, by default the one that ships. Progress is in
+        files. Raises `RefusedError` if no drive would be left, and what `forget` raises.
+        """
+        from fleet_slip.maintenance.retention import load_retention, retain
+
+        told = count_from_start(progress)
+        with step("retain") as figures:
+            report = retain(self.warehouse, load_retention(config), date.today(), told)
+            figures.rows, figures.size_bytes = report.forgotten.rows, report.vacuumed.size_bytes
+        return report
+
+
+def _forgettable(vehicle: str | None, drive: str | None) -> "Forgettable":
+    from fleet_slip.warehouse.audit import Forgettable
+
+    if (vehicle is None) == (drive is None):
+        raise ConfigError("give one of vehicle and drive.")
+    return Forgettable("drive", drive) if drive else Forgettable("vehicle", vehicle or "")

@@ -1,0 +1,132 @@
+"""Options that several commands share: those of a selection, as one parameter of a command."""
+
+import functools
+import inspect
+from collections.abc import Callable, Collection
+from dataclasses import fields
+from typing import Annotated, Any, TypeVar
+
+import typer
+
+from fleet_slip.regression.criteria import CRITERIA
+from fleet_slip.regression.ranking import RANKINGS
+from fleet_slip.regression.stepwise import METHODS
+from fleet_slip.selection.model_list import DEFAULT_MOST
+from fleet_slip.selection.request import DEFAULT_MODELS, SelectionRequest
+
+R = TypeVar("R")
+
+SELECTION: dict[str, Any] = {
+    "cohort": typer.Option(
+        help="SQL condition on the view drives, such as \"track = 'waterford_hills'\"."
+    ),
+    "models": typer.Option(
+        help=f"A model list of configs/models, or a TOML file. Default: {DEFAULT_MODELS}, unless "
+        "--nested or an option that searches is given.",
+        show_default=False,
+    ),
+    "nested": typer.Option(
+        help="Add the nested models of an order of signals, separated by commas; 'catalogue' is "
+        "all inputs in the order of configs/signals.toml."
+    ),
+    "features": typer.Option(
+        help="Feature set of configs/features.toml, computed before with: fleet-slip gram "
+        "--features NAME. Default: what the list says, else the logged signals."
+    ),
+    "by": typer.Option(
+        help="What a fold is made of. Default: what the list says. By row is WEKA's way and leaks."
+    ),
+    "folds": typer.Option(
+        "--folds",
+        metavar="NUMBER|each",
+        help="Number of folds, or each: every drive, or whatever folds are made of, is a fold of "
+        "its own. Default: what the list says.",
+    ),
+    "rank": typer.Option(
+        help=f"Rank the inputs of --nested first: {', '.join(RANKINGS)}. Default: declared.",
+        show_default=False,
+    ),
+    "criterion": typer.Option(
+        help="What decides how many of the ranked inputs are kept: cv (the smallest model that "
+        f"falls negligibly short of the best; see --worth), {', '.join(CRITERIA)}. Default: cv.",
+        show_default=False,
+    ),
+    "worth": typer.Option(
+        "--worth",
+        help="The smallest gain in RMSE that is worth a signal, such as 0.005deg or 2%. Of the "
+        "models that fall less short of the best, or by no more than one standard error of the "
+        "difference, that with the fewest signals wins.",
+    ),
+    "all_subsets": typer.Option(
+        "--all-subsets", help="Search all subsets of the inputs of --nested instead of an order."
+    ),
+    "naive": typer.Option(
+        "--naive",
+        help="Take rows for independent evidence, not drives. At 100 Hz they are not: then every "
+        "criterion keeps nearly everything.",
+    ),
+    "search": typer.Option(
+        "--search",
+        help=f"Search among the inputs of --nested, or all: {', '.join(METHODS)}; the search is "
+        "made again in every fold. Adds its models of 1, 2, ... columns.",
+        show_default=False,
+    ),
+    "most": typer.Option(
+        min=1, max=200, help=f"Most columns of --search. Default: {DEFAULT_MOST}."
+    ),
+    "repeat": typer.Option(
+        min=2, help="Cross-validate the winner again with so many other deals of folds."
+    ),
+    "bootstrap": typer.Option(
+        min=100,
+        help="Confidence interval of the winner's correlation by drawing the drives so many times.",
+    ),
+}
+"""The option of each field of `SelectionRequest`, which has their types and defaults."""
+
+TEXTS = {"folds": str | None}
+"""Fields that may be a number or a word: on the command line they are text."""
+
+RESAMPLING = ("repeat", "bootstrap")
+"""Fields that tell more of a winner and choose none."""
+
+Cohort = Annotated[str, SELECTION["cohort"]]
+FoldCount = Annotated[str | None, SELECTION["folds"]]
+Worth = Annotated[str, SELECTION["worth"]]
+Naive = Annotated[bool, SELECTION["naive"]]
+
+
+def selection_options(
+    *, without: Collection[str] = ()
+) -> Callable[[Callable[..., R]], Callable[..., R]]:
+    """Give a command the options of a selection in place of its parameter `SelectionRequest`."""
+    given = [
+        inspect.Parameter(
+            field.name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=field.default,
+            annotation=Annotated[TEXTS.get(field.name, field.type), SELECTION[field.name]],
+        )
+        for field in fields(SelectionRequest)
+        if field.name not in without
+    ]
+
+    def expand(command: Callable[..., R]) -> Callable[..., R]:
+        own = inspect.signature(command).parameters.values()
+        request = next(one.name for one in own if one.annotation is SelectionRequest)
+        parameters = [
+            each.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+            for one in own
+            for each in (given if one.name == request else [one])
+        ]
+
+        @functools.wraps(command)
+        def run(**values: Any) -> R:
+            chosen = {one.name: values.pop(one.name) for one in given}
+            return command(**values, **{request: SelectionRequest(**chosen)})
+
+        run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        run.__annotations__ = {one.name: one.annotation for one in parameters}
+        return run
+
+    return expand

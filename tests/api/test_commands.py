@@ -1,0 +1,239 @@
+"""What commands do, done in Python: on a folder and on an object store, with the same bits."""
+
+import json
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from datetime import date
+from pathlib import Path
+
+import pytest
+
+import fleet_slip
+from fleet_slip import Fleet
+from fleet_slip.errors import ConfigError, DataError, QuestionError, RefusedError
+from fleet_slip.files.folder import Folder
+from fleet_slip.models.manifest import Manifest
+from tests.support.commands import start
+from tests.support.s3_server import forget_clients
+
+DAY = date(2024, 5, 1)
+REPOSITORY = Path(__file__).parents[2]
+SERVER = """
+import json, sys
+from tests.support.s3_server import Server
+server = Server()
+print(json.dumps({"environment": server.environment, "bucket": server.bucket()}), flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.fixture(scope="module", params=["folder", "object store"])
+def filled(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Fleet]:
+    """One day of the campaign `smoke`, made by calls."""
+    with pytest.MonkeyPatch.context() as patch:
+        if request.param == "folder":
+            yield _fill(fleet_slip.open(tmp_path_factory.mktemp("calls") / "data"))
+            return
+        # In a process of its own: calls of the Delta library hold the interpreter while they wait.
+        with start([sys.executable, "-c", SERVER], stdin=subprocess.PIPE, cwd=REPOSITORY) as server:
+            assert server.stdout
+            told = json.loads(server.stdout.readline())
+            for name, value in told["environment"].items():
+                patch.setenv(name, value)
+            forget_clients()
+            yield _fill(fleet_slip.open(f"{told['bucket']}/data"))
+            server.kill()
+        forget_clients()
+
+
+def _fill(fleet: Fleet) -> Fleet:
+    seen: list[tuple[int, int]] = []
+    report = fleet.simulate(
+        "smoke", through=DAY, workers=2, progress=lambda done, total: seen.append((done, total))
+    )
+    assert report.changed
+    assert seen == sorted(seen)
+    assert seen[-1][0] == report.rows
+    assert not fleet.simulate("smoke", days=1).changed
+    with ThreadPoolExecutor(2) as executor:
+        assert fleet.gram(workers=executor).rows_read == report.rows
+    return fleet
+
+
+def test_a_notebook_does_what_the_command_line_does(filled: Fleet) -> None:
+    cohort = filled.cohort("adhesion > 0.9")
+    selection = cohort.select(models="table1", folds=3)
+    publication = filled.publish("dry", selection)
+    assert publication.new
+    assert publication.version.manifest.trained_on.cohort == "adhesion > 0.9"
+    assert not filled.publish("dry", selection).new
+    log = filled.sql("FROM log").pl()
+    angles = filled.model("dry").predict(log)
+    error = (angles - log["sideslip_rad"]).to_numpy()
+    score = filled.score("dry")
+    assert score.rows == len(error)
+    assert abs(error).max() == pytest.approx(score.error_max_deg * 3.14159265 / 180, rel=1e-6)
+    assert filled.check().drives == 4
+    assert filled.status().tables["logs"].rows == log.height
+    assert not filled.verify().damage
+    assert not filled.quality().findings
+    assert filled.vacuum(dry_run=True).dry_run
+
+
+def test_a_call_that_changes_the_warehouse_is_in_the_history_of_runs(filled: Fleet) -> None:
+    runs = filled.sql(
+        "SELECT command, arguments, outcome, steps FROM runs ORDER BY started_at"
+    ).pl()
+    first = runs.row(0, named=True)
+    assert (first["command"], first["outcome"]) == ("simulate", "done")
+    assert first["arguments"] == ["smoke", "--through=2024-05-01", "--workers=2"]
+    assert [step["name"] for step in first["steps"]] == ["simulate"]
+    assert "check" not in set(runs["command"])
+
+
+def test_only_what_the_history_may_keep_is_kept(fleet: Fleet, tmp_path: Path) -> None:
+    vehicle = "WVWZZZ1JZXW000001"
+    own = fleet_slip.open(tmp_path / "own")
+    own.simulate("smoke", days=1)
+    own.gram()
+    with pytest.raises(QuestionError):
+        own.forget(vehicle=vehicle)
+    history = [file for file in (tmp_path / "own/runs").iterdir() if file.suffix == ".jsonl"]
+    text = "".join(file.read_text() for file in history)
+    assert "forget" in text
+    assert vehicle not in text
+
+
+def test_running_twice_does_nothing_twice(tmp_path: Path) -> None:
+    fleet = fleet_slip.open(tmp_path / "data")
+    steps: list[str] = []
+    first = fleet.run("smoke", days=1, progress=lambda step, *_: steps.append(step))
+    assert first.changed
+    assert first.publication
+    assert first.publication.new
+    assert {*steps} >= {"simulate", "gram"}
+    second = fleet.run("smoke", days=1)
+    assert not second.changed
+    assert second.publication
+    assert second.publication.version == first.publication.version
+    assert fleet.sql("SELECT command FROM runs").fetchall() == [("run",), ("run",)]
+
+
+def test_a_worse_model_is_refused_and_aliases_move(fleet: Fleet, tmp_path: Path) -> None:
+    own = fleet_slip.open(tmp_path / "data")
+    own.simulate("smoke")
+    own.gram()
+    own.publish("slip", own.cohort())
+    with pytest.raises(RefusedError, match="worse than the champion"):
+        own.publish("slip", own.cohort().select(nested="ax"))
+    forced = own.publish("slip", own.cohort().select(nested="ax"), force=True)
+    assert own.model("slip") == forced.version
+    assert own.rollback("slip").version == 1
+    assert own.promote("slip@2", "candidate").reference == "slip@2"
+    assert own.model("slip@candidate").version == 2
+    with pytest.raises(ConfigError, match="cannot be the name"):
+        own.promote("slip@2", "Not A Name")
+
+
+def test_a_cohort_answers_from_gram_rows(fleet: Fleet) -> None:
+    cohort = fleet.cohort("speed_factor < 0.95")
+    assert "speed_factor" in repr(cohort)
+    diagnosis = cohort.diagnose("bent")
+    assert diagnosis.fitted.model.signals == fleet.model("bent").manifest.signals
+    assert cohort.diagnose(fleet.model("bent")).drives == diagnosis.drives
+    worse = cohort.what_if(signals="ay,yaw_rate,steering_wheel", noise={"ay": 0.5})
+    assert worse.after.error_std_deg > worse.before.error_std_deg
+    found = cohort.shrink("ay,yaw_rate,steering_wheel", folds=3)
+    assert found[0].cross_validation.name == "least squares"
+    subset = cohort.select(nested="ay,yaw_rate", all_subsets=True, criterion="bic", bootstrap=100)
+    assert subset.uncertainty
+    with pytest.raises(ConfigError, match="say what is added"):
+        cohort.what_if("smoke")
+    with pytest.raises(ConfigError, match="not both"):
+        cohort.diagnose("bent", signals="ay")
+    with pytest.raises(QuestionError, match="name a published model"):
+        cohort.diagnose()
+    with pytest.raises(DataError, match="no drive satisfies"):
+        fleet.cohort("mass_kg > 1e6").select()
+    with pytest.raises(QuestionError, match="no_such_column"):
+        fleet.cohort("no_such_column > 1").select()
+
+
+def test_a_campaign_without_such_days_is_refused(fleet: Fleet) -> None:
+    for wrong in ({"days": 0}, {"days": -1}, {"through": date(1999, 1, 1)}):
+        with pytest.raises(ConfigError, match="smoke lasts from 2024-05-01 to 2024-05-02"):
+            fleet.simulate("smoke", **wrong)
+
+
+def test_measured_files_are_ingested_and_reported_in_their_order(tmp_path: Path) -> None:
+    fleet = fleet_slip.open(tmp_path / "data")
+    files, mapping = _measured(tmp_path)
+    each: list[str] = []
+    seen: list[tuple[int, int]] = []
+    reports = fleet.ingest(
+        files,
+        mapping,
+        each=lambda report: each.append(report.file),
+        progress=lambda done, total: seen.append((done, total)),
+    )
+    assert [report.file for report in reports] == each == [str(file) for file in files]
+    assert all(report.new for report in reports)
+    assert seen == [(1, 2), (2, 2)]
+    (again,) = fleet.ingest(str(files[0]), mapping)
+    assert not again.new
+    ((arguments,),) = fleet.sql("SELECT arguments FROM runs LIMIT 1").fetchall()
+    assert str(files[0]) not in arguments
+
+
+def _measured(folder: Path) -> tuple[list[Path], str]:
+    mapping = folder / "bench.toml"
+    mapping.write_text(
+        """
+        name = "bench"
+        [time]
+        column = "t"
+        unit = "s"
+        [drive]
+        vehicle_id = "bench-1"
+        vehicle_model = "bench"
+        day = 2024-05-01
+        [signals.ay]
+        column = "ay"
+        unit = "m/s^2"
+        """
+    )
+    files = [folder / f"{name}.csv" for name in ("b", "a")]
+    for number, file in enumerate(files):
+        rows = "\n".join(f"{tick / 100:.2f},{number + tick / 1000}" for tick in range(300))
+        file.write_text(f"t,ay\n{rows}\n")
+    return files, str(mapping)
+
+
+def test_two_threads_publish_one_model(tmp_path: Path) -> None:
+    fleet = fleet_slip.open(tmp_path / "data")
+    fleet.run("smoke", days=1)
+    selection = fleet.cohort().select()
+    made: list[object] = []
+    threads = [
+        threading.Thread(target=lambda: made.append(fleet.publish("slip", selection)))
+        for _ in range(2)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(120)
+    assert len(made) == 2
+    assert fleet.models("slip").num_rows == 1
+
+
+def test_a_manifest_names_the_columns_of_todays_catalogue(fleet: Fleet) -> None:
+    manifest: Manifest = fleet.model("bent").manifest
+    log = {name for name, *_ in fleet.sql("DESCRIBE log").fetchall()}
+    assert {*manifest.columns} <= log
+    folder: Folder = fleet.root
+    assert folder.exists()
