@@ -31,7 +31,7 @@ TESTED_BY = {
     "regression": ["tests/regression"],
     "grams": ["tests/grams", "tests/catalogue/test_features.py", "tests/warehouse"],
     "delta": ["tests/delta"],
-    "ingest": ["tests/ingest"],
+    "ingest": ["tests/ingest", "tests/environment/test_hostile_names.py"],
 }
 PARTS = (
     "benchmarks",

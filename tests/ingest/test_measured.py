@@ -346,6 +346,18 @@ def test_every_row_is_kept_or_quarantined(
     assert keys == sorted(set(keys))
 
 
+@pytest.mark.parametrize(
+    ("day", "kept"),
+    [("1969-12-31", False), ("1970-01-01", True), ("2199-12-31", True), ("2200-01-01", False)],
+)
+def test_days_of_two_centuries_are_kept(tmp_path: Path, day: str, kept: bool) -> None:
+    good = good_columns(20)
+    columns = {**good, "d": ["2024-05-31"] * 10 + [day] * 10}
+    log = read_columns(tmp_path, columns, a_mapping(drive={"day": {"column": "d"}}))
+    assert log.counts.quarantined == ({} if kept else {"out_of_range": 10})
+    assert (date.fromisoformat(day) in log.drives["day"].to_pylist()) is kept
+
+
 def test_the_worked_example_of_the_docs(tmp_path: Path) -> None:
     text = (Path(__file__).parents[2] / "docs" / "ingest.md").read_text(encoding="utf-8")
     log_text, mapping_text = (block.partition("\n")[2] for block in text.split("```")[1:4:2])

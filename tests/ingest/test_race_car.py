@@ -60,6 +60,8 @@ def test_a_log_without_wheel_speeds_gives_its_model_through_the_shipped_mapping(
         20_000,
         1,
     )
+    again = ingest_file(warehouse, file, load_mapping("race_car_250lm"))
+    assert [(one.new, one.drives_forgotten) for one in (report, again)] == [(True, 0), (False, 0)]
     update_grams(warehouse)
     with connect(warehouse.root) as database:
         answer = database.sql("SELECT vehicle_id, mass_kg, adhesion, rows FROM drives").fetchall()
