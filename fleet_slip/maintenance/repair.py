@@ -73,7 +73,8 @@ def _find_elsewhere(warehouse: Warehouse, damaged: Collection[str]) -> list[str]
     rebuilt = []
     for table in warehouse.tables:
         name = table.folder.name
-        lost = [file for file in table.snapshot().files if f"{name}/{file.path}" in damaged]
+        files = table.snapshot(unchecked=True).files
+        lost = [file for file in files if f"{name}/{file.path}" in damaged]
         sizes = {file.size_bytes for file in lost}
         for other in table.folder.files() if lost else ():
             if other.size_bytes not in sizes or other.path.startswith("_delta_log/"):
