@@ -15,6 +15,7 @@ from fleet_slip.grams.backlog import find_backlog
 from fleet_slip.models.versions import Registry
 from fleet_slip.monitoring.thresholds import StatusThresholds, thresholds
 from fleet_slip.resources import read_sql
+from fleet_slip.runs.anchors import find_missing_documents
 from fleet_slip.runs.history import lend_runs, run_source, state_of
 from fleet_slip.warehouse.database import database_errors, open_database
 from fleet_slip.warehouse.tables import Warehouse
@@ -101,6 +102,10 @@ def status_of(
         *_failed(last_runs),
         *_full(free, limits),
         *damaged,
+        *(
+            f"{path}: {what}"
+            for path, what in find_missing_documents(warehouse.root, f"{now - REMEMBERED:%Y-%m}")
+        ),
     ]
     return Status(
         root=str(warehouse.root),

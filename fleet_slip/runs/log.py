@@ -25,6 +25,8 @@ from typing import Any
 
 from fleet_slip.errors import StorageError
 from fleet_slip.files.folder import Folder
+from fleet_slip.runs.anchors import KEY as ANCHORS
+from fleet_slip.runs.anchors import newest_documents
 
 RECORD_COLUMNS = {
     "run_id": "VARCHAR",
@@ -52,6 +54,7 @@ ERROR_MAX = 2000
 """So many characters of a message are kept."""
 
 _PRIVATE_OPTION = re.compile(r"(?i)--?(?:[\w-]*(?:key|token|secret|passw)[\w-]*|vehicle|drive)")
+_NAMES = re.compile(r"(?i)\b(?:vehicle_id|drive_id)\b")
 _DATA_FILE = re.compile(r"(?is).*(\.(?:csv|parquet|mf4)(?:\.\w+)?)")
 _URL_CREDENTIALS = re.compile(r"(?<=://)[^/@\s]+(?=@)")
 HIDDEN = "***"
@@ -159,6 +162,8 @@ def recording(root: Folder, command: str, arguments: Sequence[str]) -> Iterator[
         end = run.end(error, time.monotonic() - begun)
         log_event("run ended", **{key: end[key] for key in ("outcome", "exit_code", "seconds")})
         if _exists(root):
+            with contextlib.suppress(StorageError):
+                end[ANCHORS] = newest_documents(root)
             _append(root, file, *([] if told else [run.beginning()]), end)
         _current.reset(token)
 
@@ -185,12 +190,15 @@ def publishable(arguments: Sequence[str]) -> list[str]:
 
     That is the value of an option whose name speaks of a key, token, secret or password, the user
     part of a URL, and what may name a person's car, since the history outlives what is forgotten:
-    the values of --vehicle and --drive, and the names of data files.
+    the values of --vehicle and --drive, conditions on vehicle_id or drive_id, and the names of data
+    files.
     """
     kept: list[str] = []
     hide_next = False
     for argument in arguments:
         text = _URL_CREDENTIALS.sub(HIDDEN, argument.encode(errors="replace").decode())
+        if _NAMES.search(text):
+            text = HIDDEN
         option, equals, _ = text.partition("=")
         private = bool(_PRIVATE_OPTION.fullmatch(option))
         if hide_next:
