@@ -260,7 +260,7 @@ def test_a_frame_without_columns_and_one_with_many() -> None:
         np.array([1j, 2j]),
         np.array(["2024-05-01", "2024-05-02"], dtype="datetime64[s]"),
         ["1.0", 2.0],
-        [object(), 1.0],
+        pytest.param([object(), 1.0], id="objects"),
         1.0,
         "12",
         [2**60 + 1, 2],

@@ -211,7 +211,7 @@ FORGED = (
         (["score", "smoke", "--cohort", "mass_kg > 9000"], 5, "no row of the cohort"),
         (["ingest", "none.csv", "--mapping", "race_car_250lm"], 4, "none.csv"),
         (["ingest", "none.csv", "--mapping", "unknown"], 3, "Known: race_car_250lm"),
-        (["select", "--folds", "1"], 2, "greater than or equal to 2"),
+        (["select", "--folds", "1"], 3, "choose a number from 2 to 1000"),
         (["publish", "Bad Name!"], 3, "cannot be the name of a model"),
     ],
 )
