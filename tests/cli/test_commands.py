@@ -50,7 +50,7 @@ def test_the_bits_are_those_of_other_machines(smoke_root: Path) -> None:
     assert digests == {
         "logs": "b875580a1d17083def2771a1c408763eb3a55e5ba122d59e699d2cce7b2f7c40",
         "grams": "d81339d42929335003f976666893a4ac71b7a9f530338fac71c9c606d61b46d2",
-        "models": "ffb88042af046cc2bdd034eab336a0390e7ebbfa672404654a5835f2605818ee",
+        "models": "3d2c8d74c3094b2ef884f4634d0f9af4b1cd805c9791c8505bfe4a94e752e404",
     }
 
 
@@ -204,7 +204,7 @@ FORGED = (
         (["score", "smoke", "--cohort", "true) OR (true"], 5, "not valid SQL"),
         (["select", "--cohort", "1; DROP VIEW grams"], 5, "not valid SQL"),
         (["select", "--nested", "ax,beta"], 3, "beta is not an input"),
-        (["select", "--models", "table9"], 3, "Known: table1"),
+        (["select", "--models", "table9"], 3, "Known: estimator, table1"),
         (["select", "--by", "vehicle"], 5, "at least two folds"),
         (["show", "nothing"], 5, "no model is called"),
         (["score", "smoke@9"], 5, "has no version"),

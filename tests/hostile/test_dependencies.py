@@ -67,6 +67,10 @@ def test_what_is_installed_is_what_was_pinned() -> None:
     assert {name: pinned().get(name) for name in installed} == installed
 
 
+@pytest.mark.skipif(
+    any(required(*GROUPS["docs"])[name] is None for name in required(*GROUPS["docs"])),
+    reason="what the group docs needs is known once it is installed: make docs",
+)
 def test_nothing_is_pinned_that_nothing_needs() -> None:
     assert pinned().keys() - everything().keys() == set()
 
