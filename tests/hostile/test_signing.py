@@ -68,7 +68,7 @@ def test_a_signature_leaves_the_document_as_it_is(signed: Registry, tmp_path: Pa
 def test_a_forged_manifest_is_refused_although_its_checksum_is_right(signed: Registry) -> None:
     file = version_file(signed)
     document = json.loads(file.read_text())
-    document["content"]["intercept"] = 0.25
+    document["content"] |= {"intercept": 0.25, "intercept_exact": "1/4"}
     document["sha256"] = checksum(document["content"])
     file.write_text(json.dumps(document))
     with pytest.raises(RefusedError, match="is not what the key"):

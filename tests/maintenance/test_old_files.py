@@ -37,9 +37,9 @@ def compacted(warehouse: Warehouse) -> Warehouse:
 
 
 def found(warehouse: Warehouse, subject: Forgettable) -> list[str]:
-    """Folder and name of each old file, without the checksum."""
+    """Folder and name of each old file, without its writer and the checksum."""
     old = [one.file for one in find_old_files(warehouse, subject)]
-    return [f"{file.folder.name}/{file.path}".rpartition("-")[0] for file in old]
+    return [f"{file.folder.name}/{file.path}".rsplit("-x", 1)[0] for file in old]
 
 
 def test_old_files_with_the_car_are_found_and_no_others_those_of_the_logs_last(

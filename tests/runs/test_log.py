@@ -142,7 +142,7 @@ def test_commands_are_recorded_and_questions_are_not(run_command: RunCommand) ->
     run_command("run", "--no-such-option")
     query = "SELECT command, exit_code, rows, outcome, [s.name FOR s IN steps] AS steps FROM runs"
     done, failed = run_command("sql", f"{query} ORDER BY started_at", "--json").json
-    steps = ["simulate", "gram", "select", "publish"]
+    steps = ["simulate", "gram", "gram", "select", "publish"]
     assert (done["command"], done["exit_code"], done["steps"]) == ("run", 0, steps)
     assert done["rows"] > 10_000
     assert (failed["command"], failed["exit_code"], failed["outcome"]) == ("gram", 5, "failed")
