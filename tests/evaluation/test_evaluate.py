@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from fleet_slip.cli.main import app
 from fleet_slip.errors import RefusedError
-from fleet_slip.evaluation.estimators import LinearEstimate
+from fleet_slip.evaluation.estimators import published_estimate
 from fleet_slip.evaluation.evaluated_drives import load_drives
 from fleet_slip.evaluation.filters import FILTERS, bound
 from fleet_slip.evaluation.results import keep
@@ -136,7 +136,7 @@ def test_an_estimator_does_not_see_the_truth(root: Path) -> None:
     (drive,) = load_drives(Warehouse(LocalFolder(root)), [load_scenario("nominal")])
     assert not {"vx_mps", "vy_mps", "sideslip_rad", "station_m"} & set(drive.signals)
     manifest = Registry(LocalFolder(root / "models")).resolve("smoke").manifest
-    estimate = LinearEstimate.published(manifest)(drive.signals)
+    estimate = published_estimate(manifest)(drive.signals)
     assert np.corrcoef(estimate, drive.sideslip_rad)[0, 1] > 0.9
 
 
