@@ -152,7 +152,7 @@ def test_publish_show_score_promote_and_roll_back(run_command: RunCommand, tmp_p
     assert "worse than the champion" in worse.stderr
     other = run_command("publish", "smoke", "--nested", "ax")
     assert other.exit_code == 7
-    assert "cannot be compared on this cohort" in other.stderr
+    assert "cannot be compared" in other.stderr
     forced = run_command("publish", "smoke", *alone, "--force", "--json").json
     assert (forced["version"], forced["new"]) == (2, True)
     assert run_command("show", "smoke", "--json").json["version"] == 2
@@ -261,7 +261,7 @@ def test_two_runs_at_once_do_the_job_once(tmp_path: Path, smoke_root: Path) -> N
     alone = Warehouse(LocalFolder(smoke_root)).logs.snapshot()
     together = Warehouse(LocalFolder(tmp_path / "data")).logs.snapshot()
     assert [file.path for file in together.files] == [file.path for file in alone.files]
-    assert len(list((tmp_path / "data" / "models" / "smoke" / "versions").iterdir())) == 1
+    assert len(list((tmp_path / "data" / "models" / "smoke" / "versions").glob("*.json"))) == 1
 
 
 def test_simulations_and_gram_jobs_at_once_lose_and_double_nothing(

@@ -68,7 +68,7 @@ def test_status_asks_for_no_record_older_than_a_year(root: Folder, server: Serve
     with server.misbehaving() as watched:
         (last,) = status_of(Warehouse(root)).last_runs
     assert last["started_at"] > datetime.now(UTC) - timedelta(days=31)
-    assert len([request for request in watched.seen if "/runs/" in request]) == 2
+    assert len({request for request in watched.seen if "/runs/" in request}) == 2
     assert len(history(root)) == 2
 
 
