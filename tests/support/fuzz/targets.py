@@ -205,7 +205,7 @@ def _template(temporary: str) -> Path:
         warehouse.logs.snapshot().commit(Change(add=[action], units=[unit]))
     program = "from fleet_slip.cli.main import main; main()"
     command = [sys.executable, "-c", program, "--root", str(root)]
-    for arguments in (["gram"], ["publish", MODEL, "--nested", "ax,ay", "--folds", "2"]):
+    for arguments in (["gram"], ["publish", MODEL, "--nested", "ax,ay", "--folds", "2", "--force"]):
         subprocess.run([*command, *arguments], check=True, capture_output=True)
     return root
 
