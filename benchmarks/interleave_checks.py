@@ -13,7 +13,8 @@ import pyarrow.compute as pc
 
 import fleet_slip
 from benchmarks.interleave_roots import CAR, FIRST_DAY, RESCALED, ROWS
-from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.catalogue.feature_sets import PLAIN
+from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.delta import Table
 from fleet_slip.errors import FleetSlipError

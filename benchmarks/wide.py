@@ -18,7 +18,8 @@ from unittest.mock import patch
 import pyarrow as pa
 
 from fleet_slip.catalogue import features as features_module
-from fleet_slip.catalogue.features import PLAIN, FeatureCatalogue, FeatureSet, features
+from fleet_slip.catalogue.feature_sets import PLAIN, FeatureSet
+from fleet_slip.catalogue.features import FeatureCatalogue, features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.windows import Window
 from fleet_slip.files.data_root import data_root

@@ -10,7 +10,7 @@ from fleet_slip.api.calls import Workers, open_workers, record_call
 from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.filling import Filling
 from fleet_slip.api.tending import Tending
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.errors import QuestionError, RefusedError
 from fleet_slip.models.manifest import require_model_name

@@ -2,7 +2,8 @@
 
 from dataclasses import dataclass
 
-from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.catalogue.feature_sets import PLAIN
+from fleet_slip.catalogue.features import features
 from fleet_slip.errors import ConfigError, QuestionError
 from fleet_slip.grams.cohort import Cohort
 from fleet_slip.models.model_version import ModelVersion

@@ -1,4 +1,4 @@
-"""A column of counts over time: what it is, as types that a manifest can hold, and its SQL.
+"""A column of counts over time: what it is, as types that a manifest can hold.
 
 A window looks back on the counts of one row, a logged signal or a feature, within its drive. One
 rule for all, in SQL, in the compiled kernel and on board:
@@ -12,14 +12,14 @@ rule for all, in SQL, in the compiled kernel and on board:
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from fractions import Fraction
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, StringConstraints, model_validator
 
 from fleet_slip.catalogue.arithmetic import parse
-from fleet_slip.catalogue.signals import COUNT_MAX, Identifier, catalogue
+from fleet_slip.catalogue.signals import Identifier, catalogue
 from fleet_slip.config import Config
 from fleet_slip.errors import QuestionError
 
@@ -167,89 +167,6 @@ class Definition(Config):
         """The logged signals in it."""
         return parse(self.sql).inputs if self.sql else (self.of,)
 
-    @property
-    def window(self) -> tuple[str, str]:
-        """The name and the SQL of the frame of rows that it looks back on."""
-        if self.over == "lag":
-            frame = f"BETWEEN {self.ticks} PRECEDING AND {self.ticks} PRECEDING"
-            return f"lag_{self.ticks}", frame
-        if self.over == "running_mean":
-            return "since_start", "BETWEEN UNBOUNDED PRECEDING AND CURRENT ROW"
-        return f"last_{self.ticks}", f"BETWEEN {self.ticks - 1} PRECEDING AND CURRENT ROW"
-
-    @property
-    def raw_sql(self) -> str:
-        """The count before it is clipped, as SQL over the frames and the columns of rows."""
-        frame, _ = self.window
-        if self.over is None:
-            return rounded_sql(self.of, self.ratio)
-        if self.over == "lag":
-            return rounded_sql(f"(max({self.of}) OVER {frame})", self.ratio)
-        total = f"(sum({self.of}::BIGINT) OVER {frame})::BIGINT"
-        values = f"(count({self.of}) OVER {frame})" if self.over != "sum" else "1"
-        quotient = rounded_sql(total, self.ratio, values)
-        return f"CASE WHEN {self.of} IS NOT NULL THEN {quotient} END"
-
-
-def rounded_sql(value: str, ratio: Fraction, divisor: str = "1") -> str:
-    """Return SQL of value * ratio / divisor, rounded to the nearest, halves away from zero."""
-    product = f"{value}::BIGINT * {ratio.numerator}" if ratio.numerator != 1 else f"{value}::BIGINT"
-    below = f"{ratio.denominator} * {divisor}" if divisor != "1" else f"{ratio.denominator}"
-    if below == "1":
-        return product
-    return f"(2 * {product} + sign({value}) * {below}) // (2 * {below})"
-
-
-def clipped_sql(name: str, limit: int = COUNT_MAX) -> str:
-    """Return the SQL of an integer column clipped to the range of counts; null stays null."""
-    kind = "SMALLINT" if limit == COUNT_MAX else "INTEGER"
-    return (
-        f"CASE WHEN {name} > {limit} THEN {limit} "
-        f"WHEN {name} < -{limit} THEN -{limit} ELSE {name} END::{kind}"
-    )
-
-
-def with_absent(rows: str, absent: Sequence[str]) -> str:
-    """Return a table expression with signals that none of its files has, as nulls."""
-    if not absent:
-        return rows
-    nulls = ", ".join(f"NULL::SMALLINT AS {name}" for name in absent)
-    return f"(SELECT *, {nulls} FROM {rows})"
-
-
-def with_features(
-    rows: str, definitions: Mapping[str, str], limits: Mapping[str, int] | None = None
-) -> str:
-    """Return a subquery: the rows with features as columns of counts, each clipped to its limit.
-
-    `rows` is a table expression with counts; `definitions` gives the SQL of each feature; `limits`
-    those that are not int16. The column `clipped` says how many of the features of a row were out
-    of range.
-    """
-    return _layer(rows, definitions, limits or {}) if definitions else rows
-
-
-def with_windows(
-    rows: str, features: Mapping[str, str], definitions: Mapping[str, Definition]
-) -> str:
-    """Return a subquery: the rows of a table expression with features and columns over time.
-
-    `features` gives the SQL of features of 16 bits. The column `clipped` counts what was out of
-    range, also of what is looked back on.
-    """
-    looked_at = features_behind(definitions)
-    rows = with_features(
-        rows,
-        {**features, **{name: one.sql for name, one in looked_at.items()}},
-        {name: limit_of(one.of_bits) for name, one in looked_at.items()},
-    )
-    if not definitions:
-        return rows
-    own = {name: one for name, one in definitions.items() if name not in looked_at}
-    if not features and not looked_at:
-        rows = f"(SELECT *, 0 AS clipped FROM {rows})"
-    return over_windows(rows, own) if own else rows
-
 
 def features_behind(definitions: Mapping[str, Definition]) -> dict[str, Definition]:
     """Return a definition with the SQL of each feature that columns are made of, by its name.
@@ -263,61 +180,3 @@ def features_behind(definitions: Mapping[str, Definition]) -> dict[str, Definiti
         if one.sql and (one.sql, one.of_bits) != (found[one.of].sql, found[one.of].of_bits):
             raise QuestionError(f"the feature {one.of} is defined in two ways.")
     return found
-
-
-def over_windows(rows: str, definitions: Mapping[str, Definition]) -> str:
-    """Return the same where `rows` has what is looked back on already, and the column `clipped`."""
-    frames = dict(one.window for one in definitions.values() if one.over)
-    named = ",\n            ".join(
-        f"{name} AS (PARTITION BY drive_id ORDER BY tick RANGE {frame})"
-        for name, frame in frames.items()
-    )
-    limits = {name: limit_of(one.bits) for name, one in definitions.items()}
-    clause = f"\n            WINDOW {named}" if frames else ""
-    raw = {name: one.raw_sql for name, one in definitions.items()}
-    found = _layer(rows, raw, limits, clause=clause, counted=True)
-    times = {
-        name: rounded_sql(f"({name}::BIGINT * ({one.fact.sql}))", one.fact.ratio)
-        for name, one in definitions.items()
-        if one.fact
-    }
-    return _layer(found, times, limits, counted=True, replaced=True) if times else found
-
-
-def _layer(
-    rows: str,
-    definitions: Mapping[str, str],
-    limits: Mapping[str, int],
-    *,
-    clause: str = "",
-    counted: bool = False,
-    replaced: bool = False,
-) -> str:
-    """Return a subquery that computes columns, new ones or `replaced` ones, and clips them.
-
-    With `counted`, the rows have the column `clipped` already.
-    """
-    separator = ",\n            "
-    limit = {name: limits.get(name, COUNT_MAX) for name in definitions}
-    computed = separator.join(f"{sql} AS {name}" for name, sql in definitions.items())
-    inside = [f"{clipped_sql(name, limit[name])} AS {name}" for name in definitions]
-    outside = " + ".join(
-        f"coalesce(abs({name}) > {limit[name]}, false)::INTEGER" for name in definitions
-    )
-    if counted:
-        inside.append(f"clipped + {outside} AS clipped")
-    new = "" if counted else f",\n            {outside} AS clipped"
-    columns = (
-        f"* REPLACE (\n            {computed}\n            )"
-        if replaced
-        else f"*,\n            {computed}"
-    )
-    return f"""(
-        SELECT * REPLACE (
-            {separator.join(inside)}
-        ){new}
-        FROM (
-            SELECT {columns}
-            FROM {rows}{clause}
-        )
-    )"""

@@ -1,30 +1,22 @@
-"""Features and feature sets: `configs/features.toml` as types.
+"""Features and feature sets: `configs/features.toml` as a catalogue.
 
 A feature is an integer function of the counts of one row; a window looks back on a signal or a
-feature over time; a factor is a column times what a car knows of itself. A feature set is the
-columns of one kind of Gram row, and how a drive's rows are divided into several, if they are.
+feature over time; a factor is a column times what a car knows of itself.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from decimal import Decimal
+from collections.abc import Callable, Mapping
 from fractions import Fraction
 from functools import cache, cached_property
 from importlib.resources.abc import Traversable
-from itertools import pairwise
 
 from pydantic import Field, ValidationError, model_validator
 
 from fleet_slip.canonical import canonical_json, sha256_of
-from fleet_slip.catalogue.columns import (
-    COUNT_BITS,
-    Bits,
-    Definition,
-    limit_of,
-    with_features,
-    with_windows,
-)
-from fleet_slip.catalogue.feature_sql import integer_sql, names_in
-from fleet_slip.catalogue.signals import Identifier, Signal, SIUnit, catalogue
+from fleet_slip.catalogue.column_sql import with_features, with_windows
+from fleet_slip.catalogue.columns import COUNT_BITS, Definition
+from fleet_slip.catalogue.feature_sets import PLAIN, FeatureSet, Regime
+from fleet_slip.catalogue.row_features import Feature
+from fleet_slip.catalogue.signals import Identifier, Signal, catalogue
 from fleet_slip.catalogue.windows import (
     Factor,
     TimeColumn,
@@ -35,131 +27,6 @@ from fleet_slip.catalogue.windows import (
 from fleet_slip.config import Config, faults_of, load_config, load_toml
 from fleet_slip.errors import ConfigError, QuestionError
 from fleet_slip.resources import config_file, folder
-
-PLAIN = "signals"
-"""The feature set whose columns are the catalogue's inputs and label themselves."""
-
-LAG = "_lag"
-"""What the column of a signal's previous value ends in."""
-
-
-def lag_signals(signals: Sequence[str]) -> tuple[str, ...]:
-    """Return the columns of a lagged set: all signals now, then all one sample before."""
-    return (*signals, *(name + LAG for name in signals))
-
-
-class Feature(Config):
-    """One feature. `physical = scale * count`, the count clipped to its bits: 16 are +-32767."""
-
-    counts: str = Field(min_length=1)
-    divided_by: str | None = None
-    at_least: int | None = Field(default=None, gt=0)
-    scale: Decimal = Field(gt=0)
-    bits: Bits = COUNT_BITS
-    unit: SIUnit
-    column: Identifier
-    description: str = Field(min_length=1)
-
-    @model_validator(mode="after")
-    def _is_integer_arithmetic(self) -> "Feature":
-        guarded = self.divided_by is not None and not self._divisor_is_number
-        if guarded != (self.at_least is not None):
-            raise ValueError("at_least is for a divisor that varies, which must have it")
-        if self._divisor_is_number and int(self.divided_by or 0) == 0:
-            raise ValueError("divided_by is zero")
-        _ = self.sql
-        return self
-
-    @cached_property
-    def sql(self) -> str:
-        """The count before it is clipped, as SQL over the view `log_counts`."""
-        counts = integer_sql(self.counts)
-        if self.divided_by is None:
-            return counts
-        divisor = integer_sql(self.divided_by)
-        # `//` truncates, so half a divisor with the sign of the dividend rounds to the nearest.
-        quotient = f"(2 * ({counts}) + sign({counts}) * ({divisor})) // (2 * ({divisor}))"
-        if self._divisor_is_number:
-            return quotient
-        return f"CASE WHEN {divisor} >= {self.at_least} THEN {quotient} END"
-
-    @property
-    def _divisor_is_number(self) -> bool:
-        return self.divided_by is not None and self.divided_by.isdecimal()
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """The signals that it is computed from, in catalogue order."""
-        used = names_in(self.counts) | names_in(self.divided_by or "")
-        return tuple(name for name in catalogue().inputs if name in used)
-
-    @property
-    def exact_scale(self) -> Fraction:
-        """Physical value of one count, exactly."""
-        return Fraction(self.scale)
-
-    @property
-    def limit(self) -> int:
-        """Largest count."""
-        return limit_of(self.bits)
-
-
-class Regime(Config):
-    """Bands of a signal or feature."""
-
-    of: Identifier
-    absolute: bool = False
-    bounds: tuple[Decimal, ...] = Field(min_length=1)
-
-    @model_validator(mode="after")
-    def _bounds_rise(self) -> "Regime":
-        if list(self.bounds) != sorted(set(self.bounds)):
-            raise ValueError("the bounds of a regime must rise")
-        return self
-
-    @property
-    def bands(self) -> tuple[str, ...]:
-        """What the bands are called."""
-        name = f"|{self.of}|" if self.absolute else self.of
-        edges = [f"{bound:f}".rstrip("0").rstrip(".") for bound in self.bounds]
-        middle = [f"{name} {low}-{high}" for low, high in pairwise(edges)]
-        return (f"{name} < {edges[0]}", *middle, f"{name} >= {edges[-1]}")
-
-
-class FeatureSet(Config):
-    """The columns of one kind of Gram row, and what divides a drive's rows."""
-
-    description: str = Field(min_length=1)
-    signals: tuple[Identifier, ...] = Field(min_length=1)
-    features: tuple[Identifier, ...] = ()
-    windows: tuple[Identifier, ...] = ()
-    regimes: tuple[Identifier, ...] = ()
-    row_folds: int | None = Field(default=None, ge=2, le=1000)
-    lagged: bool = False
-
-    @model_validator(mode="after")
-    def _consistent(self) -> "FeatureSet":
-        unknown = [name for name in self.signals if name not in catalogue().inputs]
-        if unknown:
-            raise ValueError(f"not input signals: {', '.join(unknown)}")
-        if len(set(self.columns)) < len(self.columns):
-            raise ValueError("a column stands twice")
-        if bool(self.regimes) + bool(self.row_folds) + self.lagged > 1:
-            raise ValueError("a set has regimes, row_folds or lagged, not several of them")
-        if self.windows and (self.regimes or self.row_folds or self.lagged):
-            raise ValueError("a set with windows has no regimes, row_folds or lagged")
-        return self
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """What a model of this set may use."""
-        return (*self.signals, *self.features, *self.windows)
-
-    @property
-    def columns(self) -> tuple[str, ...]:
-        """The columns of a Gram row, in its order."""
-        now = (*self.inputs, catalogue().label)
-        return lag_signals(now) if self.lagged else now
 
 
 class FeatureCatalogue(Config):

@@ -11,7 +11,7 @@ import typer
 
 from fleet_slip.api.calls import open_workers
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features as known_features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.cli.output import Json, print_json, print_table, progress, say

@@ -7,7 +7,7 @@ import typer
 from fleet_slip.api.calls import open_workers
 from fleet_slip.api.fleet import RUN_MODELS, Fleet
 from fleet_slip.api.run_report import RunReport
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.cli.data import Days, Through, last_day
 from fleet_slip.cli.options import Worth
 from fleet_slip.cli.output import Json, print_json, progress_of_steps, say

@@ -5,7 +5,8 @@ from typing import Annotated
 import typer
 
 from fleet_slip.api.cohort import FleetCohort
-from fleet_slip.catalogue.features import PLAIN, FeatureSet, column_query
+from fleet_slip.catalogue.feature_sets import PLAIN, FeatureSet
+from fleet_slip.catalogue.features import column_query
 from fleet_slip.catalogue.features import features as known_features
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli.options import Cohort, FoldCount, Naive

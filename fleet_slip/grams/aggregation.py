@@ -10,7 +10,8 @@ from os import cpu_count
 import duckdb
 import pyarrow as pa
 
-from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.catalogue.feature_sets import PLAIN
+from fleet_slip.catalogue.features import features
 from fleet_slip.compute.tasks import LocalThreads, in_flight, run_tasks
 from fleet_slip.delta import TableFile, absent_columns
 from fleet_slip.grams.statement import gram_statement

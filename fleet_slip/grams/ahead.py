@@ -10,7 +10,8 @@ from datetime import date
 
 from deltalake.transaction import AddAction
 
-from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.catalogue.feature_sets import PLAIN
+from fleet_slip.catalogue.features import features
 from fleet_slip.delta import Change, Snapshot, TableFile, Unit
 from fleet_slip.errors import ConflictError
 from fleet_slip.grams.aggregation import aggregate

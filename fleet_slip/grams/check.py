@@ -10,7 +10,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.catalogue.feature_sets import PLAIN
+from fleet_slip.catalogue.features import features
 from fleet_slip.delta import TableFile
 from fleet_slip.errors import DataError, StorageError
 from fleet_slip.grams.aggregation import aggregate, by_sql

@@ -11,7 +11,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.arrays import BoolArray, IntArray
-from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.catalogue.feature_sets import PLAIN
+from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import SCENARIO, TRAINING_DRIVES
 from fleet_slip.errors import DataError, QuestionError, RefusedError

@@ -1,7 +1,7 @@
 """From the counts of one drive to the integer columns of a feature set, sample by sample.
 
 This is the one path to the columns of models with windows: Gram rows, scores, evaluations and
-predictions all come through it. It computes what the SQL of `fleet_slip.catalogue.columns` says.
+predictions all come through it. It computes what the SQL of `fleet_slip.catalogue.column_sql` says.
 """
 
 from collections.abc import Mapping, Sequence

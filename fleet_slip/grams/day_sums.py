@@ -7,7 +7,7 @@ from datetime import date
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.grams.cohort import empty_cohort_error, gram_table, require_training

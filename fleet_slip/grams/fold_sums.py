@@ -13,7 +13,8 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, IntArray
-from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.catalogue.feature_sets import PLAIN
+from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohort import (

@@ -12,7 +12,8 @@ from itertools import chain
 
 import pyarrow.compute as pc
 
-from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.catalogue.feature_sets import PLAIN
+from fleet_slip.catalogue.features import features
 from fleet_slip.delta import Change, Snapshot, TableFile, Unit, retry_conflicts
 from fleet_slip.errors import ConflictError, StorageError
 from fleet_slip.grams.aggregation import compute_grams

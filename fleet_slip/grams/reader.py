@@ -9,7 +9,8 @@ from typing import Self
 import duckdb
 import pyarrow as pa
 
-from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.catalogue.feature_sets import PLAIN
+from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.delta.table import Snapshot
 from fleet_slip.errors import DataError

@@ -5,8 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
-from fleet_slip.catalogue.columns import over_windows, with_absent, with_features
-from fleet_slip.catalogue.features import LAG, PLAIN, FeatureCatalogue, Regime, features
+from fleet_slip.catalogue.column_sql import over_windows, with_absent, with_features
+from fleet_slip.catalogue.feature_sets import LAG, PLAIN, Regime
+from fleet_slip.catalogue.features import FeatureCatalogue, features
 from fleet_slip.catalogue.signals import COUNT_MAX, SignalCatalogue
 from fleet_slip.resources import read_sql
 

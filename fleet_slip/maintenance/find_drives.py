@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import pyarrow.compute as pc
 
-from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.catalogue.feature_sets import PLAIN
+from fleet_slip.catalogue.features import features
 from fleet_slip.delta import Snapshot
 from fleet_slip.maintenance.old_files import rows_of
 from fleet_slip.resources import read_sql

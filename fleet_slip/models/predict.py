@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.arrays import FloatArray, IntArray
-from fleet_slip.catalogue.columns import with_features
+from fleet_slip.catalogue.column_sql import with_features
 from fleet_slip.catalogue.counts import round_to_counts
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.errors import DataError, InputError

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.columns import with_windows
+from fleet_slip.catalogue.column_sql import with_windows
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.errors import DataError

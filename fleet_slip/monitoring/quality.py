@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.grams.cohort import Cohort, empty_cohort_error, load_cohort, require_training

@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from fleet_slip.canonical import canonical_json, sha256_of
-from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.catalogue.feature_sets import PLAIN
+from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import SCENARIO
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation.estimators import (

@@ -4,7 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from fleet_slip.catalogue.features import LAG, input_scales, lag_signals
+from fleet_slip.catalogue.feature_sets import LAG, lag_signals
+from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import Cohort, Served

@@ -6,7 +6,8 @@ from typing import Literal
 from pydantic import Field, model_validator
 
 from fleet_slip.canonical import canonical_json, sha256_of
-from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.catalogue.feature_sets import PLAIN
+from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import Identifier
 from fleet_slip.config import Config, load_config
 from fleet_slip.grams.folding import Folding

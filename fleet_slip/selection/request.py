@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from fleet_slip.canonical import canonical_json, sha256_of
-from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.catalogue.feature_sets import PLAIN
+from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.errors import ConfigError, QuestionError
 from fleet_slip.grams.cohort import Cohort, load_cohort

@@ -15,11 +15,19 @@ from itertools import pairwise
 from deltalake.transaction import AddAction
 
 from fleet_slip.compute.tasks import run_tasks
-from fleet_slip.delta import Change, Snapshot, Unit, retry_conflicts
-from fleet_slip.errors import RefusedError
+from fleet_slip.delta import Change, Snapshot, retry_conflicts
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.simulation.campaign import Batch, Campaign, DriveSpec
 from fleet_slip.simulation.drives import simulate_batch
+from fleet_slip.simulation.units import (
+    changed_campaign,
+    day_units,
+    file_name,
+    has_landed,
+    require_unchanged,
+    unit_name,
+    unit_of,
+)
 from fleet_slip.warehouse.audit import Audit
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -115,26 +123,21 @@ def _open_days(snapshot: Snapshot, campaign: Campaign, days: Iterable[date]) -> 
     Raises `RefusedError` if a day was completed by the campaign as it was before a change.
     """
     found = []
-    for unit, day in _day_units(campaign, days):
+    for unit, day in day_units(campaign, days):
         landed = snapshot.landed(unit.name)
         if landed is None:
             found.append(day)
         elif landed != unit.version:
-            raise _changed(campaign.name, day)
+            raise changed_campaign(campaign.name, day)
     return tuple(found)
 
 
 def _complete(warehouse: Warehouse, campaign: Campaign, days: Iterable[date]) -> None:
     """Record that all batches of some days have landed."""
     snapshot = warehouse.logs.snapshot()
-    units = [unit for unit, _ in _day_units(campaign, _open_days(snapshot, campaign, days))]
+    units = [unit for unit, _ in day_units(campaign, _open_days(snapshot, campaign, days))]
     if units:
         snapshot.commit(Change(units=units, note={"job": "simulate", "campaign": campaign.name}))
-
-
-def _day_units(campaign: Campaign, days: Iterable[date]) -> Iterator[tuple[Unit, date]]:
-    version = int(campaign.digest[:15], base=16)
-    return ((Unit(f"simulate/{campaign.name}/{day}", version), day) for day in days)
 
 
 def simulate_batches(
@@ -216,37 +219,6 @@ class _Backlog:
             yield from missing
 
 
-def has_landed(snapshot: Snapshot, batch: Batch) -> bool:
-    """Whether a batch is in the logs. Raises `RefusedError` if another batch has its place."""
-    landed = snapshot.landed(unit_name(batch.campaign, batch.day, batch.index))
-    if landed is not None and landed != unit_of(batch).version:
-        raise _changed(batch.campaign, batch.day)
-    return landed is not None
-
-
-def require_unchanged(snapshot: Snapshot, batch: Batch) -> None:
-    """Raise `RefusedError` if another batch has the place of this one in the logs."""
-    has_landed(snapshot, batch)
-
-
-def _changed(campaign: str, day: date) -> RefusedError:
-    return RefusedError(
-        f"{day}: the campaign {campaign!r} was changed since this day was simulated, and logs are "
-        "never replaced. Give the changed campaign another name, or use another --root."
-    )
-
-
-def unit_of(batch: Batch) -> Unit:
-    """Return the unit of work that lands a batch; its version is from the batch's content."""
-    name = unit_name(batch.campaign, batch.day, batch.index)
-    return Unit(name, int(batch.digest[:15], base=16))
-
-
-def unit_name(campaign: str, day: date, index: int) -> str:
-    """Return the name of the unit of work that lands a day's batch of an index."""
-    return f"simulate/{campaign}/{day}/{index}"
-
-
 def _name(batch: Batch) -> str:
     return f"{batch.campaign}, {batch.day}, file {batch.index}"
 
@@ -276,11 +248,6 @@ def _not_forgotten(warehouse: Warehouse, drives: tuple[DriveSpec, ...]) -> tuple
         for drive in drives
         if drive.vehicle_id not in barred.vehicles and drive.drive_id not in barred.drives
     )
-
-
-def file_name(batch: Batch) -> str:
-    """Return the name of a batch's file, before the checksum of its bytes."""
-    return f"{batch.campaign}-{batch.index:04d}-{batch.digest[:12]}"
 
 
 def _land(warehouse: Warehouse, written: _Written) -> _Written | None:

@@ -13,8 +13,9 @@ import pyarrow as pa
 import pytest
 
 from fleet_slip.catalogue import features as features_module
-from fleet_slip.catalogue.columns import with_features
-from fleet_slip.catalogue.features import features, lag_signals, load_features
+from fleet_slip.catalogue.column_sql import with_features
+from fleet_slip.catalogue.feature_sets import lag_signals
+from fleet_slip.catalogue.features import features, load_features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.delta import Change, Unit
 from fleet_slip.errors import ConfigError, DataError, QuestionError

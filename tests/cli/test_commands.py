@@ -11,7 +11,7 @@ import pyarrow.compute as pc
 import pytest
 
 import fleet_slip
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.models.versions import Registry
 from fleet_slip.warehouse.tables import Warehouse

@@ -7,7 +7,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.errors import DataError, FleetSlipError, QuestionError
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams import reader as gram_reader

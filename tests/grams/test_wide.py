@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.catalogue.columns import Definition, Fact, limit_of, with_windows
+from fleet_slip.catalogue.column_sql import with_windows
+from fleet_slip.catalogue.columns import Definition, Fact, limit_of
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from fleet_slip.catalogue.features import LAG, input_scales, lag_signals
+from fleet_slip.catalogue.feature_sets import LAG, lag_signals
+from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError
 from fleet_slip.selection.diagnostics import diagnose

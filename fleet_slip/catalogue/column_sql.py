@@ -1,0 +1,151 @@
+"""The SQL of columns of counts: features of a row, and columns over time.
+
+This is what defines them. Subqueries wrap a table expression with counts, so that anyone can run
+them over the view `log_counts`.
+"""
+
+from collections.abc import Mapping, Sequence
+from fractions import Fraction
+
+from fleet_slip.catalogue.columns import Definition, features_behind, limit_of
+from fleet_slip.catalogue.signals import COUNT_MAX
+
+
+def rounded_sql(value: str, ratio: Fraction, divisor: str = "1") -> str:
+    """Return SQL of value * ratio / divisor, rounded to the nearest, halves away from zero."""
+    product = f"{value}::BIGINT * {ratio.numerator}" if ratio.numerator != 1 else f"{value}::BIGINT"
+    below = f"{ratio.denominator} * {divisor}" if divisor != "1" else f"{ratio.denominator}"
+    if below == "1":
+        return product
+    return f"(2 * {product} + sign({value}) * {below}) // (2 * {below})"
+
+
+def clipped_sql(name: str, limit: int = COUNT_MAX) -> str:
+    """Return the SQL of an integer column clipped to the range of counts; null stays null."""
+    kind = "SMALLINT" if limit == COUNT_MAX else "INTEGER"
+    return (
+        f"CASE WHEN {name} > {limit} THEN {limit} "
+        f"WHEN {name} < -{limit} THEN -{limit} ELSE {name} END::{kind}"
+    )
+
+
+def with_absent(rows: str, absent: Sequence[str]) -> str:
+    """Return a table expression with signals that none of its files has, as nulls."""
+    if not absent:
+        return rows
+    nulls = ", ".join(f"NULL::SMALLINT AS {name}" for name in absent)
+    return f"(SELECT *, {nulls} FROM {rows})"
+
+
+def with_features(
+    rows: str, definitions: Mapping[str, str], limits: Mapping[str, int] | None = None
+) -> str:
+    """Return a subquery: the rows with features as columns of counts, each clipped to its limit.
+
+    `rows` is a table expression with counts; `definitions` gives the SQL of each feature; `limits`
+    those that are not int16. The column `clipped` says how many of the features of a row were out
+    of range.
+    """
+    return _layer(rows, definitions, limits or {}) if definitions else rows
+
+
+def with_windows(
+    rows: str, features: Mapping[str, str], definitions: Mapping[str, Definition]
+) -> str:
+    """Return a subquery: the rows of a table expression with features and columns over time.
+
+    `features` gives the SQL of features of 16 bits. The column `clipped` counts what was out of
+    range, also of what is looked back on.
+    """
+    looked_at = features_behind(definitions)
+    rows = with_features(
+        rows,
+        {**features, **{name: one.sql for name, one in looked_at.items()}},
+        {name: limit_of(one.of_bits) for name, one in looked_at.items()},
+    )
+    if not definitions:
+        return rows
+    own = {name: one for name, one in definitions.items() if name not in looked_at}
+    if not features and not looked_at:
+        rows = f"(SELECT *, 0 AS clipped FROM {rows})"
+    return over_windows(rows, own) if own else rows
+
+
+def over_windows(rows: str, definitions: Mapping[str, Definition]) -> str:
+    """Return the same where `rows` has what is looked back on already, and the column `clipped`."""
+    frames = dict(frame_of(one) for one in definitions.values() if one.over)
+    named = ",\n            ".join(
+        f"{name} AS (PARTITION BY drive_id ORDER BY tick RANGE {frame})"
+        for name, frame in frames.items()
+    )
+    limits = {name: limit_of(one.bits) for name, one in definitions.items()}
+    clause = f"\n            WINDOW {named}" if frames else ""
+    raw = {name: unclipped_sql(one) for name, one in definitions.items()}
+    found = _layer(rows, raw, limits, clause=clause, counted=True)
+    times = {
+        name: rounded_sql(f"({name}::BIGINT * ({one.fact.sql}))", one.fact.ratio)
+        for name, one in definitions.items()
+        if one.fact
+    }
+    return _layer(found, times, limits, counted=True, replaced=True) if times else found
+
+
+def frame_of(one: Definition) -> tuple[str, str]:
+    """Return the name and the SQL of the frame of rows that a column looks back on."""
+    if one.over == "lag":
+        return f"lag_{one.ticks}", f"BETWEEN {one.ticks} PRECEDING AND {one.ticks} PRECEDING"
+    if one.over == "running_mean":
+        return "since_start", "BETWEEN UNBOUNDED PRECEDING AND CURRENT ROW"
+    return f"last_{one.ticks}", f"BETWEEN {one.ticks - 1} PRECEDING AND CURRENT ROW"
+
+
+def unclipped_sql(one: Definition) -> str:
+    """Return the count before it is clipped, as SQL over the frames and the columns of rows."""
+    frame, _ = frame_of(one)
+    if one.over is None:
+        return rounded_sql(one.of, one.ratio)
+    if one.over == "lag":
+        return rounded_sql(f"(max({one.of}) OVER {frame})", one.ratio)
+    total = f"(sum({one.of}::BIGINT) OVER {frame})::BIGINT"
+    values = f"(count({one.of}) OVER {frame})" if one.over != "sum" else "1"
+    quotient = rounded_sql(total, one.ratio, values)
+    return f"CASE WHEN {one.of} IS NOT NULL THEN {quotient} END"
+
+
+def _layer(
+    rows: str,
+    definitions: Mapping[str, str],
+    limits: Mapping[str, int],
+    *,
+    clause: str = "",
+    counted: bool = False,
+    replaced: bool = False,
+) -> str:
+    """Return a subquery that computes columns, new ones or `replaced` ones, and clips them.
+
+    With `counted`, the rows have the column `clipped` already.
+    """
+    separator = ",\n            "
+    limit = {name: limits.get(name, COUNT_MAX) for name in definitions}
+    computed = separator.join(f"{sql} AS {name}" for name, sql in definitions.items())
+    inside = [f"{clipped_sql(name, limit[name])} AS {name}" for name in definitions]
+    outside = " + ".join(
+        f"coalesce(abs({name}) > {limit[name]}, false)::INTEGER" for name in definitions
+    )
+    if counted:
+        inside.append(f"clipped + {outside} AS clipped")
+    new = "" if counted else f",\n            {outside} AS clipped"
+    columns = (
+        f"* REPLACE (\n            {computed}\n            )"
+        if replaced
+        else f"*,\n            {computed}"
+    )
+    return f"""(
+        SELECT * REPLACE (
+            {separator.join(inside)}
+        ){new}
+        FROM (
+            SELECT {columns}
+            FROM {rows}{clause}
+        )
+    )"""

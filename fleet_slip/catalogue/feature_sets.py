@@ -1,0 +1,83 @@
+"""Feature sets and regimes of `configs/features.toml` as types.
+
+A feature set is the columns of one kind of Gram row, and how a drive's rows are divided into
+several, if they are.
+"""
+
+from collections.abc import Sequence
+from decimal import Decimal
+from itertools import pairwise
+
+from pydantic import Field, model_validator
+
+from fleet_slip.catalogue.signals import Identifier, catalogue
+from fleet_slip.config import Config
+
+PLAIN = "signals"
+"""The feature set whose columns are the catalogue's inputs and label themselves."""
+
+LAG = "_lag"
+"""What the column of a signal's previous value ends in."""
+
+
+def lag_signals(signals: Sequence[str]) -> tuple[str, ...]:
+    """Return the columns of a lagged set: all signals now, then all one sample before."""
+    return (*signals, *(name + LAG for name in signals))
+
+
+class Regime(Config):
+    """Bands of a signal or feature."""
+
+    of: Identifier
+    absolute: bool = False
+    bounds: tuple[Decimal, ...] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _bounds_rise(self) -> "Regime":
+        if list(self.bounds) != sorted(set(self.bounds)):
+            raise ValueError("the bounds of a regime must rise")
+        return self
+
+    @property
+    def bands(self) -> tuple[str, ...]:
+        """What the bands are called."""
+        name = f"|{self.of}|" if self.absolute else self.of
+        edges = [f"{bound:f}".rstrip("0").rstrip(".") for bound in self.bounds]
+        middle = [f"{name} {low}-{high}" for low, high in pairwise(edges)]
+        return (f"{name} < {edges[0]}", *middle, f"{name} >= {edges[-1]}")
+
+
+class FeatureSet(Config):
+    """The columns of one kind of Gram row, and what divides a drive's rows."""
+
+    description: str = Field(min_length=1)
+    signals: tuple[Identifier, ...] = Field(min_length=1)
+    features: tuple[Identifier, ...] = ()
+    windows: tuple[Identifier, ...] = ()
+    regimes: tuple[Identifier, ...] = ()
+    row_folds: int | None = Field(default=None, ge=2, le=1000)
+    lagged: bool = False
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "FeatureSet":
+        unknown = [name for name in self.signals if name not in catalogue().inputs]
+        if unknown:
+            raise ValueError(f"not input signals: {', '.join(unknown)}")
+        if len(set(self.columns)) < len(self.columns):
+            raise ValueError("a column stands twice")
+        if bool(self.regimes) + bool(self.row_folds) + self.lagged > 1:
+            raise ValueError("a set has regimes, row_folds or lagged, not several of them")
+        if self.windows and (self.regimes or self.row_folds or self.lagged):
+            raise ValueError("a set with windows has no regimes, row_folds or lagged")
+        return self
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """What a model of this set may use."""
+        return (*self.signals, *self.features, *self.windows)
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """The columns of a Gram row, in its order."""
+        now = (*self.inputs, catalogue().label)
+        return lag_signals(now) if self.lagged else now
