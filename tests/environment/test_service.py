@@ -71,8 +71,8 @@ def confined(service: dict[str, str], folder: Path, arguments: list[str], **extr
             f"mkdir {place}",
             f"mount --bind {real} {place}",
         ]
-    for closed in closed_folders(Path(sys.executable), folder / "shown"):
-        lines += closed
+    needed = [Path(sys.executable).resolve(), Path(COMMAND).resolve()]
+    lines += show_closed_folders(needed, folder / "shown")
     lines.append("mount -o remount,bind,ro /")
     variables = " ".join(f"{k}={shlex.quote(v)}" for k, v in environment.items())
     lines.append(
@@ -82,16 +82,23 @@ def confined(service: dict[str, str], folder: Path, arguments: list[str], **extr
     return "\n".join(lines)
 
 
-def closed_folders(program: Path, aside: Path) -> Iterator[list[str]]:
-    """Yield how to show others what a program needs of a folder that is closed to them."""
-    file = program.resolve()
-    for parent, child in zip(file.parents[1:], file.parents, strict=False):
-        if not parent.stat().st_mode & stat.S_IXOTH:
-            yield [
-                f"mkdir -p {aside} && mount --bind {child} {aside}",
-                f"mount -t tmpfs -o mode=755 none {parent} && mkdir {child}",
-                f"mount --move {aside} {child}",
-            ]
+def show_closed_folders(files: list[Path], aside: Path) -> Iterator[str]:
+    """Yield how to show others what files need of folders that are closed to them.
+
+    A clone often lies in a folder of one user alone: a home, or one made by ``mktemp -d``.
+    """
+    closed: dict[Path, set[Path]] = {}
+    for file in files:
+        for parent, child in zip(file.parents[1:], file.parents, strict=False):
+            if not parent.stat().st_mode & stat.S_IXOTH:
+                closed.setdefault(parent, set()).add(child)
+    for parent in sorted(closed, key=lambda path: len(path.parts), reverse=True):
+        shown = {child: aside / child.relative_to("/") for child in sorted(closed[parent])}
+        for child, place in shown.items():
+            yield f"mkdir -p {place} && mount --rbind {child} {place}"
+        yield f"mount -t tmpfs -o mode=755 none {parent}"
+        for child, place in shown.items():
+            yield f"mkdir -p {child} && mount --move {place} {child}"
 
 
 def run(script: str) -> Finished:
