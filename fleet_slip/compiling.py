@@ -2,14 +2,20 @@
 
 import contextlib
 import functools
+import hashlib
 import logging
+import pickle
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
-from numba.core.caching import FunctionCache, NullCache
+from numba.core.caching import FunctionCache, IndexDataCacheFile, NullCache
+from numba.core.serialize import dumps
 
 LOGGER = logging.getLogger("fleet_slip")
+
+DIGEST_BYTES = hashlib.sha256().digest_size
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -32,7 +38,7 @@ def kernel(function: Function) -> Function:
     """
     compiled: Any = numba.njit(nogil=True, error_model="numpy")(function)
     try:
-        compiled._cache = _KeptCode(function)  # type: ignore[no-untyped-call]
+        compiled._cache = _KeptCode(function)
     except RuntimeError:  # numba found no folder
         compiled._cache = _NoFolder()
     return cast(Function, compiled)
@@ -41,11 +47,20 @@ def kernel(function: Function) -> Function:
 class _KeptCode(FunctionCache):
     """Compiled code on disk. A full disk or a damaged file costs the time to compile, no more."""
 
+    def __init__(self, function: Callable[..., Any]) -> None:
+        """Take the function. Raises `RuntimeError` if there is no folder."""
+        super().__init__(function)  # type: ignore[no-untyped-call]
+        self._cache_file = _CheckedFiles(  # type: ignore[no-untyped-call]
+            self.cache_path,
+            f"{self._impl.filename_base}.checked",
+            self._impl.locator.get_source_stamp(),
+        )
+
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return the code for a signature, None if there is none that can be used."""
         try:
             return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
-        except Exception as error:
+        except _USELESS as error:
             _remark(f"{self.cache_path}: the compiled code is damaged ({type(error).__name__})")
             with contextlib.suppress(OSError):
                 self.flush()  # type: ignore[no-untyped-call]
@@ -57,6 +72,47 @@ class _KeptCode(FunctionCache):
             super().save_overload(sig, data)  # type: ignore[no-untyped-call]
         except OSError as error:
             _remark(f"{self.cache_path}: compiled code cannot be kept ({error.strerror})")
+
+
+class _DamagedCodeError(Exception):
+    """A file of compiled code is not what was written."""
+
+
+_USELESS = (_DamagedCodeError, ImportError, AttributeError, RuntimeError)
+"""What loading raises at a damaged file, a name that is gone, and code that LLVM does not read."""
+
+
+class _CheckedFiles(IndexDataCacheFile):
+    """Files that begin with the checksum of the rest.
+
+    Without one, code with a flipped bit is executed, and computes something else or ends the
+    process; and what unpickling it raises can be anything.
+    """
+
+    def _save_index(self, overloads: Any) -> None:
+        stamped = dumps((self._source_stamp, overloads))  # type: ignore[no-untyped-call]
+        self._save_data(self._index_name, (self._version, stamped))  # type: ignore[no-untyped-call]
+
+    def _load_index(self) -> Any:
+        try:
+            version, stamped = self._load_data(self._index_name)
+        except FileNotFoundError:
+            return {}
+        if version != self._version:  # of numba: the rest may name what it does not have
+            return {}
+        stamp, overloads = pickle.loads(stamped)  # noqa: S301 - as far as numba's own trust goes
+        return overloads if stamp == self._source_stamp else {}
+
+    def _load_data(self, name: str) -> Any:
+        content = Path(self._data_path(name)).read_bytes()  # type: ignore[no-untyped-call]
+        digest, pickled = content[:DIGEST_BYTES], content[DIGEST_BYTES:]
+        if hashlib.sha256(pickled).digest() != digest:
+            raise _DamagedCodeError(name)
+        return pickle.loads(pickled)  # noqa: S301 - of the user's own folder, and undamaged
+
+    def _dump(self, obj: Any) -> bytes:
+        pickled: bytes = super()._dump(obj)  # type: ignore[no-untyped-call]
+        return hashlib.sha256(pickled).digest() + pickled
 
 
 class _NoFolder(NullCache):

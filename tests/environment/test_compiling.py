@@ -80,6 +80,24 @@ def test_damaged_code_is_compiled_anew(
     assert sum(mended.stats.cache_hits.values()) == 1
 
 
+def test_code_with_a_flipped_bit_is_not_executed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It would compute something else, or end the process."""
+    half = load(tmp_path).half
+    half(3.0)
+    for file in kept(tmp_path):
+        content = file.read_bytes()
+        for bit in range(0, 8 * len(content), 997):
+            flipped = bytearray(content)
+            flipped[bit // 8] ^= 1 << bit % 8
+            file.write_bytes(flipped)
+            with pytest.raises(compiling._DamagedCodeError):
+                half._cache._cache_file._load_data(file.name)
+    assert load(tmp_path).half(3.0) == 1.5
+    assert "damaged" in caplog.text
+
+
 def test_a_full_disk_keeps_nothing_and_fails_nothing(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
