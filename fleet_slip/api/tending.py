@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from fleet_slip.models.model_version import ModelVersion
     from fleet_slip.monitoring.monitor import Chart
     from fleet_slip.monitoring.quality import QualityReport
-    from fleet_slip.monitoring.status import Status
+    from fleet_slip.monitoring.status import WarehouseStatus
     from fleet_slip.warehouse.audit import Forgettable
 
 
@@ -37,7 +37,7 @@ class Tending(Serving):
     Nothing here raises `AlarmError` or `DamageError`: the answers say what calls for attention.
     """
 
-    def status(self, max_age_hours: float | None = None) -> "Status":
+    def status(self, max_age_hours: float | None = None) -> "WarehouseStatus":
         """Return the warehouse's health: freshness, backlog, last runs, disk, champions.
 
         Data, or a backlog, older than `max_age_hours` is among its `problems`. Raises

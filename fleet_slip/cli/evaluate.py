@@ -22,7 +22,7 @@ OneCar = Annotated[
         "Table I on the cohort that it was trained on."
     ),
 ]
-Fleet = Annotated[
+FleetModels = Annotated[
     list[str] | None,
     typer.Option(help="Another model, to be compared with the first. May be repeated."),
 ]
@@ -80,7 +80,7 @@ def score(
 def evaluate(
     context: typer.Context,
     one_car: OneCar = DEFAULT_CAMPAIGN,
-    fleet: Fleet = None,
+    fleet: FleetModels = None,
     scenario: Scenarios = None,
     rivals: Annotated[
         bool,

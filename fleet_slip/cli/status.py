@@ -6,7 +6,7 @@ import typer
 
 from fleet_slip.cli.output import Json, print_json, print_table
 from fleet_slip.errors import AlarmError
-from fleet_slip.monitoring.status import Status
+from fleet_slip.monitoring.status import WarehouseStatus
 
 
 def status(
@@ -21,7 +21,7 @@ def status(
 
     Exit code 10 if something calls for attention.
     """
-    found: Status = context.obj.status(max_age_hours)
+    found: WarehouseStatus = context.obj.status(max_age_hours)
     if json:
         print_json(found.as_dict())
     else:
@@ -30,7 +30,7 @@ def status(
         raise AlarmError("; ".join(found.problems))
 
 
-def _print_status(found: Status) -> None:
+def _print_status(found: WarehouseStatus) -> None:
     print_table(
         f"{found.root} at {found.checked_at:%Y-%m-%d %H:%M} UTC",
         ["table", "last commit", "version", "files", "rows", "size MB"],
@@ -79,13 +79,13 @@ def _print_status(found: Status) -> None:
         )
 
 
-def _disk(found: Status) -> list[list[str]]:
+def _disk(found: WarehouseStatus) -> list[list[str]]:
     if found.disk_free_bytes is None or found.disk_free_fraction is None:
         return []
     return [["disk", f"{found.disk_free_bytes / 1e9:,.1f} GB free, {found.disk_free_fraction:.0%}"]]
 
 
-def _print_runs(found: Status) -> None:
+def _print_runs(found: WarehouseStatus) -> None:
     if not found.last_runs:
         return
     print_table(

@@ -32,7 +32,7 @@ class FleetComparison:
         return {**asdict(self), "better": self.better}
 
 
-def compare(
+def compare_fleets(
     runs: Sequence[EvaluatedScenario], one_car: TrainedModels, fleet: TrainedModels
 ) -> tuple[FleetComparison, ...]:
     """Compare the models of Table I that both cohorts can serve, wherever both have estimates."""

@@ -55,7 +55,7 @@ def error_figures(
     return ErrorFigures(
         rows=rows,
         coverage=len(truth) / rows,
-        correlation=correlation(estimate, truth),
+        correlation=pearson_correlation(estimate, truth),
         error_mean_deg=float(error.mean()),
         error_std_deg=float(error.std(ddof=1)),
         rmse_deg=float(np.sqrt(np.mean(error**2))),
@@ -66,7 +66,7 @@ def error_figures(
     )
 
 
-def correlation(first: FloatArray, second: FloatArray) -> float | None:
+def pearson_correlation(first: FloatArray, second: FloatArray) -> float | None:
     """Return Pearson's correlation of two arrays of shape (rows,); None if one is constant."""
     if np.ptp(first) == 0 or np.ptp(second) == 0:
         return None

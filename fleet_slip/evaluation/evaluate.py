@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.evaluation.comparison import FleetComparison, compare
+from fleet_slip.evaluation.comparison import FleetComparison, compare_fleets
 from fleet_slip.evaluation.estimators import Estimate, Signals, TrainedModels, train_models
 from fleet_slip.evaluation.filters import filter_bank
 from fleet_slip.evaluation.results import document
@@ -73,7 +73,7 @@ class Evaluation:
         )
 
 
-def gather(
+def train_competitors(
     warehouse: Warehouse,
     one_car: ModelVersion,
     fleets: Sequence[ModelVersion],
@@ -113,7 +113,7 @@ def evaluate(
     train_rivals: TrainRivals | None = None,
 ) -> Evaluation:
     """Evaluate a model and all that competes with it on scenarios that are in the logs."""
-    competitors = gather(warehouse, one_car, fleets, executor, train_rivals)
+    competitors = train_competitors(warehouse, one_car, fleets, executor, train_rivals)
     runs = run_all(warehouse, scenarios, competitors.estimators)
     first = competitors.one_car
     return Evaluation(
@@ -124,6 +124,6 @@ def evaluate(
             *check_filter_targets(runs, first.table_one),
         ),
         comparisons=tuple(
-            row for fleet in competitors.fleets for row in compare(runs, first, fleet)
+            row for fleet in competitors.fleets for row in compare_fleets(runs, first, fleet)
         ),
     )

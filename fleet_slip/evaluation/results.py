@@ -85,14 +85,14 @@ def _result(result: Result) -> dict[str, Any]:
     }
 
 
-def folder(warehouse: Warehouse) -> DocumentFolder:
+def evaluations_of(warehouse: Warehouse) -> DocumentFolder:
     """Return where a data root keeps its evaluations."""
     return DocumentFolder(warehouse.root / "evaluations")
 
 
 def keep(warehouse: Warehouse, content: Mapping[str, Any]) -> Document:
     """Add an evaluation, unless the latest one is the same; return its document."""
-    documents = folder(warehouse)
+    documents = evaluations_of(warehouse)
 
     def attempt(newest: int) -> Document | None:
         if newest and (before := documents.read(newest)).sha256 == checksum(content):

@@ -77,10 +77,10 @@ def run_all(
     warehouse: Warehouse, scenarios: Sequence[Scenario], estimators: Mapping[str, Estimate]
 ) -> tuple[EvaluatedScenario, ...]:
     """Evaluate estimators on scenarios whose drives are in the logs."""
-    return tuple(run(drive, estimators) for drive in load_drives(warehouse, scenarios))
+    return tuple(evaluate_drive(drive, estimators) for drive in load_drives(warehouse, scenarios))
 
 
-def run(drive: EvaluatedDrive, estimators: Mapping[str, Estimate]) -> EvaluatedScenario:
+def evaluate_drive(drive: EvaluatedDrive, estimators: Mapping[str, Estimate]) -> EvaluatedScenario:
     """Evaluate estimators on one drive. An estimator sees its signals and nothing else."""
     parts = sections(drive)
     estimates = {name: _estimates(drive, estimate) for name, estimate in estimators.items()}

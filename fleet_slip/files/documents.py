@@ -53,7 +53,7 @@ class DocumentFolder:
     def read(self, number: int) -> Document:
         """Return a document. Raises `StorageError` if its checksum does not match."""
         file = self.file(number)
-        text = self.folder.read(file_name(number))
+        text = self.folder.read(document_file(number))
         try:
             envelope = json.loads(text, object_pairs_hook=_object_of_different_keys)
             content, stated = envelope["content"], envelope["sha256"]
@@ -75,7 +75,7 @@ class DocumentFolder:
             file = self.file(number)
             try:
                 document = self.read(number)
-                if self.folder.read(file_name(number)) != _rendered(document):
+                if self.folder.read(document_file(number)) != _rendered(document):
                     found[file] = "its layout was changed"
             except StorageError as error:
                 found[file] = str(error).removeprefix(f"{file}: ")
@@ -100,7 +100,7 @@ class DocumentFolder:
     def create(self, number: int, content: Mapping[str, Any]) -> Document | None:
         """Add a document under this number, durably; return None if the number is taken."""
         document = Document(number, content, checksum(content))
-        file, text = file_name(number), _rendered(document)
+        file, text = document_file(number), _rendered(document)
         # An object store's answer may be lost: then the attempt is made again and finds itself.
         if self.folder.create(file, text) or self.folder.read(file) == text:
             return document
@@ -108,7 +108,7 @@ class DocumentFolder:
 
     def file(self, number: int) -> str:
         """Return where a document of this number is."""
-        return f"{self.folder}/{file_name(number)}"
+        return f"{self.folder}/{document_file(number)}"
 
 
 def _object_of_different_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -119,7 +119,7 @@ def _object_of_different_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def file_name(number: int) -> str:
+def document_file(number: int) -> str:
     """Return the name of a document's file."""
     return f"{number}.json"
 

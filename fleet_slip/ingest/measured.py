@@ -15,7 +15,7 @@ from fleet_slip.ingest.look_alikes import find_look_alikes
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.measured_drives import cut, drive_id, log_table, to_ticks
 from fleet_slip.ingest.quarantine import DriveKeys, check_rows, with_values
-from fleet_slip.ingest.reading import MAX_ROWS, file_digest, read_batches, require_unchanged
+from fleet_slip.ingest.reading import MAX_ROWS, file_digest, read_batches, require_unchanged_file
 from fleet_slip.ingest.resampling import STEP_S
 from fleet_slip.ingest.timebase import cut_into_drives, sample_interval_s
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA
@@ -66,7 +66,7 @@ def read_measured(file: Path, mapping: Mapping) -> MeasuredLog:
     Raises `InputError` if the file cannot be read, is not what the mapping says, or has no usable
     row.
     """
-    with require_unchanged(file):
+    with require_unchanged_file(file):
         digest = _identity(file, mapping)
         rows, bad, keys, rows_read = _check(file, mapping)
     rows, misplaced = cut_into_drives(rows, mapping.time)

@@ -24,7 +24,7 @@ MAX_ROWS = 20_000_000
 
 
 @contextmanager
-def require_unchanged(file: Path) -> Iterator[None]:
+def require_unchanged_file(file: Path) -> Iterator[None]:
     """Raise `InputError` if this is no regular file, or if it is written to while it is read."""
     if not file.is_file():
         what = "is not a regular file" if file.exists() else "no such file"

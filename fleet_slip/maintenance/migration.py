@@ -37,7 +37,7 @@ from fleet_slip.delta.sealing import NOTE, seal_note
 from fleet_slip.errors import ConflictError, RefusedError, StorageError
 from fleet_slip.files.storage_errors import storage_errors
 from fleet_slip.grams.ahead import land_ahead
-from fleet_slip.maintenance.rewriting import read_drives
+from fleet_slip.maintenance.rewriting import read_kept_drives
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -160,7 +160,7 @@ def _rescale(warehouse: Warehouse, found: Evolution, progress: Progress) -> tupl
 
 
 def _rewrite(table: Table, file: TableFile, ratios: Mapping[str, Fraction]) -> AddAction:
-    rows = read_drives(table, [file])
+    rows = read_kept_drives(table, [file])
     for name, ratio in ratios.items():
         column = rows[name].combine_chunks()
         absent = column.is_null().to_numpy(zero_copy_only=False)

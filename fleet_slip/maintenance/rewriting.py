@@ -51,7 +51,7 @@ def rewrite(
     replaced = [file for one in rewritings for file in one.files]
     try:
         for one in rewritings:
-            rows = read_drives(logs.table, one.files, one.without)
+            rows = read_kept_drives(logs.table, one.files, one.without)
             if rows.num_rows:
                 action = logs.table.write_file(one.name, rows, one.files[0].day)
                 new.append(dataclasses.replace(action, data_change=data_change))
@@ -70,7 +70,7 @@ def rewrite(
     return new
 
 
-def read_drives(
+def read_kept_drives(
     table: Table, files: Sequence[TableFile], without: Collection[str] = ()
 ) -> pa.Table:
     """Return the rows of log files, but for some drives, in the order and types of a new file.

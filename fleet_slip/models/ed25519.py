@@ -21,7 +21,7 @@ def generate() -> tuple[bytes, bytes]:
     return private, public
 
 
-def sign(private: bytes, message: bytes) -> bytes:
+def sign_message(private: bytes, message: bytes) -> bytes:
     """Return the signature of a message. Raises `ValueError` if that is no such key."""
     try:
         key = serialization.load_pem_private_key(private, password=None)

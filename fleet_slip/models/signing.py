@@ -48,7 +48,7 @@ def require_signing_key(key: Path) -> None:
     _signed(key, b"")
 
 
-def sign(folder: Folder, number: int, name: str, sha256: str, key: Path) -> None:
+def sign_version(folder: Folder, number: int, name: str, sha256: str, key: Path) -> None:
     """Write the signature of a version beside its document, durably.
 
     Raises `ConfigError` for a key that cannot be used.

@@ -23,7 +23,7 @@ from fleet_slip.files.folder import Folder
 from fleet_slip.models.aliases import CHAMPION, AliasHistory
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.models.signing import require_signature, require_signing_key, sign
+from fleet_slip.models.signing import require_signature, require_signing_key, sign_version
 from fleet_slip.models.trained_drives import keep_drives
 
 _IDENTIFIER = re.compile(IDENTIFIER_PATTERN)
@@ -69,7 +69,7 @@ class Registry:
         if self.signing_key is not None:
             loaded = self._read(name, version)
             folder = self._versions(name).folder
-            sign(folder, version, name, loaded.sha256, self.signing_key)
+            sign_version(folder, version, name, loaded.sha256, self.signing_key)
 
     def _read(self, name: str, version: int) -> ModelVersion:
         if not _IDENTIFIER.fullmatch(name):

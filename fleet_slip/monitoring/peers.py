@@ -34,7 +34,7 @@ ROUNDS = 5
 
 
 @dataclass(frozen=True)
-class Figures:
+class SensorFigures:
     """Offset (counts), gain and log noise of signals in drives, shape (drives, signals) each."""
 
     offset: FloatArray
@@ -83,7 +83,7 @@ class Prediction:
         floors = [limits.offset_floor_counts, limits.gain_floor, limits.noise_floor]
         return cls(at, weights, middle, np.maximum(spread, floors))
 
-    def figures(self, moments: MeanMoments) -> Figures:
+    def figures(self, moments: MeanMoments) -> SensorFigures:
         """Return the figures of drives."""
         m, w = moments.matrices, self.weights
         residual = -w.copy()
@@ -94,7 +94,7 @@ class Prediction:
         predicted = np.maximum(_quadratic(m, w), np.finfo(np.float64).tiny)
         # A residual below a tenth of a count is rounding.
         noise = 0.5 * np.log(np.maximum(square - offset**2, 0.01))
-        return Figures(offset, own / predicted, noise)
+        return SensorFigures(offset, own / predicted, noise)
 
     def scores(self, moments: MeanMoments) -> FloatArray:
         """Return how many spreads each figure is from the middle, (drives, targets, 3).
@@ -180,7 +180,7 @@ class Peers:
                 faults.append(self._kind(int(own.argmax()), drive, moments, figures))
         return faults
 
-    def _kind(self, target: int, drive: int, moments: MeanMoments, figures: Figures) -> Fault:
+    def _kind(self, target: int, drive: int, moments: MeanMoments, figures: SensorFigures) -> Fault:
         """Name the fault of a sensor by what would mend it: a sign, an offset, a factor."""
         name = (moments.signals[target],)
         offset, gain = figures.offset[drive, target], figures.gain[drive, target]

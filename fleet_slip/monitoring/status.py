@@ -53,7 +53,7 @@ class ChampionStatus:
 
 
 @dataclass(frozen=True)
-class Status:
+class WarehouseStatus:
     """What there is to know; `problems` says what calls for attention."""
 
     root: str
@@ -77,7 +77,7 @@ class Status:
 
 def status_of(
     warehouse: Warehouse, max_age_hours: float | None = None, now: datetime | None = None
-) -> Status:
+) -> WarehouseStatus:
     """Examine a warehouse. Reads the Delta logs, the history of runs and the manifests.
 
     Data older than `max_age_hours`, and log files that old without Gram rows, are a problem; so are
@@ -107,7 +107,7 @@ def status_of(
             for path, what in find_missing_documents(warehouse.root, f"{now - REMEMBERED:%Y-%m}")
         ),
     ]
-    return Status(
+    return WarehouseStatus(
         root=str(warehouse.root),
         checked_at=now,
         newest_day=max((file.day for file in logs.files if file.day), default=None),

@@ -263,7 +263,9 @@ class KalmanEstimate:
     ay_bias_mps2: FloatArray
 
 
-def run(drive: DriveSignals, yaw_rate_rad_s: FloatArray, noise: FilterNoise) -> KalmanEstimate:
+def run_filter(
+    drive: DriveSignals, yaw_rate_rad_s: FloatArray, noise: FilterNoise
+) -> KalmanEstimate:
     """Run the filter over a drive with a yaw rate that is known.
 
     It begins at the first GPS fix, predicts at every row and updates at every fix. Gaps of the
@@ -288,12 +290,12 @@ def run(drive: DriveSignals, yaw_rate_rad_s: FloatArray, noise: FilterNoise) -> 
 
 
 def estimate(drive: DriveSignals, car: VehicleParameters, noise: FilterNoise) -> FloatArray:
-    """Estimate side-slip in rad at every row, NaN before the first fix. Raises as `run`.
+    """Estimate side-slip in rad at every row, NaN before the first fix. Raises as `run_filter`.
 
     Of the car, only the geometry counts that turns wheel speeds into a yaw rate. All of it is
     compiled and releases the interpreter's lock: many drives run on threads, as in
     `executor.map(partial(estimate, car=car, noise=noise), drives)`.
     """
     turning = yaw_rate.estimate(drive, car, noise.yaw_rate)
-    motion = run(drive, turning.yaw_rate_rad_s, noise)
+    motion = run_filter(drive, turning.yaw_rate_rad_s, noise)
     return sideslip_angle(motion.vx_mps, motion.vy_mps)

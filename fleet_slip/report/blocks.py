@@ -16,7 +16,7 @@ BLOCK_S = 5.0
 
 
 @dataclass(frozen=True)
-class Difference:
+class ErrorDifference:
     """Whether one estimator's squared error is smaller than another's.
 
     Attributes:
@@ -39,11 +39,11 @@ def mean_squares(run: EvaluatedScenario, estimator: str) -> FloatArray:
     return squares
 
 
-def difference(run: EvaluatedScenario, first: str, second: str) -> Difference:
+def difference(run: EvaluatedScenario, first: str, second: str) -> ErrorDifference:
     """Compare the squared errors of two estimators by a paired t test over blocks."""
     gain = mean_squares(run, second) - mean_squares(run, first)
     t = float(gain.mean() / (gain.std(ddof=1) / math.sqrt(len(gain))))
-    return Difference(t, len(gain), student_t_two_sided(t, len(gain) - 1))
+    return ErrorDifference(t, len(gain), student_t_two_sided(t, len(gain) - 1))
 
 
 def blocks_won(run: EvaluatedScenario, estimators: Sequence[str]) -> dict[str, int]:

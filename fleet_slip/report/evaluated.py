@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation.errors import ErrorFigures
-from fleet_slip.evaluation.results import folder
+from fleet_slip.evaluation.results import evaluations_of
 from fleet_slip.files.documents import Document
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.warehouse.tables import Warehouse
@@ -97,7 +97,7 @@ def latest_of(warehouse: Warehouse, version: ModelVersion) -> Evaluated:
 
     Raises `DataError` if there is none.
     """
-    kept = folder(warehouse)
+    kept = evaluations_of(warehouse)
     for number in reversed(kept.numbers()):
         document = kept.read(number)
         first = next(iter(document.content["estimators"].values()))

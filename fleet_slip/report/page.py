@@ -15,7 +15,7 @@ from fleet_slip.report.data import ReportData
 from fleet_slip.report.drawing import inline_svgs
 from fleet_slip.report.pictures import Picture
 from fleet_slip.report.style import PALETTE
-from fleet_slip.report.table import Table
+from fleet_slip.report.table import ReportTable
 from fleet_slip.report.text import count, degrees, size
 
 TEMPLATES = files("fleet_slip.report") / "templates"
@@ -81,7 +81,7 @@ def missing_scenarios(data: ReportData) -> list[str]:
     return [one for one in data.shipped if one not in data.evaluated.scenarios]
 
 
-def _further(data: ReportData) -> list[Table]:
+def _further(data: ReportData) -> list[ReportTable]:
     learned = tables.rivals(data)
     return [tables.scenarios(data), *tables.fleets(data), *([learned] if learned else [])]
 

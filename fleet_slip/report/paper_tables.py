@@ -5,7 +5,7 @@ from typing import Any
 
 from fleet_slip.evaluation.targets import FILTER_SCENARIOS
 from fleet_slip.report.data import ReportData
-from fleet_slip.report.table import Cell, Table, table
+from fleet_slip.report.table import Cell, ReportTable, table
 from fleet_slip.report.text import count, degrees, number
 
 PAPER_TABLE_ONE = {"1": 0.9013, "2": 0.9534, "3": 0.9796, "4": 0.9911, "5": 0.9911}
@@ -21,7 +21,7 @@ PAPER_TABLE_TWO = {
 """Mean and standard deviation of the error in deg, Table II."""
 
 
-def table_one(data: ReportData) -> Table:
+def table_one(data: ReportData) -> ReportTable:
     """Return Table I: cross-validated correlation of the five models."""
     folding = data.trained.selection.folds
     rows: list[list[str | Cell]] = [
@@ -52,7 +52,7 @@ def table_one(data: ReportData) -> Table:
     )
 
 
-def table_two(data: ReportData) -> Table:
+def table_two(data: ReportData) -> ReportTable:
     """Return Table II: mean and standard deviation of the error on the nominal drive."""
     rows: list[list[str | Cell]] = []
     for name, estimator in data.evaluated.models.items():
@@ -80,7 +80,7 @@ def table_two(data: ReportData) -> Table:
     )
 
 
-def targets(data: ReportData) -> Iterator[Table]:
+def targets(data: ReportData) -> Iterator[ReportTable]:
     """Return the requirements on the models of Table I, and those against the Kalman filter."""
     checks = data.evaluated.rows("checks")
     models = list(data.evaluated.models.values())

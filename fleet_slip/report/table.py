@@ -16,7 +16,7 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Table:
+class ReportTable:
     """A table with a caption; the first `left` columns are text, the others are numbers."""
 
     key: str
@@ -35,7 +35,7 @@ def table(
     *,
     left: int = 1,
     note: str = "",
-) -> Table:
+) -> ReportTable:
     """Return a table of plain texts and marked cells."""
     cells = [[cell if isinstance(cell, Cell) else Cell(cell) for cell in row] for row in rows]
-    return Table(key, caption, head, cells, left, note)
+    return ReportTable(key, caption, head, cells, left, note)

@@ -7,14 +7,14 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.evaluation.errors import ErrorFigures
 from fleet_slip.report.coefficients import Coefficient, Coefficients
 from fleet_slip.report.data import ReportData
-from fleet_slip.report.table import Cell, Table, table
+from fleet_slip.report.table import Cell, ReportTable, table
 from fleet_slip.report.text import count, degrees, number, percent, scientific, size
 
 SHOWN_MODELS = ("1", "2", "4", "5")
 """Model 3 hardly differs from model 2 anywhere."""
 
 
-def coefficient_tables(data: ReportData) -> Iterator[Table]:
+def coefficient_tables(data: ReportData) -> Iterator[ReportTable]:
     """Return a coefficient table for each model that has one."""
     for number_of, found in enumerate(data.coefficients):
         yield table(
@@ -60,7 +60,7 @@ def _evidence(found: Coefficients) -> str:
     )
 
 
-def scenarios(data: ReportData) -> Table:
+def scenarios(data: ReportData) -> ReportTable:
     """Return how the models and the filters do on every scenario."""
     evaluated = data.evaluated
     shown = {
@@ -109,7 +109,7 @@ def _std(found: ErrorFigures | None, least: float | None = None) -> Cell:
     return Cell(text, "good" if found.error_std_deg == least else "")
 
 
-def rivals(data: ReportData) -> Table | None:
+def rivals(data: ReportData) -> ReportTable | None:
     """Return what the learned rivals reach and cost; None if they were not trained."""
     found = data.evaluated.rows("rivals")
     if not found:
@@ -144,7 +144,7 @@ def rivals(data: ReportData) -> Table | None:
     )
 
 
-def fleets(data: ReportData) -> Iterator[Table]:
+def fleets(data: ReportData) -> Iterator[ReportTable]:
     """Return for each fleet-trained model its errors beside those of the one-car model."""
     rows = data.evaluated.rows("comparisons")
     for fleet in dict.fromkeys(row["fleet"].rpartition("/")[0] for row in rows):
@@ -175,7 +175,7 @@ def _pair(row: Mapping[str, Any] | None) -> Cell:
     return Cell(text, "good" if row["better"] == row["fleet"] else "")
 
 
-def storage(data: ReportData) -> Table:
+def storage(data: ReportData) -> ReportTable:
     """Return what the warehouse holds."""
     return table(
         "storage",

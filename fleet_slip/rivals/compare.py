@@ -34,7 +34,7 @@ def all_signals() -> tuple[str, ...]:
 
 
 @dataclass(frozen=True)
-class Rival:
+class TrainedRival:
     """One learner on one set of signals.
 
     Attributes:
@@ -88,7 +88,7 @@ class Rival:
         }
 
 
-def train_rivals(warehouse: Warehouse, cohort: Cohort) -> tuple[Rival, ...]:
+def train_rivals(warehouse: Warehouse, cohort: Cohort) -> tuple[TrainedRival, ...]:
     """Fit and cross-validate every learner on both sets of signals."""
     sample = draw_sample(warehouse, cohort, all_signals())
     sets = (TWO_SIGNALS, all_signals())
@@ -96,7 +96,7 @@ def train_rivals(warehouse: Warehouse, cohort: Cohort) -> tuple[Rival, ...]:
         return tuple(train(learner, sample, signals) for learner in LEARNERS for signals in sets)
 
 
-def train(learner: Learner, sample: Sample, signals: tuple[str, ...]) -> Rival:
+def train(learner: Learner, sample: Sample, signals: tuple[str, ...]) -> TrainedRival:
     """Fit and cross-validate one learner, and measure it."""
     inputs = sample.of(tuple(catalogue()[name].column for name in signals))
     started = time.perf_counter()
@@ -106,12 +106,12 @@ def train(learner: Learner, sample: Sample, signals: tuple[str, ...]) -> Rival:
     singles = [
         _seconds(fitted.predict, inputs[i : i + 1]) for i in range(min(SINGLE_ESTIMATES, len(many)))
     ]
-    return Rival(
+    return TrainedRival(
         name=f"{learner.name}_{len(signals)}",
         learner=learner,
         signals=signals,
         fitted=fitted,
-        cross_validated=cross_validate(learner, inputs, sample),
+        cross_validated=cross_validate_learner(learner, inputs, sample),
         rows=len(inputs),
         training_s=training_s,
         one_estimate_us=float(np.median(singles)) * 1e6,
@@ -119,7 +119,7 @@ def train(learner: Learner, sample: Sample, signals: tuple[str, ...]) -> Rival:
     )
 
 
-def cross_validate(learner: Learner, inputs: FloatArray, sample: Sample) -> ErrorFigures:
+def cross_validate_learner(learner: Learner, inputs: FloatArray, sample: Sample) -> ErrorFigures:
     """Return the figures on rows of drives that each fold's fit has not seen."""
     folds = sample.folds(FOLDS)
     estimates = np.full(len(inputs), np.nan)

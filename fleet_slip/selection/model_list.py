@@ -98,7 +98,7 @@ def load_model_list(name_or_path: str) -> ModelList:
     return load_config(find_config("models", name_or_path), ModelList)
 
 
-def nested_models(order: Sequence[str]) -> tuple[CandidateModel, ...]:
+def nested_candidates(order: Sequence[str]) -> tuple[CandidateModel, ...]:
     """Return the nested models of a predefined order (paper, section II.B): its first 1..k inputs.
 
     The null model, without any input, predicts the mean and has no correlation to compare.

@@ -23,7 +23,7 @@ from fleet_slip.selection.model_list import (
     ModelList,
     Search,
     load_model_list,
-    nested_models,
+    nested_candidates,
 )
 from fleet_slip.selection.search import require_criterion, select_ranked, select_subsets
 from fleet_slip.selection.uncertainty import estimate_uncertainty
@@ -188,7 +188,9 @@ def _compare_listed(
     search = _search_of(request, model_list)
     inputs = inputs_of(cohort, request.nested or WHOLE_SET) if search else ()
     nested = (
-        nested_models(inputs_of(cohort, request.nested)) if request.nested and not search else ()
+        nested_candidates(inputs_of(cohort, request.nested))
+        if request.nested and not search
+        else ()
     )
     if search and not listed:
         selection = select(cohort, (), folds, parse_worth(request.worth), search, inputs)

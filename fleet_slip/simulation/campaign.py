@@ -21,7 +21,7 @@ from fleet_slip.catalogue.signals import Identifier
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import ConfigError
 from fleet_slip.resources import find_config
-from fleet_slip.simulation.drive_plan import Fleet, Grid, random_generator
+from fleet_slip.simulation.drive_plan import FleetPlan, GridPlan, random_generator
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ, Sensors
 from fleet_slip.simulation.speed_profile import SpeedLimits, SpeedProfile, speed_profile
 from fleet_slip.simulation.track import Track
@@ -95,7 +95,7 @@ class Campaign(Config):
     drives_per_day: int = Field(gt=0, le=9999)
     laps: float = Field(gt=0, le=1000)
     rows_per_file: int = Field(gt=0, le=2_000_000)
-    plan: Annotated[Grid | Fleet, Field(discriminator="kind")]
+    plan: Annotated[GridPlan | FleetPlan, Field(discriminator="kind")]
     sensors: Sensors
 
     @model_validator(mode="after")
@@ -155,7 +155,7 @@ class Campaign(Config):
         plan, number = self.plan, first + index
         drive_id = f"{self.name}-{day.isoformat()}-{index:04d}"
         vehicle_id = f"{self.name}-{plan.car(number):04d}"
-        if isinstance(plan, Grid):
+        if isinstance(plan, GridPlan):
             assignment = plan.assignment(number, self.sensors)
         else:
             assignment = plan.assignment(

@@ -95,7 +95,7 @@ class Plan(Config):
         )
 
 
-class Grid(Plan):
+class GridPlan(Plan):
     """Every combination of the lists once, then again from the beginning.
 
     The order strides through the combinations by about 1/φ of their number (φ the golden
@@ -166,7 +166,7 @@ class SensorBiases(Config):
         )
 
 
-class Fleet(Plan):
+class FleetPlan(Plan):
     """Many different cars that take turns, each on roads and at speeds drawn for every drive.
 
     Model, load, tyres and sensor biases are a car's own and stay. The driver sees the road: he uses

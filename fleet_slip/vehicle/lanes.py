@@ -85,7 +85,7 @@ class Truth:
 
 
 @dataclass(frozen=True)
-class Block:
+class TruthBlock:
     """What happened in a part of a drive: at most `BLOCK` samples, without a gap."""
 
     drive: int
@@ -100,7 +100,7 @@ class Block:
 
 def simulate_blocks(
     drives: Sequence[LaneDrive], steps_per_sample: int = STEPS_PER_SAMPLE
-) -> Iterator[Block]:
+) -> Iterator[TruthBlock]:
     """Yield what happens in each drive, sampled at 100 Hz from its start, block by block.
 
     The blocks of a drive come in order, those of different drives in any. A drive ends after its
@@ -136,7 +136,7 @@ def simulate_blocks(
             if last or tick - first == BLOCK:
                 lost = int(ended[drive, kernel.LOST])
                 channels = dict(zip(CHANNELS, truth[lane, :, : tick - first], strict=True))
-                yield Block(drive, channels, last, None if lost == NOBODY else lost)
+                yield TruthBlock(drive, channels, last, None if lost == NOBODY else lost)
                 book[FIRST, lane] = tick
             if last:
                 lane_memory.clear(memory, book, lane)

@@ -10,7 +10,7 @@ from fleet_slip.catalogue.signals import SignalCatalogue
 from fleet_slip.config import Config, load_toml
 from fleet_slip.resources import folder
 
-SHARED = "shared"
+COMMON = "shared"
 """Section of `warehouse/columns.toml` for columns of several views."""
 
 
@@ -42,7 +42,7 @@ def describe_columns(database: duckdb.DuckDBPyConnection, signals: SignalCatalog
     ).fetchall()
     rows = []
     for view, column, data_type in found:
-        described = {**from_catalogue, **by_view[SHARED], **by_view.get(view, {})}.get(column)
+        described = {**from_catalogue, **by_view[COMMON], **by_view.get(view, {})}.get(column)
         unit, description = (described.unit, described.description) if described else ("", "")
         rows.append(
             {

@@ -5,7 +5,13 @@ import pytest
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.regression.folds import by_hash
-from fleet_slip.rivals.compare import TWO_SIGNALS, Rival, all_signals, cross_validate, train
+from fleet_slip.rivals.compare import (
+    TWO_SIGNALS,
+    TrainedRival,
+    all_signals,
+    cross_validate_learner,
+    train,
+)
 from fleet_slip.rivals.learners import (
     CENTRES,
     LEARNERS,
@@ -102,7 +108,7 @@ def test_no_fold_is_tested_on_drives_that_it_was_fitted_on() -> None:
         return fit_regression(inputs, label)
 
     learner = Learner("memory", "", remember)  # type: ignore[arg-type]
-    cross_validate(learner, number[:, None].astype(float), data)
+    cross_validate_learner(learner, number[:, None].astype(float), data)
     folds = by_hash(data.drive_id.tolist(), 5)
     assert len(seen) == len(folds.names)
     for fold, fitted_on in enumerate(seen):
@@ -110,7 +116,7 @@ def test_no_fold_is_tested_on_drives_that_it_was_fitted_on() -> None:
 
 
 def test_a_null_input_leaves_no_estimate() -> None:
-    rival: Rival = train(LEARNERS[0], sample(), TWO_SIGNALS)
+    rival: TrainedRival = train(LEARNERS[0], sample(), TWO_SIGNALS)
     signals = {column: np.array([0.5, np.nan, 0.5]) for column in COLUMNS}
     estimate = rival.estimate(signals)
     assert np.isfinite(estimate).tolist() == [True, False, True]

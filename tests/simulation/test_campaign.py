@@ -10,7 +10,7 @@ import pytest
 from fleet_slip.errors import ConfigError
 from fleet_slip.resources import config_names, find_config
 from fleet_slip.simulation.campaign import Campaign, load_campaign
-from fleet_slip.simulation.drive_plan import Grid, random_generator
+from fleet_slip.simulation.drive_plan import GridPlan, random_generator
 
 SMOKE = find_config("campaigns", "smoke").read_text(encoding="utf-8")
 FLEET = find_config("campaigns", "fleet").read_text(encoding="utf-8")
@@ -127,7 +127,7 @@ def test_track_and_vehicle_are_part_of_the_digest(
 
 def test_grid_takes_every_combination_once_before_any_twice() -> None:
     plan = load_campaign("waterford").plan
-    assert isinstance(plan, Grid)
+    assert isinstance(plan, GridPlan)
     sensors = load_campaign("waterford").sensors
     count = len(plan.lateral_mps2) * len(plan.speed_factor)
     taken = [plan.assignment(number, sensors) for number in range(2 * count)]
@@ -139,7 +139,7 @@ def test_grid_takes_every_combination_once_before_any_twice() -> None:
 
 def test_each_day_of_a_grid_covers_the_range_of_speeds() -> None:
     campaign = load_campaign("waterford")
-    assert isinstance(campaign.plan, Grid)
+    assert isinstance(campaign.plan, GridPlan)
     lowest, highest = min(campaign.plan.speed_factor), max(campaign.plan.speed_factor)
     for day in campaign.days():
         factors = sorted(drive.speed_factor for drive in campaign.drives(day))

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.views import VIEWS, connect
-from fleet_slip.warehouse.dictionary import SHARED, column_descriptions
+from fleet_slip.warehouse.dictionary import COMMON, column_descriptions
 
 
 def columns(root: Path) -> dict[str, dict[str, tuple[str, str]]]:
@@ -23,7 +23,7 @@ def test_every_description_is_of_a_column_and_every_column_has_one(tmp_path: Pat
     assert {*found, "dictionary"} == VIEWS
     for view, described in column_descriptions().items():
         shown = {name for of_view in found.values() for name in of_view}
-        assert described.keys() <= (shown if view == SHARED else found[view].keys()), view
+        assert described.keys() <= (shown if view == COMMON else found[view].keys()), view
     for view, described_columns in found.items():
         for column, (_, description) in described_columns.items():
             assert description, (view, column)

@@ -26,7 +26,7 @@ KEY_IN = 0.62
 HEAD_IN = 0.3
 
 
-def positions(drive: EvaluatedDrive) -> tuple[FloatArray, FloatArray]:
+def car_positions(drive: EvaluatedDrive) -> tuple[FloatArray, FloatArray]:
     """Return x and y of the car in m, shape (ticks,): along the centre line, and off it."""
     line = drive.scenario.track.centre_line(SPACING_M)
     x, y, heading = (
@@ -59,7 +59,7 @@ def error_map(runs: Sequence[tuple[str, EvaluatedScenario]], estimator: str, siz
 
 
 def _draw(axes: Axes, run: EvaluatedScenario, estimator: str) -> None:
-    x, y = positions(run.drive)
+    x, y = car_positions(run.drive)
     error = np.degrees(run.estimates[estimator] - run.drive.sideslip_rad)
     error = smooth(error, int(SMOOTHED_S * SAMPLE_RATE_HZ))
     shown = np.isfinite(error) & run.drive.evaluated
