@@ -102,7 +102,7 @@ def _message(number: int, name: str, sha256: str) -> bytes:
 def _signed(key: Path, message: bytes) -> bytes:
     secret = _read_private_key(key)
     try:
-        signature = _ed25519().sign(secret, message)
+        signature = _ed25519().sign_message(secret, message)
     except ValueError:
         raise ConfigError(
             f"{key}: not an unencrypted Ed25519 private key in PEM. Make one with: fleet-slip "
