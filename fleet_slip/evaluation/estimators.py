@@ -1,6 +1,6 @@
 """What is evaluated: anything that turns a drive's signals into side-slip angles."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -60,6 +60,18 @@ class LinearEstimate:
         return {"intercept": self.intercept, "coefficients": dict(self.coefficients)}
 
 
+def counts_of(signals: Signals, names: Sequence[str], facts: Mapping[str, Any]) -> DriveCounts:
+    """Return the counts of some signals of a drive that has a row for every tick."""
+    counts, present = {}, {}
+    for name in names:
+        values = signals[catalogue()[name].column]
+        present[name] = np.isfinite(values)
+        scaled = np.where(present[name], values, 0.0) / float(catalogue()[name].scale)
+        counts[name] = np.rint(scaled).astype(np.int64)
+    ticks = np.arange(len(next(iter(counts.values()))))
+    return DriveCounts(ticks, counts, present, facts)
+
+
 @dataclass(frozen=True)
 class ColumnEstimate:
     """A published model with features or columns over time, sample by sample as a car drives.
@@ -82,14 +94,7 @@ class ColumnEstimate:
 
     def __call__(self, signals: Signals) -> FloatArray:
         """Return the estimate at each tick; there is one row for every tick."""
-        counts, present = {}, {}
-        for name in self.predictor.plan.signals:
-            values = signals[catalogue()[name].column]
-            present[name] = np.isfinite(values)
-            scaled = np.where(present[name], values, 0.0) / float(catalogue()[name].scale)
-            counts[name] = np.rint(scaled).astype(np.int64)
-        ticks = np.arange(len(next(iter(counts.values()))))
-        return self.predictor(DriveCounts(ticks, counts, present, self.facts))
+        return self.predictor(counts_of(signals, self.predictor.plan.signals, self.facts))
 
     def as_dict(self) -> dict[str, Any]:
         """Return what a JSON document needs to compute the same estimates."""

@@ -15,16 +15,18 @@ from fleet_slip.evaluation.estimators import (
     Estimate,
     LinearEstimate,
     TrainedModels,
+    published_estimate,
     train_models,
 )
 from fleet_slip.evaluation.filters import FILTERS, bound
 from fleet_slip.evaluation.runs import EvaluatedScenario, run_all
 from fleet_slip.evaluation.targets import THE_PAPERS_CHOICE
-from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.report.coefficients import Coefficients, coefficient_table
 from fleet_slip.report.evaluated import Evaluated, latest_of
 from fleet_slip.report.histogram import Histogram, held_out_histogram
+from fleet_slip.report.memory import Memory, looks_back, weigh_memory
 from fleet_slip.report.ordering import Ordering, compare_orders
 from fleet_slip.resources import config_file
 from fleet_slip.selection.model_list import load_model_list
@@ -84,6 +86,7 @@ class ReportData:
         coefficients: of the paper's choice, then of the published model if that is another.
         histogram: held-out estimates of all training rows by the paper's choice.
         ordering: what the order of the signals is worth.
+        memory: what columns over time are worth; None if the published model has none.
         tables: of the warehouse.
         campaigns: of the drives that the model was trained on.
         configs: checksums of what determines the results.
@@ -97,6 +100,7 @@ class ReportData:
     coefficients: tuple[Coefficients, ...]
     histogram: Histogram
     ordering: Ordering
+    memory: Memory | None
     tables: tuple[TableSize, ...]
     campaigns: tuple[str, ...]
     configs: tuple[ConfigHash, ...]
@@ -121,19 +125,25 @@ def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
     scenarios = [one for one in shipped if one.name in evaluated.scenarios]
     drawn = [one for one in scenarios if one.name in DRAWN_SCENARIOS]
     runs = {
-        run.scenario.name: run for run in run_all(warehouse, drawn, drawn_estimators(evaluated))
+        run.scenario.name: run
+        for run in run_all(warehouse, drawn, drawn_estimators(evaluated, version))
     }
     _same_figures(evaluated, runs)
     cohort, models = trained.selection.cohort, trained.selection.models
+    own = _own_cohort(warehouse, trained)
+    manifest = version.manifest
     choice = next(model for model in models if model.name == THE_PAPERS_CHOICE)
     return ReportData(
         version=version,
         evaluated=evaluated,
         trained=trained,
         runs=runs,
-        coefficients=_coefficients(warehouse, trained),
+        coefficients=_coefficients(trained, own),
         histogram=held_out_histogram(warehouse, trained.selection, choice),
         ordering=compare_orders(cohort, tuple(dict.fromkeys(models[-1].signals))),
+        memory=weigh_memory(own, manifest, trained.selection.folds, runs)
+        if looks_back(manifest)
+        else None,
         tables=_tables(warehouse),
         campaigns=tuple(sorted(set(cohort.drives["campaign"].to_pylist()))),
         configs=_configs(scenarios),
@@ -141,7 +151,7 @@ def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
     )
 
 
-def drawn_estimators(evaluated: Evaluated) -> dict[str, Estimate]:
+def drawn_estimators(evaluated: Evaluated, version: ModelVersion) -> dict[str, Estimate]:
     """Return the estimators that figures show, rebuilt from what the evaluation says of them."""
     car = load_scenario("nominal").car
     kinds = {one.name: one for one in FILTERS}
@@ -156,7 +166,7 @@ def drawn_estimators(evaluated: Evaluated) -> dict[str, Estimate]:
                 evaluated.estimators[name]["parameters"]
             )
             estimators[name] = bound(kind, parameters, car)
-    return estimators
+    return estimators | {version.reference: published_estimate(version.manifest)}
 
 
 def _same_models(evaluated: Evaluated, trained: TrainedModels) -> None:
@@ -189,15 +199,19 @@ def _changed(evaluated: Evaluated, what: str) -> str:
     )
 
 
-def _coefficients(warehouse: Warehouse, trained: TrainedModels) -> tuple[Coefficients, ...]:
+def _own_cohort(warehouse: Warehouse, trained: TrainedModels) -> Cohort:
+    """Return the cohort with the Gram rows that the published model was made of."""
+    cohort = trained.selection.cohort
+    name = features().name_of(trained.version.manifest.trained_on.feature_set)
+    return cohort if name == PLAIN else load_cohort(warehouse, cohort.condition, name)
+
+
+def _coefficients(trained: TrainedModels, own: Cohort) -> tuple[Coefficients, ...]:
     cohort, published = trained.selection.cohort, trained.version
     choice = next(m for m in trained.selection.models if m.name == THE_PAPERS_CHOICE)
     tables = [coefficient_table(cohort, f"model {choice.name}", choice.signals)]
     if set(published.manifest.signals) != set(choice.signals):
-        manifest = published.manifest
-        name = features().name_of(manifest.trained_on.feature_set)
-        own = cohort if name == PLAIN else load_cohort(warehouse, cohort.condition, name)
-        tables.append(coefficient_table(own, published.reference, manifest.signals))
+        tables.append(coefficient_table(own, published.reference, published.manifest.signals))
     return tuple(tables)
 
 

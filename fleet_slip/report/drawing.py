@@ -7,7 +7,7 @@ from typing import Any
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
-from fleet_slip.report.pictures import Picture
+from fleet_slip.report.picture import Picture
 from fleet_slip.report.style import DESK, FONT, PALETTE, PHONE, STYLE, Size
 
 PNG_DPI = 150

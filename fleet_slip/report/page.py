@@ -13,7 +13,7 @@ from fleet_slip.report.claims import Judged, judge_claims
 from fleet_slip.report.claims.claim import Status
 from fleet_slip.report.data import ReportData
 from fleet_slip.report.drawing import inline_svgs
-from fleet_slip.report.pictures import Picture
+from fleet_slip.report.picture import Picture
 from fleet_slip.report.style import PALETTE
 from fleet_slip.report.table import ReportTable
 from fleet_slip.report.text import count, degrees, size
@@ -57,7 +57,8 @@ def render(data: ReportData, shown: Sequence[Picture]) -> str:
         version=data.version,
         evaluation=data.evaluated.document,
         paper=[one for one in drawn if one.picture.key.startswith("figure-")],
-        beyond=[one for one in drawn if not one.picture.key.startswith("figure-")],
+        beyond=[one for one in drawn if not one.picture.key.startswith(("figure-", "memory-"))],
+        memory=[one for one in drawn if one.picture.key.startswith("memory-")],
         table_one=paper_tables.table_one(data),
         table_two=paper_tables.table_two(data),
         targets=list(paper_tables.targets(data)),

@@ -1,9 +1,6 @@
 """Which figures a report has, in the order of the paper, with captions from the same data."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-
-from matplotlib.figure import Figure
+from collections.abc import Iterator, Mapping, Sequence
 
 from fleet_slip.evaluation.runs import EvaluatedScenario
 from fleet_slip.report.data import DRAWN_FILTERS, ReportData
@@ -11,9 +8,10 @@ from fleet_slip.report.figures.density import density
 from fleet_slip.report.figures.lateral import error_by_acceleration
 from fleet_slip.report.figures.series import Block, Line, side_slip
 from fleet_slip.report.figures.speed import KMH_PER_MPS, speed
-from fleet_slip.report.figures.track_map import error_map
+from fleet_slip.report.figures.track_map import Map, error_map
 from fleet_slip.report.histogram import Histogram
-from fleet_slip.report.style import Size
+from fleet_slip.report.memory_pictures import memory_pictures
+from fleet_slip.report.picture import Picture
 from fleet_slip.report.text import count, degrees, listed, number, percent
 
 STYLES = ("style_gentle", "nominal", "style_brisk", "style_sporty", "style_limit")
@@ -24,28 +22,9 @@ TRAINED_SHARE = 0.999
 FILTER_LABELS = {"kalman": "Kalman filter", "kalman_tuned": "Kalman filter, tuned"}
 
 
-@dataclass(frozen=True)
-class Picture:
-    """One figure of the report.
-
-    Attributes:
-        key: name of its files, and of its place on the page.
-        title: what it shows.
-        caption: what is to be seen, in numbers.
-        alternative: for those who cannot see it.
-        draw: makes it at a size.
-    """
-
-    key: str
-    title: str
-    caption: str
-    alternative: str
-    draw: Callable[[Size], Figure]
-
-
 def draw_pictures(data: ReportData) -> tuple[Picture, ...]:
     """Return all figures whose drives were evaluated."""
-    return (*_of_the_paper(data), *_beyond_the_paper(data))
+    return (*_of_the_paper(data), *_beyond_the_paper(data), *memory_pictures(data))
 
 
 def model_line(data: ReportData, number_in_table: str) -> Line:
@@ -193,14 +172,14 @@ def _speed(key: str, title: str, run: EvaluatedScenario) -> Picture:
 
 def _beyond_the_paper(data: ReportData) -> Iterator[Picture]:
     maps = [("Nominal drive", "nominal"), ("Adhesion 0.4", "adhesion_0_4")]
-    shown = [(title, data.runs[name]) for title, name in maps if name in data.runs]
+    shown = [Map(title, data.runs[name], data.choice) for title, name in maps if name in data.runs]
     if shown:
         yield _map(data, shown)
     yield _density(data, data.histogram)
     yield from _lateral(data, data.runs)
 
 
-def _map(data: ReportData, shown: Sequence[tuple[str, EvaluatedScenario]]) -> Picture:
+def _map(data: ReportData, shown: Sequence[Map]) -> Picture:
     label = choice_line(data).label
     title = f"Where on the track {label} is off"
     caption = (
@@ -211,9 +190,9 @@ def _map(data: ReportData, shown: Sequence[tuple[str, EvaluatedScenario]]) -> Pi
         "error-map",
         title,
         caption,
-        f"{title}: maps of the track for {listed([name for name, _ in shown])}, coloured by the "
+        f"{title}: maps of the track for {listed([one.title for one in shown])}, coloured by the "
         "error.",
-        lambda size: error_map(shown, data.choice, size),
+        lambda size: error_map(shown, size),
     )
 
 

@@ -12,9 +12,9 @@ from hypothesis.extra.numpy import arrays
 from matplotlib.figure import Figure
 
 from fleet_slip.report.drawing import inline, inline_svgs
-from fleet_slip.report.figures.lateral import apart
+from fleet_slip.report.figures.labels import apart
 from fleet_slip.report.figures.lines import band, smooth
-from fleet_slip.report.pictures import Picture
+from fleet_slip.report.picture import Picture
 from fleet_slip.report.style import PALETTE, Size, colour
 from fleet_slip.report.text import degrees, listed, number, percent, scientific, size
 

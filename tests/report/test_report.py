@@ -1,5 +1,6 @@
 """A report from end to end: its numbers are those of the evaluation, and it stands by itself."""
 
+import math
 import re
 import shutil
 from collections import Counter
@@ -12,10 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fleet_slip.catalogue.features import input_scales
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation.results import keep
 from fleet_slip.files.documents import Document
 from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.regression.gram import Gram
 from fleet_slip.report import paper_tables
 from fleet_slip.report.blocks import blocks_won, difference
 from fleet_slip.report.claims import CLAIMS, judge_claims
@@ -24,6 +28,7 @@ from fleet_slip.report.claims.conditions import noise_is_slight
 from fleet_slip.report.data import ReportData
 from fleet_slip.report.drawing import png_file, svg_file
 from fleet_slip.report.histogram import ANGLE_DEG, held_out_coefficients
+from fleet_slip.report.memory import by_length, looks_back
 from fleet_slip.report.page import render
 from fleet_slip.report.pictures import draw_pictures
 from fleet_slip.report.text import number
@@ -83,6 +88,7 @@ def test_each_figure_is_on_the_page_and_in_two_files(reported: Reported, page: P
     svgs = sorted(file.stem for file in reported.figures.glob("*.svg"))
     assert svgs == sorted(file.stem for file in reported.figures.glob("*.png"))
     assert set(svgs) >= {"figure-1a", "figure-1b", "figure-2", "figure-3", "figure-5", "figure-8"}
+    assert set(svgs) >= {"memory-columns", "memory-left-out", "memory-map"}
     assert set(svgs) <= set(page.ids)
     assert page.elements["figure"] == len(svgs)
     assert page.elements["svg"] == 2 * len(svgs)
@@ -225,3 +231,70 @@ def test_a_model_that_was_not_evaluated_is_told(
     done = run_command("report", "--model", "smoke")
     assert done.exit_code == 5
     assert "fleet-slip evaluate --one-car smoke@1" in done.stderr
+
+
+def test_the_path_of_columns_ends_at_the_published_model(data: ReportData) -> None:
+    """Its errors are those of the selection and of the evaluation, which come another way."""
+    memory, manifest = data.memory, data.version.manifest
+    assert memory is not None
+    assert set(memory.searched.models[-1].signals) == set(manifest.signals)
+    published = manifest.cross_validation.rmse_deg
+    assert memory.cross_validated_deg[-1] == pytest.approx(published, rel=1e-12)
+    assert memory.rmse_deg < published  # whose columns were chosen again in every fold
+    assert set(memory.on_drives) == {"nominal", "noise_doubled"}
+    for name, errors in memory.on_drives.items():
+        found = data.evaluated.figures(name, data.version.reference)
+        assert found is not None
+        assert errors[-1] == pytest.approx(found.rmse_deg, rel=1e-9)
+
+
+def test_the_error_without_columns_is_that_of_a_fit_without_them(
+    reported: Reported, data: ReportData
+) -> None:
+    """By least squares in float64 on the moments of each fold, instead of exact elimination."""
+    memory, manifest = data.memory, data.version.manifest
+    assert memory is not None
+    warehouse = Warehouse(LocalFolder(reported.root))
+    cohort = load_cohort(warehouse, manifest.trained_on.cohort, "windows")
+    folding = data.trained.selection.folds
+    folds = cohort.folds(folding.by, folding.count).serving(manifest.signals, "sideslip")
+    moments = [_moments(gram) for gram in folds.grams]
+    everything = list(range(len(manifest.signals)))
+    assert memory.rmse_deg == pytest.approx(_held_out_rmse_deg(moments, everything), rel=1e-6)
+    left_out = {name: [name] for name in manifest.signals} | by_length(manifest)
+    assert sum(len(columns) for columns in by_length(manifest).values()) == len(manifest.signals)
+    assert len(memory.columns) == len(manifest.signals)
+    for one in (*memory.columns, *memory.windows):
+        gone = left_out[one.name]
+        kept = [i for i, name in enumerate(manifest.signals) if name not in gone]
+        assert one.columns == len(gone)
+        assert one.rmse_deg == pytest.approx(_held_out_rmse_deg(moments, kept), rel=1e-6)
+
+
+def _moments(gram: Gram) -> np.ndarray:
+    size = len(gram.signals) + 1
+    matrix = np.empty((size, size))
+    matrix[0] = matrix[:, 0] = [gram.n, *gram.sums]
+    matrix[1:, 1:] = gram.raw()
+    return matrix
+
+
+def _held_out_rmse_deg(moments: list[np.ndarray], kept: list[int]) -> float:
+    at = [0, *(i + 1 for i in kept)]
+    total = np.sum(moments, axis=0)
+    squares = 0.0
+    for test in moments:
+        training = total - test
+        size = np.sqrt(np.diag(training)[at])
+        system = training[np.ix_(at, at)] / np.outer(size, size)
+        weights = np.linalg.solve(system, training[at, -1] / size) / size
+        direction = np.zeros(len(test))
+        direction[at], direction[-1] = weights, -1.0
+        squares += float(direction @ test @ direction)
+    return math.degrees(math.sqrt(squares / total[0, 0]) * float(input_scales()["sideslip"]))
+
+
+def test_a_model_of_one_instant_has_no_figures_on_memory(data: ReportData) -> None:
+    assert not [one for one in draw_pictures(replace(data, memory=None)) if "memory" in one.key]
+    plain = [term for term in data.version.manifest.terms if term.logged]
+    assert not looks_back(data.version.manifest.model_copy(update={"terms": tuple(plain)}))

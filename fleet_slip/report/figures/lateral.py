@@ -7,6 +7,7 @@ from matplotlib.figure import Figure
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.evaluation.runs import EvaluatedScenario
+from fleet_slip.report.figures.labels import End, label_ends, tick_degrees
 from fleet_slip.report.figures.lines import smooth
 from fleet_slip.report.figures.series import Line
 from fleet_slip.report.style import Size, colour
@@ -62,11 +63,12 @@ def error_by_acceleration(
             1 - 0.8 / HEIGHT_IN,
         )
     )
-    ends = []
+    ends, furthest = [], 0.0
     for line in lines:
         middle, error = error_by_bin(runs, line.estimator)
         axes.plot(middle, error, color=colour(line.colour), linewidth=1.6, marker="o", markersize=3)
-        ends.append((float(error[-1]), float(middle[-1]), line))
+        furthest = max(furthest, float(middle[-1]))
+        ends.append(End(float(error[-1]), line.label, line.colour))
     axes.set_yscale("log")
     axes.axvspan(0, trained_to_mps2, color=colour("model_4"), alpha=0.07, linewidth=0)
     axes.text(
@@ -79,45 +81,9 @@ def error_by_acceleration(
         color=colour("muted"),
         fontsize=8.5,
     )
-    axes.set_xlim(0, max(end[1] for end in ends) + BIN_MPS2 / 2)
-    ticks = [0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10]
-    low, high = axes.get_ylim()
-    shown = [tick for tick in ticks if low <= tick <= high]
-    axes.set_yticks(shown, [f"{tick:g}°" for tick in shown])
-    axes.minorticks_off()
+    axes.set_xlim(0, furthest + BIN_MPS2 / 2)
+    tick_degrees(axes)
     axes.set_xlabel("size of the lateral acceleration (m/s²)", labelpad=2)
     axes.set_title("root mean square error", color=colour("muted"))
-    _label_ends(figure, axes.get_ylim(), ends, size)
+    label_ends(axes, ends, size)
     return figure
-
-
-def _label_ends(
-    figure: Figure, limits: tuple[float, float], ends: list[tuple[float, float, Line]], size: Size
-) -> None:
-    """Write each line's name at its right end, far enough apart to be read."""
-    (axes,) = figure.axes
-    low, high = np.log(limits)
-    least = 13.0 / (axes.get_position().height * HEIGHT_IN * 72)
-    ordered = sorted(ends, key=lambda end: end[0])
-    places = apart([(np.log(error) - low) / (high - low) for error, _, _ in ordered], least)
-    for place, (_, _, line) in zip(places, ordered, strict=True):
-        axes.text(
-            1.01,
-            place,
-            line.label,
-            transform=axes.transAxes,
-            color=colour(line.colour),
-            va="center",
-            fontsize=9 if size.wide else 8,
-        )
-
-
-def apart(places: Sequence[float], least: float) -> list[float]:
-    """Move ascending places at most 1 apart by at least so much, up first, then down from 1."""
-    moved = list(places)
-    for i in range(1, len(moved)):
-        moved[i] = max(moved[i], moved[i - 1] + least)
-    moved[-1] = min(moved[-1], 1.0)
-    for i in reversed(range(len(moved) - 1)):
-        moved[i] = min(moved[i], moved[i + 1] - least)
-    return moved

@@ -1,6 +1,7 @@
 """A map of the track, coloured by the estimator's error."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -17,7 +18,12 @@ from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 SMOOTHED_S = 0.5
 """Noise of single samples would hide where the error is."""
 
-EDGES_DEG = (-1.0, -0.3, -0.1, 0.1, 0.3, 1.0)
+EDGES_DEG = (0.1, 0.3, 1.0)
+"""Sizes of errors at which the colour changes."""
+
+FINE_EDGES_DEG = (0.03, 0.06, 0.12)
+"""The same where models on a dry road are compared."""
+
 CLASSES = ("below_3", "below_2", "below_1", "near_0", "above_1", "above_2", "above_3")
 WIDTHS = (4.4, 3.6, 3.0, 2.4, 3.0, 3.6, 4.4)
 SPACING_M = 3.0
@@ -37,33 +43,44 @@ def car_positions(drive: EvaluatedDrive) -> tuple[FloatArray, FloatArray]:
     return x - offset * np.sin(heading), y + offset * np.cos(heading)
 
 
-def error_map(runs: Sequence[tuple[str, EvaluatedScenario]], estimator: str, size: Size) -> Figure:
-    """Draw a map for each drive, side by side where there is room."""
-    columns = len(runs) if size.wide else 1
-    rows = -(-len(runs) // columns)
+@dataclass(frozen=True)
+class Map:
+    """One map of a figure: its title, the drive, and whose error is drawn."""
+
+    title: str
+    run: EvaluatedScenario
+    estimator: str
+
+
+def error_map(maps: Sequence[Map], size: Size, edges_deg: Sequence[float] = EDGES_DEG) -> Figure:
+    """Draw the maps, side by side where there is room."""
+    edges = (*(-edge for edge in reversed(edges_deg)), *edges_deg)
+    columns = len(maps) if size.wide else 1
+    rows = -(-len(maps) // columns)
     each_in = size.width_in / columns
     tall_in = 0.68 * each_in + HEAD_IN
     height = rows * tall_in + KEY_IN
     figure = Figure(figsize=(size.width_in, height))
-    for i, (title, run) in enumerate(runs):
+    for i, one in enumerate(maps):
         left, below = (i % columns) / columns, height - (i // columns + 1) * tall_in
         figure.text(
-            left + 0.02, (below + tall_in - 0.04) / height, title, fontweight="bold", va="top"
+            left + 0.02, (below + tall_in - 0.04) / height, one.title, fontweight="bold", va="top"
         )
         axes = figure.add_axes(
             (left + 0.02, below / height, 1 / columns - 0.04, (tall_in - HEAD_IN) / height)
         )
-        _draw(axes, run, estimator)
-    _key(figure, size)
+        _draw(axes, one, edges)
+    _key(figure, size, edges)
     return figure
 
 
-def _draw(axes: Axes, run: EvaluatedScenario, estimator: str) -> None:
+def _draw(axes: Axes, one: Map, edges: Sequence[float]) -> None:
+    run = one.run
     x, y = car_positions(run.drive)
-    error = np.degrees(run.estimates[estimator] - run.drive.sideslip_rad)
+    error = np.degrees(run.estimates[one.estimator] - run.drive.sideslip_rad)
     error = smooth(error, int(SMOOTHED_S * SAMPLE_RATE_HZ))
     shown = np.isfinite(error) & run.drive.evaluated
-    classes = np.digitize(error, EDGES_DEG)
+    classes = np.digitize(error, edges)
     kinds = np.where(shown, classes, -1)
     for kind, name in enumerate(CLASSES):
         lines = [np.column_stack([x[part], y[part]]) for part in _stretches(kinds, kind, run.drive)]
@@ -100,7 +117,7 @@ def _scale_bar(axes: Axes, left_m: float, bottom_m: float) -> None:
     )
 
 
-def _key(figure: Figure, size: Size) -> None:
+def _key(figure: Figure, size: Size, edges: Sequence[float]) -> None:
     """Draw what the colours mean, along the lower edge."""
     width, height = figure.get_size_inches()
     margin, each = 0.15, min(0.95, (size.width_in - 0.3) / len(CLASSES))
@@ -110,11 +127,11 @@ def _key(figure: Figure, size: Size) -> None:
         )
         axes.axhline(0, color=colour(name), linewidth=thickness)
         axes.set_axis_off()
-    for i, edge in enumerate(EDGES_DEG, start=1):
+    for i, edge in enumerate(edges, start=1):
         figure.text(
             (margin + i * each) / width,
             0.29 / height,
-            f"{edge:+.1f}°".replace("-", "\N{MINUS SIGN}"),
+            f"{edge:+g}°".replace("-", "\N{MINUS SIGN}"),
             ha="center",
             va="top",
             fontsize=8,
