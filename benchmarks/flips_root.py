@@ -1,0 +1,181 @@
+"""A small data root with every kind of file, for `benchmarks/flips.py`, and flips in its files."""
+
+import contextlib
+import hashlib
+import json
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from benchmarks.flips_commands import Ended, command, in_a_child
+from fleet_slip.delta import Change
+from fleet_slip.delta.checkpoints import seal_checkpoints
+from fleet_slip.files.documents import DocumentFolder
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.resources import CONFIG_VARIABLE, find_config, folder
+from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA, Warehouse
+
+KINDS = {
+    "logs": "logs/day=*/*.parquet",
+    "Gram rows": "grams/*.parquet",
+    "quarantine": "quarantine/*.parquet",
+    "commits": "*/_delta_log/*.json",
+    "checkpoints": "*/_delta_log/*.checkpoint.parquet",
+    "last checkpoint": "*/_delta_log/_last_checkpoint",
+    "checksums of checkpoints": "*/_checkpoints/*.json",
+    "manifests": "models/*/versions/*.json",
+    "trained drives": "models/*/versions/*.bin",
+    "histories": "models/*/history/*.json",
+    "evaluations": "evaluations/*.json",
+    "forgotten": "forgotten/*.json",
+    "run records": "runs/*.jsonl",
+}
+
+_CAMPAIGN = (
+    ("number_of_days = 2", "number_of_days = 9"),
+    ("laps = 0.5", "laps = 0.03"),
+    ("rows_per_file = 15_000", "rows_per_file = 1_500"),
+)
+_SEARCH = (("most = 24", "most = 3"),)
+_WINDOWS = re.compile(r'(?s)(\[sets\.windows\].*?windows = \[).*?"yaw_rate_bias",.*?\]')
+
+
+@dataclass(frozen=True)
+class Flip:
+    """A bit of a file below a data root."""
+
+    path: Path
+    bit: int
+
+    def __str__(self) -> str:
+        """Name it."""
+        return f"bit {self.bit} of {self.path}"
+
+    def make(self, root: Path) -> None:
+        """Flip the bit, in its place; twice is as before."""
+        with (root / self.path).open("r+b") as stream:
+            stream.seek(self.bit // 8)
+            byte = stream.read(1)[0]
+            stream.seek(self.bit // 8)
+            stream.write(bytes([byte ^ 1 << self.bit % 8]))
+
+
+@contextlib.contextmanager
+def flipped(root: Path, flip: Flip | None) -> Iterator[None]:
+    """Flip a bit, and take back what is left of it afterwards, so that the rest can be looked at.
+
+    A command may append to the file, remove it, or write it anew.
+    """
+    if flip is None:
+        yield
+        return
+    flip.make(root)
+    file = root / flip.path
+    damaged = file.read_bytes()
+    yield
+    if file.exists() and file.read_bytes().startswith(damaged):
+        flip.make(root)
+
+
+@contextlib.contextmanager
+def copied(root: Path) -> Iterator[Path]:
+    """Yield a copy of a root, for a command that writes."""
+    with tempfile.TemporaryDirectory(dir=root.parent) as where:
+        copy = Path(where) / "data"
+        shutil.copytree(root, copy)
+        yield copy
+
+
+def campaign(root: Path) -> Path:
+    """Return the campaign that a root is made of."""
+    return root.with_name("smoke.toml")
+
+
+def write_configs(root: Path) -> None:
+    """Write a campaign of short drives, and sets and searches of few columns; choose them."""
+    configs = root.with_name("configs")
+    (configs / "models").mkdir(parents=True)
+    campaign(root).write_text(_replace(find_config("campaigns", "smoke").read_text(), _CAMPAIGN))
+    estimator = _replace(find_config("models", "estimator").read_text(), _SEARCH)
+    (configs / "models" / "estimator.toml").write_text(estimator)
+    features = (folder("configs") / "features.toml").read_text(encoding="utf-8")
+    fewer, found = _WINDOWS.subn(r'\1"ay_mean", "yaw_rate_bias"]', features)
+    assert found == 1
+    (configs / "features.toml").write_text(fewer)
+    os.environ[CONFIG_VARIABLE] = str(configs)
+
+
+def _replace(text: str, pairs: tuple[tuple[str, str], ...]) -> str:
+    for old, new in pairs:
+        assert old in text, old
+        text = text.replace(old, new)
+    return text
+
+
+def fill(root: Path) -> None:
+    """Make a small data root with every kind of file, and a day of logs without Gram rows."""
+    given = str(campaign(root))
+    for step in (
+        ("run", "--campaign", given, "--days", "8", "--threads", "1"),
+        ("publish", "smoke", "--nested", "ay,yaw_rate", "--force"),
+        ("forget", "--drive", "smoke-2024-05-01-0000", "--now"),
+    ):
+        _require_done(command(root, *step))
+    _require_done(in_a_child(lambda: _add_what_is_rare(root)))
+    _require_done(command(root, "simulate", given, "--threads", "1"))
+    for kind, pattern in KINDS.items():
+        assert any(root.glob(pattern)), f"no {kind}"
+
+
+def _require_done(ended: Ended) -> None:
+    assert ended.exit_code == 0, ended
+
+
+def _add_what_is_rare(root: Path) -> None:
+    warehouse = Warehouse(LocalFolder(root))
+    refused = [{name: "1" if name != "row" else 1 for name in QUARANTINE_SCHEMA.names}]
+    rows = QUARANTINE_SCHEMA.empty_table().from_pylist(refused, schema=QUARANTINE_SCHEMA)
+    written = warehouse.quarantine.write_file("refused", rows)
+    warehouse.quarantine.snapshot().commit(Change(add=[written]))
+    DocumentFolder(warehouse.root / "evaluations").append({"format": 1, "values": [1, 2.5]})
+    for table in (warehouse.logs, warehouse.grams):
+        delta = table.open_delta()
+        assert delta is not None
+        delta.create_checkpoint()
+        seal_checkpoints(table.folder)
+
+
+def digest(root: Path) -> str:
+    """Return a digest of what a root means: rows of logs and Gram rows, versions, aliases."""
+
+    def work() -> None:
+        warehouse = Warehouse(LocalFolder(root))
+        found = hashlib.sha256()
+        for table, order in ((warehouse.logs, "tick"), (warehouse.grams, "feature_set")):
+            names = [name for name in table.schema.names if name not in ("file", "day")]
+            parts = [
+                pq.read_table(path, partitioning=None, columns=names)
+                for path in table.snapshot(unchecked=True).paths
+            ]
+            rows = pa.concat_tables(parts).sort_by(
+                [("drive_id", "ascending"), (order, "ascending")]
+            )
+            with pa.ipc.new_stream(sink := pa.BufferOutputStream(), rows.schema) as writer:
+                writer.write_table(rows.combine_chunks())
+            found.update(sink.getvalue())
+        for file in sorted(root.glob("models/*/*/*.json")):
+            content = json.loads(file.read_text())["content"]
+            for varying in ("at", "trained_on"):
+                content.pop(varying, None)
+            found.update(json.dumps(content, sort_keys=True).encode())
+        print(found.hexdigest())
+
+    ended = in_a_child(work)
+    return ended.printed if not ended.exit_code else ended.remarks
