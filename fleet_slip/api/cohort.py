@@ -236,4 +236,4 @@ class FleetCohort(Rooted):
 def _folding(by: "FoldKey", count: int | str | None) -> "Folding":
     from fleet_slip.grams.folding import Folding, make_folding
 
-    return Folding(by=by) if count is None else make_folding(by, count)
+    return make_folding(by, count, Folding().count)

@@ -6,11 +6,12 @@ several, if they are.
 
 from collections.abc import Sequence
 from decimal import Decimal
+from fractions import Fraction
 from itertools import pairwise
 
 from pydantic import Field, model_validator
 
-from fleet_slip.catalogue.signals import Identifier, catalogue
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S, Identifier, catalogue
 from fleet_slip.config import Config
 
 PLAIN = "signals"
@@ -55,6 +56,7 @@ class FeatureSet(Config):
     features: tuple[Identifier, ...] = ()
     windows: tuple[Identifier, ...] = ()
     regimes: tuple[Identifier, ...] = ()
+    block_s: Decimal | None = Field(default=None, gt=0, le=100_000)
     row_folds: int | None = Field(default=None, ge=2, le=1000)
     lagged: bool = False
 
@@ -65,11 +67,18 @@ class FeatureSet(Config):
             raise ValueError(f"not input signals: {', '.join(unknown)}")
         if len(set(self.columns)) < len(self.columns):
             raise ValueError("a column stands twice")
-        if bool(self.regimes) + bool(self.row_folds) + self.lagged > 1:
-            raise ValueError("a set has regimes, row_folds or lagged, not several of them")
-        if self.windows and (self.regimes or self.row_folds or self.lagged):
-            raise ValueError("a set with windows has no regimes, row_folds or lagged")
+        if bool(self.regimes) + bool(self.block_s) + bool(self.row_folds) + self.lagged > 1:
+            raise ValueError("a set has regimes, block_s, row_folds or lagged, not several of them")
+        if self.windows and (self.row_folds or self.lagged):
+            raise ValueError("a set with windows has no row_folds or lagged")
+        if self.block_s is not None and Fraction(self.block_s) % SAMPLE_TIME_S:
+            raise ValueError(f"block_s must be a multiple of {float(SAMPLE_TIME_S)}")
         return self
+
+    @property
+    def block_ticks(self) -> int | None:
+        """Number of ticks of a block of time; None where rows are not divided by time."""
+        return None if self.block_s is None else int(Fraction(self.block_s) / SAMPLE_TIME_S)
 
     @property
     def inputs(self) -> tuple[str, ...]:

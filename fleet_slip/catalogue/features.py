@@ -144,6 +144,8 @@ class FeatureCatalogue(Config):
             "row_folds": one.row_folds,
             "lagged": one.lagged,
         }
+        if one.block_ticks:
+            content["block_ticks"] = one.block_ticks
         if one.windows:
             content["windows"] = {
                 w: self.time_columns[w].model_dump(mode="json", exclude={"description"})

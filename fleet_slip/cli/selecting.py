@@ -10,7 +10,7 @@ from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli.options import selection_options
 from fleet_slip.cli.output import Json, print_json, print_table, say, stdout
-from fleet_slip.grams.folding import ROW_FOLDS
+from fleet_slip.grams.folding import BANDS, PARTS, ROW_FOLDS
 from fleet_slip.regression.crossval import CrossValidation
 from fleet_slip.regression.nested_choice import CROSS_VALIDATION, NestedChoice
 from fleet_slip.selection.compare import Selection
@@ -64,6 +64,8 @@ def print_selection(selection: Selection[Any]) -> None:
         ],
         left=1 + listed,
     )
+    if selection.folds.by in (PARTS, BANDS):
+        _print_folds(selection.winner.model)
     if selection.folds.by == ROW_FOLDS:
         say(
             "folds of rows leak: each test row's neighbours at 100 Hz are training rows, so that "
@@ -78,6 +80,24 @@ def print_selection(selection: Selection[Any]) -> None:
         _print_honest(selection.choice.honest)
     if selection.uncertainty is not None:
         _print_uncertainty(selection.uncertainty)
+
+
+def _print_folds(model: CrossValidation) -> None:
+    print_table(
+        f"\nmodel {model.name}, each fold left out in turn",
+        ["fold", "rows", "correlation", "RMSE deg", "mean deg", "std deg"],
+        [
+            [
+                name,
+                f"{found.rows:,}",
+                f"{found.correlation:.4f}",
+                f"{found.rmse_deg:.4f}",
+                f"{found.error_mean_deg:+.4f}",
+                f"{found.error_std_deg:.4f}",
+            ]
+            for name, found in zip(model.fold_names, model.folds, strict=True)
+        ],
+    )
 
 
 def _columns_of(model: CrossValidation, selection: Selection[Any]) -> str:

@@ -99,6 +99,8 @@ def features(
 def _parts(one: FeatureSet) -> str:
     if one.regimes:
         return f"by {' and '.join(one.regimes)}"
+    if one.block_s:
+        return f"in blocks of {one.block_s:f} s"
     if one.row_folds:
         return f"{one.row_folds} folds of rows"
     return "with the one before" if one.lagged else "together"

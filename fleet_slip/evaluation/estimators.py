@@ -60,7 +60,7 @@ class LinearEstimate:
         return {"intercept": self.intercept, "coefficients": dict(self.coefficients)}
 
 
-def counts_of(signals: Signals, names: Sequence[str], facts: Mapping[str, Any]) -> DriveCounts:
+def as_counts(signals: Signals, names: Sequence[str], facts: Mapping[str, Any]) -> DriveCounts:
     """Return the counts of some signals of a drive that has a row for every tick."""
     counts, present = {}, {}
     for name in names:
@@ -94,7 +94,7 @@ class ColumnEstimate:
 
     def __call__(self, signals: Signals) -> FloatArray:
         """Return the estimate at each tick; there is one row for every tick."""
-        return self.predictor(counts_of(signals, self.predictor.plan.signals, self.facts))
+        return self.predictor(as_counts(signals, self.predictor.plan.signals, self.facts))
 
     def as_dict(self) -> dict[str, Any]:
         """Return what a JSON document needs to compute the same estimates."""

@@ -98,10 +98,11 @@ def _check_wide(warehouse: Warehouse, file: TableFile, feature_set: str) -> int:
     kept = grams_of_file(warehouse, file, identity)
     if not kept:
         return 0
-    from_sql = grams_of(by_sql(warehouse, [file], feature_set))
+    rows = by_sql(warehouse, [file], feature_set)
+    from_sql = grams_of(rows)
     _compare(file, "the kernel", from_sql, grams_of(wide_grams(warehouse, [file], feature_set)))
     _compare(file, f"the stored Gram rows of {feature_set}", from_sql, kept)
-    return len({drive for drive, _ in from_sql})
+    return len(rows["drive_id"].unique())
 
 
 def grams_of_file(warehouse: Warehouse, file: TableFile, identity: str) -> "DriveGrams":
@@ -120,13 +121,12 @@ DriveGrams = dict[tuple[str, tuple[str, ...]], Gram]
 
 
 def grams_of(rows: pa.Table) -> DriveGrams:
-    """Return rows of the table `grams` as Grams."""
+    """Return rows of the table `grams` as Grams; a part of a drive goes by the names of both."""
     found = {}
-    for row in rows.select(["drive_id", "signals", "n", "sums", "products"]).to_pylist():
+    for row in rows.select(["drive_id", "part", "signals", "n", "sums", "products"]).to_pylist():
         signals = tuple(row["signals"].split(",")) if row["signals"] else ()
-        found[row["drive_id"], signals] = Gram(
-            signals, row["n"], tuple(row["sums"]), tuple(row["products"])
-        )
+        drive = row["drive_id"] if row["part"] is None else f"{row['drive_id']}, {row['part']}"
+        found[drive, signals] = Gram(signals, row["n"], tuple(row["sums"]), tuple(row["products"]))
     return found
 
 

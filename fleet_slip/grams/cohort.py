@@ -16,11 +16,11 @@ from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import SCENARIO, TRAINING_DRIVES
 from fleet_slip.errors import DataError, QuestionError, RefusedError
-from fleet_slip.grams.folding import EACH, FOLD_KEYS, ROW_FOLDS, FoldCount
+from fleet_slip.grams.folding import BANDS, EACH, FOLD_KEYS, PARTS, ROW_FOLDS, FoldCount
 from fleet_slip.grams.members import Members, hash_numbers
 from fleet_slip.grams.reader import GramReader, open_grams
 from fleet_slip.regression.drive_moments import serving_drives
-from fleet_slip.regression.folds import CohortFolds, FoldAssignment, by_hash, by_value
+from fleet_slip.regression.folds import CohortFolds, FoldAssignment, by_band, by_hash, by_value
 from fleet_slip.regression.gram import packed_size
 from fleet_slip.regression.gram_table import GramTable
 from fleet_slip.warehouse.condition import Condition, asking, parse_condition
@@ -99,13 +99,11 @@ class Cohort:
         """Divide the cohort into folds, of whole drives unless by `row`.
 
         By `drive`: hashed into `count` folds. By another key of `FOLD_KEYS`: one fold for each
-        value, or hashed into `count` folds if there are more values than that. With `EACH`, every
-        drive or value is a fold. By `row`: the folds
-        that the feature set made of single rows, `count` of them. Raises `QuestionError` if
-        it made none.
+        value, or hashed into `count` folds if there are more values than that; by `speed`, cut into
+        `count` bands. With `EACH`, every drive or value is a fold. By `part` or `row`: the parts or
+        the folds of single rows that the feature set made. Raises `QuestionError` if it made none.
         """
-        if by == ROW_FOLDS:
-            require_row_folds(self.feature_set, count)
+        require_divided(self.feature_set, by, count)
         values = self.drives[FOLD_KEYS[by]].to_pylist()
         return CohortFolds.of(self.tables, assign_folds(values, by, count), self.drive_numbers)
 
@@ -162,8 +160,20 @@ MOST_FOLDS = 10_000
 """Each fold is an exact fit of every model."""
 
 
-def require_row_folds(feature_set: str, count: FoldCount) -> None:
-    """Raise `QuestionError` if a feature set has not made so many folds of rows."""
+def require_divided(feature_set: str, by: str, count: FoldCount) -> None:
+    """Raise `QuestionError` if a feature set has not divided the rows of drives as folds need."""
+    if by == ROW_FOLDS:
+        _require_row_folds(feature_set, count)
+    one = features().feature_set(feature_set)
+    if by == PARTS and not (one.regimes or one.block_s):
+        known = ", ".join(n for n, s in features().sets.items() if s.regimes or s.block_s)
+        raise QuestionError(
+            f"the feature set {feature_set} does not divide the rows of a drive. Feature sets with "
+            f"bands or blocks: {known}."
+        )
+
+
+def _require_row_folds(feature_set: str, count: FoldCount) -> None:
     made = features().feature_set(feature_set).row_folds
     if made is None:
         known = ", ".join(name for name, one in features().sets.items() if one.row_folds)
@@ -189,6 +199,8 @@ def assign_folds(values: Sequence[Any], by: str, count: FoldCount) -> FoldAssign
                 f"Fold by another key than {by}, or say how many folds."
             )
         return by_value(values)
+    if by == BANDS:
+        return by_band(values, count)
     if by == ROW_FOLDS:
         return by_value([(int(value) - 1) % count + 1 for value in values])
     if by == "drive" or len(set(values)) > count:

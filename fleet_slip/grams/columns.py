@@ -67,7 +67,7 @@ class ColumnPlan:
 
     Attributes:
         names: the columns, in order.
-        rows: the columns of one row that are asked for or looked back on.
+        rows: the columns of one row that are asked for, looked back on, or tell a row's part.
         windows: the columns over time.
     """
 
@@ -81,13 +81,15 @@ class ColumnPlan:
         names: Sequence[str],
         features: Mapping[str, RowColumn],
         windows: Mapping[str, Definition],
+        also: Sequence[str] = (),
     ) -> "ColumnPlan":
         """Plan columns by name: of `features`, of `windows`, or else logged signals.
 
-        Raises `DataError` if two of them define the same feature differently.
+        `also` are columns of one row that are computed beside them. Raises `DataError` if two of
+        them define the same feature differently.
         """
         rows: dict[str, RowColumn] = {}
-        for name in names:
+        for name in (*names, *also):
             if name not in windows:
                 rows[name] = features.get(name, RowColumn(name))
         features_behind(windows)
@@ -103,11 +105,13 @@ class ColumnPlan:
     def of_set(cls, known: FeatureCatalogue, name: str) -> "ColumnPlan":
         """Plan the columns of a feature set, the label last."""
         one = known.feature_set(name)
+        divided_by = [known.regimes[regime].of for regime in one.regimes]
         features = {
             f: RowColumn(f, parse(known.features[f].sql), known.features[f].limit)
-            for f in one.features
+            for f in (*one.features, *divided_by)
+            if f in known.features
         }
-        return cls.of(one.columns, features, known.definitions(name))
+        return cls.of(one.columns, features, known.definitions(name), divided_by)
 
     @property
     def signals(self) -> tuple[str, ...]:
@@ -160,6 +164,11 @@ class DriveColumns:
                 self._look_back(self.plan.windows[name], first, row)
             else:
                 row[:] = self._values[name][first:last]
+
+    @property
+    def rows_now(self) -> Mapping[str, FloatArray]:
+        """The columns of single rows, shape (rows,) each; missing is NaN."""
+        return self._values
 
     def compute(self) -> FloatArray:
         """Return all columns, shape (columns, rows); missing is NaN."""

@@ -22,10 +22,10 @@ from fleet_slip.grams.cohort import (
     empty_cohort_error,
     gram_condition,
     gram_table,
-    require_row_folds,
+    require_divided,
     require_training,
 )
-from fleet_slip.grams.folding import EACH, FOLD_KEYS, ROW_FOLDS, FoldCount, Folding
+from fleet_slip.grams.folding import EACH, FOLD_KEYS, FoldCount, Folding
 from fleet_slip.grams.members import Members, hash_numbers
 from fleet_slip.grams.reader import GramReader, OpenedGrams, open_grams
 from fleet_slip.regression.folds import CohortFolds
@@ -92,8 +92,7 @@ def sum_cohort(
     if there are not two folds.
     """
     condition = parse_condition(condition)
-    if folding.by == ROW_FOLDS:
-        require_row_folds(feature_set, folding.count)
+    require_divided(feature_set, folding.by, folding.count)
     with open_grams(warehouse, feature_set, condition) as opened:
         names, fold_of = _folding(opened, folding, condition)
         sums = _Sums(len(names), fold_of)

@@ -7,7 +7,7 @@ from pydantic import Field, model_validator
 from fleet_slip.config import Config
 from fleet_slip.errors import ConfigError
 
-FoldKey = Literal["drive", "vehicle", "track", "day", "mass", "adhesion", "row"]
+FoldKey = Literal["drive", "vehicle", "track", "day", "mass", "adhesion", "speed", "part", "row"]
 
 FOLD_KEYS: dict[str, str] = {
     "drive": "drive_id",
@@ -16,9 +16,17 @@ FOLD_KEYS: dict[str, str] = {
     "day": "day",
     "mass": "mass_kg",
     "adhesion": "adhesion",
+    "speed": "speed_factor",
+    "part": "part",
     "row": "part",
 }
 """What a fold may be made of, and the column that tells."""
+
+BANDS: FoldKey = "speed"
+"""Whole bands of speed: neighbouring drives share a fold, so that no model sees their speed."""
+
+PARTS: FoldKey = "part"
+"""Parts of drives that the feature set divides rows into: bands of a signal, or blocks of time."""
 
 ROW_FOLDS: FoldKey = "row"
 """Folds of single rows, as WEKA makes them. They leak: a test row's neighbours train the model."""
@@ -43,8 +51,13 @@ class Folding(Config):
         return self
 
 
-def make_folding(by: FoldKey, count: int | str) -> Folding:
-    """Return a folding that was asked for. Raises `ConfigError`."""
+def make_folding(by: FoldKey, count: int | str | None, usual: FoldCount) -> Folding:
+    """Return a folding that was asked for, with the usual count if none is. Raises `ConfigError`.
+
+    Each part of drives is a fold of its own unless a number is asked for.
+    """
+    if count is None:
+        count = EACH if by == PARTS else usual
     try:
         return Folding.model_validate({"by": by, "count": count if count == EACH else int(count)})
     except ValueError:

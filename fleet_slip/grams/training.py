@@ -8,7 +8,7 @@ from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import Cohort, Served, assign_folds
-from fleet_slip.grams.folding import FOLD_KEYS, ROW_FOLDS, Folding
+from fleet_slip.grams.folding import FOLD_KEYS, PARTS, ROW_FOLDS, Folding
 from fleet_slip.regression.drive_moments import DriveMoments
 from fleet_slip.regression.folds import CohortFolds, Folds
 from fleet_slip.regression.nested_choice import Training
@@ -43,9 +43,9 @@ def drive_folds(
 
     Raises `DataError` if no drive has them all, and `QuestionError` for folds of rows.
     """
-    if folding.by == ROW_FOLDS:
+    if folding.by in (ROW_FOLDS, PARTS):
         raise QuestionError(
-            "with folds of rows there are no drives to hold out. Fold by drive for this."
+            f"with folds by {folding.by} there are no drives to hold out. Fold by drive for this."
         )
     served = cohort.serving(inputs)
     assignment = assign_folds(

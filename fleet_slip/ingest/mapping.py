@@ -1,10 +1,18 @@
 """The mapping of a measured log: which column is which signal, in which unit, with which sign."""
 
 from datetime import UTC, date, datetime
-from typing import Annotated
+from typing import Annotated, Any
 
 import polars as pl
-from pydantic import AfterValidator, Field, StringConstraints, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    Field,
+    SerializerFunctionWrapHandler,
+    StringConstraints,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
 from fleet_slip.canonical import canonical_ascii
 from fleet_slip.catalogue.signals import Identifier, catalogue
@@ -18,6 +26,9 @@ def _printable(text: str) -> str:
         raise ValueError("has characters that cannot be printed")
     return text
 
+
+WHEELS = "wheel_"
+"""How the names of wheel speeds begin."""
 
 Name = Annotated[str, StringConstraints(min_length=1, max_length=200), AfterValidator(_printable)]
 PositiveFloat = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -113,6 +124,22 @@ class SignalColumn(Config):
     """For axes that are not ISO 8855, such as y to the right."""
     offset: Annotated[float, Field(allow_inf_nan=False)] = 0.0
     """Added after the sign, in the column's unit."""
+    radius_m: Annotated[PositiveFloat, Field(ge=0.05, le=2)] | None = None
+    """For wheel speeds that are logged as a speed over ground: what that was computed with."""
+
+    @model_serializer(mode="wrap")
+    def _without_radius(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out a radius that there is none of: drives keep the names they had before."""
+        content: dict[str, Any] = handler(self)
+        if self.radius_m is None:
+            del content["radius_m"]
+        return content
+
+    def factor(self, si_unit: str) -> float:
+        """Return the value in SI units of one in the column's. Raises `ValueError`."""
+        if self.radius_m is None:
+            return conversion_factor(self.unit, si_unit)
+        return conversion_factor(self.unit, "m/s") / self.radius_m
 
 
 class Mapping(Config):
@@ -132,8 +159,11 @@ class Mapping(Config):
         for name, column in self.signals.items():
             if name not in known:
                 raise ValueError(f"unknown signal {name!r}. Known signals: {', '.join(known)}")
+            rolling = column.radius_m is not None
+            if rolling and not name.startswith(WHEELS):
+                raise ValueError(f"signals.{name}: radius_m is for wheel speeds")
             try:
-                require_unit(column.unit, known[name].unit, name)
+                require_unit(column.unit, "m/s" if rolling else known[name].unit, name)
             except ValueError as error:
                 raise ValueError(f"signals.{name}: {column.column} {error}") from None
         return self
@@ -155,7 +185,7 @@ class Mapping(Config):
     def linear(self, signal: str) -> tuple[float, float]:
         """Return (gain, bias) of a signal: `value in SI = gain * value in the file + bias`."""
         column = self.signals[signal]
-        factor = conversion_factor(column.unit, catalogue()[signal].unit)
+        factor = column.factor(catalogue()[signal].unit)
         return (-factor if column.negate else factor), factor * column.offset
 
     def canonical_json(self) -> str:

@@ -90,6 +90,21 @@ def by_value(values: Sequence[Any]) -> FoldAssignment:
     return FoldAssignment(fold, tuple(str(value) for value in distinct))
 
 
+def by_band(values: Sequence[Any], count: int) -> FoldAssignment:
+    """Cut the range of a number into `count` bands of about as many distinct values each.
+
+    A fold is a whole band, so that a model is tested between or beyond the values that it was
+    fitted on. Unlike the other folds these move with the cohort. Raises `DataError` as `by_value`.
+    """
+    assignment = by_value(values)
+    if len(assignment.names) <= count:
+        return assignment
+    bands = np.array_split(np.arange(len(assignment.names)), count)
+    band = np.repeat(np.arange(count), [len(one) for one in bands])
+    names = tuple(f"{assignment.names[one[0]]} to {assignment.names[one[-1]]}" for one in bands)
+    return FoldAssignment(band[assignment.fold].astype(np.int64), names)
+
+
 @dataclass(frozen=True)
 class Folds:
     """One Gram a fold, all of the same signals: what cross-validation needs.

@@ -12,7 +12,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.evaluation.errors import error_figures
-from fleet_slip.evaluation.estimators import counts_of
+from fleet_slip.evaluation.estimators import as_counts
 from fleet_slip.evaluation.runs import EvaluatedScenario
 from fleet_slip.grams.cohort import Cohort
 from fleet_slip.grams.columns import ColumnPlan, DriveColumns
@@ -143,7 +143,7 @@ def _errors_on(
         {name: whole.windows[name] for name in names if name in whole.windows},
     )
     drive = run.drive
-    columns = DriveColumns(plan, counts_of(drive.signals, plan.signals, drive.facts)).compute()
+    columns = DriveColumns(plan, as_counts(drive.signals, plan.signals, drive.facts)).compute()
     physical = {
         name: column * float(input_scales()[name])
         for name, column in zip(names, columns, strict=True)

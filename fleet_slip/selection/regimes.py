@@ -12,8 +12,8 @@ from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.cohort import Cohort, assign_folds
-from fleet_slip.grams.folding import FOLD_KEYS, ROW_FOLDS, Folding
-from fleet_slip.grams.statement import UNKNOWN_PART
+from fleet_slip.grams.folding import FOLD_KEYS, PARTS, ROW_FOLDS, Folding
+from fleet_slip.grams.parts import UNKNOWN_PART
 from fleet_slip.regression.crossval import held_out_errors
 from fleet_slip.regression.drive_moments import require_serving_drives
 from fleet_slip.regression.exact import LinearModel, fit
@@ -131,7 +131,7 @@ def compare_regimes(
     Raises `QuestionError` for a feature set without regimes, and `DataError` for absent signals or
     empty folds.
     """
-    if folding.by == ROW_FOLDS:
+    if folding.by in (ROW_FOLDS, PARTS):
         raise QuestionError("rows are divided by regime already: fold by drive, or by vehicle.")
     names = regime_names(cohort, over)
     order = band_order(cohort, names)

@@ -165,7 +165,7 @@ def answer_request(warehouse: Warehouse, request: SelectionRequest) -> Requested
 
 def _folding(request: SelectionRequest, model_list: ModelList | None) -> Folding:
     listed = model_list.folds if model_list else Folding()
-    folding = make_folding(request.by or listed.by, request.folds or listed.count)
+    folding = make_folding(request.by or listed.by, request.folds, listed.count)
     if request.repeat and folding.count == EACH:
         raise ConfigError("--repeat deals the folds anew, and --folds each has one deal only.")
     return folding

@@ -128,6 +128,9 @@ def test_every_feature_is_its_physical_definition_rounded_and_clipped() -> None:
         ('divided_by = "50000"', 'divided_by = "0"', "divided_by is zero"),
         ('regimes = ["speed", "ay"]', 'regimes = ["mood"]', "unknown mood"),
         ("row_folds = 10", "row_folds = 10\nlagged = true", "not several of them"),
+        ("block_s = 60", "block_s = 60\nregimes = ['speed']", "not several of them"),
+        ("block_s = 60", "block_s = 0.005", "block_s must be a multiple of 0.01"),
+        ("block_s = 60", "row_folds = 5", "a set with windows has no row_folds"),
     ],
 )
 def test_a_feature_that_is_not_integer_arithmetic_on_inputs_is_refused(

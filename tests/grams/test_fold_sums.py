@@ -37,7 +37,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Warehouse:
     return warehouse
 
 
-@pytest.mark.parametrize("by", ["drive", "vehicle", "track", "day", "mass", "adhesion"])
+@pytest.mark.parametrize("by", ["drive", "vehicle", "track", "day", "mass", "adhesion", "speed"])
 @pytest.mark.parametrize(("batch", "count"), [(7, 4), (1000, 4), (7, "each")])
 def test_sums_equal_those_of_the_cohort(
     fleet: Warehouse, monkeypatch: pytest.MonkeyPatch, by: FoldKey, batch: int, count: FoldCount

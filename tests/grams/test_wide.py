@@ -165,6 +165,14 @@ def test_a_whole_drive_takes_the_fast_loop_to_the_same_integers() -> None:
     np.testing.assert_array_equal(fast[:, :-1], slow[:, :-1])
 
 
+PARTS: dict[str, set[str | None]] = {
+    "windows": {None},
+    "bands": {"speed < 10", "speed 10-15", "unknown"},
+    "blocks": {"block 0001", "block 0002", "block 0010"},
+}
+"""Some of the parts that the hostile drives must have."""
+
+
 def hostile_drive(name: str, rows: int, seed: int, *, null: float = 0.1) -> pa.Table:
     rng = np.random.default_rng(seed)
     counts: dict[str, Any] = random_counts(rng, rows)
@@ -179,19 +187,26 @@ def hostile_drive(name: str, rows: int, seed: int, *, null: float = 0.1) -> pa.T
     return table.set_column(at, "tick", pa.array(ticks))
 
 
-def test_gram_rows_of_the_kernel_are_those_of_the_statement(warehouse: Warehouse) -> None:
+@pytest.mark.parametrize("feature_set", ["windows", "bands", "blocks"])
+def test_gram_rows_of_the_kernel_are_those_of_the_statement(
+    warehouse: Warehouse, feature_set: str
+) -> None:
     whole = log_rows("whole", random_counts(np.random.default_rng(3), 700))
     land(warehouse, "one", hostile_drive("b", 400, 1), hostile_drive("a", 2, 2).slice(0, 1), whole)
     land(warehouse, "two", hostile_drive("c", 5000, 4, null=0.001))
     files = warehouse.logs.snapshot().files
-    kernel = wide_grams(warehouse, files, "windows")
-    defined = by_sql(warehouse, files, "windows").cast(kernel.schema)
+    kernel = wide_grams(warehouse, files, feature_set)
+    defined = by_sql(warehouse, files, feature_set).cast(kernel.schema)
     assert kernel.num_rows > 8
+    assert sum(kernel["n"].to_pylist()) == 6101
+    parts = set(kernel["part"].to_pylist())
+    assert parts >= PARTS[feature_set]
+    assert len(grams_of(kernel)) == kernel.num_rows
     assert grams_of(kernel) == grams_of(defined)
     assert kernel.sort_by("drive_id").drop_columns(["sums", "products"]).num_rows
     for name in kernel.column_names:
         assert kernel[name].to_pylist() == defined[name].to_pylist(), name
-    assert aggregate(warehouse, files, feature_set="windows").equals(kernel)
+    assert aggregate(warehouse, files, feature_set=feature_set).equals(kernel)
 
 
 def test_a_drive_that_goes_back_in_time_is_refused(warehouse: Warehouse) -> None:

@@ -1,9 +1,12 @@
 """A log with the columns of a real recording, from the file to the coefficients."""
 
+import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 
+from fleet_slip.catalogue.features import column_query, features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.cohort import load_cohort
@@ -14,10 +17,14 @@ from fleet_slip.regression.exact import fit
 from fleet_slip.regression.inference import infer_classically
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.commands import RunCommand
 from tests.support.measured import csv_text
+from tests.support.reported import call
 
 COEFFICIENTS = {"ax": 2e-4, "ay": -3e-3, "yaw_rate": 0.08, "steer_fl": 0.15, "steer_fr": 0.1}
 OFFSET = 0.004
+NOISE_RAD = 0.002
+REMEMBERED = ("curvature_mean_16", "ay_mean_16")
 
 
 def race_car_log(rows: int = 20_000) -> dict[str, list[float]]:
@@ -85,3 +92,86 @@ def test_a_log_without_wheel_speeds_gives_its_model_through_the_shipped_mapping(
     ):
         assert abs(estimate.value - true) < 4 * estimate.standard_error
         assert estimate.standard_error < 0.2 * abs(true)
+
+
+def remembering_log(rows: int = 12_000) -> dict[str, list[float]]:
+    """A made-up lap whose side-slip angle follows means over 0.16 s, at 18 to 42 m/s."""
+    rng = np.random.default_rng(251)
+    log = race_car_log(rows)
+    t = np.arange(rows) / 100
+    vx = 30 + 12 * np.sin(t / 7)
+    ay, yaw_rate = np.array(log["ay_mps2"]), np.array(log["yaw_rate_rad_s"])
+    beta = 1.3 * trailing_mean(yaw_rate / vx) - 0.004 * trailing_mean(ay)
+    beta += NOISE_RAD * rng.standard_normal(rows)
+    return log | {
+        "vx_kmh": (3.6 * vx).tolist(),
+        "vy_kmh": (3.6 * vx * np.tan(beta)).tolist(),
+        "sideslip_deg": np.degrees(beta).tolist(),
+    }
+
+
+def trailing_mean(values: np.ndarray, ticks: int = 16) -> np.ndarray:
+    return np.array([values[max(0, i + 1 - ticks) : i + 1].mean() for i in range(len(values))])
+
+
+@pytest.mark.slow
+def test_what_a_log_remembers_is_found_and_carries_to_speeds_it_was_not_fitted_at(
+    tmp_path: Path,
+) -> None:
+    """From the file to `--by part`: blocks of time, and bands of speed left out of the training."""
+    file = tmp_path / "lap.csv"
+    file.write_text(csv_text(remembering_log()))
+    root, models = tmp_path / "data", tmp_path / "models.toml"
+    models.write_text(MODELS)
+    call(root, "ingest", str(file), "--mapping", "race_car_250lm_speed")
+    for name in ("blocks", "bands"):
+        call(root, "gram", "--features", name)
+    asked = ("select", "--by", "part", "--models", str(models), "--json", "--features")
+    blocks, bands = (json.loads(call(root, *asked, name)) for name in ("blocks", "bands"))
+    assert [one["fold"] for one in blocks["models"][0]["folds"]] == ["block 0001", "block 0002"]
+    names = ["speed 15-20", "speed 20-25", "speed 25-30", "speed >= 30"]
+    assert [one["fold"] for one in bands["models"][0]["folds"]] == names
+    for found in (blocks, bands):
+        instant, remembering = found["models"]
+        assert remembering["rmse_deg"] == pytest.approx(np.degrees(NOISE_RAD), rel=0.05)
+        assert instant["rmse_deg"] > 2 * remembering["rmse_deg"]
+    fast = bands["models"][1]["folds"][-1]
+    assert fast["rmse_deg"] == pytest.approx(slow_to_fast_deg(root), rel=1e-9)
+    shown = call(root, *asked[:5], "--features", "bands")
+    assert f"{fast['rmse_deg']:.4f}" in next(row for row in shown.splitlines() if names[-1] in row)
+
+
+def slow_to_fast_deg(root: Path) -> float:
+    """Fit below 30 m/s by numpy on the columns as SQL defines them, and test above."""
+    known = features()
+    with connect(LocalFolder(root)) as database:
+        columns = [
+            np.array(database.sql(column_query(known, name)).fetchnumpy()[name], dtype=np.float64)
+            for name in REMEMBERED
+        ]
+        log = database.sql("SELECT * FROM log_counts ORDER BY tick").fetchnumpy()
+    beta = np.asarray(log["sideslip"], dtype=np.float64) * float(catalogue()["sideslip"].scale)
+    fast = 4 * np.asarray(log["wheel_fl"], dtype=np.int64) * 0.0031 / 4 >= 30
+    matrix = np.column_stack([np.ones(len(beta)), *(c / np.abs(c).max() for c in columns)])
+    weights = np.linalg.lstsq(matrix[~fast], beta[~fast], rcond=None)[0]
+    error = np.degrees(matrix[fast] @ weights - beta[fast])
+    return float(np.sqrt(np.mean(error**2)))
+
+
+MODELS = """
+description = "One instant, and memory"
+features = "bands"
+[[model]]
+name = "instant"
+signals = ["curvature", "ay_signed_square"]
+[[model]]
+name = "remembering"
+signals = ["curvature_mean_16", "ay_mean_16"]
+"""
+
+
+def test_parts_are_told_where_a_set_has_none(tmp_path: Path, run_command: RunCommand) -> None:
+    done = run_command("select", "--by", "part")
+    assert done.exit_code == 5
+    assert "does not divide the rows of a drive" in done.stderr
+    assert "bands, blocks" in done.stderr

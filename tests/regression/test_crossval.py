@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from fractions import Fraction
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from scipy import stats
 
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression.crossval import CrossValidation, cross_validate_inputs
-from fleet_slip.regression.folds import CohortFolds, by_hash, by_value, hash_fold
+from fleet_slip.regression.folds import CohortFolds, by_band, by_hash, by_value, hash_fold
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.winner import Worth, choose
 from tests.support.counts import dense_fit, gram_of, names, random_drives, table_of
@@ -211,3 +212,23 @@ def test_a_constant_prediction_has_no_correlation() -> None:
     drives = random_drives(2, drives=4)
     result = cross_validate_inputs("null", cohort_of(drives, [0, 0, 1, 1]), [], "y", SCALES)
     assert all(fold.correlation == 0 for fold in result.folds)
+
+
+@given(st.lists(st.integers(0, 30), min_size=2, max_size=60), st.integers(2, 6))
+def test_bands_are_contiguous_and_whole(values: list[int], count: int) -> None:
+    if len(set(values)) < 2:
+        return
+    found = by_band(values, count)
+    assert len(found.names) == min(count, len(set(values)))
+    by_fold = [
+        {v for v, f in zip(values, found.fold, strict=True) if f == fold}
+        for fold in range(len(found.names))
+    ]
+    assert all(max(low) < min(high) for low, high in pairwise(by_fold))
+    sizes = [len(band) for band in by_fold]
+    assert max(sizes) - min(sizes) <= 1
+
+
+def test_a_drive_without_a_speed_is_in_no_band() -> None:
+    with pytest.raises(DataError, match="no value of the column to fold by"):
+        by_band([0.5, None, 0.7], 2)

@@ -1,0 +1,148 @@
+"""What divides a drive's rows into several Gram rows: in SQL, and the same of arrays.
+
+Bands of a signal or feature, blocks of time, or folds of single rows.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_slip.arrays import FloatArray, IntArray
+from fleet_slip.catalogue.feature_sets import FeatureSet
+from fleet_slip.catalogue.features import FeatureCatalogue
+
+UNKNOWN_PART = "unknown"
+"""Part of the rows whose regime is not known because a signal is absent."""
+
+UNKNOWN = -1
+
+BLOCK_FORMAT = "block %04d"
+"""Names that sort as numbers do."""
+
+
+@dataclass(frozen=True)
+class Bands:
+    """The bands of a regime, as counts: a row's band is how many of the bounds it has reached.
+
+    Attributes:
+        of: the signal or feature.
+        absolute: whether its sign is ignored.
+        bounds: the least count of each band but the first.
+        names: of the bands.
+    """
+
+    of: str
+    absolute: bool
+    bounds: tuple[int, ...]
+    names: tuple[str, ...]
+
+    @property
+    def sql(self) -> str:
+        """The SQL of a row's band; null where the signal is."""
+        value = f"abs({self.of}::INTEGER)" if self.absolute else self.of
+        return "(" + " + ".join(f"({value} >= {bound})::INTEGER" for bound in self.bounds) + ")"
+
+    def __call__(self, counts: FloatArray) -> FloatArray:
+        """Return the band of each row, shape (rows,); NaN where the count is."""
+        size = np.abs(counts) if self.absolute else counts
+        reached = np.searchsorted(np.array(self.bounds, dtype=np.float64), size, side="right")
+        return np.where(np.isnan(counts), np.nan, reached)
+
+
+@dataclass(frozen=True)
+class Parts:
+    """How the rows of a drive are divided: by at most one of the three.
+
+    Attributes:
+        bands: of each regime; a part is a combination of them, the last running fastest.
+        block_ticks: length of a block of time.
+        row_folds: number of folds that rows are dealt into.
+    """
+
+    bands: tuple[Bands, ...] = ()
+    block_ticks: int | None = None
+    row_folds: int | None = None
+
+    @classmethod
+    def of_set(cls, known: FeatureCatalogue, one: FeatureSet) -> "Parts":
+        """Return what divides the rows of a feature set."""
+        bands = []
+        for name in one.regimes:
+            regime = known.regimes[name]
+            scale = known.of(regime.of).exact_scale
+            # Counts are whole, so that reaching a bound is reaching the next whole count.
+            bounds = tuple(math.ceil(Fraction(bound) / scale) for bound in regime.bounds)
+            bands.append(Bands(regime.of, regime.absolute, bounds, regime.bands))
+        return cls(tuple(bands), one.block_ticks, one.row_folds)
+
+    def __bool__(self) -> bool:
+        """Return whether rows are divided at all."""
+        return bool(self.bands or self.block_ticks or self.row_folds)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the combinations of bands."""
+        names = [""]
+        for bands in self.bands:
+            names = [f"{name}, {band}".removeprefix(", ") for name in names for band in bands.names]
+        return tuple(names)
+
+    @property
+    def number_sql(self) -> str:
+        """SQL of a row's part, a number from 0; null where it is not known."""
+        if self.row_folds:
+            return _row_fold_sql(self.row_folds)
+        if self.block_ticks:
+            return f"tick // {self.block_ticks}"
+        number = "0"
+        for bands in self.bands:
+            number = f"({number}) * {len(bands.names)} + {bands.sql}"
+        return number
+
+    def name_sql(self, number: str) -> str:
+        """Return the SQL of a part's name, given that of its number."""
+        if self.row_folds:
+            return f"({number} + 1)::VARCHAR"
+        if self.block_ticks:
+            return f"printf('{BLOCK_FORMAT}', {number} + 1)"
+        names = ", ".join(f"'{name}'" for name in self.names)
+        return f"coalesce([{names}][{number} + 1], '{UNKNOWN_PART}')"
+
+    def numbers(self, ticks: NDArray[Any], counts: Mapping[str, FloatArray]) -> IntArray:
+        """Return the part of each row, shape (rows,); `UNKNOWN` where it is not known.
+
+        Given the columns that the bands are of. Folds of single rows are for SQL alone.
+        """
+        if self.row_folds:
+            raise ValueError("rows are dealt into folds by SQL alone")
+        if self.block_ticks:
+            return ticks.astype(np.int64) // self.block_ticks
+        number: FloatArray = np.zeros(len(ticks))
+        for bands in self.bands:
+            number = number * len(bands.names) + bands(counts[bands.of])
+        return np.where(np.isnan(number), UNKNOWN, number).astype(np.int64)
+
+    def name(self, number: int) -> str | None:
+        """Return the name of a part; None where rows are not divided."""
+        if self.block_ticks:
+            return BLOCK_FORMAT % (number + 1)
+        if not self.bands:
+            return None
+        return UNKNOWN_PART if number == UNKNOWN else self.names[number]
+
+
+def _row_fold_sql(count: int) -> str:
+    """Number the folds by a hash of drive and tick that is the same everywhere and for ever.
+
+    MD5 of the drive's id begins a sequence; two rounds of multiplication and exclusive or (the
+    32-bit integer hash of Thomas Mueller) scatter the ticks. All below 2^63.
+    """
+    value = "((md5_number_lower(drive_id) % 4294967296)::BIGINT + tick) % 4294967296"
+    for _ in range(2):
+        value = f"xor({value}, ({value}) >> 16) * 73244475 % 4294967296"
+    return f"({value}) % {count}"
