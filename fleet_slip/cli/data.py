@@ -153,8 +153,10 @@ def _ingested(report: dict[str, Any]) -> str:
     if not report["new"] and not report["drives_forgotten"]:
         return f"{report['file']}: nothing to do, it was ingested before"
     reasons = ", ".join(f"{n:,} {reason}" for reason, n in report["quarantined"].items())
+    left_out = report["rows_left_out"]
     return (
         f"{report['file']}: {report['ticks']:,} rows in {report['drives']} drives"
+        + (f"; {left_out:,} rows do not meet the mapping's conditions" if left_out else "")
         + (f"; {report['rows_quarantined']:,} rows in quarantine ({reasons})" if reasons else "")
         + _left_out(report["drives_forgotten"])
     )

@@ -72,6 +72,18 @@ def fields_of(mapping: Mapping, schema: pl.Schema) -> list[Field]:
     return fields
 
 
+def meets_conditions(mapping: Mapping, schema: pl.Schema) -> pl.Expr:
+    """Return whether a row meets all of the mapping's conditions. Raises `InputError`."""
+    met = pl.lit(value=True)
+    for condition in mapping.where:
+        column = pl.col(RAW + condition.column)
+        if condition.one_of:
+            met &= condition.is_met(column, _as_text(condition.column, schema, mapping))
+        else:
+            met &= condition.is_met(_number(condition.column, schema, mapping)[1], column)
+    return met
+
+
 def find_problems(*cases: tuple[pl.Expr, str]) -> pl.Expr:
     """Return the index of the first reason whose condition holds, else null."""
     return pl.coalesce(
@@ -88,17 +100,19 @@ def _condition(condition: pl.Expr, reason: str, raw: pl.Expr) -> Field:
 
 def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> Field:
     """A signal in SI units. Its range is checked on the count that it will become."""
-    raw, number, present = _number(mapping.signals[name].column, schema, mapping)
-    gain, bias = mapping.linear(name)
+    source = mapping.signals[name]
+    raw, number, present = _number(source.column, schema, mapping)
     signal, value = catalogue()[name], pl.col(name)
+    gain, bias = source.linear(signal.unit)
     count = value / float(signal.scale)
     outside = (count <= signal.min_count - 0.5) | (count >= signal.max_count + 0.5)
     problem = find_problems(
         (value.is_null() & present, "not_a_number"),
+        (source.is_outside_table(number), "out_of_range"),
         (~value.is_finite(), "not_finite"),
         (outside, "out_of_range"),
     )
-    return Field(name, "signal", raw, number * gain + bias, problem)
+    return Field(name, "signal", raw, source.looked_up(number) * gain + bias, problem)
 
 
 def _positive(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Field:
@@ -113,14 +127,19 @@ def _positive(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Fi
 
 
 def _text(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Field:
+    too_long = pl.col(name).str.len_chars() > LONGEST_TEXT
+    problem = find_problems((pl.col(name).is_null(), "missing"), (too_long, "out_of_range"))
+    return Field(name, "key", pl.col(RAW + column), _as_text(column, schema, mapping), problem)
+
+
+def _as_text(column: str, schema: pl.Schema, mapping: Mapping) -> pl.Expr:
+    """Return a column as text, whole numbers without a point, null for missing."""
     raw = pl.col(RAW + column)
     text = raw.cast(pl.String)
     if schema[RAW + column] == pl.Float64:
         whole = raw.cast(pl.Int64, strict=False)
         text = pl.when(whole == raw).then(whole.cast(pl.String)).otherwise(text)
-    too_long = pl.col(name).str.len_chars() > LONGEST_TEXT
-    problem = find_problems((pl.col(name).is_null(), "missing"), (too_long, "out_of_range"))
-    return Field(name, "key", raw, _without_missing(text, mapping), problem)
+    return _without_missing(text, mapping)
 
 
 def _day(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Field:

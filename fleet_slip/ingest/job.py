@@ -39,6 +39,7 @@ class IngestReport:
             "file": self.file,
             "new": self.new,
             "rows_read": self.counts.rows_read,
+            "rows_left_out": self.counts.rows_left_out,
             "rows_kept": self.counts.rows_kept,
             "rows_quarantined": sum(self.counts.quarantined.values()),
             "quarantined": self.counts.quarantined,

@@ -1,37 +1,22 @@
 """The mapping of a measured log: which column is which signal, in which unit, with which sign."""
 
 from datetime import UTC, date, datetime
-from typing import Annotated, Any
+from pathlib import Path
+from typing import Annotated
 
 import polars as pl
-from pydantic import (
-    AfterValidator,
-    Field,
-    SerializerFunctionWrapHandler,
-    StringConstraints,
-    field_validator,
-    model_serializer,
-    model_validator,
-)
+from pydantic import Field, field_validator, model_validator
 
 from fleet_slip.canonical import canonical_ascii
 from fleet_slip.catalogue.signals import Identifier, catalogue
 from fleet_slip.config import Config, load_config
-from fleet_slip.ingest.units import conversion_factor, require_unit
+from fleet_slip.errors import ConfigError
+from fleet_slip.ingest.names import Name, PositiveFloat
+from fleet_slip.ingest.row_condition import RowCondition
+from fleet_slip.ingest.signal_column import SignalColumn
+from fleet_slip.ingest.units import require_unit
+from fleet_slip.ingest.vehicle_facts import VehicleFacts, read_vehicle_facts
 from fleet_slip.resources import find_config
-
-
-def _printable(text: str) -> str:
-    if not text.isprintable():
-        raise ValueError("has characters that cannot be printed")
-    return text
-
-
-WHEELS = "wheel_"
-"""How the names of wheel speeds begin."""
-
-Name = Annotated[str, StringConstraints(min_length=1, max_length=200), AfterValidator(_printable)]
-PositiveFloat = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 class FromColumn(Config):
@@ -109,37 +94,14 @@ class DriveMetadata(Config):
     day: date | FromColumn | None = None
     """Date of the drive; with timestamps it may be left out and is that of the first row (UTC)."""
     vehicle_id: Name | FromColumn
-    vehicle_model: Name | FromColumn
+    vehicle_model: Name | FromColumn | None = None
     track: Name | FromColumn | None = None
     mass_kg: PositiveFloat | FromColumn | None = None
     adhesion: PositiveFloat | FromColumn | None = None
 
 
-class SignalColumn(Config):
-    """One column of the file: `signal = factor(unit) * (±value + offset)`."""
-
-    column: Name
-    unit: str
-    negate: bool = False
-    """For axes that are not ISO 8855, such as y to the right."""
-    offset: Annotated[float, Field(allow_inf_nan=False)] = 0.0
-    """Added after the sign, in the column's unit."""
-    radius_m: Annotated[PositiveFloat, Field(ge=0.05, le=2)] | None = None
-    """For wheel speeds that are logged as a speed over ground: what that was computed with."""
-
-    @model_serializer(mode="wrap")
-    def _without_radius(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out a radius that there is none of: drives keep the names they had before."""
-        content: dict[str, Any] = handler(self)
-        if self.radius_m is None:
-            del content["radius_m"]
-        return content
-
-    def factor(self, si_unit: str) -> float:
-        """Return the value in SI units of one in the column's. Raises `ValueError`."""
-        if self.radius_m is None:
-            return conversion_factor(self.unit, si_unit)
-        return conversion_factor(self.unit, "m/s") / self.radius_m
+def _is_empty(value: object) -> bool:
+    return value == ()
 
 
 class Mapping(Config):
@@ -152,6 +114,10 @@ class Mapping(Config):
     time: TimeBase
     drive: DriveMetadata
     signals: dict[str, SignalColumn] = Field(min_length=1)
+    where: tuple[RowCondition, ...] = Field(default=(), exclude_if=_is_empty)
+    """Conditions that a row meets, all of them, or is left out and only counted."""
+    vehicles: tuple[VehicleFacts, ...] | Name = Field(default=(), exclude_if=_is_empty)
+    """What is known of each car; a text is the path of a CSV file, seen from the mapping's own."""
 
     @model_validator(mode="after")
     def _signals_fit_catalogue(self) -> "Mapping":
@@ -159,11 +125,8 @@ class Mapping(Config):
         for name, column in self.signals.items():
             if name not in known:
                 raise ValueError(f"unknown signal {name!r}. Known signals: {', '.join(known)}")
-            rolling = column.radius_m is not None
-            if rolling and not name.startswith(WHEELS):
-                raise ValueError(f"signals.{name}: radius_m is for wheel speeds")
             try:
-                require_unit(column.unit, "m/s" if rolling else known[name].unit, name)
+                column.require_unit_of(name, known[name].unit)
             except ValueError as error:
                 raise ValueError(f"signals.{name}: {column.column} {error}") from None
         return self
@@ -174,19 +137,26 @@ class Mapping(Config):
             raise ValueError("drive.day is needed: the time has no date. Give a date or a column")
         return self
 
+    @model_validator(mode="after")
+    def _vehicle_model_is_known(self) -> "Mapping":
+        if self.drive.vehicle_model is None and not self.vehicles:
+            raise ValueError("drive.vehicle_model is needed, or 'vehicles', a table of the cars")
+        return self
+
     def columns(self) -> list[str]:
         """Return the names of all columns of a file that the mapping uses, each once."""
         metadata = (getattr(self.drive, name) for name in DriveMetadata.model_fields)
         names = [self.time.column, self.drive.column]
         names += [source.column for source in metadata if isinstance(source, FromColumn)]
         names += [signal.column for signal in self.signals.values()]
+        names += [condition.column for condition in self.where]
         return list(dict.fromkeys(name for name in names if name is not None))
 
-    def linear(self, signal: str) -> tuple[float, float]:
-        """Return (gain, bias) of a signal: `value in SI = gain * value in the file + bias`."""
-        column = self.signals[signal]
-        factor = column.factor(catalogue()[signal].unit)
-        return (-factor if column.negate else factor), factor * column.offset
+    def vehicle_facts(self) -> tuple[VehicleFacts, ...]:
+        """Return what is known of each car. Raises `ConfigError` if its file was not read."""
+        if isinstance(self.vehicles, str):
+            raise ConfigError(f"{self.vehicles}: not read. Load the mapping by its name or path.")
+        return self.vehicles
 
     def canonical_json(self) -> str:
         """The mapping as JSON that does not depend on the order or layout of its TOML file."""
@@ -206,4 +176,9 @@ def _reads_back(timestamp_format: str) -> bool:
 
 def load_mapping(name_or_path: str) -> Mapping:
     """Load a mapping by name from `configs/mappings`, or by path. Raises `ConfigError`."""
-    return load_config(find_config("mappings", name_or_path), Mapping)
+    file = find_config("mappings", name_or_path)
+    mapping = load_config(file, Mapping)
+    if isinstance(mapping.vehicles, str):
+        facts = read_vehicle_facts(Path(str(file)).parent / mapping.vehicles)
+        mapping = mapping.model_copy(update={"vehicles": facts})
+    return mapping

@@ -10,13 +10,14 @@ import pyarrow as pa
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import shown
-from fleet_slip.ingest.fields import RAW, Field, fields_of
+from fleet_slip.ingest.fields import RAW, Field, fields_of, meets_conditions
 from fleet_slip.ingest.look_alikes import find_look_alikes
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.measured_drives import cut, drive_id, log_table, to_ticks
 from fleet_slip.ingest.quarantine import DriveKeys, check_rows, with_values
 from fleet_slip.ingest.reading import MAX_ROWS, file_digest, read_batches, require_unchanged_file
 from fleet_slip.ingest.resampling import STEP_S
+from fleet_slip.ingest.row_condition import describe
 from fleet_slip.ingest.timebase import cut_into_drives, sample_interval_s
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA
 
@@ -30,9 +31,14 @@ MAX_TICKS = 2 * MAX_ROWS
 
 @dataclass(frozen=True)
 class IngestCounts:
-    """What became of a file's rows. `rows_read == rows_kept + sum(quarantined.values())`."""
+    """What became of a file's rows.
+
+    `rows_read == rows_left_out + rows_kept + sum(quarantined.values())`.
+    """
 
     rows_read: int
+    rows_left_out: int
+    """Rows that do not meet the mapping's conditions."""
     rows_kept: int
     quarantined: dict[str, int]
     """Rejected rows by reason."""
@@ -68,7 +74,7 @@ def read_measured(file: Path, mapping: Mapping) -> MeasuredLog:
     """
     with require_unchanged_file(file):
         digest = _identity(file, mapping)
-        rows, bad, keys, rows_read = _check(file, mapping)
+        rows, bad, keys, read = _check(file, mapping)
     rows, misplaced = cut_into_drives(rows, mapping.time)
     bad = pl.concat([bad, misplaced]).sort("row")
     _require_usable(file, mapping, rows, bad)
@@ -77,7 +83,10 @@ def read_measured(file: Path, mapping: Mapping) -> MeasuredLog:
     interval_s = sample_interval_s(rows)
     drives = cut(rows, prefix, keys.metadata())
     ticked = [to_ticks(rows[drive.rows], mapping, interval_s) for drive in drives]
-    table = log_table(drives, ticked, mapping)
+    try:
+        table = log_table(drives, ticked, mapping)
+    except InputError as error:
+        raise InputError(f"{shown(file)}: {error}") from None
     if not table.num_rows:
         raise InputError(
             f"{shown(file)}: its rows are {interval_s:g} s apart and none is on a tick of 100 Hz; "
@@ -85,7 +94,8 @@ def read_measured(file: Path, mapping: Mapping) -> MeasuredLog:
             f"Raise it in the mapping {mapping.name!r} if the signals change slowly enough."
         )
     counts = IngestCounts(
-        rows_read=rows_read,
+        rows_read=read.rows,
+        rows_left_out=read.left_out,
         rows_kept=rows.height,
         quarantined=dict(sorted(Counter(bad["reason"]).items())),
         drives=len(drives),
@@ -103,23 +113,36 @@ def _identity(file: Path, mapping: Mapping) -> str:
     return digest.hexdigest()
 
 
-def _check(file: Path, mapping: Mapping) -> tuple[pl.DataFrame, pl.DataFrame, DriveKeys, int]:
+@dataclass
+class _Read:
+    """How many rows were read, and how many of them do not meet the mapping's conditions."""
+
+    rows: int = 0
+    left_out: int = 0
+
+
+def _check(file: Path, mapping: Mapping) -> tuple[pl.DataFrame, pl.DataFrame, DriveKeys, _Read]:
     """Read all batches; return the good rows, the bad ones, the drives' keys, and how many rows."""
     good: list[pl.DataFrame] = []
     bad: list[pl.DataFrame] = []
     fields: list[Field] = []
     keys = DriveKeys(fields)
-    rows_read = 0
+    read = _Read()
+    meeting = pl.lit(value=True)
     for batch in read_batches(file, mapping.columns(), mapping.csv):
         raw = batch.select(pl.all().name.prefix(RAW))
-        if not rows_read:
+        if not read.rows:
             try:
                 fields = fields_of(mapping, raw.schema)
+                meeting = meets_conditions(mapping, raw.schema)
             except InputError as error:
                 raise InputError(f"{shown(file)}: {error}") from None
             keys = DriveKeys(fields)
-        row = pl.int_range(rows_read + 1, rows_read + batch.height + 1, dtype=pl.Int64)
-        valued = with_values(raw.with_columns(row.alias("row")), fields)
+        row = pl.int_range(read.rows + 1, read.rows + batch.height + 1, dtype=pl.Int64)
+        raw = raw.with_columns(row.alias("row")).filter(meeting)
+        read.rows += batch.height
+        read.left_out += batch.height - raw.height
+        valued = with_values(raw, fields)
         rows, rejected = check_rows(keys.number(valued), fields)
         if len(keys) > MAX_KEYS:
             raise InputError(
@@ -130,10 +153,14 @@ def _check(file: Path, mapping: Mapping) -> tuple[pl.DataFrame, pl.DataFrame, Dr
             rows = rows.with_columns((pl.col("row") / mapping.time.rate_hz).alias("time"))
         good.append(rows)
         bad.append(rejected)
-        rows_read += batch.height
-    if not rows_read:
+    if not read.rows:
         raise InputError(f"{shown(file)}: it has a header and no rows. Export it again.")
-    return pl.concat(good), pl.concat(bad), keys, rows_read
+    if read.left_out == read.rows:
+        raise InputError(
+            f"{shown(file)}: none of its {read.rows:,} rows meets the condition of the mapping "
+            f"{mapping.name!r}: {describe(mapping.where)}."
+        )
+    return pl.concat(good), pl.concat(bad), keys, read
 
 
 def _require_usable(file: Path, mapping: Mapping, rows: pl.DataFrame, bad: pl.DataFrame) -> None:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import date
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,9 @@ from numpy.typing import NDArray
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.counts import round_to_counts
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.errors import InputError
 from fleet_slip.ingest.mapping import FromColumn, Mapping
-from fleet_slip.ingest.resampling import Method, choose_method, resampler
+from fleet_slip.ingest.resampling import Method, build_resampler, choose_method
 
 SOURCE = "measured"
 _SECONDS_PER_DAY = 86_400
@@ -68,12 +70,16 @@ def to_ticks(rows: pl.DataFrame, mapping: Mapping, interval_s: float) -> Ticked:
     start_s = float(rows["time"][0])
     time_s = rows["time"].to_numpy() - start_s
     method = choose_method(time_s, interval_s)
-    ticks, resample = resampler(time_s, method, mapping.time.longest_gap_s)
+    resampler = build_resampler(time_s, method, mapping.time.longest_gap_s)
+    ticks = resampler.ticks
     counts, somewhere = {}, np.zeros(ticks.size, dtype=np.bool_)
-    for name in mapping.signals:
+    for name, source in mapping.signals.items():
         values = rows[name].to_numpy().astype(np.float64)
-        between_samples = method != "snap" and name == catalogue().label
-        values = _on_the_circle(resample, values) if between_samples else resample(values)
+        bring = resampler.resample if source.interpolate else resampler.place
+        resample = partial(bring, delay_s=source.delay_s)
+        between_samples = (method != "snap" or source.delay_s) and source.interpolate
+        angle = between_samples and name == catalogue().label
+        values = _on_the_circle(resample, values) if angle else resample(values)
         somewhere |= ~np.isnan(values)
         # Rounding clips a resampled value's last bit, no more: the rest is in quarantine.
         counts[name] = round_to_counts(values, catalogue()[name])
@@ -122,11 +128,33 @@ def _metadata(drive: MeasuredDrive, ticked: Ticked, mapping: Mapping) -> dict[st
         known["day"] = date.fromordinal(
             date(1970, 1, 1).toordinal() + int(ticked.start_s // _SECONDS_PER_DAY)
         )
+    known |= {name: value for name, value in drive.metadata.items() if name in given}
     return {
         **known,
-        **{name: value for name, value in drive.metadata.items() if name in given},
+        **_facts_of(mapping, known),
         "drive_id": drive.drive_id,
         "source": SOURCE,
         "campaign": mapping.name,
         "saturated": 0,  # what is outside its range is quarantined, not clipped
     }
+
+
+def _facts_of(mapping: Mapping, known: dict[str, Any]) -> dict[str, Any]:
+    """Return what the mapping's table says of a drive's car and nobody said before.
+
+    Raises `InputError` if the car is not in the table, or nobody says its model.
+    """
+    vehicles = mapping.vehicle_facts()
+    if not vehicles:
+        return {}
+    vehicle = known["vehicle_id"]
+    facts = next((facts for facts in vehicles if facts.vehicle_id == vehicle), None)
+    if facts is None:
+        raise InputError(
+            f"the car {vehicle!r} is not in the table of vehicles of the mapping "
+            f"{mapping.name!r}. Add a row for it."
+        )
+    told = {name: fact for name, fact in facts.model_dump().items() if known.get(name) is None}
+    if told.get("vehicle_model", "") is None:
+        raise InputError(f"nobody says the vehicle_model of the car {vehicle!r}. Add it.")
+    return told

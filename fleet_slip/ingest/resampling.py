@@ -5,7 +5,7 @@ is NaN, and each signal is resampled from its own samples, so that a slow sensor
 as well off as one with a file of its own. Nothing is extrapolated.
 """
 
-from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -39,15 +39,50 @@ def choose_method(time_s: FloatArray, interval_s: float) -> Method:
     return "interpolate"
 
 
-def resampler(
-    time_s: FloatArray, method: Method, longest_gap_s: float
-) -> tuple[IntArray, Callable[[FloatArray], FloatArray]]:
-    """Return the ticks of a drive, and what brings one signal's samples onto them."""
-    if method == "snap":
-        return snap(time_s), lambda values: values
-    at_s = tick_times(time_s, method)
-    resample = average if method == "average" else interpolate
-    return np.arange(at_s.size), lambda values: resample(time_s, values, at_s, longest_gap_s)
+@dataclass(frozen=True)
+class Resampler:
+    """Brings the signals of one drive onto its ticks.
+
+    Attributes:
+        ticks: the drive's ticks, shape (n_ticks,).
+    """
+
+    time_s: FloatArray
+    method: Method
+    longest_gap_s: float
+    ticks: IntArray
+
+    def resample(self, values: FloatArray, delay_s: float = 0.0) -> FloatArray:
+        """Return a signal on the ticks; what was measured at t stands in the file at t + delay."""
+        if self.method == "snap" and not delay_s:
+            return values
+        resample = average if self.method == "average" else interpolate
+        return resample(self.time_s - delay_s, values, self._at_s, self.longest_gap_s)
+
+    def place(self, values: FloatArray, delay_s: float = 0.0) -> FloatArray:
+        """Return a signal with each sample at the tick nearest to it, NaN at the other ticks.
+
+        Of several samples nearest to one tick the last stays.
+        """
+        present = np.flatnonzero(~np.isnan(values))
+        nearest = np.rint((self.time_s[present] - delay_s - self._at_s[0]) / STEP_S)
+        place = np.searchsorted(self.ticks, nearest)
+        found = np.isin(nearest, self.ticks)
+        placed = np.full(self.ticks.size, np.nan)
+        placed[place[found]] = values[present[found]]
+        return placed
+
+    @property
+    def _at_s(self) -> FloatArray:
+        if self.method == "snap":
+            return np.asarray(self.time_s[0] + self.ticks * STEP_S, dtype=np.float64)
+        return tick_times(self.time_s, self.method)
+
+
+def build_resampler(time_s: FloatArray, method: Method, longest_gap_s: float) -> Resampler:
+    """Return what brings signals at these times onto the ticks of their drive."""
+    ticks = snap(time_s) if method == "snap" else np.arange(tick_times(time_s, method).size)
+    return Resampler(time_s, method, longest_gap_s, ticks)
 
 
 def snap(time_s: FloatArray) -> IntArray:

@@ -34,13 +34,13 @@ def test_shipped_mappings_load() -> None:
 
 
 def test_gain_and_bias_apply_sign_then_offset_then_unit(tmp_path: Path) -> None:
-    gain, bias = load(tmp_path, GOOD).linear("ax")
+    gain, bias = load(tmp_path, GOOD).signals["ax"].linear("m/s^2")
     assert (gain, bias) == pytest.approx((-9.80665, 0.5 * 9.80665))
 
 
 def test_a_speed_over_its_radius_is_a_wheel_speed(tmp_path: Path) -> None:
     mapping = load(tmp_path, GOOD.replace(STEER, WHEEL))
-    assert mapping.linear("wheel_fl") == pytest.approx((1 / 3.6 / 0.3, 0))
+    assert mapping.signals["wheel_fl"].linear("rad/s") == pytest.approx((1 / 3.6 / 0.3, 0))
 
 
 def test_a_mapping_without_a_radius_says_nothing_of_one(tmp_path: Path) -> None:
@@ -84,7 +84,7 @@ def test_canonical_json_does_not_depend_on_the_layout(tmp_path: Path) -> None:
         ('"a",', '"a\\n",', "has characters that cannot be printed"),
         ("time =", "csv = { separator = '--' }\ntime =", "one ASCII character"),
         ("[signals]", "[signal]", "signals: Field required"),
-        ('"deg"', '"km/h", radius_m = 0.3', "steer_fl: radius_m is for wheel speeds"),
+        ('"deg"', '"km/h", radius_m = 0.3', "radius_m is for wheel speeds"),
         ("steer_fl =", "wheel_fl =", "wheel_fl needs an angular velocity"),
         (STEER, WHEEL.replace("km/h", "rpm"), "wheel_fl needs a velocity, such as 'km/h'"),
         (STEER, WHEEL.replace("0.3", "0"), "signals.wheel_fl.radius_m"),

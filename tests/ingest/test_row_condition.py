@@ -1,0 +1,77 @@
+"""Rows that a mapping leaves out are counted, and not quarantined one by one."""
+
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from pydantic import ValidationError
+
+from fleet_slip.errors import InputError
+from fleet_slip.ingest import read_measured
+from tests.support.measured import a_mapping, good_columns, read_columns, ticks
+
+
+def columns() -> dict[str, Any]:
+    speed = [4, 5, 5.5, None, "n/a", *[20] * 15]
+    fix = ["RTK"] * 18 + ["none", ""]
+    return good_columns(20) | {"speed": speed, "fix": fix}
+
+
+@pytest.mark.parametrize(
+    ("where", "kept"),
+    [
+        ([{"column": "speed", "at_least": 5}], [1, 2, *range(5, 20)]),
+        ([{"column": "speed", "at_least": 5, "at_most": 6}], [1, 2]),
+        ([{"column": "fix", "one_of": ["RTK", "float"]}], list(range(18))),
+        (
+            [{"column": "speed", "at_least": 6}, {"column": "fix", "one_of": ["RTK"]}],
+            list(range(5, 18)),
+        ),
+    ],
+)
+def test_rows_that_do_not_meet_the_conditions_are_counted(
+    tmp_path: Path, where: list[dict[str, Any]], kept: list[int]
+) -> None:
+    log = read_columns(tmp_path, columns(), a_mapping(where=where))
+    first = kept[0]
+    assert ticks(log) == [tick - first for tick in kept]
+    assert (log.counts.rows_read, log.counts.rows_left_out) == (20, 20 - len(kept))
+    assert log.counts.rows_kept == len(kept)
+    assert log.counts.quarantined == {}
+
+
+def test_a_number_in_parquet_can_be_one_of_several(tmp_path: Path) -> None:
+    table = {"t": [0, 0.01, 0.02, 0.03], "ax": [1.0] * 4, "beta": [0.0] * 4, "fix": [4.0, 4, 5, 1]}
+    pq.write_table(pa.table(table), tmp_path / "log.parquet")
+    where = [{"column": "fix", "one_of": ["4", "5"]}]
+    log = read_measured(tmp_path / "log.parquet", a_mapping(where=where))
+    assert ticks(log) == [0, 1, 2]
+    assert log.counts.rows_left_out == 1
+
+
+def test_rows_keep_their_numbers_in_the_quarantine(tmp_path: Path) -> None:
+    bad = columns()
+    bad["ax"][7] = "much"
+    log = read_columns(tmp_path, bad, a_mapping(where=[{"column": "speed", "at_least": 6}]))
+    assert log.quarantine["row"].to_pylist() == [8]
+
+
+def test_a_condition_that_no_row_meets_is_an_error(tmp_path: Path) -> None:
+    where = [{"column": "speed", "at_least": 500}]
+    with pytest.raises(InputError, match=r"none of its 20 rows .* 'speed' is at least 500"):
+        read_columns(tmp_path, columns(), a_mapping(where=where))
+
+
+@pytest.mark.parametrize(
+    ("condition", "message"),
+    [
+        ({}, "needs 'at_least', 'at_most' or 'one_of'"),
+        ({"at_least": 1, "one_of": ["a"]}, "and not both"),
+        ({"at_least": float("nan")}, "finite number"),
+    ],
+)
+def test_what_a_condition_cannot_be(condition: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        a_mapping(where=[{"column": "speed", **condition}])
