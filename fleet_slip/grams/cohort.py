@@ -16,7 +16,15 @@ from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import SCENARIO, TRAINING_DRIVES
 from fleet_slip.errors import DataError, QuestionError, RefusedError
-from fleet_slip.grams.folding import BANDS, EACH, FOLD_KEYS, PARTS, ROW_FOLDS, FoldCount
+from fleet_slip.grams.folding import (
+    BANDS,
+    EACH,
+    FOLD_KEYS,
+    PARTS,
+    ROW_FOLDS,
+    FoldCount,
+    FoldKey,
+)
 from fleet_slip.grams.members import Members, hash_numbers
 from fleet_slip.grams.reader import GramReader, open_grams
 from fleet_slip.regression.drive_moments import serving_drives
@@ -95,7 +103,7 @@ class Cohort:
             name for name in features().feature_set(self.feature_set).inputs if name in found
         )
 
-    def folds(self, by: str, count: FoldCount) -> CohortFolds:
+    def folds(self, by: FoldKey, count: FoldCount) -> CohortFolds:
         """Divide the cohort into folds, of whole drives unless by `row`.
 
         By `drive`: hashed into `count` folds. By another key of `FOLD_KEYS`: one fold for each

@@ -25,7 +25,13 @@ from fleet_slip.grams.cohort import (
     require_divided,
     require_training,
 )
-from fleet_slip.grams.folding import EACH, FOLD_KEYS, FoldCount, Folding
+from fleet_slip.grams.folding import (
+    EACH,
+    FOLD_KEYS,
+    FoldCount,
+    Folding,
+    FoldKey,
+)
 from fleet_slip.grams.members import Members, hash_numbers
 from fleet_slip.grams.reader import GramReader, OpenedGrams, open_grams
 from fleet_slip.regression.folds import CohortFolds
@@ -48,6 +54,7 @@ class SummedCohort:
         rows, drive_count: number of rows of the logs, and of drives, behind the cohort.
         logs_version, grams_version: versions of the Delta tables that were read.
         members: which drives and cars the Gram rows are of.
+        source: where they were read, and can be read again over other folds.
         feature_set: which Gram rows were read.
     """
 
@@ -59,6 +66,7 @@ class SummedCohort:
     logs_version: int
     grams_version: int
     members: Members
+    source: Warehouse | GramReader
     feature_set: str = PLAIN
 
     @property
@@ -69,11 +77,15 @@ class SummedCohort:
             name for name in features().feature_set(self.feature_set).inputs if name in found
         )
 
-    def folds(self, by: str, count: FoldCount) -> CohortFolds:
-        """Return the folds, which must be those that were asked for when the cohort was read."""
-        if (by, count) != (self.folding.by, self.folding.count):
-            raise ValueError(f"the sums are over {self.folding}, not over {count} folds by {by}")
-        return self.sums
+    def folds(self, by: FoldKey, count: FoldCount) -> CohortFolds:
+        """Return the folds; for others than the cohort was read over, its Gram rows as of now.
+
+        Raises what `sum_cohort` raises.
+        """
+        if (by, count) == (self.folding.by, self.folding.count):
+            return self.sums
+        folding = Folding(by=by, count=count)
+        return sum_cohort(self.source, folding, self.condition, self.feature_set).sums
 
     def gram_condition(self, inputs: Sequence[str]) -> str:
         """Return the SQL condition on the view `grams` of the rows that a model is made of."""
@@ -110,6 +122,7 @@ def sum_cohort(
         logs_version=opened.logs_version,
         grams_version=opened.grams_version,
         members=sums.members,
+        source=warehouse,
         feature_set=feature_set,
     )
 

@@ -40,6 +40,8 @@ class AliasMove(Config):
     version: Annotated[int, Field(ge=1, lt=10**MAX_DIGITS)]
     command: Command
     at: datetime
+    best: Annotated[int, Field(ge=1, lt=10**MAX_DIGITS)] | None = None
+    """Of a publication: the best of the champions so far, if that is another version."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +82,14 @@ class AliasHistory:
                 trail = _after(trail, move)
         return trail[-2] if len(trail) > 1 else None
 
+    def best_of(self, alias: str) -> int | None:
+        """Return the best of the versions that an alias was led through since a person moved it.
+
+        That is what publications said; None if the alias points at no version.
+        """
+        last = next((move for move in self.latest_moves() if move.alias == alias), None)
+        return None if last is None else last.best or last.version
+
     def published_at(self, version: int) -> datetime | None:
         """Return when a version was published last; None if no move tells."""
         moves = self.latest_moves()
@@ -104,15 +114,24 @@ class AliasHistory:
         """
         return self.documents.after_newest(decision)
 
-    def move(self, alias: str, version: int, command: Command, *, after: int) -> bool:
+    def move(
+        self, alias: str, version: int, command: Command, *, after: int, best: int | None = None
+    ) -> bool:
         """Point an alias at a version; return False if there were moves after the one given."""
         if not re.fullmatch(IDENTIFIER_PATTERN, alias):
             raise QuestionError(
                 f"{alias!r} cannot be an alias: use small letters, digits and _, beginning with a "
                 "letter, at most 41."
             )
-        move = AliasMove(alias=alias, version=version, command=command, at=datetime.now(UTC))
-        return self.documents.create(after + 1, move.model_dump(mode="json")) is not None
+        move = AliasMove(
+            alias=alias,
+            version=version,
+            command=command,
+            at=datetime.now(UTC),
+            best=None if best == version else best,
+        )
+        content = move.model_dump(mode="json", exclude_none=True)
+        return self.documents.create(after + 1, content) is not None
 
 
 def _after(trail: list[int], move: AliasMove) -> list[int]:
@@ -121,6 +140,8 @@ def _after(trail: list[int], move: AliasMove) -> list[int]:
         case "rollback":
             return trail[:-1]
         case "pin" | "unpin":
+            return trail
+        case _ if trail and trail[-1] == move.version:
             return trail
         case _:
             return [*trail, move.version]

@@ -2,11 +2,14 @@
 
 Both are asked of rows that the challenger was not fitted on. The champion is what cars have: its
 own coefficients, not its signals fitted anew. It is compared on the same held-out drives, so that
-the error that counts is that of the difference over the folds.
+the error that counts is that of the difference, over what is independent in the data: cars where
+there are several, else drives. And so that many small steps do not lead downhill, the best of the
+champions so far is compared as well.
 """
 
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -18,6 +21,7 @@ from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import DataError
+from fleet_slip.grams.folding import FoldKey
 from fleet_slip.models.counts_model import counts_model
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.model_version import ModelVersion
@@ -29,7 +33,8 @@ from fleet_slip.regression.crossval import (
 )
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.folds import Folds
-from fleet_slip.regression.winner import Shortfall, Worth, fall_short
+from fleet_slip.regression.paired import compare_paired
+from fleet_slip.regression.winner import Shortfall, Worth
 from fleet_slip.resources import folder
 from fleet_slip.selection.compare import Selection
 
@@ -55,43 +60,77 @@ def floor() -> Floor:
     return load_config(Path(chosen) if chosen else folder("configs") / "publish.toml", Floor)
 
 
+LEAST_VEHICLES = 5
+"""With fewer cars their difference says little of other cars, and drives are held out instead."""
+
+GROUPS = 20
+"""Into so many groups, or fewer, cars or drives are dealt. Each is an exact fit."""
+
+
 @dataclass(frozen=True)
 class Comparison:
-    """A challenger and the champion's own coefficients on the same held-out rows."""
+    """A challenger and the own coefficients of published versions on the same held-out rows.
 
+    Attributes:
+        by: what was held out, vehicle or drive.
+        challenger: fitted to all groups but the one that it is tested on.
+        incumbents: the champion, and the best of the champions so far if that is another one.
+        shortfalls: of the challenger, from each of them.
+    """
+
+    by: FoldKey
     challenger: CrossValidation
-    champion: CrossValidation
-    shortfall: Shortfall
+    incumbents: tuple[CrossValidation, ...]
+    shortfalls: tuple[Shortfall, ...]
+
+    @property
+    def better(self) -> tuple[CrossValidation, ...]:
+        """Those that the challenger is worse than."""
+        pairs = zip(self.incumbents, self.shortfalls, strict=True)
+        return tuple(one for one, shortfall in pairs if not shortfall.negligible)
+
+    @property
+    def best(self) -> str | None:
+        """The incumbent that is better than all others and the challenger; None if none is."""
+        first = min(self.incumbents, key=lambda one: one.pooled.rmse)
+        return first.name if first.pooled.rmse < self.challenger.pooled.rmse else None
 
     def __str__(self) -> str:
         """Return what was compared, with its figures."""
-        challenger, champion = self.challenger.pooled, self.champion.pooled
+        challenger = self.challenger.pooled
+        others = "; ".join(
+            f"the coefficients of {one.name} have {one.pooled.rmse_deg:.4f} deg and "
+            f"{one.pooled.correlation:.4f}, difference {shortfall}"
+            for one, shortfall in zip(self.incumbents, self.shortfalls, strict=True)
+        )
         return (
             f"on the same {challenger.rows:,} rows of {self.challenger.drives:,} drives, held out "
-            f"in {len(self.challenger.folds)} folds, it has RMSE {challenger.rmse_deg:.4f} deg and "
-            f"correlation {challenger.correlation:.4f}; the coefficients of "
-            f"{self.champion.name} have {champion.rmse_deg:.4f} deg and "
-            f"{champion.correlation:.4f}; difference {self.shortfall}"
+            f"in {len(self.challenger.folds)} groups by {self.by}, it has RMSE "
+            f"{challenger.rmse_deg:.4f} deg and correlation {challenger.correlation:.4f}; {others}"
         )
 
 
-def compare(selection: Selection[Any], champion: ModelVersion) -> Comparison:
-    """Compare a selection's winner with the champion's own coefficients, fold by fold.
+def compare(selection: Selection[Any], incumbents: Sequence[ModelVersion]) -> Comparison:
+    """Compare a selection's winner with the own coefficients of published versions.
 
-    Over the drives that have the signals of both. Raises `DataError` or `QuestionError` if there
-    are none, or the champion's features are not defined as they were.
+    Over the drives that have the signals of all. Raises `DataError` or `QuestionError` if there
+    are none, or the features of a version are not defined as they were.
     """
-    _require_same_features(champion.manifest)
+    for version in incumbents:
+        _require_same_features(version)
     label, inputs = catalogue().label, selection.winner.model.signals
-    both = tuple(dict.fromkeys((*inputs, *champion.manifest.signals)))
-    divided = selection.cohort.folds(selection.folds.by, selection.folds.count)
-    folds = divided.serving(both, label)
+    every = (name for version in incumbents for name in version.manifest.signals)
+    signals = tuple(dict.fromkeys((*inputs, *every)))
+    cars = selection.cohort.members.count_vehicles_with((*signals, label))
+    by: FoldKey = "vehicle" if cars >= LEAST_VEHICLES else "drive"
+    groups = selection.cohort.folds(by, GROUPS).serving(signals, label, sparse=True)
     challenger = cross_validate(
-        selection.winner.model.name, folds, least_squares(inputs, label), input_scales()
+        selection.winner.model.name, groups, least_squares(inputs, label), input_scales()
     )
-    incumbent = _as_it_is(champion, folds)
+    others = tuple(_as_it_is(version, groups) for version in incumbents)
     worth = Worth(math.radians(floor().worth_deg))
-    return Comparison(challenger, incumbent, fall_short(challenger, incumbent, worth))
+    shortfalls = tuple(compare_paired(challenger, other, worth) for other in others)
+    return Comparison(by, challenger, others, shortfalls)
 
 
 def _as_it_is(version: ModelVersion, folds: Folds) -> CrossValidation:
@@ -133,11 +172,11 @@ def _shrunk(manifest: Manifest, champion: Manifest, part: float) -> list[str]:
     ]
 
 
-def _require_same_features(champion: Manifest) -> None:
-    known = features()
-    for name, sql in champion.features.items():
+def _require_same_features(version: ModelVersion) -> None:
+    known, then = features(), version.manifest
+    for name, sql in then.features.items():
         if name not in known.features or known.features[name].sql != sql:
-            raise DataError(f"its feature {name} is not defined as it was then.")
-    for name, definition in champion.definitions.items():
+            raise DataError(f"the feature {name} of {version.reference} is not defined as then.")
+    for name, definition in then.definitions.items():
         if name not in known.inputs or known.definition(name) != definition:
-            raise DataError(f"its column {name} is not defined as it was then.")
+            raise DataError(f"the column {name} of {version.reference} is not defined as then.")

@@ -118,11 +118,11 @@ def publish(
 ) -> Publication:
     """Make the winner the next version of its model, and its champion.
 
-    It must be above the floor and no worse than the champion (`fleet_slip.models.gate`), else it is
-    refused (`RefusedError`) unless forced. A `candidate` waits for somebody to promote it, and so
-    does whatever is published while the champion is held by `rollback` or `pin`. A challenger that
-    is the same estimator from the same rows changes nothing. If the champion changes meanwhile, all
-    is decided again.
+    It must be above the floor, and no worse than the champion and the best of the champions so far
+    (`fleet_slip.models.gate`), else it is refused (`RefusedError`) unless forced. A `candidate`
+    waits for somebody to promote it, and so does whatever is published while the champion is held
+    by `rollback` or `pin`. A challenger that is the same estimator from the same rows changes
+    nothing. If the champion changes meanwhile, all is decided again.
     """
     history = registry.history(manifest.name)
 
@@ -135,14 +135,15 @@ def publish(
         if champion and champion.manifest.same_estimator(manifest):
             return Publication(champion, False, "The champion is this very model.")
         held = history.held_by(CHAMPION)
-        if candidate:
-            reason = _describe(champion, manifest, selection)
-        else:
-            reason = _why_publish(champion, manifest, selection, force=force)
+        judgement = _judge(registry, champion, manifest, selection)
+        if not force and not candidate:
+            judgement.require_passed(manifest.name)
         if candidate or held:
-            return _wait(registry, added(), newest_move, reason, held)
-        published = registry.make_champion(added(), after=newest_move)
-        return Publication(added(), True, reason) if published else None
+            return _wait(registry, added(), newest_move, judgement.reason, held)
+        version = added()
+        best = None if judgement.problems else judgement.best
+        published = registry.make_champion(version, after=newest_move, best=best)
+        return Publication(version, True, judgement.reason) if published else None
 
     return history.decide(decision)
 
@@ -175,35 +176,69 @@ def drives_of(selection: Selection[Any], name: str) -> bytes:
     return pack_drives(name, selection.cohort.members.drives_with(signals))
 
 
-def _why_publish(
-    champion: ModelVersion | None, manifest: Manifest, selection: Selection[Any], *, force: bool
-) -> str:
+@dataclass(frozen=True)
+class _Judgement:
+    """What the gate says of a challenger.
+
+    Attributes:
+        problems: why it is not to become champion.
+        compared: with what it was compared.
+        best: the number of a champion of before that is better than it; None if none is.
+    """
+
+    problems: tuple[str, ...]
+    compared: str
+    best: int | None = None
+
+    @property
+    def reason(self) -> str:
+        """The problems, else what was compared, as a sentence."""
+        text = "; ".join(self.problems) or self.compared
+        return f"{text[:1].upper()}{text[1:]}."
+
+    def require_passed(self, name: str) -> None:
+        """Raise `RefusedError` if there are problems."""
+        if self.problems:
+            raise RefusedError(
+                f"{name} was not published: {'; '.join(self.problems)}. Look at the data, or use "
+                "--force to publish it all the same."
+            )
+
+
+def _judge(
+    registry: Registry,
+    champion: ModelVersion | None,
+    manifest: Manifest,
+    selection: Selection[Any],
+) -> _Judgement:
     problems = faults(manifest, champion.manifest if champion else None)
-    compared = "It is the first version"
-    if champion is not None:
-        try:
-            comparison = compare(selection, champion)
-        except (DataError, QuestionError) as error:
-            problems.append(f"the champion {champion.reference} cannot be compared ({error})")
-        else:
-            compared = str(comparison)
-            if not comparison.shortfall.negligible:
-                problems.append(f"it is worse than the champion: {comparison}")
-    if problems and not force:
-        raise RefusedError(
-            f"{manifest.name} was not published: {'; '.join(problems)}. Look at the data, or use "
-            "--force to publish it all the same."
+    if champion is None:
+        return _Judgement(tuple(problems), "It is the first version")
+    try:
+        incumbents = _incumbents(registry, champion)
+        comparison = compare(selection, incumbents)
+    except (DataError, QuestionError) as error:
+        problems.append(f"the champion {champion.reference} cannot be compared ({error})")
+        return _Judgement(tuple(problems), "")
+    better = [one.name for one in comparison.better]
+    if champion.reference in better:
+        problems.append(f"it is worse than the champion: {comparison}")
+    elif better:
+        problems.append(
+            f"it is worse than {better[0]}, the best of the champions so far, from which small "
+            f"steps have led away: {comparison}. To begin anew at the champion: fleet-slip promote "
+            f"{champion.reference}"
         )
-    return f"{_capitalised('; '.join(problems) or compared)}."
+    best = next((one.version for one in incumbents if one.reference == comparison.best), None)
+    return _Judgement(tuple(problems), str(comparison), best)
 
 
-def _describe(champion: ModelVersion | None, manifest: Manifest, selection: Selection[Any]) -> str:
-    """Return what the gate says of a candidate, which passes it all the same."""
-    return _why_publish(champion, manifest, selection, force=True)
-
-
-def _capitalised(text: str) -> str:
-    return text[:1].upper() + text[1:]
+def _incumbents(registry: Registry, champion: ModelVersion) -> list[ModelVersion]:
+    """Return the champion, and the best of the champions so far if that is another version."""
+    name = champion.manifest.name
+    best = registry.history(name).best_of(CHAMPION)
+    others = [] if best in (None, champion.version) else [registry.load(name, best)]
+    return [champion, *others]
 
 
 def _cross_validated(winner: CrossValidation, selection: Selection[Any]) -> CrossValidated:

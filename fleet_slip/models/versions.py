@@ -151,23 +151,27 @@ class Registry:
         self.sign(name, version)
         return self._read(name, version)
 
-    def make_champion(self, version: ModelVersion, *, after: int) -> bool:
-        """Point the champion at a version; return False if an alias moved after the move given."""
+    def make_champion(self, version: ModelVersion, *, after: int, best: int | None = None) -> bool:
+        """Point the champion at a version; return False if an alias moved after the move given.
+
+        `best` is the best of the champions so far, by default this version.
+        """
         history = self.history(version.manifest.name)
         there = history.pointed_at(CHAMPION) == version.version
-        return there or history.move(CHAMPION, version.version, "publish", after=after)
+        return there or history.move(CHAMPION, version.version, "publish", after=after, best=best)
 
     def promote(self, name: str, version: int, alias: str) -> None:
         """Point an alias at a version. Raises `QuestionError` for an unknown version.
 
         Where it points there already nothing is added, so that a repeated command can be undone by
-        one `rollback`.
+        one `rollback`; unless that ends a hold, or the comparison with a better champion of before.
         """
         self.load(name, version)
         history = self.history(name)
 
         def move(newest: int) -> int | None:
-            there = history.pointed_at(alias) == version and not history.held_by(alias)
+            chosen = history.pointed_at(alias) == history.best_of(alias) == version
+            there = chosen and not history.held_by(alias)
             moved = there or history.move(alias, version, "promote", after=newest)
             return version if moved else None
 

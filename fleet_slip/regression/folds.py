@@ -175,10 +175,11 @@ class CohortFolds:
         )
         return cls(assignment.names, grams, tuple(np.split(numbers, stops)))
 
-    def serving(self, inputs: Sequence[str], label: str) -> Folds:
+    def serving(self, inputs: Sequence[str], label: str, *, sparse: bool = False) -> Folds:
         """Return the folds of the drives that have the label and all the inputs.
 
-        Raises `DataError` if no drive has them all, or a fold has no such row.
+        `sparse` leaves out folds without such a drive. Raises `DataError` if no drive has them all,
+        if a fold has no such row, or if there are not two folds that have.
         """
         signals = (*inputs, label)
         served = [i for i, grams in enumerate(self.tables) if set(signals) <= set(grams[0].signals)]
@@ -194,10 +195,14 @@ class CohortFolds:
             for f in range(len(self.names))
         )
         empty = [name for name, gram in zip(self.names, folds, strict=True) if gram.n == 0]
-        if empty:
+        names = self.names
+        if sparse:
+            names = tuple(name for name in names if name not in empty)
+            folds = tuple(gram for gram in folds if gram.n)
+        if len(folds) < 2 or (empty and not sparse):
             raise DataError(
                 f"fold {', '.join(empty)} has no rows with all of {', '.join(signals)}. Choose "
                 "fewer folds, another key to fold by, or fewer signals."
             )
         rows_of_drive = np.bincount(np.concatenate([self.drives[i] for i in served]))
-        return Folds(folds, self.names, int(np.count_nonzero(rows_of_drive)))
+        return Folds(folds, names, int(np.count_nonzero(rows_of_drive)))

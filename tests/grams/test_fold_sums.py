@@ -120,9 +120,10 @@ def test_errors_are_those_of_the_cohort(fleet: Warehouse, condition: str) -> Non
     assert str(summed.value) == str(whole.value)
 
 
-def test_sums_of_other_folds_are_refused(fleet: Warehouse) -> None:
-    with pytest.raises(ValueError, match="sums are over"):
-        sum_cohort(fleet, Folding()).folds("drive", 7)
+def test_sums_over_other_folds_are_read_again(fleet: Warehouse) -> None:
+    again = sum_cohort(fleet, Folding()).folds("drive", 7)
+    at_once = sum_cohort(fleet, Folding(count=7)).sums
+    assert (again.names, again.tables) == (at_once.names, at_once.tables)
 
 
 def test_folds_of_rows_need_a_set_that_made_them(fleet: Warehouse) -> None:

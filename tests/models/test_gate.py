@@ -24,12 +24,17 @@ from tests.support.logs import land, log_rows
 
 ROWS = 200
 
+WEAK = ("ax", "steering_wheel", "steer_fl")
+"""Signals whose loss costs 0.0035 deg each, which is not worth refusing."""
+
 
 def counts(rng: np.random.Generator, label: float = 1.0, noise: float = 20.0) -> dict[str, Any]:
     """Counts of a drive whose label is a sum of two signals, times a factor, and noise."""
-    ay, yaw_rate = rng.normal(0, 1000, (2, ROWS))
-    sideslip = label * (0.3 * ay + 0.2 * yaw_rate) + rng.normal(0, noise, ROWS)
-    found = {"ay": ay, "yaw_rate": yaw_rate, "sideslip": sideslip}
+    ay, yaw_rate, *weak = rng.normal(0, 1000, (2 + len(WEAK), ROWS))
+    true = 0.3 * ay + 0.2 * yaw_rate + 0.005 * sum(weak)
+    sideslip = label * true + rng.normal(0, noise, ROWS)
+    found = {"ay": ay, "yaw_rate": yaw_rate, **dict(zip(WEAK, weak, strict=True))}
+    found["sideslip"] = sideslip
     return {name: np.rint(values).astype(np.int16) for name, values in found.items()}
 
 
@@ -48,7 +53,9 @@ def publish_from(
     warehouse: Warehouse, cohort: str = "true", signals: str = "ay,yaw_rate", **options: Any
 ) -> Publication:
     """Select on a cohort and publish the winner."""
-    answer = answer_request(warehouse, SelectionRequest(cohort=cohort, nested=signals))
+    answer = answer_request(
+        warehouse, SelectionRequest(cohort=cohort, nested=signals, worth="0.0001deg")
+    )
     manifest = manifest_of(answer, "beta")
     return publish(registry_of(warehouse), manifest, answer, **options)
 
@@ -93,7 +100,7 @@ def test_more_data_of_the_same_replaces_the_champion_and_says_what_was_compared(
     write(champion, "more", 48)
     done = publish_from(champion)
     assert done.version.version == 2
-    assert "On the same 19,200 rows of 96 drives, held out in 5 folds" in done.reason
+    assert "On the same 19,200 rows of 96 drives, held out in 8 groups by vehicle" in done.reason
     assert "the coefficients of beta@1 have" in done.reason
 
 
@@ -101,10 +108,46 @@ def test_the_champion_is_compared_as_it_is_not_fitted_anew(champion: Warehouse) 
     write(champion, "more", 48)
     version = registry_of(champion).load("beta", 1)
     request = SelectionRequest(cohort="drive_id LIKE 'more%'", nested="ay,yaw_rate")
-    comparison = gate.compare(answer_request(champion, request), version)
-    model = comparison.champion.counts
-    assert model.coefficients == counts_model(version.manifest).coefficients
-    assert comparison.champion.pooled.rows == comparison.challenger.pooled.rows == 48 * ROWS
+    comparison = gate.compare(answer_request(champion, request), [version])
+    (as_it_is,) = comparison.incumbents
+    assert as_it_is.counts.coefficients == counts_model(version.manifest).coefficients
+    assert as_it_is.pooled.rows == comparison.challenger.pooled.rows == 48 * ROWS
+
+
+@pytest.mark.parametrize(("cars", "by", "groups"), [(8, "vehicle", 8), (4, "drive", 18)])
+def test_cars_are_held_out_where_there_are_several_else_drives(
+    warehouse: Warehouse, cars: int, by: str, groups: int
+) -> None:
+    write(warehouse, "good", 60)
+    cohort = " OR ".join(f"vehicle_id = 'car-{i}'" for i in range(cars))
+    version = publish_from(warehouse, cohort).version
+    request = SelectionRequest(cohort=cohort, nested="ay,yaw_rate")
+    comparison = gate.compare(answer_request(warehouse, request), [version])
+    assert (comparison.by, len(comparison.challenger.folds)) == (by, groups)
+
+
+def test_small_steps_do_not_lead_downhill(warehouse: Warehouse) -> None:
+    write(warehouse, "good", 48)
+    strong, registry = "ay,yaw_rate", registry_of(warehouse)
+    first = ",".join((strong, *WEAK))
+    assert publish_from(warehouse, signals=first).version.version == 1
+    second = ",".join((strong, *WEAK[:2]))
+    assert publish_from(warehouse, signals=second).version.version == 2
+    assert registry.history("beta").best_of("champion") == 1
+    third = ",".join((strong, *WEAK[:1]))
+    with pytest.raises(RefusedError, match=r"worse than beta@1, the best of the champions so far"):
+        publish_from(warehouse, signals=third)
+    registry.promote("beta", 2, "champion")  # a person begins anew
+    assert registry.history("beta").best_of("champion") == 2
+    assert publish_from(warehouse, signals=third).version.version == 3
+    assert registry.rollback("beta", "champion") == 2
+
+
+def test_what_was_forced_is_where_it_begins_anew(warehouse: Warehouse) -> None:
+    write(warehouse, "good", 48)
+    publish_from(warehouse)
+    publish_from(warehouse, signals="ay", force=True)
+    assert registry_of(warehouse).history("beta").best_of("champion") == 2
 
 
 @pytest.mark.parametrize(
