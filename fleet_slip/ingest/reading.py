@@ -8,16 +8,21 @@ as it was written.
 import hashlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from io import BufferedReader
 from pathlib import Path
+from typing import BinaryIO
 
 import polars as pl
 import pyarrow as pa
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import shown
-from fleet_slip.ingest.csv_batches import csv_batches
+from fleet_slip.ingest.csv_batches import BLOCK_BYTES, csv_batches
 from fleet_slip.ingest.mapping import CsvFormat
 from fleet_slip.ingest.parquet_batches import PARQUET_MAGIC, parquet_batches
+
+COMPRESSED = {b"\x1f\x8b": "gzip", b"\x28\xb5\x2f\xfd": "zstd"}
+"""What compressed files begin with."""
 
 MAX_ROWS = 20_000_000
 """Rows of one file: 55 hours at 100 Hz. All of them are in memory once, as float64."""
@@ -63,13 +68,25 @@ def read_batches(
         batches = (
             parquet_batches(stream, file, columns, MAX_ROWS)
             if binary
-            else csv_batches(stream, file, columns, csv_format)
+            else csv_batches(_decompressed(stream), file, columns, csv_format)
         )
         for batch in batches:
             rows += batch.height
             if rows > MAX_ROWS:
                 raise InputError(f"{shown(file)}: more than {MAX_ROWS:,} rows. Split the file.")
             yield batch
+
+
+def _decompressed(stream: BinaryIO) -> BinaryIO:
+    """Return the text of a stream, whatever it is compressed with."""
+    start = stream.read(max(map(len, COMPRESSED)))
+    stream.seek(0)
+    for magic, codec in COMPRESSED.items():
+        if start.startswith(magic):
+            # Text is read in blocks: what a small file may become is never in memory at once.
+            plain = pa.CompressedInputStream(stream, codec)
+            return BufferedReader(plain, BLOCK_BYTES)
+    return stream
 
 
 @contextmanager

@@ -1,0 +1,62 @@
+"""CSV files that were compressed, by the standard library's gzip and by Arrow's zstd."""
+
+import gzip
+from collections.abc import Callable
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+
+from fleet_slip.errors import InputError
+from fleet_slip.ingest import read_measured
+from fleet_slip.ingest.csv_batches import BLOCK_BYTES
+from tests.support.measured import a_mapping, csv_text, good_columns, read_text
+
+TEXT = csv_text(good_columns(200)).encode()
+
+
+def zstd(text: bytes) -> bytes:
+    return bytes(pa.compress(text, "zstd", asbytes=True))
+
+
+both = pytest.mark.parametrize("compress", [gzip.compress, zstd], ids=["gzip", "zstd"])
+Compress = Callable[[bytes], bytes]
+
+
+def failure(folder: Path, content: bytes) -> str:
+    file = folder / "log.csv.gz"
+    file.write_bytes(content)
+    with pytest.raises(InputError) as caught:
+        read_measured(file, a_mapping())
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@both
+def test_compressed_text_gives_the_same_counts_under_any_name(
+    tmp_path: Path, compress: Compress
+) -> None:
+    plain = read_text(tmp_path, TEXT).drives.drop_columns("drive_id")
+    assert read_text(tmp_path, compress(TEXT)).drives.drop_columns("drive_id").equals(plain)
+
+
+@both
+def test_a_truncated_file_is_no_shorter_drive(tmp_path: Path, compress: Compress) -> None:
+    whole = compress(TEXT)
+    for kept in (len(whole) // 2, len(whole) - 1):
+        assert "Truncated compressed stream" in failure(tmp_path, whole[:kept])
+
+
+def test_a_flipped_bit_is_noticed_by_the_checksum_of_gzip(tmp_path: Path) -> None:
+    content = bytearray(gzip.compress(TEXT))
+    content[-6] ^= 1  # in the CRC-32
+    assert "cannot be read" in failure(tmp_path, bytes(content))
+
+
+@both
+def test_what_would_not_fit_into_memory_is_refused_while_it_unfolds(
+    tmp_path: Path, compress: Compress
+) -> None:
+    bomb = compress(TEXT + b"9" * (3 * BLOCK_BYTES))
+    assert len(bomb) < BLOCK_BYTES / 100
+    assert "a line is longer than" in failure(tmp_path, bomb)
