@@ -12,7 +12,7 @@ from fleet_slip.api.filling import Filling
 from fleet_slip.api.tending import Tending
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.errors import QuestionError, RefusedError
+from fleet_slip.errors import RefusedError
 from fleet_slip.models.manifest import require_model_name
 from fleet_slip.runs.log import step
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     import duckdb
 
     from fleet_slip.api.run_report import RunReport
+    from fleet_slip.api.session import Session
     from fleet_slip.models.publish import Publication
     from fleet_slip.selection.request import RequestedSelection
     from fleet_slip.simulation.campaign import Campaign
@@ -50,17 +51,28 @@ class Fleet(Filling, Tending):
         Raises `QuestionError` for a query that is not valid or would write, and `StorageError`
         without a data root.
         """
-        from fleet_slip.views import connect
-        from fleet_slip.warehouse.database import database_errors
-        from fleet_slip.warehouse.read_only_sql import one_query
+        return self.session(query, threads=threads).sql(query)
 
-        database = connect(self.root, threads=threads, query=query)
-        text = one_query(database, query)
-        with database_errors("the query"):
-            relation = database.sql(text)
-        if relation is None:
-            raise QuestionError("the query has no result.")
-        return relation
+    def session(self, query: str | None = None, *, threads: int | None = None) -> "Session":
+        """Open the views of this moment for many queries, all of which see the same commits.
+
+        With a `query`, only the views that it names are opened, which is faster. Raises
+        `StorageError` without a data root.
+        """
+        from fleet_slip.api.session import Session
+        from fleet_slip.views import connect
+
+        return Session(connect(self.root, threads=threads, query=query))
+
+    def unlocked_session(self, query: str | None = None) -> "Session":
+        """Open a session that allows any statement, and any file that you may read or write.
+
+        Only for SQL that you trust: it can overwrite the warehouse. Else like `session`.
+        """
+        from fleet_slip.api.session import Session, any_statement
+        from fleet_slip.views import connect
+
+        return Session(connect(self.root, locked=False, query=query), any_statement)
 
     def cohort(self, condition: str = TRAINING_DRIVES) -> FleetCohort:
         """Return the drives that satisfy an SQL condition on the view `drives`.

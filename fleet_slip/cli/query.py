@@ -5,25 +5,18 @@ import logging
 import shutil
 import sys
 from collections.abc import Iterator
-from functools import partial
 from typing import Annotated
 
-import duckdb
 import pyarrow as pa
 import pyarrow.compute as pc
 import typer
 from pyarrow.csv import write_csv
 
+from fleet_slip.api.fleet import Fleet
+from fleet_slip.api.session import Session
 from fleet_slip.cli.output import Json, print_json, say
 from fleet_slip.errors import FleetSlipError, QuestionError
-from fleet_slip.views import connect
-from fleet_slip.warehouse.database import (
-    check_opened_files,
-    interruptible,
-    limit_memory,
-    reading_files,
-)
-from fleet_slip.warehouse.read_only_sql import one_query
+from fleet_slip.warehouse.database import limit_memory
 
 ROWS_SHOWN = 40
 FORMULA = "^[=+@\\t\\r\\n＝＋－＠-]"
@@ -59,12 +52,19 @@ def sql(
     Every column is described in the view dictionary. A query can read the warehouse, and nothing
     else.
     """
+    fleet: Fleet = context.obj
     text = _read_stdin() if query == "-" else query
     if not unsafe:
         limit_memory()
-    with connect(context.obj.root, locked=not unsafe, query=text) as database:
-        allowed = text if unsafe else one_query(database, text)
-        interruptible(database, lambda: _answer(database, allowed, json=json, csv=csv, exact=exact))
+    opened = (fleet.unlocked_session if unsafe else fleet.session)(text)
+    with opened as session, _representation_errors():
+        if not (json or csv):
+            _show(session, text)
+        elif json:
+            print_json(session.table(text).to_pylist())
+        else:
+            rows = session.table(text)
+            write_csv(rows if exact else _mark_formulas(rows), sys.stdout.buffer)
 
 
 def _read_stdin() -> str:
@@ -74,27 +74,9 @@ def _read_stdin() -> str:
         raise QuestionError("the query on stdin is not UTF-8 text.") from None
 
 
-def _answer(
-    database: duckdb.DuckDBPyConnection,
-    text: str,
-    *,
-    json: bool = False,
-    csv: bool = False,
-    exact: bool = False,
-) -> None:
-    with _representation_errors(), reading_files(database, "the query"):
-        relation = database.sql(text)
-        if relation is None:  # an unsafe statement without a result
-            return
-        if not (json or csv):
-            relation.show(max_rows=ROWS_SHOWN, max_width=_width())
-            return
-        rows = relation.to_arrow_table()
-        check_opened_files(database)  # before anything is printed
-        if json:
-            print_json(rows.to_pylist())
-        else:
-            write_csv(rows if exact else _mark_formulas(rows), sys.stdout.buffer)
+def _show(session: Session, text: str) -> None:
+    width = shutil.get_terminal_size((160, 40)).columns
+    session.compute(text, lambda answer: answer.show(max_rows=ROWS_SHOWN, max_width=width))
 
 
 def _mark_formulas(answer: pa.Table) -> pa.Table:
@@ -129,22 +111,18 @@ def _representation_errors() -> Iterator[None]:
         ) from None
 
 
-def _width() -> int:
-    return shutil.get_terminal_size((160, 40)).columns
-
-
 def shell(context: typer.Context) -> None:
     """Type SQL queries against the warehouse, one after the other. End with .quit or Ctrl-D."""
     import readline  # noqa: F401, PLC0415 - gives input() history and editing
 
     limit_memory()
-    with connect(context.obj.root) as database:
+    with context.obj.session() as session:
         say("Views: log, log_counts, drives, grams, models, quarantine, dictionary. End: .quit")
         while (text := _read_statement()) is not None:
             try:
                 if text.strip():
-                    allowed = one_query(database, text)
-                    interruptible(database, partial(_answer, database, allowed))
+                    with _representation_errors():
+                        _show(session, text)
             except FleetSlipError as error:
                 say(f"error: {error}")
             except KeyboardInterrupt:

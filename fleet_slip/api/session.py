@@ -1,0 +1,82 @@
+"""SQL on the views of one moment, for any number of queries."""
+
+import types
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Self, TypeVar
+
+import duckdb
+import pyarrow as pa
+
+from fleet_slip.errors import QuestionError
+from fleet_slip.warehouse.database import database_errors, interruptible, reading_files
+from fleet_slip.warehouse.read_only_sql import one_query
+
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class Session:
+    """A connection with the views of one moment; `Fleet.session` opens one.
+
+    Close it, or use it in a `with` block. For one thread at a time. Every query raises
+    `QuestionError` if it is not valid or would write.
+
+    Attributes:
+        database: the connection.
+        allow: returns a query's text if it may be asked, and raises `QuestionError` otherwise.
+    """
+
+    database: duckdb.DuckDBPyConnection
+    allow: Callable[[duckdb.DuckDBPyConnection, str], str] = one_query
+
+    def sql(self, query: str) -> duckdb.DuckDBPyRelation:
+        """Return the answer to a query as a relation, computed when it is asked for rows.
+
+        It and all that is made of it keep the connection open.
+        """
+        text = self.allow(self.database, query)
+        with database_errors("the query"):
+            relation: duckdb.DuckDBPyRelation | None = self.database.sql(text)
+        if relation is None:
+            raise QuestionError("the query is empty.")
+        return relation
+
+    def table(self, query: str) -> pa.Table:
+        """Return the answer as an Arrow table; see `compute`."""
+        return self.compute(query, duckdb.DuckDBPyRelation.to_arrow_table)
+
+    def compute(self, query: str, work: Callable[[duckdb.DuckDBPyRelation], Result]) -> Result:
+        """Do work with the answer to a query, and return what it returns.
+
+        Ctrl-C ends it in the middle of the query. Raises `StorageError` if a file that was read is
+        not what its checksum says.
+        """
+
+        def answer() -> Result:
+            with reading_files(self.database, "the query"):
+                return work(self.sql(query))
+
+        return interruptible(self.database, answer)
+
+    def close(self) -> None:
+        """Close the connection."""
+        self.database.close()
+
+    def __enter__(self) -> Self:
+        """Return the session."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: types.TracebackType | None,
+    ) -> None:
+        """Close the connection."""
+        self.close()
+
+
+def any_statement(_database: duckdb.DuckDBPyConnection, text: str) -> str:
+    """Return a text as it is: what an unlocked session may be asked."""
+    return text
