@@ -22,6 +22,12 @@ class FleetSlipError(Exception):
         super().__init__(printable(message))
 
 
+class UsageError(FleetSlipError):
+    """What is asked for means nothing: a value out of range, options that exclude each other."""
+
+    exit_code = 2
+
+
 class ConfigError(FleetSlipError):
     """A file in `configs/`, or one given by the user, does not say what it must."""
 

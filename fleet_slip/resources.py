@@ -40,7 +40,7 @@ def own_configs() -> Path | None:
         return None
     folder_of_own = Path(chosen)
     if not folder_of_own.is_dir():
-        raise ConfigError(f"{chosen}: no such folder. ${CONFIG_VARIABLE} or --config names it.")
+        raise ConfigError(f"{chosen}: no such folder of configs.")
     for file in sorted(folder_of_own.rglob("*.toml")):
         _require_kind(file.relative_to(folder_of_own).as_posix(), file)
     return folder_of_own

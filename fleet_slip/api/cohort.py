@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from fleet_slip.api.root import Rooted
-from fleet_slip.errors import ConfigError
+from fleet_slip.errors import UsageError
 from fleet_slip.warehouse.tables import Warehouse
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ class FleetCohort(Rooted):
             bootstrap: draw the drives so many times for an interval of the winner's correlation.
             repeat: cross-validate the winner again with so many other deals of folds.
 
-        Raises `ConfigError` for options that do not go together or a list that is not valid, and
+        Raises `UsageError` for options that do not go together or a list that is not valid, and
         `DataError` if no model can be fitted.
         """
         from fleet_slip.selection.request import SelectionRequest, answer_request
@@ -122,7 +122,7 @@ class FleetCohort(Rooted):
             sensor_noise: noise that the logs already have, as standard deviations in SI units by
                 signal: shows the coefficients without it (errors in variables).
 
-        Raises `ConfigError` if both a model and signals are named, and what `Fleet.model` raises.
+        Raises `UsageError` if both a model and signals are named, and what `Fleet.model` raises.
         """
         from fleet_slip.catalogue.features import features as known
         from fleet_slip.selection.diagnostics import diagnose
@@ -153,7 +153,7 @@ class FleetCohort(Rooted):
         signal, which come on top of what the logs have. `model`, `signals` and `features` are those
         of `diagnose`. Shown too: the best model for such sensors.
 
-        Raises `ConfigError` if nothing is added or both a model and signals are named,
+        Raises `UsageError` if nothing is added or both a model and signals are named,
         `QuestionError` for a signal that enters the model through a feature, and what `Fleet.model`
         raises.
         """
@@ -163,7 +163,9 @@ class FleetCohort(Rooted):
         from fleet_slip.selection.what_if import what_if
 
         if not noise and not bias:
-            raise ConfigError("say what is added: --noise ay=0.2 or --bias yaw_rate=0.02.")
+            raise UsageError(
+                "say what is added: noise such as ay=0.2, or bias such as yaw_rate=0.02."
+            )
         examined = self._examined(model, signals, features)
         cohort = self._load(examined.feature_set)
         if examined.version is not None:

@@ -45,8 +45,8 @@ class Filling(Rooted):
         `campaign` is the name of one that ships, the path of a TOML file, or a `Campaign`. Of its
         days the first `days` are simulated, up to the day `through`. Progress is in rows.
 
-        Raises `ConfigError` for a campaign that is not valid or has no such days, `RefusedError`
-        for one that was changed since its drives were written, and `ClusterError`.
+        Raises `ConfigError` for a campaign that is not valid, `UsageError` if it has no such days,
+        `RefusedError` for one that was changed since its drives were written, and `ClusterError`.
         """
         from fleet_slip.simulation.campaign import load_campaign
         from fleet_slip.simulation.job import simulate_campaign

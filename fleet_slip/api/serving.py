@@ -8,7 +8,7 @@ from fleet_slip.api.calls import ShowProgress, count_from_start, open_workers, r
 from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.root import Rooted
 from fleet_slip.catalogue.sources import ALL_DRIVES
-from fleet_slip.errors import ConfigError
+from fleet_slip.errors import UsageError
 from fleet_slip.models.aliases import CHAMPION
 from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.model_version import ModelVersion
@@ -75,8 +75,8 @@ class Serving(Rooted):
         whatever is published while the champion is held by `rollback` or `pin`. `sign_key` is the
         private key that signs the version.
 
-        Raises `RefusedError` for a worse winner, `ConfigError` for a name or key that cannot be
-        used, and what `FleetCohort.select` raises.
+        Raises `RefusedError` for a worse winner, `UsageError` for a name that no model may have,
+        `ConfigError` for a key that cannot be used, and what `FleetCohort.select` raises.
         """
         from fleet_slip.models.publish import manifest_of, publish
 
@@ -90,7 +90,7 @@ class Serving(Rooted):
     def promote(self, reference: str, alias: str = CHAMPION) -> ModelVersion:
         """Point an alias, the champion unless told otherwise, at a version; return the version.
 
-        Raises `ConfigError` for a name that no alias may have, and what `model` raises.
+        Raises `UsageError` for a name that no alias may have, and what `model` raises.
         """
         require_model_name(alias)
         version = self.model(reference)
@@ -138,12 +138,12 @@ class Serving(Rooted):
     def sign(self, reference: str, key: Path) -> ModelVersion:
         """Sign a version that was published without a signature; return it.
 
-        `reference` is `NAME@VERSION`. Raises `ConfigError` for another or for a key that cannot be
-        used, and what `model` raises.
+        `reference` is `NAME@VERSION`. Raises `UsageError` for another, `ConfigError` for a key
+        that cannot be used, and what `model` raises.
         """
         name, _, version = reference.partition("@")
         if not (version.isascii() and version.isdigit() and len(version) < 10):
-            raise ConfigError(f"{reference!r}: name one version, such as sideslip@3.")
+            raise UsageError(f"{reference!r}: name one version, such as sideslip@3.")
         registry = self.registry(key)
         registry.sign(name, int(version))
         return registry.load(name, int(version))

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
-from fleet_slip.errors import ConfigError, QuestionError
+from fleet_slip.errors import QuestionError, UsageError
 from fleet_slip.grams.cohort import Cohort
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.versions import Registry
@@ -34,11 +34,11 @@ def subject_of(
 ) -> Examined:
     """Return what is to be examined; by default the only model that there is.
 
-    Raises `ConfigError` if a model and signals are named.
+    Raises `UsageError` if a model and signals are named.
     """
     if signals is not None or feature_set is not None:
         if model is not None:
-            raise ConfigError("name a published model or --signals (of --features), not both.")
+            raise UsageError("name a published model or signals (of a feature set), not both.")
         return Examined(feature_set or PLAIN, signals, None)
     version = (
         model
@@ -54,4 +54,4 @@ def _only_model(registry: Registry) -> str:
     if len(names) == 1:
         return names[0]
     known = ", ".join(names) or "none"
-    raise QuestionError(f"name a published model, or --signals. Published: {known}.")
+    raise QuestionError(f"name a published model, or signals. Published: {known}.")

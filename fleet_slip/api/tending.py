@@ -15,7 +15,7 @@ from fleet_slip.api.calls import (
 )
 from fleet_slip.api.serving import Serving
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.errors import ConfigError, QuestionError, RefusedError
+from fleet_slip.errors import QuestionError, RefusedError, UsageError
 from fleet_slip.runs.log import step
 
 if TYPE_CHECKING:
@@ -158,7 +158,7 @@ class Tending(Serving):
         With `now` the old files are deleted at once, not when vacuum is due; while anything
         is `pending` in the report, repeat it. Progress is in files.
 
-        Raises `ConfigError` unless one of `vehicle` and `drive` is given, `QuestionError` if there
+        Raises `UsageError` unless one of `vehicle` and `drive` is given, `QuestionError` if there
         never was such a drive, `StorageError` and `ConflictError`.
         """
         from fleet_slip.maintenance.forget import forget
@@ -174,7 +174,7 @@ class Tending(Serving):
     def allow(self, *, vehicle: str | None = None, drive: str | None = None) -> bool:
         """Let a forgotten vehicle or drive come back: land its new rows again from now on.
 
-        What was forgotten stays forgotten. Returns whether that is new. Raises `ConfigError` unless
+        What was forgotten stays forgotten. Returns whether that is new. Raises `UsageError` unless
         one of `vehicle` and `drive` is given, `QuestionError` if it was never forgotten, and
         `RefusedError` while it is being forgotten.
         """
@@ -216,5 +216,5 @@ def _forgettable(vehicle: str | None, drive: str | None) -> "Forgettable":
     from fleet_slip.warehouse.audit import Forgettable
 
     if (vehicle is None) == (drive is None):
-        raise ConfigError("give one of vehicle and drive.")
+        raise UsageError("give one of vehicle and drive.")
     return Forgettable("drive", drive) if drive else Forgettable("vehicle", vehicle or "")

@@ -11,6 +11,7 @@ from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.score import score as score_rows
 from fleet_slip.warehouse.condition import parse_condition, row_columns
 from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.words import number_of
 
 
 def diff(context: typer.Context, one: Reference, other: Reference, json: Json = False) -> None:
@@ -64,7 +65,7 @@ def score_against(
         print_json({"cohort": cohort, "models": models})
         return
     print_table(
-        f"{one.reference} and {other.reference} on the same {first['rows']:,} rows",
+        f"{one.reference} and {other.reference} on the same {number_of(first['rows'], 'row')}",
         ["figure", one.reference, other.reference, "difference"],
         [
             [

@@ -17,8 +17,9 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.cli.output import Json, print_json, print_table, progress, say
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.workers import Cluster, Threads
-from fleet_slip.errors import ConfigError
+from fleet_slip.errors import UsageError
 from fleet_slip.grams.statement import gram_statement
+from fleet_slip.words import number_of
 
 if TYPE_CHECKING:
     from fleet_slip.grams.job import GramReport
@@ -41,13 +42,13 @@ Days = Annotated[
 
 
 def last_day(through: str | None) -> date | None:
-    """Return the day that --through names. Raises `ConfigError` for what is none."""
+    """Return the day that --through names. Raises `UsageError` for what is none."""
     if through is None or through == "today":
         return None if through is None else date.today()
     try:
         return date.fromisoformat(through)
     except ValueError:
-        raise ConfigError(
+        raise UsageError(
             f"--through {through}: not a date; write it as 2024-05-01, or today."
         ) from None
 
@@ -76,20 +77,24 @@ def simulate(
         print_json(asdict(report))
     elif report.changed:
         say(
-            f"{plan.name}: {report.drives} drives, {report.rows:,} rows in "
-            f"{report.batches_written} files, {report.size_bytes / max(report.rows, 1):.1f} bytes "
+            f"{plan.name}: {number_of(report.drives, 'drive')}, {number_of(report.rows, 'row')} in "
+            f"{number_of(report.batches_written, 'file')}, "
+            f"{report.size_bytes / max(report.rows, 1):.1f} bytes "
             f"a row{_left_out(report.drives_forgotten)}"
         )
         say(_where_the_time_went(report))
     else:
         chosen = plan.chosen_days(days, last)
-        say(f"{plan.name}: nothing to do, all {len(chosen)} days are there")
+        say(f"{plan.name}: nothing to do, {number_of(len(chosen), 'day')} done before")
 
 
 def _left_out(drives: int) -> str:
     if not drives:
         return ""
-    return f"; {drives} drives left out, forgotten (fleet-slip forget --allow lets them come back)"
+    return (
+        f"; {number_of(drives, 'drive')} left out, forgotten (fleet-slip forget --allow lets them "
+        "come back)"
+    )
 
 
 def _where_the_time_went(report: "SimulationReport") -> str:
@@ -153,11 +158,16 @@ def _ingested(report: dict[str, Any]) -> str:
     if not report["new"] and not report["drives_forgotten"]:
         return f"{report['file']}: nothing to do, it was ingested before"
     reasons = ", ".join(f"{n:,} {reason}" for reason, n in report["quarantined"].items())
-    left_out = report["rows_left_out"]
+    left_out, held = report["rows_left_out"], report["rows_quarantined"]
     return (
-        f"{report['file']}: {report['ticks']:,} rows in {report['drives']} drives"
-        + (f"; {left_out:,} rows do not meet the mapping's conditions" if left_out else "")
-        + (f"; {report['rows_quarantined']:,} rows in quarantine ({reasons})" if reasons else "")
+        f"{report['file']}: {number_of(report['ticks'], 'row')} in "
+        f"{number_of(report['drives'], 'drive')}"
+        + (
+            f"; not as the mapping's conditions ask: {number_of(left_out, 'row')}"
+            if left_out
+            else ""
+        )
+        + (f"; in quarantine: {number_of(held, 'row')} ({reasons})" if reasons else "")
         + _left_out(report["drives_forgotten"])
     )
 
@@ -218,12 +228,15 @@ def _run_gram(
 def _say_gram(report: "GramReport") -> None:
     if report.changed:
         say(
-            f"gram {report.feature_set}: {report.files_read} new files, {report.rows_read:,} rows "
-            f"read, {report.files_dropped} files dropped; {report.gram_rows:,} Gram rows in all"
+            f"gram {report.feature_set}: {number_of(report.files_read, 'new file')}, "
+            f"{number_of(report.rows_read, 'row')} "
+            f"read, {number_of(report.files_dropped, 'file')} dropped; "
+            f"{number_of(report.gram_rows, 'Gram row')} in all"
         )
     else:
         say(
-            f"gram {report.feature_set}: nothing to do, {report.gram_rows:,} Gram rows in all are "
+            f"gram {report.feature_set}: nothing to do, {number_of(report.gram_rows, 'Gram row')} "
+            "in all are "
             "up to date"
         )
 

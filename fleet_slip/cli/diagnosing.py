@@ -12,6 +12,7 @@ from fleet_slip.cli.output import Json, print_json, print_table, say, stdout
 from fleet_slip.cli.subject import FeatureSetOption, Model, Signals, quantities
 from fleet_slip.regression.inference import INTERCEPT, Estimate
 from fleet_slip.selection.diagnostics import CohortComparison, Diagnosis
+from fleet_slip.words import number_of
 
 
 def diagnose(
@@ -62,7 +63,7 @@ def diagnose(
 
 def _print_diagnosis(result: Diagnosis) -> None:
     print_table(
-        f"{result.drives:,} drives, {result.fitted.gram.n:,} rows, worth "
+        f"{number_of(result.drives, 'drive')}, {number_of(result.fitted.gram.n, 'row')}, worth "
         f"{result.evidence.rows:,.0f} independent ones; R squared {result.fitted.r_squared:.4f}, "
         f"condition {result.condition_number:.3g}",
         _coefficient_header(result),

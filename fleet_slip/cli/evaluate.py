@@ -14,6 +14,7 @@ from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.run import DEFAULT_CAMPAIGN
 from fleet_slip.cli.workers import Threads
 from fleet_slip.models.score import score_statement
+from fleet_slip.words import number_of
 
 OneCar = Annotated[
     str,
@@ -66,7 +67,7 @@ def score(
         print_json({"model": version.reference, "cohort": cohort, **result})
         return
     print_table(
-        f"{version.reference} on {result['rows']:,} rows",
+        f"{version.reference} on {number_of(result['rows'], 'row')}",
         ["figure", "value"],
         [
             [name.replace("_deg", ", deg").replace("_", " "), f"{value:.4f}"]
@@ -236,7 +237,8 @@ def _print_rivals(rivals: Sequence[dict[str, Any]]) -> None:
     if not rivals:
         return
     print_table(
-        f"\nlearned rivals, on {rivals[0]['rows']:,} rows of the training drives, cross-validated",
+        f"\nlearned rivals, on {number_of(rivals[0]['rows'], 'row')} of the training drives, "
+        "cross-validated",
         ["rival", "learner", "correlation", "std deg", "training s", "bytes", "one us", "each us"],
         [
             [

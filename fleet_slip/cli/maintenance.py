@@ -19,6 +19,7 @@ from fleet_slip.maintenance.forget import ForgetReport
 from fleet_slip.maintenance.vacuum import RETENTION_HOURS, VacuumReport
 from fleet_slip.maintenance.verification import Damage, Verification
 from fleet_slip.runs.log import recording
+from fleet_slip.words import number_of
 
 PENDING_SHOWN = 5
 """So many are named on a line; --json names all."""
@@ -92,8 +93,10 @@ def _print_verification(report: Verification, rebuilt: list[str]) -> None:
         if findings:
             print_table(title, ["where", "problem"], map(_row, findings), left=2)
     say(
-        f"{report.files} files with {report.size_bytes:,} bytes and {report.documents} documents "
-        f"were read, the Gram rows of {report.log_files_recomputed} log files computed again: "
+        f"{number_of(report.files, 'file')} with {report.size_bytes:,} bytes and "
+        f"{number_of(report.documents, 'document')} "
+        f"were read, the Gram rows of {number_of(report.log_files_recomputed, 'log file')} "
+        "computed again: "
         + (f"{len(report.damage)} damaged" if report.damage else "all is as it must be")
     )
 
@@ -117,12 +120,13 @@ def compact(
         print_json(asdict(report))
     elif report.changed:
         say(
-            f"{report.files_before} files became {report.files_after}; {report.rows_rewritten:,} "
+            f"{number_of(report.files_before, 'file')} became {report.files_after}; "
+            f"{report.rows_rewritten:,} "
             f"rows were written again, {report.size_bytes_before:,} bytes became "
             f"{report.size_bytes_after:,}"
         )
     else:
-        say(f"nothing to do, all {report.files_after} files are large or alone in their day")
+        say(f"nothing to do: {number_of(report.files_after, 'file')}, large or alone in the day")
 
 
 @record_run
@@ -151,7 +155,7 @@ def vacuum(
 
 def _vacuumed(report: VacuumReport) -> str:
     done = "would be removed" if report.dry_run else "removed"
-    return f"{len(report.files)} files with {report.size_bytes:,} bytes {done}"
+    return f"{number_of(len(report.files), 'file')} with {report.size_bytes:,} bytes {done}"
 
 
 @record_run
@@ -205,7 +209,8 @@ def _say_forgotten(report: ForgetReport) -> None:
         say("nothing to do, it was forgotten before")
         return
     say(
-        f"{report.drives} drives forgotten, {report.rows:,} rows: {report.files_rewritten} files "
+        f"{number_of(report.drives, 'drive')} forgotten, {number_of(report.rows, 'row')}: "
+        f"{number_of(report.files_rewritten, 'file')} "
         f"written again without them, {report.files_removed} removed"
     )
     if report.old_files_deleted:

@@ -10,6 +10,7 @@ from fleet_slip.cli.recorded import record_run
 from fleet_slip.models.aliases import CHAMPION
 from fleet_slip.models.manifest import ModelTerm
 from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.words import number_of
 
 Reference = Annotated[
     str, typer.Argument(help="NAME, NAME@VERSION or NAME@ALIAS. NAME alone is its champion.")
@@ -150,12 +151,16 @@ def _print_version(version: ModelVersion) -> None:
             ["RMSE", f"{figures.rmse_deg:.4f} deg"],
             ["error std", f"{figures.error_std_deg:.4f} deg"],
             ["error mean", f"{figures.error_mean_deg:+.4f} deg"],
-            ["cross-validation", f"{figures.folds} folds by {figures.folds_by}"],
+            ["cross-validation", f"{number_of(figures.folds, 'fold')} by {figures.folds_by}"],
             [
                 "cohort",
-                f"{trained.cohort}: {trained.drives:,} drives"
-                + (f" of {trained.vehicles:,} cars" if trained.vehicles is not None else "")
-                + f", {trained.rows:,} rows",
+                f"{trained.cohort}: {number_of(trained.drives, 'drive')}"
+                + (
+                    f" of {number_of(trained.vehicles, 'car')}"
+                    if trained.vehicles is not None
+                    else ""
+                )
+                + f", {number_of(trained.rows, 'row')}",
             ],
             ["tables", f"logs version {trained.logs_version}, grams {trained.grams_version}"],
             [

@@ -12,9 +12,10 @@ from fleet_slip.cli.models import Reference
 from fleet_slip.cli.output import Json, print_json, print_table, progress, say
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.run import DEFAULT_CAMPAIGN
-from fleet_slip.errors import AlarmError, ConfigError
+from fleet_slip.errors import AlarmError, UsageError
 from fleet_slip.monitoring.monitor import Chart
 from fleet_slip.monitoring.quality import QualityReport
+from fleet_slip.words import number_of
 
 
 def quality(
@@ -42,7 +43,8 @@ def quality(
 
 def _print_quality(found: QualityReport) -> None:
     print_table(
-        f"{found.drives:,} drives examined, {found.compared:,} of them beside their peers",
+        f"{number_of(found.drives, 'drive')} examined, {found.compared:,} of them beside their "
+        "peers",
         ["drive", "car", "fault", "signals", "what shows it"],
         [
             [
@@ -100,7 +102,7 @@ def _first_new_day(text: str | None) -> date | None:
     try:
         return None if text is None else date.fromisoformat(text)
     except ValueError:
-        raise ConfigError(f"--since {text}: not a date; write it as 2024-05-01.") from None
+        raise UsageError(f"--since {text}: not a date; write it as 2024-05-01.") from None
 
 
 def _print_chart(chart: Chart) -> None:
@@ -144,6 +146,7 @@ def migrate(context: typer.Context, json: Json = False) -> None:
         say(f"{name}: counts of {old} are now counts of {new}")
     if report.files_rewritten:
         say(
-            f"{report.files_rewritten} files, {report.rows_rewritten:,} rows rewritten. Run: "
+            f"{number_of(report.files_rewritten, 'file')}, "
+            f"{number_of(report.rows_rewritten, 'row')} rewritten. Run: "
             "fleet-slip gram"
         )

@@ -31,6 +31,7 @@ from rich.text import Text
 from fleet_slip.cli.logs import for_people, stderr
 from fleet_slip.errors import printable
 from fleet_slip.runs.log import LOGGER, log_event
+from fleet_slip.words import number_of
 
 TOLD_EVERY_S = 30.0
 """How often the log tells the progress of a job."""
@@ -104,7 +105,7 @@ class _Workers(ProgressColumn):
 
     def render(self, task: Task) -> Text:
         number = getattr(task.fields.get("executor"), "workers", None)
-        return Text("" if number is None else f"{number} workers")
+        return Text("" if number is None else f"{number_of(number, 'worker')}")
 
 
 def _short(value: float) -> str:

@@ -17,6 +17,7 @@ from fleet_slip.cli.selecting import print_selection
 from fleet_slip.cli.signing import signing_key
 from fleet_slip.cli.workers import Cluster, Threads
 from fleet_slip.selection.request import WORTH
+from fleet_slip.words import number_of
 
 DEFAULT_CAMPAIGN = "waterford"
 
@@ -79,10 +80,13 @@ def _print_report(report: RunReport) -> None:
         kept = publication.version.reference if publication else report.refusal
         say(f"{report.campaign}: nothing to do, {kept} is up to date ({report.seconds:.1f} s)")
         return
-    say(f"simulated {simulated.drives} drives, {simulated.rows:,} rows")
-    say(f"gram: {gram.rows_read:,} rows read, {gram.gram_rows:,} Gram rows")
+    say(f"simulated {number_of(simulated.drives, 'drive')}, {number_of(simulated.rows, 'row')}")
+    say(f"gram: {number_of(gram.rows_read, 'row')} read, {number_of(gram.gram_rows, 'Gram row')}")
     if wide := report.gram_features:
-        say(f"gram {wide.feature_set}: {wide.rows_read:,} rows read, {wide.gram_rows:,} Gram rows")
+        say(
+            f"gram {wide.feature_set}: {number_of(wide.rows_read, 'row')} read, "
+            f"{number_of(wide.gram_rows, 'Gram row')}"
+        )
     print_selection(report.selection)
     if publication:
         print_publication(publication)

@@ -17,6 +17,7 @@ from fleet_slip.selection.compare import Selection
 from fleet_slip.selection.request import RequestedSelection, SelectionRequest
 from fleet_slip.selection.search import SearchChoice
 from fleet_slip.selection.uncertainty import Uncertainty
+from fleet_slip.words import number_of
 
 FIGURES = ("drives", "correlation", "RMSE deg", "mean deg", "std deg", "condition")
 
@@ -54,9 +55,10 @@ def print_selection(selection: Selection[Any]) -> None:
     if selection.choice is not None:
         _print_choice(selection.choice)
     print_table(
-        f"{selection.cohort.drive_count:,} drives, {selection.cohort.rows:,} rows"
+        f"{number_of(selection.cohort.drive_count, 'drive')}, "
+        f"{number_of(selection.cohort.rows, 'row')}"
         + ("" if where == TRAINING_DRIVES else f" where {where}")
-        + f"; {len(selection.models[0].folds)} folds by {selection.folds.by}",
+        + f"; {number_of(len(selection.models[0].folds), 'fold')} by {selection.folds.by}",
         ["model", *(["signals"] if listed else []), *FIGURES],
         [
             [model.name, *([_columns_of(model, selection)] if listed else []), *_figures(model)]

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from fleet_slip.cli.output import say
-from fleet_slip.errors import ConfigError
+from fleet_slip.errors import UsageError
 from fleet_slip.models.signing import SIGNING_VARIABLE, VERIFY_VARIABLE, make_keys
 
 SignKey = Annotated[
@@ -42,6 +42,6 @@ def sign(
     """Sign a version that was published without a signature."""
     key = signing_key(sign_key)
     if key is None:
-        raise ConfigError(f"no key to sign with. Give --sign-key FILE, or set ${SIGNING_VARIABLE}.")
+        raise UsageError(f"no key to sign with. Give --sign-key FILE, or set ${SIGNING_VARIABLE}.")
     version = context.obj.sign(reference, key)
     say(f"{version.reference} is signed")

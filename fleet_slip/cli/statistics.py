@@ -17,6 +17,7 @@ from fleet_slip.regression.figures import Figures
 from fleet_slip.regression.inference import INTERCEPT
 from fleet_slip.selection.regimes import RegimeComparison
 from fleet_slip.selection.what_if import WhatIf
+from fleet_slip.words import number_of
 
 By = Annotated[FoldKey, typer.Option(help="What a fold is made of.")]
 
@@ -102,7 +103,7 @@ def _parts(one: FeatureSet) -> str:
     if one.block_s:
         return f"in blocks of {one.block_s:f} s"
     if one.row_folds:
-        return f"{one.row_folds} folds of rows"
+        return f"{number_of(one.row_folds, 'fold')} of rows"
     return "with the one before" if one.lagged else "together"
 
 
@@ -148,7 +149,7 @@ def _cohort(context: typer.Context, condition: str) -> FleetCohort:
 
 def _print_what_if(result: WhatIf) -> None:
     print_table(
-        f"{result.drives:,} drives, {result.before.rows:,} rows",
+        f"{number_of(result.drives, 'drive')}, {number_of(result.before.rows, 'row')}",
         ["", "correlation", "RMSE deg", "mean deg", "std deg"],
         [
             ["as logged", *_error(result.before)],
@@ -208,7 +209,8 @@ def regimes(
 
 def _print_regimes(result: RegimeComparison, by: str) -> None:
     print_table(
-        f"{result.drives:,} drives, {result.folds} folds by {by}: {' '.join(result.signals)}",
+        f"{number_of(result.drives, 'drive')}, {number_of(result.folds, 'fold')} by {by}: "
+        f"{' '.join(result.signals)}",
         ["regime", "rows", "share", "pooled RMSE deg", "std", "split RMSE deg", "std", ""],
         [
             [
@@ -258,7 +260,7 @@ def shrink(
         return
     first = found[0].cross_validation
     print_table(
-        f"{first.drives:,} drives, {len(first.folds)} folds by {by}",
+        f"{number_of(first.drives, 'drive')}, {number_of(len(first.folds), 'fold')} by {by}",
         ["method", "signals kept", "penalty", "correlation", "RMSE deg", "mean deg", "std deg"],
         [
             [

@@ -7,6 +7,7 @@ import typer
 from fleet_slip.cli.output import Json, print_json, print_table
 from fleet_slip.errors import AlarmError
 from fleet_slip.monitoring.status import WarehouseStatus
+from fleet_slip.words import number_of
 
 
 def status(
@@ -54,7 +55,7 @@ def _print_status(found: WarehouseStatus) -> None:
             ["newest day", str(found.newest_day or "none")],
             [
                 "waiting for the Gram job",
-                f"{found.backlog_files} files, {found.backlog_rows:,} rows",
+                f"{number_of(found.backlog_files, 'file')}, {number_of(found.backlog_rows, 'row')}",
             ],
             *_disk(found),
         ],

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from fleet_slip.errors import ConfigError
+from fleet_slip.errors import UsageError
 
 Model = Annotated[
     str | None,
@@ -31,14 +31,14 @@ FeatureSetOption = Annotated[
 
 
 def quantities(values: Sequence[str] | None, option: str) -> dict[str, float]:
-    """Return what options like `--noise ay=0.2` say, in SI units. Raises `ConfigError`."""
+    """Return what options like `--noise ay=0.2` say, in SI units. Raises `UsageError`."""
     found = {}
     for value in values or ():
         name, _, number = value.partition("=")
         try:
             found[name.strip()] = float(number)
         except ValueError:
-            raise ConfigError(
+            raise UsageError(
                 f"{option} {value}: write SIGNAL=NUMBER in SI units, such as ay=0.2."
             ) from None
     return found

@@ -74,7 +74,7 @@ def cluster_executor(address: str, root: Folder) -> Iterator["ClusterExecutor"]:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ClusterError(
             f"{address}: no Dask scheduler can be reached there ({reason}). Start one with: dask "
-            "scheduler; or leave --cluster out, and DASK_SCHEDULER_ADDRESS unset, to work on this "
+            "scheduler; or name no cluster, and unset DASK_SCHEDULER_ADDRESS, to work on this "
             "machine."
         ) from None
     try:

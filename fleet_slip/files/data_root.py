@@ -43,19 +43,19 @@ def _local(path: Path) -> Folder:
     unfit = [c for c in str(path) if not c.isprintable() or c in UNFIT_CHARACTERS]
     if unfit:
         raise StorageError(
-            f"{path}: a data root cannot have {unfit[0]!r} in its path. Choose another with --root."
+            f"{path}: a data root cannot have {unfit[0]!r} in its path. Choose another."
         )
     if found := _ESCAPE.search(str(path.absolute())):
         raise StorageError(
             f"{path}: a data root cannot have {found[0]!r} in its full path: Delta reads it as one "
-            "character. Choose another with --root."
+            "character. Choose another."
         )
     for folder in (place := Path(os.path.realpath(path)), *place.parents):
         # Whatever lies in a table and is not part of it, vacuum removes.
         if os.access(folder / "_delta_log", os.F_OK):
             raise StorageError(
                 f"{path}: it is inside the table {folder}. Choose the folder that the table is in, "
-                "or another, with --root."
+                "or another."
             )
     from fleet_slip.files.local_folder import LocalFolder  # noqa: PLC0415 - pyarrow and Delta
 
@@ -67,12 +67,12 @@ def _at_url(url: str) -> Folder:
     if url.startswith("file://"):
         parts = urlsplit(url)
         if parts.netloc not in ("", "localhost") or parts.query or parts.fragment:
-            raise StorageError("--root: a file URL is written as file:///PATH.")
+            raise StorageError("a data root at a file URL is written as file:///PATH.")
         return _local(Path(unquote(parts.path)))
     found = _OBJECT_URL.fullmatch(url)
     if found is None:
         raise StorageError(
-            "--root: the URL of an object store is written as s3://BUCKET/PATH, gs://BUCKET/PATH "
+            "a data root on an object store is written as s3://BUCKET/PATH, gs://BUCKET/PATH "
             "or az://CONTAINER/PATH, with letters, digits and any of _ . = + - in the path. "
             "Credentials are not part of it: they come from the environment."
         )

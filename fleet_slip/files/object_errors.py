@@ -23,7 +23,7 @@ _MEANINGS: tuple[tuple[str, str], ...] = (
     ),
     (
         r"NoSuchBucket|ContainerNotFound|[Tt]he specified bucket does not exist",
-        "there is no such bucket. Make it, or choose another --root.",
+        "there is no such bucket. Make it, or choose another data root.",
     ),
     (
         r"InvalidAccessKeyId|SignatureDoesNotMatch|ExpiredToken|InvalidToken|InvalidSecurity|"

@@ -19,6 +19,7 @@ from fleet_slip.grams.wide import wide_grams
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.database import open_database, reading_files
 from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.words import number_of
 
 FILES_PER_QUERY = 16
 """Planning 77 aggregates costs 20 ms, so that one query takes many files."""
@@ -98,7 +99,7 @@ def _groups(files: Sequence[TableFile], step: int) -> list[Sequence[TableFile]]:
 
 
 def _group_name(group: Sequence[TableFile]) -> str:
-    return f"the Gram rows of {len(group)} log files from {group[0].path}"
+    return f"the Gram rows of {number_of(len(group), 'log file')} from {group[0].path}"
 
 
 def _aggregate_group(
@@ -125,7 +126,7 @@ def _query(
     absent = absent_columns(files, warehouse.catalogue.signals)
     statement = gram_statement(warehouse.catalogue, feature_set, whole=whole, absent=absent)
     identity = features().identity(feature_set)
-    doing = f"the Gram query over {len(files)} log files in {warehouse.logs.folder}"
+    doing = f"the Gram query over {number_of(len(files), 'log file')} in {warehouse.logs.folder}"
     with reading_files(database, doing):
         database.execute("SET VARIABLE log_files = $files", {"files": list(paths)})
         rows = database.sql(statement, params={"feature_set": identity}).to_arrow_table()

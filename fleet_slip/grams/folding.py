@@ -5,7 +5,7 @@ from typing import Annotated, Literal, TypeAlias
 from pydantic import Field, model_validator
 
 from fleet_slip.config import Config
-from fleet_slip.errors import ConfigError
+from fleet_slip.errors import UsageError
 
 FoldKey = Literal["drive", "vehicle", "track", "day", "mass", "adhesion", "speed", "part", "row"]
 
@@ -52,7 +52,7 @@ class Folding(Config):
 
 
 def make_folding(by: FoldKey, count: int | str | None, usual: FoldCount) -> Folding:
-    """Return a folding that was asked for, with the usual count if none is. Raises `ConfigError`.
+    """Return a folding that was asked for, with the usual count if none is. Raises `UsageError`.
 
     Each part of drives is a fold of its own unless a number is asked for.
     """
@@ -62,4 +62,4 @@ def make_folding(by: FoldKey, count: int | str | None, usual: FoldCount) -> Fold
         return Folding.model_validate({"by": by, "count": count if count == EACH else int(count)})
     except ValueError:
         each = "" if by == ROW_FOLDS else f", or each: every {by} a fold of its own"
-        raise ConfigError(f"--folds {count}: choose a number from 2 to 1000{each}.") from None
+        raise UsageError(f"folds = {count}: choose a number from 2 to 1000{each}.") from None

@@ -20,6 +20,7 @@ from fleet_slip.ingest.resampling import STEP_S
 from fleet_slip.ingest.row_condition import describe
 from fleet_slip.ingest.timebase import cut_into_drives, sample_interval_s
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA
+from fleet_slip.words import number_of
 
 MAX_DRIVES = 10_000
 """Drives in one file. More means that time or the drive's column is not what the mapping says."""
@@ -169,7 +170,8 @@ def _require_usable(file: Path, mapping: Mapping, rows: pl.DataFrame, bad: pl.Da
         first = bad.row(0, named=True)
         example = f"{first['signal'] or 'the row'} = {first['value']!r} in row {first['row']}"
         raise InputError(
-            f"{shown(file)}: none of its {bad.height:,} rows is usable ({reasons}; first: "
+            f"{shown(file)}: none of its {number_of(bad.height, 'row')} is usable ({reasons}; "
+            "first: "
             f"{example}). Check columns, units and time in the mapping {mapping.name!r}."
         )
     spans = rows.group_by("part").agg((pl.col("time").last() - pl.col("time").first()).alias("s"))

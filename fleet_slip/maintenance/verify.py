@@ -22,6 +22,7 @@ from fleet_slip.maintenance.verify_files import verify_files
 from fleet_slip.maintenance.verify_grams import SoundFiles, verify_drives, verify_grams
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.words import number_of
 
 
 def verify(
@@ -53,7 +54,7 @@ def verify(
     if not report.findings and not report.documents and not _any_table(snapshots):
         raise StorageError(
             f"{warehouse.root}: there is nothing to verify, neither tables nor models. Is it the "
-            "right folder, and is its disk there? Choose another with --root."
+            "right folder, and is its disk there? Choose another data root."
         )
     return report
 
@@ -100,7 +101,7 @@ def _report_missing_logs(snapshots: Mapping[str, Snapshot], report: Verification
     """Report a table of logs that is gone, as a folder that was not mounted is."""
     logs, grams = snapshots.get("logs"), snapshots.get("grams")
     if logs and grams and logs.version is None and grams.rows:
-        problem = f"the table is gone that {grams.rows:,} Gram rows were computed from"
+        problem = f"the table is gone that {number_of(grams.rows, 'Gram row')} were computed from"
         report.findings.append(Damage("log", "logs", problem))
 
 

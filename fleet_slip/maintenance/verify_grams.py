@@ -18,6 +18,7 @@ from fleet_slip.maintenance.verification import Damage, Verification
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.database import database_errors, open_database
 from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.words import number_of
 
 SAMPLE = 4
 """Log files whose Gram rows are computed again, evenly chosen, unless all are asked for."""
@@ -31,7 +32,10 @@ def verify_drives(warehouse: Warehouse, files: Sequence[TableFile], report: Veri
         database.execute("SET VARIABLE log_files = $files", {"files": paths})
         rows = database.execute(read_sql("jobs", "verify_drives.sql")).fetchall()
     for drive, in_files, beginnings, n, file in rows:
-        problem = f"{n:,} rows in {in_files} files with {beginnings} rows of tick 0; one is {file}"
+        problem = (
+            f"{n:,} rows in {number_of(in_files, 'file')} with {number_of(beginnings, 'row')} of "
+            f"tick 0; one is {file}"
+        )
         report.findings.append(Damage("drive", drive, problem))
 
 
@@ -69,7 +73,10 @@ def verify_grams(
     missing = len(sound.logs) - len(covered)
     stale = stored.keys() - set(sound.active)
     if missing or stale:
-        problem = f"{missing} log files have no Gram rows, {len(stale)} with Gram rows are gone"
+        problem = (
+            f"no Gram rows of {number_of(missing, 'log file')}, Gram rows of {len(stale)} that "
+            "are gone"
+        )
         report.findings.append(Damage("backlog", "grams", f"{problem}; run: fleet-slip gram"))
 
 

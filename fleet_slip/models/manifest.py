@@ -25,7 +25,7 @@ from fleet_slip.catalogue.columns import Definition
 from fleet_slip.catalogue.feature_sql import names_in, require_integer_sql
 from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN, Identifier, catalogue
 from fleet_slip.config import Config
-from fleet_slip.errors import ConfigError, RefusedError
+from fleet_slip.errors import RefusedError, UsageError
 
 _FRACTION = re.compile(r"-?[0-9]{1,4000}/[0-9]{1,4000}")
 
@@ -241,9 +241,9 @@ class Manifest(Config):
 
 
 def require_model_name(name: str) -> str:
-    """Return a name that a model or an alias may have. Raises `ConfigError` otherwise."""
+    """Return a name that a model or an alias may have. Raises `UsageError` otherwise."""
     if not re.fullmatch(IDENTIFIER_PATTERN, name):
-        raise ConfigError(
+        raise UsageError(
             f"{name!r} cannot be the name of a model: use small letters, digits and _, beginning "
             "with a letter, at most 41."
         )

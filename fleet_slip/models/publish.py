@@ -200,8 +200,8 @@ class _Judgement:
         """Raise `RefusedError` if there are problems."""
         if self.problems:
             raise RefusedError(
-                f"{name} was not published: {'; '.join(self.problems)}. Look at the data, or use "
-                "--force to publish it all the same."
+                f"{name} was not published: {'; '.join(self.problems)}. Look at the data, or "
+                "publish it with force all the same."
             )
 
 

@@ -24,7 +24,7 @@ def draw(chart: Chart, file: Path) -> None:
         from matplotlib.figure import Figure  # noqa: PLC0415
     except ImportError:
         raise ConfigError(
-            "--plot needs matplotlib. Install it with: pip install matplotlib"
+            "a chart needs matplotlib. Install it with: pip install matplotlib"
         ) from None
     figure = Figure(figsize=(9, 5.5), layout="constrained")
     FigureCanvasAgg(figure)
@@ -41,7 +41,7 @@ def draw(chart: Chart, file: Path) -> None:
             # Without a date, the same chart is the same file.
             figure.savefig(file, metadata={"Date": None} if file.suffix == ".svg" else None)
         except ValueError as error:
-            raise ConfigError(f"--plot {file}: {error}") from None
+            raise ConfigError(f"{file}: {error}") from None
 
 
 def _panel(axes: Any, chart: Chart, values: list[float], limits: Limits, name: str) -> None:

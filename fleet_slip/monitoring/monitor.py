@@ -28,6 +28,7 @@ from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.special import student_t_quantile
 from fleet_slip.warehouse.condition import Condition, parse_condition
 from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.words import number_of
 
 
 @dataclass(frozen=True)
@@ -122,10 +123,9 @@ def monitor(
     training = [day < since if since else last is not None and day <= last for day in days]
     if sum(training) < limits.min_training_days:
         raise DataError(
-            f"{version.reference} was trained on {sum(training)} days of the cohort "
-            f"{condition.text!r}, too few to tell what is usual. Choose another --since or "
-            f"--cohort; "
-            f"{limits.min_training_days} days are needed."
+            f"{version.reference} was trained on {number_of(sum(training), 'day')} of the cohort "
+            f"{condition.text!r}, too few to tell what is usual. {limits.min_training_days} "
+            "days are needed. Choose another cohort, or a later first new day."
         )
     models = _models(counts_model(manifest), grams, training)
     found = [
@@ -173,6 +173,6 @@ def _last_training_day(warehouse: Warehouse, version: ModelVersion) -> date | No
     except StorageError:
         raise StorageError(
             f"{logs.folder}: version {number}, which {version.reference} was trained on, is no "
-            "longer in the Delta log. Say where new days begin with --since."
+            "longer in the Delta log. Say which day is the first new one."
         ) from None
     return max((file.day for file in then.files if file.day), default=None)

@@ -13,6 +13,7 @@ from fleet_slip.regression import rounding
 from fleet_slip.regression.eigenvalues import symmetric_eigenvalues
 from fleet_slip.regression.elimination import Elimination, eliminate
 from fleet_slip.regression.gram import Gram
+from fleet_slip.words import number_of
 
 Scales = Mapping[str, Fraction]
 """Physical value of one count of each signal: `catalogue()[name].exact_scale`."""
@@ -151,7 +152,7 @@ def dependence(gram: Gram, inputs: Sequence[str], *, intercept: bool = True) -> 
             independent.append(name)
     if not found:
         return ""
-    rows = f" There are only {gram.n} rows." if gram.n <= len(inputs) else ""
+    rows = f" There are only {number_of(gram.n, 'row')}." if gram.n <= len(inputs) else ""
     relations = "; ".join(found)
     return f"the model has no unique solution: {relations}.{rows} Leave out one signal of each."
 

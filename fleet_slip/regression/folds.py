@@ -19,6 +19,7 @@ from fleet_slip.arrays import IntArray
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression.gram import Gram, require_signals
 from fleet_slip.regression.gram_table import GramTable
+from fleet_slip.words import number_of
 
 
 def hash_number(key: str) -> int:
@@ -55,7 +56,7 @@ class FoldAssignment:
         if empty:
             raise DataError(
                 f"no drive falls into fold {', '.join(empty)} of {len(self.names)}: the cohort has "
-                f"{len(self.fold)} drives. Choose fewer folds, or more drives."
+                f"{number_of(len(self.fold), 'drive')}. Choose fewer folds, or more drives."
             )
 
 

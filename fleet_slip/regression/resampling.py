@@ -15,6 +15,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
 from fleet_slip.regression.drive_moments import DriveMoments
 from fleet_slip.regression.exact import LinearModel
+from fleet_slip.words import number_of
 
 _BATCH_BYTES = 2**26
 
@@ -143,7 +144,9 @@ def repeated_cross_validation(
     Raises `DataError` if there are fewer drives than folds.
     """
     if len(drives) < folds:
-        raise DataError(f"{len(drives)} drives cannot fill {folds} folds.")
+        raise DataError(
+            f"{number_of(len(drives), 'drive')} cannot fill {number_of(folds, 'fold')}."
+        )
     rng = np.random.default_rng(seed)
     batch = max(1, _BATCH_BYTES // (8 * folds * len(drives)))
     figures = []

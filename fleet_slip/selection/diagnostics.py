@@ -31,6 +31,7 @@ from fleet_slip.regression.serial import (
     fit_autoregressive,
     serial_correlation,
 )
+from fleet_slip.words import number_of
 
 
 @dataclass(frozen=True)
@@ -182,8 +183,9 @@ def _compare(here: Served, fitted: Fit, moments: DriveMoments, against: Cohort) 
     shared = {*here.drives["drive_id"].to_pylist()} & {*there.drives["drive_id"].to_pylist()}
     if shared:
         raise QuestionError(
-            f"the two cohorts share {len(shared)} drives, such as {min(shared)}: a comparison "
-            f"needs different drives. Add to --cohort: AND NOT ({against.condition})"
+            f"the two cohorts share {number_of(len(shared), 'drive')}, such as {min(shared)}: a "
+            "comparison "
+            f"needs different drives. Add to the cohort: AND NOT ({against.condition})"
         )
     other_moments = DriveMoments.of(there.table)
     other = fit(there.table.total(), inputs, label)

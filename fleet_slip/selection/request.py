@@ -10,7 +10,7 @@ from fleet_slip.canonical import canonical_json, sha256_of
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.errors import ConfigError, QuestionError
+from fleet_slip.errors import QuestionError, UsageError
 from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.grams.fold_sums import SummedCohort, sum_cohort
 from fleet_slip.grams.folding import EACH, ROW_FOLDS, Folding, FoldKey, make_folding
@@ -42,11 +42,11 @@ _WORTH = re.compile(r"(\d+(?:\.\d*)?|\.\d+) ?(deg|%)")
 
 
 def parse_worth(text: str) -> Worth:
-    """Return a gain in RMSE from text such as `0.005deg` or `2%`. Raises `ConfigError`."""
+    """Return a gain in RMSE from text such as `0.005deg` or `2%`. Raises `UsageError`."""
     found = _WORTH.fullmatch(text.strip())
     if found is None:
-        raise ConfigError(
-            f"--worth {text}: write an angle such as {WORTH}, or a share of the best RMSE such as "
+        raise UsageError(
+            f"worth = {text}: write an angle such as {WORTH}, or a share of the best RMSE such as "
             "2%."
         )
     amount = float(found[1])
@@ -119,22 +119,21 @@ class RequestedSelection(Selection[Any]):
 
 
 def answer_request(warehouse: Warehouse, request: SelectionRequest) -> RequestedSelection:
-    """Select as asked. Raises `ConfigError` for options that do not go together."""
+    """Select as asked. Raises `UsageError` for options that do not go together."""
     parse_worth(request.worth)  # before anything is read
     if request.ordered and request.models:
-        raise ConfigError(
-            "a list of models is compared by cross-validation as it stands: leave out --models, or "
-            "--rank, --criterion, --all-subsets and --naive, which search among the inputs of "
-            "--nested."
+        raise UsageError(
+            "a list of models is compared by cross-validation as it stands: leave out models, or "
+            "rank, criterion, all_subsets and naive, which search among the inputs of nested."
         )
     if request.rank and request.all_subsets:
-        raise ConfigError("--all-subsets needs no order: leave out --rank.")
+        raise UsageError("a search of all subsets needs no order: leave out rank.")
     if request.most and not request.search:
-        raise ConfigError("--most is for --search: say how to search.")
+        raise UsageError("most is for a search: say how to search.")
     if request.search and request.ordered:
-        raise ConfigError(
-            "--search makes the whole search again in every fold, and looks at folds alone: leave "
-            "out --rank, --criterion, --all-subsets and --naive."
+        raise UsageError(
+            "a search is made again in every fold, and looks at folds alone: leave out rank, "
+            "criterion, all_subsets and naive."
         )
     named = request.nested or request.ordered or request.search
     name = request.models or (None if named else DEFAULT_MODELS)
@@ -167,7 +166,7 @@ def _folding(request: SelectionRequest, model_list: ModelList | None) -> Folding
     listed = model_list.folds if model_list else Folding()
     folding = make_folding(request.by or listed.by, request.folds, listed.count)
     if request.repeat and folding.count == EACH:
-        raise ConfigError("--repeat deals the folds anew, and --folds each has one deal only.")
+        raise UsageError("repeat deals the folds anew, and folds of each drive have one deal only.")
     return folding
 
 
@@ -248,7 +247,7 @@ def _search(cohort: Cohort, request: SelectionRequest, folds: Folding) -> Reques
 def inputs_of(cohort: Cohort | SummedCohort, order: str) -> tuple[str, ...]:
     """Return an order of inputs from text, `catalogue` meaning all that the cohort has.
 
-    Raises `ConfigError` for an unknown input, or one that stands twice.
+    Raises what `require_inputs` raises.
     """
     if order == WHOLE_SET:
         return cohort.inputs
@@ -256,14 +255,17 @@ def inputs_of(cohort: Cohort | SummedCohort, order: str) -> tuple[str, ...]:
 
 
 def require_inputs(names: Sequence[str], feature_set: str) -> tuple[str, ...]:
-    """Return the names of inputs of a feature set. Raises `ConfigError` for what is none."""
+    """Return the names of inputs of a feature set.
+
+    Raises `QuestionError` for an unknown input, and `UsageError` for one that stands twice.
+    """
     known = features().feature_set(feature_set).inputs
     order = tuple(name.strip() for name in names)
-    unknown = [name for name in order if name not in known]
-    if unknown or len(set(order)) < len(order):
-        raise ConfigError(
-            f"{','.join(order)}: {', '.join(unknown) or 'a signal'} "
-            f"{'is not an input' if unknown else 'stands twice'}. Inputs of the feature set "
+    if unknown := [name for name in order if name not in known]:
+        raise QuestionError(
+            f"{','.join(order)}: {', '.join(unknown)} is not an input. Inputs of the feature set "
             f"{feature_set}: {', '.join(known)}."
         )
+    if len(set(order)) < len(order):
+        raise UsageError(f"{','.join(order)}: an input stands twice.")
     return order

@@ -166,7 +166,7 @@ def _winner(models: Sequence[CrossValidation], size: int, rule: Rule, evidence: 
     if size == 0:
         raise DataError(
             f"the criterion {rule.criterion} keeps no signal: none says more than chance. Choose "
-            "more drives, other signals, or --criterion cv."
+            "more drives, other signals, or the criterion cv."
         )
     best = max(models, key=lambda model: model.sums.signed_r_squared)
     among = "the best subsets" if rule.ranking == ALL_SUBSETS else f"the order by {rule.ranking}"

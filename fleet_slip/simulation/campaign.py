@@ -19,7 +19,7 @@ from pydantic import Field, TypeAdapter, model_validator
 from fleet_slip.canonical import canonical_ascii, sha256_of
 from fleet_slip.catalogue.signals import Identifier
 from fleet_slip.config import Config, load_config
-from fleet_slip.errors import ConfigError
+from fleet_slip.errors import ConfigError, UsageError
 from fleet_slip.resources import find_config
 from fleet_slip.simulation.drive_plan import FleetPlan, GridPlan, random_generator
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ, Sensors
@@ -116,7 +116,7 @@ class Campaign(Config):
         return tuple(self.first_day + timedelta(days=day) for day in range(self.number_of_days))
 
     def chosen_days(self, count: int | None, through: date | None) -> tuple[date, ...]:
-        """Return the first days, as many as asked for and up to a day. Raises `ConfigError`."""
+        """Return the first days, as many as asked for and up to a day. Raises `UsageError`."""
         days = self.days()
         chosen = tuple(
             day
@@ -124,7 +124,7 @@ class Campaign(Config):
             if through is None or day <= through
         )
         if not chosen:
-            raise ConfigError(
+            raise UsageError(
                 f"no day is asked for: {self.name} lasts from {days[0]} to {days[-1]}."
             )
         return chosen

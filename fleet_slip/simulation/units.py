@@ -29,7 +29,7 @@ def changed_campaign(campaign: str, day: date) -> RefusedError:
     """Return the error that a day's batches, or the day, landed as something else."""
     return RefusedError(
         f"{day}: the campaign {campaign!r} was changed since this day was simulated, and logs are "
-        "never replaced. Give the changed campaign another name, or use another --root."
+        "never replaced. Give the changed campaign another name, or use another data root."
     )
 
 

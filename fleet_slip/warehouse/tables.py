@@ -41,7 +41,7 @@ class Warehouse:
     def require(self) -> None:
         """Raise `StorageError` if there is no data root: a wrong path is not an empty warehouse."""
         if not self.root.exists():
-            raise StorageError(f"{self.root}: there is no data root. Choose another with --root.")
+            raise StorageError(f"{self.root}: there is no data root. Choose another.")
 
     @cached_property
     def logs(self) -> Table:

@@ -13,7 +13,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip import Fleet
-from fleet_slip.errors import ConfigError, DataError, QuestionError, RefusedError
+from fleet_slip.errors import DataError, QuestionError, RefusedError, UsageError
 from fleet_slip.files.folder import Folder
 from fleet_slip.models.manifest import Manifest
 from tests.support.commands import start
@@ -136,7 +136,7 @@ def test_a_worse_model_is_refused_and_aliases_move(fleet: Fleet, tmp_path: Path)
     assert own.rollback("slip").version == 1
     assert own.promote("slip@2", "candidate").reference == "slip@2"
     assert own.model("slip@candidate").version == 2
-    with pytest.raises(ConfigError, match="cannot be the name"):
+    with pytest.raises(UsageError, match="cannot be the name"):
         own.promote("slip@2", "Not A Name")
 
 
@@ -152,9 +152,9 @@ def test_a_cohort_answers_from_gram_rows(fleet: Fleet) -> None:
     assert found[0].cross_validation.name == "least squares"
     subset = cohort.select(nested="ay,yaw_rate", all_subsets=True, criterion="bic", bootstrap=100)
     assert subset.uncertainty
-    with pytest.raises(ConfigError, match="say what is added"):
+    with pytest.raises(UsageError, match="say what is added"):
         cohort.what_if("smoke")
-    with pytest.raises(ConfigError, match="not both"):
+    with pytest.raises(UsageError, match="not both"):
         cohort.diagnose("bent", signals="ay")
     with pytest.raises(QuestionError, match="name a published model"):
         cohort.diagnose()
@@ -166,7 +166,7 @@ def test_a_cohort_answers_from_gram_rows(fleet: Fleet) -> None:
 
 def test_a_campaign_without_such_days_is_refused(fleet: Fleet) -> None:
     for wrong in ({"days": 0}, {"days": -1}, {"through": date(1999, 1, 1)}):
-        with pytest.raises(ConfigError, match="smoke lasts from 2024-05-01 to 2024-05-02"):
+        with pytest.raises(UsageError, match="smoke lasts from 2024-05-01 to 2024-05-02"):
             fleet.simulate("smoke", **wrong)
 
 

@@ -189,8 +189,8 @@ FORGED = (
     [
         (["run", "--campaign", "nowhere"], 3, "Known: fleet, smoke, waterford"),
         (["run", "--campaign", "missing.toml"], 3, "no such file"),
-        (["run", "--campaign", "smoke", "--through", "yesterday"], 3, "write it as 2024-05-01"),
-        (["run", "--campaign", "smoke", "--through", "1999-01-01"], 3, "lasts from"),
+        (["run", "--campaign", "smoke", "--through", "yesterday"], 2, "write it as 2024-05-01"),
+        (["run", "--campaign", "smoke", "--through", "1999-01-01"], 2, "lasts from"),
         (["select", "--cohort", "campaign = 'none'"], 5, "no drive satisfies"),
         (["select", "--cohort", "campain = 'x'"], 5, "campain"),
         (["select", "--cohort", "true) OR (true"], 5, "not valid SQL"),
@@ -203,7 +203,7 @@ FORGED = (
         (["monitor", "smoke", "--cohort", "true UNION SELECT 1"], 5, "not valid SQL"),
         (["score", "smoke", "--cohort", "true) OR (true"], 5, "not valid SQL"),
         (["select", "--cohort", "1; DROP VIEW grams"], 5, "not valid SQL"),
-        (["select", "--nested", "ax,beta"], 3, "beta is not an input"),
+        (["select", "--nested", "ax,beta"], 5, "beta is not an input"),
         (["select", "--models", "table9"], 3, "Known: estimator, table1"),
         (["select", "--by", "vehicle"], 5, "at least two folds"),
         (["show", "nothing"], 5, "no model is called"),
@@ -211,8 +211,8 @@ FORGED = (
         (["score", "smoke", "--cohort", "mass_kg > 9000"], 5, "no row of the cohort"),
         (["ingest", "none.csv", "--mapping", "race_car_250lm"], 4, "none.csv"),
         (["ingest", "none.csv", "--mapping", "unknown"], 3, "Known: race_car_250lm"),
-        (["select", "--folds", "1"], 3, "choose a number from 2 to 1000"),
-        (["publish", "Bad Name!"], 3, "cannot be the name of a model"),
+        (["select", "--folds", "1"], 2, "choose a number from 2 to 1000"),
+        (["publish", "Bad Name!"], 2, "cannot be the name of a model"),
     ],
 )
 def test_a_mistake_is_one_line_and_its_exit_code(

@@ -128,7 +128,7 @@ def test_a_snapshot_does_not_see_later_commits(warehouse: Warehouse) -> None:
 def test_a_root_that_is_a_file_is_told_with_a_next_step(tmp_path: Path) -> None:
     (tmp_path / "data").write_text("not a folder")
     with pytest.raises(
-        StorageError, match=r"Choose another --root|not a directory|Not a directory"
+        StorageError, match=r"Choose another data root|not a directory|Not a directory"
     ):
         Warehouse(LocalFolder(tmp_path / "data")).logs.write_file("one", rows("a"), DAY)
 

@@ -155,7 +155,7 @@ def test_the_command_line_makes_keys_signs_and_refuses(
     assert run_command("show", name, env=asking).exit_code == 7
     assert "not signed" in run_command("verify", env=asking).stdout
     assert "not signed" in run_command("status", env=asking).stderr
-    assert run_command("sign", f"{name}@1").exit_code == 3
+    assert run_command("sign", f"{name}@1").exit_code == 2
     assert run_command("sign", f"{name}@1", "--sign-key", "mine").exit_code == 0
     assert run_command("show", name, env=asking).exit_code == 0
     assert "not signed" not in run_command("verify", env=asking).stdout
