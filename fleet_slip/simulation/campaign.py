@@ -22,9 +22,11 @@ from fleet_slip.config import Config, load_config
 from fleet_slip.errors import ConfigError, UsageError
 from fleet_slip.resources import find_config
 from fleet_slip.simulation.drive_plan import FleetPlan, GridPlan, random_generator
+from fleet_slip.simulation.manoeuvres import Manoeuvre
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ, Sensors
 from fleet_slip.simulation.speed_profile import SpeedLimits, SpeedProfile, speed_profile
 from fleet_slip.simulation.track import Track
+from fleet_slip.simulation.trials import TrialPlan
 from fleet_slip.vehicle.parameters import VehicleParameters
 
 ROAD_SPACING_M = 1.0
@@ -48,6 +50,8 @@ class DriveSpec:
     laps: float
     seed: int
     source: str = "simulated"
+    script: Annotated[tuple[Manoeuvre, ...], Field(exclude_if=lambda script: not script)] = ()
+    """Manoeuvres; a drive without any has the digest that it had before there were some."""
 
     @property
     def profile(self) -> SpeedProfile:
@@ -95,7 +99,7 @@ class Campaign(Config):
     drives_per_day: int = Field(gt=0, le=9999)
     laps: float = Field(gt=0, le=1000)
     rows_per_file: int = Field(gt=0, le=2_000_000)
-    plan: Annotated[GridPlan | FleetPlan, Field(discriminator="kind")]
+    plan: Annotated[GridPlan | FleetPlan | TrialPlan, Field(discriminator="kind")]
     sensors: Sensors
 
     @model_validator(mode="after")
@@ -158,11 +162,12 @@ class Campaign(Config):
         if isinstance(plan, GridPlan):
             assignment = plan.assignment(number, self.sensors)
         else:
-            assignment = plan.assignment(
-                self.sensors,
-                random_generator(self.seed, "car", vehicle_id),
-                random_generator(self.seed, "drive", drive_id),
-            )
+            of_car = random_generator(self.seed, "car", vehicle_id)
+            of_drive = random_generator(self.seed, "drive", drive_id)
+            if isinstance(plan, TrialPlan):
+                assignment = plan.assignment(number, self.sensors, of_car, of_drive)
+            else:
+                assignment = plan.assignment(self.sensors, of_car, of_drive)
         return DriveSpec(
             drive_id=drive_id,
             vehicle_id=vehicle_id,
@@ -176,6 +181,7 @@ class Campaign(Config):
             speed_factor=assignment.speed_factor,
             laps=self.laps,
             seed=self.seed,
+            script=assignment.script,
         )
 
 

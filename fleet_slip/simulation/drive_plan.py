@@ -11,6 +11,7 @@ from pydantic import BeforeValidator, Field, FiniteFloat, model_validator
 
 from fleet_slip.config import Config
 from fleet_slip.errors import ConfigError
+from fleet_slip.simulation.manoeuvres import Manoeuvre
 from fleet_slip.simulation.sensors import Sensors
 from fleet_slip.simulation.speed_profile import SpeedLimits
 from fleet_slip.simulation.track import Track, load_track
@@ -74,6 +75,7 @@ class CarOnRoad:
     adhesion: float
     limits: SpeedLimits
     speed_factor: float
+    script: tuple[Manoeuvre, ...] = ()
 
 
 class Plan(Config):

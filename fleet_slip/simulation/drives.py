@@ -8,6 +8,7 @@ import pyarrow as pa
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.simulation.campaign import Batch, DriveSpec
+from fleet_slip.simulation.manoeuvres import road_with
 from fleet_slip.simulation.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ, Measurement, Recorder
 from fleet_slip.vehicle.lanes import LaneDrive, Road, simulate_blocks
 
@@ -60,6 +61,7 @@ def lane_drive(spec: DriveSpec) -> LaneDrive:
         length_m=spec.track.length_m,
         closed=spec.track.closed,
     )
+    road = road_with(road, spec.script)
     return LaneDrive(vehicle=spec.vehicle, road=road, adhesion=spec.adhesion, laps=spec.laps)
 
 

@@ -1,0 +1,139 @@
+"""Trials on a proving ground: what is drawn, and what manoeuvres make of a road and a drive."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fleet_slip.errors import ConfigError
+from fleet_slip.resources import find_config
+from fleet_slip.simulation.campaign import DriveSpec, load_campaign
+from fleet_slip.simulation.drives import lane_drive
+from fleet_slip.simulation.manoeuvres import SLOWEST_MPS, Manoeuvre, road_with
+from fleet_slip.simulation.scenario import shipped_scenarios
+from fleet_slip.simulation.trials import TrialPlan
+from fleet_slip.vehicle.lanes import LaneDrive, Road, simulate_drives
+from fleet_slip.vehicle.parameters import load_vehicle
+
+TEXT = find_config("campaigns", "proving_ground").read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def drives() -> tuple[DriveSpec, ...]:
+    campaign = load_campaign("proving_ground")
+    return tuple(drive for day in campaign.days() for drive in campaign.drives(day))
+
+
+def straight(speed_mps: float = 20.0, *, closed: bool = False) -> Road:
+    entries = 600 if closed else 601
+    return Road(1.0, np.zeros(entries), np.full(entries, speed_mps), 600.0, closed)
+
+
+def test_one_car_is_tested_and_others_take_turns(drives: tuple[DriveSpec, ...]) -> None:
+    plan = load_campaign("proving_ground").plan
+    assert isinstance(plan, TrialPlan)
+    tested = [d for d in drives if d.vehicle_id == "proving_ground-0000"]
+    assert len(tested) == len(drives) * (plan.other_every - 1) // plan.other_every
+    assert {d.vehicle.name for d in tested} == {"d_class_sedan"}
+    others = {d.vehicle_id: d.vehicle.name for d in drives if d not in tested}
+    assert len(others) == plan.others
+    assert len(set(others.values())) == 4
+
+
+def test_drives_cover_what_the_test_drives_ask(drives: tuple[DriveSpec, ...]) -> None:
+    tested = [d for d in drives if d.vehicle_id == "proving_ground-0000"]
+    masses = [d.vehicle.body.sprung_mass_kg for d in tested]
+    assert min(masses) < 1010 < 1730 < max(masses)
+    assert masses.count(1320) == pytest.approx(len(masses) / 2, rel=0.15)
+    adhesion = [d.adhesion for d in tested]
+    assert 0.35 <= min(adhesion) < 0.38
+    assert max(adhesion) == 1.0
+    lateral = [d.limits.lateral_mps2 for d in tested if d.adhesion == 1]
+    assert min(lateral) < 2.2
+    assert 7.7 < max(lateral) <= 8.0
+    noise = [d.sensors.yaw_rate_std_rad_s for d in tested]
+    assert noise.count(0.01) > len(noise) / 2
+    assert max(noise) > 0.02
+    assert {d.track.name for d in drives} == {"waterford_hills", "melbourne"}
+    assert all(d.limits.lateral_mps2 <= 1.1 * d.adhesion * 9.81 for d in drives)
+
+
+def test_no_drive_of_a_scenario_is_driven(drives: tuple[DriveSpec, ...]) -> None:
+    tests = [scenario.batch().drives[0] for scenario in shipped_scenarios()]
+    assert {d.seed for d in drives}.isdisjoint(d.seed for d in tests)
+    plans = {(d.vehicle, d.track.name, d.limits, d.adhesion) for d in drives}
+    assert plans.isdisjoint((d.vehicle, d.track.name, d.limits, d.adhesion) for d in tests)
+
+
+def test_a_script_is_part_of_the_digest(tmp_path: Path) -> None:
+    file = tmp_path / "campaign.toml"
+    file.write_text(
+        TEXT.replace("usual = 0.0\nshare = 0.4\nmin = 0.5", "usual = 3.0\nshare = 1.0\nmin = 0.5")
+    )
+    scripted, original = load_campaign(str(file)), load_campaign("proving_ground")
+    day = original.first_day
+    first, again = scripted.batches(day)[0], original.batches(day)[0]
+    assert first.drives[0].script
+    assert first.digest != again.digest
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [("share = 0.4", "share = 1.4"), ("other_every = 10", "other_every = 1")]
+)
+def test_faults_in_a_plan_are_named(tmp_path: Path, old: str, new: str) -> None:
+    assert TEXT.count(old) == 1
+    file = tmp_path / "campaign.toml"
+    file.write_text(TEXT.replace(old, new))
+    with pytest.raises(ConfigError, match=old.split(maxsplit=1)[0]):
+        load_campaign(str(file))
+
+
+def test_without_a_script_a_road_is_what_it_was() -> None:
+    road = straight()
+    assert road_with(road, ()) is road
+
+
+def test_a_step_turns_to_its_side_and_back() -> None:
+    road = road_with(straight(), [Manoeuvre("step", 100.0, 2.0, 3.0, 1.0)])
+    assert road.curvature_1pm[99] == 0.0
+    assert road.curvature_1pm[100:120] == pytest.approx(3.0 / 400)
+    assert road.curvature_1pm[120:140] == pytest.approx(-3.0 / 400)
+    assert road.curvature_1pm[140:] == pytest.approx(0.0)
+    assert road.speed_mps == pytest.approx(20.0)
+
+
+def test_a_slalom_swings_once_a_period_and_ends_where_it_began() -> None:
+    road = road_with(straight(), [Manoeuvre("slalom", 100.0, 4.0, 2.0, 2.0)])
+    swing = road.curvature_1pm[100:180]
+    assert np.abs(swing).max() == pytest.approx(2.0 / 400)
+    assert swing.sum() == pytest.approx(0.0, abs=1e-12)
+    assert int((np.diff(np.sign(swing[1:])) < 0).sum()) == 2
+
+
+def test_braking_slows_down_as_hard_as_it_says_and_never_to_a_stop() -> None:
+    road = road_with(straight(), [Manoeuvre("braking", 100.0, 2.0, -3.0, 1.0)])
+    assert road.speed_mps.min() == pytest.approx(20.0 - 3.0)
+    assert road.speed_mps[100] == pytest.approx(20.0)
+    slow = road_with(straight(5.0), [Manoeuvre("braking", 100.0, 9.0, 9.0, 1.0)])
+    assert slow.speed_mps.min() == SLOWEST_MPS
+
+
+def test_a_manoeuvre_goes_on_over_the_start_of_a_closed_road_and_not_of_an_open_one() -> None:
+    script = [Manoeuvre("step", 590.0, 2.0, 3.0, 1.0)]
+    assert road_with(straight(closed=True), script).curvature_1pm[:5] == pytest.approx(3.0 / 400)
+    assert road_with(straight(), script).curvature_1pm[:5] == pytest.approx(0.0)
+
+
+def test_a_car_drives_the_lateral_acceleration_of_a_slalom() -> None:
+    car = load_vehicle("d_class_sedan")
+    road = road_with(straight(), [Manoeuvre("slalom", 200.0, 8.0, 2.0, 4.0)])
+    (plain, swung) = simulate_drives([LaneDrive(car, r, 1.0, 1.0) for r in (straight(), road)])
+    assert np.abs(plain.ay_mps2).max() < 0.01
+    assert 1.6 < np.abs(swung.ay_mps2).max() < 2.8
+    assert swung.lost_control_tick is None
+
+
+def test_a_scripted_drive_takes_its_road(drives: tuple[DriveSpec, ...]) -> None:
+    spec = next(d for d in drives if any(m.kind == "step" for m in d.script))
+    plain = spec.track.curvature(spec.profile.station_m)
+    assert not np.array_equal(lane_drive(spec).road.curvature_1pm, plain)
