@@ -8,16 +8,19 @@ from fleet_slip.maintenance.verification import Damage, Verification
 from fleet_slip.models.trained_drives import read_trained_drives
 from fleet_slip.models.versions import Registry
 from fleet_slip.runs.anchors import find_missing_documents
+from fleet_slip.runs.records import find_changed_lines
 from fleet_slip.warehouse.tables import Warehouse
 
 
 def verify_documents(root: Folder, report: Verification) -> None:
-    """Look for documents that do not match their checksums, leave gaps, or are gone."""
+    """Look for documents and lines of the history that were changed, and documents gone."""
     for folder in _document_folders(root):
         report.documents += len(folder.numbers())
         for file, problem in folder.faults().items():
             report.findings.append(Damage("document", file.removeprefix(f"{root}/"), problem))
     for path, problem in find_missing_documents(root):
+        report.findings.append(Damage("document", path, problem))
+    for path, problem in find_changed_lines(root):
         report.findings.append(Damage("document", path, problem))
 
 

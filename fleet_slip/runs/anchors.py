@@ -15,10 +15,7 @@ from typing import Any
 from fleet_slip.errors import StorageError
 from fleet_slip.files.documents import DocumentFolder
 from fleet_slip.files.folder import Folder
-
-FOLDER = "runs"
-KEY = "documents"
-"""Name of the anchors in the record of a run."""
+from fleet_slip.runs.records import ANCHORS, FOLDER, is_intact
 
 Anchors = Mapping[str, tuple[int, str]]
 """Number and SHA-256 of the newest document of each folder, by its path below the data root."""
@@ -64,10 +61,12 @@ def _kept_anchors(root: Folder, since: str) -> dict[str, tuple[int, str]]:
 
 
 def _anchors_in(line: bytes) -> Iterator[tuple[str, int, str]]:
-    """Yield the anchors of a record; none of a line that is torn or says something else."""
+    """Yield the anchors of a record; none of a line that is torn, changed, or without them."""
+    if not is_intact(line):
+        return
     try:
         record: Any = json.loads(line)
-        found = record.get(KEY) or {}
+        found = record.get(ANCHORS) or {}
         for path, (number, sha256) in found.items():
             if _is_document_folder(str(path)):
                 yield str(path), int(number), str(sha256)

@@ -9,7 +9,6 @@ whatever gatherers do at once, or are killed at, every record is there once or m
 `runs` counts a run by its name. A reader whose files are gathered meanwhile lists them again.
 """
 
-import contextlib
 import hashlib
 import json
 import os
@@ -24,7 +23,8 @@ import duckdb
 
 from fleet_slip.files.folder import Folder, StoredFile
 from fleet_slip.resources import read_sql
-from fleet_slip.runs.log import FOLDER, RECORD_COLUMNS, current_run_id
+from fleet_slip.runs.log import current_run_id
+from fleet_slip.runs.records import FOLDER, RECORD_COLUMNS, is_intact, require_unchanged
 
 REMOVALS_AT_ONCE = 16
 RUNNING = "running"
@@ -33,8 +33,10 @@ RUNNING = "running"
 def lend_runs(root: Folder, database: duckdb.DuckDBPyConnection, since: str = "") -> list[str]:
     """Let a connection read the history's files; return their URIs, none if there is no history.
 
-    `since` is the first month that is wanted, as YYYY-MM.
+    `since` is the first month that is wanted, as YYYY-MM. Raises `StorageError` for a line that was
+    changed.
     """
+    require_unchanged(root, since)
     return (root / FOLDER).lend(database, lambda path: _is_record(path) and path >= since)
 
 
@@ -49,7 +51,7 @@ def runs_under_way(root: Folder) -> list[str]:
     paths = [f.path for f in folder.files() if _is_record(f.path) and f.path >= f"{since:%Y-%m}"]
     for content in folder.read_many(paths):
         for line in (content or b"").splitlines():
-            with contextlib.suppress(ValueError):
+            if is_intact(line):
                 record = json.loads(line)
                 begun[record["run_id"]] = {**begun.get(record["run_id"], {}), **record}
     return [

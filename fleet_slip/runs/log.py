@@ -3,13 +3,13 @@
     runs/2026-11.jsonl    one line when a command starts, one when it ends
 
 A line is appended by a single write to the month's file and never changed, so that processes need
-no lock, and a run that was killed is known by its missing second line. A line that a full disk or
-a power cut tore is skipped by readers; it cannot damage its successor, since every record begins
-on a new line. Nothing here may fail or delay the command: what cannot be written is not written.
+no lock, and a run that was killed is known by its missing second line. Each has a checksum
+(`fleet_slip.runs.records`). A line that a full disk or a power cut tore is skipped by readers; it
+cannot damage its successor, since every record begins on a new line. Nothing here may fail or delay
+the command: what cannot be written is not written.
 """
 
 import contextlib
-import json
 import logging
 import os
 import re
@@ -25,28 +25,10 @@ from typing import Any
 
 from fleet_slip.errors import StorageError
 from fleet_slip.files.folder import Folder
-from fleet_slip.runs.anchors import KEY as ANCHORS
 from fleet_slip.runs.anchors import newest_documents
-
-RECORD_COLUMNS = {
-    "run_id": "VARCHAR",
-    "command": "VARCHAR",
-    "arguments": "VARCHAR[]",
-    "started_at": "VARCHAR",
-    "ended_at": "VARCHAR",
-    "outcome": "VARCHAR",
-    "exit_code": "INTEGER",
-    "error": "VARCHAR",
-    "seconds": "DOUBLE",
-    "steps": "STRUCT(name VARCHAR, seconds DOUBLE, rows BIGINT, size_bytes BIGINT)[]",
-    "host": "VARCHAR",
-    "process": "INTEGER",
-    "package_version": "VARCHAR",
-}
-"""What a line of the history may say, with DuckDB's types."""
+from fleet_slip.runs.records import ANCHORS, FOLDER, write_line
 
 LOGGER = logging.getLogger("fleet_slip")
-FOLDER = "runs"
 INTERRUPTED = 130
 ARGUMENTS_MAX = 50
 """So many arguments are kept; a glob may have given a hundred thousand."""
@@ -234,9 +216,9 @@ def _exists(root: Folder) -> bool:
 
 def _append(root: Folder, file: str, *records: Mapping[str, Any]) -> bool:
     """Append records in one write; False where that is not possible."""
-    text = "".join(f"\n{json.dumps(record, separators=(',', ':'))}\n" for record in records)
+    text = b"".join(b"\n" + write_line(record) + b"\n" for record in records)
     try:
-        root.append(file, text.encode())
+        root.append(file, text)
     except StorageError as error:
         log_event("run not recorded", logging.WARNING, file=f"{root}/{file}", reason=str(error))
         return False
