@@ -1,13 +1,20 @@
 """Which model versions were trained on drives that were forgotten.
 
-Who forgets judges the versions that there are. A version that was published meanwhile from Gram
-rows that still had the drives was judged by nobody: it counts as trained on them.
+Who forgets judges the versions that there are. A version that was published meanwhile was judged by
+nobody. Made of Gram rows from before they were without the drives, it counts as trained on them
+until the erasure is done; then it does if one of its own drives (`models/trained_drives.py`) has no
+Gram rows any more. A version from before those were kept counts as trained on them for ever.
 """
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.files.folder import Folder
+from fleet_slip.models.trained_drives import hash_drives, read_trained_drives
 from fleet_slip.models.versions import Registry
 from fleet_slip.warehouse.audit import Audit
+from fleet_slip.warehouse.tables import Warehouse
 
 
 def marked_models(root: Folder) -> frozenset[str]:
@@ -24,12 +31,13 @@ def marked_models(root: Folder) -> frozenset[str]:
             without[entry["subject"]] = entry.get("grams_version")
     registry = Registry(root / "models")
     versions = [(n, number) for n in registry.names() if judged for number in registry.versions(n)]
+    drives = _PresentDrives(Warehouse(root))
     for subject, numbers in judged.items():
         found |= {
             f"{name}@{number}"
             for name, number in versions
             if number > numbers.get(name, 0)
-            and _may_have_seen(registry, name, number, without[subject])
+            and _may_have_seen(registry, name, number, without[subject], drives)
         }
     return frozenset(found)
 
@@ -40,11 +48,39 @@ def newest_versions(root: Folder) -> dict[str, int]:
     return {name: max(registry.versions(name), default=0) for name in registry.names()}
 
 
-def _may_have_seen(registry: Registry, name: str, number: int, without: int | None) -> bool:
-    """Whether a version was made of Gram rows from before a version of them; true if unknown."""
+@dataclass(frozen=True)
+class _PresentDrives:
+    """The drives that have Gram rows, read when they are asked for."""
+
+    warehouse: Warehouse
+    hashed: dict[str, frozenset[int]] = field(default_factory=dict)
+
+    def hashed_for(self, name: str) -> frozenset[int]:
+        """Return them as the versions of a model keep them."""
+        if name not in self.hashed:
+            self.hashed[name] = hash_drives(name, frozenset(self._names()))
+        return self.hashed[name]
+
+    def _names(self) -> Iterator[str]:
+        grams = self.warehouse.grams.snapshot()
+        for file in grams.files:
+            yield from grams.table.read(file.path, ["drive_id"])["drive_id"].unique().to_pylist()
+
+
+def _may_have_seen(
+    registry: Registry, name: str, number: int, without: int | None, present: _PresentDrives
+) -> bool:
+    """Whether a version was trained on drives that Gram rows are without since a version of them.
+
+    True if that cannot be told.
+    """
     if without is None:
         return True
     try:
-        return registry.load(name, number).manifest.trained_on.grams_version < without
+        manifest = registry.load(name, number).manifest
+        if manifest.trained_on.grams_version >= without:
+            return False
+        kept = read_trained_drives(registry.folder_of(name), manifest)
+        return kept is None or not kept <= present.hashed_for(name)
     except FleetSlipError:
         return True

@@ -26,7 +26,10 @@ from fleet_slip.maintenance.marks import marked_models
 from fleet_slip.maintenance.repair import repair
 from fleet_slip.maintenance.vacuum import find_expired
 from fleet_slip.maintenance.verify import verify
+from fleet_slip.models.publish import manifest_of, publish
+from fleet_slip.models.versions import Registry
 from fleet_slip.runs.log import recording
+from fleet_slip.selection.request import SelectionRequest, answer_request
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.job import simulate_batches
 from fleet_slip.warehouse.audit import Audit, Forgettable
@@ -243,19 +246,36 @@ def test_repair_finds_a_file_by_its_checksum_under_any_name(tmp_path: Path) -> N
     assert not verify(warehouse, full=True).damage
 
 
-def test_a_version_published_from_gram_rows_before_an_erasure_counts_as_trained_on_it(
-    run_command: RunCommand, tmp_path: Path
+def test_versions_published_from_gram_rows_before_an_erasure_are_judged_by_their_own_drives(
+    tmp_path: Path,
 ) -> None:
-    run_command("run", "--campaign", "smoke")
-    root = LocalFolder(tmp_path / "data")
-    audit = Audit(root)
-    audit.begin(BETA, 1, [], {"smoke": 0})  # published after the versions were judged
-    assert marked_models(root) == {"smoke@1"}
-    audit.end(BETA, grams_version=99)  # and made of rows that still had the drives
-    assert marked_models(root) == {"smoke@1"}
-    audit.begin(BETA, 1, [], {"smoke": 0})
-    audit.end(BETA, grams_version=0)
-    assert not marked_models(root)
+    """Whoever selected before the erasure and publishes after it."""
+    warehouse = fill(tmp_path, *CARS)
+    registry, answers = Registry(warehouse.root / "models"), {}
+    cohorts = {"of_all": "true", "of_others": "vehicle_id <> 'beta'"}
+    for name, cohort in cohorts.items():
+        request = SelectionRequest(cohort=cohort, nested="ay,yaw_rate")
+        answers[name] = answer_request(warehouse, request)
+    manifests = {name: manifest_of(answer, name) for name, answer in answers.items()}
+    forget(warehouse, BETA, now=True)
+    for name, answer in answers.items():
+        publish(registry, manifests[name], answer, force=True)
+    assert marked_models(warehouse.root) == {"of_all@1"}
+    (kept,) = Path(str(registry.folder_of("of_others"))).glob("drives-*.bin")
+    kept.unlink()  # then it cannot be told
+    assert marked_models(warehouse.root) == {"of_all@1", "of_others@1"}
+
+
+def test_while_an_erasure_is_under_way_what_is_published_counts_as_trained_on_it(
+    tmp_path: Path,
+) -> None:
+    warehouse = fill(tmp_path, *CARS)
+    Audit(warehouse.root).begin(BETA, 3, [], {"beta": 0})
+    answer = answer_request(warehouse, SelectionRequest(nested="ay,yaw_rate"))
+    publish(Registry(warehouse.root / "models"), manifest_of(answer, "beta"), answer, force=True)
+    assert marked_models(warehouse.root) == {"beta@1"}
+    Audit(warehouse.root).end(BETA, grams_version=0)
+    assert not marked_models(warehouse.root)
 
 
 def test_the_command_says_what_may_be_left_and_finishes_when_it_is_repeated(
@@ -280,10 +300,19 @@ def test_the_command_says_what_may_be_left_and_finishes_when_it_is_repeated(
 
 
 @pytest.mark.slow
-def test_commands_that_meet_at_any_point_lose_and_double_nothing() -> None:
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        (("compact", "ingest"), "forget"),
+        (("ingest", "gram", "publish", "promote"), "migrate"),
+    ],
+)
+def test_commands_that_meet_at_any_point_lose_and_double_nothing(
+    first: tuple[str, ...], second: str
+) -> None:
     """A part of what `python -m benchmarks.interleave` does; a new process, because it forks."""
     command = [sys.executable, "-m", "benchmarks.interleave", "--schedules", "10"]
-    command += ["--first", "compact", "ingest", "--second", "forget"]
+    command += ["--first", *first, "--second", second]
     done = run(command, cwd=Path(__file__).parents[2])
     assert done.exit_code == 0, done.stdout + done.stderr
     assert "0 findings of 0 kinds" in done.stdout
