@@ -58,10 +58,13 @@ def update_grams(
     return retry_conflicts(lambda: _update_once(warehouse, progress, feature_set, executor, among))
 
 
-def reconcile(warehouse: Warehouse, progress: Progress = no_progress) -> list[GramReport]:
+def reconcile(
+    warehouse: Warehouse, progress: Progress = no_progress, *, unreadable: Collection[str] = ()
+) -> list[GramReport]:
     """Bring the Gram rows of every feature set up to date that was ever computed here.
 
     A set that was computed for some drives only is brought up to date for the files of these.
+    `unreadable` log files are left for later.
     """
     grams = warehouse.grams.snapshot()
     identities = {name: features().identity(name) for name in (PLAIN, *features().sets)}
@@ -73,6 +76,9 @@ def reconcile(warehouse: Warehouse, progress: Progress = no_progress) -> list[Gr
         among = None
         if name in drives:
             among = _files_of(warehouse.grams.snapshot(), drives[name])
+        if unreadable:
+            active = {file.path for file in warehouse.logs.snapshot().files}
+            among = (active if among is None else among).difference(unreadable)
         reports.append(update_grams(warehouse, progress, name, among=among))
     return reports
 

@@ -44,7 +44,8 @@ def repair(
     found = _find_elsewhere(warehouse, damaged)
     rebuilt += found
     rebuilt += _simulate_again(warehouse, damaged - set(found), campaigns)
-    rebuilt += _aggregate_again(warehouse, damaged, wrong)
+    lost = {path.removeprefix("logs/") for path in damaged.difference(rebuilt)}
+    rebuilt += _aggregate_again(warehouse, damaged, wrong, lost)
     return rebuilt
 
 
@@ -146,9 +147,12 @@ def _batch(campaign: Campaign, day: date, drives: Sequence[DriveSpec]) -> Batch:
 
 
 def _aggregate_again(
-    warehouse: Warehouse, damaged: Collection[str], wrong: Collection[str]
+    warehouse: Warehouse, damaged: Collection[str], wrong: Collection[str], lost: Collection[str]
 ) -> list[str]:
-    """Drop the Gram files that are damaged or have wrong rows, and compute what is missing."""
+    """Drop the Gram files that are damaged or have wrong rows, and compute what is missing.
+
+    That of `lost` log files cannot be.
+    """
     removed: list[str] = []
 
     def attempt() -> None:
@@ -166,7 +170,7 @@ def _aggregate_again(
             removed.extend(f"grams/{file.path}" for file in bad)
 
     retry_conflicts(attempt)
-    reconcile(warehouse)  # also what an interrupted repair has dropped
+    reconcile(warehouse, unreadable=lost)  # also what an interrupted repair has dropped
     return removed
 
 

@@ -33,9 +33,11 @@ def verify_files(
         for group, found in run_tasks(executor or threads, task, groups, _group_name):
             problems |= found
             progress(sum(file.size_bytes for file in group), snapshot.size_bytes)
+    held = {file.path: file for file in snapshot.files}
     for path, problem in sorted(problems.items()):
         if problem:
-            report.findings.append(Damage("file", f"{table.folder.name}/{path}", problem))
+            told = f"{problem} (it held {held[path].rows:,} rows)"
+            report.findings.append(Damage("file", f"{table.folder.name}/{path}", told))
     report.files += len(snapshot.files)
     report.size_bytes += snapshot.size_bytes
     report.rows += snapshot.rows if table.folder.name == "logs" else 0

@@ -160,6 +160,30 @@ def test_an_unknown_log_file_is_told_and_never_deleted(filled: Warehouse) -> Non
     assert damaged(filled) == {("file", str(file.relative_to(path_of(filled.root))))}
 
 
+def test_a_log_file_lost_with_its_gram_rows_is_told_and_the_rest_rebuilt(
+    filled: Warehouse, run_command: RunCommand
+) -> None:
+    lost, *others = filled.logs.snapshot().paths
+    assert others
+    content = Path(lost).read_bytes()
+    Path(lost).unlink()
+    for gram in filled.grams.snapshot().paths:
+        Path(gram).unlink()
+    told = run_command("verify", "--repair", "--json")
+    assert told.exit_code == 9
+    (left,) = told.json["damage"]
+    assert left["path"] == str(Path(lost).relative_to(path_of(filled.root)))
+    assert left["problem"].endswith("rows)")
+    assert "under any name" in told.stderr
+    rows = [filled.grams.read(f.path, ["file"]) for f in filled.grams.snapshot().files]
+    assert {name for part in rows for name in part["file"].to_pylist()} == {
+        str(Path(other).relative_to(path_of(filled.logs.folder))) for other in others
+    }
+    (Path(lost).parent / "from-the-backup.parquet").write_bytes(content)
+    assert run_command("verify", "--repair").exit_code == 0
+    assert not damaged(filled)
+
+
 def test_a_document_is_checked_to_the_last_byte(filled: Warehouse) -> None:
     folder = DocumentFolder(filled.root / "models" / "m" / "history")
     for number in range(3):
