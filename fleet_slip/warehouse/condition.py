@@ -18,7 +18,7 @@ from typing import Any
 import duckdb
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.errors import QuestionError, printable
+from fleet_slip.errors import QuestionError, StorageError, printable
 from fleet_slip.warehouse.database import duckdb_message, reading_files
 from fleet_slip.warehouse.lasting_sql import Tree, problems
 from fleet_slip.warehouse.read_only_sql import LONGEST_QUERY
@@ -73,6 +73,13 @@ def asking(
     try:
         with reading_files(database, f"the cohort {condition.text!r}"):
             yield
+    except StorageError as error:
+        cause = error.__context__
+        if isinstance(cause, duckdb.InvalidInputException):  # and every file is sound
+            raise QuestionError(
+                f"the cohort {condition.text!r} cannot be asked: {duckdb_message(cause)}."
+            ) from None
+        raise
     except BaseException:
         if not over.is_set():
             raise

@@ -230,3 +230,16 @@ def test_asking_ends_when_the_time_is_over() -> None:
         asking(database, condition, limit_s=0.1),
     ):
         database.execute(endless).fetchall()
+
+
+@pytest.mark.parametrize(
+    "condition", ["regexp_matches(drive_id, '(')", "drive_id SIMILAR TO '['", "drive_id ~ '*'"]
+)
+def test_a_wrong_regular_expression_is_a_wrong_question(
+    warehouse: Warehouse, condition: str
+) -> None:
+    land(warehouse, "one", log_rows("d1", random_counts(np.random.default_rng(0), 50)))
+    update_grams(warehouse)
+    for ask in (load_cohort, lambda w, c: sum_cohort(w, Folding(), c)):
+        with pytest.raises(QuestionError, match="cannot be asked"):
+            ask(warehouse, condition)
