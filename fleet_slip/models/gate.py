@@ -90,6 +90,11 @@ class Comparison:
         return tuple(one for one, shortfall in pairs if not shortfall.negligible)
 
     @property
+    def contradicted(self) -> bool:
+        """Whether a published version estimates the opposite of the label."""
+        return any(one.pooled.correlation < 0 for one in self.incumbents)
+
+    @property
     def best(self) -> str | None:
         """The incumbent that is better than all others and the challenger; None if none is."""
         first = min(self.incumbents, key=lambda one: one.pooled.rmse)

@@ -220,6 +220,11 @@ def _judge(
     except (DataError, QuestionError) as error:
         problems.append(f"the champion {champion.reference} cannot be compared ({error})")
         return _Judgement(tuple(problems), "")
+    if comparison.contradicted:
+        problems.append(
+            f"the label runs against what {champion.reference} estimates: is it reversed? "
+            f"{comparison}"
+        )
     better = [one.name for one in comparison.better]
     if champion.reference in better:
         problems.append(f"it is worse than the champion: {comparison}")
