@@ -62,7 +62,8 @@ def verify(
         _print_verification(report, rebuilt)
     if report.damage:
         advice = (
-            "What is left cannot be rebuilt here: restore these files from a backup."
+            "What is left cannot be rebuilt here: restore these files from a backup. Data files "
+            "may be copied below their table under any name; then give the command again."
             if repair
             else "Rebuild what can be rebuilt with: fleet-slip verify --repair"
         )
@@ -241,6 +242,10 @@ def retain(
         return
     if report.forgotten.changed:
         _say_forgotten(report.forgotten)
+        say(
+            "their files do not land again; drives as old that come in other files do, until the "
+            "next retain"
+        )
     else:
         say(f"no drive is older than {report.before}")
     say(_vacuumed(report.vacuumed))
