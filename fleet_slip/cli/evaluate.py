@@ -1,6 +1,6 @@
 """Commands that evaluate: score on the rows of a cohort, evaluate on test drives."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any
 
 import typer
@@ -117,29 +117,53 @@ def print_evaluation(content: dict[str, Any]) -> None:
     for name, about in content["estimators"].items():
         groups.setdefault(about["group"], []).append(name)
     for group, names in groups.items():
-        _print_group(content, group, names)
+        if content["estimators"][names[0]]["kind"] == "regression":
+            title = f"{group}: RMSE, standard deviation and mean of the error in deg, correlation"
+            _print_group(content, title, names, _full_cell, 25)
+        else:
+            _print_group(content, f"{group}: RMSE in deg", names, _rmse_cell, 12)
+    print_ranking(content["ranking"])
     _print_sections(content)
     _print_checks(content["checks"])
     _print_comparisons(content["comparisons"])
     _print_rivals(content["rivals"])
 
 
-def _print_group(content: dict[str, Any], group: str, names: Sequence[str]) -> None:
-    print_table(
-        f"\n{group}: RMSE, standard deviation and mean of the error in deg, and correlation",
-        ["scenario", "side-slip std", *(name.removeprefix(f"{group}/") for name in names)],
-        [
+def _print_group(
+    content: dict[str, Any],
+    title: str,
+    names: Sequence[str],
+    cell: Callable[[dict[str, Any]], str],
+    width: int,
+) -> None:
+    """Print a table of estimators; as many tables as the terminal's width makes of it."""
+    at_once = max(1, (stdout().width - NAMES_WIDTH) // (width + 2))
+    for first in range(0, len(names), at_once):
+        shown = names[first : first + at_once]
+        print_table(
+            f"\n{title}{', continued' if first else ''}",
+            ["scenario", "side-slip", *(_heading(name) for name in shown)],
             [
-                one["name"],
-                f"{one['truth']['sideslip_std_deg']:.2f}",
-                *(_cell(one["results"][name]) for name in names),
-            ]
-            for one in content["scenarios"]
-        ],
-    )
+                [
+                    one["name"],
+                    f"{one['truth']['sideslip_std_deg']:.2f}",
+                    *(cell(one["results"][name]) for name in shown),
+                ]
+                for one in content["scenarios"]
+            ],
+        )
 
 
-def _cell(result: dict[str, Any]) -> str:
+NAMES_WIDTH = 33
+"""Of the columns with a scenario's name and its side-slip."""
+
+
+def _heading(name: str) -> str:
+    """Return an estimator's name in words, which a heading can wrap."""
+    return name.rpartition("/")[2].replace("_", " ")
+
+
+def _full_cell(result: dict[str, Any]) -> str:
     if result["error_std_deg"] is None:
         return "no estimate"
     figures = (
@@ -149,6 +173,35 @@ def _cell(result: dict[str, Any]) -> str:
         figures += f" {result['correlation']:.3f}"
     covered = result["coverage"]
     return figures if covered == 1 else f"{figures} ({covered:.0%})"
+
+
+def _rmse_cell(result: dict[str, Any]) -> str:
+    if result["rmse_deg"] is None:
+        return "none"
+    covered = result["coverage"]
+    return f"{result['rmse_deg']:.3f}" + ("" if covered == 1 else f" ({covered:.0%})")
+
+
+def print_ranking(ranking: dict[str, Any]) -> None:
+    """Print who wins each test drive."""
+    least, ours = ranking["least_coverage"], ranking["estimator"]
+    print_table(
+        f"\n{ours} wins {ranking['won']} of {ranking['drives']} test drives by RMSE, and is within "
+        f"{ranking['close_ratio']:g} of the winner on {ranking['close']} others.\nAll compete that "
+        f"need no GPS and estimate {least:.0%} of the rows.",
+        ["scenario", "won by", "RMSE deg", f"{ours} deg", "ratio"],
+        [
+            [
+                one["scenario"],
+                one["winner"] or "",
+                _figure(one["winner_rmse_deg"]),
+                _figure(one["rmse_deg"]),
+                _figure(one["ratio"], 2),
+            ]
+            for one in ranking["standings"]
+        ],
+        left=2,
+    )
 
 
 def _print_sections(content: dict[str, Any]) -> None:

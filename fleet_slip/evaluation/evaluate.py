@@ -9,6 +9,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.evaluation.comparison import FleetComparison, compare_fleets
 from fleet_slip.evaluation.estimators import Estimate, Signals, TrainedModels, train_models
 from fleet_slip.evaluation.filters import filter_bank
+from fleet_slip.evaluation.ranking import Ranking, rank
 from fleet_slip.evaluation.results import document
 from fleet_slip.evaluation.runs import EvaluatedScenario, run_all
 from fleet_slip.evaluation.targets import Check, check_filter_targets, check_targets
@@ -49,6 +50,11 @@ class Competitors:
     estimators: Mapping[str, Estimate]
     descriptions: Mapping[str, Mapping[str, Any]]
 
+    @property
+    def using_gps(self) -> frozenset[str]:
+        """Names of the estimators that need satellite navigation."""
+        return frozenset(name for name, one in self.descriptions.items() if one.get("gps"))
+
 
 @dataclass(frozen=True)
 class Evaluation:
@@ -58,6 +64,7 @@ class Evaluation:
     runs: tuple[EvaluatedScenario, ...]
     checks: tuple[Check, ...]
     comparisons: tuple[FleetComparison, ...]
+    ranking: Ranking
 
     def as_dict(self) -> dict[str, Any]:
         """Return the evaluation's document."""
@@ -70,6 +77,7 @@ class Evaluation:
             checks=[check.as_dict() for check in self.checks],
             comparisons=[comparison.as_dict() for comparison in self.comparisons],
             rivals=[rival.as_dict() for rival in self.competitors.rivals],
+            ranking=self.ranking.as_dict(),
         )
 
 
@@ -126,4 +134,5 @@ def evaluate(
         comparisons=tuple(
             row for fleet in competitors.fleets for row in compare_fleets(runs, first, fleet)
         ),
+        ranking=rank(runs, first.version.reference, competitors.using_gps),
     )

@@ -11,6 +11,7 @@ from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.evaluation.errors import ErrorFigures, error_figures
 from fleet_slip.evaluation.estimators import ColumnEstimate, Estimate
 from fleet_slip.evaluation.evaluated_drives import EvaluatedDrive, load_drives
+from fleet_slip.evaluation.filters import FilterEstimate
 from fleet_slip.evaluation.stability import CRITERION, find_unstable
 from fleet_slip.grams.job import update_grams
 from fleet_slip.progress import Progress, no_progress
@@ -93,6 +94,8 @@ def _estimates(drive: EvaluatedDrive, estimate: Estimate) -> FloatArray:
     try:
         if isinstance(estimate, ColumnEstimate):
             estimate = estimate.in_car(drive.facts)
+        elif isinstance(estimate, FilterEstimate):
+            estimate = estimate.in_scenario(drive.scenario)
         return estimate(drive.signals)
     except (DataError, QuestionError):
         return np.full(len(drive.time_s), np.nan)

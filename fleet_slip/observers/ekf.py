@@ -1,13 +1,17 @@
 """An extended Kalman filter on the nonlinear single-track model, without GPS.
 
 After Best, Gordon and Dixon, "An extended adaptive Kalman filter for real-time state estimation of
-vehicle handling dynamics", Vehicle System Dynamics 34 (2000), without the adaptation of the tyres.
-The state is x = [vx, vy, r]; ax and the steering angle δ drive it, and wheel speed, yaw rate and ay
+vehicle handling dynamics", Vehicle System Dynamics 34 (2000); instead of adapting the tyres it
+follows the wheels' loads (`axle_forces`). The state is x = [vx, vy, r, b], with b the bias of the
+lateral accelerometer; ax and the steering angle δ drive it, and wheel speed, yaw rate and ay
 correct it. With the lateral forces F of the axles:
 
     v̇x = ax + r vy                         z1 = vx
     v̇y = (Ff cos δ + Fr)/m − r vx          z2 = r
-    ṙ  = (a Ff cos δ − b Fr)/I             z3 = (Ff cos δ + Fr)/m
+    ṙ  = (a Ff cos δ − b Fr)/I             z3 = (Ff cos δ + Fr)/m + b
+    ḃ  = 0
+
+The gyroscope's bias is a state of the yaw rate filter (`yaw_rate`) before it.
 """
 
 from typing import NamedTuple
@@ -20,13 +24,9 @@ from fleet_slip.compiling import kernel
 from fleet_slip.config import Config
 from fleet_slip.observers import yaw_rate
 from fleet_slip.observers.angle import sideslip_angle
+from fleet_slip.observers.axle_forces import Axles, Chassis, loaded_axles, rates
 from fleet_slip.observers.signals import STEP_S, DriveSignals, hold_last
-from fleet_slip.observers.single_track import (
-    SLOWEST_MPS,
-    SingleTrack,
-    measured_speed_mps,
-    measured_steer_rad,
-)
+from fleet_slip.observers.single_track import measured_speed_mps, measured_steer_rad
 from fleet_slip.observers.yaw_rate import YawRateNoise
 from fleet_slip.vehicle.parameters import VehicleParameters
 
@@ -46,8 +46,13 @@ class EkfNoise(Config):
     wheel_speed_std_mps: FiniteFloat = Field(default=0.005, gt=0)
     yaw_rate_std_rad_s: FiniteFloat = Field(default=0.01, gt=0)
     ay_std_mps2: FiniteFloat = Field(default=0.1, gt=0)
-    stiffness_factor: FiniteFloat = Field(default=1.0, ge=0.5, le=1.5)
-    """Cornering stiffness over that at rest: load transfer in corners softens an axle."""
+    ay_bias_std_mps2: FiniteFloat = Field(default=0.15, ge=0)
+    """Of the accelerometer's bias before the drive; 0 leaves it out of the state."""
+    stiffness_front_factor: FiniteFloat = Field(default=1.0, ge=0.5, le=1.5)
+    """Cornering stiffness of the front axle over what the car's parameters say."""
+    stiffness_rear_factor: FiniteFloat = Field(default=1.0, ge=0.5, le=1.5)
+    adhesion: FiniteFloat = Field(default=1.0, gt=0)
+    """What the filter is told of the road."""
     yaw_rate: YawRateNoise = YawRateNoise()
 
 
@@ -57,23 +62,17 @@ TUNABLE = (
     "wheel_speed_std_mps",
     "yaw_rate_std_rad_s",
     "ay_std_mps2",
-    "stiffness_factor",
+    "ay_bias_std_mps2",
+    "stiffness_front_factor",
+    "stiffness_rear_factor",
     *yaw_rate.TUNABLE,
 )
 """The parameters that `tuning.tune` should search."""
 
 
-class Model(NamedTuple):
-    """The single-track model and the filter's variances, for compiled code."""
+class Variances(NamedTuple):
+    """Variances of a step of the state, and of the measurements."""
 
-    mass: float
-    inertia: float
-    front: float
-    rear: float
-    stiffness_front: float
-    stiffness_rear: float
-    grip_front: float
-    grip_rear: float
     q_vx: float
     q_vy: float
     q_r: float
@@ -83,94 +82,30 @@ class Model(NamedTuple):
 
 
 class Belief(NamedTuple):
-    """Mean of [vx, vy, r] and its covariance, upper triangle."""
+    """Mean of [vx, vy, r, b] and its covariance, upper triangle."""
 
     vx: float
     vy: float
     r: float
+    b: float
     p00: float
     p01: float
     p02: float
+    p03: float
     p11: float
     p12: float
+    p13: float
     p22: float
-
-
-class LateralForce(NamedTuple):
-    """Lateral force of an axle across the car, and its derivatives."""
-
-    force: float
-    per_vx: float
-    per_vy: float
-    per_r: float
+    p23: float
+    p33: float
 
 
 @kernel
-def lateral_force(
-    x: Belief, steer: float, lever: float, stiffness: float, grip: float
-) -> LateralForce:
-    """Return the force of an axle at the distance `lever` before the centre of gravity.
-
-    With slip σ = −across / along of the axle's velocity in the wheel's frame, the brush tyre of
-    Fiala gives, up to the slip where all of it slides,
-
-        F = C σ − C² |σ| σ / (3 G) + C³ σ³ / (27 G²),   dF/dσ = C (1 − C |σ| / (3 G))²
-
-    and beyond it ±G (Pacejka, "Tire and Vehicle Dynamics" (2012), section 3.2.1).
-    """
-    cosine, sine = np.cos(steer), np.sin(steer)
-    side = x.vy + lever * x.r
-    across = cosine * side - sine * x.vx
-    along = cosine * x.vx + sine * side
-    rolling = max(along, SLOWEST_MPS)
-    turning = 1.0 if along > SLOWEST_MPS else 0.0
-    slip = -across / rolling
-    use = stiffness * slip / (3.0 * grip)
-    stuck = max(1.0 - abs(use), 0.0)
-    force = 3.0 * grip * use * (1.0 - abs(use) + use * use / 3.0)
-    if stuck == 0.0:
-        force = grip if slip > 0.0 else -grip
-    per_slip = stiffness * stuck * stuck / rolling
-    # dσ = −(d across + σ d along) / rolling
-    per_side = -per_slip * (cosine + turning * slip * sine) * cosine
-    per_vx = -per_slip * (-sine + turning * slip * cosine) * cosine
-    return LateralForce(cosine * force, per_vx, per_side, lever * per_side)
-
-
-class Rates(NamedTuple):
-    """Lateral acceleration and yaw acceleration, with their derivatives."""
-
-    ay: float
-    ay_vx: float
-    ay_vy: float
-    ay_r: float
-    yaw: float
-    yaw_vx: float
-    yaw_vy: float
-    yaw_r: float
-
-
-@kernel
-def rates(x: Belief, steer: float, m: Model) -> Rates:
-    """Return (Ff cos δ + Fr)/m and (a Ff cos δ − b Fr)/I, linearised."""
-    f = lateral_force(x, steer, m.front, m.stiffness_front, m.grip_front)
-    r = lateral_force(x, 0.0, -m.rear, m.stiffness_rear, m.grip_rear)
-    return Rates(
-        (f.force + r.force) / m.mass,
-        (f.per_vx + r.per_vx) / m.mass,
-        (f.per_vy + r.per_vy) / m.mass,
-        (f.per_r + r.per_r) / m.mass,
-        (m.front * f.force - m.rear * r.force) / m.inertia,
-        (m.front * f.per_vx - m.rear * r.per_vx) / m.inertia,
-        (m.front * f.per_vy - m.rear * r.per_vy) / m.inertia,
-        (m.front * f.per_r - m.rear * r.per_r) / m.inertia,
-    )
-
-
-@kernel
-def predict(x: Belief, ax: float, steer: float, dt: float, m: Model) -> Belief:
+def predict(
+    x: Belief, ax: float, steer: float, dt: float, axles: Axles, c: Chassis, v: Variances
+) -> Belief:
     """Return the belief one step later: x ← x + Δt f(x), P ← F P Fᵀ + Q, F = I + Δt ∂f/∂x."""
-    d = rates(x, steer, m)
+    d = rates(x.vx, x.vy, x.r, steer, axles, c)
     f00, f01, f02 = 1.0, dt * x.r, dt * x.vy
     f10, f11, f12 = dt * (d.ay_vx - x.r), 1.0 + dt * d.ay_vy, dt * (d.ay_r - x.vx)
     f20, f21, f22 = dt * d.yaw_vx, dt * d.yaw_vy, 1.0 + dt * d.yaw_r
@@ -187,55 +122,77 @@ def predict(x: Belief, ax: float, steer: float, dt: float, m: Model) -> Belief:
         x.vx + dt * (ax + x.r * x.vy),
         x.vy + dt * (d.ay - x.r * x.vx),
         x.r + dt * d.yaw,
-        a00 * f00 + a01 * f01 + a02 * f02 + m.q_vx,
+        x.b,
+        a00 * f00 + a01 * f01 + a02 * f02 + v.q_vx,
         a00 * f10 + a01 * f11 + a02 * f12,
         a00 * f20 + a01 * f21 + a02 * f22,
-        a10 * f10 + a11 * f11 + a12 * f12 + m.q_vy,
+        f00 * x.p03 + f01 * x.p13 + f02 * x.p23,
+        a10 * f10 + a11 * f11 + a12 * f12 + v.q_vy,
         a10 * f20 + a11 * f21 + a12 * f22,
-        a20 * f20 + a21 * f21 + a22 * f22 + m.q_r,
+        f10 * x.p03 + f11 * x.p13 + f12 * x.p23,
+        a20 * f20 + a21 * f21 + a22 * f22 + v.q_r,
+        f20 * x.p03 + f21 * x.p13 + f22 * x.p23,
+        x.p33,
     )
 
 
 @kernel
 def condition(
-    x: Belief, h0: float, h1: float, h2: float, innovation: float, variance: float
+    x: Belief, h: tuple[float, float, float, float], innovation: float, variance: float
 ) -> Belief:
-    """Return the belief given one measurement with the row H = [h0, h1, h2], in Joseph form.
+    """Return the belief given one measurement with the row H, in Joseph form.
 
     K = P Hᵀ / (H P Hᵀ + R). With u = P Hᵀ, Joseph's (I − K H) P (I − K H)ᵀ + K R Kᵀ is
     P − K uᵀ + (K R − (u − K H u)) Kᵀ, whose last term is zero but for rounding.
     """
-    u0 = x.p00 * h0 + x.p01 * h1 + x.p02 * h2
-    u1 = x.p01 * h0 + x.p11 * h1 + x.p12 * h2
-    u2 = x.p02 * h0 + x.p12 * h1 + x.p22 * h2
-    known = h0 * u0 + h1 * u1 + h2 * u2
-    k0, k1, k2 = u0 / (known + variance), u1 / (known + variance), u2 / (known + variance)
+    u0 = x.p00 * h[0] + x.p01 * h[1] + x.p02 * h[2] + x.p03 * h[3]
+    u1 = x.p01 * h[0] + x.p11 * h[1] + x.p12 * h[2] + x.p13 * h[3]
+    u2 = x.p02 * h[0] + x.p12 * h[1] + x.p22 * h[2] + x.p23 * h[3]
+    u3 = x.p03 * h[0] + x.p13 * h[1] + x.p23 * h[2] + x.p33 * h[3]
+    known = h[0] * u0 + h[1] * u1 + h[2] * u2 + h[3] * u3
+    whole = known + variance
+    k0, k1, k2, k3 = u0 / whole, u1 / whole, u2 / whole, u3 / whole
     e0 = k0 * variance - (u0 - k0 * known)
     e1 = k1 * variance - (u1 - k1 * known)
     e2 = k2 * variance - (u2 - k2 * known)
+    e3 = k3 * variance - (u3 - k3 * known)
     return Belief(
         x.vx + k0 * innovation,
         x.vy + k1 * innovation,
         x.r + k2 * innovation,
+        x.b + k3 * innovation,
         x.p00 - k0 * u0 + e0 * k0,
         x.p01 - k0 * u1 + e0 * k1,
         x.p02 - k0 * u2 + e0 * k2,
+        x.p03 - k0 * u3 + e0 * k3,
         x.p11 - k1 * u1 + e1 * k1,
         x.p12 - k1 * u2 + e1 * k2,
+        x.p13 - k1 * u3 + e1 * k3,
         x.p22 - k2 * u2 + e2 * k2,
+        x.p23 - k2 * u3 + e2 * k3,
+        x.p33 - k3 * u3 + e3 * k3,
     )
 
 
 @kernel
-def update(x: Belief, vx: float, yaw_rate: float, ay: float, steer: float, m: Model) -> Belief:
+def update(
+    x: Belief,
+    vx: float,
+    yaw_rate: float,
+    ay: float,
+    steer: float,
+    axles: Axles,
+    c: Chassis,
+    v: Variances,
+) -> Belief:
     """Return the belief given wheel speed, yaw rate and lateral acceleration, one after the other.
 
     Their noises are independent, so that the order does not matter but for the linearisation.
     """
-    x = condition(x, 1.0, 0.0, 0.0, vx - x.vx, m.r_vx)
-    x = condition(x, 0.0, 0.0, 1.0, yaw_rate - x.r, m.r_r)
-    d = rates(x, steer, m)
-    return condition(x, d.ay_vx, d.ay_vy, d.ay_r, ay - d.ay, m.r_ay)
+    x = condition(x, (1.0, 0.0, 0.0, 0.0), vx - x.vx, v.r_vx)
+    x = condition(x, (0.0, 0.0, 1.0, 0.0), yaw_rate - x.r, v.r_r)
+    d = rates(x.vx, x.vy, x.r, steer, axles, c)
+    return condition(x, (d.ay_vx, d.ay_vy, d.ay_r, 1.0), ay - d.ay - x.b, v.r_ay)
 
 
 @kernel
@@ -245,30 +202,28 @@ def _filter(
     yaw_rate: FloatArray,
     vx: FloatArray,
     steer: FloatArray,
+    loaded: FloatArray,
+    model_noise: FloatArray,
     x: Belief,
-    m: Model,
+    c: Chassis,
+    v: Variances,
 ) -> FloatArray:
     means = np.empty((2, len(ax)))
     for k in range(len(ax)):
+        axles = Axles(loaded[0, k], loaded[1, k], loaded[2, k], loaded[3, k])
         if k > 0:
-            x = predict(x, ax[k], steer[k], STEP_S, m)
-        x = update(x, vx[k], yaw_rate[k], ay[k], steer[k], m)
+            noise = model_noise[k]
+            w = Variances(v.q_vx, noise * v.q_vy, noise * v.q_r, v.r_vx, v.r_r, v.r_ay)
+            x = predict(x, ax[k], steer[k], STEP_S, axles, c, w)
+        x = update(x, vx[k], yaw_rate[k], ay[k], steer[k], axles, c, v)
         means[0, k] = x.vx
         means[1, k] = x.vy
     return means
 
 
-def build_model(track: SingleTrack, noise: EkfNoise) -> Model:
-    """Return the model with the variances per step."""
-    return Model(
-        track.mass_kg,
-        track.yaw_inertia_kgm2,
-        track.front_m,
-        track.rear_m,
-        track.stiffness_front_n,
-        track.stiffness_rear_n,
-        track.grip_front_n,
-        track.grip_rear_n,
+def variances(noise: EkfNoise) -> Variances:
+    """Return the variances per step."""
+    return Variances(
         q_vx=(noise.ax_std_mps2 * STEP_S) ** 2,
         q_vy=(noise.lateral_model_std_mps2 * STEP_S) ** 2,
         q_r=(noise.yaw_model_std_rad_s2 * STEP_S) ** 2,
@@ -278,21 +233,54 @@ def build_model(track: SingleTrack, noise: EkfNoise) -> Model:
     )
 
 
-def estimate(drive: DriveSignals, car: VehicleParameters, noise: EkfNoise) -> FloatArray:
+def chassis(car: VehicleParameters) -> Chassis:
+    """Return what the filter knows of a car beside its tyres."""
+    body = car.body
+    return Chassis(body.mass_kg, body.yaw_inertia_kgm2, body.front_axle_m, body.rear_axle_m)
+
+
+def axles_of(
+    car: VehicleParameters, ax_mps2: FloatArray, ay_mps2: FloatArray, noise: EkfNoise
+) -> FloatArray:
+    """Return the axles under the measured accelerations, as stiff as the parameters say.
+
+    The shape is that of `loaded_axles`.
+    """
+    axles = loaded_axles(car, ax_mps2, ay_mps2, noise.adhesion)
+    axles[0] *= noise.stiffness_front_factor
+    axles[1] *= noise.stiffness_rear_factor
+    return axles
+
+
+def estimate(
+    drive: DriveSignals,
+    car: VehicleParameters,
+    noise: EkfNoise,
+    model_noise: FloatArray | None = None,
+) -> FloatArray:
     """Estimate side-slip in rad at every row. Gaps of a sensor are bridged by the value before.
 
+    `model_noise`, shape (rows,), multiplies the variances of the model's errors in each row.
     Raises `DataError` if a sensor is absent.
     """
     turning = yaw_rate.estimate(drive, car, noise.yaw_rate).yaw_rate_rad_s
     vx_mps = measured_speed_mps(drive, car)
+    ax_mps2, ay_mps2 = hold_last(drive.ax_mps2, "ax"), hold_last(drive.ay_mps2, "ay")
     p0, p1, p2 = (std**2 for std in INITIAL_STD)
+    first = Belief(
+        vx_mps[0], 0.0, turning[0], 0.0,
+        p0, 0.0, 0.0, 0.0, p1, 0.0, 0.0, p2, 0.0, noise.ay_bias_std_mps2**2,
+    )  # fmt: skip
     means = _filter(
-        hold_last(drive.ax_mps2, "ax"),
-        hold_last(drive.ay_mps2, "ay"),
+        ax_mps2,
+        ay_mps2,
         turning,
         vx_mps,
         measured_steer_rad(drive),
-        Belief(vx_mps[0], 0.0, turning[0], p0, 0.0, 0.0, p1, 0.0, p2),
-        build_model(SingleTrack.of(car, noise.stiffness_factor), noise),
+        axles_of(car, ax_mps2, ay_mps2, noise),
+        np.ones(len(drive)) if model_noise is None else model_noise,
+        first,
+        chassis(car),
+        variances(noise),
     )
     return sideslip_angle(means[0], means[1])

@@ -28,19 +28,19 @@ LEAST_GAIN = 1e-3
 
 @dataclass(frozen=True)
 class Tuned(Generic[P]):
-    """The best parameters found, and the standard deviation of their error on the drives."""
+    """The best parameters found, and the root mean square of their error on the drives."""
 
     parameters: P
-    error_std_rad: float
+    rmse_rad: float
     evaluations: int
 
 
-def error_std_rad(
+def rmse_rad(
     estimate: Callable[[DriveSignals], FloatArray],
     drives: Sequence[LabelledDrive],
     executor: Executor,
 ) -> float:
-    """Return the standard deviation of estimate − truth over all rows that have both.
+    """Return the root mean square of estimate − truth over all rows that have both.
 
     Raises `DataError` if no row has.
     """
@@ -50,7 +50,7 @@ def error_std_rad(
     error = error[np.isfinite(error)]
     if not len(error):
         raise DataError("no row has both an estimate and a label. Choose other drives.")
-    return float(error.std())
+    return float(np.sqrt(np.mean(error**2)))
 
 
 def tune(
@@ -71,7 +71,7 @@ def tune(
     """
 
     def cost(parameters: P) -> float:
-        return error_std_rad(partial(_bound, estimator, parameters, car), drives, executor)
+        return rmse_rad(partial(_bound, estimator, parameters, car), drives, executor)
 
     best, lowest, evaluations = start, cost(start), 1
     factor = FIRST_FACTOR

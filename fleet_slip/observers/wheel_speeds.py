@@ -15,16 +15,18 @@ from fleet_slip.vehicle.parameters import VehicleParameters
 
 @dataclass(frozen=True)
 class AxleSpeeds:
-    """Velocity along the car of the two wheels of one axle, and their distance."""
+    """Rolling velocity of the two wheels of one axle over cos δ, and their distance."""
 
     left_mps: FloatArray
     right_mps: FloatArray
     track_m: FloatArray | float
+    turned_m: FloatArray | float = 0.0
+    """Mean of tan δ times the axle's distance before the centre of gravity."""
 
     @property
     def vx_mps(self) -> FloatArray:
-        """Longitudinal velocity between the wheels."""
-        return (self.left_mps + self.right_mps) / 2
+        """Longitudinal velocity of the centre of gravity."""
+        return (self.left_mps + self.right_mps) / 2 - self.turned_m * self.yaw_rate_rad_s
 
     @property
     def yaw_rate_rad_s(self) -> FloatArray:
@@ -39,17 +41,18 @@ def undriven_axle(drive: DriveSignals, car: VehicleParameters) -> AxleSpeeds:
 
         R ω / cos δ = vx ∓ t/2 r + tan δ (vy + a r).
 
-    At the rear δ = 0. At the front tan δ differs between left and right by Ackermann's geometry
-    alone; times vy, the difference is neglected.
+    At the rear δ = 0. At the front the wheels travel with the yaw of the car, too: tan δ a r is
+    taken off their mean. tan δ vy, a thousandth of vx, is neglected.
     """
-    radius = car.tyre.rolling_radius_m
+    radius, front = car.tyre.rolling_radius_m, car.body.front_axle_m
     if car.drivetrain.front_drive_share >= 0.5:
         return AxleSpeeds(
             radius * drive.wheel_rl_rad_s, radius * drive.wheel_rr_rad_s, car.body.track_rear_m
         )
+    left, right = np.tan(drive.steer_fl_rad), np.tan(drive.steer_fr_rad)
     return AxleSpeeds(
         radius * drive.wheel_fl_rad_s / np.cos(drive.steer_fl_rad),
         radius * drive.wheel_fr_rad_s / np.cos(drive.steer_fr_rad),
-        car.body.track_front_m
-        + car.body.front_axle_m * (np.tan(drive.steer_fr_rad) - np.tan(drive.steer_fl_rad)),
+        car.body.track_front_m + front * (right - left),
+        front * (left + right) / 2,
     )

@@ -18,7 +18,7 @@ from fleet_slip.evaluation.estimators import (
     published_estimate,
     train_models,
 )
-from fleet_slip.evaluation.filters import FILTERS, bound
+from fleet_slip.evaluation.filters import rebuild
 from fleet_slip.evaluation.runs import EvaluatedScenario, run_all
 from fleet_slip.evaluation.targets import THE_PAPERS_CHOICE
 from fleet_slip.grams.cohort import Cohort, load_cohort
@@ -154,18 +154,13 @@ def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
 def drawn_estimators(evaluated: Evaluated, version: ModelVersion) -> dict[str, Estimate]:
     """Return the estimators that figures show, rebuilt from what the evaluation says of them."""
     car = load_scenario("nominal").car
-    kinds = {one.name: one for one in FILTERS}
     estimators: dict[str, Estimate] = {}
     for name in evaluated.models.values():
         about = evaluated.estimators[name]
         estimators[name] = LinearEstimate(about["intercept"], about["coefficients"])
     for name in DRAWN_FILTERS:
-        kind = kinds[name.removesuffix("_tuned")]
         if name in evaluated.estimators:
-            parameters = type(kind.parameters).model_validate(
-                evaluated.estimators[name]["parameters"]
-            )
-            estimators[name] = bound(kind, parameters, car)
+            estimators[name] = rebuild(name, evaluated.estimators[name], car)
     return estimators | {version.reference: published_estimate(version.manifest)}
 
 

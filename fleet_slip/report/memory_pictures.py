@@ -11,7 +11,7 @@ from fleet_slip.report.memory import Memory, Without
 from fleet_slip.report.picture import Picture
 from fleet_slip.report.text import degrees, listed
 
-FILTER = "ekf_tuned"
+FILTER = "ekf_told_tuned"
 """The best filter: an extended Kalman filter that knows the car."""
 
 LINES = {

@@ -13,7 +13,7 @@ from fleet_slip.cli.main import app
 from fleet_slip.errors import RefusedError
 from fleet_slip.evaluation.estimators import published_estimate
 from fleet_slip.evaluation.evaluated_drives import load_drives
-from fleet_slip.evaluation.filters import FILTERS, bound
+from fleet_slip.evaluation.filters import FILTERS, FilterEstimate
 from fleet_slip.evaluation.results import keep
 from fleet_slip.files.documents import DocumentFolder
 from fleet_slip.files.local_folder import LocalFolder
@@ -155,7 +155,7 @@ def test_a_filter_gives_the_same_estimates_here_as_by_itself(root: Path) -> None
     with connect(root) as database:
         alone = read_drive(database, scenario.drive_id)
     expected = kalman.estimate(alone.signals, scenario.car, kalman.FilterNoise())
-    found = bound(FILTERS[0], FILTERS[0].parameters, scenario.car)(drive.signals)
+    found = FilterEstimate(FILTERS[0], FILTERS[0].parameters, scenario.car)(drive.signals)
     np.testing.assert_array_equal(found, expected)
 
 

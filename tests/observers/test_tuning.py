@@ -13,7 +13,7 @@ from fleet_slip.errors import DataError
 from fleet_slip.observers import ekf, kalman, luenberger, sliding_mode
 from fleet_slip.observers.kalman import FilterNoise
 from fleet_slip.observers.signals import DriveSignals, LabelledDrive
-from fleet_slip.observers.tuning import error_std_rad, tune
+from fleet_slip.observers.tuning import rmse_rad, tune
 from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
 from tests.support.drives import noisy, slalom
 
@@ -55,7 +55,7 @@ def test_finds_the_optimum_of_a_valley_with_a_nested_and_a_bounded_parameter(
     found = tune(valley, Parameters(), ("a", "inner.b"), [labelled(1)], CAR, executor)
     assert found.parameters.a == pytest.approx(3, rel=0.05)
     assert found.parameters.inner.b == pytest.approx(0.2, rel=0.05)
-    assert found.error_std_rad == pytest.approx(0.01, rel=0.1)
+    assert found.rmse_rad == pytest.approx(0.01, rel=0.1)
 
 
 def test_a_parameter_without_effect_stays(executor: Executor) -> None:
@@ -68,13 +68,13 @@ def test_tuning_makes_up_for_wrong_noise_and_never_makes_worse(executor: Executo
     drives = [labelled(seed) for seed in range(3)]
     wrong = FilterNoise(ay_std_mps2=5.0)
     names = ("ay_std_mps2", "gps_vy_std_mps")
-    before = error_std_rad(lambda d: kalman.estimate(d, CAR, wrong), drives, executor)
-    right = error_std_rad(lambda d: kalman.estimate(d, CAR, FilterNoise()), drives, executor)
+    before = rmse_rad(lambda d: kalman.estimate(d, CAR, wrong), drives, executor)
+    right = rmse_rad(lambda d: kalman.estimate(d, CAR, FilterNoise()), drives, executor)
     found = tune(kalman.estimate, wrong, names, drives, CAR, executor)
-    assert found.error_std_rad < 0.5 * before
-    assert found.error_std_rad < 1.05 * right
-    again = error_std_rad(lambda d: kalman.estimate(d, CAR, found.parameters), drives, executor)
-    assert again == found.error_std_rad
+    assert found.rmse_rad < 0.5 * before
+    assert found.rmse_rad < 1.05 * right
+    again = rmse_rad(lambda d: kalman.estimate(d, CAR, found.parameters), drives, executor)
+    assert again == found.rmse_rad
 
 
 @pytest.mark.parametrize(
@@ -99,4 +99,4 @@ def test_drives_without_labels_are_refused(executor: Executor) -> None:
     drive = labelled(1, rows=100)
     unknown = LabelledDrive("x", drive.signals, np.full(100, np.nan))
     with pytest.raises(DataError, match="no row has both"):
-        error_std_rad(lambda d: kalman.estimate(d, CAR, FilterNoise()), [unknown], executor)
+        rmse_rad(lambda d: kalman.estimate(d, CAR, FilterNoise()), [unknown], executor)

@@ -90,14 +90,14 @@ def _std(rival: Mapping[str, Any]) -> float:
 )
 def needs_gps(data: ReportData) -> Verdict:
     """Compare the extended Kalman filter, which has no GPS, with the paper's filter."""
-    ekf, fusion = (known(data, "nominal", name) for name in ("ekf_tuned", "kalman_tuned"))
-    other, ours = known(data, "car_suv", "ekf_tuned"), known(data, "car_suv")
+    ekf, fusion = (known(data, "nominal", name) for name in ("ekf_class_tuned", "kalman_tuned"))
+    other, ours = known(data, "tyres_soft", "ekf_class_tuned"), known(data, "tyres_soft")
     return verdict(
         ekf.std_deg >= fusion.std_deg,
         f"an extended Kalman filter without GPS {degrees(ekf.std_deg)}, the fusion with GPS "
         f"{degrees(fusion.std_deg)}, the regression {degrees(known(data, 'nominal').std_deg)}",
         "A filter on the single-track model with wheel speeds needs no GPS. It needs to know mass, "
-        "geometry and tyres instead: in an SUV, taken for the sedan, it has "
+        "geometry and tyres instead: on softer tyres than it believes it has "
         f"{degrees(other.std_deg)}, the regression {degrees(ours.std_deg)}.",
     )
 
