@@ -1,15 +1,15 @@
 """Commands that evaluate: score on the rows of a cohort, evaluate on test drives."""
 
-from collections.abc import Callable, Sequence
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from fleet_slip.catalogue.sources import ALL_DRIVES
 from fleet_slip.cli.comparing import score_against
+from fleet_slip.cli.evaluation_tables import print_evaluation
 from fleet_slip.cli.models import Reference
 from fleet_slip.cli.options import Cohort
-from fleet_slip.cli.output import Json, print_json, print_table, progress, say, stdout
+from fleet_slip.cli.output import Json, print_json, print_table, progress, say
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.run import DEFAULT_CAMPAIGN
 from fleet_slip.cli.workers import Threads
@@ -35,10 +35,6 @@ Scenarios = Annotated[
         show_default=False,
     ),
 ]
-
-
-PLACES = ("inside", "outside")
-"""Of an unstable section."""
 
 
 def score(
@@ -109,202 +105,3 @@ def evaluate(
     else:
         print_evaluation(content)
         say(f"kept as evaluations/{kept.number}.json")
-
-
-def print_evaluation(content: dict[str, Any]) -> None:
-    """Print the tables of an evaluation."""
-    groups: dict[str, list[str]] = {}
-    for name, about in content["estimators"].items():
-        groups.setdefault(about["group"], []).append(name)
-    for group, names in groups.items():
-        if content["estimators"][names[0]]["kind"] == "regression":
-            title = f"{group}: RMSE, standard deviation and mean of the error in deg, correlation"
-            _print_group(content, title, names, _full_cell, 25)
-        else:
-            _print_group(content, f"{group}: RMSE in deg", names, _rmse_cell, 12)
-    print_ranking(content["ranking"])
-    _print_sections(content)
-    _print_checks(content["checks"])
-    _print_comparisons(content["comparisons"])
-    _print_rivals(content["rivals"])
-
-
-def _print_group(
-    content: dict[str, Any],
-    title: str,
-    names: Sequence[str],
-    cell: Callable[[dict[str, Any]], str],
-    width: int,
-) -> None:
-    """Print a table of estimators; as many tables as the terminal's width makes of it."""
-    at_once = max(1, (stdout().width - NAMES_WIDTH) // (width + 2))
-    for first in range(0, len(names), at_once):
-        shown = names[first : first + at_once]
-        print_table(
-            f"\n{title}{', continued' if first else ''}",
-            ["scenario", "side-slip", *(_heading(name) for name in shown)],
-            [
-                [
-                    one["name"],
-                    f"{one['truth']['sideslip_std_deg']:.2f}",
-                    *(cell(one["results"][name]) for name in shown),
-                ]
-                for one in content["scenarios"]
-            ],
-        )
-
-
-NAMES_WIDTH = 33
-"""Of the columns with a scenario's name and its side-slip."""
-
-
-def _heading(name: str) -> str:
-    """Return an estimator's name in words, which a heading can wrap."""
-    return name.rpartition("/")[2].replace("_", " ")
-
-
-def _full_cell(result: dict[str, Any]) -> str:
-    if result["error_std_deg"] is None:
-        return "no estimate"
-    figures = (
-        f"{result['rmse_deg']:.3f} {result['error_std_deg']:.3f} {result['error_mean_deg']:+.3f}"
-    )
-    if result["correlation"] is not None:
-        figures += f" {result['correlation']:.3f}"
-    covered = result["coverage"]
-    return figures if covered == 1 else f"{figures} ({covered:.0%})"
-
-
-def _rmse_cell(result: dict[str, Any]) -> str:
-    if result["rmse_deg"] is None:
-        return "none"
-    covered = result["coverage"]
-    return f"{result['rmse_deg']:.3f}" + ("" if covered == 1 else f" ({covered:.0%})")
-
-
-def print_ranking(ranking: dict[str, Any]) -> None:
-    """Print who wins each test drive."""
-    least, ours = ranking["least_coverage"], ranking["estimator"]
-    print_table(
-        f"\n{ours} wins {ranking['won']} of {ranking['drives']} test drives by RMSE, and is within "
-        f"{ranking['close_ratio']:g} of the winner on {ranking['close']} others.\nAll compete that "
-        f"need no GPS and estimate {least:.0%} of the rows.",
-        ["scenario", "won by", "RMSE deg", f"{ours} deg", "ratio"],
-        [
-            [
-                one["scenario"],
-                one["winner"] or "",
-                _figure(one["winner_rmse_deg"]),
-                _figure(one["rmse_deg"]),
-                _figure(one["ratio"], 2),
-            ]
-            for one in ranking["standings"]
-        ],
-        left=2,
-    )
-
-
-def _print_sections(content: dict[str, Any]) -> None:
-    for one in content["scenarios"]:
-        for section in one["sections"]:
-            if section["name"] != "unstable":
-                continue
-            where = ", ".join(
-                f"{s['from_s']:.1f}-{s['until_s']:.1f} s" for s in section["stretches"]
-            )
-            print_table(
-                f"\n{one['name']}: unstable at {where}: {section['criterion']}",
-                [
-                    "estimator",
-                    *(f"{name} {at}" for name in ("RMSE", "std", "corr.") for at in PLACES),
-                ],
-                [
-                    [
-                        name,
-                        *(
-                            _figure(result[place]["unstable"][figure])
-                            for figure in ("rmse_deg", "error_std_deg", "correlation")
-                            for place in PLACES
-                        ),
-                    ]
-                    for name, result in one["results"].items()
-                ],
-            )
-
-
-def _figure(value: float | None, digits: int = 3) -> str:
-    return "" if value is None else f"{value:.{digits}f}"
-
-
-def _print_checks(checks: Sequence[dict[str, Any]]) -> None:
-    if not checks:
-        return
-    print_table(
-        "\nwhat the paper's scenarios ask for",
-        ["requirement", "estimator", "found", "limit", ""],
-        [
-            [
-                check["requirement"],
-                check["estimator"],
-                _figure(check["found"], 4),
-                _figure(check["limit"], 4),
-                "" if check["reached"] else "missed",
-            ]
-            for check in checks
-        ],
-        left=2,
-    )
-    for check in checks:
-        if not check["reached"]:
-            stdout().print(
-                f"missed: {check['requirement']}, {check['estimator']}. {check['explanation']}",
-                markup=False,
-            )
-
-
-def _print_comparisons(comparisons: Sequence[dict[str, Any]]) -> None:
-    for fleet in dict.fromkeys(row["fleet"].rpartition("/")[0] for row in comparisons):
-        rows = [row for row in comparisons if row["fleet"].startswith(f"{fleet}/")]
-        errors = {(row["scenario"], row["model"]): row for row in rows}
-        models = list(dict.fromkeys(row["model"] for row in rows))
-        one_car = rows[0]["one_car"].rpartition("/")[0]
-        print_table(
-            f"\nroot mean square error in deg, trained as {one_car} and as {fleet}; * the better",
-            ["scenario", *models],
-            [
-                [name, *(_pair(errors.get((name, model))) for model in models)]
-                for name in dict.fromkeys(row["scenario"] for row in rows)
-            ],
-        )
-
-
-def _pair(row: dict[str, Any] | None) -> str:
-    if row is None:
-        return ""
-    first, second = f"{row['one_car_rmse_deg']:.3f}", f"{row['fleet_rmse_deg']:.3f}"
-    better = row["better"] == row["one_car"]
-    return f"{first}* {second} " if better else f"{first}  {second}*"
-
-
-def _print_rivals(rivals: Sequence[dict[str, Any]]) -> None:
-    if not rivals:
-        return
-    print_table(
-        f"\nlearned rivals, on {number_of(rivals[0]['rows'], 'row')} of the training drives, "
-        "cross-validated",
-        ["rival", "learner", "correlation", "std deg", "training s", "bytes", "one us", "each us"],
-        [
-            [
-                rival["name"],
-                rival["learner"],
-                f"{rival['cross_validated']['correlation']:.4f}",
-                f"{rival['cross_validated']['error_std_deg']:.4f}",
-                f"{rival['training_s']:.2f}",
-                f"{rival['size_bytes']:,}",
-                f"{rival['one_estimate_us']:.1f}",
-                f"{rival['each_of_many_us']:.3f}",
-            ]
-            for rival in rivals
-        ],
-        left=2,
-    )

@@ -8,7 +8,8 @@ from typing import Any, Protocol
 from fleet_slip.arrays import FloatArray
 from fleet_slip.evaluation.comparison import FleetComparison, compare_fleets
 from fleet_slip.evaluation.estimators import Estimate, Signals, TrainedModels, train_models
-from fleet_slip.evaluation.filters import filter_bank
+from fleet_slip.evaluation.filters import FilterEstimate, filter_bank
+from fleet_slip.evaluation.gps_noise import GpsSweep, sweep_gps_noise
 from fleet_slip.evaluation.ranking import Ranking, rank
 from fleet_slip.evaluation.results import document
 from fleet_slip.evaluation.runs import EvaluatedScenario, run_all
@@ -55,6 +56,15 @@ class Competitors:
         """Names of the estimators that need satellite navigation."""
         return frozenset(name for name, one in self.descriptions.items() if one.get("gps"))
 
+    @property
+    def gps_filters(self) -> dict[str, FilterEstimate]:
+        """The filters that need satellite navigation, by name."""
+        return {
+            name: one
+            for name, one in self.estimators.items()
+            if isinstance(one, FilterEstimate) and one.filter.gps
+        }
+
 
 @dataclass(frozen=True)
 class Evaluation:
@@ -65,6 +75,7 @@ class Evaluation:
     checks: tuple[Check, ...]
     comparisons: tuple[FleetComparison, ...]
     ranking: Ranking
+    gps_noise: GpsSweep | None
 
     def as_dict(self) -> dict[str, Any]:
         """Return the evaluation's document."""
@@ -78,6 +89,7 @@ class Evaluation:
             comparisons=[comparison.as_dict() for comparison in self.comparisons],
             rivals=[rival.as_dict() for rival in self.competitors.rivals],
             ranking=self.ranking.as_dict(),
+            gps_noise=self.gps_noise.as_dict() if self.gps_noise else None,
         )
 
 
@@ -135,4 +147,5 @@ def evaluate(
             row for fleet in competitors.fleets for row in compare_fleets(runs, first, fleet)
         ),
         ranking=rank(runs, first.version.reference, competitors.using_gps),
+        gps_noise=sweep_gps_noise(runs, competitors.gps_filters, list(first.estimators())),
     )
