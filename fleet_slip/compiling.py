@@ -28,6 +28,15 @@ IEEE 754 rounds in one way. Division by zero gives an infinity, not an exception
 branch in the loop.
 """
 
+inner_loop = numba.njit(nogil=True, error_model="numpy")
+"""Compiles a loop that compiled code calls, to the same bits as an equation."""
+
+exact_loop = numba.njit(nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
+"""Compiles a loop over integers whose every product and sum is below 2^53 in size.
+
+They are exact in any order, so that the compiler may change the order, and fuse operations.
+"""
+
 
 def kernel(function: Function) -> Function:
     """Compile a function that is called from Python, without the GIL.
@@ -53,7 +62,7 @@ class _KeptCode(FunctionCache):
         self._cache_file = _CheckedFiles(  # type: ignore[no-untyped-call]
             self.cache_path,
             f"{self._impl.filename_base}.checked",
-            self._impl.locator.get_source_stamp(),
+            (self._impl.locator.get_source_stamp(), _sources_stamp(function.__code__.co_filename)),
         )
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
@@ -72,6 +81,19 @@ class _KeptCode(FunctionCache):
             super().save_overload(sig, data)  # type: ignore[no-untyped-call]
         except OSError as error:
             _remark(f"{self.cache_path}: compiled code cannot be kept ({error.strerror})")
+
+
+@functools.cache
+def _sources_stamp(file: str) -> str:
+    """Return a checksum of a source file, of those beside it, and of this one.
+
+    Compiled code has the functions and constants of other files in it; numba looks at its own file
+    alone, and would go on with what is no longer written in the others.
+    """
+    digest = hashlib.sha256()
+    for source in [*sorted(Path(file).parent.glob("*.py")), Path(__file__)]:
+        digest.update(source.read_bytes())
+    return digest.hexdigest()
 
 
 class _DamagedCodeError(Exception):
