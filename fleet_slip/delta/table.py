@@ -21,7 +21,7 @@ from fleet_slip.delta.files import TableFile, active_files, have_same_columns, r
 from fleet_slip.delta.log_check import require_sound_log
 from fleet_slip.delta.schema import require_readable, require_writable
 from fleet_slip.delta.sealing import NOTE, seal_note
-from fleet_slip.errors import ConflictError
+from fleet_slip.errors import ConflictError, StorageError
 from fleet_slip.files.checksums import checksum_in
 from fleet_slip.files.folder import Folder
 from fleet_slip.files.storage_errors import first_line, storage_errors
@@ -75,7 +75,12 @@ class Table:
         self.folder.check(path)
         with storage_errors(f"{self.folder}/{path}"), self.folder.open(path) as file:
             wanted = None if columns is None else list(columns)
-            return pq.read_table(file, columns=wanted, partitioning=None)
+            # Not `read_table`: it imports pyarrow.dataset, and with it pandas if that is installed.
+            with pq.ParquetFile(file, pre_buffer=True) as parquet:
+                rows = parquet.read(columns=wanted)
+        if absent := set(wanted or ()).difference(rows.column_names):
+            raise StorageError(f"{self.folder}/{path}: no column {min(absent)}.")
+        return rows
 
     def read_metadata(self, path: str) -> pq.FileMetaData:
         """Return the footer of one of the table's files."""

@@ -4,25 +4,23 @@ This is the one path to the columns of models with windows: Gram rows, scores, e
 predictions all come through it. It computes what the SQL of `fleet_slip.catalogue.column_sql` says.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.catalogue.arithmetic import Arithmetic, parse
-from fleet_slip.catalogue.columns import Definition, features_behind, limit_of
-from fleet_slip.catalogue.features import FeatureCatalogue
-from fleet_slip.catalogue.signals import COUNT_MAX, catalogue
+from fleet_slip.catalogue.columns import limit_of
 from fleet_slip.errors import DataError
-from fleet_slip.grams.lookback import quotients, quotients_of_whole, scaled
-
-BLOCK_ROWS = 2**12
-"""Rows that are worked on at once, so that they stay in the processor's cache."""
+from fleet_slip.grams.column_plan import ColumnPlan
+from fleet_slip.grams.kernel import BAD_DIVISOR, GAPS, LACKING, run
+from fleet_slip.grams.operations import BLOCK_ROWS, Region
+from fleet_slip.grams.program import padded
 
 _EXACT = 2**53
+_COUNTS = np.iinfo(np.int16)
 
 
 @dataclass(frozen=True)
@@ -47,235 +45,158 @@ class DriveCounts:
         return bool(int(self.ticks[-1]) - int(self.ticks[0]) + 1 == len(self.ticks))
 
 
-@dataclass(frozen=True)
-class RowColumn:
-    """A column of one row: a logged signal, or a feature with its arithmetic and largest count."""
-
-    name: str
-    arithmetic: Arithmetic | None = None
-    limit: int = COUNT_MAX
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """The signals that it is computed from."""
-        return self.arithmetic.inputs if self.arithmetic else (self.name,)
-
-
-@dataclass(frozen=True)
-class ColumnPlan:
-    """What to compute of a drive.
+class Workspace:
+    """The memory that the columns of a plan are computed in, for one drive after the other.
 
     Attributes:
-        names: the columns, in order.
-        rows: the columns of one row that are asked for, looked back on, or tell a row's part.
-        windows: the columns over time.
+        rows: of the drive that was loaded last.
     """
 
-    names: tuple[str, ...]
-    rows: Mapping[str, RowColumn]
-    windows: Mapping[str, Definition]
+    def __init__(self, plan: ColumnPlan) -> None:
+        """Take a plan; memory is taken when a drive comes."""
+        self.plan, self._program = plan, plan.program
+        size = padded(len(plan.names))
+        self._products = np.zeros((size + 1, size))
+        self._room = -1
+        self.rows = 0
 
-    @classmethod
-    def of(
-        cls,
-        names: Sequence[str],
-        features: Mapping[str, RowColumn],
-        windows: Mapping[str, Definition],
-        also: Sequence[str] = (),
-    ) -> "ColumnPlan":
-        """Plan columns by name: of `features`, of `windows`, or else logged signals.
+    def load(self, drive: DriveCounts) -> None:
+        """Take a drive. Raises `DataError` for one that cannot be looked back on."""
+        _require_exact(self.plan, drive)
+        program, self.rows = self._program, len(drive.ticks)
+        if self.rows > self._room:
+            self._room = self.rows
+            self._steps, self._regions = program.steps(self.rows), program.regions(self.rows)
+            self._memory = np.zeros(self._regions[-1, 0])
+        for number, name in enumerate(program.signals):
+            counts = self._part(Region.SIGNAL, number, self.rows)
+            counts[:] = drive.counts[name]
+            if name in drive.present:
+                counts[~drive.present[name]] = np.nan
+        self._part(Region.TICK, 0, self.rows)[:] = drive.ticks
+        for number, fact in enumerate(program.facts):
+            known = fact.number(drive.facts[fact.name])
+            self._part(Region.FACT, number, 1)[:] = np.nan if known is None else known
+        self._flags = np.zeros((2, max(program.slots, program.kinds, 1)), dtype=np.bool_)
+        self._flags[GAPS] = not drive.whole
 
-        `also` are columns of one row that are computed beside them. Raises `DataError` if two of
-        them define the same feature differently.
+    def block(self, first: int) -> tuple[FloatArray, FloatArray]:
+        """Return the columns of the block that was computed last, and what was clipped of each row.
+
+        Columns have shape (columns, rows of the block), NaN where missing; the next block
+        overwrites them.
         """
-        rows: dict[str, RowColumn] = {}
-        for name in (*names, *also):
-            if name not in windows:
-                rows[name] = features.get(name, RowColumn(name))
-        features_behind(windows)
-        for one in windows.values():
-            row = RowColumn(one.of)
-            if one.sql:
-                row = RowColumn(one.of, parse(one.sql), limit_of(one.of_bits))
-            if rows.setdefault(one.of, row) != row:
-                raise DataError(f"the feature {one.of} is defined in two ways.")
-        return cls(tuple(names), rows, dict(windows))
+        place, stride = self._regions[Region.REGISTER]
+        rows, columns = min(BLOCK_ROWS, self.rows - first), len(self.plan.names)
+        registers = self._memory[place : place + columns * stride].reshape(columns, stride)
+        return registers[:, :rows], self._memory[:rows]
 
-    @classmethod
-    def of_set(cls, known: FeatureCatalogue, name: str) -> "ColumnPlan":
-        """Plan the columns of a feature set, the label last."""
-        one = known.feature_set(name)
-        divided_by = [known.regimes[regime].of for regime in one.regimes]
-        features = {
-            f: RowColumn(f, parse(known.features[f].sql), known.features[f].limit)
-            for f in (*one.features, *divided_by)
-            if f in known.features
-        }
-        return cls.of(one.columns, features, known.definitions(name), divided_by)
+    def beside(self, first: int) -> dict[str, FloatArray]:
+        """Return the columns that the plan has beside its own, as `block` does."""
+        place, stride = self._regions[Region.REGISTER]
+        rows, begin = min(BLOCK_ROWS, self.rows - first), padded(len(self.plan.names))
+        parts = (place + (begin + i) * stride for i in range(len(self.plan.also)))
+        found = (self._memory[part : part + rows] for part in parts)
+        return dict(zip(self.plan.also, found, strict=True))
 
-    @property
-    def signals(self) -> tuple[str, ...]:
-        """The logged signals that are needed, in catalogue order."""
-        used = {name for row in self.rows.values() for name in row.inputs}
-        return tuple(name for name in catalogue().signals if name in used)
+    def compute_block(self, first: int) -> None:
+        """Compute the block that begins with a row; blocks are computed in the order of time."""
+        self._run(first, 0, self._products.astype(np.int64))
 
-    @property
-    def facts(self) -> tuple[str, ...]:
-        """The drive columns that are needed."""
-        return tuple(dict.fromkeys(w.fact.name for w in self.windows.values() if w.fact))
+    def add_blocks(self, first: int, exact_rows: int, totals: NDArray[np.int64]) -> "Added":
+        """Compute blocks from a row on and add the complete ones to `totals`; see `kernel.run`.
 
-    @property
-    def limits(self) -> tuple[int, ...]:
-        """The largest size that each column can have."""
-        return tuple(
-            limit_of(self.windows[name].bits)
-            if name in self.windows
-            else self.rows[name].limit + (self.rows[name].arithmetic is None)
-            for name in self.names
+        It stops at a block that lacks a value, which `block` returns.
+        """
+        return self._run(first, exact_rows, totals)
+
+    def totals(self) -> NDArray[np.int64]:
+        """Return zeros for `add_blocks`, shape (columns + 1, columns), padded."""
+        return np.zeros(self._products.shape, dtype=np.int64)
+
+    def _run(self, first: int, exact_rows: int, totals: NDArray[np.int64]) -> "Added":
+        place, stride = self._regions[Region.REGISTER]
+        found = run(
+            self._steps,
+            self._program.ratios,
+            self._memory,
+            self._flags,
+            self.rows,
+            self._regions[Region.TICK, 0],
+            first,
+            len(self.plan.names),
+            place,
+            stride,
+            exact_rows,
+            self._products,
+            totals,
         )
+        following, became, rows, clipped = found
+        if became == BAD_DIVISOR:
+            raise DataError("a feature divides by a count that is not positive.")
+        return Added(following, became == LACKING, rows, clipped)
+
+    def _part(self, region: Region, number: int, size: int) -> FloatArray:
+        begin, stride = self._regions[region]
+        return self._memory[begin + number * stride :][:size]
+
+
+class Added(NamedTuple):
+    """What became of blocks.
+
+    Attributes:
+        following: the first row that is not added.
+        lacks: whether the block that begins there lacks a value.
+        rows: how many were added.
+        clipped: how often a column of theirs was clipped.
+    """
+
+    following: int
+    lacks: bool
+    rows: int
+    clipped: int
+
+
+def _require_exact(plan: ColumnPlan, drive: DriveCounts) -> None:
+    """Raise `DataError` for a drive of which not every sum would be exact."""
+    rows = len(drive.ticks)
+    if (np.diff(drive.ticks) <= 0).any():
+        raise DataError(
+            "the ticks of a drive do not rise: it cannot be looked back on. Run: fleet-slip verify"
+        )
+    for one in plan.windows.values():
+        summed = one.over not in {None, "lag"}
+        if summed and 2 * (rows + 1) * limit_of(one.of_bits) * one.ratio.numerator >= _EXACT:
+            raise DataError(f"the drive has {rows:,} rows: too many to look back on.")
+    for name in plan.program.signals:
+        counts = drive.counts[name]
+        if counts.dtype == np.int16 or not rows:
+            continue
+        if not _COUNTS.min <= counts.min() <= counts.max() <= _COUNTS.max:
+            raise DataError(f"{name} has counts beyond 16 bits.")
 
 
 class DriveColumns:
-    """The columns of one drive; `fill` gives those of some of its rows."""
+    """The columns of one drive.
+
+    `clipped`, shape (rows,), is how many columns of each row `compute` has clipped.
+    """
 
     def __init__(self, plan: ColumnPlan, drive: DriveCounts) -> None:
-        """Compute the columns of single rows, and their running sums. Raises `DataError`."""
-        if (np.diff(drive.ticks) <= 0).any():
-            raise DataError(
-                "the ticks of a drive do not rise: it cannot be looked back on. Run: fleet-slip "
-                "verify"
-            )
-        self.plan, self.drive = plan, drive
-        self.rows = len(drive.ticks)
-        self.clipped = np.zeros(self.rows)
-        self._values = self._row_values()
-        self._whole = drive.whole
-        self._sums: dict[str, FloatArray] = {}
-        self._counts: dict[str, FloatArray] = {}
-        self._begin: dict[int, NDArray[np.int64]] = {}
-        for one in plan.windows.values():
-            self._prepare(one)
-
-    def fill(self, first: int, out: FloatArray) -> None:
-        """Write the columns of the rows from `first`, shape (columns, block); missing is NaN."""
-        last = first + out.shape[1]
-        for name, row in zip(self.plan.names, out, strict=True):
-            if name in self.plan.windows:
-                self._look_back(self.plan.windows[name], first, row)
-            else:
-                row[:] = self._values[name][first:last]
-
-    @property
-    def rows_now(self) -> Mapping[str, FloatArray]:
-        """The columns of single rows, shape (rows,) each; missing is NaN."""
-        return self._values
+        """Take a drive. Raises `DataError` for one that cannot be looked back on."""
+        self._workspace = Workspace(plan)
+        self._workspace.load(drive)
+        self.clipped = np.zeros(len(drive.ticks))
 
     def compute(self) -> FloatArray:
-        """Return all columns, shape (columns, rows); missing is NaN."""
-        out = np.empty((len(self.plan.names), self.rows))
-        self.fill(0, out)
+        """Return all columns, shape (columns, rows), NaN where missing; count what was clipped.
+
+        Raises `DataError` if a feature divides by a count that is not positive.
+        """
+        out = np.empty((len(self._workspace.plan.names), len(self.clipped)))
+        for first in range(0, len(self.clipped), BLOCK_ROWS):
+            self._workspace.compute_block(first)
+            block, clipped = self._workspace.block(first)
+            out[:, first : first + block.shape[1]] = block
+            self.clipped[first : first + block.shape[1]] = clipped
         return out
-
-    def _row_values(self) -> dict[str, FloatArray]:
-        """Return the columns of single rows, NaN where missing."""
-        found = {name: np.empty(self.rows) for name in self.plan.rows}
-        for first in range(0, self.rows, BLOCK_ROWS):
-            part = slice(first, min(first + BLOCK_ROWS, self.rows))
-            known: dict[Any, Any] = {}
-            for name, row in self.plan.rows.items():
-                found[name][part] = self._block_of_row(row, part, known)
-        return found
-
-    def _block_of_row(self, row: RowColumn, part: slice, known: dict[Any, Any]) -> FloatArray:
-        drive = self.drive
-        there: list[BoolArray] = [drive.present[n][part] for n in row.inputs if n in drive.present]
-        if row.arithmetic is None:
-            values = drive.counts[row.name][part].astype(np.float64)
-        else:
-            inputs = {n: self._input(n, part, row.arithmetic.dtype, known) for n in row.inputs}
-            counts, chosen = row.arithmetic(inputs, known)
-            if chosen is not None:
-                there.append(chosen)
-            values = np.clip(counts, -row.limit, row.limit).astype(np.float64, copy=False)
-            if row.arithmetic.bound > row.limit and (outside := counts != values).any():
-                self.clipped[part] += np.logical_and.reduce([outside, *there])
-        if there:
-            missing = ~np.logical_and.reduce(there)
-            if missing.any():
-                values[missing] = np.nan
-        return values
-
-    def _input(self, name: str, part: slice, kind: type, known: dict[Any, Any]) -> NDArray[Any]:
-        """Return a signal's counts of some rows, zero where missing."""
-        if (name, kind) not in known:
-            counts: NDArray[Any] = self.drive.counts[name][part].astype(kind)
-            if name in self.drive.present:
-                counts[~self.drive.present[name][part]] = 0
-            known[name, kind] = counts
-        found: NDArray[Any] = known[name, kind]
-        return found
-
-    def _prepare(self, one: Definition) -> None:
-        if one.over is None or one.over == "lag":
-            return
-        if 2 * (self.rows + 1) * limit_of(one.of_bits) * one.ratio.numerator >= _EXACT:
-            raise DataError(f"the drive has {self.rows:,} rows: too many to look back on.")
-        values = self._values[one.of]
-        if one.of not in self._sums:
-            missing = np.isnan(values)
-            self._sums[one.of] = _before(np.where(missing, 0.0, values))
-            if missing.any() or not self._whole:
-                self._counts[one.of] = _before((~missing).astype(np.float64))
-        if one.of in self._counts and one.ticks not in self._begin:
-            self._begin[one.ticks] = self._begins(one.ticks)
-
-    def _begins(self, ticks: int) -> NDArray[np.int64]:
-        """Return the first row of the window of each row; 0 ticks are all since the start."""
-        if not ticks:
-            return np.zeros(self.rows, dtype=np.int64)
-        now = self.drive.ticks.astype(np.int64)
-        return np.searchsorted(now, now - ticks, side="right").astype(np.int64)
-
-    def _look_back(self, one: Definition, first: int, out: FloatArray) -> None:
-        clipped = self.clipped[first : first + len(out)]
-        numerator, denominator = float(one.ratio.numerator), float(one.ratio.denominator)
-        limit = float(limit_of(one.bits))
-        if one.over is None:
-            values = self._values[one.of][first : first + len(out)]
-            scaled(values, numerator, denominator, limit, out, clipped)
-        elif one.over == "lag":
-            values = self._ago(self._values[one.of], one.ticks, first, len(out))
-            scaled(values, numerator, denominator, limit, out, clipped)
-        else:
-            fixed, each = (denominator, 0.0) if one.over == "sum" else (0.0, denominator)
-            terms = (numerator, fixed, each, limit, out, clipped)
-            sums, counts = self._sums[one.of], self._counts.get(one.of)
-            if counts is None:
-                quotients_of_whole(sums, first, one.ticks or self.rows + 1, *terms)
-            else:
-                quotients(sums, counts, self._begin[one.ticks], first, *terms)
-        if one.fact:
-            number = one.fact.number(self.drive.facts[one.fact.name])
-            product = out * (np.nan if number is None else float(number))
-            ratio = one.fact.ratio
-            scaled(product, float(ratio.numerator), float(ratio.denominator), limit, out, clipped)
-
-    def _ago(self, values: FloatArray, ticks: int, first: int, rows: int) -> FloatArray:
-        """Return the values so many ticks before each of some rows; NaN where there is none."""
-        now = self.drive.ticks[first : first + rows].astype(np.int64)
-        if self._whole:
-            at = np.arange(first, first + rows) - ticks
-            there = at >= 0
-        else:
-            every = self.drive.ticks.astype(np.int64)
-            at = np.searchsorted(every, now - ticks)
-            there = every[at] == now - ticks
-        return np.where(there, values[np.where(there, at, 0)], np.nan)
-
-
-def _before(values: FloatArray) -> FloatArray:
-    """Return the sum of the values before each row and of all, shape (rows + 1,)."""
-    sums = np.empty(len(values) + 1)
-    sums[0] = 0.0
-    np.cumsum(values, out=sums[1:])
-    return sums

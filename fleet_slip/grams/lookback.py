@@ -1,62 +1,83 @@
-"""Compiled loops of windows over one drive: running sums, each quotient rounded and clipped.
+"""Compiled loops of windows over the rows of a block: running sums, quotients, values of before.
 
-Values and sums are integers below 2^53 in binary64, so that additions are exact. A quotient x / y
-of such integers, rounded once by IEEE 754 and then down, is the exact quotient rounded down: where
-it is no integer it is at least 1 / y away from one, and the rounding error is smaller.
+Sums, counts, values, begins and ticks are of all rows of a drive; sums and counts are those of the
+rows before each, so that they have one more. Sums are integers below 2^53 in binary64, which are
+added exactly.
 """
 
 from typing import Any
 
 import numpy as np
 
-from fleet_slip.compiling import equation, kernel
+from fleet_slip.compiling import inner_loop
+from fleet_slip.grams.operations import EACH, FIXED, LIMIT, NUMERATOR
+from fleet_slip.grams.rounding import clip, nearest
 
 
-@equation
-def nearest(value: float, numerator: float, divisor: float) -> Any:
-    """Return value * numerator / divisor to the nearest integer, halves away from zero.
+@inner_loop
+def add_up(
+    memory: Any, values: int, sums: int, counts: int, first: int, size: int, gaps: Any
+) -> Any:
+    """Write running sums of a block's values; return whether the drive has had gaps up to here.
 
-    All are integers, the divisor positive, and 2 |value| numerator + divisor below 2^53.
+    A drive with gaps, which are missing ticks or values, gets counts of its values, too.
     """
-    size = np.floor((2.0 * abs(value) * numerator + divisor) / (2.0 * divisor))
-    return -size if value < 0.0 else size
+    a, out = memory[values : values + size], memory[sums + first : sums + first + size + 1]
+    count = memory[counts : counts + first + size + 1]
+    total = out[0] if first else 0.0
+    out[0] = total
+    if not gaps:
+        for i in range(size):
+            total += a[i]
+            out[i + 1] = total
+        if not np.isnan(total):
+            return False
+        total = out[0]
+        for i in range(first):
+            count[i] = i
+    present = float(first) if not gaps else (count[first] if first else 0.0)
+    count[first] = present
+    for i in range(size):
+        if not np.isnan(a[i]):
+            total += a[i]
+            present += 1.0
+        out[i + 1], count[first + i + 1] = total, present
+    return True
 
 
-@equation
-def clip(value: float, limit: float) -> float:
-    """Return a value clipped to +-limit."""
-    return min(max(value, -limit), limit)
-
-
-@kernel
-def quotients_of_whole(
-    sums: Any,
-    first: int,
-    ticks: int,
-    numerator: float,
-    fixed: float,
-    each: float,
-    limit: float,
-    out: Any,
-    clipped: Any,
+@inner_loop
+def divide_sums(
+    memory: Any, places: Any, first: int, size: int, ticks: int, ratio: Any, gaps: Any
 ) -> None:
-    """Write the quotients of the last `ticks` rows of a drive without holes or missing values.
+    """Write the rounded quotients of a window, clipped; count what is clipped in the first rows.
 
-    `sums` (rows + 1,) are those of the values before each row; `out` and `clipped` (block,) are of
-    the rows from `first`. A sum is divided by fixed + each * number of rows.
+    `places` are where what is written, the sums, the counts, the begins and the values begin.
+    0 ticks are all rows since the start. A row without a value of its own gets NaN. See
+    `operations` for the ratio.
     """
-    begins = min(max(ticks - 1 - first, 0), len(out))
-    for i in range(begins):
-        size = first + i + 1
-        value = nearest(sums[size], numerator, fixed + each * size)
+    at, of_sums, of_counts, of_begins, of_values = places
+    out, clipped = memory[at : at + size], memory[0:size]
+    numerator, fixed, each, limit = ratio[NUMERATOR], ratio[FIXED], ratio[EACH], ratio[LIMIT]
+    sums, counts = memory[of_sums:], memory[of_counts:]
+    begins, values = memory[of_begins + first :], memory[of_values : of_values + size]
+    # The rows before `single` are divided one by one, the others by the same number.
+    single = size
+    if not gaps and ticks:
+        single = min(max(ticks - 1 - first, 0), size)
+    for i in range(single):
+        t = first + i
+        begin = int(begins[i]) if gaps else (max(t + 1 - ticks, 0) if ticks else 0)
+        count = counts[t + 1] - counts[begin] if gaps else float(t + 1 - begin)
+        divisor = fixed + each * count
+        value = nearest(sums[t + 1] - sums[begin], numerator, divisor)
+        if np.isnan(values[i]):
+            value = np.nan
         clipped[i] += 1.0 if abs(value) > limit else 0.0
         out[i] = clip(value, limit)
     # Slices of one length and a count of integers: then the loop is vectorised.
-    rows = len(out) - begins
-    until = first + begins + 1
+    rows, until = size - single, first + single + 1
     newest, oldest = sums[until : until + rows], sums[until - ticks : until - ticks + rows]
-    written = out[begins:]
-    divisor = fixed + each * ticks
+    written, divisor = out[single:], fixed + each * ticks
     outside = 0
     for i in range(rows):
         value = nearest(newest[i] - oldest[i], numerator, divisor)
@@ -65,46 +86,31 @@ def quotients_of_whole(
     if outside:
         for i in range(rows):
             value = nearest(newest[i] - oldest[i], numerator, divisor)
-            clipped[begins + i] += 1.0 if abs(value) > limit else 0.0
+            clipped[single + i] += 1.0 if abs(value) > limit else 0.0
 
 
-@kernel
-def quotients(
-    sums: Any,
-    counts: Any,
-    begin: Any,
-    first: int,
-    numerator: float,
-    fixed: float,
-    each: float,
-    limit: float,
-    out: Any,
-    clipped: Any,
-) -> None:
-    """Write the same of any drive: the values of the rows begin[t] to t.
+@inner_loop
+def values_ago(memory: Any, places: Any, first: int, size: int, ticks: int) -> None:
+    """Write the values of so many ticks before; NaN where that tick was not logged.
 
-    `counts` (rows + 1,) is how many values there are before each row. A row without a value of its
-    own gets NaN.
+    `places` are where what is written, the values, the ticks and the begins begin. A row's window
+    begins at the first row that is not earlier than that.
     """
-    for t in range(first, first + len(out)):
-        if counts[t + 1] == counts[t]:
-            out[t - first] = np.nan
-            continue
-        divisor = fixed + each * (counts[t + 1] - counts[begin[t]])
-        value = nearest(sums[t + 1] - sums[begin[t]], numerator, divisor)
-        clipped[t - first] += 1.0 if abs(value) > limit else 0.0
-        out[t - first] = clip(value, limit)
+    at, of_values, of_ticks, of_begins = places
+    for i in range(size):
+        begin = int(memory[of_begins + first + i])
+        there = memory[of_ticks + begin] == memory[of_ticks + first + i] - ticks
+        memory[at + i] = memory[of_values + begin] if there else np.nan
 
 
-@kernel
-def scaled(
-    values: Any, numerator: float, denominator: float, limit: float, out: Any, clipped: Any
-) -> None:
-    """Write values times a ratio, rounded and clipped; NaN stays. All have shape (block,)."""
-    for t in range(len(out)):
-        if np.isnan(values[t]):
-            out[t] = np.nan
-            continue
-        value = nearest(values[t], numerator, denominator)
-        clipped[t] += 1.0 if abs(value) > limit else 0.0
-        out[t] = clip(value, limit)
+@inner_loop
+def find_begins(memory: Any, of_ticks: int, rows: int, ticks: int, begins: int) -> None:
+    """Write the first row of the last `ticks` ticks of each row; 0 ticks are all since the start.
+
+    Ticks rise.
+    """
+    at = 0
+    for t in range(rows):
+        while ticks and memory[of_ticks + at] <= memory[of_ticks + t] - ticks:
+            at += 1
+        memory[begins + t] = at

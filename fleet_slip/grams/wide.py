@@ -1,8 +1,8 @@
 """Gram rows of feature sets with windows, from the columns of log files: what SQL says, faster.
 
-Each drive is gone through once in the order of time. Blocks of its columns, integers below 2^19 in
-binary64, are multiplied by the BLAS; every product and every sum in a block is an integer below
-2^53, so that it is exact in whatever order the BLAS adds. Sums of blocks are 64-bit integers.
+Each drive is gone through once in the order of time. Blocks of its columns are integers below 2^19
+in binary64; every product and every sum of so many rows is an integer below 2^53, so that it is
+exact in whatever order it is added. Sums of blocks are 64-bit integers.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,13 +18,10 @@ from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.catalogue.features import features
 from fleet_slip.delta import TableFile
 from fleet_slip.errors import DataError, StorageError
-from fleet_slip.grams.columns import (
-    BLOCK_ROWS,
-    ColumnPlan,
-    DriveColumns,
-    DriveCounts,
-)
+from fleet_slip.grams.column_plan import ColumnPlan
+from fleet_slip.grams.columns import DriveCounts, Workspace
 from fleet_slip.grams.drive_rows import LoggedDrive, read_drives
+from fleet_slip.grams.operations import BLOCK_ROWS
 from fleet_slip.grams.parts import UNKNOWN, Parts
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -39,6 +36,7 @@ def wide_grams(warehouse: Warehouse, files: Sequence[TableFile], feature_set: st
     `StorageError` for one whose sums need more than 64 bits.
     """
     plan = ColumnPlan.of_set(features(), feature_set)
+    workspace = Workspace(plan)
     parts = Parts.of_set(features(), features().feature_set(feature_set))
     identity = features().identity(feature_set)
     columns: dict[str, list[Any]] = {name: [] for name in warehouse.grams.schema.names}
@@ -48,7 +46,7 @@ def wide_grams(warehouse: Warehouse, files: Sequence[TableFile], feature_set: st
             for drive in sorted(read_drives(warehouse, file, plan), key=lambda one: one.drive_id):
                 _append_rows(
                     columns,
-                    plan,
+                    workspace,
                     parts,
                     drive,
                     {"feature_set": identity, "file": file.path, "day": file.day},
@@ -58,14 +56,15 @@ def wide_grams(warehouse: Warehouse, files: Sequence[TableFile], feature_set: st
 
 def _append_rows(
     columns: dict[str, list[Any]],
-    plan: ColumnPlan,
+    workspace: Workspace,
     parts: Parts,
     drive: LoggedDrive,
     known: Mapping[str, Any],
 ) -> None:
+    plan = workspace.plan
     where = f"{known['file']}: drive {drive.drive_id}"
     try:
-        found = drive_sums(plan, parts, drive.counts)
+        found = drive_sums(workspace, parts, drive.counts)
     except DataError as error:
         raise DataError(f"{where}: {error}") from None
     for absent, part in sorted(found, key=_last_if_unknown):
@@ -101,12 +100,18 @@ class DriveSums:
         self.sums = np.zeros(self.size, dtype=np.int64)
         self.products = np.zeros((self.size, self.size), dtype=np.int64)
 
-    def add(self, block: FloatArray, sums: FloatArray, clipped: FloatArray) -> None:
-        """Add complete rows, shape (columns, rows), their sums, and what was clipped in each."""
+    def add(self, block: FloatArray, clipped: FloatArray) -> None:
+        """Add complete rows, shape (columns, rows), and what was clipped in each."""
         self.n += block.shape[1]
         self.clipped += int(clipped.sum())
-        self.sums += sums.astype(np.int64)
+        self.sums += block.sum(axis=1).astype(np.int64)
         self.products += (block @ block.T).astype(np.int64)
+
+    def add_totals(self, totals: NDArray[np.int64]) -> None:
+        """Add what `Workspace.add_blocks` has added up: a lower triangle, and sums."""
+        lower = np.tril(totals[: self.size, : self.size])
+        self.products += lower + np.tril(lower, -1).T
+        self.sums += totals[-1, : self.size]
 
 
 Kind = tuple[int, int]
@@ -119,33 +124,51 @@ def _last_if_unknown(kind: Kind) -> tuple[int, bool, int]:
     return absent, part == UNKNOWN, part
 
 
-def drive_sums(plan: ColumnPlan, parts: Parts, counts: DriveCounts) -> dict[Kind, DriveSums]:
+def drive_sums(workspace: Workspace, parts: Parts, counts: DriveCounts) -> dict[Kind, DriveSums]:
     """Return the sums of a drive's rows, by which columns they lack and by part.
 
     Raises `DataError` for a drive that cannot be looked back on, and `StorageError` if sums of
     products could need more than 64 bits.
     """
-    columns = DriveColumns(plan, counts)
+    plan, total = workspace.plan, len(counts.ticks)
     largest = max(plan.limits)
-    if BLOCK_ROWS * largest**2 >= _EXACT or columns.rows * largest**2 >= _INT64:
-        raise StorageError(f"the drive has {columns.rows:,} rows: too many for 64-bit sums.")
-    numbers = parts.numbers(counts.ticks, columns.rows_now) if parts else None
-    found: dict[Kind, DriveSums] = {}
-    for first in range(0, columns.rows, BLOCK_ROWS):
-        last = min(first + BLOCK_ROWS, columns.rows)
-        block = np.empty((len(plan.names), last - first))
-        columns.fill(first, block)
-        clipped = columns.clipped[first:last]
-        sums = block.sum(axis=1)
-        if numbers is None and not np.isnan(sums).any():
-            found.setdefault((0, 0), DriveSums(len(block))).add(block, sums, clipped)
-            continue
-        for (absent, part), rows in _kinds(block, None if numbers is None else numbers[first:last]):
-            has = [i for i in range(len(block)) if not absent >> i & 1]
-            few = block[np.ix_(np.array(has, dtype=np.int64), rows)]
-            kept = found.setdefault((absent, part), DriveSums(len(has)))
-            kept.add(few, few.sum(axis=1), clipped[rows])
-    return found
+    exact_rows = (_EXACT - 1) // largest**2
+    if exact_rows < BLOCK_ROWS or total * largest**2 >= _INT64:
+        raise StorageError(f"the drive has {total:,} rows: too many for 64-bit sums.")
+    workspace.load(counts)
+    complete, totals = DriveSums(len(plan.names)), workspace.totals()
+    found = {(0, 0): complete}
+    first = 0
+    while first < total:
+        if parts:
+            workspace.compute_block(first)
+        else:
+            first, lacks, rows, clipped = workspace.add_blocks(first, exact_rows, totals)
+            complete.n += rows
+            complete.clipped += clipped
+            if not lacks:
+                continue
+        first += _add_by_kind(found, workspace, parts, counts.ticks, first)
+    complete.add_totals(totals)
+    return {kind: sums for kind, sums in found.items() if sums.n}
+
+
+def _add_by_kind(
+    found: dict[Kind, DriveSums],
+    workspace: Workspace,
+    parts: Parts,
+    ticks: NDArray[Any],
+    first: int,
+) -> int:
+    """Add the rows of a block, which are of several kinds; return how many there are."""
+    block, clipped = workspace.block(first)
+    last = first + len(clipped)
+    numbers = parts.numbers(ticks[first:last], workspace.beside(first)) if parts else None
+    for (absent, part), rows in _kinds(block, numbers):
+        has = [i for i in range(len(block)) if not absent >> i & 1]
+        few = block[np.ix_(np.array(has, dtype=np.int64), rows)]
+        found.setdefault((absent, part), DriveSums(len(has))).add(few, clipped[rows])
+    return len(clipped)
 
 
 def _kinds(block: FloatArray, numbers: IntArray | None) -> Iterator[tuple[Kind, NDArray[np.int64]]]:

@@ -7,7 +7,9 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.arithmetic import parse
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.columns import ColumnPlan, DriveColumns, DriveCounts, RowColumn
+from fleet_slip.grams.column_plan import ColumnPlan
+from fleet_slip.grams.columns import DriveColumns, DriveCounts
+from fleet_slip.grams.row_code import RowColumn
 from fleet_slip.models.manifest import Manifest
 
 

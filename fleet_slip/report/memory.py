@@ -15,7 +15,8 @@ from fleet_slip.evaluation.errors import error_figures
 from fleet_slip.evaluation.estimators import as_counts
 from fleet_slip.evaluation.runs import EvaluatedScenario
 from fleet_slip.grams.cohort import Cohort
-from fleet_slip.grams.columns import ColumnPlan, DriveColumns
+from fleet_slip.grams.column_plan import ColumnPlan
+from fleet_slip.grams.columns import DriveColumns
 from fleet_slip.grams.folding import Folding
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.regression.crossval import CrossValidation, cross_validate_inputs

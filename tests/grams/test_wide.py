@@ -18,7 +18,8 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError
 from fleet_slip.grams.aggregation import aggregate, by_sql
 from fleet_slip.grams.check import grams_of
-from fleet_slip.grams.columns import ColumnPlan, DriveColumns, DriveCounts
+from fleet_slip.grams.column_plan import ColumnPlan
+from fleet_slip.grams.columns import DriveColumns, DriveCounts
 from fleet_slip.grams.job import update_grams
 from fleet_slip.grams.wide import wide_grams
 from fleet_slip.warehouse.tables import Warehouse

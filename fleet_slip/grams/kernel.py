@@ -1,0 +1,138 @@
+"""Runs a program of vector operations over the rows of a drive, block by block, compiled."""
+
+from typing import Any
+
+import numpy as np
+
+from fleet_slip.compiling import inner_loop, kernel
+from fleet_slip.grams.block_arithmetic import compute, compute_integers
+from fleet_slip.grams.lookback import add_up, divide_sums, find_begins, values_ago
+from fleet_slip.grams.operations import (
+    ADD_UP,
+    AGO,
+    BLOCK_ROWS,
+    FIXED,
+    KEEP,
+    KIND,
+    LIMIT,
+    MOVES,
+    NUMBER,
+    NUMERATOR,
+    OPERATION,
+    OUT,
+    SLOT,
+    TICKS,
+    TO_INTEGERS,
+    A,
+    B,
+    C,
+    D,
+)
+from fleet_slip.grams.product_sums import add_products, add_sums
+
+COMPLETE, LACKING, BAD_DIVISOR = 0, 1, 2
+"""What became of a block."""
+
+GAPS, FOUND = 0, 1
+"""Rows of `flags`: whether a sum has had gaps, and whether a kind's begins were found."""
+
+
+@kernel
+def run(
+    steps: Any,
+    ratios: Any,
+    memory: Any,
+    flags: Any,
+    rows: int,
+    ticks: int,
+    first: int,
+    columns: int,
+    place: int,
+    stride: int,
+    exact_rows: int,
+    products: Any,
+    totals: Any,
+) -> Any:
+    """Compute blocks from the row `first` on.
+
+    With `exact_rows`, the sums and products of complete blocks are added to the integers `totals`,
+    by way of `products`, in which no more rows than that come together; see `product_sums` for
+    their shapes. It stops at a block that lacks a value. Without, it stops after one block.
+
+    `steps` and `ratios` are a program, `memory` what it works on, and `flags` what is known of sums
+    and kinds of windows. `ticks` is where the ticks of the drive's
+    `rows` begin, `place` where the columns do, so many with a stride.
+
+    Returns the first row that is not done, what became of the last block, how many rows were
+    added, and how often a column of theirs was clipped.
+    """
+    added, clipped, waiting = 0, 0.0, 0
+    became = COMPLETE
+    while first < rows and became == COMPLETE:
+        size = min(BLOCK_ROWS, rows - first)
+        memory[:size] = 0.0
+        for number in range(len(steps)):
+            if _do(steps[number], ratios[number], memory, flags, rows, ticks, first, size):
+                became = BAD_DIVISOR
+        if became != COMPLETE or exact_rows == 0:
+            break
+        if waiting + size > exact_rows:
+            _move_to_integers(products, totals)
+            waiting = 0
+        if add_sums(memory, place, stride, size, columns, products):
+            became = LACKING
+            break
+        add_products(memory, place, stride, size, products)
+        for count in memory[:size]:
+            clipped += count
+        waiting += size
+        added += size
+        first += size
+    _move_to_integers(products, totals)
+    return first, became, added, int(clipped)
+
+
+@inner_loop
+def _do(
+    step: Any, ratio: Any, memory: Any, flags: Any, rows: int, ticks: int, first: int, size: int
+) -> Any:
+    """Do a step for some rows; return whether it divides by what is not positive."""
+    operation, slot, kind = step[OPERATION], step[SLOT], step[KIND]
+    out = step[OUT] + step[MOVES + OUT] * first
+    a, b = step[A] + step[MOVES + A] * first, step[B] + step[MOVES + B] * first
+    c, d = step[C] + step[MOVES + C] * first, step[D] + step[MOVES + D] * first
+    if operation >= TO_INTEGERS:
+        return compute_integers(operation, memory, (out, a, b, c), size, step[NUMBER])
+    if operation < ADD_UP:
+        return compute(
+            operation,
+            memory,
+            (out, a, b, c),
+            size,
+            ratio[NUMERATOR],
+            ratio[FIXED],
+            ratio[LIMIT],
+        )
+    if operation == ADD_UP:
+        flags[GAPS, slot] = add_up(memory, a, b, c, first, size, flags[GAPS, slot])
+    elif operation == KEEP:
+        for i in range(size):
+            memory[b + first + i] = memory[a + i]
+    else:
+        if (operation == AGO or flags[GAPS, slot]) and not flags[FOUND, kind]:
+            find_begins(memory, ticks, rows, step[TICKS] + (1 if operation == AGO else 0), c)
+            flags[FOUND, kind] = True
+        if operation == AGO:
+            values_ago(memory, (out, a, ticks, c), first, size, step[TICKS])
+        else:
+            places, gaps = (out, b, d, c, a), flags[GAPS, slot]
+            divide_sums(memory, places, first, size, step[TICKS], ratio, gaps)
+    return False
+
+
+@inner_loop
+def _move_to_integers(values: Any, totals: Any) -> None:
+    for i in range(values.shape[0]):
+        for j in range(values.shape[1]):
+            totals[i, j] += np.int64(values[i, j])
+            values[i, j] = 0.0

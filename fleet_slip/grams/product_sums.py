@@ -1,0 +1,95 @@
+"""Compiled sums of products of columns: exact, because all are integers below 2^53.
+
+Tiles of 4 by 4 columns keep their sixteen sums in the processor's registers while a block of rows
+goes by.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from fleet_slip.compiling import exact_loop, inner_loop
+from fleet_slip.grams.operations import TILE
+
+
+@inner_loop
+def add_sums(memory: Any, place: int, stride: int, rows: int, columns: int, products: Any) -> Any:
+    """Add the sum of each column to the last row of `products`; return whether a value is missing.
+
+    If one is, nothing is added. Columns lie `stride` apart from `place` on; shape of `products`:
+    (columns + 1, columns), padded to whole tiles.
+    """
+    missing = 0.0
+    for i in range(columns):
+        missing += _total(memory, place + i * stride, rows) * 0.0
+    if np.isnan(missing):
+        return True
+    for i in range(columns):
+        products[products.shape[1], i] += _total(memory, place + i * stride, rows)
+    return False
+
+
+@inner_loop
+def add_products(memory: Any, place: int, stride: int, rows: int, products: Any) -> None:
+    """Add the products of every two columns to the lower triangle."""
+    for i in range(0, products.shape[1], TILE):
+        for j in range(0, i + TILE, TILE):
+            _add_tile(memory, place + i * stride, place + j * stride, stride, rows, products, i, j)
+
+
+@exact_loop
+def _total(memory: Any, place: int, rows: int) -> Any:
+    total = 0.0
+    for value in memory[place : place + rows]:
+        total += value
+    return total
+
+
+@exact_loop
+def _add_tile(
+    memory: Any, a: int, b: int, stride: int, rows: int, products: Any, i: int, j: int
+) -> None:
+    a0, a1 = memory[a : a + rows], memory[a + stride : a + stride + rows]
+    a2 = memory[a + 2 * stride : a + 2 * stride + rows]
+    a3 = memory[a + 3 * stride : a + 3 * stride + rows]
+    b0, b1 = memory[b : b + rows], memory[b + stride : b + stride + rows]
+    b2 = memory[b + 2 * stride : b + 2 * stride + rows]
+    b3 = memory[b + 3 * stride : b + 3 * stride + rows]
+    s00 = s01 = s02 = s03 = s10 = s11 = s12 = s13 = 0.0
+    s20 = s21 = s22 = s23 = s30 = s31 = s32 = s33 = 0.0
+    for t in range(rows):
+        x0, x1, x2, x3 = a0[t], a1[t], a2[t], a3[t]
+        y0, y1, y2, y3 = b0[t], b1[t], b2[t], b3[t]
+        s00 += x0 * y0
+        s01 += x0 * y1
+        s02 += x0 * y2
+        s03 += x0 * y3
+        s10 += x1 * y0
+        s11 += x1 * y1
+        s12 += x1 * y2
+        s13 += x1 * y3
+        s20 += x2 * y0
+        s21 += x2 * y1
+        s22 += x2 * y2
+        s23 += x2 * y3
+        s30 += x3 * y0
+        s31 += x3 * y1
+        s32 += x3 * y2
+        s33 += x3 * y3
+    tile = products[i : i + TILE, j : j + TILE]
+    tile[0, 0] += s00
+    tile[0, 1] += s01
+    tile[0, 2] += s02
+    tile[0, 3] += s03
+    tile[1, 0] += s10
+    tile[1, 1] += s11
+    tile[1, 2] += s12
+    tile[1, 3] += s13
+    tile[2, 0] += s20
+    tile[2, 1] += s21
+    tile[2, 2] += s22
+    tile[2, 3] += s23
+    tile[3, 0] += s30
+    tile[3, 1] += s31
+    tile[3, 2] += s32
+    tile[3, 3] += s33

@@ -1,0 +1,187 @@
+"""A program of vector operations: how it is written, and put into a memory."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_slip.arrays import FloatArray
+from fleet_slip.catalogue.columns import Fact
+from fleet_slip.grams.operations import ADD_UP, BLOCK_ROWS, COPY, KEEP, TILE, Region
+
+Place = tuple[Region, int]
+"""A part of the memory, and its number there."""
+
+Value = int | Place
+"""What an operation reads: the result of an earlier one, by its number, or a part of the memory."""
+
+NOWHERE: Place = (Region.CLIPPED, 0)
+
+STRIDE = BLOCK_ROWS + 2 * 8
+"""Registers are so many numbers apart: if it were a power of two, the cache would have one place
+for all of them."""
+
+
+@dataclass(frozen=True)
+class Operation:
+    """One operation; `operations` says what it reads and does."""
+
+    operation: int
+    a: Value = NOWHERE
+    b: Value = NOWHERE
+    c: Value = NOWHERE
+    d: Value = NOWHERE
+    slot: int = 0
+    kind: int = 0
+    ticks: int = 0
+    number: int = 0
+    ratio: tuple[float, float, float, float] = (0.0, 1.0, 0.0, np.inf)
+
+    @property
+    def reads(self) -> tuple[Value, ...]:
+        """What it reads."""
+        return (self.a, self.b, self.c, self.d)
+
+
+@dataclass
+class Code:
+    """Operations in order, equal ones once, and what they number.
+
+    Attributes:
+        operations: they are numbered from 0.
+        signals, facts: what the program reads of a drive, with their numbers.
+        summed, kept: what is summed up, and what is kept, over a drive.
+        kinds: windows of different lengths in ticks.
+    """
+
+    operations: list[Operation] = field(default_factory=list)
+    signals: dict[str, int] = field(default_factory=dict)
+    facts: dict[Fact, int] = field(default_factory=dict)
+    summed: dict[Value, int] = field(default_factory=dict)
+    kept: dict[Value, int] = field(default_factory=dict)
+    kinds: dict[int, int] = field(default_factory=dict)
+    _known: dict[Operation, int] = field(default_factory=dict)
+
+    def add(self, one: Operation) -> int:
+        """Add an operation if there is no equal one; return its number."""
+        if one not in self._known:
+            self._known[one] = self.add_anew(one)
+        return self._known[one]
+
+    def add_anew(self, one: Operation) -> int:
+        """Add an operation that counts what it clips, for each column that it does so."""
+        self.operations.append(one)
+        return len(self.operations) - 1
+
+    def signal(self, name: str) -> Place:
+        """Return where the counts of a signal are."""
+        return (Region.SIGNAL, self.signals.setdefault(name, len(self.signals)))
+
+    def assemble(self, results: Sequence[Value], also: Sequence[Value] = ()) -> "Program":
+        """Return the program that leaves some results in the first registers, in their order.
+
+        Those of `also` come after them and what pads them to whole tiles.
+        """
+        columns = [
+            one if isinstance(one, int) else self.add_anew(Operation(COPY, one)) for one in results
+        ]
+        beside = [self.add_anew(Operation(COPY, one)) for one in also]
+        registers = {value: register for register, value in enumerate(columns)}
+        registers |= {value: padded(len(columns)) + i for i, value in enumerate(beside)}
+        last = {read: number for number, one in enumerate(self.operations) for read in one.reads}
+        count, free = padded(len(columns)) + len(beside), list[int]()
+        for number, one in enumerate(self.operations):
+            if number not in registers and one.operation not in {ADD_UP, KEEP}:
+                if not free:
+                    free, count = [count], count + 1
+                registers[number] = free.pop()
+            # Given back after the result has a register: loops do not write what they read.
+            ended = {read for read in one.reads if isinstance(read, int) and last[read] == number}
+            free += [registers[read] for read in ended.difference(columns, beside)]
+        places = [
+            [(Region.REGISTER, registers[number]) if number in registers else NOWHERE]
+            + [(Region.REGISTER, registers[r]) if isinstance(r, int) else r for r in one.reads]
+            for number, one in enumerate(self.operations)
+        ]
+        return Program(self, np.array(places, dtype=np.int64), len(columns), count)
+
+
+def padded(columns: int) -> int:
+    """Return how many columns whole tiles have."""
+    return -(-columns // TILE) * TILE
+
+
+@dataclass(frozen=True)
+class Program:
+    """Operations with places for what they read and write.
+
+    Attributes:
+        code: the operations.
+        places: the region and the number there of what each writes and reads, shape (steps, 5, 2).
+        columns: how many of the first registers are columns.
+        registers: how many there are.
+    """
+
+    code: Code
+    places: NDArray[np.int64]
+    columns: int
+    registers: int
+
+    @cached_property
+    def ratios(self) -> FloatArray:
+        """The ratio of each step, shape (steps, 4)."""
+        return np.array([one.ratio for one in self.code.operations])
+
+    @cached_property
+    def signals(self) -> tuple[str, ...]:
+        """The signals that it reads, in the order of their numbers."""
+        return tuple(self.code.signals)
+
+    @cached_property
+    def facts(self) -> tuple[Fact, ...]:
+        """The facts that it reads, in the order of their numbers."""
+        return tuple(self.code.facts)
+
+    @property
+    def slots(self) -> int:
+        """How many values it sums up over a drive."""
+        return len(self.code.summed)
+
+    @property
+    def kinds(self) -> int:
+        """How many windows of different lengths it has."""
+        return len(self.code.kinds)
+
+    def regions(self, rows: int) -> NDArray[np.int64]:
+        """Return where each region begins, how far apart its parts are, and the memory's size.
+
+        Shape (regions + 1, 2): for drives of up to so many rows.
+        """
+        code = self.code
+        shapes = {
+            Region.CLIPPED: (1, STRIDE),
+            Region.REGISTER: (self.registers, STRIDE),
+            Region.FACT: (len(code.facts), 1),
+            Region.SIGNAL: (len(code.signals), rows),
+            Region.TICK: (1, rows),
+            Region.SUM: (len(code.summed), rows + 1),
+            Region.COUNT: (len(code.summed), rows + 1),
+            Region.VALUE: (len(code.kept), rows),
+            Region.BEGIN: (len(code.kinds), rows),
+        }
+        # Whoever reads a fact as a block must not read beyond the end.
+        sizes = [parts * size for parts, size in shapes.values()] + [BLOCK_ROWS]
+        begins = np.cumsum([0, *sizes])
+        strides = [shapes[region][1] for region in Region] + [0]
+        return np.column_stack([begins[: len(strides)], strides])
+
+    def steps(self, rows: int) -> NDArray[np.int64]:
+        """Return the table of `operations` for a memory for so many rows."""
+        regions = self.regions(rows)
+        begins, strides = regions[self.places[..., 0]].transpose(2, 0, 1)
+        moves = self.places[..., 0] == Region.SIGNAL
+        others = [[one.slot, one.kind, one.ticks, one.number] for one in self.code.operations]
+        operations = [[one.operation] for one in self.code.operations]
+        return np.hstack([operations, begins + strides * self.places[..., 1], moves, others])
