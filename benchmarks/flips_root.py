@@ -162,7 +162,7 @@ def digest(root: Path) -> str:
             names = [name for name in table.schema.names if name not in ("file", "day")]
             parts = [
                 pq.read_table(path, partitioning=None, columns=names)
-                for path in table.snapshot(unchecked=True).paths
+                for path in table.unchecked_snapshot().paths
             ]
             rows = pa.concat_tables(parts).sort_by(
                 [("drive_id", "ascending"), (order, "ascending")]

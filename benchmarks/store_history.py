@@ -14,12 +14,12 @@ import subprocess
 import time
 from collections import defaultdict
 from datetime import UTC, datetime, timedelta
-from typing import Any
 
 from moto.core.models import DEFAULT_ACCOUNT_ID
 from moto.s3.models import s3_backends
 
 from benchmarks.billion import PROGRAM
+from tests.support.growth_history import records_of_run
 from tests.support.s3_server import Server
 
 RUN = ("run", "--campaign", "smoke", "--days", "1")
@@ -40,22 +40,7 @@ def records(count: int, scattered: bool) -> dict[str, bytes]:
         age = timedelta(hours=i + 1)
         at = datetime.now(UTC) - age
         name = f"{at:%Y%m%dT%H%M%S.%fZ}-{i:08x}"
-        begun: dict[str, Any] = {
-            "run_id": name,
-            "command": "gram",
-            "arguments": ["gram"],
-            "host": "growth",
-        }
-        begun |= {"started_at": at.isoformat(), "process": 1, "package_version": "0.1.0"}
-        ended: dict[str, Any] = {
-            "run_id": name,
-            "ended_at": at.isoformat(),
-            "seconds": 1.5,
-            "outcome": "done",
-        }
-        step = {"name": "gram", "seconds": 1.0, "rows": 1000, "size_bytes": None}
-        ended |= {"exit_code": 0, "error": None, "steps": [step]}
-        for part, line in enumerate((begun, ended)):
+        for part, line in enumerate(records_of_run(name, at)):
             stamp = f"{int(at.timestamp() * 1e9) + part:020d}-{i:08x}"
             key = stamp if scattered or age < WEEK else "0" * 32
             found[f"runs/{at:%Y-%m}.jsonl/{key}.jsonl"] += json.dumps(line).encode() + b"\n"

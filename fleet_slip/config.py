@@ -1,13 +1,14 @@
 """Reads a TOML file into a pydantic model; says what is wrong with it by file, key and reason."""
 
 import tomllib
+from collections.abc import Mapping
 from decimal import Decimal
 from importlib.resources.abc import Traversable
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from fleet_slip.errors import ConfigError
+from fleet_slip.errors import ConfigError, StorageError
 
 
 class Config(BaseModel):
@@ -17,6 +18,7 @@ class Config(BaseModel):
 
 
 ConfigT = TypeVar("ConfigT", bound=Config)
+ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
 LONGEST_FILE_BYTES = 2**20
@@ -49,6 +51,20 @@ def load_config(file: Traversable, model: type[ConfigT]) -> ConfigT:
         return model.model_validate(load_toml(file))
     except ValidationError as error:
         raise ConfigError(f"{file}: {faults_of(error)}") from None
+
+
+def parse_document(content: Mapping[str, Any], model: type[ModelT], name: str, kind: str) -> ModelT:
+    """Return the content of a document whose checksum is right. Raises `StorageError` otherwise.
+
+    Then another version of the program has written it.
+    """
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        raise StorageError(
+            f"{name}: this program does not understand {kind}: {faults_of(error)}. Update "
+            "fleet-slip, or publish again."
+        ) from None
 
 
 def faults_of(error: ValidationError) -> str:

@@ -33,7 +33,6 @@ def connect(
     root: Folder | Path | str | None = None,
     *,
     threads: int | None = None,
-    locked: bool = True,
     query: str | None = None,
 ) -> duckdb.DuckDBPyConnection:
     """Return a DuckDB connection with the views of the warehouse at `root`, a path or a URL.
@@ -43,11 +42,24 @@ def connect(
     see later commits. With a `query`, only the views that it names are there: opening the logs
     takes longer the more files there are, and so does reading every model version.
 
-    Locked, it can open the files of the snapshot and no others, and its settings cannot be
-    changed. DuckDB knows no right to read without the right to write: run SQL of others through
-    `fleet_slip.warehouse.read_only_sql.one_query` first, as the command line does.
+    It can open the files of the snapshot and no others, and its settings cannot be changed. DuckDB
+    knows no right to read without the right to write: ask SQL of others through `Fleet.sql`.
     """
-    warehouse = Warehouse(data_root(root))
+    database, paths = _open_views(data_root(root), query, threads)
+    lock(database, paths)
+    return database
+
+
+def connect_unlocked(root: Folder, query: str | None = None) -> duckdb.DuckDBPyConnection:
+    """Return a connection as `connect` does that can open any file and change any setting."""
+    return _open_views(root, query)[0]
+
+
+def _open_views(
+    root: Folder, query: str | None, threads: int | None = None
+) -> tuple[duckdb.DuckDBPyConnection, list[str]]:
+    """Return a connection with views, and the paths of all files that they read."""
+    warehouse = Warehouse(root)
     warehouse.require()
     wanted = VIEWS if query is None else needed_views(query)
     snapshots = table_snapshots(warehouse, wanted)
@@ -62,9 +74,7 @@ def connect(
         add_table(database, "models", Registry(warehouse.root / "models").as_table())
     if "dictionary" in wanted:
         add_table(database, "dictionary", describe_columns(database, warehouse.catalogue))
-    if locked:
-        lock(database, paths)
-    return database
+    return database, paths
 
 
 def needed_views(query: str) -> frozenset[str]:

@@ -70,9 +70,9 @@ class Fleet(Filling, Tending):
         Only for SQL that you trust: it can overwrite the warehouse. Else like `session`.
         """
         from fleet_slip.api.session import Session, any_statement
-        from fleet_slip.views import connect
+        from fleet_slip.views import connect_unlocked
 
-        return Session(connect(self.root, locked=False, query=query), any_statement)
+        return Session(connect_unlocked(self.root, query), any_statement)
 
     def cohort(self, condition: str = TRAINING_DRIVES) -> FleetCohort:
         """Return the drives that satisfy an SQL condition on the view `drives`.

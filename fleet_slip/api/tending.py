@@ -127,21 +127,26 @@ class Tending(Serving):
         return report
 
     @record_call
-    def vacuum(
-        self, retention_hours: float | None = None, *, dry_run: bool = False
-    ) -> "VacuumReport":
+    def vacuum(self, retention_hours: float | None = None) -> "VacuumReport":
         """Remove replaced files and leftovers of killed jobs when they are old enough.
 
-        What a version of the last `retention_hours` refers to is kept, by default of a week. With
-        `dry_run` nothing is removed. Raises `StorageError`.
+        What a version of the last `retention_hours` refers to is kept, by default of a week. Raises
+        `StorageError`.
         """
-        from fleet_slip.maintenance.vacuum import RETENTION_HOURS, preview_vacuum, vacuum
+        from fleet_slip.maintenance.vacuum import RETENTION_HOURS, vacuum
 
         hours = RETENTION_HOURS if retention_hours is None else retention_hours
         with step("vacuum") as figures:
-            report = (preview_vacuum if dry_run else vacuum)(self.warehouse, hours)
+            report = vacuum(self.warehouse, hours)
             figures.size_bytes = report.size_bytes
         return report
+
+    def preview_vacuum(self, retention_hours: float | None = None) -> "VacuumReport":
+        """Return what `vacuum` would remove. Raises `StorageError`."""
+        from fleet_slip.maintenance.vacuum import RETENTION_HOURS, preview_vacuum
+
+        hours = RETENTION_HOURS if retention_hours is None else retention_hours
+        return preview_vacuum(self.warehouse, hours)
 
     @record_call
     def forget(

@@ -145,7 +145,8 @@ def vacuum(
     json: Json = False,
 ) -> None:
     """Remove replaced files and leftovers of killed jobs when they are old enough."""
-    report = context.obj.vacuum(retention_hours, dry_run=dry_run)
+    fleet: Fleet = context.obj
+    report = (fleet.preview_vacuum if dry_run else fleet.vacuum)(retention_hours)
     if json:
         print_json(asdict(report))
         return

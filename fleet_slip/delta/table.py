@@ -40,16 +40,23 @@ class Table:
     partition_by: tuple[str, ...] = ()
     description: str = ""
 
-    def snapshot(self, version: int | None = None, *, unchecked: bool = False) -> "Snapshot":
+    def snapshot(self, version: int | None = None) -> "Snapshot":
         """Return the table as it is now; a table that nobody has written yet is empty.
 
         An earlier version can be asked for; `StorageError` is raised if it is no longer known, or
-        if the log was damaged, unless it is to be `unchecked`: who looks for damage opens it.
+        if the log was damaged.
         """
         delta = self.open_delta(version)
-        if delta is not None and not unchecked:
+        if delta is not None:
             require_sound_log(self.folder, delta.version())
         if delta is not None and version is None:
+            require_readable(self.folder, self.schema, delta)
+        return Snapshot(self, delta)
+
+    def unchecked_snapshot(self) -> "Snapshot":
+        """Return the table as it is now, though its log may be damaged: to look for damage."""
+        delta = self.open_delta()
+        if delta is not None:
             require_readable(self.folder, self.schema, delta)
         return Snapshot(self, delta)
 

@@ -22,7 +22,11 @@ from fleet_slip.errors import FleetSlipError, QuestionError
 from fleet_slip.grams.job import reconcile
 from fleet_slip.maintenance.find_drives import Located, drives_by_file, locate
 from fleet_slip.maintenance.marks import newest_versions
-from fleet_slip.maintenance.old_files import quarantined_of, remove_old_files
+from fleet_slip.maintenance.old_files import (
+    quarantined_of,
+    remove_old_files,
+    remove_uncommitted_files,
+)
 from fleet_slip.maintenance.rewriting import Rewriting, rewrite
 from fleet_slip.models.manifest import TrainedOn
 from fleet_slip.models.trained_drives import hash_drives, read_trained_drives
@@ -93,9 +97,9 @@ def forget(
     rows, rewritten, removed = _rewrite_logs(warehouse, subject, located, progress)
     if drives or state:
         warehouse.grams.fence()
-    uncommitted = remove_old_files(warehouse, subject, delete=False)
+    uncommitted = remove_uncommitted_files(warehouse, subject)
     reconcile(warehouse)
-    old = remove_old_files(warehouse, subject, delete=now)
+    old = (remove_old_files if now else remove_uncommitted_files)(warehouse, subject)
     if drives or state in ("begun", ALLOWED):
         audit.end(subject, warehouse.grams.snapshot().version)
     under_way = [f"the run {run}" for run in runs_under_way(warehouse.root)] if now else []

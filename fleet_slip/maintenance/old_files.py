@@ -1,6 +1,6 @@
 """Files on disk that no version of a table refers to any more, and the drives that they hold."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
 
@@ -27,21 +27,33 @@ class OldFiles:
     """Files that may be being written, and may have the drives: they are left alone."""
 
 
-def remove_old_files(warehouse: Warehouse, subject: Forgettable, *, delete: bool) -> OldFiles:
-    """Delete the files with the drives that no version refers to; `delete` the replaced ones, too.
+def remove_old_files(warehouse: Warehouse, subject: Forgettable) -> OldFiles:
+    """Delete the files with the drives that no version refers to, those of `vacuum` included.
+
+    See `remove_uncommitted_files`.
+    """
+    return _remove(warehouse, subject, find_old_files(warehouse, subject), kept=0)
+
+
+def remove_uncommitted_files(warehouse: Warehouse, subject: Forgettable) -> OldFiles:
+    """Delete the files with the drives that no version ever referred to; keep replaced ones.
 
     What was never committed is deleted at once: since the fence no commit can land a row of a
     forgotten car or drive, so that whoever wrote the file will be told. Drives before a day are not
     barred; there a file younger than an hour is left to its writer.
     """
     old = find_old_files(warehouse, subject)
-    young = [one.file for one in old if one.is_young and subject.kind == "before"]
-    deleted, kept, pending = 0, 0, [str(file) for file in young]
-    for one in old:
-        if one.file in young:
-            continue
-        if one.replaced and not delete:
-            kept += 1
+    uncommitted = [one for one in old if not one.replaced]
+    return _remove(warehouse, subject, uncommitted, kept=len(old) - len(uncommitted))
+
+
+def _remove(
+    warehouse: Warehouse, subject: Forgettable, files: Sequence["OldFile"], kept: int
+) -> OldFiles:
+    deleted, pending = 0, list[str]()
+    for one in files:
+        if one.is_young and subject.kind == "before":
+            pending.append(str(one.file))
         elif one.file.folder.remove(one.file):
             deleted += 1
         else:

@@ -74,7 +74,7 @@ def _find_elsewhere(warehouse: Warehouse, damaged: Collection[str]) -> list[str]
     rebuilt = []
     for table in warehouse.tables:
         name = table.folder.name
-        files = table.snapshot(unchecked=True).files
+        files = table.unchecked_snapshot().files
         lost = [file for file in files if f"{name}/{file.path}" in damaged]
         sizes = {file.size_bytes for file in lost}
         for other in table.folder.files() if lost else ():
@@ -94,9 +94,7 @@ def _simulate_again(
     warehouse: Warehouse, damaged: Collection[str], campaigns: Sequence[str]
 ) -> list[str]:
     files = [
-        file
-        for file in warehouse.logs.snapshot(unchecked=True).files
-        if f"logs/{file.path}" in damaged
+        file for file in warehouse.logs.unchecked_snapshot().files if f"logs/{file.path}" in damaged
     ]
     if not files:
         return []
@@ -157,7 +155,7 @@ def _aggregate_again(
 
     def attempt() -> None:
         removed.clear()
-        snapshot = warehouse.grams.snapshot(unchecked=True)
+        snapshot = warehouse.grams.unchecked_snapshot()
         readable = _readable_grams(warehouse)
         bad = [
             file
@@ -181,7 +179,7 @@ def _names_any(rows: pa.Table, files: Collection[str]) -> bool:
 def _readable_grams(warehouse: Warehouse) -> dict[str, pa.Table]:
     """Return which drives and log files the Gram files name, of those that are whole."""
     found = {}
-    for file in warehouse.grams.snapshot(unchecked=True).files:
+    for file in warehouse.grams.unchecked_snapshot().files:
         if problem_of(warehouse.grams, file) is None:
             with contextlib.suppress(FleetSlipError):
                 found[file.path] = warehouse.grams.read(file.path, ["file", "drive_id"])

@@ -64,7 +64,7 @@ def _open_tables(warehouse: Warehouse, report: Verification) -> dict[str, Snapsh
     for table in warehouse.tables:
         _verify_checkpoints(table, report)
         try:
-            snapshot = table.snapshot(unchecked=True)
+            snapshot = table.unchecked_snapshot()
             _ = snapshot.files
         except FleetSlipError as error:
             report.findings.append(Damage("log", table.folder.name, str(error)))

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Annotated, Literal, TypeVar
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN, Identifier
-from fleet_slip.config import Config, faults_of
-from fleet_slip.errors import QuestionError, StorageError
+from fleet_slip.config import Config, parse_document
+from fleet_slip.errors import QuestionError
 from fleet_slip.files.documents import MAX_DIGITS, DocumentFolder
 
 CHAMPION = "champion"
@@ -58,14 +58,8 @@ class AliasHistory:
         """Yield the moves, newest first, each read when it is asked for."""
         for number in reversed(self.documents.numbers()):
             document = self.documents.read(number)
-            try:
-                move = AliasMove.model_validate(document.content)
-            except ValidationError as error:
-                raise StorageError(
-                    f"{self.documents.file(number)}: this program does not understand this move of "
-                    f"an alias: {faults_of(error)}. Update fleet-slip, or publish again."
-                ) from None
-            yield move
+            file = self.documents.file(number)
+            yield parse_document(document.content, AliasMove, file, "this move of an alias")
 
     def pointed_at(self, alias: str) -> int | None:
         """Return the version that an alias points at, or None."""

@@ -13,10 +13,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 import pyarrow as pa
-from pydantic import ValidationError
 
 from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN
-from fleet_slip.config import faults_of
+from fleet_slip.config import parse_document
 from fleet_slip.errors import QuestionError, RefusedError, StorageError
 from fleet_slip.files.documents import MAX_DIGITS, DocumentFolder
 from fleet_slip.files.folder import Folder
@@ -82,13 +81,7 @@ class Registry:
             if version in numbers:
                 raise
             raise QuestionError(_unknown(name, str(version), self.names(), numbers)) from None
-        try:
-            manifest = Manifest.model_validate(document.content)
-        except ValidationError as error:
-            raise StorageError(
-                f"{name}@{version}: this program does not understand its manifest: "
-                f"{faults_of(error)}. Update fleet-slip, or publish again."
-            ) from None
+        manifest = parse_document(document.content, Manifest, f"{name}@{version}", "its manifest")
         if manifest.name != name:
             raise StorageError(
                 f"{name}@{version}: its manifest is of the model {manifest.name}. Restore the file "

@@ -220,31 +220,39 @@ def write_versions(root: Path, name: str, versions: int) -> None:
             (folder / f"{i}.json").write_text(_document(content), encoding="utf-8")
 
 
+def records_of_run(run_id: str, at: datetime) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the records of the beginning and the end of a nightly run."""
+    begun = {
+        "run_id": run_id,
+        "command": "gram",
+        "arguments": ["gram"],
+        "host": "growth",
+        "started_at": at.isoformat(),
+        "process": 1,
+        "package_version": "0.1.0",
+    }
+    step = {"name": "gram", "seconds": 1.0, "rows": 1000, "size_bytes": None}
+    ended = {
+        "run_id": run_id,
+        "ended_at": at.isoformat(),
+        "seconds": 1.5,
+        "outcome": "done",
+        "exit_code": 0,
+        "error": None,
+        "steps": [step],
+    }
+    return begun, ended
+
+
 def write_runs(root: Path, runs: int) -> None:
     """Write the history of so many nightly runs: two lines each, a file a month."""
     folder = root / "runs"
     folder.mkdir(exist_ok=True)
     for month, numbers in _months(runs):
-        lines = []
+        lines: list[str] = []
         for i in numbers:
             at = datetime(2000, 1, 1, tzinfo=UTC) + timedelta(hours=i)
-            run = f"{at:%Y%m%dT%H%M%SZ}-{i:08x}"
-            begun: dict[str, Any] = {
-                "run_id": run,
-                "command": "gram",
-                "arguments": ["gram"],
-                "host": "growth",
-            }
-            begun |= {"started_at": at.isoformat(), "process": 1, "package_version": "0.1.0"}
-            ended: dict[str, Any] = {
-                "run_id": run,
-                "ended_at": at.isoformat(),
-                "seconds": 1.5,
-                "outcome": "done",
-            }
-            step = {"name": "gram", "seconds": 1.0, "rows": 1000, "size_bytes": None}
-            ended |= {"exit_code": 0, "error": None, "steps": [step]}
-            lines += [json.dumps(begun), json.dumps(ended)]
+            lines += map(json.dumps, records_of_run(f"{at:%Y%m%dT%H%M%SZ}-{i:08x}", at))
         (folder / f"{month}.jsonl").write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
