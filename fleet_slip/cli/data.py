@@ -14,7 +14,8 @@ from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features as known_features
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.cli.output import Json, print_json, print_table, progress, say
+from fleet_slip.cli.output import Json, print_json, print_table, say
+from fleet_slip.cli.progress import progress
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.workers import Cluster, Threads
 from fleet_slip.errors import UsageError

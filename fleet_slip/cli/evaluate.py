@@ -9,7 +9,8 @@ from fleet_slip.cli.comparing import score_against
 from fleet_slip.cli.evaluation_tables import print_evaluation
 from fleet_slip.cli.models import Reference
 from fleet_slip.cli.options import Cohort
-from fleet_slip.cli.output import Json, print_json, print_table, progress, say
+from fleet_slip.cli.output import Json, print_json, print_table, say
+from fleet_slip.cli.progress import progress
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.run import DEFAULT_CAMPAIGN
 from fleet_slip.cli.workers import Threads

@@ -9,7 +9,8 @@ import typer
 
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli.models import Reference
-from fleet_slip.cli.output import Json, print_json, print_table, progress, say
+from fleet_slip.cli.output import Json, print_json, print_table, say
+from fleet_slip.cli.progress import progress
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.run import DEFAULT_CAMPAIGN
 from fleet_slip.errors import AlarmError, UsageError

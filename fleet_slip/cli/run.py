@@ -10,7 +10,8 @@ from fleet_slip.api.run_report import RunReport
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.cli.data import Days, Through, last_day
 from fleet_slip.cli.options import Worth
-from fleet_slip.cli.output import Json, print_json, progress_of_steps, say
+from fleet_slip.cli.output import Json, print_json, say
+from fleet_slip.cli.progress import progress_of_steps
 from fleet_slip.cli.publishing import print_publication
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.selecting import print_selection
