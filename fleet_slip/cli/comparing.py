@@ -18,7 +18,7 @@ def diff(context: typer.Context, one: Reference, other: Reference, json: Json = 
     """Tell two model versions apart: their data, signals, coefficients and figures."""
     found = context.obj.diff(one, other)
     if json:
-        print_json(found.as_dict())
+        print_json(found)
     else:
         _print_difference(found)
 

@@ -2,7 +2,6 @@
 
 import logging
 from concurrent.futures import Executor
-from dataclasses import asdict
 from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -75,7 +74,7 @@ def simulate(
     ):
         report = fleet.simulate(plan, days=days, through=last, workers=executor, progress=show)
     if json:
-        print_json(asdict(report))
+        print_json(report)
     elif report.changed:
         say(
             f"{plan.name}: {number_of(report.drives, 'drive')}, {number_of(report.rows, 'row')} in "
@@ -134,7 +133,7 @@ def ingest(
         files, mapping, workers=cluster, each=_warn_of_look_alikes if json else _say_ingested
     )
     if json:
-        print_json([report.as_dict() for report in reports])
+        print_json(reports)
 
 
 def _say_ingested(report: "IngestReport") -> None:
@@ -212,8 +211,7 @@ def gram(
             _run_gram(fleet, executor, PLAIN, None)
         reports = [_run_gram(fleet, executor, name, cohort) for name in names]
     if json:
-        documents = [asdict(report) for report in reports]
-        print_json(documents if feature_set == ALL_SETS else documents[0])
+        print_json(reports if feature_set == ALL_SETS else reports[0])
         return
     for report in reports:
         _say_gram(report)
@@ -257,7 +255,7 @@ def check(
     with progress("check", "files") as show:
         report = context.obj.check(files, progress=show)
     if json:
-        print_json(asdict(report))
+        print_json(report)
     else:
         wide = [f"{report.wide_drives}"]
         print_table(

@@ -119,7 +119,7 @@ def compact(
     with progress("compact", "days") as show:
         report = context.obj.compact(target_rows, progress=show)
     if json:
-        print_json(asdict(report))
+        print_json(report)
     elif report.changed:
         say(
             f"{number_of(report.files_before, 'file')} became {report.files_after}; "
@@ -149,7 +149,7 @@ def vacuum(
     fleet: Fleet = context.obj
     report = (fleet.preview_vacuum if dry_run else fleet.vacuum)(retention_hours)
     if json:
-        print_json(asdict(report))
+        print_json(report)
         return
     if dry_run and report.files:
         print_table("", ["would be removed"], ([file] for file in report.files))
@@ -196,7 +196,7 @@ def forget(
     with progress("forget", "files") as show:
         report = fleet.forget(vehicle=vehicle, drive=drive, now=now, progress=show)
     if json:
-        print_json(asdict(report))
+        print_json(report)
     else:
         _say_forgotten(report)
     if now and report.pending:
@@ -240,7 +240,7 @@ def retain(
     with progress("retain", "files") as show:
         report = context.obj.retain(config, progress=show)
     if json:
-        print_json(asdict(report))
+        print_json(report)
         return
     if report.forgotten.changed:
         _say_forgotten(report.forgotten)

@@ -1,6 +1,5 @@
 """Commands that watch sensors and models, and follow the catalogue: quality, monitor, migrate."""
 
-from dataclasses import asdict
 from datetime import date
 from pathlib import Path
 from typing import Annotated
@@ -33,7 +32,7 @@ def quality(
     """
     found: QualityReport = context.obj.quality(cohort)
     if json:
-        print_json(found.as_dict())
+        print_json(found)
     else:
         _print_quality(found)
     if found.findings:
@@ -91,7 +90,7 @@ def monitor(
 
         draw(chart, plot)
     if json:
-        print_json(chart.as_dict())
+        print_json(chart)
     else:
         _print_chart(chart)
     if chart.alarms:
@@ -137,7 +136,7 @@ def migrate(context: typer.Context, json: Json = False) -> None:
     with progress("migrate", "rows") as show:
         report = context.obj.migrate(progress=show)
     if json:
-        print_json(asdict(report))
+        print_json(report)
         return
     if not report.changed:
         say("migrate: nothing to do, the logs agree with the signal catalogue")

@@ -5,6 +5,7 @@ import logging
 import math
 import sys
 from collections.abc import Iterable, Sequence
+from dataclasses import asdict, is_dataclass
 from decimal import Decimal
 from typing import Annotated, Any
 
@@ -30,12 +31,20 @@ def say(text: str, level: int = logging.INFO) -> None:
 
 
 def print_json(content: Any) -> None:
-    """Print a JSON document; numbers that JSON does not know (NaN, infinity) become null."""
+    """Print a JSON document; numbers that JSON does not know (NaN, infinity) become null.
+
+    A dataclass is printed field by field, unless it has an `as_dict` that says otherwise. pydantic
+    would write decimal numbers as texts, and every start would wait for it.
+    """
     text = json.dumps(_for_json(content), indent=2, default=str, allow_nan=False)
     sys.stdout.write(text + "\n")
 
 
 def _for_json(value: Any) -> Any:
+    if hasattr(value, "as_dict"):
+        value = value.as_dict()
+    elif is_dataclass(value) and not isinstance(value, type):
+        value = asdict(value)
     match value:
         case dict():
             return {key: _for_json(item) for key, item in value.items()}

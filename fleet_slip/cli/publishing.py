@@ -44,7 +44,7 @@ def publish(
         name, selection, force=force, candidate=candidate, sign_key=signing_key(sign_key)
     )
     if json:
-        print_json(publication.as_dict())
+        print_json(publication)
     else:
         print_selection(selection)
         print_publication(publication)

@@ -1,6 +1,5 @@
 """The command that writes the report."""
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -27,7 +26,7 @@ def report(
     """
     written = context.obj.report(model, output)
     if json:
-        print_json(asdict(written))
+        print_json(written)
     else:
         say(
             f"{written.page}: {written.size_bytes / 1e6:.1f} MB, {written.figures} figures, "

@@ -70,7 +70,7 @@ def run(
             waiting=lambda: say(f"{plan.name}: waiting for another run"),
         )
     if json:
-        print_json(report.as_dict())
+        print_json(report)
     else:
         _print_report(report)
 

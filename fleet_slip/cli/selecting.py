@@ -36,7 +36,7 @@ def select(context: typer.Context, request: SelectionRequest, json: Json = False
     """
     selection = answer(context.obj, request)
     if json:
-        print_json(selection.as_dict())
+        print_json(selection)
     else:
         print_selection(selection)
 

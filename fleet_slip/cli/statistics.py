@@ -256,7 +256,7 @@ def shrink(
     )
     inputs = found[0].cross_validation.signals  # least squares keeps all
     if json:
-        print_json({"cohort": cohort, "methods": [one.as_dict() for one in found]})
+        print_json({"cohort": cohort, "methods": found})
         return
     first = found[0].cross_validation
     print_table(

@@ -24,7 +24,7 @@ def status(
     """
     found: WarehouseStatus = context.obj.status(max_age_hours)
     if json:
-        print_json(found.as_dict())
+        print_json(found)
     else:
         _print_status(found)
     if found.problems:

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from datetime import date
 from statistics import fmean, stdev
-from typing import Any
 
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.errors import DataError, StorageError
@@ -94,10 +93,6 @@ class Chart:
     def alarms(self) -> tuple[Day, ...]:
         """The days that are beyond a limit."""
         return tuple(day for day in self.days if day.alarms)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the chart for a JSON document."""
-        return asdict(self)
 
 
 def monitor(

@@ -1,7 +1,7 @@
 """The health of a warehouse on one page: freshness, backlog, last runs, disk, champions."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
 from typing import Any
 
@@ -69,10 +69,6 @@ class WarehouseStatus:
     last_runs: tuple[Mapping[str, Any], ...]
     champions: tuple[ChampionStatus, ...]
     problems: tuple[str, ...]
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the status for a JSON document."""
-        return asdict(self)
 
 
 def status_of(

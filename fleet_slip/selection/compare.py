@@ -1,7 +1,7 @@
 """Compares candidate models on a cohort by cross-validation and chooses one; no log row is read."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Generic
 
 from typing_extensions import TypeVar
@@ -74,7 +74,7 @@ class Selection(Generic[AnyCohort]):
         if self.searched is not None:
             document["search"] = self.searched.as_dict()
         if self.uncertainty is not None:
-            document["uncertainty"] = self.uncertainty.as_dict()
+            document["uncertainty"] = asdict(self.uncertainty)
         return document
 
 

@@ -1,7 +1,6 @@
 """How far to trust a winner's figures: drawing the drives again, and dealing the folds again."""
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.grams.cohort import Cohort
@@ -35,10 +34,6 @@ class Uncertainty:
     repeats: int
     repeated_mean: float | None
     repeated_spread: float | None
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return what a JSON document needs."""
-        return asdict(self)
 
 
 def estimate_uncertainty(

@@ -1,5 +1,6 @@
 """Drawing the drives again, and dealing the folds again."""
 
+from dataclasses import asdict
 from fractions import Fraction
 
 import numpy as np
@@ -72,7 +73,7 @@ def test_folds_dealt_again_give_about_the_same_figure_and_the_same_each_time() -
     assert found.repeated_mean == pytest.approx(model.correlation, abs=0.01)
     assert found.repeated_spread is not None
     assert 0 < found.repeated_spread < 0.01
-    assert set(found.as_dict()) == {"interval", "repeats", "repeated_mean", "repeated_spread"}
+    assert set(asdict(found)) == {"interval", "repeats", "repeated_mean", "repeated_spread"}
 
 
 def test_rows_are_no_drives_to_draw() -> None:
