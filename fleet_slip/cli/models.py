@@ -10,6 +10,7 @@ from fleet_slip.cli.recorded import record_run
 from fleet_slip.models.aliases import CHAMPION
 from fleet_slip.models.manifest import ModelTerm
 from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.models.on_board import cost_on_board
 from fleet_slip.words import number_of
 
 Reference = Annotated[
@@ -83,7 +84,9 @@ def show(context: typer.Context, reference: Reference, json: Json = False) -> No
     version: ModelVersion = context.obj.model(reference)
     if json:
         content = version.manifest.model_dump(mode="json")
-        print_json({"version": version.version, "sha256": version.sha256, **content})
+        on_board = cost_on_board(version.manifest).as_dict()
+        facts = {"version": version.version, "sha256": version.sha256, "on_board": on_board}
+        print_json({**facts, **content})
     else:
         _print_version(version)
 
@@ -151,6 +154,7 @@ def _print_version(version: ModelVersion) -> None:
             ["RMSE", f"{figures.rmse_deg:.4f} deg"],
             ["error std", f"{figures.error_std_deg:.4f} deg"],
             ["error mean", f"{figures.error_mean_deg:+.4f} deg"],
+            ["on board", str(cost_on_board(manifest))],
             ["cross-validation", f"{number_of(figures.folds, 'fold')} by {figures.folds_by}"],
             [
                 "cohort",
