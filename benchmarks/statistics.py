@@ -22,7 +22,7 @@ from fleet_slip.regression.drive_moments import DriveMoments
 from fleet_slip.regression.exact import correlation_matrix, fit
 from fleet_slip.regression.folds import CohortFolds, by_hash
 from fleet_slip.regression.gram_table import GramTable
-from fleet_slip.regression.inference import infer_by_drives
+from fleet_slip.regression.inference import infer_by_clusters
 from fleet_slip.regression.nested_choice import (
     Rule,
     Training,
@@ -120,7 +120,7 @@ def whole_selection(fleet: Fleet) -> None:
         chosen = select_nested(training, INPUTS, LABEL, rule)
         cross_validate_selection("rule", training, assignment.fold, INPUTS, LABEL, rule)
         best_subsets(folds.total, INPUTS, LABEL)
-        infer_by_drives(chosen.fit, drives, SCALES)
+        infer_by_clusters(chosen.fit, drives, SCALES)
         models = [fit(folds.total - f, chosen.fit.model.signals, LABEL).model for f in folds.grams]
         products = held_out_products(drives, assignment.fold, models)
         bootstrap_correlations(products, 1000, seed=1)

@@ -21,7 +21,7 @@ from fleet_slip.regression.drive_moments import DriveMoments, serving_drives
 from fleet_slip.regression.evidence import Evidence
 from fleet_slip.regression.exact import correlation_matrix, fit
 from fleet_slip.regression.folds import CohortFolds, by_hash
-from fleet_slip.regression.inference import infer_by_drives, infer_classically
+from fleet_slip.regression.inference import infer_by_clusters, infer_classically
 from fleet_slip.regression.nested import nested_fits
 from fleet_slip.regression.nested_choice import (
     CROSS_VALIDATION,
@@ -72,7 +72,7 @@ def evidence(training: Training) -> None:
         print(f"  {name:<15} keeps {sizes[0]} by rows, {sizes[1]} by drives")
     naive, robust = (
         infer_classically(fits[-1], SCALES),
-        infer_by_drives(fits[-1], training.drives, SCALES),
+        infer_by_clusters(fits[-1], training.drives, SCALES),
     )
     for one, other in zip(naive.estimates, robust.estimates, strict=True):
         errors = f"{one.standard_error:.2g} or {other.standard_error:.2g}"

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from fleet_slip.grams.cohort import Cohort
     from fleet_slip.grams.folding import Folding, FoldKey
     from fleet_slip.models.model_version import ModelVersion
+    from fleet_slip.regression.drive_moments import ClusterUnit
     from fleet_slip.selection.diagnostics import Diagnosis
     from fleet_slip.selection.regimes import RegimeComparison
     from fleet_slip.selection.request import RequestedSelection
@@ -50,6 +51,7 @@ class FleetCohort(Rooted):
         worth: str = "0.005deg",
         all_subsets: bool = False,
         naive: bool = False,
+        cluster: "ClusterUnit | None" = None,
         search: str | None = None,
         most: int | None = None,
         bootstrap: int | None = None,
@@ -70,7 +72,9 @@ class FleetCohort(Rooted):
             criterion: what decides how many of the ranked inputs are kept: `cv`, `bic` ...
             worth: the smallest gain in RMSE that is worth a signal, such as `0.005deg` or `2%`.
             all_subsets: search all subsets of the inputs of `nested` instead of an order.
-            naive: take rows for independent evidence, not drives.
+            naive: take rows for independent evidence, not drives or cars.
+            cluster: what is independent evidence, `vehicle` or `drive`; by default cars where there
+                are several.
             search: search among the inputs of `nested`, or all, in every fold, as by `exchange`.
             most: the most columns of `search`.
             bootstrap: draw the drives so many times for an interval of the winner's correlation.
@@ -93,6 +97,7 @@ class FleetCohort(Rooted):
             worth=worth,
             all_subsets=all_subsets,
             naive=naive,
+            cluster=cluster,
             search=search,
             most=most,
             bootstrap=bootstrap,
@@ -109,6 +114,7 @@ class FleetCohort(Rooted):
         against: str | None = None,
         serial: bool = False,
         sensor_noise: Mapping[str, float] | None = None,
+        cluster: "ClusterUnit | None" = None,
     ) -> "Diagnosis":
         """Fit a model's signals to the cohort and examine the fit.
 
@@ -121,6 +127,7 @@ class FleetCohort(Rooted):
                 `fleet.gram("lags")` makes.
             sensor_noise: noise that the logs already have, as standard deviations in SI units by
                 signal: shows the coefficients without it (errors in variables).
+            cluster: what is independent evidence, as in `select`.
 
         Raises `UsageError` if both a model and signals are named, and what `Fleet.model` raises.
         """
@@ -136,6 +143,7 @@ class FleetCohort(Rooted):
             lagged=self._load(lagged) if serial else None,
             against=self._load(examined.feature_set, against) if against else None,
             sensor_noise=sensor_noise,
+            cluster=cluster,
         )
 
     def what_if(
@@ -207,19 +215,20 @@ class FleetCohort(Rooted):
         by: "FoldKey" = "drive",
         folds: int | str | None = None,
         naive: bool = False,
+        cluster: "ClusterUnit | None" = None,
     ) -> "tuple[Shrunk, ...]":
         """Compare least squares with ridge, lasso, James-Stein and Pace regression.
 
         Penalties are chosen by cross-validation inside each training fold. `signals` are inputs of
         the feature set `features` separated by commas, by default all; with `naive` rows are
-        independent evidence, not drives.
+        independent evidence, else what `cluster` says, as in `select`.
         """
         from fleet_slip.selection.request import WHOLE_SET, inputs_of
         from fleet_slip.selection.shrinkage import compare_shrinkage
 
         folding, cohort = _folding(by, folds), self._load(features)
         inputs = inputs_of(cohort, signals or WHOLE_SET)
-        return compare_shrinkage(cohort, inputs, folding, naive=naive)
+        return compare_shrinkage(cohort, inputs, folding, naive=naive, cluster=cluster)
 
     def _load(self, feature_set: str, condition: str | None = None) -> "Cohort":
         from fleet_slip.grams.cohort import load_cohort

@@ -7,7 +7,7 @@ import typer
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.cli.options import Cohort
+from fleet_slip.cli.options import Cluster, Cohort
 from fleet_slip.cli.output import Json, print_json, print_table, say, stdout
 from fleet_slip.cli.subject import FeatureSetOption, Model, Signals, quantities
 from fleet_slip.regression.inference import INTERCEPT, Estimate
@@ -33,6 +33,7 @@ def diagnose(
             "fleet-slip gram --features lags",
         ),
     ] = False,
+    cluster: Cluster = None,
     sensor_noise: Annotated[
         list[str] | None,
         typer.Option(
@@ -44,8 +45,8 @@ def diagnose(
 ) -> None:
     """Fit a model's signals to a cohort and examine the fit, from Gram rows.
 
-    Standard errors by drives are the ones to believe: at 100 Hz a row says little that the one
-    before did not say.
+    Standard errors by drives, or by cars where there are several, are the ones to believe: at
+    100 Hz a row says little that the one before did not say, and a car's drives share its biases.
     """
     result = context.obj.cohort(cohort).diagnose(
         model,
@@ -54,6 +55,7 @@ def diagnose(
         against=against,
         serial=serial,
         sensor_noise=quantities(sensor_noise, "--sensor-noise"),
+        cluster=cluster,
     )
     if json:
         print_json({"cohort": cohort, **result.as_dict()})
@@ -83,7 +85,15 @@ def _print_diagnosis(result: Diagnosis) -> None:
 
 
 def _coefficient_header(result: Diagnosis) -> list[str]:
-    header = ["signal", "unit", "coefficient", "s.e. by drives", "t", "s.e. by rows", "VIF"]
+    header = [
+        "signal",
+        "unit",
+        "coefficient",
+        f"s.e. by {result.cluster}s",
+        "t",
+        "s.e. by rows",
+        "VIF",
+    ]
     if result.serial is not None:
         header += ["AR(1)", "s.e. AR(1)"]
     if result.noise_free is not None:
@@ -132,14 +142,26 @@ def _print_comparison(result: Diagnosis, found: CohortComparison) -> None:
             for here, there in zip(result.robust.estimates, found.other.estimates, strict=True)
         ],
     )
-    for test, kind in ((found.drives, "Wald, by drives"), (found.rows, "Chow, by rows")):
+    tests = [(found.drives, f"Wald, by {result.cluster}s"), (found.rows, "Chow, by rows")]
+    for test, kind in tests:
+        if test is None:
+            continue
         stdout().print(
             f"the same coefficients? {kind}: F({test.numerator}, {test.denominator}) = "
             f"{test.f:,.2f}, p = {test.p:.2g}.",
             markup=False,
         )
-    if found.drives.p > 0.05 >= found.rows.p:
-        say("by drives, the difference is no more than chance: the rows only look like evidence.")
+    if found.drives is None:
+        say(
+            f"there are too few {result.cluster}s to compare so many coefficients by them. Chow's "
+            "test takes neighbouring rows for independent evidence, which they are not: its p is "
+            "far too small, and only a large one says something."
+        )
+    elif found.drives.p > 0.05 >= found.rows.p:
+        say(
+            f"by {result.cluster}s, the difference is no more than chance: the rows only look like "
+            "evidence."
+        )
 
 
 def _standardised(here: Estimate, there: Estimate) -> float:

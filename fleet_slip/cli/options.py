@@ -9,6 +9,7 @@ from typing import Annotated, Any, TypeVar
 import typer
 
 from fleet_slip.regression.criteria import CRITERIA
+from fleet_slip.regression.drive_moments import ClusterUnit
 from fleet_slip.regression.ranking import RANKINGS
 from fleet_slip.regression.stepwise import METHODS
 from fleet_slip.selection.model_list import DEFAULT_MOST
@@ -62,8 +63,13 @@ SELECTION: dict[str, Any] = {
     ),
     "naive": typer.Option(
         "--naive",
-        help="Take rows for independent evidence, not drives. At 100 Hz they are not: then every "
-        "criterion keeps nearly everything.",
+        help="Take rows for independent evidence, not drives or cars. At 100 Hz they are not: "
+        "then every criterion keeps nearly everything.",
+    ),
+    "cluster": typer.Option(
+        help="What is independent evidence: vehicle, since a car's drives share its biases and "
+        "tyres, or drive. Default: vehicle where there are several, else drive.",
+        show_default=False,
     ),
     "search": typer.Option(
         "--search",
@@ -94,6 +100,7 @@ Cohort = Annotated[str, SELECTION["cohort"]]
 FoldCount = Annotated[str | None, SELECTION["folds"]]
 Worth = Annotated[str, SELECTION["worth"]]
 Naive = Annotated[bool, SELECTION["naive"]]
+Cluster = Annotated[ClusterUnit | None, SELECTION["cluster"]]
 
 
 def selection_options(

@@ -188,8 +188,8 @@ def _print_honest(honest: CrossValidation) -> None:
 def _print_uncertainty(found: Uncertainty) -> None:
     if found.interval is not None:
         stdout().print(
-            f"{found.interval.level:.0%} interval of the winner's correlation, drawing its drives "
-            f"{found.interval.replicates:,} times: {found.interval.low:.4f} to "
+            f"{found.interval.level:.0%} interval of the winner's correlation, drawing its "
+            f"{found.drawn}s {found.interval.replicates:,} times: {found.interval.low:.4f} to "
             f"{found.interval.high:.4f}.",
             markup=False,
         )

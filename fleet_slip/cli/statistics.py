@@ -9,7 +9,7 @@ from fleet_slip.catalogue.feature_sets import PLAIN, FeatureSet
 from fleet_slip.catalogue.features import column_query
 from fleet_slip.catalogue.features import features as known_features
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.cli.options import Cohort, FoldCount, Naive
+from fleet_slip.cli.options import Cluster, Cohort, FoldCount, Naive
 from fleet_slip.cli.output import Json, print_json, print_table, stdout
 from fleet_slip.cli.subject import FeatureSetOption, Model, Signals, quantities
 from fleet_slip.grams.folding import FoldKey
@@ -244,6 +244,7 @@ def shrink(
     by: By = "drive",
     folds: FoldCount = None,
     naive: Naive = False,
+    cluster: Cluster = None,
     json: Json = False,
 ) -> None:
     """Compare least squares with ridge, lasso, James-Stein and Pace regression.
@@ -252,7 +253,7 @@ def shrink(
     signal there is little to shrink; with few drives, or many features, it shows here.
     """
     found = _cohort(context, cohort).shrink(
-        signals, features=feature_set or PLAIN, by=by, folds=folds, naive=naive
+        signals, features=feature_set or PLAIN, by=by, folds=folds, naive=naive, cluster=cluster
     )
     inputs = found[0].cross_validation.signals  # least squares keeps all
     if json:

@@ -3,13 +3,15 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import Cohort, Served, assign_folds
 from fleet_slip.grams.folding import FOLD_KEYS, PARTS, ROW_FOLDS, Folding
-from fleet_slip.regression.drive_moments import DriveMoments
+from fleet_slip.regression.drive_moments import ClusterUnit, DriveMoments
 from fleet_slip.regression.folds import CohortFolds, Folds
 from fleet_slip.regression.nested_choice import Training
 
@@ -32,14 +34,39 @@ class DriveFolds:
     def moments(self) -> DriveMoments:
         """Moments of each drive, for cluster-robust errors and resampling."""
         if self.training.drives is None:
-            return DriveMoments.of(self.served.table)
+            return clustered_moments(self.served)
         return self.training.drives
 
 
+def clustered_moments(
+    served: Served, cluster: ClusterUnit | None = None, cars: Sequence[str] = ()
+) -> DriveMoments:
+    """Return the moments of each drive, and which of them are one piece of evidence.
+
+    By default the coarser there is: cars where there are several, else drives. Clusters are
+    numbered by their place among `cars`, by default those of these drives, so that two cohorts can
+    share them.
+    """
+    owners = served.drives["vehicle_id"].to_pylist()
+    cars = cars or owners
+    if (cluster or ("vehicle" if len(set(cars)) > 1 else "drive")) == "drive":
+        return DriveMoments.of(served.table)
+    number = {car: i for i, car in enumerate(sorted(set(cars)))}
+    of_drive = np.array([number[car] for car in owners], dtype=np.int64)
+    return DriveMoments.of(served.table, of_drive, "vehicle")
+
+
 def drive_folds(
-    cohort: Cohort, inputs: Sequence[str], folding: Folding, *, naive: bool = False
+    cohort: Cohort,
+    inputs: Sequence[str],
+    folding: Folding,
+    *,
+    naive: bool = False,
+    cluster: ClusterUnit | None = None,
 ) -> DriveFolds:
-    """Divide the drives that have all the inputs into folds. `naive` takes rows for independent.
+    """Divide the drives that have all the inputs into folds.
+
+    `naive` takes rows for independent; otherwise drives or cars are, see `clustered_moments`.
 
     Raises `DataError` if no drive has them all, and `QuestionError` for folds of rows.
     """
@@ -52,7 +79,7 @@ def drive_folds(
         served.drives[FOLD_KEYS[folding.by]].to_pylist(), folding.by, folding.count
     )
     folds = CohortFolds.of([served.table], assignment).serving(inputs, catalogue().label)
-    moments = None if naive else DriveMoments.of(served.table)
+    moments = None if naive else clustered_moments(served, cluster)
     return DriveFolds(served, assignment.fold, Training(folds, moments, input_scales()))
 
 

@@ -6,7 +6,7 @@ window; every window has a running sum and a number of values. Each estimate is 
 """
 
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Hashable, Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -89,13 +89,16 @@ def _operations(sql: Iterable[str]) -> dict[str, int]:
 
     What is made of constants alone is made before.
     """
-    steps: dict[int, str] = {}
+    steps: dict[Hashable, str] = {}
     for one in map(parse, sql):
+        keys: list[Hashable] = []
         constant: list[bool] = []
-        for step, key in zip(one.steps, one.keys, strict=True):
+        for step in one.steps:
+            parts = tuple(keys[at] for at in step.operands)
+            keys.append((step.function, parts, step.value, step.name))
             constant.append(not step.name and all(constant[at] for at in step.operands))
             if not constant[-1]:
-                steps[key] = step.function
+                steps[keys[-1]] = step.function
     done: dict[str, int] = defaultdict(int)
     for function in steps.values():
         done["+" if function == "-" else function] += 1

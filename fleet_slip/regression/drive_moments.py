@@ -6,16 +6,19 @@ integers; so nothing is lost to cancellation before they are scaled to unit spre
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.arrays import BoolArray, FloatArray
+from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.errors import DataError
 from fleet_slip.regression.exact import LinearModel
 from fleet_slip.regression.gram import packed_position, packed_size
 from fleet_slip.regression.gram_table import GramTable
+
+ClusterUnit = Literal["drive", "vehicle"]
+"""What counts as one independent piece of evidence."""
 
 
 def missing_signals_error(signals: Sequence[str]) -> DataError:
@@ -64,15 +67,22 @@ class DriveMoments:
         centre: mean count of each signal over all drives, rounded to an integer.
         spread: standard deviation of each signal's counts; 1 for a constant.
         packed: lower triangle of the (k+1) x (k+1) moments of u, shape (drives, (k+1)(k+2)/2).
+        cluster: number of the piece of evidence that each drive belongs to, shape (drives,): drives
+            of a car share its biases and tyres. None: every drive is one of its own.
+        unit: what a piece of evidence is.
     """
 
     signals: tuple[str, ...]
     centre: tuple[int, ...]
     spread: FloatArray
     packed: FloatArray
+    cluster: IntArray | None = None
+    unit: ClusterUnit = "drive"
 
     @classmethod
-    def of(cls, table: GramTable) -> "DriveMoments":
+    def of(
+        cls, table: GramTable, cluster: IntArray | None = None, unit: ClusterUnit = "drive"
+    ) -> "DriveMoments":
         """Centre and scale a table of drives. Raises `DataError` if it has no rows."""
         total = table.total()
         if total.n == 0:
@@ -93,7 +103,7 @@ class DriveMoments:
             for i, j in zip((row + 1).tolist(), (column + 1).tolist(), strict=True)
         ]
         packed[:, inner] = about.products / (spread[row] * spread[column])
-        return cls(table.signals, centre, spread, packed)
+        return cls(table.signals, centre, spread, packed, cluster, unit)
 
     def __len__(self) -> int:
         """Return the number of drives."""
@@ -106,7 +116,24 @@ class DriveMoments:
 
     def take(self, rows: NDArray[Any]) -> "DriveMoments":
         """Return the drives at an index array or a mask, with the same centre and spread."""
-        return replace(self, packed=self.packed[rows])
+        cluster = None if self.cluster is None else self.cluster[rows]
+        return replace(self, packed=self.packed[rows], cluster=cluster)
+
+    @property
+    def clusters(self) -> "DriveMoments":
+        """The moments of each independent piece of evidence, in the order of their numbers."""
+        if self.cluster is None:
+            return self
+        numbers = np.unique(self.cluster)
+        return replace(self, packed=self.sum_clusters(self.packed), cluster=numbers)
+
+    def sum_clusters(self, values: FloatArray) -> FloatArray:
+        """Add up what is given for each drive, shape (drives, columns), over each cluster."""
+        if self.cluster is None:
+            return values
+        order = np.argsort(self.cluster, kind="stable")
+        _, first = np.unique(self.cluster[order], return_index=True)
+        return np.add.reduceat(values[order], first, axis=0)
 
     def matrix(self, packed: FloatArray) -> FloatArray:
         """Unpack moments, shape (..., p), to symmetric matrices, shape (..., k+1, k+1)."""

@@ -18,7 +18,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
 from fleet_slip.regression.drive_moments import DriveMoments
 from fleet_slip.regression.exact import Fit
-from fleet_slip.regression.inference import drive_scores, noise_variance, small_sample_factor
+from fleet_slip.regression.inference import cluster_scores, noise_variance, small_sample_factor
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Evidence:
         design_effect: variance of an estimate over what independent rows would give.
         variance: sigma^2 of the full model, counts^2.
         full_rss: residual sum of squares of the full model, counts^2.
-        kind: "rows" if rows count as independent, "drives" if only drives do.
+        kind: "rows" if rows count as independent, "drives" or "vehicles" if only those do.
     """
 
     contributions: tuple[float, ...]
@@ -39,7 +39,7 @@ class Evidence:
     design_effect: float
     variance: float
     full_rss: float
-    kind: Literal["rows", "drives"]
+    kind: Literal["rows", "drives", "vehicles"]
 
     @classmethod
     def naive(cls, fits: Sequence[Fit]) -> "Evidence":
@@ -59,20 +59,21 @@ class Evidence:
 
     @classmethod
     def clustered(cls, fits: Sequence[Fit], drives: DriveMoments) -> "Evidence":
-        """Take drives for independent: A_j is a squared cluster-robust t value.
+        """Take drives, or cars, for independent: A_j is a squared cluster-robust t value.
 
         With q_j the orthogonal direction of signal j and e the full model's residuals,
-        A_j = (q_j'y)^2 / (c sum_p (q_j'e)_p^2), p running over drives. The ratio to the naive
+        A_j = (q_j'y)^2 / (c sum_p (q_j'e)_p^2), p running over clusters. The ratio to the naive
         A_j is the design effect of that direction (Kish 1965); rows divided by the mean design
         effect are the effective rows, at least k + 2. Raises `DataError` as `naive` does.
         """
         full, variance = fits[-1], _variance(fits[-1])
         at = [0, *(drives.signals.index(name) + 1 for name in full.model.signals)]
         total = drives.matrix(drives.packed.sum(axis=0))[np.ix_(at, at)]
-        scores = drive_scores(full, drives)
+        scores = cluster_scores(full, drives)
         rotated = np.linalg.solve(np.linalg.cholesky(total), scores.T)[1:]
         unit = float(drives.spread[-1]) ** 2
-        noise = small_sample_factor(full, len(drives)) * np.sum(rotated**2, axis=1) * unit
+        factor = small_sample_factor(full, len(scores), drives.unit)
+        noise = factor * np.sum(rotated**2, axis=1) * unit
         gains = np.array([float(gain) for gain in _gains(fits)])
         effects = noise / float(variance)
         effect = float(effects.mean()) if len(effects) else 1.0
@@ -83,7 +84,7 @@ class Evidence:
             effect,
             float(variance),
             float(full.rss),
-            "drives",
+            "vehicles" if drives.unit == "vehicle" else "drives",
         )
 
     @property

@@ -110,45 +110,62 @@ def infer_classically(fitted: Fit, scales: Scales, variance: Fraction | None = N
     )
 
 
-def infer_by_drives(fitted: Fit, drives: DriveMoments, scales: Scales) -> Inference:
-    """Return cluster-robust standard errors, one cluster a drive (Cameron and Miller 2015).
+def infer_by_clusters(fitted: Fit, drives: DriveMoments, scales: Scales) -> Inference:
+    """Return cluster-robust standard errors, a cluster being a drive or a car.
 
-    V = c B (sum_p s_p s_p') B with B = (X'X)^-1, s_p the drive's sum of x times residual, and
-    c = P/(P-1) (n-1)/(n-k-1). The t distribution has P - 1 degrees of freedom.
-    Raises `DataError` if there is only one drive.
+    After Cameron and Miller, A Practitioner's Guide to Cluster-Robust Inference (2015):
+    V = c B (sum_p s_p s_p') B with B = (X'X)^-1, s_p the cluster's sum of x times residual, and
+    c = P/(P-1) (n-1)/(n-k-1), their correction CR1 for few clusters. The t distribution has P - 1
+    degrees of freedom. Raises `DataError` if there is only one cluster.
     """
     covariance = cluster_covariance(fitted, drives)
     units = [float(unit) for unit in _units(fitted, scales)]
     errors = [math.sqrt(v) * u for v, u in zip(np.diag(covariance), units, strict=True)]
     sigma2 = noise_variance(fitted)
-    return _inference(fitted, scales, sigma2, errors, degrees=len(drives) - 1, kind="cluster")
+    return _inference(
+        fitted, scales, sigma2, errors, degrees=len(drives.clusters) - 1, kind="cluster"
+    )
 
 
 def cluster_covariance(fitted: Fit, drives: DriveMoments) -> FloatArray:
     """Return the cluster-robust covariance of (intercept, coefficients) in counts."""
+    half = cluster_influences(fitted, drives)
+    return np.asarray(half @ half.T, dtype=np.float64)
+
+
+def cluster_influences(fitted: Fit, drives: DriveMoments) -> FloatArray:
+    """Return how each cluster moves (intercept, coefficients), in counts, shape (k+1, clusters).
+
+    Their products sum up to the cluster-robust covariance. Raises `DataError` for one cluster.
+    """
     at = _columns(fitted, drives)
-    scores = drive_scores(fitted, drives)
+    scores = cluster_scores(fitted, drives)
     total = drives.matrix(drives.packed.sum(axis=0))[np.ix_(at, at)]
-    half = np.linalg.solve(total, scores.T)
-    covariance = small_sample_factor(fitted, len(drives)) * (half @ half.T)
+    factor = small_sample_factor(fitted, len(scores), drives.unit)
+    half = math.sqrt(factor) * np.linalg.solve(total, scores.T)
     # From (1, (c - centre)/spread) in spreads of the label back to (1, c) in its counts.
     spread = drives.spread[[i - 1 for i in at[1:]]]
     centre = np.array([drives.centre[i - 1] for i in at[1:]], dtype=np.float64)
     back = np.diag([1.0, *(1 / spread)])
     back[0, 1:] = -centre / spread
-    return np.asarray(drives.spread[-1] ** 2 * back @ covariance @ back.T, dtype=np.float64)
+    return np.asarray(drives.spread[-1] * back @ half, dtype=np.float64)
 
 
-def drive_scores(fitted: Fit, drives: DriveMoments) -> FloatArray:
-    """Return each drive's sum of (1, inputs) times residual, standardised, shape (drives, k+1)."""
+def cluster_scores(fitted: Fit, drives: DriveMoments) -> FloatArray:
+    """Return each cluster's sum of (1, inputs) times residual, standardised.
+
+    The shape is (clusters, k+1).
+    """
     w = drives.direction(fitted.model)
-    return -drives.products_with(w)[:, _columns(fitted, drives)]
+    scores = -drives.products_with(w)[:, _columns(fitted, drives)]
+    return drives.sum_clusters(scores)
 
 
-def small_sample_factor(fitted: Fit, clusters: int) -> float:
-    """Return P/(P-1) (n-1)/(n-k-1). Raises `DataError` for a single drive."""
+def small_sample_factor(fitted: Fit, clusters: int, unit: str = "drive") -> float:
+    """Return P/(P-1) (n-1)/(n-k-1). Raises `DataError` for a single cluster."""
     if clusters < 2:
-        raise DataError("cluster-robust errors need at least two drives.")
+        otherwise = ": take drives for independent, cluster drive" if unit == "vehicle" else ""
+        raise DataError(f"cluster-robust errors need at least two {unit}s{otherwise}.")
     _require_noise(fitted)
     return clusters / (clusters - 1) * (fitted.gram.n - 1) / fitted.degrees_of_freedom
 
@@ -222,22 +239,42 @@ def wald_test(
 ) -> WaldTest:
     """Compare the coefficients of the same model fitted to two sets of drives.
 
-    F = d'(V_1 + V_2)^-1 d / (k + 1), d the difference and V the cluster-robust covariances; its
-    denominator is the number of drives minus two (Cameron and Miller 2015). Unlike `chow_test`, it
-    does not take neighbouring rows for independent. Raises `DataError` with fewer drives than
-    coefficients.
+    F = d'V^-1 d / (k + 1), d the difference and V its cluster-robust covariance, the sum of both
+    models' where no car is in both sets; its denominator is the number of clusters minus two
+    (Cameron and Miller 2015). Unlike `chow_test`, it does not take neighbouring rows for
+    independent. Clusters of the same number are the same car. Raises `DataError` with fewer
+    clusters than coefficients.
     """
-    size, drives = one.size + 1, len(one_drives) + len(other_drives)
-    if min(len(one_drives), len(other_drives)) <= size:
+    size, unit = one.size + 1, one_drives.unit
+    here, there = cluster_influences(one, one_drives), cluster_influences(other, other_drives)
+    if min(here.shape[1], there.shape[1]) <= size:
         raise DataError(
-            f"comparing {size} coefficients by drives needs more than {size} drives in each cohort."
+            f"comparing {size} coefficients by {unit}s needs more than {size} {unit}s in each "
+            "cohort."
         )
     gap = [a - b for a, b in zip(_numbers(one), _numbers(other), strict=True)]
-    covariance = cluster_covariance(one, one_drives) + cluster_covariance(other, other_drives)
+    moved = _side_by_side((here, one_drives), (there, other_drives))
+    covariance, drives = moved @ moved.T, moved.shape[1]
     spread = np.sqrt(np.diag(covariance))
     d = np.array([float(x) for x in gap]) / spread
     f = float(d @ np.linalg.solve(covariance / np.outer(spread, spread), d)) / size
     return WaldTest(f, size, drives - 2, special.f_upper(f, size, drives - 2))
+
+
+def _side_by_side(
+    one: tuple[FloatArray, DriveMoments], other: tuple[FloatArray, DriveMoments]
+) -> FloatArray:
+    """Return how each cluster moves the difference of two models; a car may be in both."""
+    (here, one_drives), (there, other_drives) = one, other
+    clusters = [drives.cluster for drives in (one_drives, other_drives)]
+    numbers = [np.unique(cluster) for cluster in clusters if cluster is not None]
+    if len(numbers) < len(clusters):  # drives, of which none is in both
+        return np.concatenate([here, -there], axis=1)
+    every = np.union1d(*numbers)
+    moved = np.zeros((len(here), len(every)))
+    moved[:, np.searchsorted(every, numbers[0])] += here
+    moved[:, np.searchsorted(every, numbers[1])] -= there
+    return moved
 
 
 def _numbers(fitted: Fit) -> list[Fraction]:

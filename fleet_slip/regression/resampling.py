@@ -48,9 +48,9 @@ def held_out_products(
     fold: np.ndarray[tuple[int], np.dtype[np.int64]],
     models: Sequence[LinearModel],
 ) -> FloatArray:
-    """Return each drive's moments of (1, error, label) under the model that did not see it.
+    """Return each cluster's moments of (1, error, label) under the models that did not see it.
 
-    `models` holds the model (of counts) for each fold. Shape (drives, 6), packed lower triangle,
+    `models` holds the model (of counts) for each fold. Shape (clusters, 6), packed lower triangle,
     in spreads of the label.
     """
     result = np.empty((len(drives), 6))
@@ -62,7 +62,7 @@ def held_out_products(
         change[0, 0] = change[2, label] = 1.0
         change[1] = drives.direction(model)
         result[rows] = part @ _congruence(change)
-    return result
+    return drives.sum_clusters(result)
 
 
 def bootstrap_correlations(products: FloatArray, replicates: int, seed: int) -> FloatArray:
@@ -85,12 +85,12 @@ def _correlation(n: Any, p: Any, pp: Any, py: Any, y: Any, yy: Any) -> Any:
 
 
 def bootstrap_coefficients(drives: DriveMoments, replicates: int, seed: int) -> FloatArray:
-    """Return refitted coefficients of resampled drives, in counts, shape (replicates, k+1).
+    """Return refitted coefficients of resampled clusters, in counts, shape (replicates, k+1).
 
     The columns are the intercept and the inputs of the moments. Raises `DataError` for fewer
     than two drives, and where a draw leaves signals dependent.
     """
-    totals = drives.matrix(_resampled_totals(drives.packed, replicates, seed))
+    totals = drives.matrix(_resampled_totals(drives.clusters.packed, replicates, seed))
     return to_counts(drives, solve(totals))
 
 
@@ -189,7 +189,7 @@ def _resampled_totals(values: FloatArray, replicates: int, seed: int) -> FloatAr
     """Return sums over as many drives drawn with replacement, shape (replicates, columns)."""
     drives = len(values)
     if drives < 2:
-        raise DataError("a bootstrap over drives needs at least two drives.")
+        raise DataError("a bootstrap needs at least two drives, or cars, to draw from.")
     # SFC64 and 64-bit draws are the fastest that bincount takes without a copy.
     rng = np.random.Generator(np.random.SFC64(seed))
     batch = max(1, _BATCH_BYTES // (8 * drives))

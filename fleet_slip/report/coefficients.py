@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.grams.cohort import Cohort
-from fleet_slip.regression.drive_moments import DriveMoments
+from fleet_slip.grams.training import clustered_moments
+from fleet_slip.regression.drive_moments import ClusterUnit
 from fleet_slip.regression.exact import fit
 from fleet_slip.regression.inference import (
     INTERCEPT,
-    infer_by_drives,
+    infer_by_clusters,
     infer_classically,
     variance_inflation,
 )
@@ -25,7 +26,7 @@ class Coefficient:
         name: signal, or "intercept".
         unit: of the value.
         value: coefficient.
-        cluster_error: standard error with drives as the independent pieces of evidence.
+        cluster_error: standard error with drives, or cars, as the independent pieces of evidence.
         row_error: standard error as if every row were independent.
         t: value / cluster_error.
         p: two-sided probability of a larger |t| if the true coefficient were zero.
@@ -51,6 +52,7 @@ class Coefficients:
     model: str
     rows: Sequence[Coefficient]
     drives: int
+    cluster: ClusterUnit
     log_rows: int
 
 
@@ -61,10 +63,10 @@ def coefficient_table(cohort: Cohort, model: str, inputs: Sequence[str]) -> Coef
     """
     label = catalogue().label
     served = cohort.serving(inputs)
-    moments = DriveMoments.of(served.table)
+    moments = clustered_moments(served)
     fitted = fit(served.table.total(), inputs, label)
     scales = input_scales()
-    robust, naive = infer_by_drives(fitted, moments, scales), infer_classically(fitted, scales)
+    robust, naive = infer_by_clusters(fitted, moments, scales), infer_classically(fitted, scales)
     inflation = variance_inflation(fitted.gram, inputs)
     spread = dict(zip(moments.signals, moments.spread.tolist(), strict=True))
     rows = []
@@ -88,4 +90,4 @@ def coefficient_table(cohort: Cohort, model: str, inputs: Sequence[str]) -> Coef
                 inflation=inflation.get(estimate.name),
             )
         )
-    return Coefficients(model, tuple(rows), len(moments), served.table.total().n)
+    return Coefficients(model, tuple(rows), len(moments), moments.unit, served.table.total().n)

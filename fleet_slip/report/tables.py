@@ -24,7 +24,7 @@ def coefficient_tables(data: ReportData) -> Iterator[ReportTable]:
                 "signal",
                 "unit",
                 "coefficient",
-                "standard error, by drives",
+                f"standard error, by {found.cluster}s",
                 "t",
                 "p",
                 "standard error, by rows",
@@ -54,9 +54,9 @@ def _coefficient(row: Coefficient) -> list[str]:
 def _evidence(found: Coefficients) -> str:
     return (
         f"{count(found.log_rows)} rows of {found.drives} drives. Rows at 100 Hz are not "
-        "independent: the cluster-robust standard errors take each drive as one piece of evidence; "
-        "those by rows, which are far too small, stand beside. Effect of one std: degrees of "
-        "estimate for one standard deviation of the signal."
+        "independent: the cluster-robust standard errors take each {found.cluster} as one piece of "
+        "evidence; those by rows, which are far too small, stand beside. Effect of one std: "
+        "degrees of estimate for one standard deviation of the signal."
     )
 
 

@@ -9,7 +9,8 @@ from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import Cohort, Served
-from fleet_slip.regression.drive_moments import DriveMoments, serving_drives
+from fleet_slip.grams.training import clustered_moments
+from fleet_slip.regression.drive_moments import ClusterUnit, DriveMoments, serving_drives
 from fleet_slip.regression.evidence import Evidence
 from fleet_slip.regression.exact import Fit, LinearModel, condition_number, fit
 from fleet_slip.regression.inference import (
@@ -17,7 +18,7 @@ from fleet_slip.regression.inference import (
     Inference,
     WaldTest,
     chow_test,
-    infer_by_drives,
+    infer_by_clusters,
     infer_classically,
     variance_inflation,
     wald_test,
@@ -57,13 +58,14 @@ class CohortComparison:
         condition: the other cohort.
         other: the coefficients there.
         rows: Chow's test, which takes rows for independent.
-        drives: Wald's test, which takes drives for independent.
+        drives: Wald's test, which takes drives or cars for independent; None with fewer of them
+            than coefficients.
     """
 
     condition: str
     other: Inference
     rows: ChowTest
-    drives: WaldTest
+    drives: WaldTest | None
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,8 @@ class Diagnosis:
     Attributes:
         fitted: exact fit, in counts.
         drives: number of drives that serve it.
-        naive, robust: coefficients in SI units, rows or drives counting as independent.
+        cluster: what counts as independent in `robust` and `evidence`.
+        naive, robust: coefficients in SI units, rows or clusters counting as independent.
         inflation: variance inflation of each input.
         condition_number: of the inputs' correlation matrix.
         evidence: effective rows and design effect.
@@ -84,6 +87,7 @@ class Diagnosis:
 
     fitted: Fit
     drives: int
+    cluster: ClusterUnit
     naive: Inference
     robust: Inference
     inflation: Mapping[str, float]
@@ -98,6 +102,8 @@ class Diagnosis:
         document: dict[str, Any] = {
             "signals": list(self.fitted.model.signals),
             "drives": self.drives,
+            "cluster": self.cluster,
+            "clusters": self.robust.degrees_of_freedom + 1,
             "rows": self.fitted.gram.n,
             "effective_rows": self.evidence.rows,
             "design_effect": self.evidence.design_effect,
@@ -106,7 +112,7 @@ class Diagnosis:
             "condition_number": self.condition_number,
             "variance_inflation": dict(self.inflation),
             "by_rows": [asdict(estimate) for estimate in self.naive.estimates],
-            "by_drives": [asdict(estimate) for estimate in self.robust.estimates],
+            "by_clusters": [asdict(estimate) for estimate in self.robust.estimates],
         }
         if self.serial is not None:
             document["serial"] = {
@@ -117,9 +123,11 @@ class Diagnosis:
         if self.comparison is not None:
             document["against"] = {
                 "cohort": self.comparison.condition,
-                "by_drives": [asdict(estimate) for estimate in self.comparison.other.estimates],
+                "by_clusters": [asdict(estimate) for estimate in self.comparison.other.estimates],
                 "chow_rows_independent": asdict(self.comparison.rows),
-                "wald_drives_independent": asdict(self.comparison.drives),
+                "wald_clusters_independent": asdict(self.comparison.drives)
+                if self.comparison.drives
+                else None,
             }
         if self.noise_free is not None:
             document["noise_free"] = {
@@ -136,6 +144,7 @@ def diagnose(
     lagged: Cohort | None = None,
     against: Cohort | None = None,
     sensor_noise: Mapping[str, float] | None = None,
+    cluster: ClusterUnit | None = None,
 ) -> Diagnosis:
     """Fit the inputs to the drives of a cohort that have them all, and examine the fit.
 
@@ -144,7 +153,8 @@ def diagnose(
     """
     label, scales = catalogue().label, input_scales()
     served = cohort.serving(inputs)
-    moments = DriveMoments.of(served.table)
+    there = against.serving(inputs) if against else None
+    moments = clustered_moments(served, cluster, _cars(served, there))
     total = served.table.total()
     fits = nested_fits(total, inputs, label)
     fitted = fits[-1]
@@ -154,13 +164,16 @@ def diagnose(
     return Diagnosis(
         fitted=fitted,
         drives=len(served.table),
+        cluster=moments.unit,
         naive=infer_classically(fitted, scales),
-        robust=infer_by_drives(fitted, moments, scales),
+        robust=infer_by_clusters(fitted, moments, scales),
         inflation=variance_inflation(total, inputs),
         condition_number=condition_number(total, inputs),
         evidence=Evidence.clustered(fits, moments),
         serial=_serial(fitted, lagged) if lagged else None,
-        comparison=_compare(served, fitted, moments, against) if against else None,
+        comparison=_compare(served, fitted, moments, against.condition.text, there)
+        if against and there
+        else None,
         noise_free=free,
     )
 
@@ -177,21 +190,27 @@ def _serial(fitted: Fit, lagged: Cohort) -> SerialDiagnosis:
     )
 
 
-def _compare(here: Served, fitted: Fit, moments: DriveMoments, against: Cohort) -> CohortComparison:
+def _cars(*cohorts: Served | None) -> list[str]:
+    """Return the cars of some cohorts."""
+    return [car for one in cohorts if one for car in one.drives["vehicle_id"].to_pylist()]
+
+
+def _compare(
+    here: Served, fitted: Fit, moments: DriveMoments, condition: str, there: Served
+) -> CohortComparison:
     inputs, label = fitted.model.signals, fitted.model.label
-    there = against.serving(inputs)
     shared = {*here.drives["drive_id"].to_pylist()} & {*there.drives["drive_id"].to_pylist()}
     if shared:
         raise QuestionError(
             f"the two cohorts share {number_of(len(shared), 'drive')}, such as {min(shared)}: a "
-            "comparison "
-            f"needs different drives. Add to the cohort: AND NOT ({against.condition})"
+            f"comparison needs different drives. Add to the cohort: AND NOT ({condition})"
         )
-    other_moments = DriveMoments.of(there.table)
+    other_moments = clustered_moments(there, moments.unit, _cars(here, there))
     other = fit(there.table.total(), inputs, label)
+    enough = min(len(one.clusters) for one in (moments, other_moments)) > len(inputs) + 1
     return CohortComparison(
-        against.condition.text,
-        infer_by_drives(other, other_moments, input_scales()),
+        condition,
+        infer_by_clusters(other, other_moments, input_scales()),
         chow_test([fitted.gram, other.gram], inputs, label),
-        wald_test(fitted, moments, other, other_moments),
+        wald_test(fitted, moments, other, other_moments) if enough else None,
     )

@@ -14,6 +14,7 @@ from fleet_slip.errors import QuestionError, UsageError
 from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.grams.fold_sums import SummedCohort, sum_cohort
 from fleet_slip.grams.folding import EACH, ROW_FOLDS, Folding, FoldKey, make_folding
+from fleet_slip.regression.drive_moments import ClusterUnit
 from fleet_slip.regression.nested_choice import Rule
 from fleet_slip.regression.stepwise import METHODS
 from fleet_slip.regression.winner import Worth
@@ -66,7 +67,8 @@ class SelectionRequest:
         rank, criterion: rank the inputs of `nested` first; choose by a criterion.
         all_subsets: choose among the best subsets of `nested` instead of an order's.
         worth: gain in RMSE for which cross-validation keeps a signal, such as `0.005deg` or `2%`.
-        naive: take rows for independent instead of drives.
+        naive: take rows for independent instead of drives or cars.
+        cluster: what is independent; by default cars where there are several, else drives.
         search, most: search among the inputs of `nested`, or all, for models of up to so many.
         bootstrap, repeat: how often to resample the winner's figures.
     """
@@ -82,6 +84,7 @@ class SelectionRequest:
     worth: str = WORTH
     all_subsets: bool = False
     naive: bool = False
+    cluster: ClusterUnit | None = None
     search: str | None = None
     most: int | None = None
     repeat: int | None = None
@@ -130,6 +133,11 @@ def answer_request(warehouse: Warehouse, request: SelectionRequest) -> Requested
         raise UsageError("a search of all subsets needs no order: leave out rank.")
     if request.most and not request.search:
         raise UsageError("most is for a search: say how to search.")
+    if request.cluster and (request.naive or not (request.ordered or request.bootstrap)):
+        raise UsageError(
+            "cluster says what is independent evidence for rank, criterion, all_subsets and "
+            "bootstrap: leave it out, or naive."
+        )
     if request.search and request.ordered:
         raise UsageError(
             "a search is made again in every fold, and looks at folds alone: leave out rank, "
@@ -158,6 +166,7 @@ def answer_request(warehouse: Warehouse, request: SelectionRequest) -> Requested
         folds,
         bootstrap=request.bootstrap,
         repeat=request.repeat,
+        cluster=request.cluster,
     )
     return replace(answer, uncertainty=figures)
 
@@ -224,10 +233,8 @@ def _search(cohort: Cohort, request: SelectionRequest, folds: Folding) -> Reques
     inputs = inputs_of(cohort, nested)
     criterion = require_criterion(request.criterion or "cv")
     rule = Rule(request.rank or "declared", criterion, parse_worth(request.worth))
-    if request.all_subsets:
-        found = select_subsets(cohort, inputs, folds, rule, naive=request.naive)
-    else:
-        found = select_ranked(cohort, inputs, folds, rule, naive=request.naive)
+    choose = select_subsets if request.all_subsets else select_ranked
+    found = choose(cohort, inputs, folds, rule, naive=request.naive, cluster=request.cluster)
     rule = found.choice.rule
     described = ModelList(
         description="Inputs to choose from",

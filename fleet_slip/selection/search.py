@@ -14,6 +14,7 @@ from fleet_slip.grams.folding import ROW_FOLDS, Folding
 from fleet_slip.grams.training import drive_folds, row_training
 from fleet_slip.regression.criteria import CRITERIA
 from fleet_slip.regression.crossval import CrossValidation, cross_validate, least_squares
+from fleet_slip.regression.drive_moments import ClusterUnit
 from fleet_slip.regression.evidence import Evidence
 from fleet_slip.regression.nested import nested_fits
 from fleet_slip.regression.nested_choice import (
@@ -95,7 +96,13 @@ def require_criterion(name: str) -> str:
 
 
 def select_ranked(
-    cohort: Cohort, inputs: Sequence[str], folding: Folding, rule: Rule, *, naive: bool = False
+    cohort: Cohort,
+    inputs: Sequence[str],
+    folding: Folding,
+    rule: Rule,
+    *,
+    naive: bool = False,
+    cluster: ClusterUnit | None = None,
 ) -> SearchResult:
     """Rank the inputs and choose one of the nested models, on the drives that have them all.
 
@@ -106,7 +113,7 @@ def select_ranked(
     if folding.by == ROW_FOLDS:
         training, fold = row_training(cohort, inputs, folding), np.empty(0, dtype=np.int64)
     else:
-        ready = drive_folds(cohort, inputs, folding, naive=naive)
+        ready = drive_folds(cohort, inputs, folding, naive=naive, cluster=cluster)
         training, fold = ready.training, ready.fold
     chosen = select_nested(training, inputs, label, rule)
     models = cross_validate_nested(training.folds, chosen.order, label, training.scales)[1:]
@@ -122,7 +129,13 @@ def select_ranked(
 
 
 def select_subsets(
-    cohort: Cohort, inputs: Sequence[str], folding: Folding, rule: Rule, *, naive: bool = False
+    cohort: Cohort,
+    inputs: Sequence[str],
+    folding: Folding,
+    rule: Rule,
+    *,
+    naive: bool = False,
+    cluster: ClusterUnit | None = None,
 ) -> SearchResult:
     """Find the best subset of every size and choose one of them.
 
@@ -132,7 +145,7 @@ def select_subsets(
     if folding.by == ROW_FOLDS:
         training = row_training(cohort, inputs, folding)
     else:
-        training = drive_folds(cohort, inputs, folding, naive=naive).training
+        training = drive_folds(cohort, inputs, folding, naive=naive, cluster=cluster).training
     total = training.folds.total
     results = best_subsets(total, inputs, label)
     evidence = _evidence(training, inputs)

@@ -19,6 +19,7 @@ from fleet_slip.regression.crossval import (
     held_out_errors,
     least_squares,
 )
+from fleet_slip.regression.drive_moments import ClusterUnit
 from fleet_slip.regression.evidence import Evidence
 from fleet_slip.regression.exact import Scales
 from fleet_slip.regression.folds import Folds
@@ -47,17 +48,22 @@ class Shrunk:
 
 
 def compare_shrinkage(
-    cohort: Cohort, inputs: Sequence[str], folding: Folding, *, naive: bool = False
+    cohort: Cohort,
+    inputs: Sequence[str],
+    folding: Folding,
+    *,
+    naive: bool = False,
+    cluster: ClusterUnit | None = None,
 ) -> tuple[Shrunk, ...]:
     """Cross-validate every method on the drives that have all the inputs.
 
     Ridge and lasso choose their penalty by cross-validation inside each training fold. Pace
-    weighs effects by the noise; drives count as independent, so its noise is larger by the design
-    effect, unless `naive`. Raises `QuestionError` for fewer than three folds, and
+    weighs effects by the noise; drives or cars count as independent, so its noise is larger by
+    the design effect, unless `naive`. Raises `QuestionError` for fewer than three folds, and
     `DataError` for dependent signals.
     """
     label = catalogue().label
-    ready = drive_folds(cohort, inputs, folding)
+    ready = drive_folds(cohort, inputs, folding, cluster=cluster)
     folds, scales = ready.training.folds, ready.training.scales
     if len(folds.grams) < FEWEST_FOLDS:
         raise QuestionError("choosing a penalty inside the training folds needs three folds.")

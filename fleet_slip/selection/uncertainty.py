@@ -7,6 +7,7 @@ from fleet_slip.grams.cohort import Cohort
 from fleet_slip.grams.folding import EACH, Folding
 from fleet_slip.grams.training import drive_folds
 from fleet_slip.regression.crossval import CrossValidation
+from fleet_slip.regression.drive_moments import ClusterUnit
 from fleet_slip.regression.exact import fit
 from fleet_slip.regression.resampling import (
     Interval,
@@ -25,12 +26,14 @@ class Uncertainty:
     """What resampling says of a model's cross-validated correlation.
 
     Attributes:
-        interval: percentile interval by cluster bootstrap over drives.
+        interval: percentile interval by cluster bootstrap.
+        drawn: what is drawn for it: drives, or cars with all their drives.
         repeats: number of deals of drives into folds; with `EACH` there is no other.
         repeated_mean, repeated_spread: mean and standard deviation of the correlation over them.
     """
 
     interval: Interval | None
+    drawn: ClusterUnit
     repeats: int
     repeated_mean: float | None
     repeated_spread: float | None
@@ -43,13 +46,16 @@ def estimate_uncertainty(
     *,
     bootstrap: int | None,
     repeat: int | None,
+    cluster: ClusterUnit | None = None,
 ) -> Uncertainty:
     """Draw the drives with replacement `bootstrap` times, deal the folds anew `repeat` times.
+
+    Of several cars, whole cars are drawn, see `fleet_slip.grams.training.clustered_moments`.
 
     Raises `QuestionError` for folds of rows, `DataError` for too few drives.
     """
     label = catalogue().label
-    ready = drive_folds(cohort, model.signals, folding)
+    ready = drive_folds(cohort, model.signals, folding, cluster=cluster)
     interval = None
     if bootstrap:
         splits = ready.training.folds.splits()
@@ -61,6 +67,7 @@ def estimate_uncertainty(
         repeated = repeated_cross_validation(ready.moments, folding.count, repeat, SEED)
     return Uncertainty(
         interval,
+        ready.moments.unit,
         repeat or 0,
         repeated.mean if repeated else None,
         repeated.spread if repeated else None,

@@ -163,7 +163,7 @@ def test_diagnose_shows_both_kinds_of_errors_and_the_serial_correlation(
 ) -> None:
     arguments = ("diagnose", "--signals", "ay,steer_fl", "--serial", "--sensor-noise", "ay=0.1")
     report = run_command(*arguments, "--json", root=every_set).json
-    for naive, robust in zip(report["by_rows"], report["by_drives"], strict=True):
+    for naive, robust in zip(report["by_rows"], report["by_clusters"], strict=True):
         assert naive["value"] == robust["value"]
         assert robust["standard_error"] > naive["standard_error"]
     assert report["effective_rows"] < report["rows"]
@@ -175,7 +175,7 @@ def test_diagnose_shows_both_kinds_of_errors_and_the_serial_correlation(
     fast, slow = "speed_factor > 0.85", "speed_factor <= 0.85"
     compared = ("diagnose", "--signals", "ay", "--cohort", fast, "--against", slow)
     against = run_command(*compared, "--json", root=every_set).json["against"]
-    assert against["chow_rows_independent"]["f"] > against["wald_drives_independent"]["f"] > 0
+    assert against["chow_rows_independent"]["f"] > against["wald_clusters_independent"]["f"] > 0
     assert "Wald, by drives" in run_command(*compared, root=every_set).stdout
 
 

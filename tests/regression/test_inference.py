@@ -15,7 +15,7 @@ from fleet_slip.regression.gram_table import GramTable
 from fleet_slip.regression.inference import (
     chow_test,
     cluster_covariance,
-    infer_by_drives,
+    infer_by_clusters,
     infer_classically,
     variance_inflation,
 )
@@ -65,7 +65,7 @@ def test_cluster_errors_equal_dense(seed: int, inputs: int) -> None:
     fitted = fit(gram_of(np.concatenate(drives)), names(inputs)[:-1], "y")
     covariance = cluster_covariance(fitted, moments_of(drives))
     np.testing.assert_allclose(covariance, dense_cluster_covariance(drives), rtol=1e-8, atol=1e-12)
-    result = infer_by_drives(fitted, moments_of(drives), unit_scales(inputs))
+    result = infer_by_clusters(fitted, moments_of(drives), unit_scales(inputs))
     errors = [estimate.standard_error for estimate in result.estimates]
     np.testing.assert_allclose(errors, np.sqrt(np.diag(covariance)), rtol=1e-12)
     assert result.degrees_of_freedom == 8
@@ -82,7 +82,9 @@ def test_drive_effects_make_the_classical_error_too_small() -> None:
     drives = random_drives(8, drives=30, noise=300)
     fitted = fit(gram_of(np.concatenate(drives)), names(4)[:-1], "y")
     naive = infer_classically(fitted, unit_scales(4)).estimates[0].standard_error
-    robust = infer_by_drives(fitted, moments_of(drives), unit_scales(4)).estimates[0].standard_error
+    robust = (
+        infer_by_clusters(fitted, moments_of(drives), unit_scales(4)).estimates[0].standard_error
+    )
     assert robust > 3 * naive
 
 
@@ -115,7 +117,7 @@ def test_questions_without_an_answer_are_errors() -> None:
     with pytest.raises(DataError, match="two groups"):
         chow_test([gram], ["x1"], "y")
     with pytest.raises(DataError, match="two drives"):
-        infer_by_drives(fit(gram, ["x1"], "y"), moments_of(drives[:1]), unit_scales(4))
+        infer_by_clusters(fit(gram, ["x1"], "y"), moments_of(drives[:1]), unit_scales(4))
     few = gram_of(drives[0][:2, [0, -1]])
     with pytest.raises(DataError, match="2 rows cannot tell"):
         infer_classically(fit(few, ["x1"], "y"), unit_scales(1))

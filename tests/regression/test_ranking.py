@@ -16,7 +16,7 @@ from fleet_slip.regression.drive_moments import DriveMoments
 from fleet_slip.regression.evidence import Evidence
 from fleet_slip.regression.exact import correlation_matrix, fit
 from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.inference import infer_by_drives
+from fleet_slip.regression.inference import infer_by_clusters
 from fleet_slip.regression.lars import fit_lasso, lars_path, lasso_path, lasso_path_of_moments
 from fleet_slip.regression.leaps import best_by_leaps
 from fleet_slip.regression.nested import nested_fits, nested_models
@@ -285,7 +285,7 @@ def test_contributions_over_drives_are_squared_cluster_t_values() -> None:
     moments = DriveMoments.of(table_of([gram_of(counts) for counts in drives]))
     fits = nested_fits(gram, names(4)[:-1], "y")
     evidence = Evidence.clustered(fits, moments)
-    t = infer_by_drives(fits[-1], moments, unit_scales(4)).estimates[-1].t
+    t = infer_by_clusters(fits[-1], moments, unit_scales(4)).estimates[-1].t
     assert evidence.contributions[-1] == pytest.approx(t**2, rel=1e-9)
     assert evidence.kind == "drives"
     assert 6 <= evidence.rows <= gram.n

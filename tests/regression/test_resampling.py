@@ -9,7 +9,7 @@ from fleet_slip.regression.drive_moments import DriveMoments
 from fleet_slip.regression.exact import fit
 from fleet_slip.regression.folds import CohortFolds, by_value
 from fleet_slip.regression.gram_table import GramTable
-from fleet_slip.regression.inference import infer_by_drives
+from fleet_slip.regression.inference import infer_by_clusters
 from fleet_slip.regression.resampling import (
     bootstrap_coefficients,
     bootstrap_correlations,
@@ -61,7 +61,9 @@ def test_bootstrap_spread_is_the_cluster_robust_error() -> None:
     moments = DriveMoments.of(table_of_drives(drives))
     draws = bootstrap_coefficients(moments, 2000, seed=3)
     fitted = fit(gram_of(np.concatenate(drives)), INPUTS, "y")
-    errors = [e.standard_error for e in infer_by_drives(fitted, moments, unit_scales(4)).estimates]
+    errors = [
+        e.standard_error for e in infer_by_clusters(fitted, moments, unit_scales(4)).estimates
+    ]
     np.testing.assert_allclose(draws.std(axis=0), errors, rtol=0.15)
 
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from fleet_slip.regression.drive_moments import DriveMoments
 from fleet_slip.regression.exact import fit
-from fleet_slip.regression.inference import infer_by_drives, infer_classically
+from fleet_slip.regression.inference import infer_by_clusters, infer_classically
 from fleet_slip.regression.serial import fit_autoregressive
 from tests.support.counts import (
     autoregressive_drives,
@@ -54,7 +54,7 @@ def test_coefficients_and_both_kinds_of_errors_agree(
     moments = DriveMoments.of(table_of([gram_of(part) for part in parts]))
     ours = [
         infer_classically(fitted, unit_scales(inputs)),
-        infer_by_drives(fitted, moments, unit_scales(inputs)),
+        infer_by_clusters(fitted, moments, unit_scales(inputs)),
     ]
     theirs = [model.fit(), model.fit(cov_type="cluster", cov_kwds={"groups": groups})]
     for mine, other in zip(ours, theirs, strict=True):

@@ -1,12 +1,18 @@
 """A model's fit examined: against the rows, and against a cohort with another law."""
 
+from dataclasses import replace
+from typing import cast
+
 import numpy as np
+import pyarrow as pa
 import pytest
+import statsmodels.api as sm
 
 from fleet_slip.catalogue.feature_sets import LAG, lag_signals
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError
+from fleet_slip.regression.drive_moments import ClusterUnit
 from fleet_slip.selection.diagnostics import diagnose
 from tests.support.cohorts import INPUTS, LABEL, Driven, cohort_of, driven, rows_of
 from tests.support.counts import dense_fit
@@ -44,7 +50,7 @@ def test_an_offset_of_each_drive_makes_the_naive_errors_too_small() -> None:
     rng = np.random.default_rng(3)
     for one in drives:
         one.counts[:, -1] += int(rng.normal(0, 200))
-    found = diagnose(cohort_of(drives), INPUTS)
+    found = diagnose(cohort_of(drives), INPUTS, cluster="drive")
     naive, robust = found.naive.estimates[0], found.robust.estimates[0]
     assert robust.standard_error > 3 * naive.standard_error
     assert found.evidence.kind == "drives"
@@ -55,10 +61,12 @@ def test_cohorts_of_one_law_agree_and_of_two_do_not() -> None:
     here = cohort_of(driven(3, COEFFICIENTS, drives=20, name="a"))
     same = cohort_of(driven(4, COEFFICIENTS, drives=20, name="b"), condition="mass_kg > 1")
     other = cohort_of(driven(5, (0.1, 0.4, 0.8, 0.2), drives=20, name="c"))
-    agreeing = diagnose(here, INPUTS, against=same).comparison
-    differing = diagnose(here, INPUTS, against=other).comparison
+    agreeing = diagnose(here, INPUTS, against=same, cluster="drive").comparison
+    differing = diagnose(here, INPUTS, against=other, cluster="drive").comparison
     assert agreeing is not None
     assert differing is not None
+    assert differing.drives is not None
+    assert agreeing.drives is not None
     assert agreeing.condition == "mass_kg > 1"
     assert agreeing.drives.p > 0.01
     assert differing.drives.p < 1e-6
@@ -114,3 +122,78 @@ def test_the_residual_says_as_much_of_the_next_as_was_put_in() -> None:
     errors = [e.standard_error for e in serial.inference.estimates]
     assert len(errors) == len(INPUTS) + 1
     assert min(errors) > 0
+
+
+def test_drives_of_a_car_are_one_piece_of_evidence_unless_told_otherwise() -> None:
+    """Against statsmodels 0.15, cov_type="cluster", with the cars or the drives as groups."""
+    drives = driven(9, COEFFICIENTS, drives=22)
+    cohort = cohort_of(drives)
+    owners = cohort.drives["vehicle_id"].to_pylist()
+    rows = rows_of(drives).astype(float)
+    model = sm.OLS(rows[:, -1], sm.add_constant(rows[:, :-1]))
+    units = [float(input_scales()[LABEL] / input_scales()[name]) for name in INPUTS]
+    lengths = [len(one.counts) for one in drives]
+    for cluster, groups in (("vehicle", owners), ("drive", [one.drive for one in drives])):
+        codes = np.repeat(np.unique(groups, return_inverse=True)[1], lengths)
+        expected = model.fit(cov_type="cluster", cov_kwds={"groups": codes}, use_t=True)
+        found = diagnose(cohort, INPUTS, cluster=cast(ClusterUnit, cluster))
+        assert found.cluster == cluster
+        slopes = found.robust.estimates[1:]
+        errors = [estimate.standard_error for estimate in slopes]
+        np.testing.assert_allclose(errors, expected.bse[1:] * units, rtol=1e-8)
+        p = [estimate.p for estimate in found.robust.estimates]
+        np.testing.assert_allclose(p, expected.pvalues, rtol=1e-6, atol=1e-15)
+        assert found.robust.degrees_of_freedom == len(set(groups)) - 1
+        assert found.evidence.kind == f"{cluster}s"
+    assert diagnose(cohort, INPUTS).cluster == "vehicle"
+    one_car = cohort.drives.set_column(1, "vehicle_id", pa.array(["a"] * len(drives)))
+    assert diagnose(replace(cohort, drives=one_car), INPUTS).cluster == "drive"
+
+
+def test_offsets_of_cars_are_seen_by_cars_alone() -> None:
+    """What all drives of a car share makes the errors by drives too small, and rows worth more."""
+    drives = driven(10, COEFFICIENTS, drives=160, rows=40, noise=10)
+    cars = np.random.default_rng(11).normal(0, 300, 4)
+    for number, one in enumerate(drives):
+        one.counts[:, -1] += int(cars[number % 4])
+    by_car, by_drive = (
+        diagnose(cohort_of(drives), INPUTS, cluster=cluster) for cluster in (None, "drive")
+    )
+    errors = [one.robust.estimates[0].standard_error for one in (by_car, by_drive)]
+    assert errors[0] > 3 * errors[1]
+
+
+def test_cars_in_both_cohorts_are_not_counted_twice() -> None:
+    """The difference of two fits is one fit on all rows with each column once more for one cohort.
+
+    Its cluster-robust F test by statsmodels, with another small-sample factor.
+    """
+    inputs = INPUTS[:1]
+    parts = [driven(seed, (0.3,), drives=40, name=name) for seed, name in ((12, "a"), (13, "b"))]
+    parts = [[replace(one, signals=(*inputs, LABEL)) for one in part] for part in parts]
+    here, there = (cohort_of(part) for part in parts)
+    comparison = diagnose(here, inputs, against=there).comparison
+    assert comparison is not None
+    assert comparison.drives is not None
+    rows = [np.concatenate([one.counts for one in part]).astype(float) for part in parts]
+    cars = np.concatenate([np.repeat(np.arange(40) % 4, 80)] * 2)
+    alone = np.concatenate([np.zeros(len(rows[0])), np.ones(len(rows[1]))])
+    x, y = np.concatenate(rows).T
+    design = np.column_stack([np.ones(len(x)), x, alone, alone * x])
+    kind = {"groups": cars, "use_correction": False}
+    fitted = sm.OLS(y, design).fit(cov_type="cluster", cov_kwds=kind, use_t=True)
+    size = len(rows[0])
+    factor = 4 / 3 * (size - 1) / (size - 2)
+    expected = float(fitted.f_test(np.eye(4)[2:]).statistic) / factor
+    assert comparison.drives.f == pytest.approx(expected, rel=1e-6)
+    assert comparison.drives.denominator == 4 - 2
+
+
+def test_too_few_cars_leave_the_rows_to_tell() -> None:
+    here = cohort_of(driven(14, COEFFICIENTS, name="a"))
+    there = cohort_of(driven(15, COEFFICIENTS, name="b"))
+    found = diagnose(here, INPUTS, against=there)
+    assert found.comparison is not None
+    assert found.comparison.drives is None
+    assert found.comparison.rows.f > 0
+    assert found.as_dict()["against"]["wald_clusters_independent"] is None

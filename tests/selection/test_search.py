@@ -12,6 +12,7 @@ from fleet_slip.grams.cohort import assign_folds
 from fleet_slip.grams.folding import Folding
 from fleet_slip.grams.training import drive_folds
 from fleet_slip.regression.crossval import cross_validate, least_squares
+from fleet_slip.regression.drive_moments import ClusterUnit
 from fleet_slip.regression.nested_choice import CROSS_VALIDATION, Rule, select_nested
 from fleet_slip.selection.search import (
     ALL_SUBSETS,
@@ -73,12 +74,12 @@ def test_each_nested_model_has_the_figures_of_its_own_cross_validation(
 def test_the_honest_figures_are_of_the_choice_itself_and_need_three_folds() -> None:
     rule, two = Rule("forward", "aic"), Folding(by="drive", count=2)
     drives = driven(5, (0.3, 0.1, 0.1, 0.1), drives=9, rows=15, noise=300)
-    honest = select_ranked(cohort_of(drives), INPUTS, FIVE, rule).choice.honest
+    honest = select_ranked(cohort_of(drives), INPUTS, FIVE, rule, cluster="drive").choice.honest
     fold = assign_folds([one.drive for one in drives], "drive", 5).fold
     errors, choices = [], set()
     for number in set(fold):
         rest = [one for one, mine in zip(drives, fold, strict=True) if mine != number]
-        training = drive_folds(cohort_of(rest), INPUTS, two).training
+        training = drive_folds(cohort_of(rest), INPUTS, two, cluster="drive").training
         chosen = select_nested(training, INPUTS, LABEL, rule).signals
         at = [INPUTS.index(name) for name in chosen]
         b, _ = dense_fit(rows_of(rest)[:, [*at, -1]])
@@ -92,17 +93,21 @@ def test_the_honest_figures_are_of_the_choice_itself_and_need_three_folds() -> N
     assert select_ranked(cohort_of(drives), INPUTS, two, rule).choice.honest is None
 
 
-@pytest.mark.parametrize("naive", [True, False])
+@pytest.mark.parametrize(
+    ("naive", "cluster", "kind"),
+    [(True, None, "rows"), (False, "drive", "drives"), (False, None, "vehicles")],
+)
 def test_what_counts_as_independent_is_what_was_asked_for(
-    drives: list[Driven], naive: bool
+    drives: list[Driven], naive: bool, cluster: ClusterUnit | None, kind: str
 ) -> None:
     rule = Rule("forward", "bic")
-    choice = select_ranked(cohort_of(drives), INPUTS, FIVE, rule, naive=naive).choice
-    assert choice.evidence.kind == ("rows" if naive else "drives")
+    cohort = cohort_of(drives)
+    choice = select_ranked(cohort, INPUTS, FIVE, rule, naive=naive, cluster=cluster).choice
+    assert choice.evidence.kind == kind
     assert (choice.evidence.rows == 30 * 80) is naive
     assert choice.as_dict()["evidence"] == choice.evidence.kind
     subsets = select_subsets(
-        cohort_of(drives), INPUTS, FIVE, Rule(ALL_SUBSETS, "bic"), naive=naive
+        cohort_of(drives), INPUTS, FIVE, Rule(ALL_SUBSETS, "bic"), naive=naive, cluster=cluster
     ).choice
     assert subsets.evidence.kind == choice.evidence.kind
 

@@ -15,7 +15,7 @@ FIVE = Folding(by="drive", count=5)
 
 
 def compared(drives: list[Driven], *, naive: bool = False) -> dict[str, Shrunk]:
-    found = compare_shrinkage(cohort_of(drives), INPUTS, FIVE, naive=naive)
+    found = compare_shrinkage(cohort_of(drives), INPUTS, FIVE, naive=naive, cluster="drive")
     return {one.cross_validation.name: one for one in found}
 
 

@@ -10,6 +10,7 @@ from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import assign_folds
 from fleet_slip.grams.folding import Folding
 from fleet_slip.regression.crossval import CrossValidation, cross_validate_inputs
+from fleet_slip.regression.drive_moments import ClusterUnit
 from fleet_slip.selection.uncertainty import estimate_uncertainty
 from tests.support.cohorts import INPUTS, LABEL, Driven, cohort_of, driven, rows_of
 
@@ -35,11 +36,15 @@ def test_the_interval_holds_the_figure_and_narrows_with_more_drives() -> None:
     assert widths[0] > 2 * widths[1]
 
 
-def test_the_interval_is_that_of_drawing_drives_by_hand() -> None:
-    """Predictions of each drive by the model that has not seen its fold, and whole drives drawn."""
+@pytest.mark.parametrize("cluster", ["drive", "vehicle"])
+def test_the_interval_is_that_of_drawing_clusters_by_hand(cluster: ClusterUnit) -> None:
+    """Predictions of each drive by the model that has not seen its fold; whole drives, or cars."""
     drives = driven(2, (0.1, 0.2, 0.1, 0.05), drives=20, noise=150)
     cohort = cohort_of(drives)
-    found = estimate_uncertainty(cohort, validated(drives), FIVE, bootstrap=1000, repeat=None)
+    found = estimate_uncertainty(
+        cohort, validated(drives), FIVE, bootstrap=1000, repeat=None, cluster=cluster
+    )
+    assert found.drawn == cluster
     assignment = assign_folds([one.drive for one in drives], "drive", 5).fold
     estimates = []
     for one, mine in zip(drives, assignment, strict=True):
@@ -47,10 +52,13 @@ def test_the_interval_is_that_of_drawing_drives_by_hand() -> None:
         x = np.column_stack([np.ones(len(rest)), rest[:, :-1]]).astype(float)
         b = np.linalg.lstsq(x, rest[:, -1].astype(float), rcond=None)[0]
         estimates.append((b[0] + one.counts[:, :-1] @ b[1:], one.counts[:, -1]))
+    owners = cohort.drives[f"{cluster}_id"].to_pylist()
+    members = [[i for i, one in enumerate(owners) if one == name] for name in sorted(set(owners))]
     rng = np.random.default_rng(0)
     drawn = []
     for _ in range(1000):
-        at = rng.integers(0, len(drives), len(drives))
+        clusters = rng.integers(0, len(members), len(members))
+        at = [i for number in clusters for i in members[number]]
         p, y = (np.concatenate([estimates[i][k] for i in at]) for k in (0, 1))
         drawn.append(np.corrcoef(p, y)[0, 1])
     assert found.interval is not None
@@ -73,7 +81,8 @@ def test_folds_dealt_again_give_about_the_same_figure_and_the_same_each_time() -
     assert found.repeated_mean == pytest.approx(model.correlation, abs=0.01)
     assert found.repeated_spread is not None
     assert 0 < found.repeated_spread < 0.01
-    assert set(asdict(found)) == {"interval", "repeats", "repeated_mean", "repeated_spread"}
+    keys = {"interval", "drawn", "repeats", "repeated_mean", "repeated_spread"}
+    assert set(asdict(found)) == keys
 
 
 def test_rows_are_no_drives_to_draw() -> None:
