@@ -17,6 +17,7 @@ from fleet_slip.monitoring.thresholds import StatusThresholds, thresholds
 from fleet_slip.resources import read_sql
 from fleet_slip.runs.anchors import find_missing_documents
 from fleet_slip.runs.history import lend_runs, run_source, state_of
+from fleet_slip.runs.records import find_changed_lines
 from fleet_slip.warehouse.database import database_errors, open_database
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -90,7 +91,9 @@ def status_of(
     free_bytes, disk_bytes = warehouse.root.free_bytes() or (None, 0)
     free = None if free_bytes is None else free_bytes / disk_bytes
     champions, damaged = _champions(warehouse, logs, grams, now)
-    last_runs = tuple(_last_runs(warehouse.root, now))
+    since = f"{now - REMEMBERED:%Y-%m}"
+    changed = list(find_changed_lines(warehouse.root, since))
+    last_runs = () if changed else tuple(_last_runs(warehouse.root, since))
     age = _age_hours(tables["logs"].committed_at, now)
     limits = thresholds().status
     problems = [
@@ -100,7 +103,7 @@ def status_of(
         *damaged,
         *(
             f"{path}: {what}"
-            for path, what in find_missing_documents(warehouse.root, f"{now - REMEMBERED:%Y-%m}")
+            for path, what in (*changed, *find_missing_documents(warehouse.root, since))
         ),
     ]
     return WarehouseStatus(
@@ -155,14 +158,14 @@ def _from_ms(milliseconds: int | None) -> datetime | None:
     return None if milliseconds is None else datetime.fromtimestamp(milliseconds / 1000, UTC)
 
 
-def _last_runs(root: Folder, now: datetime) -> list[dict[str, Any]]:
+def _last_runs(root: Folder, since: str) -> list[dict[str, Any]]:
     # Not through connect(), which fails with a damaged manifest: that is for the status to tell.
     with (
         open_database(reading=root) as database,
         database_errors(f"reading the history of runs in {root}"),
     ):
         view = read_sql("warehouse", "runs.sql")
-        runs = lend_runs(root, database, since=f"{now - REMEMBERED:%Y-%m}")
+        runs = lend_runs(root, database, since=since)
         database.execute(view.format(stored_runs=run_source(database, runs)))
         rows = database.sql(read_sql("jobs", "last_runs.sql")).to_arrow_table().to_pylist()
     return [row | {"state": state_of(row)} for row in rows]

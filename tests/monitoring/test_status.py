@@ -66,6 +66,19 @@ def test_a_killed_run_is_known(warehouse: Warehouse) -> None:
     assert problem.endswith(" was killed")
 
 
+def test_a_changed_line_of_the_history_is_a_problem_and_all_else_is_told(
+    warehouse: Warehouse,
+) -> None:
+    land(warehouse, "a", log_rows("a", random_counts(np.random.default_rng(1), 50)))
+    with recording(warehouse.root, "gram", []):
+        pass
+    (history,) = (path_of(warehouse.root) / "runs").iterdir()
+    history.write_text(history.read_text().replace('"done"', '"gone"'))
+    found = status_of(warehouse)
+    assert found.problems == (f"runs/{history.name}: line 4 is not what a run has written",)
+    assert (found.last_runs, found.tables["logs"].rows) == ((), 50)
+
+
 def test_a_missing_data_root_is_a_storage_error(tmp_path: Path) -> None:
     with pytest.raises(StorageError, match="no data root"):
         status_of(Warehouse(LocalFolder(tmp_path / "nothing")))
