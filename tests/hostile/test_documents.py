@@ -45,8 +45,10 @@ def forge(registry: Registry, kind: str, **changes: Any) -> None:
         {"intercept_exact": "9" * 5000 + "/1"},
         {"intercept_exact": None},
         {"intercept_exact": 0.1},
+        {"intercept": 0.123},  # not its exact fraction, rounded once
         {"intercept": "inf"},
         {"intercept": "nan"},
+        {"term": {"coefficient": 0.123}},
         {"term": {"scale": "NaN"}},
         {"term": {"scale": "1e999999"}},
         {"term": {"scale": 0}},
@@ -98,6 +100,7 @@ def test_a_forged_history_is_refused(registry: Registry, changes: dict[str, Any]
         '{"content": ' + "[" * 5000 + "]" * 5000 + ', "sha256": ""}',
         '{"content": ' + "9" * 5000 + ', "sha256": ""}',
         '{"content": NaN, "sha256": ""}',
+        '{"content": {}, "content": {}, "sha256": ""}',  # which of the two would be read?
         '{"content": "\\ud800", "sha256": ""}',
         "[]",
         "null",

@@ -110,6 +110,15 @@ def test_an_unsigned_version_is_refused_until_it_is_signed(
     assert registry.load(manifest().name, 1).version == 1
 
 
+@pytest.mark.parametrize("name", ["", " "])
+def test_an_empty_name_of_a_key_does_not_switch_verification_off(
+    signed: Registry, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.setenv(VERIFY_VARIABLE, name)
+    with pytest.raises(ConfigError, match="is set and empty"):
+        signed.load(manifest().name, 1)
+
+
 def test_keys_that_are_none_are_told_without_quoting_them(
     signed: Registry, tmp_path: Path, key: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
