@@ -137,10 +137,15 @@ class Fleet(Filling, Tending):
                         workers=executor,
                         progress=_of_step(progress, f"gram {feature_set}"),
                     )
-            with step("select"):
-                selection = self.cohort(condition).select(models=models, worth=worth)
-            with step("publish"):
-                publication, refusal = self._publish_if_not_worse(model_name, selection, sign_key)
+            refusal, selection = "", None
+            publication = self._made_already(model_name, condition, models, worth)
+            if publication is None:
+                with step("select"):
+                    selection = self.cohort(condition).select(models=models, worth=worth)
+                with step("publish"):
+                    publication, refusal = self._publish_if_not_worse(
+                        model_name, selection, sign_key
+                    )
         return RunReport(
             campaign=chosen.name,
             simulation=simulation,
@@ -151,6 +156,21 @@ class Fleet(Filling, Tending):
             refusal=refusal,
             seconds=round(time.monotonic() - begun, 3),
         )
+
+    def _made_already(
+        self, name: str, cohort: str, models: str, worth: str
+    ) -> "Publication | None":
+        """Return the champion if a selection would come to it again, whatever it looks at."""
+        from fleet_slip.maintenance.marks import marked_models
+        from fleet_slip.models.publish import Publication
+        from fleet_slip.models.up_to_date import is_up_to_date
+
+        champion = self.registry().champion(name)
+        if champion is None or champion.reference in marked_models(self.root):
+            return None
+        if not is_up_to_date(champion.manifest, self.warehouse, cohort, models, worth):
+            return None
+        return Publication(champion, False, "The champion was made from the same data and list.")
 
     def _publish_if_not_worse(
         self, name: str, selection: "RequestedSelection", sign_key: Path | None

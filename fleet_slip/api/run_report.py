@@ -14,14 +14,15 @@ class RunReport:
     """The report of each step.
 
     `gram_features` is of the feature set of the model list, if that is not the logged signals.
-    There is no publication where it was refused, with the reason.
+    There is no selection where the champion was made from the same data, list and program, and no
+    publication where it was refused, with the reason.
     """
 
     campaign: str
     simulation: SimulationReport
     gram: GramReport
     gram_features: GramReport | None
-    selection: RequestedSelection
+    selection: RequestedSelection | None
     publication: Publication | None
     refusal: str
     seconds: float
@@ -42,7 +43,7 @@ class RunReport:
             "simulate": asdict(self.simulation),
             "gram": asdict(self.gram),
             **({"gram_features": asdict(self.gram_features)} if self.gram_features else {}),
-            "select": self.selection.as_dict(),
+            "select": self.selection.as_dict() if self.selection else None,
             "publish": self.publication.as_dict() if self.publication else refused,
             "seconds": self.seconds,
         }

@@ -88,7 +88,8 @@ def _print_report(report: RunReport) -> None:
             f"gram {wide.feature_set}: {number_of(wide.rows_read, 'row')} read, "
             f"{number_of(wide.gram_rows, 'Gram row')}"
         )
-    print_selection(report.selection)
+    if report.selection:
+        print_selection(report.selection)
     if publication:
         print_publication(publication)
     else:

@@ -15,7 +15,6 @@ from fleet_slip.catalogue.features import features
 from fleet_slip.compute.tasks import LocalThreads, in_flight, run_tasks
 from fleet_slip.delta import TableFile, absent_columns
 from fleet_slip.grams.statement import gram_statement
-from fleet_slip.grams.wide import wide_grams
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.database import open_database, reading_files
 from fleet_slip.warehouse.tables import Warehouse
@@ -57,6 +56,8 @@ def compute_grams(
     other processes, as tasks of some files and one thread each.
     """
     if features().feature_set(feature_set).windows:
+        from fleet_slip.grams.wide import wide_grams  # noqa: PLC0415 - the compiler takes a while
+
         own = LocalThreads(threads or cpu_count() or 1) if executor is None else None
         with own or nullcontext():
             task = partial(wide_grams, warehouse, feature_set=feature_set)

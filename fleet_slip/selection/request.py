@@ -204,7 +204,8 @@ def _compare_listed(
         selection = select(cohort, (), folds, parse_worth(request.worth), search, inputs)
         content = {"inputs": list(inputs), **search.model_dump()}
         label = f"search:{search.method} {search.most}"
-        return RequestedSelection.of(selection, label, sha256_of(canonical_json(content)))
+        checksum = _checksum(sha256_of(canonical_json(content)), request.worth)
+        return RequestedSelection.of(selection, label, checksum)
     described = ModelList(
         description=model_list.description if model_list else "Nested models of an order",
         features=cohort.feature_set,
@@ -215,7 +216,22 @@ def _compare_listed(
     name = request.models or (DEFAULT_MODELS if listed else None)
     label = "+".join(filter(None, [name, f"nested:{request.nested}" if nested else None]))
     selection = select(cohort, described.model, folds, parse_worth(request.worth), search, inputs)
-    return RequestedSelection.of(selection, label, described.sha256)
+    return RequestedSelection.of(selection, label, _checksum(described.sha256, request.worth))
+
+
+def checksum_of_list(model_list: ModelList, worth: str) -> str | None:
+    """Return the `config_sha256` of a selection from a list as it stands.
+
+    None for a list that is nothing but a search, whose selection depends on the cohort's inputs.
+    """
+    return _checksum(model_list.sha256, worth) if model_list.model else None
+
+
+def _checksum(compared: str, worth: str) -> str:
+    """Return the checksum of what is compared, and of the worth if it is not the usual one."""
+    if parse_worth(worth) == parse_worth(WORTH):
+        return compared
+    return sha256_of(canonical_json({"compared": compared, "worth": worth}))
 
 
 def _search_of(request: SelectionRequest, model_list: ModelList | None) -> Search | None:

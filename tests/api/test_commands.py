@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from datetime import date
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -121,7 +122,24 @@ def test_running_twice_does_nothing_twice(tmp_path: Path) -> None:
     assert not second.changed
     assert second.publication
     assert second.publication.version == first.publication.version
+    assert second.selection is None
     assert fleet.sql("SELECT command FROM runs").fetchall() == [("run",), ("run",)]
+
+
+def test_running_again_selects_again_where_anything_is_new(tmp_path: Path) -> None:
+    """The list, the worth, and the tables: each is asked for before the champion is kept unseen."""
+    fleet = fleet_slip.open(tmp_path / "data")
+
+    def selects(**changes: Any) -> bool:
+        asked = {"days": 1, "models": "table1", **changes}
+        return fleet.run("smoke", **asked).selection is not None
+
+    assert [selects(), selects()] == [True, False]
+    assert selects(worth="50%")
+    assert selects(name="other")
+    assert not selects()
+    assert selects(name="other", models="estimator")
+    assert selects(days=2)
 
 
 def test_a_worse_model_is_refused_and_aliases_move(fleet: Fleet, tmp_path: Path) -> None:

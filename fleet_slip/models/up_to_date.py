@@ -1,0 +1,40 @@
+"""Whether a published version is what a selection would publish again."""
+
+from importlib.metadata import version as package_version
+
+from fleet_slip.catalogue.features import features
+from fleet_slip.models.manifest import Manifest
+from fleet_slip.selection.model_list import load_model_list
+from fleet_slip.selection.request import checksum_of_list
+from fleet_slip.warehouse.tables import Warehouse
+
+
+def is_up_to_date(
+    manifest: Manifest, warehouse: Warehouse, cohort: str, models: str, worth: str
+) -> bool:
+    """Return whether a selection from a model list has nothing to look at that is new.
+
+    A manifest is a function of data, configuration and program alone: from the same versions of
+    the tables, the same cohort, list, feature set and program comes the same manifest. Raises
+    `ConfigError` for a list that cannot be read.
+    """
+    model_list = load_model_list(models)
+    trained, chosen = manifest.trained_on, manifest.selected_by
+    made_from = (
+        trained.cohort,
+        trained.feature_set,
+        trained.logs_version,
+        trained.grams_version,
+        chosen.model_list,
+        chosen.config_sha256,
+        manifest.package_version,
+    )
+    return made_from == (
+        cohort,
+        features().identity(model_list.features),
+        warehouse.logs.snapshot().version,
+        warehouse.grams.snapshot().version,
+        models,
+        checksum_of_list(model_list, worth),
+        package_version("fleet-slip"),
+    )
