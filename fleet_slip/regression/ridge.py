@@ -8,14 +8,11 @@ have (errors in variables, Fuller 1987).
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
 
-from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.regression import rounding
 from fleet_slip.regression.elimination import eliminate
 from fleet_slip.regression.exact import LinearModel, Scales, correlation_matrix, moments
 from fleet_slip.regression.gram import Gram
@@ -71,50 +68,17 @@ def fit_errors_in_variables(
     return fit_penalised(gram, inputs, label, [-variance for variance in variances])
 
 
-@dataclass(frozen=True)
-class RidgePath:
-    """Ridge regression of standardised signals over a grid of penalties.
+def fit_ridge(gram: Gram, inputs: Sequence[str], label: str, penalty: float) -> LinearModel:
+    """Return the ridge model of counts at one penalty, added to the correlation matrix.
 
-    Attributes:
-        penalties: lambda added to the correlation matrix, rising.
-        coefficients: standardised, shape (penalties, k).
-        rss: residual sum of squares as a share of the total.
-        degrees: effective degrees of freedom without the constant, sum l / (l + lambda).
-        gcv: generalised cross-validation, (RSS / n) / (1 - (degrees + 1) / n)^2, same share.
+    From the eigendecomposition of that matrix, C = Q diag(l) Q'. `cross_validate` with this for a
+    procedure gives the figures at a penalty.
     """
-
-    penalties: FloatArray
-    coefficients: FloatArray
-    rss: FloatArray
-    degrees: FloatArray
-    gcv: FloatArray
-
-
-def ridge_path(
-    gram: Gram, inputs: Sequence[str], label: str, penalties: Sequence[float]
-) -> RidgePath:
-    """Return the whole path from one eigendecomposition C = Q diag(l) Q'."""
     k = len(inputs)
     matrix = correlation_matrix(gram.restrict([*inputs, label]))
     eigenvalues, vectors = np.linalg.eigh(matrix[:k, :k])
-    grid = np.array(penalties, dtype=np.float64)
-    target = vectors.T @ matrix[:k, k]
-    shrunk = 1 / (eigenvalues + grid[:, None])
-    coefficients = (shrunk * target) @ vectors.T
-    # RSS = 1 - 2 b'c + b'Cb in the eigenbasis.
-    rss = 1 - np.sum(shrunk * target**2 * (2 - eigenvalues * shrunk), axis=1)
-    degrees = np.sum(eigenvalues * shrunk, axis=1)
-    gcv = rss / gram.n / (1 - (degrees + 1) / gram.n) ** 2
-    return RidgePath(grid, coefficients, rss, degrees, gcv)
-
-
-def fit_ridge(gram: Gram, inputs: Sequence[str], label: str, penalty: float) -> LinearModel:
-    """Return the ridge model of counts at one penalty on the correlation matrix.
-
-    `cross_validate` with this for a procedure gives the figures at a penalty.
-    """
-    path = ridge_path(gram, inputs, label, [penalty])
-    return from_standardised(gram, inputs, label, path.coefficients[0])
+    in_eigenbasis = (vectors.T @ matrix[:k, k]) / (eigenvalues + penalty)
+    return from_standardised(gram, inputs, label, in_eigenbasis @ vectors.T)
 
 
 def _variances(
@@ -127,21 +91,3 @@ def _variances(
             f"It uses {', '.join(inputs)}."
         )
     return [gram.n * (Fraction(noise.get(name, 0)) / scales[name]) ** 2 for name in inputs]
-
-
-def standardised_penalty(gram: Gram, inputs: Sequence[str], penalty: Fraction) -> list[Fraction]:
-    """Return the penalties in counts^2 that equal one on the sample-standardised moments.
-
-    (n - 1) C + penalty I for standard deviations with n - 1 is S + penalty diag(S) / (n - 1).
-    """
-    matrix = gram.restrict(inputs).centred()
-    return [penalty * Fraction(row[i], gram.n * (gram.n - 1)) for i, row in enumerate(matrix)]
-
-
-def standardised_size(gram: Gram, model: LinearModel) -> dict[str, float]:
-    """Return |b_j| s_j / s_y of each signal, s the standard deviations."""
-    matrix = gram.restrict([*model.signals, model.label]).centred()
-    return {
-        name: rounding.sqrt(b * b * matrix[i][i] / matrix[-1][-1])
-        for i, (name, b) in enumerate(zip(model.signals, model.coefficients, strict=True))
-    }

@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
+from fleet_slip.regression import rounding
 from fleet_slip.regression.exact import LinearModel
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.gram import Gram
@@ -26,7 +27,7 @@ from fleet_slip.regression.pace import (
     pace5,
 )
 from fleet_slip.regression.ranking import backward
-from fleet_slip.regression.ridge import fit_penalised, standardised_penalty, standardised_size
+from fleet_slip.regression.ridge import fit_penalised
 
 Selection = Literal["none", "m5", "greedy"]
 
@@ -156,3 +157,21 @@ WEKA_ESTIMATORS: dict[str, Estimator] = {
     "nested": _nested,
     "subset": _nested,
 }
+
+
+def standardised_penalty(gram: Gram, inputs: Sequence[str], penalty: Fraction) -> list[Fraction]:
+    """Return the penalties in counts^2 that equal one on the sample-standardised moments.
+
+    (n - 1) C + penalty I for standard deviations with n - 1 is S + penalty diag(S) / (n - 1).
+    """
+    matrix = gram.restrict(inputs).centred()
+    return [penalty * Fraction(row[i], gram.n * (gram.n - 1)) for i, row in enumerate(matrix)]
+
+
+def standardised_size(gram: Gram, model: LinearModel) -> dict[str, float]:
+    """Return |b_j| s_j / s_y of each signal, s the standard deviations."""
+    matrix = gram.restrict([*model.signals, model.label]).centred()
+    return {
+        name: rounding.sqrt(b * b * matrix[i][i] / matrix[-1][-1])
+        for i, (name, b) in enumerate(zip(model.signals, model.coefficients, strict=True))
+    }
