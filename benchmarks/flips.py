@@ -1,15 +1,18 @@
 """Flips single bits in every kind of file of a data root, and runs every command after each.
 
 A command may say what is wrong and end with an exit code of its own, or answer what it would answer
-without the flip. A different answer with exit 0 is a wrong result; exit 1 is a bug.
+without the flip. A different answer with exit 0 is a wrong result; exit 1 is a bug. If it is ended
+early (Ctrl-C, SIGTERM) it shows what it has counted.
 
     python -m benchmarks.flips [--flips 300] [--seed 0] [--kind K ...]
 """
 
 import argparse
 import collections
+import contextlib
 import os
 import random
+import signal
 import sys
 import tempfile
 import time
@@ -96,13 +99,12 @@ def choose(root: Path, number: int, seed: int, kinds: Sequence[str]) -> Iterator
         yield kind, Flip(file.relative_to(root), rng.randrange(file.stat().st_size * 8))
 
 
-def run(root: Path, chosen: Sequence[tuple[str, Flip]]) -> dict[str, Counts]:
-    """Flip bits one after the other; count what commands make of each."""
+def run(root: Path, chosen: Sequence[tuple[str, Flip]], found: dict[str, Counts]) -> None:
+    """Flip bits one after the other; count what commands make of each, by kind of file."""
     reading = {arguments: command(root, *arguments) for arguments in READING}
     writing = {arguments: write(root, arguments, None) for arguments in WRITING}
     for arguments, usual in (reading | writing).items():
         assert usual.exit_code in UNDAMAGED, (arguments, usual)
-    found: dict[str, Counts] = collections.defaultdict(Counts)
     for number, (kind, flip) in enumerate(chosen, 1):
         counts, told = found[kind], len(found[kind].examples)
         counts.flips += 1
@@ -117,7 +119,6 @@ def run(root: Path, chosen: Sequence[tuple[str, Flip]]) -> dict[str, Counts]:
             print(example, flush=True)
         if number % 10 == 0:
             print(f"{number} flips", file=sys.stderr, flush=True)
-    return found
 
 
 def show(found: dict[str, Counts]) -> int:
@@ -145,7 +146,10 @@ def main() -> None:
         preload(campaign(root))
         fill(root)
         kinds = options.kind or list(KINDS)
-        found = run(root, list(choose(root, options.flips, options.seed, kinds)))
+        found: dict[str, Counts] = collections.defaultdict(Counts)
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        with contextlib.suppress(KeyboardInterrupt):
+            run(root, list(choose(root, options.flips, options.seed, kinds)), found)
     bad = show(found)
     print(f"{time.monotonic() - started:.0f} s")
     sys.exit(bool(bad))

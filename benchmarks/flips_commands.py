@@ -93,6 +93,7 @@ def in_a_child(work: Callable[[], Any]) -> Ended:
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         child = os.fork()
         if not child:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
             signal.alarm(TIMEOUT_S)
             os.dup2(out.fileno(), 1)
             os.dup2(err.fileno(), 2)
