@@ -35,11 +35,11 @@ def read_drives(warehouse: Warehouse, file: TableFile, plan: ColumnPlan) -> Iter
     rows = warehouse.logs.read(file.path, wanted)
     for one in _by_drive(rows):
         ticks = one["tick"].to_numpy()
-        if (np.diff(ticks) < 0).any():
-            one = one.take(np.argsort(ticks, kind="stable"))  # noqa: PLW2901
-        beginning = np.flatnonzero(one["tick"].to_numpy() == 0)
-        if len(beginning):
-            at = int(beginning[0])
+        if (ticks[1:] < ticks[:-1]).any():
+            order = np.argsort(ticks, kind="stable")
+            one, ticks = one.take(order), ticks[order]  # noqa: PLW2901
+        at = int(np.searchsorted(ticks, 0))
+        if at < len(ticks) and ticks[at] == 0:
             metadata = {
                 name: one[name][at].as_py() if name in wanted else None for name in drive_columns
             }
@@ -89,7 +89,7 @@ def _by_drive(rows: pa.Table) -> Iterator[pa.Table]:
         ids = pc.dictionary_encode(ids)
     drive_of_row = ids.indices.to_numpy()
     starts = np.flatnonzero(np.diff(drive_of_row, prepend=-1))
-    if len(starts) > len(np.unique(drive_of_row)):  # the rows of drives are mixed
+    if len(starts) > len(np.unique(drive_of_row[starts])):  # the rows of drives are mixed
         order = np.argsort(drive_of_row, kind="stable")
         rows, drive_of_row = rows.take(order), drive_of_row[order]
         starts = np.flatnonzero(np.diff(drive_of_row, prepend=-1))
