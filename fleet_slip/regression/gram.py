@@ -163,19 +163,26 @@ class Gram:
 
     def raw(self) -> list[list[int]]:
         """Return the k x k matrix of product sums about zero, as integers."""
-        k = range(len(self.signals))
-        return [[self.products[packed_position(i, j)] for j in k] for i in k]
+        return _mirrored([self._packed_row(i) for i in range(len(self.signals))])
 
     def centred(self) -> list[list[int]]:
         """Return the integer matrix n S, with S the product sums about the means.
 
         n S_ab = n sum(a b) - sum(a) sum(b): no rounding, so a constant signal has exactly zero.
         """
-        k = range(len(self.signals))
-        return [
-            [self.n * self.products[packed_position(i, j)] - self.sums[i] * self.sums[j] for j in k]
-            for i in k
-        ]
+        return _mirrored(
+            [
+                [
+                    self.n * product - own * other
+                    for product, other in zip(self._packed_row(i), self.sums, strict=False)
+                ]
+                for i, own in enumerate(self.sums)
+            ]
+        )
+
+    def _packed_row(self, i: int) -> Sequence[int]:
+        """Return the products of a signal with those up to itself."""
+        return self.products[packed_size(i) : packed_size(i + 1)]
 
     def _require_same_signals(self, other: "Gram") -> None:
         if self.signals != other.signals:
@@ -183,6 +190,11 @@ class Gram:
                 f"Grams of different signals cannot be combined: {', '.join(self.signals)} and "
                 f"{', '.join(other.signals)}. Restrict both to the signals that they share."
             )
+
+
+def _mirrored(lower: Sequence[Sequence[int]]) -> list[list[int]]:
+    """Return a symmetric matrix, given the rows of its lower triangle."""
+    return [[*row, *(below[i] for below in lower[i + 1 :])] for i, row in enumerate(lower)]
 
 
 def require_signals(signals: Sequence[str], wanted: Sequence[str]) -> None:
