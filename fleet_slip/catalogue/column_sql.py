@@ -7,8 +7,10 @@ them over the view `log_counts`.
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
 
-from fleet_slip.catalogue.columns import Definition, features_behind, limit_of
+from fleet_slip.catalogue.columns import WEIGHT, Definition, Gate, features_behind, limit_of
 from fleet_slip.catalogue.signals import COUNT_MAX
+
+_SEPARATOR = ",\n            "
 
 
 def rounded_sql(value: str, ratio: Fraction, divisor: str = "1") -> str:
@@ -72,7 +74,61 @@ def with_windows(
 
 
 def over_windows(rows: str, definitions: Mapping[str, Definition]) -> str:
-    """Return the same where `rows` has what is looked back on already, and the column `clipped`."""
+    """Return the same where `rows` has what is looked back on already, and the column `clipped`.
+
+    What is gated, and what opens gates, adds to it once, however many columns are made of it.
+    """
+    plain = {name: one for name, one in definitions.items() if not one.gate}
+    gated = {name: one for name, one in definitions.items() if one.gate}
+    found = _over_windows(rows, plain) if plain else rows
+    return _gated(found, gated) if gated else found
+
+
+def _gated(rows: str, definitions: Mapping[str, Definition]) -> str:
+    """Return the rows with gated columns, by way of hidden ones: the parts, then the weights."""
+    parts = dict.fromkeys(part for one in definitions.values() for part in one.parts)
+    hidden = {part: f"hidden_{number}" for number, part in enumerate(parts)}
+    gates = dict.fromkeys(one.gate for one in definitions.values() if one.gate)
+    weights = {gate: f"weight_{number}" for number, gate in enumerate(gates)}
+    found = _over_windows(rows, {name: part for part, name in hidden.items()})
+    weighed = _SEPARATOR.join(
+        f"{weight_sql(hidden[gate.by], gate)} AS {name}" for gate, name in weights.items()
+    )
+    columns = _SEPARATOR.join(
+        rounded_sql(f"({hidden[one.ungated]}::BIGINT * {weights[one.gate]})", Fraction(1, WEIGHT))
+        + f"::INTEGER AS {name}"
+        for name, one in definitions.items()
+        if one.gate
+    )
+    behind = ", ".join((*hidden.values(), *weights.values()))
+    return f"""(
+        SELECT * EXCLUDE ({behind}),
+            {columns}
+        FROM (
+            SELECT *,
+            {weighed}
+            FROM {found}
+        )
+    )"""
+
+
+def weight_sql(by: str, gate: Gate) -> str:
+    """Return the SQL of a gate's weight, given the name of the column that opens and closes it."""
+    rises, at = gate.peak - gate.low, f"{by}::BIGINT"
+    rising = f"WHEN {at} < {gate.peak} THEN (({at} - ({gate.low})) * {WEIGHT}) // {rises}"
+    if gate.high is None:
+        return (
+            f"CASE WHEN {at} <= {gate.low} THEN 0 {rising} WHEN {by} IS NOT NULL THEN {WEIGHT} END"
+        )
+    falling = f"{WEIGHT} - (({at} - ({gate.peak})) * {WEIGHT}) // {gate.high - gate.peak}"
+    return (
+        f"CASE WHEN {at} <= {gate.low} THEN 0 {rising} "
+        f"WHEN {at} < {gate.high} THEN {falling} WHEN {by} IS NOT NULL THEN 0 END"
+    )
+
+
+def _over_windows(rows: str, definitions: Mapping[str, Definition]) -> str:
+    """Return the rows with columns over time that have no gate."""
     frames = dict(frame_of(one) for one in definitions.values() if one.over)
     named = ",\n            ".join(
         f"{name} AS (PARTITION BY drive_id ORDER BY tick RANGE {frame})"
@@ -125,9 +181,8 @@ def _layer(
 
     With `counted`, the rows have the column `clipped` already.
     """
-    separator = ",\n            "
     limit = {name: limits.get(name, COUNT_MAX) for name in definitions}
-    computed = separator.join(f"{sql} AS {name}" for name, sql in definitions.items())
+    computed = _SEPARATOR.join(f"{sql} AS {name}" for name, sql in definitions.items())
     inside = [f"{clipped_sql(name, limit[name])} AS {name}" for name in definitions]
     outside = " + ".join(
         f"coalesce(abs({name}) > {limit[name]}, false)::INTEGER" for name in definitions
@@ -142,7 +197,7 @@ def _layer(
     )
     return f"""(
         SELECT * REPLACE (
-            {separator.join(inside)}
+            {_SEPARATOR.join(inside)}
         ){new}
         FROM (
             SELECT {columns}

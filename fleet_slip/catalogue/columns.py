@@ -125,6 +125,37 @@ class Fact(Config):
         )
 
 
+WEIGHT = 2**10
+"""Full weight of a gate."""
+
+
+class Gate(Config):
+    """How much of a column counts, in parts of `WEIGHT`: a hat over another column.
+
+    The weight is 0 up to `low`, `WEIGHT` at `peak`, and 0 again from `high`, linear in between and
+    rounded down on the way up, so that the weights of neighbours add up to `WEIGHT`. Without `high`
+    it stays full. The column's count times the weight over `WEIGHT` is rounded.
+
+    Attributes:
+        by: the column that opens and closes the gate; it has no gate or factor itself.
+        low, peak, high: counts of it, rising.
+    """
+
+    by: "Definition"
+    low: int
+    peak: int
+    high: int | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "Gate":
+        if self.by.gate or self.by.fact:
+            raise ValueError("what opens a gate has no gate or factor itself")
+        high = self.peak + 1 if self.high is None else self.high
+        if not -limit_of(20) <= self.low < self.peak < high <= limit_of(20):
+            raise ValueError("the knots of a gate must rise, within what a column can count")
+        return self
+
+
 class Definition(Config):
     """Everything that defines a column of counts over time, whatever it is called.
 
@@ -137,6 +168,7 @@ class Definition(Config):
         ratio: counts of the column for one count of what is looked back on.
         bits: to which the column's count is clipped.
         fact: a factor, if there is one.
+        gate: how much of all that counts, if it is not everything.
     """
 
     of: Identifier
@@ -147,6 +179,7 @@ class Definition(Config):
     ratio: Ratio = Fraction(1)
     bits: Bits = 20
     fact: Fact | None = None
+    gate: Annotated[Gate | None, Field(exclude_if=lambda gate: gate is None)] = None
 
     @model_validator(mode="after")
     def _ticks_fit(self) -> "Definition":
@@ -165,7 +198,21 @@ class Definition(Config):
     @property
     def signals(self) -> tuple[str, ...]:
         """The logged signals in it."""
-        return parse(self.sql).inputs if self.sql else (self.of,)
+        own = parse(self.sql).inputs if self.sql else (self.of,)
+        return tuple(dict.fromkeys((*own, *(self.gate.by.signals if self.gate else ()))))
+
+    @property
+    def ungated(self) -> "Definition":
+        """The same without its gate."""
+        return self.model_copy(update={"gate": None})
+
+    @property
+    def parts(self) -> tuple["Definition", ...]:
+        """What it is made of, each without a gate: itself, or the gated column and the gate's."""
+        return (self.ungated, self.gate.by) if self.gate else (self,)
+
+
+Gate.model_rebuild()
 
 
 def features_behind(definitions: Mapping[str, Definition]) -> dict[str, Definition]:
@@ -173,10 +220,12 @@ def features_behind(definitions: Mapping[str, Definition]) -> dict[str, Definiti
 
     Raises `QuestionError` if a column has the name of such a feature and is something else.
     """
-    found = {one.of: one for one in definitions.values() if one.sql}
+    parts = [part for one in definitions.values() for part in one.parts]
+    found = {part.of: part for part in parts if part.sql}
     for name, one in definitions.items():
-        if name in found and (one.over or one.fact or one.of != name):
+        if name in found and (one.over or one.fact or one.gate or one.of != name):
             raise QuestionError(f"{name} is a column, and a feature that another looks back on.")
-        if one.sql and (one.sql, one.of_bits) != (found[one.of].sql, found[one.of].of_bits):
-            raise QuestionError(f"the feature {one.of} is defined in two ways.")
+    for part in parts:
+        if part.sql and (part.sql, part.of_bits) != (found[part.of].sql, found[part.of].of_bits):
+            raise QuestionError(f"the feature {part.of} is defined in two ways.")
     return found

@@ -1,13 +1,15 @@
 """Features and feature sets: `configs/features.toml` as a catalogue.
 
 A feature is an integer function of the counts of one row; a window looks back on a signal or a
-feature over time; a factor is a column times what a car knows of itself.
+feature over time; a factor is a column times what a car knows of itself; a gate is a column as far
+as another one opens it.
 """
 
 from collections.abc import Callable, Mapping
 from fractions import Fraction
 from functools import cache, cached_property
 from importlib.resources.abc import Traversable
+from typing import TypeVar
 
 from pydantic import Field, ValidationError, model_validator
 
@@ -15,6 +17,7 @@ from fleet_slip.canonical import canonical_json, sha256_of
 from fleet_slip.catalogue.column_sql import with_features, with_windows
 from fleet_slip.catalogue.columns import COUNT_BITS, Definition
 from fleet_slip.catalogue.feature_sets import PLAIN, FeatureSet, Regime
+from fleet_slip.catalogue.gates import GateFamily, gated_columns
 from fleet_slip.catalogue.row_features import Feature
 from fleet_slip.catalogue.signals import Identifier, Signal, catalogue
 from fleet_slip.catalogue.windows import (
@@ -28,6 +31,8 @@ from fleet_slip.config import Config, faults_of, load_config, load_toml
 from fleet_slip.errors import ConfigError, QuestionError
 from fleet_slip.resources import config_file, folder
 
+T = TypeVar("T")
+
 
 class FeatureCatalogue(Config):
     """All features, regimes and feature sets, in the file's order."""
@@ -35,6 +40,7 @@ class FeatureCatalogue(Config):
     features: dict[Identifier, Feature]
     windows: dict[Identifier, Window] = Field(default_factory=dict)
     factors: dict[Identifier, Factor] = Field(default_factory=dict)
+    gates: dict[Identifier, GateFamily] = Field(default_factory=dict)
     regimes: dict[Identifier, Regime]
     sets: dict[Identifier, FeatureSet]
 
@@ -56,7 +62,7 @@ class FeatureCatalogue(Config):
         for name, one in self.sets.items():
             unknown = [f for f in one.features if f not in self.features]
             unknown += [r for r in one.regimes if r not in self.regimes]
-            known = {*self.windows, *self.time_columns}
+            known = {*self.windows, *self.gates, *self.time_columns}
             unknown += [w for w in one.windows if w not in known]
             if unknown:
                 raise ValueError(f"sets.{name}: unknown {', '.join(unknown)}")
@@ -83,6 +89,11 @@ class FeatureCatalogue(Config):
             if name in found:
                 raise ValueError(f"factors.{name} stands twice")
             found[name] = _named(f"factors.{name}", factor_column, factor, base, scale)
+        for name, gate in self.gates.items():
+            members = _named(f"gates.{name}", gated_columns, name, gate, dict(found))
+            if twice := [member for member in members if member in found]:
+                raise ValueError(f"gates.{name}: {twice[0]} stands twice")
+            found |= members
         return found
 
     def _row(self, name: str, where: str) -> tuple[Definition, Fraction]:
@@ -118,14 +129,14 @@ class FeatureCatalogue(Config):
             known = ", ".join((PLAIN, *self.sets))
             raise QuestionError(f"no feature set is called {name!r}. Feature sets: {known}.")
         one = self.sets[name]
-        members = [
-            member
-            for window in one.windows
-            for member in (
-                self.windows[window].members(window) if window in self.windows else (window,)
-            )
-        ]
+        members = [member for window in one.windows for member in self.members(window)]
         return one.model_copy(update={"windows": tuple(dict.fromkeys(members))})
+
+    def members(self, name: str) -> tuple[str, ...]:
+        """Return the columns of a family of windows or gates; any other name stays."""
+        if name in self.windows:
+            return tuple(self.windows[name].members(name))
+        return tuple(self.gates[name].members(name)) if name in self.gates else (name,)
 
     def identity(self, name: str) -> str:
         """Return what the Gram rows of a set carry: its name and a checksum of its definition.
@@ -184,12 +195,14 @@ class FeatureCatalogue(Config):
         return (*catalogue().inputs, *self.features, *self.time_columns)
 
 
-def _named(where: str, make: Callable[..., TimeColumn], *parts: object) -> TimeColumn:
-    """Make a column. Raises `ValueError` that says which one cannot be."""
+def _named(where: str, make: Callable[..., T], *parts: object) -> T:
+    """Make a column, or several. Raises `ValueError` that says which one cannot be."""
     try:
         return make(*parts)
     except ValidationError as error:
         raise ValueError(f"{where}: {faults_of(error)}") from None
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
 
 
 def load_features(file: Traversable) -> FeatureCatalogue:

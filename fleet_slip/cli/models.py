@@ -96,7 +96,10 @@ def _definition_row(term: ModelTerm) -> list[str]:
     if one is None:
         return []
     ticks = str(one.ticks) if one.ticks else ""
-    about = one.fact.name if one.fact else ""
+    times = [one.fact.name] if one.fact else []
+    if gate := one.gate:
+        knots = [str(knot) for knot in (gate.low, gate.peak, gate.high) if knot is not None]
+        times.append(f"{gate.by.over or ''} {gate.by.of} {gate.by.ticks or ''}: {' '.join(knots)}")
     return [
         term.signal,
         f"{term.scale} {term.unit}",
@@ -104,7 +107,7 @@ def _definition_row(term: ModelTerm) -> list[str]:
         one.over or "",
         ticks,
         str(one.bits),
-        about,
+        ", ".join(times).strip(),
     ]
 
 
@@ -139,7 +142,7 @@ def _print_version(version: ModelVersion) -> None:
     if manifest.definitions:
         print_table(
             "\ncolumns over time (docs/memory.md): counts, times the scale",
-            ["column", "scale", "of", "over", "ticks", "bits", "a fact"],
+            ["column", "scale", "of", "over", "ticks", "bits", "times"],
             [_definition_row(term) for term in manifest.terms if term.definition],
             left=4,
         )

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from fleet_slip.catalogue.columns import WEIGHT
 from fleet_slip.compiling import inner_loop
 from fleet_slip.grams.operations import (
     ABSOLUTE,
@@ -33,8 +34,9 @@ from fleet_slip.grams.operations import (
     SUBTRACT_INTEGERS,
     TO_BINARY64,
     TO_INTEGERS,
+    WEIGH,
 )
-from fleet_slip.grams.rounding import clip, nearest, nearest_integer, truncated
+from fleet_slip.grams.rounding import clip, nearest, nearest_integer, truncated, weight
 
 
 @inner_loop
@@ -103,6 +105,9 @@ def compute(  # noqa: PLR0912 - one loop for each operation
             for i in range(size):
                 memory[i] += 1.0 if abs(a[i]) > limit else 0.0
         bad = 0
+    elif operation == WEIGH:
+        for i in range(size):
+            out[i] = nearest(a[i], weight(b[i], numerator, divisor, limit), WEIGHT)
     else:
         factor = b[0] if operation == FACT else 1.0
         outside = 0

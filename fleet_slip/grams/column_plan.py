@@ -48,7 +48,7 @@ class ColumnPlan:
             if name not in windows:
                 rows[name] = features.get(name, RowColumn(name))
         features_behind(windows)
-        for one in windows.values():
+        for one in (part for window in windows.values() for part in window.parts):
             row = RowColumn(one.of)
             if one.sql:
                 row = RowColumn(one.of, parse(one.sql), limit_of(one.of_bits))

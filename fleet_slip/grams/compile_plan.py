@@ -1,10 +1,11 @@
 """Writes the program that computes the columns of a plan; what several are made of, once."""
 
 from collections.abc import Mapping, Sequence
+from math import inf
 from typing import TypeVar
 
 from fleet_slip.catalogue.columns import Definition, limit_of
-from fleet_slip.grams.operations import ADD_UP, AGO, FACT, KEEP, QUOTIENT, SCALE, Region
+from fleet_slip.grams.operations import ADD_UP, AGO, FACT, KEEP, QUOTIENT, SCALE, WEIGH, Region
 from fleet_slip.grams.program import Code, Operation, Program, Value
 from fleet_slip.grams.row_code import RowColumn, add_row_column
 
@@ -23,12 +24,21 @@ def compile_plan(
     code = Code()
     found: dict[str, Value] = {}
     values: dict[str, Value] = {}
+    gates = {name: (one.ungated, one.gate) for name, one in windows.items() if one.gate}
+    parts: dict[Definition, Value] = {}
     for name, row in rows.items():
         value = values[name] = add_row_column(code, row)
         found.setdefault(name, value)
         for window, one in windows.items():
-            if one.of == name:
+            if one.of == name and window not in gates:
                 found[window] = _add_window(code, one, value)
+        for part in (part for window in gates for part in windows[window].parts):
+            if part.of == name and part not in parts:
+                parts[part] = _add_window(code, part, value)
+    for window, (part, gate) in gates.items():
+        high = inf if gate.high is None else float(gate.high)
+        knots = (float(gate.low), float(gate.peak), 0.0, high)
+        found[window] = code.add_anew(Operation(WEIGH, parts[part], parts[gate.by], ratio=knots))
     return code.assemble([found[name] for name in names], [values[name] for name in also])
 
 

@@ -14,7 +14,7 @@ TILE = 4
 
 COPY, ADD, SUBTRACT, MULTIPLY, ABSOLUTE, SIGN, DIVIDE = 0, 1, 2, 3, 4, 5, 6
 MULTIPLY_BY, NEAREST, FILL = 7, 8, 9
-TO_BINARY64, GUARD, CLIP, SCALE, FACT = 10, 11, 12, 13, 14
+TO_BINARY64, GUARD, CLIP, SCALE, FACT, WEIGH = 10, 11, 12, 13, 14, 15
 
 ADD_UP, KEEP, QUOTIENT, AGO = 20, 21, 22, 23
 """Operations on the rows of before."""
@@ -38,7 +38,7 @@ STEP_SIZE = 15
 
 NUMERATOR, FIXED, EACH, LIMIT = 0, 1, 2, 3
 """Ratios and limits of a step. A sum over n rows is multiplied by the first and divided by the
-second plus the third times n."""
+second plus the third times n. `WEIGH` has the knots of its gate in the first, second and last."""
 
 
 class Region(IntEnum):

@@ -35,7 +35,7 @@ def gram_statement(
     names = one.columns
     windows = known.definitions(feature_set)
     regimes = [known.regimes[name].of for name in one.regimes]
-    looked_at = [*regimes, *(window.of for window in windows.values())]
+    looked_at = [*regimes, *(part.of for one in windows.values() for part in one.parts)]
     used = {
         name: known.features[name]
         for name in dict.fromkeys([*one.features, *looked_at])

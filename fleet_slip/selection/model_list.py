@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from fleet_slip.canonical import canonical_json, sha256_of
 from fleet_slip.catalogue.feature_sets import PLAIN
@@ -15,10 +15,18 @@ from fleet_slip.resources import find_config
 
 
 class CandidateModel(Config):
-    """A named set of inputs: signals, or features of a feature set."""
+    """A named set of inputs: signals, or features of a feature set.
+
+    A family of windows or gates stands for its members.
+    """
 
     name: str = Field(min_length=1, max_length=60)
     signals: tuple[Identifier, ...] = Field(min_length=1)
+
+    @field_validator("signals")
+    @classmethod
+    def _families_are_their_members(cls, signals: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(member for name in signals for member in features().members(name))
 
     @model_validator(mode="after")
     def _signals_are_inputs(self) -> "CandidateModel":

@@ -48,6 +48,31 @@ def over_speed(name: str) -> Callable[[Row], Fraction | None]:
     return lambda row: row[name] / speed(row) if speed(row) >= 3 else None
 
 
+def rear_turn(row: Row) -> Fraction:
+    """Yaw rate of the rear axle, if its wheels roll: their difference of speed over the track."""
+    return RADIUS_M * (row["wheel_rr"] - row["wheel_rl"]) / TRACK_M
+
+
+def rear_curvature(row: Row) -> Fraction:
+    return rear_turn(row) / rear_speed(row)
+
+
+def excess(row: Row) -> Fraction:
+    """Steering beyond Ackermann's angle, which is the wheelbase of 2.78 m times the curvature."""
+    steering = (row["steer_fl"] + row["steer_fr"]) / 2
+    side = (row["ay"] > 0) - (row["ay"] < 0)
+    return (steering - Fraction(278, 100) * rear_curvature(row)) * side
+
+
+def rear_speed(row: Row) -> Fraction:
+    return RADIUS_M * (row["wheel_rl"] + row["wheel_rr"]) / 2
+
+
+def understeer(row: Row) -> Fraction | None:
+    load = 1 + abs(row["ay"])
+    return excess(row) / load if rear_speed(row) * load >= 3 else None
+
+
 PHYSICS: dict[str, Callable[[Row], Fraction | None]] = {
     "speed": speed,
     "speed_squared": lambda row: speed(row) ** 2,
@@ -67,6 +92,12 @@ PHYSICS: dict[str, Callable[[Row], Fraction | None]] = {
     "curvature_fine": over_speed("yaw_rate"),
     "ay_speed": lambda row: row["ay"] * speed(row),
     "ay_ax": lambda row: row["ay"] * row["ax"],
+    "steering_excess": lambda row: excess(row) if rear_speed(row) >= 3 else None,
+    "understeer": understeer,
+    "rear_curvature": lambda row: rear_curvature(row) if rear_speed(row) >= 3 else None,
+    "rear_ay": lambda row: rear_turn(row) * rear_speed(row),
+    "rear_ay_speed": lambda row: rear_turn(row) * rear_speed(row) ** 2,
+    "rear_ay_ax": lambda row: rear_turn(row) * rear_speed(row) * row["ax"],
     "wheel_difference_front": lambda row: row["wheel_fr"] - row["wheel_fl"],
     "wheel_difference_rear": lambda row: row["wheel_rr"] - row["wheel_rl"],
     "wheel_difference_axles": lambda row: (

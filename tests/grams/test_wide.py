@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet_slip.catalogue.column_sql import with_windows
-from fleet_slip.catalogue.columns import Definition, Fact, limit_of
+from fleet_slip.catalogue.columns import WEIGHT, Definition, Fact, Gate, limit_of
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError
@@ -26,6 +26,8 @@ from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import land, log_rows, random_counts
 
 COURSE = features().features["course_difference"]
+
+SPEED = Definition(of="wheel_fl", over="mean", ticks=4, ratio=Fraction(1), bits=16)
 
 DEFINITIONS = {
     "mean_3": Definition(of="ay", over="mean", ticks=3, ratio=Fraction(16)),
@@ -44,6 +46,24 @@ DEFINITIONS = {
         bits=18,
     ),
     "of_suv": Definition(of="ax", fact=Fact(name="vehicle_model", equals="suv")),
+    "below": Definition(
+        of="ay",
+        over="mean",
+        ticks=3,
+        ratio=Fraction(16),
+        gate=Gate(by=SPEED, low=-3, peak=500, high=1501),
+    ),
+    "above": Definition(
+        of="ay", over="mean", ticks=3, ratio=Fraction(16), gate=Gate(by=SPEED, low=500, peak=1501)
+    ),
+    "heavy_above": Definition(
+        of="ay",
+        over="mean",
+        ticks=2,
+        fact=Fact(name="mass_kg", less=1320, ratio=Fraction(1, 100)),
+        bits=18,
+        gate=Gate(by=Definition(of="change", sql=COURSE.sql, of_bits=18), low=-2000, peak=3),
+    ),
 }
 
 COUNT = st.one_of(
@@ -99,7 +119,25 @@ def by_integers(rows: list[dict[str, Any]], one: Definition) -> list[int | None]
             times = None if number is None else nearest(count * number * one.fact.ratio)
             count = None if times is None else clip(times, one.bits)
         found.append(count)
+    if one.gate:
+        openings = by_integers(rows, one.gate.by)
+        return [
+            None
+            if value is None or at is None
+            else nearest(Fraction(value * weight(at, one.gate), WEIGHT))
+            for value, at in zip(found, openings, strict=True)
+        ]
     return found
+
+
+def weight(at: int, gate: Gate) -> int:
+    if gate.low < at < gate.peak:
+        return floor(Fraction(WEIGHT * (at - gate.low), gate.peak - gate.low))
+    if at < gate.peak or (gate.high is not None and at >= gate.high):
+        return 0
+    if gate.high is None:
+        return WEIGHT
+    return WEIGHT - floor(Fraction(WEIGHT * (at - gate.peak), gate.high - gate.peak))
 
 
 def fact(row: dict[str, Any], one: Definition) -> int | None:
@@ -133,7 +171,7 @@ def counts_of_table(table: pa.Table) -> DriveCounts:
     return DriveCounts(table["tick"].to_numpy(), counts, present, facts)
 
 
-@settings(max_examples=150)
+@settings(max_examples=100)
 @given(drives())
 def test_kernel_sql_and_plain_integers_agree_on_hostile_drives(table: pa.Table) -> None:
     plan = ColumnPlan.of(list(DEFINITIONS), {}, DEFINITIONS)

@@ -1,0 +1,112 @@
+"""Gates: hats that add up to one, that never jump, and configs that cannot be."""
+
+from itertools import pairwise
+from pathlib import Path
+
+import duckdb
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fleet_slip.catalogue.column_sql import weight_sql
+from fleet_slip.catalogue.columns import WEIGHT, Definition, Gate
+from fleet_slip.catalogue.features import features, load_features_over
+from fleet_slip.errors import ConfigError
+from fleet_slip.grams.rounding import weight
+from fleet_slip.resources import folder
+from fleet_slip.selection.model_list import load_model_list
+
+BY = Definition(of="ay")
+SHIPPED = folder("configs") / "features.toml"
+
+knots = st.lists(st.integers(-2000, 2000), min_size=2, max_size=6, unique=True).map(sorted)
+
+
+def family(edges: list[int]) -> list[Gate]:
+    return [
+        Gate(
+            by=BY,
+            low=edges[k - 1],
+            peak=edges[k],
+            high=edges[k + 1] if k + 1 < len(edges) else None,
+        )
+        for k in range(1, len(edges))
+    ]
+
+
+def weights(gate: Gate, at: list[int]) -> list[float]:
+    """Weights by the kernel."""
+    high = np.inf if gate.high is None else float(gate.high)
+    return [weight(float(one), float(gate.low), float(gate.peak), high) for one in at]
+
+
+@given(knots)
+def test_weights_add_up_to_one_above_the_second_knot(edges: list[int]) -> None:
+    at = list(range(edges[1], edges[-1] + 50, 7))
+    total = np.sum([weights(gate, at) for gate in family(edges)], axis=0)
+    assert total.tolist() == [WEIGHT] * len(at)
+
+
+@given(knots)
+def test_a_weight_changes_by_no_more_than_its_slope(edges: list[int]) -> None:
+    """From count to count: at most WEIGHT over the distance of the knots, and a rounding."""
+    steepest = WEIGHT / min(high - low for low, high in pairwise(edges)) + 1
+    at = list(range(edges[0] - 3, edges[-1] + 4))
+    for gate in family(edges):
+        assert np.abs(np.diff(weights(gate, at))).max() <= steepest
+
+
+@settings(max_examples=30)
+@given(knots)
+def test_sql_and_kernel_weigh_alike(edges: list[int]) -> None:
+    at = sorted({edge + shift for edge in edges for shift in (-1, 0, 1, 5)})
+    gates = family(edges)
+    rows = ", ".join(f"({value})" for value in at)
+    columns = ", ".join(weight_sql("g", gate) for gate in gates)
+    with duckdb.connect() as database:
+        found = database.sql(f"SELECT {columns} FROM (VALUES {rows}) AS t(g)").fetchall()
+    assert list(map(list, zip(*found, strict=True))) == [weights(gate, at) for gate in gates]
+
+
+def test_members_have_the_scale_of_their_column_and_neighbours_share_a_knot() -> None:
+    known = features()
+    first, second = known.of("rear_ay_mean_16_excess_1"), known.of("rear_ay_mean_16_excess_2")
+    assert first.exact_scale == second.exact_scale == known.of("rear_ay_mean_16").exact_scale
+    gates = [
+        known.time_columns[f"rear_ay_mean_16_excess_{k}"].definition.gate for k in (1, 2, 3, 4)
+    ]
+    assert [gate.high for gate in gates if gate][:3] == [gate.peak for gate in gates if gate][1:]
+    assert gates[-1] is not None
+    assert gates[-1].high is None
+
+
+def test_a_column_without_a_gate_says_nothing_of_gates() -> None:
+    assert "gate" not in Definition(of="ay", over="mean", ticks=8).model_dump(mode="json")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('of = "ay_mean_16"\nknots = [1.0]\ncolumns = ["ay_mean_8"]', "knots"),
+        ('of = "ay_mean_16"\nknots = [1.0, 0.5]\ncolumns = ["ay_mean_8"]', "must rise"),
+        ('of = "ay_mean_16"\nknots = [0.0, 0.00001]\ncolumns = ["ay_mean_8"]', "must rise"),
+        ('of = "ay_mean_16"\nknots = [0.0, 1e9]\ncolumns = ["ay_mean_8"]', "within what"),
+        ('of = "nothing"\nknots = [0.0, 1.0]\ncolumns = ["ay_mean_8"]', "nothing"),
+        ('of = "ay_mean_16"\nknots = [0.0, 1.0]\ncolumns = ["ay"]', "ay: no column over time"),
+        ('of = "ay_mean_16_mass"\nknots = [0.0, 1.0]\ncolumns = ["ay_mean_8"]', "factor itself"),
+    ],
+)
+def test_faults_are_named(tmp_path: Path, text: str, words: str) -> None:
+    own = tmp_path / "features.toml"
+    own.write_text(f'[gates.mine]\n{text}\ndescription = "x"\n')
+    with pytest.raises(ConfigError, match=words) as caught:
+        load_features_over(SHIPPED, own)
+    assert "gates.mine" in str(caught.value)
+
+
+def test_a_family_in_a_model_list_stands_for_its_members() -> None:
+    models = {model.name: model.signals for model in load_model_list("gated").model}
+    gates = [name for name in models["both"] if name not in models["no gate"]]
+    assert gates == [*features().members("excess"), *features().members("road")]
+    assert set(models["excess"]) | set(models["road"]) == set(models["both"])
