@@ -156,6 +156,7 @@ def tuning_drives(cohort: Cohort, car: VehicleParameters) -> tuple[str, ...]:
 def _key(one: Filter, drives: Sequence[str], car: VehicleParameters) -> dict[str, Any]:
     """Return what tuned parameters depend on."""
     return {
+        "for_lowest": "rmse_deg",
         "start": one.parameters.model_dump(mode="json"),
         "tunable": list(one.tunable),
         "drives": list(drives),
