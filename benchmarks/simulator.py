@@ -23,11 +23,11 @@ from fleet_slip.vehicle.highway import FourWheelVehicle
 from fleet_slip.vehicle.lanes import (
     STEPS_PER_SAMPLE,
     LaneDrive,
-    Road,
     simulate_blocks,
     simulate_drives,
 )
 from fleet_slip.vehicle.parameters import load_vehicle
+from fleet_slip.vehicle.road import Road
 
 ROUNDS = 5
 DRIVES = 32

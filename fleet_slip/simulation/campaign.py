@@ -16,18 +16,23 @@ from typing import Annotated, Self
 import numpy as np
 from pydantic import Field, TypeAdapter, model_validator
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.canonical import canonical_ascii, sha256_of
 from fleet_slip.catalogue.signals import Identifier
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import ConfigError, UsageError
 from fleet_slip.resources import find_config
+from fleet_slip.simulation.distortion import Distortion
 from fleet_slip.simulation.drive_plan import FleetPlan, GridPlan, random_generator
+from fleet_slip.simulation.imperfections import NONE, Imperfections
 from fleet_slip.simulation.manoeuvres import Manoeuvre
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ, Sensors
 from fleet_slip.simulation.speed_profile import SpeedLimits, SpeedProfile, speed_profile
+from fleet_slip.simulation.surface import surface
 from fleet_slip.simulation.track import Track
 from fleet_slip.simulation.trials import TrialPlan
 from fleet_slip.vehicle.parameters import VehicleParameters
+from fleet_slip.vehicle.road import Surface
 
 ROAD_SPACING_M = 1.0
 """Spacing of the points at which curvature and target speed are tabulated, in m."""
@@ -52,6 +57,8 @@ class DriveSpec:
     source: str = "simulated"
     script: Annotated[tuple[Manoeuvre, ...], Field(exclude_if=lambda script: not script)] = ()
     """Manoeuvres; a drive without any has the digest that it had before there were some."""
+    flaws: Annotated[Imperfections, Field(exclude_if=lambda flaws: flaws == NONE)] = NONE
+    """Not part of the digest where there are none: it is what it was before there were any."""
 
     @property
     def profile(self) -> SpeedProfile:
@@ -67,6 +74,19 @@ class DriveSpec:
     def generator(self) -> np.random.Generator:
         """Return the generator of the drive's sensor noise, at its start."""
         return random_generator(self.seed, "sensors", self.drive_id)
+
+    def distortion(self) -> Distortion | None:
+        """Return what the sensors make of the truth, at the drive's start; None where nothing."""
+        if self.flaws == NONE:
+            return None
+        of_car = random_generator(self.seed, "pulses", self.vehicle_id)
+        return Distortion(self.flaws, of_car, random_generator(self.seed, "gps", self.drive_id))
+
+    def surface(self, station_m: FloatArray) -> Surface | None:
+        """Return the road's surface at the stations of the profile."""
+        of_track = random_generator(self.seed, "slopes", self.track.name)
+        of_drive = random_generator(self.seed, "weather", self.drive_id)
+        return surface(self.flaws.road, self.track, station_m, of_track, of_drive)
 
 
 @dataclass(frozen=True)
@@ -182,6 +202,7 @@ class Campaign(Config):
             laps=self.laps,
             seed=self.seed,
             script=assignment.script,
+            flaws=assignment.flaws,
         )
 
 

@@ -11,6 +11,7 @@ from pydantic import BeforeValidator, Field, FiniteFloat, model_validator
 
 from fleet_slip.config import Config
 from fleet_slip.errors import ConfigError
+from fleet_slip.simulation.imperfections import NONE, ImperfectionRanges, Imperfections
 from fleet_slip.simulation.manoeuvres import Manoeuvre
 from fleet_slip.simulation.sensors import Sensors
 from fleet_slip.simulation.speed_profile import SpeedLimits
@@ -76,6 +77,7 @@ class CarOnRoad:
     limits: SpeedLimits
     speed_factor: float
     script: tuple[Manoeuvre, ...] = ()
+    flaws: Imperfections = NONE
 
 
 class Plan(Config):
@@ -187,6 +189,10 @@ class FleetPlan(Plan):
     adhesion: Uniform
     friction_use: Uniform
     speed_factor: Uniform
+    imperfections: ImperfectionRanges | None = Field(
+        default=None, exclude_if=lambda ranges: ranges is None
+    )
+    """None: cars, sensors and roads are those of the textbook."""
 
     def car(self, number: int) -> int:
         """Return the car that drives the drive of this number."""
@@ -197,20 +203,22 @@ class FleetPlan(Plan):
     ) -> CarOnRoad:
         """Draw a car from one generator and its drive from another, in a fixed order."""
         vehicle = self.vehicles[of_car.integers(len(self.vehicles))]
-        vehicle = vehicle.with_sprung_mass(vehicle.body.sprung_mass_kg * self.load.draw(of_car))
-        vehicle = vehicle.with_tyres(
-            stiffness_factor=self.tyre_stiffness.draw(of_car),
-            rolling_radius_factor=self.tyre_radius.draw(of_car),
-        )
+        mass_kg = vehicle.body.sprung_mass_kg * self.load.draw(of_car)
+        stiffness, radius = self.tyre_stiffness.draw(of_car), self.tyre_radius.draw(of_car)
         sensors = self.sensor_bias_std.draw(sensors, of_car)
         track = self.tracks[of_drive.integers(len(self.tracks))]
         adhesion = self.adhesion.draw(of_drive)
         lateral_mps2 = self.friction_use.draw(of_drive) * adhesion * GRAVITY_MPS2
+        speed_factor = self.speed_factor.draw(of_drive)
+        ranges = self.imperfections or ImperfectionRanges()
+        place = ranges.load_position_m
+        vehicle = vehicle.with_sprung_mass(mass_kg, place.draw(of_car) if place else None)
         return CarOnRoad(
-            vehicle=vehicle,
+            vehicle=vehicle.with_tyres(stiffness_factor=stiffness, rolling_radius_factor=radius),
             sensors=sensors,
             track=track,
             adhesion=adhesion,
             limits=self.limits(lateral_mps2, adhesion),
-            speed_factor=self.speed_factor.draw(of_drive),
+            speed_factor=speed_factor,
+            flaws=ranges.draw(of_car, of_drive),
         )

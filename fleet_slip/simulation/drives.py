@@ -10,7 +10,8 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.simulation.campaign import Batch, DriveSpec
 from fleet_slip.simulation.manoeuvres import road_with
 from fleet_slip.simulation.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ, Measurement, Recorder
-from fleet_slip.vehicle.lanes import LaneDrive, Road, simulate_blocks
+from fleet_slip.vehicle.lanes import LaneDrive, simulate_blocks
+from fleet_slip.vehicle.road import Road
 
 DRIVES_AT_ONCE = 128
 """Drives of a batch that are simulated together, which bounds the memory for their roads."""
@@ -60,9 +61,11 @@ def lane_drive(spec: DriveSpec) -> LaneDrive:
         speed_mps=spec.speed_factor * profile.speed_mps,
         length_m=spec.track.length_m,
         closed=spec.track.closed,
+        surface=spec.surface(profile.station_m),
     )
+    felt = spec.distortion() is not None
     road = road_with(road, spec.script)
-    return LaneDrive(vehicle=spec.vehicle, road=road, adhesion=spec.adhesion, laps=spec.laps)
+    return LaneDrive(spec.vehicle, road, spec.adhesion, spec.laps, spec.flaws.car, felt)
 
 
 def simulate_batch(batch: Batch) -> pa.Table:
@@ -83,7 +86,7 @@ def simulate_logs(specs: Sequence[DriveSpec]) -> list[DriveLog]:
 
     A block of a drive is measured as soon as it is there: of true signals nothing is kept.
     """
-    recorders = [Recorder(spec.sensors, spec.generator()) for spec in specs]
+    recorders = [Recorder(s.sensors, s.generator(), s.distortion()) for s in specs]
     logs: dict[int, DriveLog] = {}
     for block in simulate_blocks([lane_drive(spec) for spec in specs]):
         recorder = recorders[block.drive]

@@ -12,7 +12,7 @@ from datetime import date
 from typing import Any, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, FiniteFloat, model_validator
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.canonical import sha256_of
@@ -23,6 +23,7 @@ from fleet_slip.errors import ConfigError
 from fleet_slip.resources import config_names, find_config
 from fleet_slip.simulation.campaign import Batch, DriveSpec
 from fleet_slip.simulation.drive_plan import NamedTrack, NamedVehicle, NotNegative, Positive
+from fleet_slip.simulation.imperfections import NONE, Imperfections
 from fleet_slip.simulation.sensors import GPS_SIGNALS, Sensors
 from fleet_slip.simulation.speed_profile import SpeedLimits, SpeedProfile
 from fleet_slip.vehicle.parameters import VehicleParameters
@@ -114,6 +115,8 @@ class Scenario(Config):
     vehicle: NamedVehicle
     sprung_mass_kg: Positive | None = None
     """None: that of the vehicle's file."""
+    load_position_m: FiniteFloat | None = None
+    """Where the load beyond that sits, before the centre of gravity; None: at that place."""
     tyre_stiffness: Positive = 1.0
     """Cornering stiffness over that of the vehicle's file."""
     tyre_radius: Positive = 1.0
@@ -126,6 +129,8 @@ class Scenario(Config):
     laps: Positive
     seed: int = Field(ge=0)
     sensors: Sensors
+    imperfections: Imperfections = NONE
+    """What car, sensors and road have beyond the textbook's."""
     failures: tuple[Failure, ...] = ()
 
     @model_validator(mode="before")
@@ -144,6 +149,12 @@ class Scenario(Config):
             )
         return self
 
+    @model_validator(mode="after")
+    def _load_has_a_mass(self) -> Self:
+        if self.load_position_m is not None and self.sprung_mass_kg is None:
+            raise ValueError("load_position_m needs a sprung_mass_kg")
+        return self
+
     @property
     def drive_id(self) -> str:
         """Name of the drive in the logs. No campaign's drive can have it."""
@@ -155,7 +166,9 @@ class Scenario(Config):
         tyred = self.vehicle.with_tyres(
             stiffness_factor=self.tyre_stiffness, rolling_radius_factor=self.tyre_radius
         )
-        return tyred if self.sprung_mass_kg is None else tyred.with_sprung_mass(self.sprung_mass_kg)
+        if self.sprung_mass_kg is None:
+            return tyred
+        return tyred.with_sprung_mass(self.sprung_mass_kg, self.load_position_m)
 
     def batch(self) -> ScenarioBatch:
         """Return the drive as the simulation job takes it."""
@@ -173,6 +186,7 @@ class Scenario(Config):
             laps=self.laps,
             seed=self.seed,
             source=SCENARIO,
+            flaws=self.imperfections,
             pace=self.pace,
         )
         return ScenarioBatch(self.drive_id, DAY, 0, (drive,))

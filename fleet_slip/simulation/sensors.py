@@ -12,6 +12,7 @@ from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, Signal, catalogue
 from fleet_slip.compiling import kernel
 from fleet_slip.config import Config
+from fleet_slip.simulation.distortion import Distortion
 
 SAMPLE_RATE_HZ = int(1 / SAMPLE_TIME_S)
 GPS_SIGNALS = {"gps_vx": "vx_mps", "gps_vy": "vy_mps"}
@@ -97,8 +98,14 @@ class Recorder:
     `Sensors.bias_and_std` are exact. So the counts depend on where a drive is cut into blocks.
     """
 
-    def __init__(self, sensors: Sensors, generator: np.random.Generator) -> None:
-        """Begin a drive."""
+    def __init__(
+        self,
+        sensors: Sensors,
+        generator: np.random.Generator,
+        distortion: Distortion | None = None,
+    ) -> None:
+        """Begin a drive. Without a distortion the sensors see the truth."""
+        self._distortion = distortion
         self._sensors = sensors
         self._generator = generator
         self._outages = _Outages(sensors.gps, generator)
@@ -114,6 +121,8 @@ class Recorder:
         signal without one is not measured, as by a car that lacks the sensor.
         """
         ticks = len(next(iter(truth.values())))
+        if self._distortion is not None:
+            truth = self._distortion.apply(truth)
         noise = np.zeros(ticks, dtype=np.float32)
         errors = self._sensors.bias_and_std
         for name, signal in catalogue().signals.items():
@@ -131,7 +140,8 @@ class Recorder:
         for name, column in GPS_SIGNALS.items():
             if name not in catalogue().signals:
                 continue
-            fixed = truth[column][fix]
+            seen = truth.get(catalogue()[name].column)
+            fixed = (truth[column] if seen is None else seen)[fix]
             noise = self._generator.standard_normal(len(fixed), dtype=np.float32)
             self._add(name, fixed, noise, (0.0, self._sensors.gps.velocity_std_mps))
             counts = np.zeros(ticks, dtype=np.int16)

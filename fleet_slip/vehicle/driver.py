@@ -57,15 +57,18 @@ class Handling(NamedTuple):
     steering_ratio: float
 
 
-def handling(vehicle: VehicleParameters) -> Handling:
-    """Return the linear handling of a car on a dry road."""
+def handling(vehicle: VehicleParameters, compliance_rad_per_n: float = 0.0) -> Handling:
+    """Return the linear handling of a car on a dry road.
+
+    `compliance_rad_per_n`: how the front wheels give way under the lateral force of their axle.
+    """
     c = constants(vehicle, adhesion=1.0)
     front = c.static_front / cornering_stiffness(c.static_front, c.stiffness_front, c)
     rear = c.static_rear / cornering_stiffness(c.static_rear, c.stiffness_rear, c)
     return Handling(
         wheelbase=c.front + c.rear,
         rear=c.rear,
-        understeer=(front - rear) / GRAVITY_MPS2,
+        understeer=(front + 2 * c.static_front * compliance_rad_per_n - rear) / GRAVITY_MPS2,
         rear_slip=rear / GRAVITY_MPS2,
         inverse_grip=1 / (vehicle.tyre.friction * GRAVITY_MPS2),
         steering_ratio=vehicle.steering.ratio,

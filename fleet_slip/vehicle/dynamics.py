@@ -14,6 +14,7 @@ from fleet_slip.vehicle.wheels import (
     Acceleration,
     WheelForces,
     WheelRate,
+    WheelRates,
     ackermann,
     build_wheel_forces,
     driven_spins,
@@ -61,7 +62,7 @@ class Derivative(NamedTuple):
 
 
 @equation
-def _driven_body(x: State, _u: Controls, force: WheelForces, c: Constants) -> Acceleration:
+def driven_body(x: State, _u: Controls, force: WheelForces, c: Constants) -> Acceleration:
     """Newton and Euler in the car's frame: m (v̇ + ω × v) = ΣF, I ṙ = ΣM."""
     air = c.drag_per_mass * abs(x.vx) * x.vx
     x_front, x_rear = force.fl.x + force.fr.x, force.rl.x + force.rr.x
@@ -85,9 +86,31 @@ def _driven_body(x: State, _u: Controls, force: WheelForces, c: Constants) -> Ac
 
 @equation
 def _commanded_body(x: State, u: Controls, force: WheelForces, c: Constants) -> Acceleration:
-    """As `_driven_body`, with vx following the demanded acceleration."""
-    free = _driven_body(x, u, force, c)
+    """As `driven_body`, with vx following the demanded acceleration."""
+    free = driven_body(x, u, force, c)
     return Acceleration(u.traction - x.yaw_rate * x.vy, free.ay, u.traction, free.vy, free.yaw_rate)
+
+
+@equation
+def rates_of(
+    x: State, u: Controls, motion: Acceleration, spin: WheelRates, c: Constants
+) -> Derivative:
+    """Return the rates of the whole state from those of body and wheels."""
+    return Derivative(
+        motion.vx,
+        motion.vy,
+        motion.yaw_rate,
+        (u.steering_wheel - x.steering_wheel) * c.inverse_steering_lag,
+        (u.traction - x.traction) * c.inverse_drive_lag,
+        (motion.ax - x.ax_lag) * c.inverse_pitch_lag,
+        (motion.ay - x.ay_lag) * c.inverse_roll_lag,
+        spin.fl,
+        spin.fr,
+        spin.rl,
+        spin.rr,
+        motion.ax,
+        motion.ay,
+    )
 
 
 def build_derivative(extensions: Extensions) -> Callable[[State, Controls, Constants], Derivative]:
@@ -98,7 +121,7 @@ def build_derivative(extensions: Extensions) -> Callable[[State, Controls, Const
     directions = ackermann if extensions.steering else parallel
     loads = transferred_loads if extensions.load_transfer else static_loads
     forces = build_wheel_forces(extensions.brush_tyres, extensions.drivetrain)
-    body = _driven_body if extensions.drivetrain else _commanded_body
+    body = driven_body if extensions.drivetrain else _commanded_body
     spins = driven_spins if extensions.drivetrain else free_spins
 
     @equation
@@ -106,22 +129,7 @@ def build_derivative(extensions: Extensions) -> Callable[[State, Controls, Const
         load = loads(x, c)
         force = forces(x, directions(x, u, c), load, c)
         motion = body(x, u, force, c)
-        fl, fr, rl, rr = spins(x, force, load, motion, c)
-        return Derivative(
-            motion.vx,
-            motion.vy,
-            motion.yaw_rate,
-            (u.steering_wheel - x.steering_wheel) * c.inverse_steering_lag,
-            (u.traction - x.traction) * c.inverse_drive_lag,
-            (motion.ax - x.ax_lag) * c.inverse_pitch_lag,
-            (motion.ay - x.ay_lag) * c.inverse_roll_lag,
-            fl,
-            fr,
-            rl,
-            rr,
-            motion.ax,
-            motion.ay,
-        )
+        return rates_of(x, u, motion, spins(x, force, load, motion, c), c)
 
     return derivative
 

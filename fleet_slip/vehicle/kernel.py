@@ -14,8 +14,6 @@ from collections.abc import Callable
 from pathlib import Path as FilePath
 from typing import Any
 
-import numpy as np
-
 from fleet_slip import compiling
 from fleet_slip.compiling import equation, kernel
 from fleet_slip.vehicle.driver import (
@@ -26,8 +24,9 @@ from fleet_slip.vehicle.driver import (
     decide,
 )
 from fleet_slip.vehicle.dynamics import derivative
+from fleet_slip.vehicle.imperfect_kernel import integrate_imperfect, look_around
 from fleet_slip.vehicle.integration import SECOND_ORDER, Slopes, advance
-from fleet_slip.vehicle.lane_blocks import BLOCK, at, fill_angles, record
+from fleet_slip.vehicle.lane_blocks import BLOCK, at, fill_angles, fill_recorded_angles, record
 from fleet_slip.vehicle.lane_memory import (
     CAR,
     CONTROLS,
@@ -47,6 +46,7 @@ from fleet_slip.vehicle.lane_memory import (
 )
 from fleet_slip.vehicle.parameters import Constants
 from fleet_slip.vehicle.pose import Path, Pose, PoseSlopes, advance_pose, pose_slopes
+from fleet_slip.vehicle.route import place
 from fleet_slip.vehicle.rows import LANES, read, write
 from fleet_slip.vehicle.state import Controls, State
 
@@ -57,19 +57,6 @@ LOST_SLIP_TANGENT = math.sqrt(3.0)
 """Side-slip of 60°."""
 LOST_SPEED_MPS = 0.5
 
-ROUTE = np.dtype(
-    [
-        ("first", np.int64),  # index of the road's first entry in the table of all roads
-        ("last", np.int64),
-        ("inverse_spacing", np.float64),
-        ("length_m", np.float64),
-        ("closed", np.bool_),
-        ("distance_m", np.float64),
-        ("samples", np.int64),  # most that the drive may take
-    ]
-)
-"""What the kernel knows of a drive."""
-
 CURVATURE, SPEED, ACCELERATION = range(3)
 """Columns of the table of all roads: curvature, target speed, target acceleration."""
 
@@ -78,24 +65,13 @@ SAMPLES, LOST = range(2)
 
 
 @equation
-def _place(route: Any, station: float) -> tuple[int, float]:
-    """Return the entry at or before a station, and how far towards the next the station is.
-
-    A closed road's entries are continued beyond its length by what a driver sees ahead.
-    """
-    place = station * route.inverse_spacing
-    entry = min(max(math.floor(place), 0), route.last - route.first - 1)
-    return route.first + entry, min(max(place - entry, 0.0), 1.0)
-
-
-@equation
 def _look_up(roads: Any, route: Any, x: State, station: float, lost: bool) -> Path:
     """Return what the driver sees of the road from a station."""
-    here, share = _place(route, station)
+    here, share = place(route, station)
     curvature = roads[here, CURVATURE]
     change = roads[here + 1, CURVATURE] - curvature
-    ahead, part = _place(route, station + STEERING_PREVIEW_S * x.vx)
-    soon, bit = _place(route, station + SPEED_PREVIEW_S * x.vx)
+    ahead, part = place(route, station + STEERING_PREVIEW_S * x.vx)
+    soon, bit = place(route, station + SPEED_PREVIEW_S * x.vx)
     return Path(
         station,
         curvature + share * change,
@@ -199,7 +175,7 @@ def _move_on(memory: Any, book: Any, routes: Any, truth: Any, ended: Any) -> int
 
 
 @equation
-def _finish(truth: Any, book: Any, ended: Any, cars: Any) -> None:
+def _finish(truth: Any, book: Any, ended: Any, cars: Any, imperfect: bool) -> None:
     """Fill in what follows from the recorded in the blocks that are complete."""
     for lane in range(LANES):
         drive, samples = book[DRIVE, lane], book[TICK, lane] - book[FIRST, lane]
@@ -208,11 +184,14 @@ def _finish(truth: Any, book: Any, ended: Any, cars: Any) -> None:
             left, right = truth[at(lane, 8, 0) :][:samples], truth[at(lane, 9, 0) :][:samples]
             slip = truth[at(lane, 10, 0) :][:samples]
             vx, vy = truth[at(lane, 11, 0) :][:samples], truth[at(lane, 12, 0) :][:samples]
-            fill_angles(wheel, left, right, vx, vy, slip, cars[drive])
+            if imperfect:
+                fill_recorded_angles(left, right, vx, vy, slip)
+            else:
+                fill_angles(wheel, left, right, vx, vy, slip, cars[drive])
 
 
-def build_kernel(sources: str) -> Callable[..., None]:
-    """Return the kernel, not yet compiled.
+def build_kernel(sources: str, imperfect: bool = False) -> Callable[..., None]:
+    """Return the kernel, not yet compiled: of cars as in the textbook, or with imperfections.
 
     Its closure holds a digest of the `sources`, and so does the key under which numba keeps the
     compiled code on disk: a change of any module compiles it again.
@@ -222,6 +201,7 @@ def build_kernel(sources: str) -> Callable[..., None]:
         routes: Any,
         cars: Any,
         roads: Any,
+        surfaces: Any,
         steps: int,
         memory: Any,
         book: Any,
@@ -230,20 +210,25 @@ def build_kernel(sources: str) -> Callable[..., None]:
     ) -> None:
         """Drive on, from sample to sample, until a lane's block is complete.
 
-        `routes` are of dtype `ROUTE` and point into the table `roads`; `cars` has `Constants` and
-        `Handling` in rows; a sample takes `steps` steps. `truth` has `BLOCK_SHAPE`, made flat;
-        `ended` gets the number of samples and the tick of the loss of each drive. There must be a
-        drive on some lane.
+        `routes` are of dtype `ROUTE` and point into the tables `roads` and, for cars with
+        imperfections, `surfaces`; `cars` has `Constants`, `Handling` and `Traits` in rows; a sample
+        takes `steps` steps. `truth` is made by `empty_blocks`; `ended` gets the number of samples
+        and the tick of the loss of each drive. There must be a drive on some lane.
         """
         _ = sources
         complete = 0
         while complete == 0:
             _look(memory, book, routes, roads, truth, ended)
+            if imperfect:
+                look_around(memory, book, routes, surfaces, truth)
             _decide(memory)
             for step in range(steps):
-                _integrate(memory, SAMPLE_S / steps, step == 0)
+                if imperfect:
+                    integrate_imperfect(memory, SAMPLE_S / steps, step == 0)
+                else:
+                    _integrate(memory, SAMPLE_S / steps, step == 0)
             complete = _move_on(memory, book, routes, truth, ended)
-        _finish(truth, book, ended, cars)
+        _finish(truth, book, ended, cars, imperfect)
 
     return simulate
 
@@ -258,3 +243,6 @@ def _source_digest() -> str:
 
 simulate = kernel(build_kernel(_source_digest()))
 """The kernel; see `build_kernel`."""
+
+simulate_imperfect = kernel(build_kernel(_source_digest(), imperfect=True))
+"""The kernel of cars with imperfections."""

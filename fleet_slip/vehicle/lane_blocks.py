@@ -5,6 +5,9 @@ A block is still in the processor's cache when it is measured.
 
 from typing import Any
 
+import numpy as np
+
+from fleet_slip.arrays import FloatArray
 from fleet_slip.compiling import equation
 from fleet_slip.vehicle.arctangent import arctan2
 from fleet_slip.vehicle.lane_memory import ACKERMANN, STEER
@@ -31,6 +34,10 @@ CHANNELS = (
 )
 """What a lane records."""
 
+IMPERFECT_CHANNELS = ("yaw_acceleration_rad_s2", "leaning_ax_mps2", "leaning_ay_mps2")
+"""What a lane records besides of a car with imperfections, for its sensors: how the body begins to
+turn, and the accelerations as its pitch and roll have followed them."""
+
 BLOCK = 2**16
 """Samples of a block: 11 minutes of a drive."""
 
@@ -42,10 +49,28 @@ BLOCK_SHAPE = (LANES, len(CHANNELS), STRIDE)
 """Shape of the blocks of all lanes."""
 
 
+IMPERFECT_BLOCK_SHAPE = (LANES, len(IMPERFECT_CHANNELS), STRIDE)
+
+
+def empty_blocks(imperfect: bool) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return memory for the blocks of all lanes, flat, and its two parts in their shapes."""
+    usual = LANES * len(CHANNELS) * STRIDE
+    memory = np.empty(usual + (LANES * len(IMPERFECT_CHANNELS) * STRIDE if imperfect else 0))
+    more = memory[usual:].reshape(IMPERFECT_BLOCK_SHAPE if imperfect else (LANES, 0, STRIDE))
+    return memory, memory[:usual].reshape(BLOCK_SHAPE), more
+
+
 @equation
 def at(lane: int, channel: int, sample: int) -> int:
     """Return where a sample of a channel stands in the blocks."""
     return (lane * len(CHANNELS) + channel) * STRIDE + sample
+
+
+@equation
+def further_at(lane: int, channel: int, sample: int) -> int:
+    """Return where a sample of one of `IMPERFECT_CHANNELS` stands in the blocks."""
+    start = LANES * len(CHANNELS) * STRIDE
+    return start + (lane * len(IMPERFECT_CHANNELS) + channel) * STRIDE + sample
 
 
 @equation
@@ -61,6 +86,17 @@ def record(truth: Any, lane: int, sample: int, x: State, pose: Pose) -> None:
     truth[at(lane, 12, sample)] = x.vy
     truth[at(lane, 13, sample)] = pose.station
     truth[at(lane, 14, sample)] = pose.offset
+
+
+@equation
+def fill_recorded_angles(left: Any, right: Any, vx: Any, vy: Any, slip: Any) -> None:
+    """Fill in the angles of a block in which the wheels' tangents stand instead of their angles."""
+    for tick in range(len(left)):
+        left[tick] = arctan2(left[tick], 1.0)
+    for tick in range(len(right)):
+        right[tick] = arctan2(right[tick], 1.0)
+    for tick in range(len(slip)):
+        slip[tick] = arctan2(vy[tick], vx[tick])
 
 
 @equation

@@ -4,6 +4,8 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.vehicle.driver import Handling
+from fleet_slip.vehicle.imperfect_dynamics import Around, Give, GiveRates
+from fleet_slip.vehicle.imperfections import Traits
 from fleet_slip.vehicle.integration import Slopes
 from fleet_slip.vehicle.parameters import Constants
 from fleet_slip.vehicle.pose import Path, Pose, PoseSlopes
@@ -30,7 +32,12 @@ ORDER = FORCE + 2
 """Extrapolation of the integration: 0 in a drive's first step."""
 CAR = ORDER + 1
 HANDLING = CAR + len(Constants._fields)
-ROWS = HANDLING + len(Handling._fields)
+TRAITS = HANDLING + len(Handling._fields)
+"""From here on only cars with imperfections use the memory."""
+AROUND = TRAITS + len(Traits._fields)
+GIVE = AROUND + len(Around._fields)
+GIVE_SLOPES = GIVE + len(Give._fields)
+ROWS = GIVE_SLOPES + len(GiveRates._fields)
 
 STEER = Constants._fields.index("steer_per_wheel")
 ACKERMANN = Constants._fields.index("ackermann")
@@ -50,7 +57,7 @@ def begin(
     car: FloatArray,
     speed_mps: float,
 ) -> None:
-    """Put a drive on a lane: rolling straight along the line at a speed."""
+    """Put a drive on a lane: rolling straight along the line at a speed, on cold tyres."""
     book[:, lane] = drive, 0, 0, 0
     spin = speed_mps * car[INVERSE_RADIUS]
     column = memory.reshape(ROWS, LANES)[:, lane]
@@ -58,6 +65,8 @@ def begin(
     column[CAR : CAR + len(car)] = car
     column[STATE : STATE + len(State._fields)] = State(speed_mps, *6 * (0.0,), *4 * (spin,))
     column[POSE : POSE + len(Pose._fields)] = Pose(0.0, 0.0, 1.0, 0.0)
+    cold = column[TRAITS + Traits._fields.index("cold_stiffness")]
+    column[AROUND : AROUND + len(Around._fields)] = Around(0.0, 0.0, 1.0, 1.0, 0.0, 1.0 + cold)
 
 
 def clear(memory: FloatArray, book: IntArray, lane: int) -> None:

@@ -2,8 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +11,20 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import ConfigError
 from fleet_slip.vehicle import kernel, lane_memory
 from fleet_slip.vehicle.driver import SAMPLE_S, handling
+from fleet_slip.vehicle.imperfections import PERFECT, CarImperfections, traits
 from fleet_slip.vehicle.integration import STEP_S
-from fleet_slip.vehicle.kernel import LOST_SPEED_MPS
-from fleet_slip.vehicle.lane_blocks import BLOCK, BLOCK_SHAPE, CHANNELS
+from fleet_slip.vehicle.lane_blocks import BLOCK, CHANNELS, IMPERFECT_CHANNELS, empty_blocks
 from fleet_slip.vehicle.lane_memory import DRIVE, FIRST, NOBODY
 from fleet_slip.vehicle.parameters import VehicleParameters, constants
+from fleet_slip.vehicle.road import (
+    Road,
+    Surface,
+    planned_time_s,
+    require_usable,
+    road_table,
+    surface_table,
+)
+from fleet_slip.vehicle.route import ROUTE
 
 STEPS_PER_SAMPLE = round(SAMPLE_S / STEP_S)
 
@@ -25,25 +33,6 @@ PATIENCE = 1.25
 
 GRACE_S = 5.0
 """Time that every drive may take beyond that."""
-
-FARTHEST_VIEW_M = 20.0
-"""How far beyond a lap's end a driver may look."""
-
-
-class Road(NamedTuple):
-    """The line to follow and the speed to hold, tabulated at equal steps of the station.
-
-    The first entry stands at station 0. A closed road is periodic: `length_m` is a whole number of
-    spacings, and the entry after the last is the first again.
-    """
-
-    spacing_m: float
-    curvature_1pm: FloatArray
-    """Curvature of the line, (m,), positive to the left."""
-    speed_mps: FloatArray
-    """Target speed, (m,), already times the speed factor."""
-    length_m: float
-    closed: bool
 
 
 @dataclass(frozen=True)
@@ -56,6 +45,14 @@ class LaneDrive:
     """Adhesion coefficient μ of the road, 1 on dry asphalt."""
     laps: float
     """Length of the drive in lengths of the road."""
+    flaws: CarImperfections = PERFECT
+    felt: bool = False
+    """Whether to record `IMPERFECT_CHANNELS` for its sensors, even of a perfect car and road."""
+
+    @property
+    def imperfect(self) -> bool:
+        """Whether the car, the road or the sensors are not those of the textbook."""
+        return self.felt or self.flaws != PERFECT or self.road.surface is not None
 
 
 @dataclass(frozen=True)
@@ -109,18 +106,33 @@ def simulate_blocks(
     drive: not on the others, their number or order, the thread or the machine. Releases the GIL.
     The memory does not depend on the number and the length of the drives: at most 63 MB.
 
-    Raises `ConfigError` if a road's table is not usable.
+    Cars and roads with imperfections are simulated by a kernel of their own; each of its blocks
+    has the channels of `IMPERFECT_CHANNELS`, too. Raises `ConfigError` if a road's table is not
+    usable.
     """
-    if not drives:
-        return
     for drive in drives:
         _require_usable(drive)
+    for imperfect in (False, True):
+        numbers = [i for i, drive in enumerate(drives) if drive.imperfect == imperfect]
+        alike = [drives[number] for number in numbers]
+        for block in _simulate_alike(alike, imperfect, steps_per_sample):
+            yield replace(block, drive=numbers[block.drive])
+
+
+def _simulate_alike(
+    drives: Sequence[LaneDrive], imperfect: bool, steps_per_sample: int
+) -> Iterator[TruthBlock]:
+    """Yield the blocks of drives that are all with imperfections, or all without."""
+    if not drives:
+        return
+    simulate = kernel.simulate_imperfect if imperfect else kernel.simulate
     routes, roads = _routes(drives)
-    cars = np.array([(*constants(d.vehicle, d.adhesion), *handling(d.vehicle)) for d in drives])
+    surfaces = _surfaces(drives) if imperfect else np.zeros((0, len(Surface._fields)))
+    cars = np.array([_car(drive) for drive in drives])
     waiting = np.argsort(routes["samples"], kind="stable").tolist()
     ended = np.full((len(drives), 2), NOBODY)
     memory, book = lane_memory.empty_lanes()
-    truth = np.empty(BLOCK_SHAPE)
+    truth, usual, further = empty_blocks(imperfect)
     while True:
         for lane in np.flatnonzero(book[DRIVE] == NOBODY)[: len(waiting)]:
             drive = waiting.pop()
@@ -128,14 +140,15 @@ def simulate_blocks(
             lane_memory.begin(memory, book, lane, drive, cars[drive], speed_mps)
         if (book[DRIVE] == NOBODY).all():
             return
-        kernel.simulate(
-            routes, cars, roads, steps_per_sample, memory, book, truth.reshape(-1), ended
-        )
+        simulate(routes, cars, roads, surfaces, steps_per_sample, memory, book, truth, ended)
         for lane, (drive, tick, _, first) in enumerate(book.T.tolist()):
             last = drive != NOBODY and ended[drive, kernel.SAMPLES] != NOBODY
             if last or tick - first == BLOCK:
                 lost = int(ended[drive, kernel.LOST])
-                channels = dict(zip(CHANNELS, truth[lane, :, : tick - first], strict=True))
+                channels = dict(zip(CHANNELS, usual[lane, :, : tick - first], strict=True))
+                if imperfect:
+                    more = further[lane, :, : tick - first]
+                    channels |= dict(zip(IMPERFECT_CHANNELS, more, strict=True))
                 yield TruthBlock(drive, channels, last, None if lost == NOBODY else lost)
                 book[FIRST, lane] = tick
             if last:
@@ -163,51 +176,35 @@ def simulate_drives(
     ]
 
 
-def planned_time_s(road: Road, distance_m: float) -> float:
-    """Return the time to drive a distance at the road's target speed."""
-    speed = np.append(road.speed_mps, road.speed_mps[0]) if road.closed else road.speed_mps
-    lap_s = float(np.sum(2 * road.spacing_m / (speed[:-1] + speed[1:])))
-    return lap_s * distance_m / road.length_m
+def _car(drive: LaneDrive) -> tuple[float, ...]:
+    """Return what the kernel knows of a car."""
+    return (
+        *constants(drive.vehicle, drive.adhesion),
+        *handling(drive.vehicle, math.radians(drive.flaws.steering_compliance_deg_per_kn) / 1000),
+        *traits(drive.vehicle, drive.flaws, SAMPLE_S),
+    )
 
 
-def target_acceleration(road: Road) -> FloatArray:
-    """Return the acceleration d(v²/2)/ds of the target speed at the road's entries, in m/s².
-
-    Central differences; interpolated linearly it is continuous, so that a drive does not hinge on
-    which side of an entry a sample falls.
-    """
-    energy = road.speed_mps**2 / 2
-    if road.closed:
-        return (np.roll(energy, -1) - np.roll(energy, 1)) / (2 * road.spacing_m)
-    return np.gradient(energy, road.spacing_m)
-
-
-def _table(road: Road) -> FloatArray:
-    """Return what the kernel looks up of a road: curvature, target speed and acceleration.
-
-    The table of a closed road goes on beyond its length by what a driver sees ahead.
-    """
-    columns = np.stack([road.curvature_1pm, road.speed_mps, target_acceleration(road)], axis=1)
-    further = math.ceil(FARTHEST_VIEW_M / road.spacing_m) + 1 if road.closed else 0
-    return np.take(columns, range(len(columns) + further), axis=0, mode="wrap")
+def _surfaces(drives: Sequence[LaneDrive]) -> FloatArray:
+    """Return the table of all surfaces, in the order of the table of all roads."""
+    roads = {id(drive.road): drive.road for drive in drives}
+    return np.concatenate([surface_table(road) for road in roads.values()])
 
 
 def _routes(drives: Sequence[LaneDrive]) -> tuple[NDArray[np.void], FloatArray]:
-    """Return what the kernel knows of the drives, `kernel.ROUTE`, and the table of all roads."""
+    """Return what the kernel knows of the drives, `ROUTE`, and the table of all roads."""
     roads = {id(drive.road): drive.road for drive in drives}
-    tables = [_table(road) for road in roads.values()]
+    tables = [road_table(road) for road in roads.values()]
     ends = np.cumsum([len(table) for table in tables])
     spans = dict(zip(roads, zip([0, *ends[:-1]], ends - 1, strict=True), strict=True))
-    routes = np.array(
-        [_route(drive, *spans[id(drive.road)]) for drive in drives], dtype=kernel.ROUTE
-    )
+    routes = np.array([_route(drive, *spans[id(drive.road)]) for drive in drives], dtype=ROUTE)
     return routes, np.concatenate(tables)
 
 
 def _route(
     drive: LaneDrive, first: int, last: int
 ) -> tuple[int, int, float, float, bool, float, int]:
-    """Return a drive's row of `kernel.ROUTE`."""
+    """Return a drive's row of `ROUTE`."""
     road = drive.road
     distance_m = (drive.laps if road.closed else min(drive.laps, 1.0)) * road.length_m
     samples = math.ceil((PATIENCE * planned_time_s(road, distance_m) + GRACE_S) / SAMPLE_S)
@@ -215,22 +212,7 @@ def _route(
 
 
 def _require_usable(drive: LaneDrive) -> None:
-    road = drive.road
-    entries = len(road.curvature_1pm)
-    if len(road.speed_mps) != entries or entries < 2:
-        raise ConfigError(
-            f"a road needs two or more entries of curvature and as many of speed, not {entries}"
-            f" and {len(road.speed_mps)}."
-        )
-    intervals = entries if road.closed else entries - 1
-    if abs(intervals * road.spacing_m - road.length_m) > 1e-6 * road.length_m:
-        raise ConfigError(
-            f"a road of {intervals} intervals of {road.spacing_m} m is not {road.length_m} m long."
-        )
-    if not (np.isfinite(road.curvature_1pm).all() and (road.speed_mps > LOST_SPEED_MPS).all()):
-        raise ConfigError(
-            f"a road needs finite curvature and target speeds above {LOST_SPEED_MPS} m/s."
-        )
+    require_usable(drive.road)
     if not 0 < drive.adhesion < math.inf or not 0 < drive.laps < math.inf:
         raise ConfigError(
             f"adhesion {drive.adhesion} and laps {drive.laps}: give positive numbers."

@@ -140,15 +140,28 @@ class VehicleParameters(Config):
     drivetrain: Drivetrain
     aerodynamics: Aerodynamics
 
-    def with_sprung_mass(self, mass_kg: float) -> Self:
+    def with_sprung_mass(self, mass_kg: float, load_position_m: float | None = None) -> Self:
         """Return the car loaded to another sprung mass.
 
-        The load sits as the sprung mass did, so that the yaw inertia of the sprung mass grows in
-        proportion and the centre of gravity stays. Wheel loads, and with them cornering stiffness
-        and friction, follow from the mass. Raises `ConfigError` if it is not a positive number.
+        Without a position the load sits as the sprung mass did, so that the yaw inertia of the
+        sprung mass grows in proportion and the centre of gravity stays. Else the load is a point at
+        a position before the centre of gravity of the car without it, and both move. Wheel loads,
+        and with them cornering stiffness and friction, follow from the mass. Raises `ConfigError`
+        if the car cannot be.
         """
-        inertia = self.body.sprung_yaw_inertia_kgm2 * mass_kg / self.body.sprung_mass_kg
-        changes = {"sprung_mass_kg": mass_kg, "sprung_yaw_inertia_kgm2": inertia}
+        body = self.body
+        changes = {"sprung_mass_kg": mass_kg}
+        if load_position_m is None:
+            inertia = body.sprung_yaw_inertia_kgm2 * mass_kg / body.sprung_mass_kg
+        else:
+            load_kg = mass_kg - body.sprung_mass_kg
+            shift_m = load_kg * load_position_m / (body.mass_kg + load_kg)
+            # The parallel axis theorem, for the car without load and for the load.
+            inertia = body.sprung_yaw_inertia_kgm2 + body.sprung_mass_kg * shift_m**2
+            inertia += load_kg * (load_position_m - shift_m) ** 2
+            changes["front_axle_m"] = body.front_axle_m - shift_m
+            changes["rear_axle_m"] = body.rear_axle_m + shift_m
+        changes["sprung_yaw_inertia_kgm2"] = inertia
         return self.model_copy(update={"body": self._changed(self.body, changes)})
 
     def with_tyres(

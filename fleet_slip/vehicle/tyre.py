@@ -60,9 +60,23 @@ def brush_force(
 
     where v_s points against the sliding and μ(v_s) = μ0 / (1 + |v_s| / V).
     """
+    return brush_force_on(along, across, rolling, load, peak, 1.0, c)
+
+
+@equation
+def brush_force_on(
+    along: float,
+    across: float,
+    rolling: float,
+    load: float,
+    peak: float,
+    grip: float,
+    c: Constants,
+) -> TyreForce:
+    """Return the force of a brush tyre where the road has `grip` times the drive's adhesion."""
     slide_x = rolling - along
     slide_y = -across
-    limit = (c.friction - c.friction_per_load * load) * load
+    limit = (c.friction - c.friction_per_load * load) * load * grip
     # One division serves three quotients: 1 / speed, Cy = 2 c1 x / (1 + x²), and 1 / (3 limit).
     speed = max(abs(rolling), CREEP_SPEED_MPS)
     x = load * c.inverse_stiffness_load

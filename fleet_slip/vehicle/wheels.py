@@ -7,7 +7,7 @@ from typing import NamedTuple
 from fleet_slip.compiling import equation
 from fleet_slip.vehicle.parameters import Constants
 from fleet_slip.vehicle.state import Controls, State
-from fleet_slip.vehicle.tyre import brush_force, linear_force
+from fleet_slip.vehicle.tyre import TyreForce, brush_force, linear_force
 
 SMALLEST_LOAD_N = 1.0
 """Load of a wheel that has lifted: it gives no force and divides nothing by zero."""
@@ -142,6 +142,22 @@ def static_loads(_x: State, c: Constants) -> Loads:
     return Loads(c.static_front, c.static_front, c.static_rear, c.static_rear)
 
 
+@equation
+def in_car_frame(force: TyreForce, to: Direction) -> WheelForce:
+    """Return a tyre's force as it acts on the car."""
+    cosine, sine = to
+    return WheelForce(
+        cosine * force.x - sine * force.y,
+        sine * force.x + cosine * force.y,
+        force.x,
+        force.damping,
+        force.slip,
+        force.slip_per_speed,
+        cosine,
+        sine,
+    )
+
+
 def build_wheel_forces(brush: bool, spinning: bool) -> Callable[..., WheelForces]:
     """Compile the forces of the wheels: brush or linear tyres, spinning or freely rolling."""
 
@@ -159,17 +175,7 @@ def build_wheel_forces(brush: bool, spinning: bool) -> Callable[..., WheelForces
         along = cosine * vx + sine * vy
         across = cosine * vy - sine * vx
         rolling = c.radius * spin if spinning else along
-        force = brush_force(along, across, rolling, load, peak, c)
-        return WheelForce(
-            cosine * force.x - sine * force.y,
-            sine * force.x + cosine * force.y,
-            force.x,
-            force.damping,
-            force.slip,
-            force.slip_per_speed,
-            cosine,
-            sine,
-        )
+        return in_car_frame(brush_force(along, across, rolling, load, peak, c), to)
 
     @equation
     def brush_forces(

@@ -187,7 +187,7 @@ FORGED = (
 @pytest.mark.parametrize(
     ("arguments", "exit_code", "message"),
     [
-        (["run", "--campaign", "nowhere"], 3, "Known: fleet, proving_ground, smoke, waterford"),
+        (["run", "--campaign", "nowhere"], 3, "Known: fleet, fleet_realistic, proving_ground"),
         (["run", "--campaign", "missing.toml"], 3, "no such file"),
         (["run", "--campaign", "smoke", "--through", "yesterday"], 2, "write it as 2024-05-01"),
         (["run", "--campaign", "smoke", "--through", "1999-01-01"], 2, "lasts from"),

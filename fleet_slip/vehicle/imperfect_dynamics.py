@@ -1,0 +1,201 @@
+"""Equations of motion of a car with imperfections, on a road that is not flat, even and calm.
+
+They are those of `dynamics` with more in them: what steers the wheels gives way, wheels differ and
+point elsewhere, tyres lag, and weight and wind act along the road. Sources:
+`docs/imperfections.md`.
+"""
+
+import math
+from typing import NamedTuple
+
+from fleet_slip.compiling import equation
+from fleet_slip.vehicle.dynamics import Derivative, driven_body, rates_of
+from fleet_slip.vehicle.imperfections import Traits
+from fleet_slip.vehicle.integration import extrapolate
+from fleet_slip.vehicle.parameters import Constants
+from fleet_slip.vehicle.state import Controls, State
+from fleet_slip.vehicle.tyre import CREEP_SPEED_MPS, brush_force_on
+from fleet_slip.vehicle.wheels import (
+    Acceleration,
+    Direction,
+    Loads,
+    WheelForce,
+    WheelForces,
+    driven_spins,
+    in_car_frame,
+    transferred_loads,
+)
+
+
+class Around(NamedTuple):
+    """The road and the air where the car is, and how warm its tyres are."""
+
+    gravity_x: float
+    """Weight per mass along the road, in m/s²; negative uphill."""
+    gravity_y: float
+    """Weight per mass across the road to the left, in m/s²."""
+    grip_left: float
+    """Adhesion under the left wheels over that of the drive."""
+    grip_right: float
+    wind: float
+    """Speed of the air across the car to the left, in m/s."""
+    stiffness: float
+    """Cornering stiffness over that of warm tyres."""
+
+
+class Give(NamedTuple):
+    """What follows the car with a delay of its own."""
+
+    rack: float
+    """Angle of the steering wheel that the rack has followed, in rad."""
+    rack_force: float
+    """Lateral force of the front axle as the steering has given way to it, in N."""
+    side_fl: float
+    """Lateral velocity of a wheel as its tyre has followed it, in m/s."""
+    side_fr: float
+    side_rl: float
+    side_rr: float
+
+
+class GiveRates(NamedTuple):
+    """Rates of `Give`; the rack has none, its play is taken up at once."""
+
+    rack_force: float
+    side_fl: float
+    side_fr: float
+    side_rl: float
+    side_rr: float
+
+
+class _Wheel(NamedTuple):
+    force: WheelForce
+    side_rate: float
+
+
+@equation
+def wheel_tangent(tangent: float, far: float, toe: float) -> tuple[float, float]:
+    """Return the vector (along, across) of a front wheel that is turned by its toe.
+
+    `tangent` over `far` is the tangent of its angle without toe.
+    """
+    return far - toe * tangent, tangent + toe * far
+
+
+@equation
+def rack_tangent(give: Give, c: Constants, t: Traits) -> float:
+    """Return the tangent of the mean front wheel's angle: less where the steering gives way."""
+    return c.steer_per_wheel * give.rack - t.compliance * give.rack_force
+
+
+@equation
+def _unit(along: float, across: float) -> Direction:
+    inverse = 1.0 / math.sqrt(along * along + across * across)
+    return Direction(along * inverse, across * inverse)
+
+
+@equation
+def _imperfect_wheel(
+    vx: float,
+    vy: float,
+    followed_side: float,
+    to: Direction,
+    rolling: float,
+    load: float,
+    peak: float,
+    grip: float,
+    c: Constants,
+    t: Traits,
+) -> _Wheel:
+    """Return the force of a wheel whose tyre follows the lateral velocity after a way.
+
+    Single contact point transient model (Pacejka 2012, section 7.2): the relaxation length L times
+    the rate of what the tyre has followed is the rolling speed times what it has not.
+    """
+    cosine, sine = to
+    along = cosine * vx + sine * vy
+    across = cosine * vy - sine * vx
+    felt = across + t.relaxes * (followed_side - across)
+    force = brush_force_on(along, felt, rolling, load, peak, grip, c)
+    speed = max(abs(rolling), CREEP_SPEED_MPS)
+    return _Wheel(in_car_frame(force, to), speed * t.inverse_relaxation * (across - followed_side))
+
+
+@equation
+def _wheels(
+    x: State, give: Give, around: Around, load: Loads, c: Constants, t: Traits
+) -> tuple[WheelForces, GiveRates]:
+    """Return the forces of the wheels and the rates of what follows them."""
+    tangent = rack_tangent(give, c, t)
+    bend = c.ackermann * tangent
+    left = _unit(*wheel_tangent(tangent, 1.0 - bend, -t.toe))
+    right = _unit(*wheel_tangent(tangent, 1.0 + bend, t.toe))
+    rear_left, rear_right = _unit(1.0, t.rear_left), _unit(1.0, t.rear_right)
+    front, rear = x.vy + c.front * x.yaw_rate, x.vy - c.rear * x.yaw_rate
+    turn_f, turn_r = c.half_track_front * x.yaw_rate, c.half_track_rear * x.yaw_rate
+    peak_f, peak_r = around.stiffness * c.stiffness_front, around.stiffness * c.stiffness_rear
+    roll_fl = (t.radius_fl - t.radius_loss * (load.fl - c.static_front)) * x.wheel_fl
+    roll_fr = (t.radius_fr - t.radius_loss * (load.fr - c.static_front)) * x.wheel_fr
+    roll_rl = (t.radius_rl - t.radius_loss * (load.rl - c.static_rear)) * x.wheel_rl
+    roll_rr = (t.radius_rr - t.radius_loss * (load.rr - c.static_rear)) * x.wheel_rr
+    grip_l, grip_r = around.grip_left, around.grip_right
+    fl = _imperfect_wheel(
+        x.vx - turn_f, front, give.side_fl, left, roll_fl, load.fl, peak_f, grip_l, c, t
+    )
+    fr = _imperfect_wheel(
+        x.vx + turn_f, front, give.side_fr, right, roll_fr, load.fr, peak_f, grip_r, c, t
+    )
+    rl = _imperfect_wheel(
+        x.vx - turn_r, rear, give.side_rl, rear_left, roll_rl, load.rl, peak_r, grip_l, c, t
+    )
+    rr = _imperfect_wheel(
+        x.vx + turn_r, rear, give.side_rr, rear_right, roll_rr, load.rr, peak_r, grip_r, c, t
+    )
+    yielding = (fl.force.y + fr.force.y - give.rack_force) * c.inverse_steering_lag
+    rates = GiveRates(yielding, fl.side_rate, fr.side_rate, rl.side_rate, rr.side_rate)
+    return WheelForces(fl.force, fr.force, rl.force, rr.force), rates
+
+
+@equation
+def imperfect_derivative(
+    x: State, u: Controls, give: Give, around: Around, c: Constants, t: Traits
+) -> tuple[Derivative, GiveRates]:
+    """Return the rates of a car with imperfections.
+
+    Weight along the road moves the car and no accelerometer; wind moves both.
+    """
+    load = transferred_loads(x, c)
+    force, give_rates = _wheels(x, give, around, load, c, t)
+    still = driven_body(x, u, force, c)
+    push = x.vx * around.wind
+    motion = Acceleration(
+        still.ax,
+        still.ay + t.wind_force * push,
+        still.vx + around.gravity_x,
+        still.vy + t.wind_force * push + around.gravity_y,
+        still.yaw_rate + t.wind_moment * push,
+    )
+    return rates_of(x, u, motion, driven_spins(x, force, load, motion, c), c), give_rates
+
+
+@equation
+def advance_give(
+    give: Give,
+    d: GiveRates,
+    before: GiveRates,
+    column: float,
+    t: Traits,
+    step: float,
+    extrapolation: float,
+) -> Give:
+    """Return what follows the car after a step, at the end of which the column stands at an angle.
+
+    The rack rests while the column moves within the play, and is taken along at its end.
+    """
+    return Give(
+        min(max(give.rack, column - t.half_lash), column + t.half_lash),
+        give.rack_force + step * extrapolate(d.rack_force, before.rack_force, extrapolation),
+        give.side_fl + step * extrapolate(d.side_fl, before.side_fl, extrapolation),
+        give.side_fr + step * extrapolate(d.side_fr, before.side_fr, extrapolation),
+        give.side_rl + step * extrapolate(d.side_rl, before.side_rl, extrapolation),
+        give.side_rr + step * extrapolate(d.side_rr, before.side_rr, extrapolation),
+    )

@@ -1,0 +1,219 @@
+"""Imperfections in campaigns and scenarios: drawn as asked for, refused where they cannot be."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from fleet_slip.errors import ConfigError
+from fleet_slip.resources import find_config
+from fleet_slip.simulation.campaign import load_campaign
+from fleet_slip.simulation.drives import simulate_logs
+from fleet_slip.simulation.imperfections import (
+    NONE,
+    ImperfectionRanges,
+    Range,
+    RoadImperfections,
+)
+from fleet_slip.simulation.scenario import load_scenario
+from fleet_slip.simulation.surface import surface
+from fleet_slip.simulation.track import load_track
+from fleet_slip.vehicle.driver import handling
+from fleet_slip.vehicle.parameters import load_vehicle
+
+FLEET = find_config("campaigns", "fleet").read_text(encoding="utf-8")
+NOMINAL = find_config("scenarios", "nominal").read_text(encoding="utf-8")
+SEDAN = load_vehicle("d_class_sedan")
+
+
+def test_ranges_are_drawn_within_their_bounds_in_the_order_of_their_class() -> None:
+    asked = {"toe_front_deg": Range(min=-0.2, max=0.1), "steering_lash_deg": Range(min=1, max=4)}
+    one = ImperfectionRanges(car=asked)
+    other = ImperfectionRanges(car=dict(reversed(asked.items())))
+    draws = [r.draw(*map(np.random.default_rng, (1, 2))) for r in (one, other)]
+    assert draws[0] == draws[1]
+    many = [one.draw(np.random.default_rng(i), np.random.default_rng(0)).car for i in range(300)]
+    for name, bounds in asked.items():
+        values = [getattr(car, name) for car in many]
+        assert bounds.min <= min(values) < max(values) <= bounds.max
+        middle, width = (bounds.min + bounds.max) / 2, bounds.max - bounds.min
+        assert np.mean(values) == pytest.approx(middle, abs=width / 10)
+    assert {car.toe_rear_deg for car in many} == {0.0}
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "bounds", "reason"),
+    [
+        ("car", "toe_front", (0.0, 0.1), "no imperfection. There are: steering_lash_deg"),
+        ("car", "steering_lash_deg", (-1.0, 2.0), "greater than or equal to 0"),
+        ("sensors", "label_latency_s", (0.0, 2.0), "less than or equal to 1"),
+        ("road", "grade_std_percent", (2.0, 1.0), "is above max"),
+    ],
+)
+def test_ranges_that_cannot_be_are_refused(
+    kind: str, name: str, bounds: tuple[float, float], reason: str
+) -> None:
+    with pytest.raises(ValidationError, match=reason):
+        ImperfectionRanges.model_validate({kind: {name: {"min": bounds[0], "max": bounds[1]}}})
+
+
+def test_a_car_keeps_its_imperfections_and_a_drive_has_its_own_road(tmp_path: Path) -> None:
+    file = tmp_path / "campaign.toml"
+    ranges = (
+        "[plan.imperfections.car]\nsteering_lash_deg = { min = 1.0, max = 4.0 }\n"
+        "[plan.imperfections.road]\nwind_mps = { min = 1.0, max = 8.0 }\n"
+    )
+    text = FLEET.replace("cars = 300", "cars = 3")
+    file.write_text(text.replace("[plan.load]", f"{ranges}[plan.load]"))
+    campaign = load_campaign(str(file))
+    drives = [drive for day in campaign.days()[:2] for drive in campaign.drives(day)]
+    lash = {(d.vehicle_id, d.flaws.car.steering_lash_deg) for d in drives}
+    assert len(lash) == 3
+    assert len({d.flaws.road.wind_mps for d in drives}) == len(drives)
+    assert (
+        campaign.batches(campaign.days()[0])[0].digest
+        != load_campaign("fleet").batches(campaign.days()[0])[0].digest
+    )
+
+
+def test_imperfections_change_nothing_else_that_is_drawn(tmp_path: Path) -> None:
+    file = tmp_path / "campaign.toml"
+    ranges = "[plan.imperfections.car]\nsteering_lash_deg = { min = 1.0, max = 4.0 }\n"
+    file.write_text(FLEET.replace("[plan.load]", f"{ranges}[plan.load]"))
+    day = load_campaign("fleet").days()[0]
+    for one, other in zip(
+        load_campaign("fleet").drives(day), load_campaign(str(file)).drives(day), strict=True
+    ):
+        assert (one.vehicle, one.sensors, one.limits, one.speed_factor) == (
+            other.vehicle,
+            other.sensors,
+            other.limits,
+            other.speed_factor,
+        )
+        assert one.flaws == NONE
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("load_position_m = -1.0\n", "needs a sprung_mass_kg"),
+        ("[imperfections.car]\nlash = 1\n", "imperfections.car.lash: unknown key"),
+        ("[imperfections.sensors]\nwheel_pulses_per_turn = -4\n", "greater than or equal to 0"),
+    ],
+)
+def test_scenarios_that_cannot_be_are_refused(tmp_path: Path, text: str, reason: str) -> None:
+    file = tmp_path / "scenario.toml"
+    file.write_text(NOMINAL.replace("[limits]", f"{text}[limits]", 1))
+    with pytest.raises(ConfigError, match=reason):
+        load_scenario(str(file))
+
+
+def test_load_in_the_boot_moves_the_centre_of_gravity_as_statics_asks() -> None:
+    """Axle loads are those of the empty car and of the load, each by its lever (a beam)."""
+    body, place, load_kg = SEDAN.body, -1.6, 200.0
+    loaded = SEDAN.with_sprung_mass(1320.0 + load_kg, place).body
+    front_kg = body.mass_kg * body.rear_axle_m / body.wheelbase_m
+    front_kg += load_kg * (body.rear_axle_m + place) / body.wheelbase_m
+    assert loaded.mass_kg * loaded.rear_axle_m / loaded.wheelbase_m == pytest.approx(front_kg)
+    assert loaded.wheelbase_m == pytest.approx(body.wheelbase_m)
+    # The sprung mass as two points at its radius of gyration, the load as a third.
+    shift = body.front_axle_m - loaded.front_axle_m
+    gyration = np.sqrt(body.sprung_yaw_inertia_kgm2 / body.sprung_mass_kg)
+    points = [(660.0, gyration), (660.0, -gyration), (load_kg, place)]
+    inertia = sum(mass * (at - shift) ** 2 for mass, at in points)
+    assert loaded.sprung_yaw_inertia_kgm2 == pytest.approx(inertia)
+
+
+def test_load_at_the_centre_of_gravity_moves_nothing() -> None:
+    loaded = SEDAN.with_sprung_mass(1500.0, 0.0).body
+    assert loaded.front_axle_m == SEDAN.body.front_axle_m
+    assert loaded.sprung_yaw_inertia_kgm2 == SEDAN.body.sprung_yaw_inertia_kgm2
+
+
+def roughness(**road: float) -> list[np.ndarray]:
+    track = load_track("waterford_hills")
+    station_m, _ = track.grid(1.0)
+    found = surface(
+        RoadImperfections.model_validate(road),
+        track,
+        station_m,
+        np.random.default_rng(1),
+        np.random.default_rng(2),
+    )
+    assert found is not None
+    return list(found)
+
+
+def test_a_perfect_road_has_no_surface() -> None:
+    track = load_track("waterford_hills")
+    generators = [np.random.default_rng(i) for i in range(2)]
+    assert surface(RoadImperfections(), track, track.grid(1.0)[0], *generators) is None
+
+
+def test_slopes_pull_downhill_and_bends_lean_inwards() -> None:
+    along, across, left, right, wind = roughness(cross_slope_percent=2.5)
+    np.testing.assert_allclose(across, -9.80665 * np.sin(np.arctan(0.025)))
+    assert not along.any()
+    assert not wind.any()
+    np.testing.assert_array_equal(left, right)
+    track = load_track("waterford_hills")
+    curvature = track.curvature(track.grid(1.0)[0])
+    inwards = roughness(superelevation_percent=6.0)[1]
+    assert (inwards * curvature >= 0).all()
+    assert inwards.max() == pytest.approx(9.80665 * np.sin(np.arctan(0.06)))
+
+
+def test_a_lap_goes_as_far_up_as_down() -> None:
+    along = roughness(grade_std_percent=3.0)[0]
+    assert np.mean(along) == pytest.approx(0.0, abs=0.003)
+    assert np.std(along) == pytest.approx(0.03 * 9.80665 * np.sqrt(2 / 3), rel=0.4)
+    assert abs(along[-1] - along[0]) < 0.03  # the lap closes
+
+
+def test_the_wind_blows_from_one_side_and_then_from_the_other() -> None:
+    wind = roughness(wind_mps=8.0)[4]
+    assert wind.min() == pytest.approx(-8.0, abs=0.3)
+    assert wind.max() == pytest.approx(8.0, abs=0.3)
+
+
+def test_adhesion_differs_along_the_road_and_across_it() -> None:
+    _, _, left, right, _ = roughness(adhesion_std=0.05, adhesion_split_std=0.1)
+    assert np.std((left + right) / 2) == pytest.approx(0.05 * np.sqrt(2 / 3), rel=0.3)
+    assert np.std(left - right) == pytest.approx(0.1 * np.sqrt(2 / 3), rel=0.3)
+
+
+@pytest.mark.parametrize("name", ["imperfect", "imperfect_car", "imperfect_sensors"])
+def test_shipped_scenarios_with_imperfections_are_driven_and_measured(name: str) -> None:
+    (spec,) = load_scenario(name).batch().drives
+    (usual,) = load_scenario("nominal").batch().drives
+    (log, plain) = simulate_logs([replace(spec, laps=0.2), replace(usual, laps=0.2)])
+    assert log.lost_control_s is None
+    assert log.measurement.saturated == 0
+    assert log.rows == pytest.approx(plain.rows, rel=0.05)
+    rows = min(log.rows, plain.rows)
+    for signal in ("ay", "steering_wheel", "wheel_rl", "steer_fl"):
+        one, other = (drive.measurement.counts[signal][:rows] for drive in (log, plain))
+        assert np.corrcoef(one, other)[0, 1] > 0.9, signal
+        assert not np.array_equal(one, other), signal
+
+
+def test_the_parts_of_a_scenario_are_those_of_the_whole() -> None:
+    whole = load_scenario("imperfect").imperfections
+    assert load_scenario("imperfect_car").imperfections.car == whole.car
+    assert load_scenario("imperfect_sensors").imperfections.sensors == whole.sensors
+    assert load_scenario("imperfect_road").imperfections.road == whole.road
+
+
+def test_the_realistic_fleet_s_cars_understeer_as_cars_do() -> None:
+    """Characteristic speeds v = √(L / K) of today's cars: 65 to 100 km/h, some beyond."""
+    campaign = load_campaign("fleet_realistic")
+    drives = [drive for day in campaign.days()[:6] for drive in campaign.drives(day)]
+    speeds_kmh = []
+    for drive in drives:
+        compliance = np.radians(drive.flaws.car.steering_compliance_deg_per_kn) / 1000
+        known = handling(drive.vehicle, float(compliance))
+        speeds_kmh.append(3.6 * np.sqrt(known.wheelbase / known.understeer))
+    assert 65 < np.median(speeds_kmh) < 100
+    assert np.mean(np.array(speeds_kmh) < 65) < 0.05

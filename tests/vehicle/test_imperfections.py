@@ -1,0 +1,293 @@
+"""Imperfections of car and road: each does what its closed form says, and none does nothing."""
+
+import numpy as np
+import pytest
+
+from fleet_slip.vehicle.driver import SAMPLE_S, handling
+from fleet_slip.vehicle.dynamics import derivative
+from fleet_slip.vehicle.imperfect_dynamics import (
+    Around,
+    Give,
+    GiveRates,
+    advance_give,
+    imperfect_derivative,
+)
+from fleet_slip.vehicle.imperfections import PERFECT, CarImperfections, traits
+from fleet_slip.vehicle.integration import SECOND_ORDER
+from fleet_slip.vehicle.lanes import LaneDrive, Truth, simulate_blocks, simulate_drives
+from fleet_slip.vehicle.parameters import GRAVITY_MPS2, constants, load_vehicle
+from fleet_slip.vehicle.road import Road, Surface
+from fleet_slip.vehicle.state import Controls, State
+
+SEDAN = load_vehicle("d_class_sedan")
+FINE = Around(0.0, 0.0, 1.0, 1.0, 0.0, 1.0)
+RIGID = Give(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def surface(entries: int, **changes: float) -> Surface:
+    usual = {"grip_left": 1.0, "grip_right": 1.0}
+    values = {name: changes.get(name, usual.get(name, 0.0)) for name in Surface._fields}
+    return Surface(**{name: np.full(entries, value) for name, value in values.items()})
+
+
+def circle(radius_m: float, speed_mps: float, **changes: float) -> Road:
+    entries = round(2 * np.pi * radius_m)
+    flat = np.ones(entries)
+    return Road(
+        2 * np.pi * radius_m / entries,
+        flat / radius_m,
+        flat * speed_mps,
+        2 * np.pi * radius_m,
+        True,
+        surface(entries, **changes) if changes else None,
+    )
+
+
+def straight(speed_mps: float, **changes: float) -> Road:
+    flat = np.ones(1201)
+    return Road(1.0, 0 * flat, flat * speed_mps, 1200.0, False, surface(1201, **changes))
+
+
+def drive(road: Road, flaws: CarImperfections = PERFECT, laps: float = 1.0) -> Truth:
+    (truth,) = simulate_drives([LaneDrive(SEDAN, road, 1.0, laps, flaws)])
+    assert truth.lost_control_tick is None
+    return truth
+
+
+def end(values: np.ndarray) -> float:
+    return float(np.mean(values[-300:]))
+
+
+def test_without_imperfections_the_equations_are_those_of_the_textbook() -> None:
+    c, t = constants(SEDAN, 0.8), traits(SEDAN, PERFECT, SAMPLE_S)
+    u = Controls(0.6, 1.0)
+    for seed in range(20):
+        draw = np.random.default_rng(seed).standard_normal(11)
+        x = State(20.0 + draw[0], draw[1], 0.3 * draw[2], draw[3], *draw[4:7], *(62.0 + draw[7:]))
+        give = RIGID._replace(rack=x.steering_wheel, side_fl=99.0)
+        plain = np.hstack([np.ravel(v) for v in derivative(x, u, c)])
+        found, _ = imperfect_derivative(x, u, give, FINE, c, t)
+        np.testing.assert_allclose(np.hstack([np.ravel(v) for v in found]), plain, rtol=1e-9)
+
+
+def test_a_perfect_car_on_a_perfect_road_drives_alike_with_either_kernel() -> None:
+    road = circle(80.0, 18.0)
+    plain = drive(road)
+    (other,) = simulate_drives(
+        [LaneDrive(SEDAN, road._replace(surface=surface(len(road.speed_mps))), 1.0, 1.0)]
+    )
+    np.testing.assert_allclose(other.sideslip_rad, plain.sideslip_rad, atol=1e-9)
+    np.testing.assert_allclose(other.steer_fl_rad, plain.steer_fl_rad, atol=1e-12)
+
+
+def test_a_mirrored_car_on_a_mirrored_road_drives_mirrored() -> None:
+    flaws = CarImperfections(
+        steering_lash_deg=3.0,
+        steering_compliance_deg_per_kn=0.1,
+        toe_front_deg=0.1,
+        thrust_angle_deg=0.2,
+        radius_error_fl=0.003,
+        radius_error_rr=-0.002,
+        radius_loss_mm_per_kn=1.0,
+        relaxation_length_m=0.4,
+        cold_stiffness=0.1,
+        side_force_area_m2=5.0,
+        yawing_moment_volume_m3=3.0,
+    )
+    image = flaws.model_copy(
+        update={
+            "thrust_angle_deg": -0.2,
+            "radius_error_fl": 0.0,
+            "radius_error_fr": 0.003,
+            "radius_error_rr": 0.0,
+            "radius_error_rl": -0.002,
+        }
+    )
+    changes = {"gravity_x_mps2": 0.2, "grip_left": 0.8}
+    here = circle(80.0, 15.0, **changes, gravity_y_mps2=0.3, cross_wind_mps=8.0)
+    there = circle(80.0, 15.0, gravity_x_mps2=0.2, grip_right=0.8, gravity_y_mps2=-0.3)
+    assert there.surface is not None
+    there = there._replace(
+        curvature_1pm=-there.curvature_1pm,
+        surface=there.surface._replace(cross_wind_mps=np.full(len(there.speed_mps), -8.0)),
+    )
+    one, other = drive(here, flaws), drive(there, image)
+    np.testing.assert_allclose(other.sideslip_rad, -one.sideslip_rad, atol=1e-9)
+    np.testing.assert_allclose(other.wheel_fr_rad_s, one.wheel_fl_rad_s, rtol=1e-9)
+    np.testing.assert_allclose(other.steer_fr_rad, -one.steer_fl_rad, atol=1e-9)
+
+
+def test_compliance_adds_its_share_to_the_understeer_gradient() -> None:
+    """On a circle the steering grows by (K + c W_f / g) ay (Gillespie 1992, chapter 6)."""
+    ratio, compliance = SEDAN.steering.ratio, 0.15
+    flaws = CarImperfections(steering_compliance_deg_per_kn=compliance)
+    added = []
+    for speed in (6.0, 15.0):
+        road = circle(100.0, speed)
+        soft, rigid = (drive(road, flaw) for flaw in (flaws, PERFECT))
+        wheel = end(soft.steering_wheel_rad) - end(rigid.steering_wheel_rad)
+        added.append(np.degrees(wheel) / ratio)
+    c = constants(SEDAN, 1.0)
+    per_ay = compliance * 2 * c.static_front / GRAVITY_MPS2 / 1000
+    expected = per_ay * (15.0**2 - 6.0**2) / 100.0
+    assert added[1] - added[0] == pytest.approx(expected, rel=0.03)
+    # What the driver feeds forward holds the line as well as without.
+    assert abs(end(soft.lateral_offset_m) - end(rigid.lateral_offset_m)) < 0.05
+
+
+def test_compliance_shows_in_the_wheels_and_not_in_what_the_sideslip_is() -> None:
+    road, flaws = circle(100.0, 15.0), CarImperfections(steering_compliance_deg_per_kn=0.2)
+    soft, rigid = drive(road, flaws), drive(road)
+    assert end(soft.sideslip_rad) == pytest.approx(end(rigid.sideslip_rad), abs=2e-5)
+    assert end(soft.steer_fl_rad) == pytest.approx(end(rigid.steer_fl_rad), abs=2e-4)
+    assert end(soft.steering_wheel_rad) > 1.1 * end(rigid.steering_wheel_rad)
+
+
+def test_a_rack_with_play_rests_until_the_column_has_crossed_it() -> None:
+    t = traits(SEDAN, CarImperfections(steering_lash_deg=4.0), SAMPLE_S)
+    half, still = np.radians(2.0), GiveRates(0.0, 0.0, 0.0, 0.0, 0.0)
+    rack = []
+    give = RIGID
+    for column in np.radians([1.0, 2.0, 3.0, 5.0, 3.0, 1.0, 0.9, -3.0]):
+        give = advance_give(give, still, still, float(column), t, 0.002, SECOND_ORDER)
+        rack.append(give.rack)
+    expected = [0.0, 0.0, np.radians(1), np.radians(3), np.radians(3), np.radians(3)]
+    np.testing.assert_allclose(rack[:6], expected, atol=1e-12)
+    assert rack[6] == pytest.approx(np.radians(0.9) + half)
+    assert rack[7] == pytest.approx(np.radians(-3.0) + half)
+
+
+def test_lash_lets_the_road_wheels_lag_behind_the_steering_wheel() -> None:
+    bends = np.concatenate([np.sin(np.arange(1201) / 30) / 60])
+    road = Road(1.0, bends, np.full(1201, 15.0), 1200.0, False)
+    loose = drive(road, CarImperfections(steering_lash_deg=6.0))
+    gap = loose.steering_wheel_rad - SEDAN.steering.ratio * np.tan(
+        (loose.steer_fl_rad + loose.steer_fr_rad) / 2
+    )
+    assert np.degrees(np.abs(gap).max()) == pytest.approx(3.0, abs=0.15)
+
+
+@pytest.mark.parametrize("wheel", ["fl", "fr", "rl", "rr"])
+def test_a_larger_wheel_turns_slower(wheel: str) -> None:
+    flaws = CarImperfections(**{f"radius_error_{wheel}": 0.003})
+    found, usual = drive(straight(20.0), flaws), drive(straight(20.0))
+    for name in ("fl", "fr", "rl", "rr"):
+        ratio = end(getattr(found, f"wheel_{name}_rad_s")) / end(
+            getattr(usual, f"wheel_{name}_rad_s")
+        )
+        assert ratio == pytest.approx(1 / 1.003 if name == wheel else 1.0, abs=2e-4), name
+
+
+def test_loaded_wheels_roll_on_a_shorter_radius() -> None:
+    """The outer wheel gains, the inner loses, what the load transfer shortens and lengthens."""
+    road = circle(100.0, 20.0)
+    found = drive(road, CarImperfections(radius_loss_mm_per_kn=1.5))
+    usual = drive(road)
+    c = constants(SEDAN, 1.0)
+    for side, sign in (("rr", 1.0), ("rl", -1.0)):
+        load = (
+            sign * c.roll_transfer_rear * end(usual.ay_mps2)
+            - c.pitch_transfer * end(usual.ax_mps2) * -1
+        )
+        expected = 1 / (1 - 1.5e-6 * load / SEDAN.tyre.rolling_radius_m)
+        name = f"wheel_{side}_rad_s"
+        ratio = end(getattr(found, name)) / end(getattr(usual, name))
+        assert ratio == pytest.approx(expected, abs=3e-4)
+
+
+def test_the_thrust_angle_is_side_slip_of_a_car_going_straight() -> None:
+    """Rear wheels turned left push the tail left: the car goes straight with its nose right."""
+    found = drive(straight(20.0), CarImperfections(thrust_angle_deg=0.3))
+    assert np.degrees(end(found.sideslip_rad)) == pytest.approx(0.3, abs=0.02)
+    assert np.degrees(end(found.steer_fl_rad)) == pytest.approx(0.3, abs=0.03)
+
+
+def test_toe_turns_the_wheels_against_each_other() -> None:
+    found = drive(straight(20.0), CarImperfections(toe_front_deg=0.2))
+    assert np.degrees(end(found.steer_fl_rad)) == pytest.approx(-0.2, abs=0.01)
+    assert np.degrees(end(found.steer_fr_rad)) == pytest.approx(0.2, abs=0.01)
+    assert abs(end(found.sideslip_rad)) < 1e-4
+
+
+@pytest.mark.parametrize("length_m", [0.2, 0.6])
+def test_a_tyre_follows_its_slip_after_the_relaxation_length(length_m: float) -> None:
+    """A step of the wheel's lateral velocity has built up to 63 % after L metres."""
+    c = constants(SEDAN, 1.0)
+    t = traits(SEDAN, CarImperfections(relaxation_length_m=length_m), SAMPLE_S)
+    speed, step = 20.0, 1e-4
+    x = State(speed, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0, *4 * (speed * c.inverse_radius,))
+    give, before, way = RIGID, GiveRates(0.0, 0.0, 0.0, 0.0, 0.0), 0.0
+    order = 0.0
+    while give.side_rl < (1 - np.exp(-1)) * 0.2:
+        _, rates = imperfect_derivative(x, Controls(0.0, 0.0), give, FINE, c, t)
+        give = advance_give(give, rates, before, 0.0, t, step, order)
+        before, order, way = rates, SECOND_ORDER, way + speed * step
+    assert way == pytest.approx(length_m, rel=0.01)
+
+
+def test_cold_tyres_stiffen_the_car_and_grow_warm() -> None:
+    road = circle(80.0, 18.0)
+    known = handling(SEDAN)
+    cold = drive(road, CarImperfections(cold_stiffness=0.2, warm_up_s=1e9))
+    warm = drive(road)
+    slip = known.rear / 80.0 - np.array([end(t.sideslip_rad) for t in (cold, warm)])
+    assert slip[1] / slip[0] == pytest.approx(1.2, rel=0.06)
+    soon = drive(road, CarImperfections(cold_stiffness=0.2, warm_up_s=1.0))
+    assert end(soon.sideslip_rad) == pytest.approx(end(warm.sideslip_rad), abs=1e-5)
+
+
+def test_an_accelerometer_feels_the_weight_that_a_banked_road_asks_for() -> None:
+    """Straight across a slope the tyres hold the weight: ay = −g_y, and v̇y = 0."""
+    found = drive(straight(20.0, gravity_y_mps2=0.4))
+    assert end(found.ay_mps2) == pytest.approx(-0.4, abs=0.005)
+    assert abs(end(found.yaw_rate_rad_s)) < 1e-3
+    c = constants(SEDAN, 1.0)
+    slip = handling(SEDAN).rear_slip * 0.4  # the rear axle's, which has no yaw rate to add
+    assert end(found.sideslip_rad) == pytest.approx(slip, rel=0.03)
+    assert c.rear > 0
+
+
+def test_an_accelerometer_feels_the_weight_that_a_climb_asks_for() -> None:
+    """At constant speed the drive force holds the weight: ax = −g_x."""
+    found = drive(straight(15.0, gravity_x_mps2=-0.5))
+    rate = np.gradient(found.vx_mps, 0.01)
+    assert end(found.ax_mps2 - rate) == pytest.approx(0.5, abs=0.005)
+    assert end(found.ax_mps2) == pytest.approx(0.5, abs=0.01)
+
+
+def test_a_side_wind_is_held_by_the_tyres() -> None:
+    """Going straight, wind and tyres cancel: ay is 0, and the axles share force and moment."""
+    flaws = CarImperfections(side_force_area_m2=5.0, yawing_moment_volume_m3=3.0)
+    found = drive(straight(30.0, cross_wind_mps=10.0), flaws)
+    assert end(found.ay_mps2) == pytest.approx(0.0, abs=0.005)
+    pressure, body = 0.5 * 1.225 * 30.0 * 10.0, SEDAN.body
+    force, moment = 5.0 * pressure, 3.0 * pressure
+    rear = (body.front_axle_m * force - moment) / body.wheelbase_m  # to the right
+    c = constants(SEDAN, 1.0)
+    per_force = handling(SEDAN).rear_slip * GRAVITY_MPS2 / (2 * c.static_rear)
+    assert end(found.sideslip_rad) == pytest.approx(rear * per_force, rel=0.05)
+
+
+def test_a_slippery_side_shifts_no_line_but_the_slip() -> None:
+    road = circle(80.0, 20.0)
+    usual, split = drive(road), drive(circle(80.0, 20.0, grip_right=0.7))
+    assert end(split.sideslip_rad) < end(usual.sideslip_rad) - np.radians(0.1)
+
+
+def test_imperfect_drives_do_not_depend_on_their_neighbours() -> None:
+    flaws = [CarImperfections(relaxation_length_m=0.1 * i) for i in range(6)]
+    drives = [LaneDrive(SEDAN, circle(60.0 + i, 12.0), 1.0, 1.0, f) for i, f in enumerate(flaws)]
+    together = simulate_drives(drives)
+    for i, lane_drive in enumerate(drives):
+        (alone,) = simulate_drives([lane_drive])
+        np.testing.assert_array_equal(alone.sideslip_rad, together[i].sideslip_rad)
+
+
+def test_the_body_s_motion_is_recorded_for_its_sensors() -> None:
+    flaws = CarImperfections(relaxation_length_m=0.3)
+    blocks = list(simulate_blocks([LaneDrive(SEDAN, circle(70.0, 15.0), 1.0, 1.0, flaws)]))
+    channels = {n: np.concatenate([b.channels[n] for b in blocks]) for n in blocks[0].channels}
+    rate = np.gradient(channels["yaw_rate_rad_s"], 0.01)
+    found = channels["yaw_acceleration_rad_s2"]
+    assert np.sqrt(np.mean((found - rate)[20:] ** 2)) < 0.1 * np.std(rate) + 0.01
+    assert end(channels["leaning_ay_mps2"]) == pytest.approx(end(channels["ay_mps2"]), abs=0.01)
