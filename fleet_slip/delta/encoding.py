@@ -3,6 +3,7 @@
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import date
 from typing import Any
 
 import pyarrow as pa
@@ -23,6 +24,11 @@ class Encoded:
     checksum: str
     fast_checksum: str
     statistics: str
+
+    def path(self, name: str, day: date | None) -> str:
+        """Return where a table has this content: in the folder of a day, if it has one."""
+        folder = f"day={day.isoformat()}/" if day else ""
+        return f"{folder}{name}-x{self.fast_checksum}-{self.checksum}.parquet"
 
 
 @dataclass(frozen=True)

@@ -43,8 +43,7 @@ class Table:
     def snapshot(self, version: int | None = None) -> "Snapshot":
         """Return the table as it is now; a table that nobody has written yet is empty.
 
-        An earlier version can be asked for; `StorageError` is raised if it is no longer known, or
-        if the log was damaged.
+        Raises `StorageError` for an earlier version that is no longer known, and a damaged log.
         """
         delta = self.open_delta(version)
         if delta is not None:
@@ -106,9 +105,9 @@ class Table:
         the new one gets a longer name. So a file that is not committed is its writer's alone: who
         deletes it can take it from nobody else.
         """
-        path = _file_path(name, encoded, day)
+        path = encoded.path(name, day)
         while not self.folder.create(path, encoded.content):
-            path = _file_path(f"{name}-{uuid.uuid4().hex[:8]}", encoded, day)
+            path = encoded.path(f"{name}-{uuid.uuid4().hex[:8]}", day)
         return addition(path, encoded, day)
 
     def discard(self, actions: Iterable[AddAction]) -> None:
@@ -250,14 +249,10 @@ class Snapshot:
         if self.delta is None:
             return set()
         with storage_errors(self.table.folder):
-            return set(
-                self.delta.vacuum(
-                    math.ceil(before_hours),
-                    dry_run=True,
-                    enforce_retention_duration=False,
-                    full=False,
-                )
+            found = self.delta.vacuum(
+                math.ceil(before_hours), dry_run=True, enforce_retention_duration=False, full=False
             )
+        return set(found)
 
     def landed(self, unit_name: str) -> int | None:
         """Return the version of a unit of work that has landed, or None."""
@@ -303,8 +298,3 @@ class Snapshot:
                 raise table._conflict(error) from None
             table.folder.settle_commits(self.version)
             seal_new_checkpoint(table.folder, self.version)
-
-
-def _file_path(name: str, encoded: Encoded, day: date | None) -> str:
-    folder = f"day={day.isoformat()}/" if day else ""
-    return f"{folder}{name}-x{encoded.fast_checksum}-{encoded.checksum}.parquet"

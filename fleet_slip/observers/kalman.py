@@ -263,9 +263,7 @@ class KalmanEstimate:
     ay_bias_mps2: FloatArray
 
 
-def run_filter(
-    drive: DriveSignals, yaw_rate_rad_s: FloatArray, noise: FilterNoise
-) -> KalmanEstimate:
+def fuse(drive: DriveSignals, yaw_rate_rad_s: FloatArray, noise: FilterNoise) -> KalmanEstimate:
     """Run the filter over a drive with a yaw rate that is known.
 
     It begins at the first GPS fix, predicts at every row and updates at every fix. Gaps of the
@@ -290,12 +288,12 @@ def run_filter(
 
 
 def estimate(drive: DriveSignals, car: VehicleParameters, noise: FilterNoise) -> FloatArray:
-    """Estimate side-slip in rad at every row, NaN before the first fix. Raises as `run_filter`.
+    """Estimate side-slip in rad at every row, NaN before the first fix. Raises as `fuse`.
 
     Of the car, only the geometry counts that turns wheel speeds into a yaw rate. All of it is
     compiled and releases the interpreter's lock: many drives run on threads, as in
     `executor.map(partial(estimate, car=car, noise=noise), drives)`.
     """
     turning = yaw_rate.estimate(drive, car, noise.yaw_rate)
-    motion = run_filter(drive, turning.yaw_rate_rad_s, noise)
+    motion = fuse(drive, turning.yaw_rate_rad_s, noise)
     return sideslip_angle(motion.vx_mps, motion.vy_mps)

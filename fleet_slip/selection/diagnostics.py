@@ -10,18 +10,15 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import Cohort, Served
 from fleet_slip.grams.training import clustered_moments
+from fleet_slip.regression.coefficient_tests import ChowTest, WaldTest, chow_test, wald_test
 from fleet_slip.regression.drive_moments import ClusterUnit, DriveMoments, serving_drives
 from fleet_slip.regression.evidence import Evidence
 from fleet_slip.regression.exact import Fit, LinearModel, condition_number, fit
 from fleet_slip.regression.inference import (
-    ChowTest,
     Inference,
-    WaldTest,
-    chow_test,
     infer_by_clusters,
     infer_classically,
     variance_inflation,
-    wald_test,
 )
 from fleet_slip.regression.nested import nested_fits
 from fleet_slip.regression.ridge import fit_errors_in_variables

@@ -16,8 +16,8 @@ from fleet_slip.observers.kalman import (
     Belief,
     FilterNoise,
     covariances,
+    fuse,
     predict,
-    run_filter,
     update,
 )
 from fleet_slip.observers.outages import TUNNEL_S, tunnel
@@ -101,9 +101,7 @@ def test_agrees_with_the_textbook_filter_to_1e_10() -> None:
     drive, yaw_rate, _ = generate(20_000, NOISE, seed=1)
     drive = without_fixes(drive, tunnel(len(drive), 60.0))
     expected = textbook_filter(drive, yaw_rate, NOISE)
-    np.testing.assert_allclose(
-        stacked(run_filter(drive, yaw_rate, NOISE)), expected, rtol=0, atol=1e-10
-    )
+    np.testing.assert_allclose(stacked(fuse(drive, yaw_rate, NOISE)), expected, rtol=0, atol=1e-10)
 
 
 def test_agrees_with_the_joint_gaussian_posterior() -> None:
@@ -238,7 +236,7 @@ def test_joseph_keeps_the_variance_that_rounding_would_lose() -> None:
 
 def test_biases_are_found() -> None:
     exact, _ = slalom(CAR, 30_000)
-    found = run_filter(noisy(exact, seed=4), exact.yaw_rate_rad_s, FilterNoise())
+    found = fuse(noisy(exact, seed=4), exact.yaw_rate_rad_s, FilterNoise())
     assert found.ax_bias_mps2[-1] == pytest.approx(0.15, abs=0.01)
     assert found.ay_bias_mps2[-1] == pytest.approx(0.15, abs=0.01)
 
@@ -249,7 +247,7 @@ def test_steady_circle_persists_without_a_fix() -> None:
     vx, vy, yaw_rate = 15 * constant, -0.4 * constant, 0.3 * constant
     drive = rolling_drive(CAR, vx, vy, yaw_rate, 0.05 * constant)
     only_first = without_fixes(drive, np.arange(3000) > 0)
-    found = run_filter(only_first, yaw_rate, FilterNoise())
+    found = fuse(only_first, yaw_rate, FilterNoise())
     np.testing.assert_allclose(found.vx_mps, vx, atol=1e-9)
     np.testing.assert_allclose(found.vy_mps, vy, atol=1e-9)
 
@@ -294,15 +292,15 @@ def test_turned_axes_give_turned_velocities() -> None:
     ax, ay = turned(drive.ax_mps2, drive.ay_mps2)
     gps = turned(drive.gps_vx_mps, drive.gps_vy_mps)
     other = replace(drive, ax_mps2=ax, ay_mps2=ay, gps_vx_mps=gps[0], gps_vy_mps=gps[1])
-    found = run_filter(drive, drive.yaw_rate_rad_s, FilterNoise())
-    again = run_filter(other, drive.yaw_rate_rad_s, FilterNoise())
+    found = fuse(drive, drive.yaw_rate_rad_s, FilterNoise())
+    again = fuse(other, drive.yaw_rate_rad_s, FilterNoise())
     expected = turned(found.vx_mps, found.vy_mps)
     np.testing.assert_allclose([again.vx_mps, again.vy_mps], expected, rtol=0, atol=1e-10)
 
 
 def test_begins_at_the_first_fix() -> None:
     drive = without_fixes(noisy(slalom(CAR, 500)[0], seed=7), np.arange(500) < 205)
-    found = run_filter(drive, drive.yaw_rate_rad_s, FilterNoise())
+    found = fuse(drive, drive.yaw_rate_rad_s, FilterNoise())
     assert np.isnan(found.vx_mps[:210]).all()
     assert found.vx_mps[210] == drive.gps_vx_mps[210]
     assert np.isfinite(stacked(found)[:, 210:]).all()
@@ -314,8 +312,8 @@ def test_half_a_fix_is_none() -> None:
     drive = noisy(slalom(CAR, 500)[0], seed=8)
     half = replace(drive, gps_vy_mps=np.where(np.arange(500) >= 100, np.nan, drive.gps_vy_mps))
     without = without_fixes(drive, np.arange(500) >= 100)
-    expected = stacked(run_filter(without, drive.yaw_rate_rad_s, FilterNoise()))
-    assert np.array_equal(stacked(run_filter(half, drive.yaw_rate_rad_s, FilterNoise())), expected)
+    expected = stacked(fuse(without, drive.yaw_rate_rad_s, FilterNoise()))
+    assert np.array_equal(stacked(fuse(half, drive.yaw_rate_rad_s, FilterNoise())), expected)
 
 
 def test_gaps_of_the_accelerometers_are_bridged() -> None:

@@ -9,11 +9,11 @@ from scipy.special import betainc
 
 from fleet_slip.errors import DataError
 from fleet_slip.regression import special
+from fleet_slip.regression.coefficient_tests import chow_test
 from fleet_slip.regression.drive_moments import DriveMoments, serving_drives
 from fleet_slip.regression.exact import fit
 from fleet_slip.regression.gram_table import GramTable
 from fleet_slip.regression.inference import (
-    chow_test,
     cluster_covariance,
     infer_by_clusters,
     infer_classically,
