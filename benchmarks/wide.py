@@ -3,9 +3,10 @@
     python -m benchmarks.wide ROOT [--threads 2] [--rounds 3] [--sql-files 1]
 
 For 12, 52, 100 and 200 columns of the logs below ROOT: whether both give the same bits, and how
-many rows a second each computes, Parquet reading included. The kernel reads all files of the
-campaign `waterford`, SQL as many as are asked for. The best of some rounds; columns that are no
-windows are signals and the label.
+many rows a second each computes, Parquet reading included, and the kernel's processor time a row,
+which other load disturbs less. The kernel reads all files of the campaign `waterford`, SQL as many
+as are asked for, perhaps none. The best of some rounds; columns that are no windows are signals and
+the label.
 """
 
 import argparse
@@ -22,9 +23,14 @@ from fleet_slip.catalogue.feature_sets import PLAIN, FeatureSet
 from fleet_slip.catalogue.features import FeatureCatalogue, features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.windows import Window
+from fleet_slip.delta import TableFile
 from fleet_slip.files.data_root import data_root
 from fleet_slip.grams import aggregation, statement, wide
 from fleet_slip.grams.aggregation import aggregate, by_sql
+from fleet_slip.grams.column_plan import ColumnPlan
+from fleet_slip.grams.columns import Workspace
+from fleet_slip.grams.drive_rows import read_drives
+from fleet_slip.grams.parts import Parts
 from fleet_slip.warehouse.tables import Warehouse
 
 COLUMNS = (12, 52, 100, 200)
@@ -69,6 +75,31 @@ def best_rate(rows: int, rounds: int, work: Callable[[], pa.Table]) -> tuple[flo
     return rows / min(seconds) / 1e6, found
 
 
+def least_cpu_ns_row(rows: int, seconds: float, work: Callable[[], Any]) -> float:
+    """Return the least processor time of this thread a row, of as many rounds as there is time."""
+    least, until = float("inf"), time.perf_counter() + seconds
+    while time.perf_counter() < until or least == float("inf"):
+        started = time.thread_time()
+        work()
+        least = min(least, time.thread_time() - started)
+    return least / rows * 1e9
+
+
+def stages(warehouse: Warehouse, file: TableFile, known: FeatureCatalogue) -> dict[str, Any]:
+    """Return the processor time of one thread a row, to read a file and to compute its first drive.
+
+    The least of many rounds of some milliseconds, which other load disturbs least.
+    """
+    plan = ColumnPlan.of_set(known, SET)
+    workspace, parts = Workspace(plan), Parts()
+    first = next(read_drives(warehouse, file, plan)).counts
+    wide.drive_sums(workspace, parts, first)  # compiles the kernel
+    read = least_cpu_ns_row(file.rows, 2, lambda: list(read_drives(warehouse, file, plan)))
+    rows = len(first.ticks)
+    computed = least_cpu_ns_row(rows, 10, lambda: wide.drive_sums(workspace, parts, first))
+    return {"read_cpu_ns_row": round(read), "kernel_cpu_ns_row": round(computed)}
+
+
 def measure(warehouse: Warehouse, columns: int, options: Any) -> dict[str, Any]:
     """Return rates and whether the bits are the same, for so many columns."""
     files = [f for f in warehouse.logs.snapshot().files if "waterford-" in f.path]
@@ -82,24 +113,30 @@ def measure(warehouse: Warehouse, columns: int, options: Any) -> dict[str, Any]:
         patch.object(statement, "features", lambda: known),
         patch.object(wide, "features", lambda: known),
     ):
-        aggregate(warehouse, few, threads=1, feature_set=SET)  # compiles the kernel
+        aggregate(warehouse, files[:1], threads=1, feature_set=SET)  # compiles the kernel
         rows = sum(file.rows for file in files)
         rate, _ = best_rate(
             rows,
             options.rounds,
             lambda: aggregate(warehouse, files, threads=options.threads, feature_set=SET),
         )
-        few_rows = sum(file.rows for file in few)
-        sql_rate, defined = best_rate(few_rows, 1, lambda: by_sql(warehouse, few, SET))
-        kernel = aggregate(warehouse, few, threads=options.threads, feature_set=SET)
+        compared: dict[str, Any] = {}
+        if few:
+            few_rows = sum(file.rows for file in few)
+            sql_rate, defined = best_rate(few_rows, 1, lambda: by_sql(warehouse, few, SET))
+            kernel = aggregate(warehouse, few, threads=options.threads, feature_set=SET)
+            compared = {
+                "sql_million_rows_s": round(sql_rate, 3),
+                "same_bits": kernel.equals(defined.cast(kernel.schema)),
+            }
     return {
         "columns": columns,
         "windows": len(known.feature_set(SET).windows),
         "rows": rows,
         "threads": options.threads,
         "kernel_million_rows_s": round(rate, 2),
-        "sql_million_rows_s": round(sql_rate, 3),
-        "same_bits": kernel.equals(defined.cast(kernel.schema)),
+        **stages(warehouse, files[0], known),
+        **compared,
     }
 
 

@@ -69,7 +69,8 @@ def test_every_command_gives_the_same_bits_as_on_one_machine(
     local, there = tmp_path / "local", tmp_path / "there"
     cluster = ["--cluster", dask.address]
     for root, options in ((local, []), (there, cluster)):
-        for command in (ingest, ["run", "--campaign", "smoke"]):
+        windows = ["gram", "--features", "windows"]
+        for command in (ingest, windows, ["run", "--campaign", "smoke"]):
             done = run_command(*command, *options, root=root)
             assert done.exit_code == 0, done.stderr
             assert "distributed" not in done.stderr
@@ -81,6 +82,7 @@ def test_every_command_gives_the_same_bits_as_on_one_machine(
     again = run_command("run", "--campaign", "smoke", root=there, **by_variable)
     assert "nothing to do" in again.stderr
     verified = run_command("verify", "--full", "--json", *cluster, root=there)
+    assert verified.exit_code == 0, verified.stderr
     assert verified.json == run_command("verify", "--full", "--json", root=local).json
     assert (verified.json["damage"], verified.json["remarks"]) == ([], [])
 
