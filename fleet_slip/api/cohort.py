@@ -42,6 +42,7 @@ class FleetCohort(Rooted):
         self,
         *,
         models: str | None = None,
+        model: str | None = None,
         nested: str | None = None,
         features: str | None = None,
         by: "FoldKey | None" = None,
@@ -63,6 +64,7 @@ class FleetCohort(Rooted):
 
         Args:
             models: a model list of `configs/models`, or the path of a TOML file.
+            model: the inputs of the one model to take, separated by commas, instead of a list.
             nested: an order of inputs, separated by commas, or `catalogue` for all inputs; adds the
                 nested models of its first 1, 2 ... inputs.
             features: a feature set; by default what the list says, else the logged signals.
@@ -88,6 +90,7 @@ class FleetCohort(Rooted):
         request = SelectionRequest(
             cohort=self.condition,
             models=models,
+            model=model,
             nested=nested,
             features=features,
             by=by,

@@ -26,6 +26,11 @@ SELECTION: dict[str, Any] = {
         "--nested or an option that searches is given.",
         show_default=False,
     ),
+    "model": typer.Option(
+        help="The inputs of the one model to take, separated by commas, such as "
+        '"ax, ay, yaw_rate", instead of a list.',
+        show_default=False,
+    ),
     "nested": typer.Option(
         help="Add the nested models of an order of signals, separated by commas; 'catalogue' is "
         "all inputs in the order of configs/signals.toml."

@@ -43,6 +43,12 @@ class Evaluated:
         rows: Sequence[Mapping[str, Any]] = self.document.content[key]
         return rows
 
+    @property
+    def gps_noise(self) -> Mapping[str, Any] | None:
+        """The filters' errors over the noise of GPS; None in evaluations without it."""
+        sweep: Mapping[str, Any] | None = self.document.content.get("gps_noise")
+        return sweep
+
     @cached_property
     def models(self) -> Mapping[str, str]:
         """The estimator's name of each model of Table I that the cohort could serve."""

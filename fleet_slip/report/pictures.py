@@ -1,9 +1,13 @@
 """Which figures a report has, in the order of the paper, with captions from the same data."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
 
 from fleet_slip.evaluation.runs import EvaluatedScenario
 from fleet_slip.report.data import DRAWN_FILTERS, ReportData
+from fleet_slip.report.figures.columns import Series, error_over
 from fleet_slip.report.figures.density import density
 from fleet_slip.report.figures.lateral import error_by_acceleration
 from fleet_slip.report.figures.series import Block, Line, side_slip
@@ -177,6 +181,8 @@ def _beyond_the_paper(data: ReportData) -> Iterator[Picture]:
         yield _map(data, shown)
     yield _density(data, data.histogram)
     yield from _lateral(data, data.runs)
+    if data.evaluated.gps_noise is not None:
+        yield _over_gps_noise(data, data.evaluated.gps_noise)
 
 
 def _map(data: ReportData, shown: Sequence[Map]) -> Picture:
@@ -234,4 +240,38 @@ def _lateral(data: ReportData, runs: Mapping[str, EvaluatedScenario]) -> Iterato
         f"{title}: the root mean square error of each estimator in bins of lateral acceleration. "
         f"{caption}",
         lambda size: error_by_acceleration(driven, lines, trained_to, size),
+    )
+
+
+def _over_gps_noise(data: ReportData, sweep: Mapping[str, Any]) -> Picture:
+    levels = sweep["levels"]
+    noise = np.array([level["velocity_std_mps"] for level in levels])
+    lines = [
+        Series(FILTER_LABELS[name], name, np.array([level["rmse_deg"][name] for level in levels]))
+        for name in DRAWN_FILTERS
+        if name in levels[0]["rmse_deg"]
+    ]
+    for label, colour, name in (
+        (choice_line(data).label, "model_4", data.choice),
+        (data.version.reference, "model_3", data.version.reference),
+    ):
+        if name in sweep["regressions"]:
+            lines.append(Series(label, colour, np.full(len(noise), sweep["regressions"][name])))
+    equal = sweep["equal_at_mps"].get("kalman_tuned", {}).get(data.choice)
+    told = (
+        f"With the tuned filter {choice_line(data).label} is level at {equal:.3f} m/s. "
+        if equal is not None
+        else ""
+    )
+    title = "The Kalman filter over the noise of GPS"
+    caption = (
+        "The nominal drive without outages; the filter is told how noisy the GPS velocity is. "
+        f"{told}The regressions use no GPS."
+    )
+    return Picture(
+        "gps-noise",
+        title,
+        caption,
+        f"{title}: rising lines of the filters, level ones of the regressions. {caption}",
+        lambda size: error_over(noise, "noise of GPS velocity (m/s)", lines, size),
     )

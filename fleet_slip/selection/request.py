@@ -32,6 +32,9 @@ from fleet_slip.warehouse.tables import Warehouse
 
 DEFAULT_MODELS = "table1"
 
+GIVEN = "given"
+"""The name of a model whose inputs were asked for one by one."""
+
 WHOLE_SET = "catalogue"
 """As an order of signals: all inputs of the feature set, in its order."""
 
@@ -61,6 +64,7 @@ class SelectionRequest:
     Attributes:
         cohort: SQL condition on the view `drives`.
         models: name or path of a model list; by default `table1`, unless signals are named.
+        model: inputs of the one model to take, separated by commas, instead of a list.
         nested: order of inputs, separated by commas, or `catalogue`; adds its nested models.
         features: name of the feature set; by default what the list says, or what the folds need.
         by, folds: how to fold; by default what the list says.
@@ -75,6 +79,7 @@ class SelectionRequest:
 
     cohort: str = TRAINING_DRIVES
     models: str | None = None
+    model: str | None = None
     nested: str | None = None
     features: str | None = None
     by: FoldKey | None = None
@@ -129,6 +134,11 @@ def answer_request(warehouse: Warehouse, request: SelectionRequest) -> Requested
             "a list of models is compared by cross-validation as it stands: leave out models, or "
             "rank, criterion, all_subsets and naive, which search among the inputs of nested."
         )
+    if request.model and (request.models or request.nested or request.ordered or request.search):
+        raise UsageError(
+            "model says which inputs to take: leave it out, or models, nested, rank, criterion, "
+            "all_subsets, naive and search, which choose."
+        )
     if request.rank and request.all_subsets:
         raise UsageError("a search of all subsets needs no order: leave out rank.")
     if request.most and not request.search:
@@ -145,7 +155,7 @@ def answer_request(warehouse: Warehouse, request: SelectionRequest) -> Requested
         )
     named = request.nested or request.ordered or request.search
     name = request.models or (None if named else DEFAULT_MODELS)
-    model_list = load_model_list(name) if name else None
+    model_list = _given(request) or (load_model_list(name) if name else None)
     folds = _folding(request, model_list)
     feature_set = _feature_set(request, model_list)
     if not request.ordered and not request.resampled:
@@ -169,6 +179,16 @@ def answer_request(warehouse: Warehouse, request: SelectionRequest) -> Requested
         cluster=request.cluster,
     )
     return replace(answer, uncertainty=figures)
+
+
+def _given(request: SelectionRequest) -> ModelList | None:
+    """Return the one model that was asked for, if there is one, as a list."""
+    if request.model is None:
+        return None
+    feature_set = request.features or PLAIN
+    signals = require_inputs(request.model.split(","), feature_set)
+    model = CandidateModel(name=GIVEN, signals=signals)
+    return ModelList(description="One model", features=feature_set, model=(model,))
 
 
 def _folding(request: SelectionRequest, model_list: ModelList | None) -> Folding:
@@ -213,7 +233,8 @@ def _compare_listed(
         model=(*listed, *nested),
         search=search,
     )
-    name = request.models or (DEFAULT_MODELS if listed else None)
+    usual = GIVEN if request.model else DEFAULT_MODELS
+    name = request.models or (usual if listed else None)
     label = "+".join(filter(None, [name, f"nested:{request.nested}" if nested else None]))
     selection = select(cohort, described.model, folds, parse_worth(request.worth), search, inputs)
     return RequestedSelection.of(selection, label, _checksum(described.sha256, request.worth))

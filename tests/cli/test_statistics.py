@@ -317,3 +317,15 @@ def test_a_number_of_folds_that_cannot_be_is_named(
     assert done.exit_code == 2
     asked = words.partition("--folds ")[2].partition(" ")[0]
     assert f"error: folds = {asked}: choose a number from 2 to 1000" in done.stderr
+
+
+def test_one_model_is_taken_without_a_list(run_command: RunCommand, every_set: Path) -> None:
+    given = run_command("select", "--model", "ax, ay,yaw_rate", "--json", root=every_set).json
+    listed = run_command("select", "--json", root=every_set).json
+    (model,) = given["models"]
+    assert model["name"] == given["winner"] == "given"
+    assert model["coefficients"] == listed["models"][0]["coefficients"]
+    done = run_command("select", "--model", "ax, vx", root=every_set)
+    assert done.exit_code in (3, 5)
+    assert "vx is not an input" in done.stderr
+    assert run_command("select", "--model", "ax", "--search", "lars", root=every_set).exit_code != 0

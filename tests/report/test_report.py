@@ -189,13 +189,13 @@ def test_every_claim_is_judged(data: ReportData) -> None:
 
 
 def test_a_verdict_follows_from_the_figures(data: ReportData) -> None:
-    assert noise_is_slight.judge(data).status is Status.REPRODUCED
+    assert noise_is_slight.judge(data).status is Status.NOT_REPRODUCED
     content = deepcopy(dict(data.evaluated.document.content))
     (noisy,) = (one for one in content["scenarios"] if one["name"] == "noise_doubled")
-    noisy["results"][data.choice]["error_std_deg"] = 0.9
+    noisy["results"][data.choice]["rmse_deg"] = 0.1
     verdict = noise_is_slight.judge(changed(data, content))
-    assert verdict.status is Status.NOT_REPRODUCED
-    assert "0.900°" in verdict.figure
+    assert verdict.status is Status.REPRODUCED
+    assert "0.100°" in verdict.figure
 
 
 def test_a_claim_without_its_drives_is_not_judged(data: ReportData) -> None:

@@ -7,14 +7,18 @@ from enum import StrEnum
 from fleet_slip.evaluation.errors import ErrorFigures
 from fleet_slip.report.data import ReportData
 
-SLIGHT_DEG = 0.1
-"""Largest change of an error's standard deviation that counts as slight."""
+SLIGHT = 1.5
+"""Largest ratio of root mean square errors that counts as slight, or as close.
 
-WELL = 0.9
-"""Least correlation of an estimate that counts as accurate."""
+Ratios, because an angle such as 0.1° may be more than the whole error to begin with; root mean
+squares, because a mean error is an error.
+"""
 
-CLOSE = 0.05
-"""Largest loss of correlation that counts as close."""
+WELL = 0.44
+"""Largest RMSE of an accurate estimate, as a share of the angle's own standard deviation.
+
+It is that of an unbiased estimate with a correlation of 0.9.
+"""
 
 
 class Status(StrEnum):
@@ -91,6 +95,7 @@ class Known:
     correlation: float
     mean_deg: float
     std_deg: float
+    rmse_deg: float
     p99_deg: float
     max_deg: float
     coverage: float
@@ -118,6 +123,7 @@ def complete(found: ErrorFigures | None, what: str) -> Known:
         or found.correlation is None
         or found.error_mean_deg is None
         or found.error_std_deg is None
+        or found.rmse_deg is None
         or found.error_p99_deg is None
         or found.error_max_deg is None
     ):
@@ -126,6 +132,7 @@ def complete(found: ErrorFigures | None, what: str) -> Known:
         found.correlation,
         found.error_mean_deg,
         found.error_std_deg,
+        found.rmse_deg,
         found.error_p99_deg,
         found.error_max_deg,
         found.coverage,

@@ -23,7 +23,7 @@ ROOM_IN = 0.6
 
 @dataclass(frozen=True)
 class Series:
-    """One line: RMSE in deg of models of 1, 2, ... columns, shape (sizes,).
+    """One line: RMSE in deg at each place, such as of models of 1, 2, ... columns, shape (places,).
 
     `mark_deg`, if there is one, is what it is compared with, and drawn dashed.
     """
@@ -35,7 +35,18 @@ class Series:
 
 
 def error_by_columns(lines: Sequence[Series], size: Size) -> Figure:
-    """Draw each line over the number of columns, on a logarithmic scale."""
+    """Draw each line over the number of columns."""
+    most = max(len(line.rmse_deg) for line in lines)
+    figure = error_over(np.arange(1.0, most + 1), "columns", lines, size)
+    (axes,) = figure.axes
+    axes.set_xlim(0.5, most + 0.5)
+    step = 1 if most <= 12 else 4
+    axes.set_xticks([1, *range(step, most + 1, step)] if step > 1 else range(1, most + 1))
+    return figure
+
+
+def error_over(places: FloatArray, label: str, lines: Sequence[Series], size: Size) -> Figure:
+    """Draw each line over some places, shape (places,), on a logarithmic scale."""
     figure = Figure(figsize=(size.width_in, HEIGHT_IN))
     room = 1.5 if size.wide else 1.05
     axes = figure.add_axes(
@@ -46,19 +57,21 @@ def error_by_columns(lines: Sequence[Series], size: Size) -> Figure:
             1 - 0.8 / HEIGHT_IN,
         )
     )
-    most = max(len(line.rmse_deg) for line in lines)
     for line in lines:
-        sizes = np.arange(1, len(line.rmse_deg) + 1)
         tone = colour(line.colour)
-        axes.plot(sizes, line.rmse_deg, color=tone, linewidth=1.6, marker="o", markersize=3)
+        axes.plot(
+            places[: len(line.rmse_deg)],
+            line.rmse_deg,
+            color=tone,
+            linewidth=1.6,
+            marker="o",
+            markersize=3,
+        )
         if line.mark_deg is not None:
             axes.axhline(line.mark_deg, color=tone, linewidth=0.9, linestyle=(0, (5, 3)))
     axes.set_yscale("log")
-    axes.set_xlim(0.5, most + 0.5)
-    step = 1 if most <= 12 else 4
-    axes.set_xticks([1, *range(step, most + 1, step)] if step > 1 else range(1, most + 1))
     tick_degrees(axes)
-    axes.set_xlabel("columns", labelpad=2)
+    axes.set_xlabel(label, labelpad=2)
     axes.set_title("root mean square error", color=colour("muted"))
     label_ends(axes, [End(float(o.rmse_deg[-1]), o.label, o.colour) for o in lines], size)
     return figure
