@@ -4,7 +4,10 @@ import re
 from pathlib import Path
 
 import duckdb
+import pyarrow as pa
 
+from fleet_slip.catalogue.car_numbers import CALIBRATION
+from fleet_slip.catalogue.features import features
 from fleet_slip.files.data_root import data_root
 from fleet_slip.files.folder import Folder
 from fleet_slip.models.versions import Registry
@@ -22,7 +25,7 @@ from fleet_slip.warehouse.table_views import (
 )
 from fleet_slip.warehouse.tables import Warehouse
 
-VIEWS = frozenset({*TABLE_VIEWS, "runs", "models", "dictionary"})
+VIEWS = frozenset({*TABLE_VIEWS, CALIBRATION, "runs", "models", "dictionary"})
 
 _ABOUT_ALL_VIEWS = re.compile(
     r"duckdb_|information_schema|pragma_|pg_|sqlite_|\b(?:show|tables|databases|dictionary)\b", re.I
@@ -37,9 +40,9 @@ def connect(
 ) -> duckdb.DuckDBPyConnection:
     """Return a DuckDB connection with the views of the warehouse at `root`, a path or a URL.
 
-    `log` (SI units), `log_counts`, `drives`, `grams`, `models`, `quarantine`, `runs` and
-    `dictionary`, which documents every column. The connection sees one snapshot; connect again to
-    see later commits. With a `query`, only the views that it names are there: opening the logs
+    `log` (SI units), `log_counts`, `drives`, `grams`, `models`, `calibration`, `quarantine`, `runs`
+    and `dictionary`, which documents every column. The connection sees one snapshot; connect again
+    to see later commits. With a `query`, only the views that it names are there: opening the logs
     takes longer the more files there are, and so does reading every model version.
 
     It can open the files of the snapshot and no others, and its settings cannot be changed. DuckDB
@@ -62,6 +65,8 @@ def _open_views(
     warehouse = Warehouse(root)
     warehouse.require()
     wanted = VIEWS if query is None else needed_views(query)
+    if CALIBRATION in wanted:
+        wanted |= {"grams"}
     snapshots = table_snapshots(warehouse, wanted)
     database = open_tables(warehouse, wanted, snapshots, threads=threads)
     paths = paths_of(snapshots, wanted)
@@ -72,9 +77,20 @@ def _open_views(
         database.execute(read_sql("warehouse", "runs.sql").format(stored_runs=source))
     if "models" in wanted:
         add_table(database, "models", Registry(warehouse.root / "models").as_table())
+    if CALIBRATION in wanted:
+        add_table(database, CALIBRATION, _calibration(database))
     if "dictionary" in wanted:
         add_table(database, "dictionary", describe_columns(database, warehouse.catalogue))
     return database, paths
+
+
+def _calibration(database: duckdb.DuckDBPyConnection) -> pa.Table:
+    """Return the numbers of every car, by the Gram rows that the connection has."""
+    # Imported when it is asked for: most queries are not about it.
+    from fleet_slip.grams.calibration import calibration_table  # noqa: PLC0415
+    from fleet_slip.grams.reader import OpenedGrams  # noqa: PLC0415
+
+    return calibration_table(OpenedGrams(database, features().identity(CALIBRATION), 0, 0))
 
 
 def needed_views(query: str) -> frozenset[str]:

@@ -14,11 +14,12 @@ from fleet_slip.api.calls import (
     within_reach,
 )
 from fleet_slip.api.serving import Serving
-from fleet_slip.catalogue.sources import TRAINING_DRIVES
+from fleet_slip.catalogue.sources import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.errors import QuestionError, RefusedError, UsageError
 from fleet_slip.runs.log import step
 
 if TYPE_CHECKING:
+    from fleet_slip.grams.calibration import Calibration
     from fleet_slip.maintenance.compaction import CompactionReport
     from fleet_slip.maintenance.forget import ForgetReport
     from fleet_slip.maintenance.retention import RetentionReport
@@ -57,6 +58,19 @@ class Tending(Serving):
         from fleet_slip.monitoring.quality import examine_drives
 
         return examine_drives(self.warehouse, cohort)
+
+    def calibrate(self, cohort: str = ALL_DRIVES) -> "Calibration":
+        """Return how the sensors of every car are off, and what else its drives tell of it.
+
+        Offsets of gyroscope, accelerometer and steering, each with its uncertainty, from all drives
+        of a car, with a label or without. `cohort` is an SQL condition on the view `drives`. Reads
+        the Gram rows of the feature set `calibration` only. Raises `DataError` if they have not
+        been computed or no drive satisfies the condition, and `QuestionError` for one that is no
+        condition.
+        """
+        from fleet_slip.grams.calibration import calibrate
+
+        return calibrate(self.warehouse, cohort)
 
     def monitor(
         self,

@@ -47,6 +47,7 @@ COMMANDS = {
     "report": "report",
     "status": "status",
     "quality": "operations",
+    "calibrate": "calibrating",
     "monitor": "operations",
     "migrate": "operations",
     "verify": "maintenance",

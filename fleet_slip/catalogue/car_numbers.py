@@ -1,0 +1,82 @@
+"""What a car's own drives tell of it without a label: its numbers, by name.
+
+Each is a physical value; models and boards use it as an integer count of its grain, rounded to the
+nearest, halves away from zero, and clipped to 16 bits.
+"""
+
+import math
+from decimal import Decimal
+from fractions import Fraction
+from typing import Literal
+
+from fleet_slip.catalogue.signals import COUNT_MAX, SIUnit
+from fleet_slip.config import Config
+
+CALIBRATION = "calibration"
+"""The feature set whose Gram rows tell the numbers."""
+
+NumberName = Literal[
+    "yaw_rate_offset",
+    "yaw_rate_offset_by_wheels",
+    "ay_offset",
+    "steering_offset",
+    "speed_ratio",
+    "steer_per_curvature",
+    "understeer",
+]
+
+
+class CarNumber(Config):
+    """One number of a car: its unit, its grain and what it means."""
+
+    unit: SIUnit | Literal["1"]
+    grain: Decimal
+    description: str
+
+    def count(self, value: Fraction | None) -> int | None:
+        """Return a value as an integer count of the grain; None stays None."""
+        if value is None:
+            return None
+        size = math.floor(abs(value) / Fraction(self.grain) + Fraction(1, 2))
+        return min(size, COUNT_MAX) * (-1 if value < 0 else 1)
+
+
+CAR_NUMBERS: dict[NumberName, CarNumber] = {
+    "yaw_rate_offset": CarNumber(
+        unit="rad/s",
+        grain=Decimal("0.00000625"),
+        description="What the gyroscope says when the car does not turn, by ay over speed",
+    ),
+    "yaw_rate_offset_by_wheels": CarNumber(
+        unit="rad/s",
+        grain=Decimal("0.00000625"),
+        description="The same by the differences of the wheels: tells whether both agree",
+    ),
+    "ay_offset": CarNumber(
+        unit="m/s^2",
+        grain=Decimal("0.0000625"),
+        description="What the accelerometer says to the side when the car goes straight",
+    ),
+    "steering_offset": CarNumber(
+        unit="rad",
+        grain=Decimal("0.00000625"),
+        description="Mean steering angle of the front wheels when the car goes straight",
+    ),
+    "speed_ratio": CarNumber(
+        unit="1",
+        grain=Decimal("0.0005"),
+        description="Speed over that of wheels of 0.31 m: the tyres' radius",
+    ),
+    "steer_per_curvature": CarNumber(
+        unit="m",
+        grain=Decimal("0.002"),
+        description="Steering angle for each curvature: the wheelbase, as driven",
+    ),
+    "understeer": CarNumber(
+        unit="rad*s^2/m",
+        grain=Decimal("0.00002"),
+        description="Steering angle that each lateral acceleration takes beyond: the tyres and the "
+        "load",
+    ),
+}
+"""The numbers, in the order in which they are shown."""

@@ -1,0 +1,252 @@
+"""The numbers that a car's drives tell: found as they were made, exactly, in any order."""
+
+import random
+from datetime import date
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from fleet_slip.catalogue.car_numbers import CAR_NUMBERS
+from fleet_slip.catalogue.features import features, input_scales
+from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.grams.calibration import Evidence, calibrate
+from fleet_slip.grams.car_numbers import KINDS, course_shape, tell_numbers
+from fleet_slip.grams.drive_sums import collect_sums
+from fleet_slip.grams.job import update_grams
+from fleet_slip.maintenance.forget import forget
+from fleet_slip.regression.exact import fit
+from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.plane import PlaneShape, fit_plane
+from fleet_slip.views import connect
+from fleet_slip.warehouse.audit import Forgettable
+from fleet_slip.warehouse.tables import Warehouse
+from tests.support import cars
+from tests.support.logs import land, log_rows
+
+DAY = date(2024, 5, 1)
+TRUE = {"yaw_rate_offset": 0.013, "ay_offset": -0.21, "steering_offset": 0.004}
+COLUMNS = features().feature_set("calibration").columns[:-1]
+
+
+def biased(rng: np.random.Generator, offsets: dict[str, float]) -> dict[str, Any]:
+    """Return the counts of a drive of a car whose sensors are off."""
+
+    def change(signals: cars.Signals) -> None:
+        signals["yaw_rate"] += offsets["yaw_rate_offset"]
+        signals["ay"] += offsets["ay_offset"]
+        for side in ("steer_fl", "steer_fr"):
+            signals[side] += offsets["steering_offset"]
+
+    return cars.counts(cars.broken(cars.drive(rng), change))
+
+
+def matrix(counts: dict[str, Any]) -> Any:
+    """Return the columns of the set as plain numpy computes them, shape (rows, columns)."""
+    wide = {name: values.astype(np.int64) for name, values in counts.items()}
+    wheels = sum(wide[f"wheel_{corner}"] for corner in ("fl", "fr", "rl", "rr"))
+    speed = wheels * 0.01 * 0.31 / 4
+    wide["curvature"] = np.rint(wide["yaw_rate"] * 1e-4 / speed / 1e-5).astype(np.int64)
+    wide["course_rate"] = np.rint(wide["ay"] * 1e-3 / speed / 1e-4).astype(np.int64)
+    wide["slowness"] = np.rint(1 / speed / 4e-5).astype(np.int64)
+    return np.stack([wide[name] for name in COLUMNS], axis=1)[speed > 3]
+
+
+def gram_row(car: str, number: int, counts: dict[str, Any]) -> dict[str, Any]:
+    gram = Gram.from_counts(COLUMNS, matrix(counts))
+    return {
+        "vehicle_id": car,
+        "day": DAY,
+        "drive_id": f"{car}-{number:03d}",
+        "signals": ",".join(COLUMNS),
+        "n": gram.n,
+        "sums": list(gram.sums),
+        "products": list(gram.products),
+    }
+
+
+def evidence(rows: list[dict[str, Any]], size: int = 7) -> Evidence:
+    batches = [pa.RecordBatch.from_pylist(rows[i : i + size]) for i in range(0, len(rows), size)]
+    return Evidence(collect_sums(batches, KINDS))
+
+
+@pytest.fixture(scope="module")
+def fleet() -> tuple[list[dict[str, Any]], dict[str, dict[str, float]]]:
+    """Gram rows of 40 cars of three drives, and how their sensors are off."""
+    rng = np.random.default_rng(20)
+    rows, true = [], {}
+    for i in range(40):
+        car = f"car-{i:02d}"
+        true[car] = {
+            "yaw_rate_offset": 0.01 * rng.standard_normal(),
+            "ay_offset": 0.15 * rng.standard_normal(),
+            "steering_offset": 0.003 * rng.standard_normal(),
+        }
+        rows += [gram_row(car, n, biased(rng, true[car])) for n in range(3)]
+    return rows, true
+
+
+def test_offsets_lie_within_their_stated_uncertainty(fleet: Any) -> None:
+    rows, true = fleet
+    found = evidence(rows)
+    for name in TRUE:
+        errors = []
+        for car, offsets in true.items():
+            one = found.calibrated(car)[name]  # type: ignore[index]
+            assert one.uncertainty is not None
+            errors.append((one.value - offsets[name]) / one.uncertainty)
+        # Of 40 standard normal numbers: mean within 3 / sqrt(40), variance within 3 sqrt(2 / 40).
+        assert abs(np.mean(errors)) < 0.48, name
+        assert 0.33 < np.mean(np.square(errors)) < 1.67, name
+        assert np.mean(np.abs(errors) < 2) > 0.85, name
+
+
+def test_more_drives_make_it_surer_as_was_stated(fleet: Any) -> None:
+    rows, _ = fleet
+    of = {(row.number, row.drives): row for row in evidence(rows).convergence()}
+    for name in (*TRUE, "speed_ratio", "yaw_rate_offset_by_wheels"):
+        one, two = of[name, 1], of[name, 2]  # type: ignore[index]
+        assert one.cars == 40
+        assert one.measured is not None
+        assert 0.6 < one.measured / one.stated < 1.6, name
+        assert 0.6 < two.stated / one.stated < 0.8, name  # 1 / sqrt(2)
+
+
+def test_the_numbers_are_the_same_in_any_order(fleet: Any) -> None:
+    rows, _ = fleet
+    shuffled = [*rows]
+    random.Random(4).shuffle(shuffled)  # noqa: S311 - an order, no secret
+    one, other = evidence(rows), evidence(shuffled, size=11)
+    assert [one.calibrated(car) for car in one.cars] == [
+        other.calibrated(car) for car in other.cars
+    ]
+    assert one.convergence() == other.convergence()
+
+
+def test_a_plane_is_the_exact_fit() -> None:
+    rng = np.random.default_rng(1)
+    counts = rng.integers(-3000, 3000, (50, 3))
+    gram = Gram.from_counts(("x1", "x2", "y"), counts)
+    expected = fit(gram, ("x1", "x2"), "y").model
+    scales = {"y": Fraction(3, 7), "x1": Fraction(2, 1000), "x2": Fraction(5, 4)}
+    found = fit_plane(gram, PlaneShape(*({name: scales[name]} for name in ("y", "x1", "x2"))))
+    assert found is not None
+    assert found.intercept == expected.intercept * scales["y"]
+    assert found.first == expected.coefficients[0] * scales["y"] / scales["x1"]
+    assert found.second == expected.coefficients[1] * scales["y"] / scales["x2"]
+
+
+def test_the_wheels_tell_the_radius_and_the_steering_the_wheelbase() -> None:
+    rng = np.random.default_rng(3)
+    rows = [gram_row("car", n, biased(rng, TRUE)) for n in range(4)]
+    found = evidence(rows).calibrated("car")
+    assert found["speed_ratio"].value == pytest.approx(cars.RADIUS_M / 0.31, rel=2e-3)
+    assert found["steer_per_curvature"].value == pytest.approx(cars.WHEELBASE_M, rel=2e-2)
+    assert found["understeer"].value == pytest.approx(0.002, rel=5e-2)
+    assert found["yaw_rate_offset_by_wheels"].value == pytest.approx(0.013, abs=3e-4)
+
+
+def test_counts_are_rounded_to_the_grain_halves_away_from_zero() -> None:
+    one = CAR_NUMBERS["speed_ratio"]
+    grain = Fraction(one.grain)
+    assert [one.count(grain * Fraction(n, 2)) for n in (3, -3, 2, 1, -1, 0)] == [2, -2, 1, 1, -1, 0]
+    assert one.count(grain * 10**9) == 2**15 - 1
+    assert one.count(None) is None
+
+
+@pytest.mark.parametrize("kind", ["one row", "straight", "even circle", "constant speed"])
+def test_what_driving_does_not_tell_is_left_out(kind: str) -> None:
+    rng = np.random.default_rng(5)
+    signals = cars.drive(rng)
+    n = cars.TICKS
+    if kind == "one row":
+        signals = {name: values[:1] for name, values in signals.items()}
+    elif kind == "straight":
+        signals["yaw_rate"] = 0.01 * rng.standard_normal(n)
+        signals["ay"] = 0.1 * rng.standard_normal(n)
+        signals["steer_fl"] = signals["steer_fr"] = 2e-4 * rng.standard_normal(n)
+    elif kind == "even circle":
+        for name, values in signals.items():
+            signals[name] = values.mean() + 0.3 + 0.01 * rng.standard_normal(n)
+    else:
+        scale = 15 / (0.31 * sum(signals[f"wheel_{c}"] for c in ("fl", "fr", "rl", "rr")) / 4)
+        for corner in ("fl", "fr", "rl", "rr"):
+            signals[f"wheel_{corner}"] = signals[f"wheel_{corner}"] * scale
+    rows = [gram_row("car", n, cars.counts(signals)) for n in range(2)]
+    found = evidence(rows).calibrated("car")
+    assert not {"yaw_rate_offset", "ay_offset", "steering_offset"} & found.keys(), found
+
+
+def test_one_drive_of_one_car_has_no_uncertainty() -> None:
+    row = gram_row("car", 0, biased(np.random.default_rng(6), TRUE))
+    found = evidence([row])
+    one = found.calibrated("car")["yaw_rate_offset"]
+    assert one.uncertainty is None
+    assert one.value == pytest.approx(0.013, abs=2e-3)
+    assert found.convergence() == ()
+
+
+def test_no_gram_rows_tell_nothing() -> None:
+    assert tell_numbers({}) == {}
+    assert fit_plane(Gram.zero(("yaw_rate", "course_rate", "slowness")), course_shape()) is None
+
+
+def filled(warehouse: Warehouse, *names: str) -> None:
+    rng = np.random.default_rng(8)
+    for car in names:
+        for number in range(2):
+            counts = biased(rng, TRUE)
+            rows = log_rows(f"{car}-{number}", counts, DAY, vehicle_id=car)
+            land(warehouse, f"{car}-{number}", rows)
+    update_grams(warehouse)
+
+
+def test_a_warehouse_says_what_is_missing_and_forgets(warehouse: Warehouse) -> None:
+    filled(warehouse, "alfa", "beta", "gamma")
+    with pytest.raises(DataError, match="fleet-slip gram --features calibration"):
+        calibrate(warehouse)
+    update_grams(warehouse, feature_set="calibration")
+    found = calibrate(warehouse)
+    assert set(found.cars) == {"alfa", "beta", "gamma"}
+    for car in found.cars:
+        for name, value in TRUE.items():
+            one = found.car(car)[name]  # type: ignore[index]
+            assert one.uncertainty is not None
+            assert abs(one.value - value) < 5 * one.uncertainty
+    with pytest.raises(QuestionError, match="delta"):
+        found.car("delta")
+    with pytest.raises(DataError, match="no drive of"):
+        calibrate(warehouse, "vehicle_id = 'delta'")
+
+    forget(warehouse, Forgettable("vehicle", "beta"))
+    after = calibrate(warehouse)
+    assert set(after.cars) == {"alfa", "gamma"}
+    assert {c: after.cars[c]["ay_offset"].value for c in after.cars} == {
+        c: found.cars[c]["ay_offset"].value for c in after.cars
+    }
+    with connect(warehouse.root, query="FROM calibration") as database:
+        rows = database.sql(
+            "SELECT vehicle_id, value, count, grain FROM calibration WHERE number = 'ay_offset' "
+            "ORDER BY 1"
+        ).fetchall()
+    assert [row[0] for row in rows] == ["alfa", "gamma"]
+    for car, value, count, grain in rows:
+        assert value == after.cars[car]["ay_offset"].value
+        assert abs(value - count * grain) <= grain / 2
+
+
+def test_a_drive_without_a_label_counts(warehouse: Warehouse) -> None:
+    rng = np.random.default_rng(9)
+    for number in range(2):
+        counts = biased(rng, TRUE)
+        del counts["sideslip"]
+        land(warehouse, f"f{number}", log_rows(f"d{number}", counts, DAY, vehicle_id="alfa"))
+    update_grams(warehouse)
+    update_grams(warehouse, feature_set="calibration")
+    assert calibrate(warehouse).car("alfa")["yaw_rate_offset"].drives == 2
+
+
+def test_the_scale_of_slowness_is_one_over_speed() -> None:
+    assert input_scales()["slowness"] == Fraction(4, 100_000)
