@@ -62,7 +62,9 @@ def catalogue_with(columns: int) -> FeatureCatalogue:
         windows=tuple(names[: columns - len(inputs) - 1]),
     )
     windows = {**known.windows, **means}
-    return known.model_copy(update={"windows": windows, "factors": {}, "sets": {SET: chosen}})
+    return known.model_copy(
+        update={"windows": windows, "factors": {}, "calibrated": {}, "sets": {SET: chosen}}
+    )
 
 
 def best_rate(rows: int, rounds: int, work: Callable[[], pa.Table]) -> tuple[float, pa.Table]:

@@ -26,19 +26,26 @@ NumberName = Literal[
 ]
 
 
+Unit = SIUnit | Literal["1"]
+"""A unit, or none."""
+
+
 class CarNumber(Config):
     """One number of a car: its unit, its grain and what it means."""
 
-    unit: SIUnit | Literal["1"]
+    unit: Unit
     grain: Decimal
     description: str
 
     def count(self, value: Fraction | None) -> int | None:
         """Return a value as an integer count of the grain; None stays None."""
-        if value is None:
-            return None
-        size = math.floor(abs(value) / Fraction(self.grain) + Fraction(1, 2))
-        return min(size, COUNT_MAX) * (-1 if value < 0 else 1)
+        return None if value is None else round_number(value, Fraction(self.grain))
+
+
+def round_number(value: Fraction, grain: Fraction) -> int:
+    """Return a value in counts: rounded to the nearest, halves away from zero, and clipped."""
+    size = math.floor(abs(value) / grain + Fraction(1, 2))
+    return min(size, COUNT_MAX) * (-1 if value < 0 else 1)
 
 
 CAR_NUMBERS: dict[NumberName, CarNumber] = {

@@ -13,13 +13,20 @@ rule for all, in SQL, in the compiled kernel and on board:
 
 import math
 from collections.abc import Mapping
+from decimal import Decimal
 from fractions import Fraction
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, StringConstraints, model_validator
+from pydantic import (
+    AfterValidator,
+    Field,
+    StringConstraints,
+    model_validator,
+)
 
 from fleet_slip.catalogue.arithmetic import parse
-from fleet_slip.catalogue.signals import Identifier, catalogue
+from fleet_slip.catalogue.car_numbers import NumberName
+from fleet_slip.catalogue.signals import COUNT_MAX, Identifier, catalogue
 from fleet_slip.config import Config
 from fleet_slip.errors import QuestionError
 
@@ -156,6 +163,35 @@ class Gate(Config):
         return self
 
 
+class Number(Config):
+    """What a car's drives tell of it (`fleet_slip.catalogue.car_numbers`): a factor of a column.
+
+    The column's count times the number's, less `less`: not rounded, and not clipped. A car whose
+    number is not known takes the mean since its drive began, `running`, of the same grain; without
+    one it counts as a usual car, whose number is `less`.
+
+    Attributes:
+        name: of the number.
+        grain: physical value of one of its counts.
+        less: taken from its count, so that the factor is small for a usual car.
+        alone: whether the column is the number itself, wherever what it is `of` has a value.
+        running: column that takes its place.
+    """
+
+    name: NumberName
+    grain: Annotated[Decimal, Field(gt=0)]
+    less: Annotated[int, Field(ge=-COUNT_MAX, le=COUNT_MAX)] = 0
+    alone: bool = False
+    running: "Definition | None" = None
+
+    @model_validator(mode="after")
+    def _runs_plainly(self) -> "Number":
+        one = self.running
+        if one and (one.over != "running_mean" or one.fact or one.number or self.less):
+            raise ValueError("running is a mean since the drive began, without factors")
+        return self
+
+
 class Definition(Config):
     """Everything that defines a column of counts over time, whatever it is called.
 
@@ -169,6 +205,7 @@ class Definition(Config):
         bits: to which the column's count is clipped.
         fact: a factor, if there is one.
         gate: how much of all that counts, if it is not everything.
+        number: a factor that the car's own drives tell, if there is one.
     """
 
     of: Identifier
@@ -180,6 +217,7 @@ class Definition(Config):
     bits: Bits = 20
     fact: Fact | None = None
     gate: Annotated[Gate | None, Field(exclude_if=lambda gate: gate is None)] = None
+    number: Annotated[Number | None, Field(exclude_if=lambda one: one is None)] = None
 
     @model_validator(mode="after")
     def _ticks_fit(self) -> "Definition":
@@ -199,7 +237,8 @@ class Definition(Config):
     def signals(self) -> tuple[str, ...]:
         """The logged signals in it."""
         own = parse(self.sql).inputs if self.sql else (self.of,)
-        return tuple(dict.fromkeys((*own, *(self.gate.by.signals if self.gate else ()))))
+        beside = self.gate.by if self.gate else self.number.running if self.number else None
+        return tuple(dict.fromkeys((*own, *(beside.signals if beside else ()))))
 
     @property
     def ungated(self) -> "Definition":
@@ -213,6 +252,7 @@ class Definition(Config):
 
 
 Gate.model_rebuild()
+Number.model_rebuild()
 
 
 def features_behind(definitions: Mapping[str, Definition]) -> dict[str, Definition]:
@@ -223,7 +263,7 @@ def features_behind(definitions: Mapping[str, Definition]) -> dict[str, Definiti
     parts = [part for one in definitions.values() for part in one.parts]
     found = {part.of: part for part in parts if part.sql}
     for name, one in definitions.items():
-        if name in found and (one.over or one.fact or one.gate or one.of != name):
+        if name in found and (one.over or one.fact or one.gate or one.number or one.of != name):
             raise QuestionError(f"{name} is a column, and a feature that another looks back on.")
     for part in parts:
         if part.sql and (part.sql, part.of_bits) != (found[part.of].sql, found[part.of].of_bits):

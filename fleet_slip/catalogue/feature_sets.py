@@ -55,6 +55,7 @@ class FeatureSet(Config):
     signals: tuple[Identifier, ...] = Field(min_length=1)
     features: tuple[Identifier, ...] = ()
     windows: tuple[Identifier, ...] = ()
+    calibrated: tuple[Identifier, ...] = ()
     regimes: tuple[Identifier, ...] = ()
     block_s: Decimal | None = Field(default=None, gt=0, le=100_000)
     row_folds: int | None = Field(default=None, ge=2, le=1000)
@@ -69,7 +70,7 @@ class FeatureSet(Config):
             raise ValueError("a column stands twice")
         if bool(self.regimes) + bool(self.block_s) + bool(self.row_folds) + self.lagged > 1:
             raise ValueError("a set has regimes, block_s, row_folds or lagged, not several of them")
-        if self.windows and (self.row_folds or self.lagged):
+        if (self.windows or self.calibrated) and (self.row_folds or self.lagged):
             raise ValueError("a set with windows has no row_folds or lagged")
         if self.block_s is not None and Fraction(self.block_s) % SAMPLE_TIME_S:
             raise ValueError(f"block_s must be a multiple of {float(SAMPLE_TIME_S)}")
@@ -83,10 +84,10 @@ class FeatureSet(Config):
     @property
     def inputs(self) -> tuple[str, ...]:
         """What a model of this set may use."""
-        return (*self.signals, *self.features, *self.windows)
+        return (*self.signals, *self.features, *self.windows, *self.calibrated)
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """The columns of a Gram row, in its order."""
-        now = (*self.inputs, catalogue().label)
+        """The columns of a Gram row, in its order; calibrated ones follow from it."""
+        now = (*self.signals, *self.features, *self.windows, catalogue().label)
         return lag_signals(now) if self.lagged else now

@@ -21,9 +21,11 @@ from fleet_slip.catalogue.gates import GateFamily, gated_columns
 from fleet_slip.catalogue.row_features import Feature
 from fleet_slip.catalogue.signals import Identifier, Signal, catalogue
 from fleet_slip.catalogue.windows import (
+    Calibrated,
     Factor,
     TimeColumn,
     Window,
+    calibrated_column,
     factor_column,
     window_column,
 )
@@ -41,6 +43,7 @@ class FeatureCatalogue(Config):
     windows: dict[Identifier, Window] = Field(default_factory=dict)
     factors: dict[Identifier, Factor] = Field(default_factory=dict)
     gates: dict[Identifier, GateFamily] = Field(default_factory=dict)
+    calibrated: dict[Identifier, Calibrated] = Field(default_factory=dict)
     regimes: dict[Identifier, Regime]
     sets: dict[Identifier, FeatureSet]
 
@@ -63,7 +66,8 @@ class FeatureCatalogue(Config):
             unknown = [f for f in one.features if f not in self.features]
             unknown += [r for r in one.regimes if r not in self.regimes]
             known = {*self.windows, *self.gates, *self.time_columns}
-            unknown += [w for w in one.windows if w not in known]
+            unknown += [w for w in one.windows if w not in known or w in self.calibrated]
+            unknown += [c for c in one.calibrated if c not in self.calibrated]
             if unknown:
                 raise ValueError(f"sets.{name}: unknown {', '.join(unknown)}")
         return self
@@ -94,7 +98,30 @@ class FeatureCatalogue(Config):
             if twice := [member for member in members if member in found]:
                 raise ValueError(f"gates.{name}: {twice[0]} stands twice")
             found |= members
+        for name, calibrated in self.calibrated.items():
+            if name in found:
+                raise ValueError(f"calibrated.{name} stands twice")
+            found[name] = self._calibrated(name, calibrated, found)
         return found
+
+    def _calibrated(
+        self, name: str, one: Calibrated, known: Mapping[str, TimeColumn]
+    ) -> TimeColumn:
+        where = f"calibrated.{name}"
+        if one.running is not None and one.running not in known:
+            raise ValueError(f"{where}: {one.running} is no column over time")
+        of: Feature | Signal | TimeColumn
+        if one.of in known:
+            of, base = known[one.of], known[one.of].definition
+        else:
+            base, _ = self._row(one.of, where)
+            of = self.features[one.of] if one.of in self.features else catalogue()[one.of]
+            if base.sql:  # the count itself, as it stands in the rows
+                base = base.model_copy(update={"bits": base.of_bits})
+        if base.number is not None:
+            raise ValueError(f"{where}: {one.of} has a number already")
+        running = known[one.running] if one.running else None
+        return _named(where, calibrated_column, one, base, of.scale, of.unit, running)
 
     def _row(self, name: str, where: str) -> tuple[Definition, Fraction]:
         """Return a signal or feature of a row as the definition of a column, and its scale."""
@@ -241,6 +268,11 @@ def column_query(known: FeatureCatalogue, name: str) -> str:
     Raises `QuestionError` for what is neither.
     """
     definition = known.definition(name)
+    if definition is not None and definition.number is not None:
+        raise QuestionError(
+            f"{name} is {known.calibrated[name].of} times {definition.number.name} of each car, in "
+            "counts: see fleet-slip features --sql of the one, and the view calibration."
+        )
     if definition is not None:
         rows = with_windows("log_counts", {}, {name: definition})
     elif name in known.features:

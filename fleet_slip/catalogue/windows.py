@@ -5,7 +5,16 @@ from fractions import Fraction
 
 from pydantic import Field, model_validator
 
-from fleet_slip.catalogue.columns import LONGEST_TICKS, Bits, Definition, Fact, FactText, Over
+from fleet_slip.catalogue.car_numbers import CAR_NUMBERS, NumberName, Unit
+from fleet_slip.catalogue.columns import (
+    LONGEST_TICKS,
+    Bits,
+    Definition,
+    Fact,
+    FactText,
+    Number,
+    Over,
+)
 from fleet_slip.catalogue.signals import Identifier, SIUnit
 from fleet_slip.config import Config
 
@@ -58,12 +67,24 @@ class Factor(Config):
     description: str = Field(min_length=1)
 
 
+class Calibrated(Config):
+    """A column times a number that the car's own drives tell; `alone`, the number by itself."""
+
+    of: Identifier
+    number: NumberName
+    less: Decimal = Decimal(0)
+    alone: bool = False
+    running: Identifier | None = None
+    column: Identifier
+    description: str = Field(min_length=1)
+
+
 class TimeColumn(Config):
     """One column over time: how it is defined, and what a count of it is worth."""
 
     definition: Definition
     scale: Decimal
-    unit: SIUnit
+    unit: Unit
     column: Identifier
     description: str
 
@@ -90,6 +111,38 @@ def window_column(window: Window, ticks: int, row: Definition, scale: Fraction) 
         unit=window.unit,
         column=window.column.replace(TICKS, str(ticks)),
         description=window.description + (f", over {ticks} ticks" if ticks else ""),
+    )
+
+
+def calibrated_column(
+    one: Calibrated, base: Definition, scale: Decimal, unit: str, running: TimeColumn | None
+) -> TimeColumn:
+    """Return a column times a number, given the column without it, its scale and its unit.
+
+    Raises `ValueError` if `running` has another grain than the number, or `less` is between counts.
+    """
+    number = CAR_NUMBERS[one.number]
+    if running is not None and running.scale != number.grain:
+        raise ValueError(
+            f"{one.running} has the scale {running.scale}, {one.number} {number.grain}"
+        )
+    less = Fraction(one.less) / Fraction(number.grain)
+    if less.denominator != 1:
+        raise ValueError(f"less is no multiple of {number.grain}")
+    factor = Number(
+        name=one.number,
+        grain=number.grain,
+        less=int(less),
+        alone=one.alone,
+        running=running.definition if running else None,
+    )
+    own = [] if number.unit == "1" else [number.unit]
+    return TimeColumn(
+        definition=base.model_copy(update={"number": factor}),
+        scale=number.grain if one.alone else number.grain * scale,
+        unit="*".join(own if one.alone else [*own, unit]) or "1",
+        column=one.column,
+        description=one.description,
     )
 
 

@@ -269,12 +269,22 @@ class Evidence:
         ]
 
 
+def calibration_of(opened: OpenedGrams, condition: Condition) -> Calibration:
+    """Return the numbers of every car that the Gram rows of a cohort tell; none, if there are none.
+
+    `opened` are the Gram rows of the feature set `calibration`.
+    """
+    evidence = Evidence(collect_sums(opened.batches(condition), KINDS))
+    cars = {car: evidence.calibrated(car) for car in evidence.cars}
+    return Calibration(cars, opened.logs_version, opened.grams_version, evidence)
+
+
 def calibration_table(opened: OpenedGrams) -> pa.Table:
     """Return the numbers as the table `calibration` that SQL sees, one row a car and number.
 
     Of the Gram rows that there are: none are required.
     """
-    evidence = Evidence(collect_sums(opened.batches(parse_condition(ALL_DRIVES)), KINDS))
+    found = calibration_of(opened, parse_condition(ALL_DRIVES))
     rows = [
         {
             "vehicle_id": car,
@@ -283,8 +293,8 @@ def calibration_table(opened: OpenedGrams) -> pa.Table:
             "unit": CAR_NUMBERS[name].unit,
             "grain": float(CAR_NUMBERS[name].grain),
         }
-        for car in evidence.cars
-        for name, one in evidence.calibrated(car).items()
+        for car, numbers in found.cars.items()
+        for name, one in numbers.items()
     ]
     return pa.Table.from_pylist(rows, schema=TABLE)
 
@@ -299,14 +309,13 @@ def calibrate(
     """
     condition = parse_condition(condition)
     with open_grams(source, CALIBRATION, condition) as opened:
-        evidence = Evidence(collect_sums(opened.batches(condition), KINDS))
-    if not evidence.cars:
+        found = calibration_of(opened, condition)
+    if not found.cars:
         raise DataError(
             f"no drive of {condition.text!r} has yaw rate, ay and wheel speeds. Choose another "
             "cohort."
         )
-    cars = {car: evidence.calibrated(car) for car in evidence.cars}
-    return Calibration(cars, opened.logs_version, opened.grams_version, evidence)
+    return found
 
 
 def _range(at: slice) -> Any:

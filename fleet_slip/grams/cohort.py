@@ -16,6 +16,7 @@ from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import SCENARIO, TRAINING_DRIVES
 from fleet_slip.errors import DataError, QuestionError, RefusedError
+from fleet_slip.grams.expansion import expansion_of
 from fleet_slip.grams.folding import (
     BANDS,
     EACH,
@@ -29,7 +30,6 @@ from fleet_slip.grams.members import Members, hash_numbers
 from fleet_slip.grams.reader import GramReader, open_grams
 from fleet_slip.regression.drive_moments import serving_drives
 from fleet_slip.regression.folds import CohortFolds, FoldAssignment, by_band, by_hash, by_value
-from fleet_slip.regression.gram import packed_size
 from fleet_slip.regression.gram_table import GramTable
 from fleet_slip.warehouse.condition import Condition, asking, parse_condition
 from fleet_slip.warehouse.tables import Warehouse
@@ -157,7 +157,9 @@ class Cohort:
 
 def gram_condition(condition: Condition, feature_set: str, inputs: Sequence[str]) -> str:
     """Return the SQL condition on the view `grams` of a cohort's rows that have some inputs."""
-    wanted = ", ".join(f"'{name}'" for name in [*inputs, catalogue().label])
+    known = features().calibrated
+    stored = dict.fromkeys(known[name].of if name in known else name for name in inputs)
+    wanted = ", ".join(f"'{name}'" for name in [*stored, catalogue().label])
     return (
         f"feature_set = '{features().identity(feature_set)}' AND {condition.sql} AND "
         f"list_has_all(string_split(signals, ','), [{wanted}])"
@@ -229,23 +231,20 @@ def load_cohort(
     """
     condition = parse_condition(condition)
     with open_grams(warehouse, feature_set, condition) as opened:
+        expansion = expansion_of(opened, feature_set)
         statement = opened.statement("cohort.sql", condition)
         with asking(opened.database, condition):
             rows = opened.database.sql(statement).to_arrow_table()
         if not rows.num_rows:
             raise empty_cohort_error(opened.database, condition)
     require_training(rows["source"].unique().to_pylist(), condition)
-    sets = rows["signals"].unique().to_pylist()
-    tables = tuple(
-        gram_table(
-            signals, rows.filter(pc.equal(rows["signals"], signals)) if len(sets) > 1 else rows
-        )
-        for signals in sets
-    )
+    parts = list(expansion.tables(rows))
+    # Rows whose calibrated columns are not the same are apart now: their metadata follows them.
+    order = np.concatenate([np.flatnonzero(here) for _, _, here in parts])
     return Cohort(
         condition=condition,
-        tables=tables,
-        drives=rows.drop_columns(["sums", "products"]),
+        tables=tuple(table for _, table, _ in parts),
+        drives=rows.drop_columns(["sums", "products"]).take(order),
         logs_version=opened.logs_version,
         grams_version=opened.grams_version,
         feature_set=feature_set,
@@ -259,25 +258,6 @@ def require_training(sources: Iterable[str], condition: Condition) -> None:
             f"the cohort {condition.text!r} has drives of evaluation scenarios, which no model "
             f"may be trained on. Add to the condition: AND {TRAINING_DRIVES}"
         )
-
-
-def gram_table(signals: str, rows: pa.Table | pa.RecordBatch) -> GramTable:
-    """Return Gram rows, all of the same signals, as arrays."""
-    names = tuple(signals.split(","))
-    k = len(names)
-    return GramTable(
-        names,
-        rows["n"].to_numpy(),
-        _matrix(rows["sums"], k),
-        _matrix(rows["products"], packed_size(k)),
-    )
-
-
-def _matrix(lists: pa.ChunkedArray | pa.ListArray, width: int) -> IntArray:
-    chunks = lists.chunks if isinstance(lists, pa.ChunkedArray) else [lists]
-    parts = [chunk.flatten().to_numpy() for chunk in chunks]
-    values: IntArray = parts[0] if len(parts) == 1 else np.concatenate(parts)
-    return values.reshape(-1, width)
 
 
 def empty_cohort_error(database: duckdb.DuckDBPyConnection, condition: Condition) -> DataError:

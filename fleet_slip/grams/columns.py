@@ -32,12 +32,14 @@ class DriveCounts:
         counts: of each signal, shape (rows,); any number where it is missing.
         present: where a signal is not missing, shape (rows,); a signal that never is has none.
         facts: what the car knows of itself, by drive column.
+        numbers: counts of what the car's drives before told of it; those that are known.
     """
 
     ticks: NDArray[Any]
     counts: Mapping[str, NDArray[Any]]
     present: Mapping[str, BoolArray] = field(default_factory=dict)
     facts: Mapping[str, Any] = field(default_factory=dict)
+    numbers: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def whole(self) -> bool:

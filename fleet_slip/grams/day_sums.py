@@ -5,13 +5,14 @@ from dataclasses import dataclass
 from datetime import date
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.grams.cohort import empty_cohort_error, gram_table, require_training
-from fleet_slip.grams.fold_sums import by_signals
+from fleet_slip.grams.cohort import empty_cohort_error, require_training
+from fleet_slip.grams.expansion import expansion_of
 from fleet_slip.grams.members import hash_numbers
 from fleet_slip.grams.reader import GramReader, open_grams
 from fleet_slip.regression.drive_moments import missing_signals_error
@@ -46,16 +47,18 @@ def sum_days(
     found = False
     condition = parse_condition(condition)
     with open_grams(source, feature_set, condition) as opened:
+        expansion = expansion_of(opened, feature_set)
         for batch in opened.batches(condition):
             found = True
             require_training(batch["source"].unique().to_pylist(), condition)
-            for names, rows, _ in by_signals(batch):
+            for names, table, chosen in expansion.tables(batch):
                 if not set(signals) <= set(names.split(",")):
                     continue
+                rows = batch.filter(pa.array(chosen))
                 here = rows["day"].dictionary_encode()
                 number = here.indices.to_numpy()
                 days = here.dictionary.to_pylist()
-                totals = gram_table(names, rows).restrict(signals).totals(number, len(days))
+                totals = table.restrict(signals).totals(number, len(days))
                 ids = hash_numbers(rows["drive_id"])
                 for i, (day, total) in enumerate(zip(days, totals, strict=True)):
                     grams[day] = grams[day] + total if day in grams else total

@@ -47,12 +47,15 @@ def read_drives(warehouse: Warehouse, file: TableFile, plan: ColumnPlan) -> Iter
 
 
 def counts_of(
-    rows: pa.Table, plan: ColumnPlan, facts: Mapping[str, Any] | None = None
+    rows: pa.Table,
+    plan: ColumnPlan,
+    facts: Mapping[str, Any] | None = None,
+    numbers: Mapping[str, int] | None = None,
 ) -> DriveCounts:
     """Return the rows of a drive, in the order of time, as what a plan is computed from.
 
     A signal that the rows have not is missing everywhere. Facts are those of the first row, if
-    they are not given.
+    they are not given. `numbers` are what the car's drives told of it.
     """
     counts, present = {}, {}
     for name in plan.signals:
@@ -66,7 +69,7 @@ def counts_of(
             column = column.fill_null(0)
         counts[name] = column.to_numpy()
     known = facts if facts is not None else {name: rows[name][0].as_py() for name in plan.facts}
-    return DriveCounts(rows["tick"].to_numpy(), counts, present, known)
+    return DriveCounts(rows["tick"].to_numpy(), counts, present, known, numbers or {})
 
 
 def drives_of_stream(batches: Iterable[pa.RecordBatch]) -> Iterator[pa.Table]:

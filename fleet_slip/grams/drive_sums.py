@@ -8,8 +8,7 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.grams.cohort import gram_table
-from fleet_slip.grams.fold_sums import by_signals
+from fleet_slip.grams.gram_rows import by_signals, gram_table
 from fleet_slip.regression.gram import packed_position
 from fleet_slip.regression.gram_table import GramTable
 

@@ -4,7 +4,7 @@ Comparing given models needs no single drive, only the Gram of each fold. So any
 rows is added up in the memory of one batch.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from fleet_slip.arrays import BoolArray, IntArray
+from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
@@ -21,10 +21,10 @@ from fleet_slip.grams.cohort import (
     assign_folds,
     empty_cohort_error,
     gram_condition,
-    gram_table,
     require_divided,
     require_training,
 )
+from fleet_slip.grams.expansion import Expansion, expansion_of
 from fleet_slip.grams.folding import (
     EACH,
     FOLD_KEYS,
@@ -107,7 +107,7 @@ def sum_cohort(
     require_divided(feature_set, folding.by, folding.count)
     with open_grams(warehouse, feature_set, condition) as opened:
         names, fold_of = _folding(opened, folding, condition)
-        sums = _Sums(len(names), fold_of)
+        sums = _Sums(len(names), fold_of, expansion_of(opened, feature_set))
         for batch in opened.batches(condition):
             require_training(batch["source"].unique().to_pylist(), condition)
             sums.add(batch)
@@ -151,23 +151,13 @@ def _folding(
     return list(assignment.names), fold_of
 
 
-def by_signals(batch: pa.RecordBatch) -> Iterator[tuple[str, pa.RecordBatch, BoolArray]]:
-    """Yield each set of signals in a batch of Gram rows, its rows, and which those are."""
-    names = batch["signals"].unique().to_pylist()
-    if len(names) == 1:
-        yield names[0], batch, np.ones(len(batch), dtype=np.bool_)
-        return
-    for signals in names:
-        mask = pc.equal(batch["signals"], signals)
-        yield signals, batch.filter(mask), mask.to_numpy(zero_copy_only=False)
-
-
 @dataclass
 class _Sums:
     """Adds up Gram rows by set of signals and fold, and remembers which drives they are of."""
 
     count: int
     fold_of: FoldOf
+    expansion: Expansion
     tables: dict[str, list[Gram]] = field(default_factory=dict)
     drives: dict[str, list[NDArray[np.uint64]]] = field(default_factory=dict)
     vehicles: dict[str, list[NDArray[np.uint64]]] = field(default_factory=dict)
@@ -181,14 +171,14 @@ class _Sums:
         folds = self.fold_of(batch, drives)
         self.used.update(np.unique(folds).tolist())
         self.divided |= batch["part"].null_count < len(batch)
-        for signals, rows, here in by_signals(batch):
-            totals = gram_table(signals, rows).totals(folds[here], self.count)
+        for signals, table, here in self.expansion.tables(batch):
+            totals = table.totals(folds[here], self.count)
             known = self.tables.get(signals)
             self.tables[signals] = (
                 [a + b for a, b in zip(known, totals, strict=True)] if known else totals
             )
             self.drives.setdefault(signals, []).append(drives[here])
-            cars = hash_numbers(rows["vehicle_id"].unique())
+            cars = hash_numbers(batch["vehicle_id"].filter(pa.array(here)).unique())
             self.vehicles.setdefault(signals, []).append(cars)
 
     @property

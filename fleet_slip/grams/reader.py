@@ -3,12 +3,13 @@
 import contextlib
 import shlex
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import duckdb
 import pyarrow as pa
 
+from fleet_slip.catalogue.car_numbers import CALIBRATION
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import ALL_DRIVES, TRAINING_DRIVES
@@ -102,6 +103,9 @@ class GramReader:
         opened = OpenedGrams(database, identity, logs.version or 0, grams.version or 0)
         if feature_set != PLAIN:
             _require_complete(logs, grams, opened, feature_set, condition)
+        if features().feature_set(feature_set).calibrated:
+            calibration = replace(opened, identity=features().identity(CALIBRATION))
+            _require_complete(logs, grams, calibration, CALIBRATION, condition)
         return opened
 
     def _connected(self, grams: Snapshot, logs: Snapshot) -> duckdb.DuckDBPyConnection:

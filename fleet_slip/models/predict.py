@@ -7,12 +7,14 @@ manifest. A model with columns over time looks back within a drive: by `drive_id
 `time_s` of the frame; a frame without them is one drive with a row for each tick.
 """
 
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
 from fleet_slip.arrays import FloatArray, IntArray
+from fleet_slip.catalogue.car_numbers import round_number
 from fleet_slip.catalogue.column_sql import with_features
 from fleet_slip.catalogue.counts import round_to_counts
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
@@ -54,15 +56,42 @@ def _over_time(manifest: Manifest, frame: Frame, columns: dict[str, FloatArray])
     if missing := [name for name in predictor.plan.facts if name not in frame.names]:
         raise InputError(f"{manifest.name} needs what the car knows: {', '.join(missing)}.")
     facts = {name: _column(frame, name) for name in predictor.plan.facts}
+    numbers = _numbers(manifest, frame)
     ticks, drives = _ticks(frame, len(next(iter(counts.values())))), _drives(frame)
     rows = pa.table({"tick": ticks, **counts, **facts})
-    if drives is None:
-        return predictor(counts_of(rows, predictor.plan)) if len(rows) else np.empty(0)
+    if not len(rows):
+        return np.empty(0)
     angle = np.full(len(rows), np.nan)
-    for drive in np.unique(drives):
-        at = np.flatnonzero(drives == drive)
-        angle[at] = predictor(counts_of(rows.take(at), predictor.plan))
+    each = [np.arange(len(rows))] if drives is None else _rows_of_each(drives)
+    for at in each:
+        own = {
+            name: round_number(Fraction(float(values[at[0]])), grain)
+            for name, (values, grain) in numbers.items()
+            if not np.isnan(values[at[0]])
+        }
+        angle[at] = predictor(counts_of(rows.take(at), predictor.plan, None, own))
     return angle
+
+
+def _rows_of_each(drives: IntArray) -> list[IntArray]:
+    return [np.flatnonzero(drives == drive) for drive in np.unique(drives)]
+
+
+def _numbers(manifest: Manifest, frame: Frame) -> dict[str, tuple[FloatArray, Fraction]]:
+    """Return what a car's drives tell of it, in SI units by row, NaN where they do not, and grains.
+
+    Raises `InputError` if the frame lacks a column of the number's name.
+    """
+    used = {one.number.name: one.number for one in manifest.definitions.values() if one.number}
+    if missing := [name for name in used if name not in frame.names]:
+        raise InputError(
+            f"{manifest.name} needs what a car's own drives tell of it: {', '.join(missing)}. Run: "
+            "fleet-slip calibrate --car NAME. A car that has driven too little has nulls there."
+        )
+    return {
+        name: (frame.numbers([name], manifest.name)[name], Fraction(number.grain))
+        for name, number in used.items()
+    }
 
 
 def _column(frame: Frame, name: str) -> pa.Array:

@@ -11,11 +11,14 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.column_sql import with_windows
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
-from fleet_slip.errors import DataError
+from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.grams.calibration import calibrate
 from fleet_slip.grams.drive_rows import counts_of, drives_of_stream
+from fleet_slip.grams.expansion import CarCounts
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predictor import Predictor
 from fleet_slip.resources import read_sql
+from fleet_slip.runs.log import log_event
 from fleet_slip.warehouse.condition import Condition, asking, parse_condition, row_columns
 from fleet_slip.warehouse.table_views import connect_tables
 from fleet_slip.warehouse.tables import Warehouse
@@ -48,8 +51,14 @@ def score_statement(manifest: Manifest, condition: str | Condition) -> str:
     """Return `jobs/score.sql` for a model: its dot product over the logs in SI units.
 
     Features are computed as the manifest defines them, whatever they are called today. Raises
-    `QuestionError` if the condition is not one expression on the columns of the view `log`.
+    `QuestionError` if the condition is not one expression on the columns of the view `log`, and for
+    a model that uses what a car's drives tell, which is no statement on rows.
     """
+    if numbers := numbers_of(manifest):
+        raise QuestionError(
+            f"{manifest.name} uses numbers of each car ({', '.join(numbers)}), which one statement "
+            "on rows does not have. They are in the view calibration. Score it without --sql."
+        )
     terms = [f"{term.coefficient!r} * {term.column}" for term in manifest.terms]
     columns = [term.column for term in manifest.terms] + [manifest.label.column]
     return read_sql("jobs", "score.sql").format(
@@ -129,7 +138,9 @@ def _score_over_time(
     """Estimate the drives that have rows of the cohort, whole; score the rows of the cohort."""
     predictor = Predictor.of(manifest)
     label = manifest.label.signal
-    counts = ", ".join(dict.fromkeys([*predictor.plan.signals, label, *predictor.plan.facts]))
+    needed = [*predictor.plan.signals, label, *predictor.plan.facts, "vehicle_id"]
+    cars = calibrated_cars(warehouse) if predictor.columns.numbers else {}
+    counts = ", ".join(dict.fromkeys(needed))
     text = read_sql("jobs", "drives_in_time.sql").format(
         columns=counts, rows=_si_rows("log_counts"), condition=condition.sql
     )
@@ -139,7 +150,8 @@ def _score_over_time(
     with connect_tables(warehouse, text) as database, asking(database, condition):
         stream = database.sql(text).to_arrow_reader(BATCH_ROWS)
         for rows in drives_of_stream(stream):
-            estimate = predictor(counts_of(rows, predictor.plan))
+            numbers = cars.get(rows["vehicle_id"][0].as_py())
+            estimate = predictor(counts_of(rows, predictor.plan, None, numbers))
             truth = rows[label].to_numpy(zero_copy_only=False).astype(np.float64) * unit
             chosen = rows["chosen"].to_numpy(zero_copy_only=False).astype(np.bool_)
             given = chosen & np.isfinite(estimate) & np.isfinite(truth)
@@ -148,6 +160,22 @@ def _score_over_time(
     if not sum(map(len, truths)):
         return None
     return _figures(np.concatenate(estimates), np.concatenate(truths))
+
+
+def numbers_of(manifest: Manifest) -> tuple[str, ...]:
+    """Return the numbers of a car that a model uses."""
+    found = (one.number.name for one in manifest.definitions.values() if one.number)
+    return tuple(dict.fromkeys(found))
+
+
+def calibrated_cars(warehouse: Warehouse) -> CarCounts:
+    """Return the counts of the numbers of every car, by its drives so far; the log says of when.
+
+    Raises `DataError` if the Gram rows that tell them have not been computed.
+    """
+    found = calibrate(warehouse)
+    log_event("calibration", cars=len(found.cars), grams_version=found.grams_version)
+    return found.counts()
 
 
 def _figures(estimate_rad: FloatArray, truth_rad: FloatArray) -> Score:

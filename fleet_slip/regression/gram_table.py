@@ -22,6 +22,8 @@ class GramTable:
         n: rows of each drive, shape (drives,).
         sums: sums of counts, shape (drives, k).
         products: packed product sums, shape (drives, k(k+1)/2).
+
+    Numbers are int64; sums and products that need more bits are integers of Python.
     """
 
     signals: tuple[str, ...]
@@ -37,8 +39,9 @@ class GramTable:
                 f"{drives} drives of {k} signals do not have sums of shape {self.sums.shape} and "
                 f"products of shape {self.products.shape}"
             )
-        if not self.n.dtype == self.sums.dtype == self.products.dtype == np.int64:
-            raise ValueError("a GramTable holds int64")
+        kinds = {self.n.dtype, self.sums.dtype, self.products.dtype}
+        if not kinds <= {np.dtype(np.int64), np.dtype(object)}:
+            raise ValueError("a GramTable holds int64, or integers of Python")
 
     def __len__(self) -> int:
         """Return the number of drives."""
@@ -108,9 +111,11 @@ def exact_sum(values: IntArray) -> list[int]:
     """Return the sums of the columns of an int64 array, shape (rows < 2^26, columns), exactly.
 
     The int64 sum is right modulo 2^64; the float64 sum is right to far less than 2^63, and so
-    says how often it wrapped around.
+    says how often it wrapped around. Integers of Python are added as they are.
     """
     wrapped = values.sum(axis=0).tolist()
+    if values.dtype == object:
+        return [int(total) for total in wrapped]
     near = values.sum(axis=0, dtype=np.float64).tolist()
     return [
         remainder + round((total - remainder) / _MODULUS) * _MODULUS

@@ -79,6 +79,7 @@ PHYSICS: dict[str, Callable[[Row], Fraction | None]] = {
     "yaw_rate_speed": lambda row: row["yaw_rate"] * speed(row),
     "curvature": over_speed("yaw_rate"),
     "course_rate": over_speed("ay"),
+    "slowness": lambda row: 1 / speed(row) if speed(row) >= 3 else None,
     "ay_signed_square": lambda row: row["ay"] * abs(row["ay"]),
     "steer_mean": lambda row: (row["steer_fl"] + row["steer_fr"]) / 2,
     "steer_speed_squared": lambda row: (row["steer_fl"] + row["steer_fr"]) / 2 * speed(row) ** 2,

@@ -10,7 +10,7 @@ from fleet_slip.delta import Change
 from fleet_slip.errors import StorageError
 from fleet_slip.grams.aggregation import aggregate
 from fleet_slip.grams.check import check_grams, differing_drives
-from fleet_slip.grams.cohort import gram_table
+from fleet_slip.grams.gram_rows import gram_table
 from fleet_slip.grams.job import update_grams
 from fleet_slip.regression.gram import Gram, packed_size
 from fleet_slip.warehouse.tables import Warehouse

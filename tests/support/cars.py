@@ -23,10 +23,13 @@ NOISE = {
 WHEEL_NOISE = 0.02
 
 
-def drive(rng: np.random.Generator) -> Signals:
-    """Return the SI signals of one drive: slow changes of speed and of curvature."""
-    speed = 15 + 5 * _wander(rng)
-    curvature = 0.02 * _wander(rng)
+def drive(rng: np.random.Generator, gentleness: float = 1.0) -> Signals:
+    """Return the SI signals of one drive: slow changes of speed and of curvature.
+
+    Some are wilder than sensors can tell; with a `gentleness` of 2, none.
+    """
+    speed = 15 + 5 * _wander(rng) / gentleness
+    curvature = 0.02 * _wander(rng) / gentleness
     yaw_rate = speed * curvature
     steer = np.arctan(WHEELBASE_M * curvature) + 0.002 * yaw_rate * speed
     half = TRACK_M / 2

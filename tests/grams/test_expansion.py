@@ -1,0 +1,175 @@
+"""Calibrated columns follow from Gram rows and a number of each car, to the bits of the rows."""
+
+from datetime import date
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fleet_slip
+from fleet_slip.catalogue.car_numbers import CAR_NUMBERS
+from fleet_slip.catalogue.features import features
+from fleet_slip.errors import DataError, InputError, QuestionError
+from fleet_slip.grams.calibration import calibrate
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.column_plan import ColumnPlan
+from fleet_slip.grams.columns import DriveCounts
+from fleet_slip.grams.expansion import expand
+from fleet_slip.grams.fold_sums import sum_cohort
+from fleet_slip.grams.folding import Folding
+from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.numbered_columns import NumberedColumns
+from fleet_slip.models.predict import predict
+from fleet_slip.models.score import score, score_statement
+from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.gram_table import GramTable
+from fleet_slip.warehouse.tables import Warehouse
+from tests.support import cars
+from tests.support.logs import land, log_rows
+
+DAY = date(2024, 5, 1)
+WANTED: tuple[str, ...] = (
+    "ay_mean_16",
+    "slowness",
+    "yaw_rate",
+    "ay_offset_alone",
+    "ay_offset_slowness",
+    "understeer_ay",
+    "wheelbase_alone",
+    "yaw_rate_offset_slowness",
+)
+
+
+def table_of(grams: list[Gram]) -> GramTable:
+    return GramTable(
+        grams[0].signals,
+        np.array([gram.n for gram in grams]),
+        np.array([gram.sums for gram in grams]),
+        np.array([gram.products for gram in grams]),
+    )
+
+
+@pytest.mark.parametrize("factor", [7, 2**15 - 1])
+def test_expanded_sums_are_those_of_the_rows(factor: int) -> None:
+    rng = np.random.default_rng(1)
+    grams, expected = [], []
+    factors = rng.integers(-factor, factor + 1, (3, 3))
+    for own in factors:
+        counts = rng.integers(-(2**19), 2**19, (40, 3))
+        new = [own[0] * counts[:, 1], own[1] * np.ones(40, dtype=np.int64), own[2] * counts[:, 0]]
+        both = np.column_stack([counts, *new])
+        grams.append(Gram.from_counts(("a", "b", "c"), counts))
+        expected.append(Gram.from_counts(("a", "b", "c", "bx", "x", "ax"), both.astype(object)))
+    found = expand(table_of(grams), ("bx", "x", "ax"), [2, 0, 1], factors)
+    assert [found.row(i) for i in range(3)] == expected
+    assert found.total() == sum(expected[1:], expected[0])
+    assert found.totals(np.array([0, 1, 0]), 2) == [expected[0] + expected[2], expected[1]]
+    # Products of the larger factors need more than 64 bits.
+    assert (found.products.dtype == object) == (factor > 7)
+
+
+def offset(signals: cars.Signals, yaw_rate: float, ay: float) -> None:
+    signals["yaw_rate"] += yaw_rate
+    signals["ay"] += ay
+
+
+def drive(rng: np.random.Generator, car: int) -> dict[str, Any]:
+    made = cars.broken(
+        cars.drive(rng, 2.0), lambda signals: offset(signals, 0.01 * (car - 1), 0.1 * (2 - car))
+    )
+    return cars.counts({name: values[:1200] for name, values in made.items()})
+
+
+@pytest.fixture(scope="module")
+def filled(tmp_path_factory: pytest.TempPathFactory) -> Warehouse:
+    """Four cars of two drives, with Gram rows of the sets fleet and calibration."""
+    warehouse = fleet_slip.open(tmp_path_factory.mktemp("fleet")).warehouse
+    rng = np.random.default_rng(2)
+    for car in range(4):
+        drives = [
+            log_rows(f"car-{car}-{n}", drive(rng, car), DAY, vehicle_id=f"car-{car}")
+            for n in range(2)
+        ]
+        land(warehouse, f"f{car}", *drives)
+    update_grams(warehouse)
+    update_grams(warehouse, feature_set="fleet")
+    with pytest.raises(DataError, match="gram --features calibration"):
+        load_cohort(warehouse, "true", "fleet")
+    update_grams(warehouse, feature_set="calibration")
+    return warehouse
+
+
+def counts_of_drive(warehouse: Warehouse, drive_id: str, numbers: dict[str, int]) -> DriveCounts:
+    plan = plan_of(WANTED).plan
+    rows = fleet_slip.open(warehouse.root).sql(
+        f"SELECT tick, {', '.join(plan.signals)} FROM log_counts WHERE drive_id = '{drive_id}' "
+        "ORDER BY tick"
+    )
+    found = {name: np.array(values) for name, values in rows.fetchnumpy().items()}
+    return DriveCounts(found.pop("tick"), found, numbers=numbers)
+
+
+def plan_of(names: tuple[str, ...]) -> NumberedColumns:
+    known = features()
+    definitions = {name: one for name in names if (one := known.definition(name)) is not None}
+    return NumberedColumns.of(names, ColumnPlan.of_set(known, "fleet").rows, definitions)
+
+
+def test_gram_rows_have_the_bits_of_the_rows(filled: Warehouse) -> None:
+    cohort = load_cohort(filled, "true", "fleet")
+    (table,) = cohort.tables
+    assert set(features().feature_set("fleet").inputs) <= set(table.signals)
+    numbers = calibrate(filled).counts()
+    for at, row in enumerate(cohort.drives.to_pylist()):
+        known = numbers[row["vehicle_id"]]
+        assert known["ay_offset"] != 0
+        columns = plan_of(WANTED).compute(counts_of_drive(filled, row["drive_id"], known))
+        assert not np.isnan(columns).any()
+        by_rows = Gram.from_counts(WANTED, columns.T.astype(np.int64).astype(object))
+        assert table.restrict(WANTED).row(at) == by_rows
+
+
+def test_sums_over_folds_are_those_of_the_drives(filled: Warehouse) -> None:
+    summed = sum_cohort(filled, Folding(by="vehicle", count=10), "true", "fleet")
+    total = load_cohort(filled, "true", "fleet").tables[0].total()
+    found = summed.sums.serving(WANTED[:-1], WANTED[-1]).total
+    assert found == total.restrict(WANTED)
+    assert "understeer_ay" not in summed.gram_condition(["understeer_ay"])
+    assert "ay_mean_16" in summed.gram_condition(["understeer_ay"])
+
+
+def test_a_new_car_takes_running_means_and_is_usual(filled: Warehouse) -> None:
+    names = ("slowness", "yaw_rate_bias", "yaw_rate_offset_slowness", "understeer_ay")
+    rows = plan_of(names).compute(counts_of_drive(filled, "car-0-0", {}))
+    np.testing.assert_array_equal(rows[2], rows[0] * rows[1])
+    assert not rows[3].any()
+    usual = features().time_columns["understeer_ay"].definition.number
+    assert usual is not None
+    assert usual.less * float(CAR_NUMBERS["understeer"].grain) == pytest.approx(0.003)
+
+
+def test_a_model_is_published_scored_and_asked(filled: Warehouse) -> None:
+    fleet = fleet_slip.open(filled.root)
+    chosen = fleet.cohort("true").select(
+        nested="ay_mean_16,curvature_mean_16,ay_offset_alone,understeer_ay", features="fleet"
+    )
+    version = fleet.publish("calibrated", chosen, force=True).version
+    manifest = version.manifest
+    used = {one.number.name for one in manifest.definitions.values() if one.number}
+    assert used
+    found = score(filled, manifest, "true")
+    assert found.rows == 8 * 1200
+    assert found.rmse_deg == pytest.approx(manifest.cross_validation.rmse_deg, rel=0.3)
+
+    frame = fleet.sql("SELECT * FROM log ORDER BY drive_id, tick").to_arrow_table()
+    with pytest.raises(InputError, match="fleet-slip calibrate --car"):
+        predict(manifest, frame)
+    cars_of = calibrate(filled)
+    for name in used:
+        values = [cars_of.car(car)[name].value for car in frame["vehicle_id"].to_pylist()]
+        frame = frame.append_column(name, [values])
+    angle = predict(manifest, frame).to_numpy()
+    error = np.degrees(angle - frame["sideslip_rad"].to_numpy())
+    assert float(np.sqrt(np.mean(error**2))) == pytest.approx(found.rmse_deg, rel=1e-12)
+    with pytest.raises(QuestionError, match="numbers of each car"):
+        score_statement(manifest, "true")
