@@ -8,6 +8,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 CAMPAIGN ?= waterford
 ROOT ?= data
+# Tests start the program hundreds of times: its compiled modules are kept, whatever the environment says.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: run report test test-all lint docs setup bench clean
 

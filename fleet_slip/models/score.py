@@ -57,7 +57,7 @@ def score_statement(manifest: Manifest, condition: str | Condition) -> str:
     if numbers := numbers_of(manifest):
         raise QuestionError(
             f"{manifest.name} uses numbers of each car ({', '.join(numbers)}), which one statement "
-            "on rows does not have. They are in the view calibration. Score it without --sql."
+            "on rows does not have. They are in the view calibration. Score it by fleet-slip score."
         )
     terms = [f"{term.coefficient!r} * {term.column}" for term in manifest.terms]
     columns = [term.column for term in manifest.terms] + [manifest.label.column]

@@ -36,7 +36,9 @@ def test_an_order_of_signals_is_no_damage(run_command: RunCommand, other: dict[s
         assert done.exit_code == 0, (command, done.stderr)
     after = run_command("run", "--campaign", "smoke", "--days", "1", "--json", env=other)
     assert not after.json["changed"], after.stderr
-    assert after.json["select"]["models"] == before.json["select"]["models"]
+    assert after.json["publish"]["version"] == before.json["publish"]["version"]
+    chosen = [run_command("select", "--json", **given).json for given in ({}, {"env": other})]
+    assert chosen[0]["models"] == chosen[1]["models"]
     assert run_command("compact", env=other).exit_code == 0
     for environment in ({}, {"env": other}):
         done = run_command("verify", "--full", **environment)
