@@ -4,7 +4,6 @@ import re
 from pathlib import Path
 
 import duckdb
-import pyarrow as pa
 
 from fleet_slip.catalogue.car_numbers import CALIBRATION
 from fleet_slip.catalogue.features import features
@@ -43,7 +42,8 @@ def connect(
     `log` (SI units), `log_counts`, `drives`, `grams`, `models`, `calibration`, `quarantine`, `runs`
     and `dictionary`, which documents every column. The connection sees one snapshot; connect again
     to see later commits. With a `query`, only the views that it names are there: opening the logs
-    takes longer the more files there are, and so does reading every model version.
+    takes longer the more files there are, and so does reading every model version. Computing
+    `calibration` takes longest: without a `query` it is not there before `add_calibration`.
 
     It can open the files of the snapshot and no others, and its settings cannot be changed. DuckDB
     knows no right to read without the right to write: ask SQL of others through `Fleet.sql`.
@@ -64,7 +64,7 @@ def _open_views(
     """Return a connection with views, and the paths of all files that they read."""
     warehouse = Warehouse(root)
     warehouse.require()
-    wanted = VIEWS if query is None else needed_views(query)
+    wanted = VIEWS - {CALIBRATION} if query is None else needed_views(query)
     if CALIBRATION in wanted:
         wanted |= {"grams"}
     snapshots = table_snapshots(warehouse, wanted)
@@ -78,19 +78,31 @@ def _open_views(
     if "models" in wanted:
         add_table(database, "models", Registry(warehouse.root / "models").as_table())
     if CALIBRATION in wanted:
-        add_table(database, CALIBRATION, _calibration(database))
+        _calibrate(database)
     if "dictionary" in wanted:
         add_table(database, "dictionary", describe_columns(database, warehouse.catalogue))
     return database, paths
 
 
-def _calibration(database: duckdb.DuckDBPyConnection) -> pa.Table:
-    """Return the numbers of every car, by the Gram rows that the connection has."""
+def add_calibration(database: duckdb.DuckDBPyConnection, query: str) -> None:
+    """Compute the view `calibration` if a query names it and the connection has not got it.
+
+    Of the Gram rows that the connection has. Raises `StorageError` if one of them is damaged.
+    """
+    if not views_in(query, (CALIBRATION,)):
+        return
+    there = database.execute("SELECT table_name FROM duckdb_tables()").fetchall()
+    if (CALIBRATION,) not in there:
+        _calibrate(database)
+
+
+def _calibrate(database: duckdb.DuckDBPyConnection) -> None:
     # Imported when it is asked for: most queries are not about it.
     from fleet_slip.grams.calibration import calibration_table  # noqa: PLC0415
     from fleet_slip.grams.reader import OpenedGrams  # noqa: PLC0415
 
-    return calibration_table(OpenedGrams(database, features().identity(CALIBRATION), 0, 0))
+    opened = OpenedGrams(database, features().identity(CALIBRATION), 0, 0)
+    add_table(database, CALIBRATION, calibration_table(opened))
 
 
 def needed_views(query: str) -> frozenset[str]:

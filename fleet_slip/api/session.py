@@ -9,6 +9,7 @@ import duckdb
 import pyarrow as pa
 
 from fleet_slip.errors import QuestionError
+from fleet_slip.views import add_calibration
 from fleet_slip.warehouse.database import database_errors, interruptible, reading_files
 from fleet_slip.warehouse.read_only_sql import one_query
 
@@ -35,6 +36,7 @@ class Session:
 
         It and all that is made of it keep the connection open.
         """
+        add_calibration(self.database, query)
         text = self.allow(self.database, query)
         with database_errors("the query"):
             relation: duckdb.DuckDBPyRelation | None = self.database.sql(text)

@@ -100,7 +100,7 @@ def test_other_columns_may_have_one_name(tmp_path: Path) -> None:
         (b"t,AX,beta_deg\n0,1,2\n", "no column 'ax'. Did the mapping mean 'AX'? Its columns are"),
         (b"t,ax,beta\n0,1\xe92,3\n", "not UTF-8, near"),
         ("t,ax,beta\n0,1,2\n".encode("utf-16"), "binary or UTF-16"),
-        (b"\x1f\x8b\x08\x00" + b"\xab" * 50, "UTF-8"),
+        (b"\x1f\x8b\x08\x00" + b"\xab" * 50, "cannot be read"),
         (b"t" * 2_000_000, "the header is longer than"),
         (b"t,ax,beta" + b",x" * 20_000 + b"\n", "20,003 columns, at most 10,000"),
         (b't,ax,"beta\n0,1,2\n', "its header is not CSV"),

@@ -159,5 +159,5 @@ def test_the_command_draws_and_tells_by_its_exit_code(
     assert bad.exit_code == 10
     assert bad.json["days"][-1]["alarms"] == ["mean"]
     assert "beyond its limits on 2024-05-08 (mean)" in bad.stderr
-    assert run_command("monitor", "m", "--since", "tomorrow").exit_code == 3
+    assert run_command("monitor", "m", "--since", "tomorrow").exit_code == 2
     assert run_command("monitor", "m", "--plot", "chart.xyz").exit_code == 3

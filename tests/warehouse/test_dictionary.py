@@ -10,7 +10,7 @@ from fleet_slip.warehouse.dictionary import COMMON, column_descriptions
 def columns(root: Path) -> dict[str, dict[str, tuple[str, str]]]:
     """Return unit and description of every column, by view."""
     found: dict[str, dict[str, tuple[str, str]]] = {}
-    with connect(root) as database:
+    with connect(root, query="FROM dictionary") as database:
         for view, column, unit, description in database.sql(
             'SELECT "view", "column", unit, description FROM dictionary'
         ).fetchall():
