@@ -110,7 +110,7 @@ class Fleet(Filling, Tending):
         """
         from fleet_slip.api.run_report import RunReport
         from fleet_slip.selection.model_list import load_model_list
-        from fleet_slip.selection.request import parse_worth
+        from fleet_slip.selection.worth import parse_worth
         from fleet_slip.simulation.campaign import load_campaign
 
         begun = time.monotonic()

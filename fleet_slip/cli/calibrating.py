@@ -10,7 +10,8 @@ from fleet_slip.catalogue.car_numbers import CAR_NUMBERS, NumberName
 from fleet_slip.catalogue.sources import ALL_DRIVES
 from fleet_slip.cli.options import Cohort
 from fleet_slip.cli.output import Json, print_json, print_table, say
-from fleet_slip.grams.calibration import Calibrated, Calibration
+from fleet_slip.grams.calibration import Calibration
+from fleet_slip.grams.car_evidence import Calibrated
 
 
 def calibrate(

@@ -17,7 +17,7 @@ from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.selecting import print_selection
 from fleet_slip.cli.signing import signing_key
 from fleet_slip.cli.workers import Cluster, Threads
-from fleet_slip.selection.request import WORTH
+from fleet_slip.selection.worth import WORTH
 from fleet_slip.words import number_of
 
 DEFAULT_CAMPAIGN = "waterford"

@@ -1,7 +1,5 @@
 """What to select, as it is asked for on the command line, and its execution."""
 
-import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,7 +15,6 @@ from fleet_slip.grams.folding import EACH, ROW_FOLDS, Folding, FoldKey, make_fol
 from fleet_slip.regression.drive_moments import ClusterUnit
 from fleet_slip.regression.nested_choice import Rule
 from fleet_slip.regression.stepwise import METHODS
-from fleet_slip.regression.winner import Worth
 from fleet_slip.selection.compare import Selection, select
 from fleet_slip.selection.model_list import (
     CandidateModel,
@@ -28,6 +25,7 @@ from fleet_slip.selection.model_list import (
 )
 from fleet_slip.selection.search import require_criterion, select_ranked, select_subsets
 from fleet_slip.selection.uncertainty import estimate_uncertainty
+from fleet_slip.selection.worth import WORTH, parse_worth
 from fleet_slip.warehouse.tables import Warehouse
 
 DEFAULT_MODELS = "table1"
@@ -37,24 +35,6 @@ GIVEN = "given"
 
 WHOLE_SET = "catalogue"
 """As an order of signals: all inputs of the feature set, in its order."""
-
-
-WORTH = "0.005deg"
-"""`fleet_slip.regression.winner.DEFAULT_WORTH` as it is asked for."""
-
-_WORTH = re.compile(r"(\d+(?:\.\d*)?|\.\d+) ?(deg|%)")
-
-
-def parse_worth(text: str) -> Worth:
-    """Return a gain in RMSE from text such as `0.005deg` or `2%`. Raises `UsageError`."""
-    found = _WORTH.fullmatch(text.strip())
-    if found is None:
-        raise UsageError(
-            f"worth = {text}: write an angle such as {WORTH}, or a share of the best RMSE such as "
-            "2%."
-        )
-    amount = float(found[1])
-    return Worth(amount / 100, relative=True) if found[2] == "%" else Worth(math.radians(amount))
 
 
 @dataclass(frozen=True, kw_only=True)

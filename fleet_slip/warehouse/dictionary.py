@@ -10,7 +10,7 @@ from fleet_slip.catalogue.signals import SignalCatalogue
 from fleet_slip.config import Config, load_toml
 from fleet_slip.resources import folder
 
-COMMON = "shared"
+COMMON = "common"
 """Section of `warehouse/columns.toml` for columns of several views."""
 
 

@@ -12,7 +12,8 @@ import pytest
 from fleet_slip.catalogue.car_numbers import CAR_NUMBERS
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.grams.calibration import Evidence, calibrate
+from fleet_slip.grams.calibration import calibrate
+from fleet_slip.grams.car_evidence import Evidence
 from fleet_slip.grams.car_numbers import KINDS, course_shape, tell_numbers
 from fleet_slip.grams.drive_sums import collect_sums
 from fleet_slip.grams.job import update_grams
