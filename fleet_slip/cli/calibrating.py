@@ -12,6 +12,7 @@ from fleet_slip.cli.options import Cohort
 from fleet_slip.cli.output import Json, print_json, print_table, say
 from fleet_slip.grams.calibration import Calibration
 from fleet_slip.grams.car_evidence import Calibrated
+from fleet_slip.words import number_of
 
 
 def calibrate(
@@ -72,7 +73,7 @@ def _print_fleet(found: Calibration) -> None:
         name: [cars[name] for cars in found.cars.values() if name in cars] for name in CAR_NUMBERS
     }
     print_table(
-        f"{len(found.cars):,} cars, by their own drives",
+        f"{number_of(len(found.cars), 'car')}, by their own drives",
         ["number", "unit", "cars", "median", "differs by", "known to +-"],
         [
             [
