@@ -62,8 +62,9 @@ def catalogue_with(columns: int) -> FeatureCatalogue:
         windows=tuple(names[: columns - len(inputs) - 1]),
     )
     windows = {**known.windows, **means}
+    emptied = dict.fromkeys(("factors", "calibrated", "gates"), {})
     return known.model_copy(
-        update={"windows": windows, "factors": {}, "calibrated": {}, "sets": {SET: chosen}}
+        update={**emptied, "windows": windows, "sets": {SET: chosen}}
     )
 
 
