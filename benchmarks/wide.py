@@ -62,10 +62,8 @@ def catalogue_with(columns: int) -> FeatureCatalogue:
         windows=tuple(names[: columns - len(inputs) - 1]),
     )
     windows = {**known.windows, **means}
-    emptied = dict.fromkeys(("factors", "calibrated", "gates"), {})
-    return known.model_copy(
-        update={**emptied, "windows": windows, "sets": {SET: chosen}}
-    )
+    emptied: dict[str, Any] = {kind: {} for kind in ("factors", "calibrated", "gates")}
+    return known.model_copy(update={**emptied, "windows": windows, "sets": {SET: chosen}})
 
 
 def best_rate(rows: int, rounds: int, work: Callable[[], pa.Table]) -> tuple[float, pa.Table]:
