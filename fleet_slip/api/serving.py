@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from fleet_slip.evaluation.evaluate import TrainRivals
+    from fleet_slip.export.files import Target
     from fleet_slip.files.documents import Document
     from fleet_slip.models.diff import Difference
     from fleet_slip.models.publish import Publication
@@ -212,6 +213,24 @@ class Serving(Rooted):
 
         folder = LocalFolder(output) if output else self.root / "report"
         return write_report(self.warehouse, self.resolve(model), folder)
+
+    def export(self, model: str | ModelVersion, to: "Target", output: Path) -> list[Path]:
+        """Write a version as a program for elsewhere into a folder; return the files.
+
+        Every export carries the version's checksum, the hash of the drives that made it, and
+        checks: inputs, among them the first ticks of a drive of the logs, and the angles.
+
+        Raises `RefusedError` if no bound of the angle's error can be stated or counts mean
+        something else now, `UsageError` for an unknown target, and what `model` raises.
+        """
+        from fleet_slip.export.files import export_files
+        from fleet_slip.files.local_folder import LocalFolder
+
+        folder = LocalFolder(output)
+        files = export_files(self.resolve(model), self.warehouse, to)
+        for name, text in files.items():
+            folder.put(name, text.encode("utf-8"))
+        return [output / name for name in files]
 
     def registry(self, sign_key: Path | None = None) -> Registry:
         """Return the registry of models; it signs new versions with a private key, if given one."""

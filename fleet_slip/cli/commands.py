@@ -36,6 +36,7 @@ COMMANDS = {
     "pin": "models",
     "unpin": "models",
     "diff": "comparing",
+    "export": "exporting",
     "score": "evaluate",
     "diagnose": "diagnosing",
     "features": "statistics",

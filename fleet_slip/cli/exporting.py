@@ -1,0 +1,28 @@
+"""The command that brings a published version into other programs: export."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fleet_slip.cli.models import Reference
+from fleet_slip.cli.output import Json, print_json, say
+from fleet_slip.export.files import Target
+
+
+def export(
+    context: typer.Context,
+    reference: Reference,
+    to: Annotated[Target, typer.Option(help="What to export to.")],
+    output: Annotated[
+        Path, typer.Option(help="Folder to write into; files of the same names are replaced.")
+    ] = Path(),
+    json: Json = False,
+) -> None:
+    """Write a version as a program for elsewhere, with checks: vectors of inputs and angles."""
+    written = context.obj.export(reference, to, output)
+    if json:
+        print_json({"files": [str(path) for path in written]})
+        return
+    for path in written:
+        say(f"{path}: {path.stat().st_size:,} bytes")

@@ -1,0 +1,181 @@
+"""Checks of a program that travel with it: ticks of a real drive and hostile ones, and the angles.
+
+The angles come from the columns as the warehouse's kernel computes them, which knows nothing of
+programs, and from exact integers.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+
+from fleet_slip.arrays import BoolArray, FloatArray
+from fleet_slip.catalogue.signals import COUNT_MAX
+from fleet_slip.export.program import Car, CarFact, Input, Program
+from fleet_slip.grams.drive_rows import counts_of, read_drives
+from fleet_slip.models.manifest import Manifest
+from fleet_slip.models.predictor import Predictor
+from fleet_slip.warehouse.tables import Warehouse
+
+REAL_TICKS = 300
+HOSTILE_TICKS = 200
+
+Sample = tuple[int | None, ...]
+"""The counts of a tick in the order of the program's signals; None where missing."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """A drive, tick by tick from the first, and the angle at each; None where there is none.
+
+    Attributes:
+        name: what it is.
+        facts, numbers: what the car knows, in the order of the program; None where unknown.
+        samples: of each tick.
+        angles: counts of the program's angle.
+    """
+
+    name: str
+    facts: tuple[int | None, ...]
+    numbers: tuple[int | None, ...]
+    samples: tuple[Sample, ...]
+    angles: tuple[int | None, ...]
+
+
+def make_checks(
+    manifest: Manifest, program: Program, warehouse: Warehouse | None
+) -> tuple[Check, ...]:
+    """Return the first ticks of a drive of the warehouse, if it has one, and hostile drives."""
+    known = _hostile_car(program)
+    found = [
+        _check(manifest, program, "extremes", known, _extremes(program, np.random.default_rng(1))),
+        _check(manifest, program, "holes", Car({}, {}), _holes(program, np.random.default_rng(2))),
+        _check(
+            manifest, program, "standstill", known, _standstill(program, np.random.default_rng(3))
+        ),
+    ]
+    real = None if warehouse is None else _real(manifest, program, warehouse)
+    return (real, *found) if real else tuple(found)
+
+
+def angles_by_kernel(
+    manifest: Manifest, program: Program, car: Car, samples: Sequence[Sample]
+) -> list[int | None]:
+    """Return the angle of each tick, by the columns of the kernel and exact integers."""
+    predictor = Predictor.of(manifest)
+    names = [one.name for one in program.signals]
+    valid = [_valid(sample, program.signals) for sample in samples]
+    counts = {
+        name: pa.array(values, pa.int16())
+        for name, values in zip(names, zip(*valid, strict=True), strict=True)
+    }
+    rows = pa.table({"tick": np.arange(len(samples), dtype=np.int64), **counts})
+    facts = {name: car.facts.get(name) for name in predictor.plan.facts}
+    drive = counts_of(rows, predictor.plan, facts, car.numbers)
+    return angles_of_columns(program, predictor.columns.compute(drive))
+
+
+def angles_of_columns(program: Program, columns: FloatArray) -> list[int | None]:
+    """Return the angle of each row, given the columns of the terms, shape (terms, rows)."""
+    angle = program.angle
+    missing: BoolArray = np.any(np.isnan(columns), axis=0)
+    whole = np.where(missing, 0.0, columns).astype(np.int64).astype(object)
+    total = np.full(columns.shape[1], angle.intercept + (1 << (angle.bits - 1)), dtype=object)
+    for (_, coefficient), column in zip(angle.terms, whole, strict=True):
+        total += coefficient * column
+    rounded = [max(-angle.limit, min(angle.limit, int(one >> angle.bits))) for one in total]
+    return [None if gone else one for one, gone in zip(rounded, missing, strict=True)]
+
+
+def _valid(sample: Sample, signals: Sequence[Input]) -> Sample:
+    """Return a sample in which counts beyond the valid range are missing."""
+    return tuple(
+        count if count is not None and one.min_count <= count <= one.max_count else None
+        for count, one in zip(sample, signals, strict=True)
+    )
+
+
+def _check(
+    manifest: Manifest, program: Program, name: str, car: Car, samples: Iterable[Sample]
+) -> Check:
+    ticks = tuple(samples)
+    angles = tuple(angles_by_kernel(manifest, program, car, ticks))
+    return Check(name, car.fact_counts(program), car.number_counts(program), ticks, angles)
+
+
+def _real(manifest: Manifest, program: Program, warehouse: Warehouse) -> Check | None:
+    """Return the first ticks of the first drive of the logs; None without logs."""
+    plan = Predictor.of(manifest).plan
+    for file in warehouse.logs.snapshot().files[:1]:
+        for drive in read_drives(warehouse, file, plan):
+            counts = drive.counts
+            at = {int(tick): row for row, tick in enumerate(counts.ticks[:REAL_TICKS])}
+            samples = [
+                tuple(
+                    int(counts.counts[one.name][at[tick]])
+                    if tick in at
+                    and (one.name not in counts.present or counts.present[one.name][at[tick]])
+                    else None
+                    for one in program.signals
+                )
+                for tick in range(REAL_TICKS)
+            ]
+            car = Car({one.name: counts.facts.get(one.name) for one in program.facts}, {})
+            return _check(manifest, program, f"drive {drive.drive_id}", car, samples)
+    return None
+
+
+def _hostile_car(program: Program) -> Car:
+    """Return a car whose facts and numbers are far from usual."""
+    facts: Mapping[str, object] = {one.name: _hostile_fact(one) for one in program.facts}
+    numbers = {
+        one.name: COUNT_MAX if place % 2 else -COUNT_MAX
+        for place, one in enumerate(program.numbers)
+    }
+    return Car(facts, numbers)
+
+
+def _hostile_fact(fact: CarFact) -> object:
+    return 2**16 if fact.equals is None else fact.equals
+
+
+def _extremes(program: Program, random: np.random.Generator) -> Iterable[Sample]:
+    """Yield ends of the ranges, all at once and one by one, and what is just beyond them."""
+    for tick in range(HOSTILE_TICKS):
+        if tick % 40 < 10:
+            high = tick % 80 < 40
+            yield tuple(one.max_count if high else one.min_count for one in program.signals)
+        else:
+            yield tuple(_extreme(one, random) for one in program.signals)
+
+
+def _extreme(one: Input, random: np.random.Generator) -> int | None:
+    within = (one.min_count, one.max_count, -1, 0, 1, one.max_count // 2)
+    beyond = (one.min_count - 1, one.max_count + 1, None)
+    if random.random() < 0.98:
+        return within[random.integers(len(within))]
+    return beyond[random.integers(len(beyond))]
+
+
+def _holes(program: Program, random: np.random.Generator) -> Iterable[Sample]:
+    """Yield a drive that lacks ticks, long and short, and single values."""
+    gone = 0
+    for _ in range(HOSTILE_TICKS):
+        begins = random.random() < 0.05
+        gone = gone - 1 if gone else (1, 2, 30)[random.integers(3)] if begins else 0
+        yield tuple(
+            None
+            if gone or random.random() < 0.01
+            else int(random.integers(0, one.max_count // 4 + 1))
+            for one in program.signals
+        )
+
+
+def _standstill(program: Program, random: np.random.Generator) -> Iterable[Sample]:
+    """Yield a start from standstill: no feature that divides by speed has a value at first."""
+    for tick in range(HOSTILE_TICKS):
+        yield tuple(
+            int(random.integers(-2, 3)) + one.max_count * tick // (8 * HOSTILE_TICKS)
+            for one in program.signals
+        )

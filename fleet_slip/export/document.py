@@ -1,0 +1,150 @@
+"""A program as a JSON document, from which an implementation can be written: docs/export.md.
+
+Whole numbers that may need more than 53 bits are texts.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from fleet_slip.canonical import canonical_json, sha256_of
+from fleet_slip.catalogue.arithmetic import Step
+from fleet_slip.catalogue.columns import LARGEST_FACT, WEIGHT
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S
+from fleet_slip.export.checks import Check
+from fleet_slip.export.program import (
+    Angle,
+    CarFact,
+    Column,
+    Factor,
+    Gated,
+    Input,
+    Numbered,
+    Program,
+    Source,
+    Window,
+)
+from fleet_slip.models.model_version import ModelVersion
+
+FORMAT = "fleet-slip estimator"
+SCHEMA = 1
+"""Number of the schema: it changes if an implementation of before would compute something else."""
+
+
+def document_of(version: ModelVersion, program: Program, checks: Sequence[Check]) -> dict[str, Any]:
+    """Return the document of a published version; `sha256` is of everything else in it."""
+    content: dict[str, Any] = {
+        "format": FORMAT,
+        "schema": SCHEMA,
+        "model": {
+            "reference": version.reference,
+            "sha256": version.sha256,
+            "drives_sha256": version.manifest.trained_on.drives_sha256,
+            "manifest": version.manifest.model_dump(mode="json"),
+        },
+        "program": program_content(program),
+        "checks": [_check(one) for one in checks],
+    }
+    return {**content, "sha256": sha256_of(canonical_json(content))}
+
+
+def program_content(program: Program) -> dict[str, Any]:
+    """Return the program alone."""
+    return {
+        "tick_s": str(float(SAMPLE_TIME_S)),
+        "signals": [_signal(one) for one in program.signals],
+        "facts": [_fact(one) for one in program.facts],
+        "numbers": [
+            {"name": one.name, "unit": one.unit, "grain": f"{one.grain:f}"}
+            for one in program.numbers
+        ],
+        "sources": [_source(one) for one in program.sources],
+        "columns": [_column(one) for one in program.columns],
+        "angle": _angle(program.angle),
+    }
+
+
+def _signal(one: Input) -> dict[str, Any]:
+    return {
+        "name": one.name,
+        "column": one.column,
+        "unit": one.unit,
+        "scale": f"{one.scale:f}",
+        "min": one.min_count,
+        "max": one.max_count,
+    }
+
+
+def _fact(one: CarFact) -> dict[str, Any]:
+    if one.equals is not None:
+        return {"name": one.name, "equals": one.equals}
+    return {"name": one.name, "largest": LARGEST_FACT}
+
+
+def _source(one: Source) -> dict[str, Any]:
+    content: dict[str, Any] = {"name": one.name, "limit": one.limit, "ticks": one.ticks}
+    if one.arithmetic is None:
+        return {**content, "steps": [["signal", one.name]]}
+    content["steps"] = [_step(step) for step in one.arithmetic.steps]
+    if one.arithmetic.guard is not None:
+        content["guard"] = {"step": one.arithmetic.guard, "at_least": one.arithmetic.at_least}
+    return content
+
+
+def _step(step: Step) -> list[Any]:
+    if step.name:
+        return ["signal", step.name]
+    return [step.function, *step.operands] if step.function else ["constant", step.value]
+
+
+def _column(column: Column) -> dict[str, Any]:
+    match column:
+        case Window():
+            content: dict[str, Any] = {
+                "kind": column.over or "value",
+                "source": column.source,
+                "numerator": column.numerator,
+                "denominator": column.denominator,
+                "limit": column.limit,
+            }
+            if column.ticks:
+                content["ticks"] = column.ticks
+            if column.over == "running_mean":
+                content["most_values"] = column.most_values
+            return content
+        case Factor():
+            return {"kind": "factor", **vars(column)}
+        case Gated():
+            return {"kind": "gate", "weight": WEIGHT, **_without(vars(column), "largest")}
+        case Numbered():
+            return {"kind": "number", **_without(vars(column), "largest")}
+
+
+def _without(content: Mapping[str, Any], name: str) -> dict[str, Any]:
+    return {key: value for key, value in content.items() if key != name}
+
+
+def _angle(angle: Angle) -> dict[str, Any]:
+    return {
+        "name": angle.name,
+        "column": angle.column,
+        "unit": angle.unit,
+        "scale": f"{angle.scale:f}",
+        "bits": angle.bits,
+        "intercept": str(angle.intercept),
+        "terms": [
+            {"column": place, "coefficient": str(coefficient)} for place, coefficient in angle.terms
+        ],
+        "error": f"{angle.error.numerator}/{angle.error.denominator}",
+        "largest": angle.largest,
+        "limit": angle.limit,
+    }
+
+
+def _check(check: Check) -> dict[str, Any]:
+    return {
+        "name": check.name,
+        "facts": list(check.facts),
+        "numbers": list(check.numbers),
+        "samples": [list(sample) for sample in check.samples],
+        "angles": list(check.angles),
+    }

@@ -1,0 +1,74 @@
+"""The files that an export of a published version consists of."""
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+from fleet_slip.errors import UsageError
+from fleet_slip.export.checks import Check, make_checks
+from fleet_slip.export.compile import compile_program
+from fleet_slip.export.document import document_of
+from fleet_slip.export.program import Program
+from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.warehouse.tables import Warehouse
+
+Target = Literal["json"]
+"""What a version can be exported to."""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A version that is exported, its program, and checks of it."""
+
+    version: ModelVersion
+    program: Program
+    checks: tuple[Check, ...]
+
+    @property
+    def stem(self) -> str:
+        """What the names of its files begin with."""
+        return f"{self.version.manifest.name}-{self.version.version}"
+
+
+def export_files(version: ModelVersion, warehouse: Warehouse | None, to: str) -> dict[str, str]:
+    """Return the texts of an export by the names of their files.
+
+    The checks in it have the first ticks of a drive of the warehouse, if there is one. Raises
+    `UsageError` for an unknown target, and what `compile_program` raises.
+    """
+    if to not in _WRITERS:
+        raise UsageError(f"{to!r}: export to one of {', '.join(get_args(Target))}.")
+    program = compile_program(version.manifest)
+    return _WRITERS[to](
+        Subject(version, program, make_checks(version.manifest, program, warehouse))
+    )
+
+
+def _json(subject: Subject) -> dict[str, str]:
+    content = document_of(subject.version, subject.program, subject.checks)
+    return {f"{subject.stem}.json": render(content)}
+
+
+def render(content: Mapping[str, Any]) -> str:
+    """Return a JSON document with a line for each of its parts, and for each tick."""
+    return _rendered(content, 0) + "\n"
+
+
+def _rendered(value: Any, depth: int) -> str:
+    """Return JSON text; what is made of numbers and texts alone stands on one line."""
+    items = value.values() if isinstance(value, Mapping) else value
+    if not isinstance(value, Mapping | list) or not any(
+        isinstance(one, Mapping | list) for one in items
+    ):
+        return json.dumps(value, ensure_ascii=False, allow_nan=False)
+    indent, close = "\n" + " " * (depth + 1), "\n" + " " * depth
+    if isinstance(value, Mapping):
+        parts = [f"{json.dumps(key)}: {_rendered(one, depth + 1)}" for key, one in value.items()]
+        return "{" + indent + f",{indent}".join(parts) + close + "}"
+    return (
+        "[" + indent + f",{indent}".join(_rendered(one, depth + 1) for one in value) + close + "]"
+    )
+
+
+_WRITERS: dict[str, Callable[[Subject], dict[str, str]]] = {"json": _json}

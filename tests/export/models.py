@@ -1,0 +1,123 @@
+"""Published models of every kind of column, and drives of counts for them."""
+
+from collections.abc import Mapping
+from decimal import Decimal
+from fractions import Fraction
+
+from hypothesis import strategies as st
+
+from fleet_slip.catalogue.columns import Definition, Fact, Gate, Number
+from fleet_slip.catalogue.features import features
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.export.checks import Sample
+from fleet_slip.export.program import Car, Program
+from fleet_slip.models.manifest import Manifest, ModelTerm
+from tests.support.manifests import manifest
+
+COURSE = features().features["course_difference"]
+SPEED = Definition(of="wheel_fl", over="mean", ticks=4, bits=16)
+EVER = Definition(of="yaw_rate", over="running_mean", ratio=Fraction(16))
+
+DEFINITIONS = {
+    "mean_3": Definition(of="ay", over="mean", ticks=3, ratio=Fraction(16)),
+    "mean_5": Definition(of="ay", over="mean", ticks=5, ratio=Fraction(1, 7), bits=16),
+    "sum_4": Definition(of="ax", over="sum", ticks=4, ratio=Fraction(3, 2), bits=17),
+    "lag_2": Definition(of="yaw_rate", over="lag", ticks=2),
+    "ever": Definition(of="ay", over="running_mean", ratio=Fraction(16)),
+    "course": Definition(
+        of="change", sql=COURSE.sql, of_bits=18, over="mean", ticks=2, ratio=Fraction(5)
+    ),
+    "heavy": Definition(
+        of="ay",
+        over="mean",
+        ticks=2,
+        fact=Fact(name="mass_kg", less=1320, ratio=Fraction(1, 100)),
+        bits=18,
+    ),
+    "of_suv": Definition(of="ax", fact=Fact(name="vehicle_model", equals="suv")),
+    "below": Definition(
+        of="ay",
+        over="mean",
+        ticks=3,
+        ratio=Fraction(16),
+        gate=Gate(by=SPEED, low=-3, peak=500, high=1501),
+    ),
+    "heavy_above": Definition(
+        of="ay",
+        over="mean",
+        ticks=2,
+        fact=Fact(name="mass_kg", less=1320, ratio=Fraction(1, 100)),
+        bits=18,
+        gate=Gate(by=Definition(of="change", sql=COURSE.sql, of_bits=18), low=-2000, peak=3),
+    ),
+    "offset": Definition(
+        of="wheel_rl",
+        over="mean",
+        ticks=2,
+        number=Number(name="yaw_rate_offset", grain=Decimal("0.00000625"), running=EVER),
+    ),
+    "radius": Definition(
+        of="ay", number=Number(name="speed_ratio", grain=Decimal("0.0005"), less=2000)
+    ),
+    "tyres": Definition(
+        of="ay", number=Number(name="understeer", grain=Decimal("0.00002"), less=-7, alone=True)
+    ),
+}
+
+
+def model_of(
+    coefficients: Mapping[str, Fraction], intercept: Fraction = Fraction(0), name: str = "sideslip"
+) -> Manifest:
+    """A manifest of columns of `DEFINITIONS`, of features of 16 bits and of signals."""
+    terms = tuple(_term(one, value) for one, value in coefficients.items())
+    return manifest(name=name).model_copy(
+        update={"terms": terms, "intercept": float(intercept), "intercept_exact": intercept}
+    )
+
+
+def _term(name: str, coefficient: Fraction) -> ModelTerm:
+    signal = catalogue().signals.get(name)
+    feature = features().features.get(name)
+    return ModelTerm(
+        signal=name,
+        column=signal.column if signal else name,
+        unit="1",
+        scale=signal.scale if signal else Decimal("0.001"),
+        sql=feature.sql if feature else "",
+        definition=None if signal or feature else DEFINITIONS[name],
+        coefficient=float(coefficient),
+        coefficient_exact=coefficient,
+    )
+
+
+COEFFICIENT = st.fractions(-2, 2, max_denominator=10**9)
+COLUMN = st.sampled_from([*DEFINITIONS, "ay", "wheel_rr", "curvature", "ay_signed_square"])
+
+
+@st.composite
+def models(draw: st.DrawFn) -> Manifest:
+    """A model of one to six columns."""
+    names = draw(st.lists(COLUMN, min_size=1, max_size=6, unique=True))
+    return model_of({name: draw(COEFFICIENT) for name in names}, draw(COEFFICIENT))
+
+
+@st.composite
+def cars(draw: st.DrawFn) -> Car:
+    """A car of which anything may be known, or nothing."""
+    mass = draw(st.sampled_from([None, 1320.0, 1320.5, 1999.4, 900.0, 1e9, float("nan")]))
+    facts = {"mass_kg": mass, "vehicle_model": draw(st.sampled_from([None, "suv", "van"]))}
+    number = st.sampled_from([-32767, -3, 0, 2000, 32767])
+    known = draw(st.sets(st.sampled_from(["yaw_rate_offset", "speed_ratio", "understeer"])))
+    return Car(facts, {name: draw(number) for name in sorted(known)})
+
+
+COUNT = st.one_of(
+    st.none(), st.sampled_from([-32768, -32767, -1, 0, 1, 32767]), st.integers(-2000, 2000)
+)
+
+
+def drives(program: Program) -> st.SearchStrategy[list[Sample]]:
+    """A drive with holes, missing values and extremes, perhaps of one tick."""
+    width = len(program.signals)
+    hole = st.just((None,) * width)
+    return st.lists(st.one_of(st.tuples(*[COUNT] * width), hole), min_size=1, max_size=12)

@@ -1,0 +1,109 @@
+"""`export` of the smoke campaign's model: whole drives, sample by sample."""
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fleet_slip
+from fleet_slip.canonical import canonical_json
+from fleet_slip.cli.main import app
+from fleet_slip.errors import QuestionError, UsageError
+from fleet_slip.export.checks import angles_of_columns
+from fleet_slip.export.compile import compile_program
+from fleet_slip.export.files import export_files
+from fleet_slip.files.documents import checksum
+from fleet_slip.grams.drive_rows import read_drives
+from fleet_slip.models.predictor import Predictor
+from tests.export import plain
+
+
+@pytest.fixture(scope="module")
+def document(smoke_root: Path) -> Any:
+    fleet = fleet_slip.open(smoke_root)
+    ((name, text),) = export_files(fleet.model("smoke"), fleet.warehouse, "json").items()
+    assert name == "smoke-1.json"
+    return json.loads(text)
+
+
+def test_the_angles_of_all_drives_are_those_of_score(smoke_root: Path) -> None:
+    fleet = fleet_slip.open(smoke_root)
+    manifest = fleet.model("smoke").manifest
+    program, predictor = compile_program(manifest), Predictor.of(manifest)
+    scale, rows = float(program.angle.scale), 0
+    for file in fleet.warehouse.logs.snapshot().files:
+        for drive in read_drives(fleet.warehouse, file, predictor.plan):
+            angles = angles_of_columns(program, predictor.columns.compute(drive.counts))
+            rounded = np.floor(predictor(drive.counts) / scale + 0.5)
+            assert angles == [None if np.isnan(one) else int(one) for one in rounded]
+            rows += len(angles)
+    assert rows == fleet.warehouse.logs.snapshot().rows
+
+
+def test_the_document_alone_gives_the_angles_of_a_whole_drive(
+    smoke_root: Path, document: Any
+) -> None:
+    fleet = fleet_slip.open(smoke_root)
+    names = [one["name"] for one in document["program"]["signals"]]
+    log = fleet.sql(
+        f"SELECT {', '.join(names)} FROM log_counts WHERE drive_id = 'smoke-2024-05-01-0003' "
+        "ORDER BY tick"
+    ).fetchall()
+    frame = fleet.sql(
+        "SELECT * FROM log WHERE drive_id = 'smoke-2024-05-01-0003' ORDER BY tick"
+    ).pl()
+    predicted = fleet.model("smoke").predict(frame).to_numpy()
+    scale = float(document["program"]["angle"]["scale"])
+    found = plain.angles(document["program"], [], [], log)
+    assert len(found) > 5000
+    assert found == [None if np.isnan(b) else int(np.floor(b / scale + 0.5)) for b in predicted]
+
+
+def test_the_checks_hold_and_begin_with_a_real_drive(document: Any) -> None:
+    names = [check["name"] for check in document["checks"]]
+    assert names == ["drive smoke-2024-05-01-0000", "extremes", "holes", "standstill"]
+    for check in document["checks"]:
+        given = (check["facts"], check["numbers"], check["samples"])
+        assert plain.angles(document["program"], *given) == check["angles"]
+
+
+def test_the_document_proves_what_it_is_of(smoke_root: Path, document: Any) -> None:
+    version = fleet_slip.open(smoke_root).model("smoke")
+    model = document["model"]
+    assert model["reference"] == "smoke@1"
+    assert model["sha256"] == checksum(model["manifest"]) == version.sha256
+    assert model["drives_sha256"] == version.manifest.trained_on.drives_sha256
+    stated = document.pop("sha256")
+    text = canonical_json(document)
+    assert stated == hashlib.sha256(text.encode()).hexdigest()
+    document["sha256"] = stated
+
+
+def test_an_export_is_the_same_again(smoke_root: Path) -> None:
+    fleet = fleet_slip.open(smoke_root)
+    one, other = (export_files(fleet.model("smoke"), fleet.warehouse, "json") for _ in range(2))
+    assert one == other
+
+
+def test_what_cannot_be_exported_is_said(smoke_root: Path, tmp_path: Path) -> None:
+    fleet = fleet_slip.open(smoke_root)
+    with pytest.raises(QuestionError, match="no version"):
+        fleet.export("smoke@9", "json", tmp_path)
+    with pytest.raises(UsageError, match="export to one of json"):
+        fleet.export("smoke", "pascal", tmp_path)  # type: ignore[arg-type]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_command_writes_the_files_and_names_them(
+    smoke_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    target = tmp_path / "new" / "folder"
+    words = ["--root", str(smoke_root), "export", "smoke@1", "--to", "json", "--json"]
+    with pytest.raises(SystemExit) as ended:
+        app([*words, "--output", str(target)])
+    assert ended.value.code == 0
+    (path,) = json.loads(capsys.readouterr().out)["files"]
+    assert json.loads(Path(path).read_text())["model"]["reference"] == "smoke@1"

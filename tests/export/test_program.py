@@ -1,0 +1,79 @@
+"""Programs of published models compute what `score` computes, by an implementation of their own."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fleet_slip.catalogue.columns import Definition
+from fleet_slip.errors import QuestionError
+from fleet_slip.export.checks import angles_by_kernel, make_checks
+from fleet_slip.export.compile import compile_program
+from fleet_slip.export.document import program_content
+from fleet_slip.export.program import Car, Window
+from fleet_slip.models.manifest import Manifest
+from tests.export import plain
+from tests.export.models import DEFINITIONS, cars, drives, model_of, models
+
+
+@settings(max_examples=40)
+@given(models(), cars(), st.data())
+def test_a_fresh_implementation_agrees_with_the_kernel(
+    manifest: Manifest, car: Car, data: st.DataObject
+) -> None:
+    program = compile_program(manifest)
+    samples = data.draw(drives(program))
+    found = plain.angles(
+        program_content(program), list(car.fact_counts(program)), list(car.number_counts(program)),
+        samples,
+    )  # fmt: skip
+    assert found == angles_by_kernel(manifest, program, car, samples)
+
+
+def test_every_kind_of_column_has_an_angle_in_the_checks() -> None:
+    """Else the checks that travel with a program would check nothing of it."""
+    for name in DEFINITIONS:
+        manifest = model_of({name: Fraction(1, 3)})
+        program = compile_program(manifest)
+        checks = make_checks(manifest, program, None)
+        angles = {angle for check in checks for angle in check.angles}
+        assert None in angles, name
+        assert len(angles) > (2 if name == "tyres" else 5), name
+        for check in checks:
+            content = program_content(program)
+            facts, numbers = list(check.facts), list(check.numbers)
+            assert plain.angles(content, facts, numbers, list(check.samples)) == list(check.angles)
+
+
+def test_what_several_columns_are_made_of_is_computed_once() -> None:
+    third = Fraction(1, 3)
+    program = compile_program(model_of(dict.fromkeys(("mean_3", "below", "mean_5", "ay"), third)))
+    assert [one.name for one in program.sources] == ["ay", "wheel_fl"]
+    assert [one.ticks for one in program.sources] == [5, 4]
+    assert len(program.columns) == 5
+
+
+def test_a_running_mean_ends_before_its_sum_overflows() -> None:
+    widest = Window(0, "running_mean", 0, 2**14, 1, 2**19 - 1, 2**19 - 1)
+    twice = 2 * widest.source_limit * widest.numerator
+    assert (twice + 1) * widest.most_values < 2**63 <= (twice + 1) * (widest.most_values + 1)
+    assert widest.most_values > 2**28
+
+
+def test_a_feature_defined_in_two_ways_is_refused() -> None:
+    manifest = model_of({"course": Fraction(1), "heavy": Fraction(1)})
+    other = Definition(of="change", sql="ay", of_bits=18, over="mean", ticks=2)
+    term = manifest.terms[1].model_copy(update={"definition": other})
+    with pytest.raises(QuestionError, match="two ways"):
+        compile_program(manifest.model_copy(update={"terms": (manifest.terms[0], term)}))
+
+
+def test_the_angle_is_rounded_halves_up() -> None:
+    """0.00005 rad for each of ay's counts, 0.001 m/s^2: 5 counts of the angle; halves of 1/2."""
+    program = compile_program(model_of({"ay": Fraction(1, 200)}))
+    assert program.angle.bits > 40
+    assert np.isclose(program.angle.terms[0][1] / 2**program.angle.bits, 0.5)
+    found = plain.angles(program_content(program), [], [], [[-3], [-1], [0], [1], [3]])
+    assert found == [-1, 0, 0, 1, 2]
