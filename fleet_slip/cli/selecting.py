@@ -1,12 +1,13 @@
 """Selecting: the command select, and how a selection is printed."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from typing import Any
 
 import typer
 
 from fleet_slip.api.fleet import Fleet
+from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli.options import selection_options
 from fleet_slip.cli.output import Json, print_json, print_table, say, stdout
@@ -18,6 +19,9 @@ from fleet_slip.selection.request import RequestedSelection, SelectionRequest
 from fleet_slip.selection.search import SearchChoice
 from fleet_slip.selection.uncertainty import Uncertainty
 from fleet_slip.words import number_of
+
+MANY_SIGNALS = 30
+"""Of more, a table names families."""
 
 FIGURES = ("drives", "correlation", "RMSE deg", "mean deg", "std deg", "condition")
 
@@ -106,11 +110,24 @@ def _columns_of(model: CrossValidation, selection: Selection[Any]) -> str:
     """Return a model's signals; of one that a search found, what its size changed."""
     found = selection.searched.models if selection.searched else ()
     if model not in found or model is selection.winner.model:
-        return " ".join(model.signals)
+        return in_families(model.signals)
     before = found[len(model.signals) - 2].signals if len(model.signals) > 1 else ()
     added = [f"+{name}" for name in model.signals if name not in before]
     removed = [f"-{name}" for name in before if name not in model.signals]
     return " ".join([*added, *removed])
+
+
+def in_families(signals: Sequence[str]) -> str:
+    """Return the names of signals; of more than `MANY_SIGNALS`, whole families by their own."""
+    if len(signals) <= MANY_SIGNALS:
+        return " ".join(signals)
+    known = features()
+    shown = {name: name for name in signals}
+    for family in (*known.windows, *known.gates):
+        members = known.members(family)
+        if shown.keys() >= set(members):
+            shown |= dict.fromkeys(members, f"{family}({len(members)})")
+    return f"{len(signals)}: " + " ".join(dict.fromkeys(shown.values()))
 
 
 def _figures(model: CrossValidation) -> list[str]:

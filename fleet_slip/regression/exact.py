@@ -13,7 +13,11 @@ from fleet_slip.regression import rounding
 from fleet_slip.regression.eigenvalues import symmetric_eigenvalues
 from fleet_slip.regression.elimination import Elimination, eliminate
 from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.lifting import solve_by_lifting
 from fleet_slip.words import number_of
+
+MANY_INPUTS = 40
+"""From so many on, lifting is faster than elimination; both give the same fractions."""
 
 Scales = Mapping[str, Fraction]
 """Physical value of one count of each signal: `catalogue()[name].exact_scale`."""
@@ -103,7 +107,10 @@ def fit(gram: Gram, inputs: Sequence[str], label: str, *, intercept: bool = True
     message then names the dependent signals and the exact relation.
     """
     part = gram.restrict([*inputs, label])
-    triangle = eliminate(moments(part, intercept=intercept))
+    matrix = moments(part, intercept=intercept)
+    if len(inputs) >= MANY_INPUTS and (lifted := _lifted(part, matrix, intercept=intercept)):
+        return lifted
+    triangle = eliminate(matrix)
     if triangle.singular is not None:
         raise DataError(dependence(part, inputs, intercept=intercept))
     return fit_leading(part, triangle, len(inputs), intercept=intercept)
@@ -111,21 +118,34 @@ def fit(gram: Gram, inputs: Sequence[str], label: str, *, intercept: bool = True
 
 def fit_leading(gram: Gram, triangle: Elimination, size: int, *, intercept: bool = True) -> Fit:
     """Return the fit of the first `size` inputs of an eliminated Gram (label last)."""
-    inputs, label = gram.signals[:size], gram.signals[-1]
-    part = gram.restrict([*inputs, label])
-    numerators, determinant = triangle.solve(size)
-    coefficients = tuple(Fraction(x, determinant) for x in numerators)
-    scale = gram.n if intercept else 1
+    part = gram.restrict([*gram.signals[:size], gram.signals[-1]])
+    return _fit_of(part, *triangle.solve(size), triangle.residual(size), intercept=intercept)
+
+
+def _lifted(part: Gram, matrix: list[list[int]], *, intercept: bool) -> Fit | None:
+    """Return the same fit from p-adic lifting; None if inputs are linearly dependent."""
+    right = matrix[-1][:-1]
+    solution = solve_by_lifting([row[:-1] for row in matrix[:-1]], right)
+    if solution is None:
+        return None
+    numerators, denominator = solution
+    explained = sum(x * b for x, b in zip(numerators, right, strict=True))
+    residual = matrix[-1][-1] - Fraction(explained, denominator)
+    return _fit_of(part, numerators, denominator, residual, intercept=intercept)
+
+
+def _fit_of(
+    part: Gram, numerators: Sequence[int], denominator: int, residual: Fraction, *, intercept: bool
+) -> Fit:
+    """Return the fit of a Gram (label last) whose equations have this solution and residual."""
+    inputs, label = part.signals[:-1], part.signals[-1]
+    coefficients = tuple(Fraction(x, denominator) for x in numerators)
     offset = Fraction(0)
     if intercept:
         explained = sum(x * s for x, s in zip(numerators, part.sums, strict=False))
-        offset = Fraction(determinant * part.sums[-1] - explained, determinant * gram.n)
-    return Fit(
-        part,
-        LinearModel(inputs, label, coefficients, offset),
-        triangle.residual(size) / scale,
-        intercept,
-    )
+        offset = Fraction(denominator * part.sums[-1] - explained, denominator * part.n)
+    model = LinearModel(inputs, label, coefficients, offset)
+    return Fit(part, model, residual / (part.n if intercept else 1), intercept)
 
 
 def moments(gram: Gram, *, intercept: bool = True) -> list[list[int]]:

@@ -1,6 +1,7 @@
 """Figures of merit from exact sums of predictions and labels."""
 
 import math
+import operator
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
@@ -132,7 +133,7 @@ def error_sums(model: LinearModel, gram: Gram, training_mean: Fraction | None = 
     w0 = int(model.intercept * denominator)
     raw = part.raw()
     linear = sum(b * s for b, s in zip(w, part.sums, strict=False))
-    quadratic = sum(w[i] * w[j] * raw[i][j] for i in range(k) for j in range(k))
+    quadratic = sum(b * sum(map(operator.mul, w, row)) for b, row in zip(w, raw, strict=False))
     cross = sum(w[i] * raw[i][k] for i in range(k))
     y, yy = Fraction(part.sums[k]), Fraction(raw[k][k])
     mean = y / n if training_mean is None else training_mean
