@@ -74,7 +74,7 @@ class Filling(Rooted):
         each: "Callable[[IngestReport], None] | None" = None,
         progress: ShowProgress | None = None,
     ) -> "list[IngestReport]":
-        """Bring measured CSV or Parquet files in through a mapping of columns, units and axes.
+        """Bring measured logs in through a mapping of columns, units and axes.
 
         `mapping` is the name of one that ships, the path of a TOML file, or a `Mapping`. Rows that
         cannot be used go to the view `quarantine` with a reason. Returns a report of each file, in

@@ -117,7 +117,12 @@ def _where_the_time_went(report: "SimulationReport") -> str:
 @record_run
 def ingest(
     context: typer.Context,
-    files: Annotated[list[Path], typer.Argument(help="CSV or Parquet files.", show_default=False)],
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Measured logs: CSV, Parquet, MDF, MATLAB, CAN traces, DuckDB.", show_default=False
+        ),
+    ],
     mapping: Annotated[
         str, typer.Option(help="A mapping of configs/mappings, or the path of a TOML file.")
     ],

@@ -1,4 +1,4 @@
-"""Brings measured logs in: a CSV or Parquet file and a mapping become counts at 100 Hz."""
+"""Brings measured logs in: a file and a mapping become counts at 100 Hz."""
 
 from fleet_slip.ingest.mapping import Mapping, load_mapping
 from fleet_slip.ingest.measured import IngestCounts, MeasuredLog, read_measured

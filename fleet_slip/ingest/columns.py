@@ -33,12 +33,13 @@ def require_columns(file: Path, names: Sequence[str], wanted: Iterable[str]) -> 
                 "Rename all but one."
             )
         if not found:
-            raise InputError(f"{shown(file)}: {_describe_missing(column, names)}")
+            raise InputError(f"{shown(file)}: {describe_missing(column, names)}")
         positions[column] = found[0]
     return positions
 
 
-def _describe_missing(column: str, names: Sequence[str]) -> str:
+def describe_missing(column: str, names: Sequence[str]) -> str:
+    """Return what to say of a column that is not among a file's."""
     folded = {name.casefold(): name for name in names}
     matches = difflib.get_close_matches(column.casefold(), folded, n=3, cutoff=0.6)
     near = [folded[match] for match in matches]

@@ -2,16 +2,20 @@
 
 import csv
 from collections.abc import Iterator, Sequence
-from io import BytesIO
+from contextlib import contextmanager
+from dataclasses import dataclass
+from io import BufferedReader, BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 import polars as pl
+import pyarrow as pa
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import require_columns, shown
-from fleet_slip.ingest.mapping import CsvFormat
+from fleet_slip.ingest.csv_format import CsvFormat
+from fleet_slip.ingest.source import Channel
 
 BLOCK_BYTES = 2**24
 """CSV is parsed in blocks of about this size."""
@@ -22,10 +26,51 @@ EXTRA_FIELDS = "\0extra fields"
 """Column of a CSV batch: what a line has after the header's last column, null if nothing."""
 
 
-def csv_batches(
+COMPRESSED = {b"\x1f\x8b": "gzip", b"\x28\xb5\x2f\xfd": "zstd"}
+"""What compressed files begin with."""
+
+
+@dataclass(frozen=True)
+class CsvSource:
+    """A CSV file, or one that is compressed."""
+
+    file: Path
+    csv_format: CsvFormat
+    has_clock = False
+
+    def channels(self) -> list[Channel]:
+        """Return the columns of the header."""
+        with self.file.open("rb") as stream:
+            names = _csv_header(_decompressed(stream), self.file, self.csv_format)
+        return [Channel(name) for name in names if names.count(name) == 1]
+
+    def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
+        """Yield the named columns as text, and `EXTRA_FIELDS`. Raises `InputError`."""
+        with self.file.open("rb") as stream:
+            yield from _csv_batches(_decompressed(stream), self.file, columns, self.csv_format)
+
+
+@contextmanager
+def open_csv(file: Path, csv_format: CsvFormat) -> Iterator[CsvSource]:
+    """Open a CSV file."""
+    yield CsvSource(file, csv_format)
+
+
+def _decompressed(stream: BinaryIO) -> BinaryIO:
+    """Return the text of a stream, whatever it is compressed with."""
+    start = stream.read(max(map(len, COMPRESSED)))
+    stream.seek(0)
+    for magic, codec in COMPRESSED.items():
+        if start.startswith(magic):
+            # Text is read in blocks: what a small file may become is never in memory at once.
+            plain = pa.CompressedInputStream(stream, codec)
+            return BufferedReader(plain, BLOCK_BYTES)
+    return stream
+
+
+def _csv_batches(
     stream: BinaryIO, file: Path, columns: Sequence[str], csv_format: CsvFormat
 ) -> Iterator[pl.DataFrame]:
-    """Yield the named columns of CSV as text, and `EXTRA_FIELDS`. Raises `InputError`."""
     names = _csv_header(stream, file, csv_format)
     positions = require_columns(file, names, columns)
     # Columns are read by position: Polars renames duplicates. The line of separators before each

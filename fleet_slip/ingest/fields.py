@@ -15,6 +15,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.csv_batches import EXTRA_FIELDS
 from fleet_slip.ingest.mapping import FromColumn, Mapping
+from fleet_slip.ingest.time_bases import DISORDER, HELD
 from fleet_slip.ingest.units import conversion_factor
 
 RAW = "raw "
@@ -26,6 +27,9 @@ REASONS = (
     "out_of_range",
     "extra_fields",
     "no_value",
+    "time_backwards",
+    "time_duplicate",
+    "isolated",
 )
 """What can be wrong with a row by itself; a problem is an index into this."""
 LONGEST_TEXT = 200
@@ -55,13 +59,15 @@ def fields_of(mapping: Mapping, schema: pl.Schema) -> list[Field]:
     """
     fields: list[Field] = []
     if mapping.drive.column is not None:
-        fields.append(_text("drive", mapping.drive.column, schema, mapping))
+        fields.append(_text("drive", held(mapping.drive.column, schema), schema, mapping))
     for name, make in _METADATA.items():
         source = getattr(mapping.drive, name)
         if isinstance(source, FromColumn):
-            fields.append(make(name, source.column, schema, mapping))
-    if mapping.time.column is not None:
-        fields.append(_time(mapping.time.column, schema, mapping))
+            fields.append(make(name, held(source.column, schema), schema, mapping))
+    if mapping.time.key is not None:
+        fields.append(_time(mapping.time.key, schema, mapping))
+        if RAW + DISORDER in schema:
+            fields.append(_disorder(mapping.time.key))
     names = [name for name in catalogue().signals if name in mapping.signals]
     signals = [_signal(name, schema, mapping) for name in names]
     nothing = pl.all_horizontal([pl.col(name).is_null() for name in names])
@@ -76,12 +82,18 @@ def meets_conditions(mapping: Mapping, schema: pl.Schema) -> pl.Expr:
     """Return whether a row meets all of the mapping's conditions. Raises `InputError`."""
     met = pl.lit(value=True)
     for condition in mapping.where:
-        column = pl.col(RAW + condition.column)
+        name = held(condition.column, schema)
+        column = pl.col(RAW + name)
         if condition.one_of:
-            met &= condition.is_met(column, _as_text(condition.column, schema, mapping))
+            met &= condition.is_met(column, _as_text(name, schema, mapping))
         else:
-            met &= condition.is_met(_number(condition.column, schema, mapping)[1], column)
+            met &= condition.is_met(_number(name, schema, mapping)[1], column)
     return met
+
+
+def held(column: str, schema: pl.Schema) -> str:
+    """Return where a column's last value stands, in rows of several time bases."""
+    return HELD + column if RAW + HELD + column in schema else column
 
 
 def find_problems(*cases: tuple[pl.Expr, str]) -> pl.Expr:
@@ -96,6 +108,13 @@ def find_problems(*cases: tuple[pl.Expr, str]) -> pl.Expr:
 
 def _condition(condition: pl.Expr, reason: str, raw: pl.Expr) -> Field:
     return Field("", "condition", raw, raw, find_problems((condition, reason)))
+
+
+def _disorder(time: str) -> Field:
+    """What a file of several time bases says of each row's time among those of its base."""
+    reasons = ("time_backwards", "time_duplicate", "isolated")
+    problem = find_problems(*((pl.col(RAW + DISORDER) == reason, reason) for reason in reasons))
+    return Field("time", "condition", pl.col(RAW + time), pl.col(RAW + time), problem)
 
 
 def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> Field:
@@ -162,7 +181,8 @@ def _day(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Field:
 
 def _time(column: str, schema: pl.Schema, mapping: Mapping) -> Field:
     """Time in s, since 1970 for timestamps."""
-    if mapping.time.unit is None:
+    unit = "s" if mapping.time.own_clock else mapping.time.unit
+    if unit is None:
         return _timestamp(column, schema, mapping)
     raw, number, present = _number(column, schema, mapping)
     value = pl.col("time")
@@ -171,7 +191,7 @@ def _time(column: str, schema: pl.Schema, mapping: Mapping) -> Field:
         (value.is_null(), "missing"),
         (~value.is_finite(), "not_finite"),
     )
-    time_s = number * conversion_factor(mapping.time.unit, "s")
+    time_s = number * conversion_factor(unit, "s")
     return Field("time", "time", raw, time_s, problem)
 
 

@@ -11,9 +11,13 @@ from fleet_slip.canonical import canonical_ascii
 from fleet_slip.catalogue.signals import Identifier, catalogue
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import ConfigError
+from fleet_slip.ingest.can_bus import CanBus, read_can_database
+from fleet_slip.ingest.csv_format import CsvFormat
+from fleet_slip.ingest.duckdb_table import DuckdbRows
 from fleet_slip.ingest.names import Name, PositiveFloat
 from fleet_slip.ingest.row_condition import RowCondition
 from fleet_slip.ingest.signal_column import SignalColumn
+from fleet_slip.ingest.source import OWN_TIME
 from fleet_slip.ingest.units import require_unit
 from fleet_slip.ingest.vehicle_facts import VehicleFacts, read_vehicle_facts
 from fleet_slip.resources import find_config
@@ -25,37 +29,19 @@ class FromColumn(Config):
     column: Name
 
 
-class CsvFormat(Config):
-    """How a CSV file is written. It is always UTF-8, with or without a byte order mark."""
-
-    separator: str = ","
-    decimal_comma: bool = False
-
-    @field_validator("separator")
-    @classmethod
-    def _one_character(cls, separator: str) -> str:
-        if len(separator) != 1 or not separator.isascii() or separator in '"\r\n\0':
-            raise ValueError("must be one ASCII character such as ',', ';' or a tab")
-        return separator
-
-    @model_validator(mode="after")
-    def _unambiguous(self) -> "CsvFormat":
-        if self.decimal_comma and self.separator == ",":
-            raise ValueError("with decimal_comma the separator cannot be ',': set it, often ';'")
-        return self
-
-
 class TimeBase(Config):
     """Where time is from, and which gaps are bridged or end a drive.
 
     Either `column` with a `unit` (numbers) or a `format` (timestamps as text, strftime codes; naive
-    ones are UTC; a Parquet timestamp column needs neither), or `rate_hz` for equally spaced rows.
+    ones are UTC; a Parquet timestamp column needs neither), or `rate_hz` for equally spaced rows,
+    or `own_clock` for a format that says itself when a sample was taken.
     """
 
     column: Name | None = None
     unit: str | None = None
     format: Name | None = None
     rate_hz: Annotated[float, Field(ge=1, le=100_000)] | None = None
+    own_clock: bool = Field(default=False, exclude_if=lambda value: not value)
     longest_gap_s: Annotated[PositiveFloat, Field(le=10)] = 0.1
     """Samples of a signal that lie further apart are not interpolated between."""
     split_gap_s: Annotated[PositiveFloat, Field(le=60)] = 1.0
@@ -70,8 +56,10 @@ class TimeBase(Config):
 
     @model_validator(mode="after")
     def _consistent(self) -> "TimeBase":
-        if (self.column is None) == (self.rate_hz is None):
-            raise ValueError("needs either 'column' or 'rate_hz'")
+        if [self.column is None, self.rate_hz is None, not self.own_clock].count(False) != 1:
+            raise ValueError(
+                "needs either 'column' or 'rate_hz', or 'own_clock' for MDF files and CAN traces"
+            )
         if self.column is None and (self.unit is not None or self.format is not None):
             raise ValueError("'unit' and 'format' describe a column, and there is none")
         if self.unit is not None and self.format is not None:
@@ -84,6 +72,16 @@ class TimeBase(Config):
             except ValueError as error:
                 raise ValueError(f"{self.column} {error}") from None
         return self
+
+    @property
+    def is_dated(self) -> bool:
+        """Whether times can tell the day."""
+        return self.unit is None and self.rate_hz is None
+
+    @property
+    def key(self) -> str | None:
+        """The column that has the times of a batch, None if the rows are equally spaced."""
+        return OWN_TIME if self.own_clock else self.column
 
 
 class DriveMetadata(Config):
@@ -101,7 +99,7 @@ class DriveMetadata(Config):
 
 
 def _is_empty(value: object) -> bool:
-    return value == ()
+    return value in ((), None)
 
 
 class Mapping(Config):
@@ -111,6 +109,8 @@ class Mapping(Config):
     missing: tuple[str, ...] = ()
     """Texts that mean "no value", besides the empty one; `nan` also clears NaN in binary files."""
     csv: CsvFormat = CsvFormat()
+    can: CanBus | None = Field(default=None, exclude_if=_is_empty)
+    duckdb: DuckdbRows | None = Field(default=None, exclude_if=_is_empty)
     time: TimeBase
     drive: DriveMetadata
     signals: dict[str, SignalColumn] = Field(min_length=1)
@@ -133,7 +133,7 @@ class Mapping(Config):
 
     @model_validator(mode="after")
     def _day_is_known(self) -> "Mapping":
-        if self.drive.day is None and (self.time.unit is not None or self.time.rate_hz is not None):
+        if self.drive.day is None and not self.time.is_dated:
             raise ValueError("drive.day is needed: the time has no date. Give a date or a column")
         return self
 
@@ -143,12 +143,29 @@ class Mapping(Config):
             raise ValueError("drive.vehicle_model is needed, or 'vehicles', a table of the cars")
         return self
 
-    def columns(self) -> list[str]:
-        """Return the names of all columns of a file that the mapping uses, each once."""
+    @model_validator(mode="after")
+    def _times_are_numbers(self) -> "Mapping":
+        for name, signal in self.signals.items():
+            if signal.time is not None and self.time.unit is None:
+                raise ValueError(f"signals.{name}: 'time' needs [time] with 'column' and 'unit'")
+        return self
+
+    def time_bases(self) -> dict[str | None, list[str]]:
+        """Return the columns that the mapping uses, each once, by the column of their times."""
+        bases = {self.time.column: [self.time.column, *self.common_columns()]}
+        for signal in self.signals.values():
+            time = self.time.column if signal.time is None else signal.time
+            bases.setdefault(time, [time]).append(signal.column)
+        return {
+            time: list(dict.fromkeys(name for name in names if name is not None))
+            for time, names in bases.items()
+        }
+
+    def common_columns(self) -> list[str]:
+        """Return the columns that say something of all signals: of the drive, and conditions."""
         metadata = (getattr(self.drive, name) for name in DriveMetadata.model_fields)
-        names = [self.time.column, self.drive.column]
+        names = [self.drive.column]
         names += [source.column for source in metadata if isinstance(source, FromColumn)]
-        names += [signal.column for signal in self.signals.values()]
         names += [condition.column for condition in self.where]
         return list(dict.fromkeys(name for name in names if name is not None))
 
@@ -178,7 +195,10 @@ def load_mapping(name_or_path: str) -> Mapping:
     """Load a mapping by name from `configs/mappings`, or by path. Raises `ConfigError`."""
     file = find_config("mappings", name_or_path)
     mapping = load_config(file, Mapping)
+    folder = Path(str(file)).parent
     if isinstance(mapping.vehicles, str):
-        facts = read_vehicle_facts(Path(str(file)).parent / mapping.vehicles)
+        facts = read_vehicle_facts(folder / mapping.vehicles)
         mapping = mapping.model_copy(update={"vehicles": facts})
+    if mapping.can is not None:
+        mapping = mapping.model_copy(update={"can": read_can_database(mapping.can, folder)})
     return mapping

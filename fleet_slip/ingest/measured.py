@@ -8,17 +8,20 @@ from pathlib import Path
 import polars as pl
 import pyarrow as pa
 
+from fleet_slip.canonical import canonical_ascii
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import shown
 from fleet_slip.ingest.fields import RAW, Field, fields_of, meets_conditions
 from fleet_slip.ingest.look_alikes import find_look_alikes
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.measured_drives import cut, drive_id, log_table, to_ticks
+from fleet_slip.ingest.parquet_batches import partition_keys
 from fleet_slip.ingest.quarantine import DriveKeys, check_rows, with_values
 from fleet_slip.ingest.reading import MAX_ROWS, file_digest, read_batches, require_unchanged_file
 from fleet_slip.ingest.resampling import STEP_S
 from fleet_slip.ingest.row_condition import describe
-from fleet_slip.ingest.timebase import cut_into_drives, sample_interval_s
+from fleet_slip.ingest.source import BASE
+from fleet_slip.ingest.timebase import cut_into_drives, sample_intervals_s
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA
 from fleet_slip.words import number_of
 
@@ -65,9 +68,10 @@ class MeasuredLog:
 
 
 def read_measured(file: Path, mapping: Mapping) -> MeasuredLog:
-    """Read a CSV or Parquet file through a mapping.
+    """Read a file through a mapping.
 
-    The result depends on the file's bytes and the mapping only, not on its path; drives are called
+    The result depends on the file's bytes and the mapping only, not on its path (but for keys in
+    the names of folders, `car=A7`, that the mapping uses); drives are called
     `<mapping>-<digest>-<number>`, and `-2`, `-3` … follow where a gap in time cut one.
 
     Raises `InputError` if the file cannot be read, is not what the mapping says, or has no usable
@@ -81,19 +85,21 @@ def read_measured(file: Path, mapping: Mapping) -> MeasuredLog:
     _require_usable(file, mapping, rows, bad)
 
     prefix = f"{mapping.name}-{digest[:12]}"
-    interval_s = sample_interval_s(rows)
+    intervals_s = sample_intervals_s(rows)
     drives = cut(rows, prefix, keys.metadata())
-    ticked = [to_ticks(rows[drive.rows], mapping, interval_s) for drive in drives]
+    ticked = [to_ticks(rows[drive.rows], mapping, intervals_s) for drive in drives]
     try:
         table = log_table(drives, ticked, mapping)
     except InputError as error:
         raise InputError(f"{shown(file)}: {error}") from None
     if not table.num_rows:
         raise InputError(
-            f"{shown(file)}: its rows are {interval_s:g} s apart and none is on a tick of 100 Hz; "
-            f"longest_gap_s = {mapping.time.longest_gap_s:g} forbids to interpolate. "
-            f"Raise it in the mapping {mapping.name!r} if the signals change slowly enough."
+            f"{shown(file)}: its rows are {min(intervals_s.values()):g} s apart and none is on a "
+            f"tick of 100 Hz; longest_gap_s = {mapping.time.longest_gap_s:g} forbids to "
+            f"interpolate. Raise it in the mapping {mapping.name!r} if the signals change slowly "
+            "enough."
         )
+    _require_no_signal_lost(file, mapping, rows, table)
     counts = IngestCounts(
         rows_read=read.rows,
         rows_left_out=read.left_out,
@@ -110,6 +116,9 @@ def read_measured(file: Path, mapping: Mapping) -> MeasuredLog:
 
 def _identity(file: Path, mapping: Mapping) -> str:
     digest = file_digest(file)
+    used = {name for names in mapping.time_bases().values() for name in names}
+    if keys := {key: text for key, text in partition_keys(file).items() if key in used}:
+        digest.update(canonical_ascii(keys).encode())
     digest.update(mapping.canonical_json().encode())
     return digest.hexdigest()
 
@@ -130,7 +139,7 @@ def _check(file: Path, mapping: Mapping) -> tuple[pl.DataFrame, pl.DataFrame, Dr
     keys = DriveKeys(fields)
     read = _Read()
     meeting = pl.lit(value=True)
-    for batch in read_batches(file, mapping.columns(), mapping.csv):
+    for batch in read_batches(file, mapping):
         raw = batch.select(pl.all().name.prefix(RAW))
         if not read.rows:
             try:
@@ -141,6 +150,7 @@ def _check(file: Path, mapping: Mapping) -> tuple[pl.DataFrame, pl.DataFrame, Dr
             keys = DriveKeys(fields)
         row = pl.int_range(read.rows + 1, read.rows + batch.height + 1, dtype=pl.Int64)
         raw = raw.with_columns(row.alias("row")).filter(meeting)
+        raw = raw.rename({RAW + BASE: "base"}, strict=False)
         read.rows += batch.height
         read.left_out += batch.height - raw.height
         valued = with_values(raw, fields)
@@ -185,6 +195,21 @@ def _require_usable(file: Path, mapping: Mapping, rows: pl.DataFrame, bad: pl.Da
             f"{shown(file)}: its drives last {ticks:,.0f} ticks of 100 Hz, at most {MAX_TICKS:,} "
             f"are read. Check the unit of time and split_gap_s in the mapping {mapping.name!r}."
         )
+
+
+def _require_no_signal_lost(
+    file: Path, mapping: Mapping, rows: pl.DataFrame, table: pa.Table
+) -> None:
+    """Raise `InputError` for a signal that the file has and no tick: it would be gone unseen."""
+    for name, source in mapping.signals.items():
+        samples = rows.height - rows[name].null_count()
+        if samples and table[name].null_count == table.num_rows:
+            raise InputError(
+                f"{shown(file)}: {name} has {number_of(samples, 'value')} in {source.column!r}, "
+                "and none is on a tick of 100 Hz: they are further apart than longest_gap_s. Give "
+                f"the signal in the mapping {mapping.name!r} a longest_gap_s of its own, or "
+                "interpolate = false."
+            )
 
 
 def _quarantine_table(

@@ -1,7 +1,7 @@
 """Makes drives of checked rows: their names, their ticks and counts, their Arrow table."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date
 from functools import partial
 from typing import Any
@@ -16,10 +16,19 @@ from fleet_slip.catalogue.counts import round_to_counts
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.mapping import FromColumn, Mapping
-from fleet_slip.ingest.resampling import Method, build_resampler, choose_method
+from fleet_slip.ingest.resampling import (
+    SNAP_TOLERANCE_S,
+    STEP_S,
+    Method,
+    Resampler,
+    build_resampler,
+    choose_method,
+)
 
 SOURCE = "measured"
 _SECONDS_PER_DAY = 86_400
+_EARLIEST_S = 10**8
+"""Times before 1973 are counted from the start of a recording, not from 1970."""
 _FROM_MAPPING = ("vehicle_id", "vehicle_model", "track", "mass_kg", "adhesion", "day")
 
 
@@ -62,20 +71,24 @@ def cut(rows: pl.DataFrame, prefix: str, metadata: Sequence[dict[str, Any]]) -> 
     return sorted(drives, key=lambda drive: drive.drive_id)
 
 
-def to_ticks(rows: pl.DataFrame, mapping: Mapping, interval_s: float) -> Ticked:
+def to_ticks(rows: pl.DataFrame, mapping: Mapping, intervals_s: dict[int, float]) -> Ticked:
     """Bring one drive's signals, SI units at times in s, to counts at 100 Hz.
 
-    Ticks at which no signal has a value are left out.
+    Ticks at which no signal has a value are left out. `intervals_s` are the usual times between
+    the samples of each time base.
     """
     start_s = float(rows["time"][0])
-    time_s = rows["time"].to_numpy() - start_s
-    method = choose_method(time_s, interval_s)
-    resampler = build_resampler(time_s, method, mapping.time.longest_gap_s)
-    ticks = resampler.ticks
+    resampler = _build_resampler(rows["time"].to_numpy() - start_s, intervals_s)
+    method, ticks = resampler.method, resampler.ticks
     counts, somewhere = {}, np.zeros(ticks.size, dtype=np.bool_)
     for name, source in mapping.signals.items():
-        values = rows[name].to_numpy().astype(np.float64)
-        bring = resampler.resample if source.interpolate else resampler.place
+        samples, own = rows, resampler
+        if len(intervals_s) > 1:
+            samples = rows.filter(pl.col(name).is_not_null())
+            own = _on_own_times(samples, start_s, resampler, intervals_s)
+        values = samples[name].to_numpy().astype(np.float64)
+        longest = source.longest_gap_s or mapping.time.longest_gap_s
+        bring = partial(own.resample, longest_gap_s=longest) if source.interpolate else own.place
         resample = partial(bring, delay_s=source.delay_s)
         between_samples = (method != "snap" or source.delay_s) and source.interpolate
         angle = between_samples and name == catalogue().label
@@ -86,6 +99,24 @@ def to_ticks(rows: pl.DataFrame, mapping: Mapping, interval_s: float) -> Ticked:
     if not somewhere.all():
         counts = {name: array.filter(pa.array(somewhere)) for name, array in counts.items()}
     return Ticked(method, start_s, ticks[somewhere].astype(np.int32), counts)
+
+
+def _build_resampler(time_s: FloatArray, intervals_s: dict[int, float]) -> Resampler:
+    """Return what says the ticks of a drive, and brings its signals there if they share times."""
+    if len(intervals_s) == 1:
+        (interval_s,) = intervals_s.values()
+        return build_resampler(time_s, choose_method(time_s, interval_s))
+    return build_resampler(time_s, "interpolate")
+
+
+def _on_own_times(
+    samples: pl.DataFrame, start_s: float, ticks: Resampler, intervals_s: dict[int, float]
+) -> Resampler:
+    """Return what brings the samples of one time base of several onto a drive's ticks."""
+    interval_s = intervals_s[samples["base"][0]] if len(samples) else STEP_S
+    fast = interval_s < STEP_S - SNAP_TOLERANCE_S
+    time_s = samples["time"].to_numpy() - start_s
+    return replace(ticks, time_s=time_s, method="average" if fast else "interpolate")
 
 
 def _on_the_circle(resample: Callable[[FloatArray], FloatArray], angle: FloatArray) -> FloatArray:
@@ -121,10 +152,12 @@ def log_table(
 
 
 def _metadata(drive: MeasuredDrive, ticked: Ticked, mapping: Mapping) -> dict[str, Any]:
-    """Return what is known of a drive, by column of `logs`."""
+    """Return what is known of a drive, by column of `logs`. Raises `InputError`."""
     given = {name: getattr(mapping.drive, name) for name in _FROM_MAPPING}
     known = {name: value for name, value in given.items() if not isinstance(value, FromColumn)}
-    if given["day"] is None:  # then time is in timestamps
+    if given["day"] is None:  # then time is in timestamps, or those of the file's own clock
+        if mapping.time.own_clock and ticked.start_s < _EARLIEST_S:
+            raise InputError("its clock does not tell the date. Give it in the mapping: drive.day.")
         known["day"] = date.fromordinal(
             date(1970, 1, 1).toordinal() + int(ticked.start_s // _SECONDS_PER_DAY)
         )

@@ -1,9 +1,11 @@
 """Reads Parquet in batches: text, numbers as float64, dates and timestamps."""
 
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from datetime import date
 from pathlib import Path
 from typing import BinaryIO
+from urllib.parse import unquote
 
 import polars as pl
 import pyarrow as pa
@@ -12,6 +14,7 @@ import pyarrow.parquet as pq
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import require_columns, shown
+from fleet_slip.ingest.source import Channel
 
 BATCH_ROWS = 2**17
 """Parquet is read in batches of this many rows."""
@@ -26,13 +29,52 @@ _FIRST_DAY = date.min.toordinal() - date(1970, 1, 1).toordinal()
 _END_DAY = date.max.toordinal() + 1 - date(1970, 1, 1).toordinal()
 
 
-def parquet_batches(
+class ParquetSource:
+    """An open Parquet file. Keys in the names of its folders, `car=A7`, are columns of text."""
+
+    has_clock = False
+
+    def __init__(self, file: Path, stream: BinaryIO, max_rows: int) -> None:
+        """Take the file's path, its bytes, and how many rows are read at most."""
+        _require_sane_footer(stream, file)
+        self._file, self._stream, self._max_rows = file, stream, max_rows
+        self._schema = pq.ParquetFile(stream).schema_arrow
+        self._keys = {
+            name: text
+            for name, text in partition_keys(file).items()
+            if name not in self._schema.names
+        }
+
+    def channels(self) -> list[Channel]:
+        """Return the columns."""
+        return [Channel(name) for name in (*self._schema.names, *self._keys)]
+
+    def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
+        """Yield rows. Raises `InputError`."""
+        require_columns(self._file, [*self._schema.names, *self._keys], columns)
+        inside = [name for name in columns if name not in self._keys]
+        keys = [pl.lit(self._keys[name]).alias(name) for name in columns if name in self._keys]
+        for batch in _parquet_batches(self._stream, self._file, inside, self._max_rows):
+            yield batch.with_columns(keys)
+
+
+@contextmanager
+def open_parquet(file: Path, max_rows: int) -> Iterator[ParquetSource]:
+    """Open a Parquet file. Raises `InputError`."""
+    with file.open("rb") as stream:
+        yield ParquetSource(file, stream, max_rows)
+
+
+def partition_keys(file: Path) -> dict[str, str]:
+    """Return what the folders above a file say of it, as Hive writes it: `key=value`."""
+    named = (part.partition("=") for part in file.parts[:-1])
+    return {key: unquote(text) for key, equals, text in named if key and equals}
+
+
+def _parquet_batches(
     stream: BinaryIO, file: Path, columns: Sequence[str], max_rows: int
 ) -> Iterator[pl.DataFrame]:
-    """Yield the named columns of Parquet. Raises `InputError`."""
-    _require_sane_footer(stream, file)
     schema = pq.ParquetFile(stream).schema_arrow
-    require_columns(file, schema.names, columns)
     texts = [name for name in columns if _is_text(schema.field(name).type)]
     parquet = pq.ParquetFile(stream, read_dictionary=texts, page_checksum_verification=True)
     if parquet.metadata.num_rows > max_rows:
@@ -41,7 +83,7 @@ def parquet_batches(
             "Split the file."
         )
     for batch in parquet.iter_batches(BATCH_ROWS, columns=list(columns)):
-        plain = {name: _plain(batch.column(name), name, file) for name in columns}
+        plain = {name: plain_column(batch.column(name), name, file) for name in columns}
         yield pl.DataFrame(pa.table(plain))
 
 
@@ -67,7 +109,7 @@ def _is_text(arrow_type: pa.DataType) -> bool:
     return bool(pa.types.is_string(arrow_type) or pa.types.is_large_string(arrow_type))
 
 
-def _plain(array: pa.Array, name: str, file: Path) -> pa.Array:
+def plain_column(array: pa.Array, name: str, file: Path) -> pa.Array:
     """Return a column as text, float64, date or timestamp. Raises `InputError` for others."""
     array.validate(full=True)  # what Parquet calls text need not be UTF-8, and Polars trusts it
     if pa.types.is_dictionary(array.type):

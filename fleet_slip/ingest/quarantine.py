@@ -47,13 +47,15 @@ def with_values(batch: pl.DataFrame, fields: list[Field]) -> pl.DataFrame:
 def check_rows(batch: pl.DataFrame, fields: list[Field]) -> tuple[pl.DataFrame, pl.DataFrame]:
     """Split a batch that has the fields' values and the columns `row` and `group`.
 
-    Returns the good rows, with `row`, `group`, the time and the signals in SI units; and the bad
-    ones, with `row`, `group`, `reason`, `signal` and `value`. The first problem of a row counts.
+    Returns the good rows, with `row`, `group`, `base` if there are several, the time and the
+    signals in SI units; and the bad ones, with `row`, `group`, `reason`, `signal` and `value`. The
+    first problem of a row counts.
     """
     codes = [field.problem + len(REASONS) * i for i, field in enumerate(fields)]
     checked = batch.with_columns(pl.coalesce(codes).alias(_PROBLEM))
     values = [field.name for field in fields if field.kind in {"time", "signal"}]
-    good = checked.filter(pl.col(_PROBLEM).is_null()).select("row", "group", *values)
+    kept = ["row", "group", *({"base"} & set(batch.columns)), *values]
+    good = checked.filter(pl.col(_PROBLEM).is_null()).select(kept)
     bad = checked.filter(pl.col(_PROBLEM).is_not_null())
     explained = [_explain(rows, fields) for rows in bad.partition_by(_PROBLEM)]
     return good, pl.concat([no_rows(), *explained])

@@ -1,28 +1,47 @@
-"""Reads CSV and Parquet files from strangers in bounded batches, and names what is wrong with them.
+"""Opens measured files of any format, and reads them in bounded batches.
 
-A batch is a Polars frame with the columns that were asked for: text (CSV, text in Parquet), 64-bit
-floats, dates or timestamps. CSV fields stay text, so that what is not a number can be quarantined
-as it was written.
+What a file is, its first bytes say; only what is text goes by the mapping and the name. A batch is
+a Polars frame with the columns that a mapping uses: text (CSV, text in Parquet), 64-bit floats,
+dates or timestamps. CSV fields stay text, so that what is not a number can be quarantined as it was
+written.
 """
 
 import hashlib
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from io import BufferedReader
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import TypeVar
 
 import polars as pl
 import pyarrow as pa
 
 from fleet_slip.errors import InputError
+from fleet_slip.ingest.can_trace import open_can_trace
 from fleet_slip.ingest.columns import shown
-from fleet_slip.ingest.csv_batches import BLOCK_BYTES, csv_batches
-from fleet_slip.ingest.mapping import CsvFormat
-from fleet_slip.ingest.parquet_batches import PARQUET_MAGIC, parquet_batches
+from fleet_slip.ingest.csv_batches import open_csv
+from fleet_slip.ingest.duckdb_table import MAGIC as DUCKDB_MAGIC
+from fleet_slip.ingest.duckdb_table import MAGIC_AT as DUCKDB_AT
+from fleet_slip.ingest.duckdb_table import open_duckdb
+from fleet_slip.ingest.mapping import Mapping
+from fleet_slip.ingest.matlab import HDF5_AT, HDF5_MAGIC, MAT5_MAGIC, open_mat, open_mat73
+from fleet_slip.ingest.mdf import MAGICS as MDF_MAGICS
+from fleet_slip.ingest.mdf import open_mdf
+from fleet_slip.ingest.parquet_batches import BATCH_ROWS, PARQUET_MAGIC, open_parquet
+from fleet_slip.ingest.source import BASE, Source
+from fleet_slip.ingest.time_bases import merge_bases
 
-COMPRESSED = {b"\x1f\x8b": "gzip", b"\x28\xb5\x2f\xfd": "zstd"}
-"""What compressed files begin with."""
+BLF_MAGIC = b"LOGG"
+_ARCHIVES = {b"PK\x03\x04": "unzip", b"7z\xbc\xaf": "7z x", b"Rar!": "unrar x"}
+_BINARY = {
+    (".parquet", ".pq"): "a Parquet file",
+    (".mf4", ".mdf"): "an MDF file",
+    (".mat", ".h5", ".hdf5"): "a MATLAB file of version 5 or 7.3",
+    (".duckdb", ".ddb"): "a DuckDB file",
+}
+_CLOCK = "this format says when each sample was taken: write own_clock = true under [time]"
+_NO_CLOCK = "this format has no clock of its own: write column or rate_hz under [time]"
+
+Told = TypeVar("Told")
 
 MAX_ROWS = 20_000_000
 """Rows of one file: 55 hours at 100 Hz. All of them are in memory once, as float64."""
@@ -33,7 +52,7 @@ def require_unchanged_file(file: Path) -> Iterator[None]:
     """Raise `InputError` if this is no regular file, or if it is written to while it is read."""
     if not file.is_file():
         what = "is not a regular file" if file.exists() else "no such file"
-        raise InputError(f"{shown(file)}: {what}. Give the path of a CSV or Parquet file.")
+        raise InputError(f"{shown(file)}: {what}. Give the path of a file.")
     with _file_errors(file):
         before = file.stat()
     yield
@@ -49,44 +68,105 @@ def file_digest(file: Path) -> "hashlib._Hash":
         return hashlib.file_digest(stream, "sha256")
 
 
-def read_batches(
-    file: Path, columns: Sequence[str], csv_format: CsvFormat
-) -> Iterator[pl.DataFrame]:
-    """Yield the named columns of a CSV or Parquet file, in the file's order, in bounded batches.
+def read_batches(file: Path, mapping: Mapping) -> Iterator[pl.DataFrame]:
+    """Yield the columns of a file that a mapping uses, in the file's order, in bounded batches.
 
     Raises `InputError` if the file cannot be read, a column is missing or ambiguous, or the file
     is larger than the limits of this module.
     """
     rows = 0
-    with _file_errors(file), file.open("rb") as stream:
-        binary = stream.read(len(PARQUET_MAGIC)) == PARQUET_MAGIC
-        stream.seek(0)
-        if not binary and file.suffix.lower() in {".parquet", ".pq"}:
-            raise InputError(
-                f"{shown(file)}: not a Parquet file. Export it again, or name it .csv."
-            )
-        batches = (
-            parquet_batches(stream, file, columns, MAX_ROWS)
-            if binary
-            else csv_batches(_decompressed(stream), file, columns, csv_format)
-        )
-        for batch in batches:
+    with _file_errors(file), open_source(file, mapping) as source:
+        for batch in _one_table(source, file, mapping):
             rows += batch.height
             if rows > MAX_ROWS:
                 raise InputError(f"{shown(file)}: more than {MAX_ROWS:,} rows. Split the file.")
             yield batch
 
 
-def _decompressed(stream: BinaryIO) -> BinaryIO:
-    """Return the text of a stream, whatever it is compressed with."""
-    start = stream.read(max(map(len, COMPRESSED)))
-    stream.seek(0)
-    for magic, codec in COMPRESSED.items():
+def _one_table(source: Source, file: Path, mapping: Mapping) -> Iterator[pl.DataFrame]:
+    """Yield the rows of all time bases as those of one table."""
+    time, bases = mapping.time.key, mapping.time_bases()
+    if source.has_clock != mapping.time.own_clock:
+        raise InputError(
+            f"{shown(file)}: {_CLOCK if source.has_clock else _NO_CLOCK}, in the mapping "
+            f"{mapping.name!r}."
+        )
+    if time is None or (len(bases) == 1 and not source.has_clock):
+        (columns,) = bases.values()
+        yield from source.batches(columns)
+        return
+    tables = (
+        table if source.has_clock else _with_times(table, own, time)
+        for own, columns in bases.items()
+        for table in source.batches(columns)
+    )
+    try:
+        merged = merge_bases(tables, time, mapping.common_columns(), mapping.time.split_gap_s)
+    except InputError as error:
+        raise InputError(f"{shown(file)}: {error}") from None
+    yield from merged.iter_slices(BATCH_ROWS)
+
+
+def _with_times(table: pl.DataFrame, own: str | None, time: str) -> pl.DataFrame:
+    """Name a base by the column of its times, and call these as all times are called."""
+    base = str(own)
+    if own != time:
+        table = table.filter(pl.col(base).is_not_null()).rename({base: time})
+    return table.with_columns(pl.lit(base).alias(BASE))
+
+
+@contextmanager
+def open_source(file: Path, mapping: Mapping) -> Iterator[Source]:
+    """Open a file, in the format that its first bytes and the mapping tell. Raises `InputError`."""
+    with file.open("rb") as stream:
+        start = stream.read(HDF5_AT + len(HDF5_MAGIC))
+    for magic, program in _ARCHIVES.items():
         if start.startswith(magic):
-            # Text is read in blocks: what a small file may become is never in memory at once.
-            plain = pa.CompressedInputStream(stream, codec)
-            return BufferedReader(plain, BLOCK_BYTES)
-    return stream
+            raise InputError(
+                f"{shown(file)}: it is an archive. Unpack it with {program} and give the files."
+            )
+    with _opened(file, start, mapping) as source:
+        yield source
+
+
+def _opened(file: Path, start: bytes, mapping: Mapping) -> AbstractContextManager[Source]:
+    for is_it, open_it in _FORMATS:
+        if is_it(start):
+            return open_it(file)
+    if start[DUCKDB_AT:].startswith(DUCKDB_MAGIC):
+        return open_duckdb(file, _wanted(mapping.duckdb, file, "duckdb", 'table = "…"', mapping))
+    suffix = file.suffix.lower()
+    if mapping.can is not None or start.startswith(BLF_MAGIC) or suffix in {".blf", ".asc"}:
+        return open_can_trace(
+            file, _wanted(mapping.can, file, "can", 'database = "….dbc"', mapping)
+        )
+    for suffixes, kind in _BINARY.items():
+        if suffix in suffixes:
+            raise InputError(
+                f"{shown(file)}: not {kind}, whatever its name says. Export it again, or name it "
+                "as what it is."
+            )
+    return open_csv(file, mapping.csv)
+
+
+def _wanted(told: Told | None, file: Path, table: str, key: str, mapping: Mapping) -> Told:
+    """Return what the mapping says of a format that needs it. Raises `InputError`."""
+    if told is None:
+        raise InputError(
+            f"{shown(file)}: this format needs [{table}] with {key} in the mapping "
+            f"{mapping.name!r}."
+        )
+    return told
+
+
+_FORMATS: tuple[
+    tuple[Callable[[bytes], bool], Callable[[Path], AbstractContextManager[Source]]], ...
+] = (
+    (lambda start: start.startswith(PARQUET_MAGIC), lambda file: open_parquet(file, MAX_ROWS)),
+    (lambda start: start.startswith(MDF_MAGICS), open_mdf),
+    (lambda start: start.startswith(MAT5_MAGIC), open_mat),
+    (lambda start: HDF5_MAGIC in (start[: len(HDF5_MAGIC)], start[HDF5_AT:]), open_mat73),
+)
 
 
 @contextmanager

@@ -45,19 +45,22 @@ class Resampler:
 
     Attributes:
         ticks: the drive's ticks, shape (n_ticks,).
+        at_s: their times.
     """
 
     time_s: FloatArray
     method: Method
-    longest_gap_s: float
     ticks: IntArray
+    at_s: FloatArray
 
-    def resample(self, values: FloatArray, delay_s: float = 0.0) -> FloatArray:
+    def resample(
+        self, values: FloatArray, delay_s: float = 0.0, longest_gap_s: float = 0.1
+    ) -> FloatArray:
         """Return a signal on the ticks; what was measured at t stands in the file at t + delay."""
         if self.method == "snap" and not delay_s:
             return values
         resample = average if self.method == "average" else interpolate
-        return resample(self.time_s - delay_s, values, self._at_s, self.longest_gap_s)
+        return resample(self.time_s - delay_s, values, self.at_s, longest_gap_s)
 
     def place(self, values: FloatArray, delay_s: float = 0.0) -> FloatArray:
         """Return a signal with each sample at the tick nearest to it, NaN at the other ticks.
@@ -65,24 +68,21 @@ class Resampler:
         Of several samples nearest to one tick the last stays.
         """
         present = np.flatnonzero(~np.isnan(values))
-        nearest = np.rint((self.time_s[present] - delay_s - self._at_s[0]) / STEP_S)
+        nearest = np.rint((self.time_s[present] - delay_s - self.at_s[0]) / STEP_S)
         place = np.searchsorted(self.ticks, nearest)
         found = np.isin(nearest, self.ticks)
         placed = np.full(self.ticks.size, np.nan)
         placed[place[found]] = values[present[found]]
         return placed
 
-    @property
-    def _at_s(self) -> FloatArray:
-        if self.method == "snap":
-            return np.asarray(self.time_s[0] + self.ticks * STEP_S, dtype=np.float64)
-        return tick_times(self.time_s, self.method)
 
-
-def build_resampler(time_s: FloatArray, method: Method, longest_gap_s: float) -> Resampler:
+def build_resampler(time_s: FloatArray, method: Method) -> Resampler:
     """Return what brings signals at these times onto the ticks of their drive."""
-    ticks = snap(time_s) if method == "snap" else np.arange(tick_times(time_s, method).size)
-    return Resampler(time_s, method, longest_gap_s, ticks)
+    if method == "snap":
+        ticks = snap(time_s)
+        return Resampler(time_s, method, ticks, time_s[0] + ticks * STEP_S)
+    at_s = tick_times(time_s, method)
+    return Resampler(time_s, method, np.arange(at_s.size), at_s)
 
 
 def snap(time_s: FloatArray) -> IntArray:

@@ -64,6 +64,12 @@ class SignalColumn(Config):
     """How much later than it happened a value stands in the file."""
     interpolate: bool = Field(default=True, exclude_if=bool)
     """False: samples stand at the nearest tick, and ticks between them have no value."""
+    longest_gap_s: Annotated[FiniteFloat, Field(gt=0, le=10)] | None = Field(
+        default=None, exclude_if=_absent
+    )
+    """Instead of the mapping's, for a signal with a rate of its own."""
+    time: Name | None = Field(default=None, exclude_if=_absent)
+    """The column of this signal's times, where the file has several, in the unit of the others."""
 
     @model_validator(mode="after")
     def _gain_is_something(self) -> "SignalColumn":

@@ -51,7 +51,7 @@ def test_a_mapping_without_a_radius_says_nothing_of_one(tmp_path: Path) -> None:
 
 def test_columns_are_listed_once(tmp_path: Path) -> None:
     text = GOOD.replace('"m" }', '{ column = "a" }, column = "run" }')
-    assert load(tmp_path, text).columns() == ["t", "run", "a", "steer_fl_deg"]
+    assert load(tmp_path, text).time_bases() == {"t": ["t", "run", "a", "steer_fl_deg"]}
 
 
 def test_canonical_json_does_not_depend_on_the_layout(tmp_path: Path) -> None:

@@ -81,7 +81,7 @@ def test_a_slow_sensor_can_stay_as_slow_as_it_is(tmp_path: Path) -> None:
 def test_placing_keeps_values_and_invents_none(steps: list[float], delay_s: float) -> None:
     time_s = np.cumsum(steps)
     values = np.arange(1.0, time_s.size + 1)
-    resampler = build_resampler(time_s, "interpolate", 0.1)
+    resampler = build_resampler(time_s, "interpolate")
     placed = resampler.place(values, delay_s)
     kept = placed[np.isfinite(placed)]
     assert placed.shape == resampler.ticks.shape

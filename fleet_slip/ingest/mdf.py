@@ -1,0 +1,132 @@
+"""Reads ASAM MDF, versions 2 to 4, through asammdf: each channel group is a time base."""
+
+import logging
+import traceback
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from fleet_slip.errors import InputError
+from fleet_slip.ingest.columns import describe_missing, shown
+from fleet_slip.ingest.source import BASE, OWN_TIME, Channel, as_column, reading_with
+
+MAGICS = (b"MDF     ", b"UnFinMF ")
+_TIME_SYNC = 1
+_EARLIEST_S = 10**8
+"""A start before 1973 is none: loggers without a clock write 0."""
+
+
+class MdfSource:
+    """An open MDF file. A channel of several groups is named `CHANNEL@GROUP`."""
+
+    has_clock = True
+
+    def __init__(self, file: Path, mdf: Any) -> None:
+        """Take the file's path and what asammdf has opened."""
+        self._file, self._mdf = file, mdf
+        start = mdf.start_time.timestamp()
+        self._start_s = start if start > _EARLIEST_S else 0.0
+
+    def channels(self) -> list[Channel]:
+        """Return all channels but the groups' masters."""
+        return [
+            Channel(self._name(channel.name, number), channel.unit or "", f"group {number}")
+            for number, group in enumerate(self._mdf.groups)
+            for index, channel in enumerate(group.channels)
+            if index != self._mdf.masters_db.get(number)
+        ]
+
+    def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
+        """Yield one batch for each channel group that has one of the columns."""
+        groups: dict[int, dict[str, int]] = {}
+        for name in columns:
+            number, index = self._find(name)
+            groups.setdefault(number, {})[name] = index
+        for number, indices in sorted(groups.items()):
+            yield self._read(number, indices)
+
+    def _read(self, number: int, indices: dict[str, int]) -> pl.DataFrame:
+        """Read channels of a group; what the file marks as invalid is null."""
+        self._require_times(number, next(iter(indices)))
+        group = self._mdf.groups[number]
+        with reading_with(self._file, "asammdf"):
+            signals = self._mdf.select([(None, number, index) for index in indices.values()])
+        expected = group.channel_group.cycles_nr
+        if len(signals[0]) != expected:
+            raise InputError(
+                f"{shown(self._file)}: group {number} has {len(signals[0]):,} of {expected:,} "
+                "samples: it is truncated. Copy it again."
+            )
+        frame = {OWN_TIME: pl.Series(self._start_s + signals[0].timestamps.astype(np.float64))}
+        for name, signal in zip(indices, signals, strict=True):
+            values = as_column(self._file, name, signal.samples)
+            invalid = signal.invalidation_bits
+            if invalid is not None:
+                values = values.set(pl.Series(np.asarray(invalid, dtype=np.bool_)), None)
+            frame[name] = values
+        return pl.DataFrame(frame).with_columns(pl.lit(f"group {number}").alias(BASE))
+
+    def _require_times(self, number: int, name: str) -> None:
+        master = self._mdf.masters_db.get(number)
+        group = self._mdf.groups[number]
+        kind = None if master is None else getattr(group.channels[master], "sync_type", _TIME_SYNC)
+        # MDF 3 knows no kinds: its masters are times.
+        if master is None or kind not in {_TIME_SYNC, None}:
+            raise InputError(
+                f"{shown(self._file)}: channel {name!r} is of group {number}, which has no times "
+                "(it is over an angle, a distance or an index). Map another channel."
+            )
+
+    def _find(self, name: str) -> tuple[int, int]:
+        places = self._places(name)
+        base, _, group = name.rpartition("@")
+        if not places and base:
+            places = [p for p in self._places(base) if group in {str(p[0]), self._title(p[0])}]
+        if not places:
+            names = [channel.name for channel in self.channels()]
+            raise InputError(f"{shown(self._file)}: {describe_missing(name, names)}")
+        if len(places) > 1:
+            titles = ", ".join(repr(f"{base or name}@{number}") for number, _ in places[:5])
+            raise InputError(
+                f"{shown(self._file)}: {len(places)} channels are called {name!r}. Say which: "
+                f"{titles}."
+            )
+        return places[0]
+
+    def _places(self, name: str) -> list[tuple[int, int]]:
+        places = self._mdf.channels_db.get(name, ())
+        return [(n, i) for n, i in places if i != self._mdf.masters_db.get(n)]
+
+    def _title(self, number: int) -> str:
+        return str(getattr(self._mdf.groups[number].channel_group, "acq_name", "") or "")
+
+    def _name(self, name: str, number: int) -> str:
+        return name if len(self._places(name)) < 2 else f"{name}@{number}"
+
+
+@contextmanager
+def open_mdf(file: Path) -> Iterator[MdfSource]:
+    """Open an MDF file. Raises `InputError`."""
+    logging.getLogger("asammdf").setLevel(logging.CRITICAL)
+    with reading_with(file, "asammdf") as asammdf:
+        try:
+            mdf = asammdf.MDF(file)
+        except Exception as error:
+            _close_half_made(error)
+            raise
+    try:
+        yield MdfSource(file, mdf)
+    finally:
+        mdf.close()
+
+
+def _close_half_made(error: Exception) -> None:
+    """Mark what asammdf had half opened as closed: its destructor would raise once more."""
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+        half_made: Any = frame.f_locals.get("self")
+        if hasattr(half_made, "_closed"):
+            half_made._closed = True

@@ -1,0 +1,235 @@
+"""CAN traces: written by python-can, with databases and payloads by cantools."""
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import can
+import cantools
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fleet_slip.errors import ConfigError, InputError
+from fleet_slip.ingest import MeasuredLog, load_mapping, read_measured
+from fleet_slip.ingest.can_decoding import physical, raw_numbers
+from tests.support.measured import ticks
+
+START_S = datetime(2024, 5, 31, 12, tzinfo=UTC).timestamp()
+TIME_S = np.arange(50) / 100
+AX = np.round(2 * np.sin(5 * TIME_S), 3)
+BETA_DEG = np.round(np.cos(3 * TIME_S), 2)
+AX_COUNTS = np.rint(AX / 0.001).astype(int).tolist()
+BETA_COUNTS = np.rint(np.radians(BETA_DEG) / 0.0001).astype(int).tolist()
+
+DBC = """VERSION ""
+NS_ :
+BS_:
+BU_: ECU
+BO_ 256 Motion: 8 ECU
+ SG_ ax : 7|16@0- (0.001,0) [0|0] "m/s2" ECU
+ SG_ beta : 20|12@1- (0.01,0) [0|0] "deg" ECU
+ SG_ state : 40|8@1+ (1,0) [0|0] "" ECU
+BO_ 2566844672 Mux: 8 ECU
+ SG_ page M : 0|8@1+ (1,0) [0|0] "" ECU
+ SG_ yaw m0 : 8|16@1- (0.01,0) [0|0] "deg/s" ECU
+ SG_ ay m1 : 8|16@0- (0.01,-1) [0|0] "m/s2" ECU
+VAL_ 256 state 0 "off" 1 "on" ;
+VAL_ 256 beta 2047 "SNA" ;
+"""
+DATABASE: Any = cantools.database.load_string(DBC, "dbc")
+
+MAPPING = """name = "bus"
+[time]
+own_clock = true
+[can]
+database = "car.dbc"
+[drive]
+vehicle_id = "A7"
+vehicle_model = "sedan"
+[signals]
+ax = { column = "Motion.ax", unit = "m/s^2" }
+sideslip = { column = "Motion.beta", unit = "deg" }
+"""
+
+
+def motion(i: int, bus: Any = 1, **changes: Any) -> can.Message:
+    values = {"ax": AX[i], "beta": BETA_DEG[i], "state": "on", **changes}
+    data = DATABASE.encode_message("Motion", values, strict=False)
+    return can.Message(
+        START_S + TIME_S[i], arbitration_id=256, is_extended_id=False, data=data, channel=bus
+    )
+
+
+def mux(i: int, page: int, value: float) -> can.Message:
+    message = DATABASE.get_message_by_name("Mux")
+    data = message.encode({"page": page, "yaw" if page == 0 else "ay": value})
+    return can.Message(START_S + TIME_S[i], arbitration_id=message.frame_id, data=data, channel=1)
+
+
+def write_trace(folder: Path, frames: list[can.Message], name: str = "log.blf") -> Path:
+    with can.Logger(folder / name) as trace:
+        for frame in frames:
+            trace(frame)
+    return folder / name
+
+
+def read(
+    file: Path, text: str = MAPPING, database: str = DBC, name: str = "car.dbc"
+) -> MeasuredLog:
+    (file.parent / name).write_text(database)
+    (file.parent / "bus.toml").write_text(text)
+    return read_measured(file, load_mapping(str(file.parent / "bus.toml")))
+
+
+def failure(file: Path, *arguments: str) -> str:
+    with pytest.raises(InputError) as caught:
+        read(file, *arguments)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["log.blf", "log.asc", "log.log"])
+def test_a_trace(tmp_path: Path, name: str) -> None:
+    noise = can.Message(START_S, arbitration_id=1792, is_extended_id=False, data=b"\1", channel=1)
+    error = can.Message(START_S + 0.001, is_error_frame=True, channel=1)
+    file = write_trace(tmp_path, [noise, *map(motion, range(50)), error], name)
+    dated = MAPPING.replace("[drive]", "[drive]\nday = 2024-05-31")
+    log = read(file, dated if name == "log.asc" else MAPPING)
+    assert ticks(log) == list(range(50))
+    assert log.drives["ax"].to_pylist() == AX_COUNTS
+    assert log.drives["sideslip"].to_pylist() == BETA_COUNTS
+    assert str(log.drives["day"][0]) == "2024-05-31"
+    if name == "log.asc":
+        assert "its clock does not tell the date" in failure(file)
+
+
+def test_a_kcd_database_says_the_same(tmp_path: Path) -> None:
+    file = write_trace(tmp_path, [motion(i) for i in range(50)])
+    expected = read(file).drives.drop_columns("drive_id")
+    text = MAPPING.replace("car.dbc", "car.kcd")
+    log = read(file, text, DATABASE.as_kcd_string(), "car.kcd")
+    assert log.drives.drop_columns("drive_id").equals(expected)
+
+
+def test_multiplexed_signals_have_the_values_of_their_own_frames(tmp_path: Path) -> None:
+    frames = [mux(i, i % 2, i / 10) for i in range(50)]
+    text = MAPPING.partition("ax =")[0] + (
+        'yaw_rate = { column = "Mux.yaw", unit = "deg/s", interpolate = false }\n'
+        'ay = { column = "Mux.ay", unit = "m/s^2", interpolate = false }\n'
+    )
+    log = read(write_trace(tmp_path, frames), text)
+    yaw = np.radians(np.arange(0, 50, 2) / 10) / 0.0001
+    assert log.drives["yaw_rate"].to_pylist()[::2] == np.rint(yaw).tolist()
+    assert log.drives["yaw_rate"].null_count == 25
+    assert log.drives["ay"].to_pylist()[1::2] == [100 * i for i in range(1, 50, 2)]
+
+
+def test_messages_that_come_late_twice_or_not_at_all(tmp_path: Path) -> None:
+    frames = [motion(i) for i in range(50) if i not in {10, 11}]
+    frames.insert(20, frames[20])  # twice
+    frames[30], frames[31] = frames[31], frames[30]  # late
+    log = read(write_trace(tmp_path, frames, "log.log"))
+    assert log.counts.quarantined == {"time_backwards": 1, "time_duplicate": 1}
+    assert log.counts.rows_kept == 47
+    assert ticks(log)[:12] == [*range(10), 12, 13]
+
+
+def test_a_value_with_a_name_is_no_number(tmp_path: Path) -> None:
+    frames = [motion(i, **({"beta": "SNA"} if i % 5 == 0 else {})) for i in range(50)]
+    for frame in frames[::5]:
+        assert DATABASE.decode_message(256, frame.data)["beta"] == "SNA"
+    log = read(write_trace(tmp_path, frames))
+    expected = [None if i % 5 == 0 else BETA_COUNTS[i] for i in range(50)]
+    assert log.drives["sideslip"].to_pylist() == expected
+
+
+def test_names_of_values_can_be_a_condition(tmp_path: Path) -> None:
+    frames = [motion(i, state="on" if i < 30 else "off") for i in range(50)]
+    text = 'where = [{ column = "Motion.state", one_of = ["on"] }]\n' + MAPPING
+    log = read(write_trace(tmp_path, frames), text)
+    assert (log.counts.rows_kept, log.counts.rows_left_out) == (30, 20)
+
+
+def test_a_message_on_two_buses_must_be_told_apart(tmp_path: Path) -> None:
+    frames = [frame for i in range(50) for frame in (motion(i, 1), motion(i, 2, ax=0.0))]
+    file = write_trace(tmp_path, frames)
+    assert "Motion is on the buses 1, 2. Say in the mapping which counts" in failure(file)
+    log = read(file, MAPPING.replace('"car.dbc"', '"car.dbc"\nchannel = "1"'))
+    assert log.drives["ax"].to_pylist() == AX_COUNTS
+    text = MAPPING.replace('"car.dbc"', '"car.dbc"\nchannel = "9"')
+    assert "buses: 1, 2" in failure(file, text)
+
+
+def test_a_database_that_does_not_fit_is_refused(tmp_path: Path) -> None:
+    file = write_trace(tmp_path, [motion(i) for i in range(50)])
+    other = DBC.replace("BO_ 256 ", "BO_ 257 ").replace("VAL_ 256", "VAL_ 257")
+    message = failure(file, MAPPING, other)
+    assert "the message Motion (0x101) is not in it. Of the 1 numbers in the trace 0" in message
+    renamed = failure(file, MAPPING.replace("Motion.beta", "Motion.Beta"))
+    assert "no column 'Motion.Beta'. Did the mapping mean 'Motion.beta'" in renamed
+    short = [
+        can.Message(START_S, arbitration_id=256, is_extended_id=False, data=b"\0\0", channel=1)
+    ]
+    assert "ends in byte 4, the longest has 2" in failure(write_trace(tmp_path, short))
+    assert "cantools cannot read it" in failure(file, MAPPING, "no DBC\0")
+
+
+def test_a_trace_without_a_database_is_refused(tmp_path: Path) -> None:
+    file = write_trace(tmp_path, [motion(0)])
+    without = MAPPING.replace('[can]\ndatabase = "car.dbc"\n', "")
+    assert 'this format needs [can] with database = "….dbc"' in failure(file, without)
+    with pytest.raises(ConfigError, match=r"absent\.dbc: the CAN database cannot be read"):
+        read(file, MAPPING.replace("car.dbc", "absent.dbc"))
+    with pytest.raises(ConfigError, match=r"a CAN database is a file \.dbc"):
+        read(file, MAPPING.replace("car.dbc", "car.xls"))
+
+
+def test_the_content_of_the_database_counts_and_its_path_does_not(tmp_path: Path) -> None:
+    file = write_trace(tmp_path, [motion(i) for i in range(50)])
+    digest = read(file).digest
+    assert read(file, MAPPING.replace("car.dbc", "b.dbc"), DBC, "b.dbc").digest == digest
+    assert read(file, MAPPING, DBC.replace("0.001", "0.002")).digest != digest
+
+
+def test_broken_traces_are_refused(tmp_path: Path) -> None:
+    file = write_trace(tmp_path, [motion(i) for i in range(50)])
+    data = file.read_bytes()
+    for cut in (0, 10, 150, len(data) - 30):
+        file.write_bytes(data[:cut])
+        assert "truncated" in failure(file) or "Is it complete" in failure(file)
+    for name in ("log.asc", "log.log"):
+        (tmp_path / name).write_bytes(b"")
+        assert "there is no CAN frame in it" in failure(tmp_path / name)
+    (tmp_path / "log.log").write_bytes(b"garbage\n")
+    assert "Is it complete" in failure(tmp_path / "log.log")
+
+
+@st.composite
+def layouts(draw: st.DrawFn) -> tuple[str, int, int, bool]:
+    length = draw(st.integers(1, 64))
+    first = draw(st.integers(0, 64 - length))
+    if draw(st.booleans()):
+        return "little_endian", first, length, draw(st.booleans())
+    return "big_endian", 8 * (first // 8) + 7 - first % 8, length, draw(st.booleans())
+
+
+@given(layouts(), st.lists(st.binary(min_size=8, max_size=8), min_size=1, max_size=5))
+def test_signals_are_decoded_as_cantools_does(
+    layout: tuple[str, int, int, bool], payloads: list[bytes]
+) -> None:
+    order, start, length, signed = layout
+    sign, byte_order = ("-" if signed else "+"), (1 if order == "little_endian" else 0)
+    text = (
+        'VERSION ""\nNS_ :\nBS_:\nBU_: E\nBO_ 1 M: 8 E\n'
+        f' SG_ s : {start}|{length}@{byte_order}{sign} (0.5,-3) [0|0] "" E\n'
+    )
+    database: Any = cantools.database.load_string(text, "dbc")
+    (signal,) = database.messages[0].signals
+    matrix = np.frombuffer(b"".join(payloads), dtype=np.uint8).reshape(-1, 8)
+    raw = raw_numbers(signal, matrix)
+    expected = [database.decode_message(1, data, scaling=False)["s"] for data in payloads]
+    assert raw.tolist() == expected
+    scaled = [database.decode_message(1, data)["s"] for data in payloads]
+    np.testing.assert_allclose(physical(signal, raw), scaled, rtol=1e-15)

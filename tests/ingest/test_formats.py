@@ -1,0 +1,304 @@
+"""The same drive in every format, written by other programs, comes out as the same counts."""
+
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import h5py
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import scipy.io
+from asammdf import MDF, Signal
+
+from fleet_slip.errors import InputError
+from fleet_slip.ingest import Mapping, MeasuredLog, read_measured
+from tests.support.measured import a_mapping, ticks
+
+START = datetime(2024, 5, 31, 12, tzinfo=UTC)
+TIME_S = np.arange(100) / 100
+AX = np.round(2 * np.sin(5 * TIME_S), 3)
+BETA_DEG = np.round(np.cos(3 * TIME_S), 2)
+AX_COUNTS = np.rint(AX / 0.001).astype(int).tolist()
+BETA_COUNTS = np.rint(np.radians(BETA_DEG) / 0.0001).astype(int).tolist()
+
+
+def require_the_drive(log: MeasuredLog) -> None:
+    assert ticks(log) == list(range(100))
+    assert log.drives["ax"].to_pylist() == AX_COUNTS
+    assert log.drives["sideslip"].to_pylist() == BETA_COUNTS
+    assert log.drives["day"].unique().to_pylist() == [START.date()]
+
+
+def failure(file: Path, mapping: Mapping) -> str:
+    with pytest.raises(InputError) as caught:
+        read_measured(file, mapping)
+    message = str(caught.value)
+    assert message.startswith(str(file))
+    assert "\n" not in message
+    return message
+
+
+def signals(ax: str, beta: str, **beta_keys: Any) -> dict[str, Any]:
+    return {
+        "ax": {"column": ax, "unit": "m/s^2"},
+        "sideslip": {"column": beta, "unit": "deg", **beta_keys},
+    }
+
+
+OWN_CLOCK = {"column": None, "unit": None, "own_clock": True}
+
+
+def mdf_mapping(**changes: Any) -> Mapping:
+    given = {"time": OWN_CLOCK, "drive": {"day": None}, "signals": signals("a_x", "beta")}
+    return a_mapping(**{**given, **changes})
+
+
+def write_mdf(folder: Path, *groups: list[Signal], version: str = "4.10", **save: Any) -> Path:
+    with MDF(version=version) as mdf:
+        mdf.start_time = START
+        for group in groups:
+            mdf.append(group)
+        return Path(mdf.save(folder / "log", overwrite=True, **save))
+
+
+def a_x(**changes: Any) -> Signal:
+    whole = {"samples": np.rint(AX * 1000).astype("i2"), "timestamps": TIME_S, "name": "a_x"}
+    return Signal(**{**whole, "conversion": {"a": 0.001, "b": 0.0}, **changes})
+
+
+def beta(**changes: Any) -> Signal:
+    return Signal(**{"samples": BETA_DEG, "timestamps": TIME_S, "name": "beta", **changes})
+
+
+@pytest.mark.parametrize(
+    ("version", "compression"), [("3.30", 0), ("4.10", 0), ("4.10", 1), ("4.20", 2)]
+)
+def test_mdf(tmp_path: Path, version: str, compression: int) -> None:
+    file = write_mdf(tmp_path, [a_x(), beta()], version=version, compression=compression)
+    require_the_drive(read_measured(file, mdf_mapping()))
+
+
+def test_groups_of_an_mdf_file_keep_their_own_times(tmp_path: Path) -> None:
+    slow = beta(samples=BETA_DEG[::5], timestamps=TIME_S[::5])
+    fast_s = np.arange(-3, 10 * 100) / 1000
+    fast = Signal(2 * fast_s, fast_s, name="fast", unit="rad/s")
+    mapping = mdf_mapping(
+        signals={
+            **signals("a_x", "beta"),
+            "yaw_rate": {"column": "fast", "unit": "rad/s"},
+            "vx": {"column": "beta", "unit": "m/s", "interpolate": False},
+        }
+    )
+    log = read_measured(write_mdf(tmp_path, [a_x()], [slow], [fast]), mapping)
+    assert log.counts.rows_kept == log.counts.rows_read == 100 + 20 + 1003
+    # The first row is 3 ms before the others' first: the ticks begin there.
+    at_s = TIME_S[: log.drives.num_rows] - 0.003
+    yaw_rate = np.array(log.drives["yaw_rate"].to_pylist(), dtype=float) * 0.0001
+    np.testing.assert_allclose(yaw_rate[1:-1], 2 * at_s[1:-1], atol=0.0001)
+    sideslip = np.array(log.drives["sideslip"].to_pylist(), dtype=float) * 0.0001
+    inside = (at_s >= 0) & (at_s <= 0.95)
+    expected = np.interp(at_s[inside], TIME_S[::5], np.radians(BETA_DEG[::5]))
+    np.testing.assert_allclose(sideslip[inside], expected, atol=0.00006)
+    assert np.isnan(sideslip[~inside]).all()
+    placed = log.drives["vx"].drop_null().to_numpy() * 0.005
+    np.testing.assert_allclose(placed, BETA_DEG[::5], atol=0.0026)
+
+
+def test_what_mdf_marks_as_invalid_is_null(tmp_path: Path) -> None:
+    invalid = np.arange(100) % 7 == 0
+    file = write_mdf(tmp_path, [a_x(), beta(invalidation_bits=invalid)])
+    log = read_measured(file, mdf_mapping())
+    assert log.drives["ax"].to_pylist() == AX_COUNTS
+    expected = [None if bad else b for b, bad in zip(BETA_COUNTS, invalid, strict=True)]
+    assert log.drives["sideslip"].to_pylist() == expected
+
+
+def test_an_unfinalised_mdf_file_is_read(tmp_path: Path) -> None:
+    file = write_mdf(tmp_path, [a_x(), beta()])
+    data = bytearray(file.read_bytes())
+    data[:8] = b"UnFinMF "
+    data[60] = 1  # the cycle counters are not up to date
+    file.write_bytes(data)
+    require_the_drive(read_measured(file, mdf_mapping()))
+
+
+def test_a_condition_of_one_group_holds_for_the_others(tmp_path: Path) -> None:
+    fix = Signal(np.array([4, 4, 0, 4] * 5, dtype="u1"), TIME_S[::5], name="fix")
+    mapping = mdf_mapping(where=[{"column": "fix", "at_least": 4}])
+    log = read_measured(write_mdf(tmp_path, [a_x(), beta()], [fix]), mapping)
+    kept = [i for i in range(100) if (i // 5) % 4 != 2]
+    assert ticks(log) == kept
+    assert log.drives["ax"].to_pylist() == [AX_COUNTS[i] for i in kept]
+
+
+def test_a_channel_of_two_groups_must_be_told_apart(tmp_path: Path) -> None:
+    file = write_mdf(tmp_path, [a_x(), beta()], [beta(samples=BETA_DEG + 1)])
+    message = failure(file, mdf_mapping())
+    assert "2 channels are called 'beta'. Say which: 'beta@0', 'beta@1'" in message
+    require_the_drive(read_measured(file, mdf_mapping(signals=signals("a_x", "beta@0"))))
+
+
+def test_the_clock_of_one_group_that_jumps_back_costs_its_rows_only(tmp_path: Path) -> None:
+    jumping = TIME_S.copy()
+    jumping[50:55] -= 0.3
+    slow = beta(samples=BETA_DEG[::2], timestamps=TIME_S[::2])
+    log = read_measured(write_mdf(tmp_path, [a_x(timestamps=jumping)], [slow]), mdf_mapping())
+    assert log.counts.quarantined == {"time_backwards": 5}
+    assert log.counts.rows_kept == 145
+
+
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.8, 0.999])
+def test_a_truncated_mdf_file_is_refused(
+    tmp_path: Path, share: float, capfd: pytest.CaptureFixture[str]
+) -> None:
+    file = write_mdf(tmp_path, [a_x(), beta()])
+    data = file.read_bytes()
+    file.write_bytes(data[: int(share * len(data))])
+    assert "Is it complete? Copy it again" in failure(file, mdf_mapping())
+    assert capfd.readouterr().err == ""
+
+
+def test_mdf_errors_name_the_channel_and_the_way_out(tmp_path: Path) -> None:
+    text = Signal(np.array([b"on"] * 100), TIME_S, name="text", encoding="utf-8")
+    file = write_mdf(tmp_path, [a_x(), beta(), text])
+    message = failure(file, mdf_mapping(signals=signals("a_x", "Beta")))
+    assert "no column 'Beta'. Did the mapping mean 'beta'?" in message
+    message = failure(file, mdf_mapping(signals={"ax": {"column": "text", "unit": "m/s^2"}}))
+    assert "100 not_a_number; first: ax = 'on' in row 1" in message
+    assert "write own_clock = true under [time]" in failure(file, a_mapping())
+    empty = write_mdf(tmp_path, [a_x(samples=np.zeros(0, "i2"), timestamps=np.zeros(0))])
+    message = failure(empty, mdf_mapping(signals={"ax": {"column": "a_x", "unit": "m/s^2"}}))
+    assert "a header and no rows" in message
+
+
+def test_a_signal_that_reaches_no_tick_is_named(tmp_path: Path) -> None:
+    rare = beta(samples=BETA_DEG[3::40], timestamps=TIME_S[3::40] + 0.004)
+    file = write_mdf(tmp_path, [a_x()], [rare])
+    message = failure(file, mdf_mapping())
+    assert "sideslip has 3 values in 'beta', and none is on a tick of 100 Hz" in message
+    bridged = mdf_mapping(signals=signals("a_x", "beta", longest_gap_s=0.4))
+    assert read_measured(file, bridged).drives["sideslip"].null_count == 100 - 80
+
+
+def test_ten_thousand_channels_do_not_matter(tmp_path: Path) -> None:
+    many = [Signal(np.zeros(2), TIME_S[:2], name=f"c{i}") for i in range(10_000)]
+    file = write_mdf(tmp_path, [a_x(), beta()], many)
+    require_the_drive(read_measured(file, mdf_mapping()))
+
+
+def mat_mapping(**changes: Any) -> Mapping:
+    given = {
+        "time": {"column": "Data.t"},
+        "drive": {"day": START.date()},
+        "signals": signals("Data.Vehicle.ax", "Data.beta(:,2)"),
+    }
+    return a_mapping(**{**given, **changes})
+
+
+def write_mat5(file: Path, content: dict[str, Any]) -> None:
+    scipy.io.savemat(file, content, do_compression=True)
+
+
+def write_mat73(file: Path, content: dict[str, Any]) -> None:
+    def write(group: Any, of: dict[str, Any]) -> None:
+        for name, value in of.items():
+            if isinstance(value, dict):
+                write(group.create_group(name), value)
+            else:  # MATLAB's axes are the other way round, and a vector is a matrix
+                group.create_dataset(name, data=np.atleast_2d(value).T if value.ndim > 1 else value)
+
+    with h5py.File(file, "w", userblock_size=512) as root:
+        write(root, content)
+    with file.open("r+b") as stream:
+        stream.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\0\x02IM")
+
+
+@pytest.mark.parametrize("write", [write_mat5, write_mat73])
+def test_matlab(tmp_path: Path, write: Callable[[Path, dict[str, Any]], None]) -> None:
+    file = tmp_path / "log.mat"
+    both = np.column_stack([np.zeros(100), BETA_DEG])
+    gps = {"t": TIME_S[::2], "beta": BETA_DEG[::2], "text": np.array([[1.0, 2.0]])}
+    data = {"t": TIME_S, "Vehicle": {"ax": AX}, "beta": both}
+    write(file, {"Data": data, "gps": gps})
+    require_the_drive(read_measured(file, mat_mapping()))
+    short = mat_mapping(signals=signals("Data.Vehicle.ax", "gps.beta"))
+    assert "'gps.beta' has 50 values and 'Data.t' has 100. Give the signal" in failure(file, short)
+    own = mat_mapping(
+        signals=signals("Data.Vehicle.ax", "gps.beta", time="gps.t", interpolate=False)
+    )
+    log = read_measured(file, own)
+    assert log.drives["ax"].to_pylist() == AX_COUNTS
+    assert log.drives["sideslip"].drop_null().to_pylist() == BETA_COUNTS[::2]
+    absent = mat_mapping(signals=signals("Data.Vehicle.ay", "gps.beta"))
+    assert "Did the mapping mean 'Data.Vehicle.ax'" in failure(file, absent)
+    content = file.read_bytes()
+    file.write_bytes(content[: len(content) // 2])
+    assert "Is it complete?" in failure(file, mat_mapping())
+
+
+def a_table() -> pa.Table:
+    return pa.table({"t": TIME_S, "ax": AX, "beta": BETA_DEG})
+
+
+def test_the_folders_of_a_hive_partitioned_dataset_are_columns(tmp_path: Path) -> None:
+    folder = tmp_path / "car=A%207" / "day=2024-05-31"
+    folder.mkdir(parents=True)
+    pq.write_table(a_table(), folder / "part-0.parquet")
+    mapping = a_mapping(drive={"vehicle_id": {"column": "car"}, "day": {"column": "day"}})
+    log = read_measured(folder / "part-0.parquet", mapping)
+    require_the_drive(log)
+    assert log.drives["vehicle_id"].unique().to_pylist() == ["A 7"]
+    other = tmp_path / "car=B" / "day=2024-05-31"
+    other.mkdir(parents=True)
+    pq.write_table(a_table(), other / "part-0.parquet")
+    assert read_measured(other / "part-0.parquet", mapping).digest != log.digest
+
+
+def test_a_table_or_a_query_of_a_duckdb_file(tmp_path: Path) -> None:
+    file = tmp_path / "log.duckdb"
+    with duckdb.connect(str(file)) as database:
+        database.register("arrow", a_table())
+        database.sql('CREATE TABLE "my ""log" AS FROM arrow')
+    drive = {"day": START.date()}
+    require_the_drive(read_measured(file, a_mapping(drive=drive, duckdb={"table": 'my "log'})))
+    query = 'SELECT t, 2 * ax AS ax, beta FROM "my ""log" ORDER BY t'
+    log = read_measured(file, a_mapping(drive=drive, duckdb={"query": query}))
+    assert log.drives["ax"].to_pylist() == [2 * count for count in AX_COUNTS]
+    assert "needs [duckdb] with table" in failure(file, a_mapping())
+    assert "with name nothing does not exist" in failure(
+        file, a_mapping(duckdb={"table": "nothing"})
+    )
+    outside = {"query": "SELECT * FROM read_csv('/etc/passwd')"}
+    assert "disabled" in failure(file, a_mapping(duckdb=outside))
+    file.write_bytes(file.read_bytes()[:5000])
+    assert "DuckDB says" in failure(file, a_mapping(duckdb={"table": "log"}))
+
+
+@pytest.mark.parametrize("magic", [b"PK\x03\x04", b"7z\xbc\xaf\x27\x1c", b"Rar!\x1a\x07"])
+def test_an_archive_is_to_be_unpacked(tmp_path: Path, magic: bytes) -> None:
+    file = tmp_path / "log.mf4"
+    file.write_bytes(magic + b"\0" * 100)
+    assert "it is an archive. Unpack it with" in failure(file, mdf_mapping())
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"), [("a.mf4", "an MDF file"), ("a.mat", "a MATLAB file"), ("a.duckdb", "DuckDB")]
+)
+def test_a_file_that_is_not_what_its_name_says_is_refused(
+    tmp_path: Path, name: str, kind: str
+) -> None:
+    (tmp_path / name).write_bytes(b"t,ax,beta\n0,1,2\n")
+    assert f"not {'a ' if kind == 'DuckDB' else ''}{kind}" in failure(tmp_path / name, a_mapping())
+
+
+def test_a_package_that_is_absent_is_named_with_its_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = write_mdf(tmp_path, [a_x(), beta()])
+    monkeypatch.setitem(__import__("sys").modules, "asammdf", None)
+    message = failure(file, mdf_mapping())
+    assert "asammdf, which is not installed. Run: pip install 'fleet-slip[logs]'" in message
