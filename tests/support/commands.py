@@ -3,10 +3,13 @@
 import json
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
+
+from tests.support.prepared import environment, server
 
 COMMAND = str(Path(sys.executable).with_name("fleet-slip"))
 PATIENCE_S = 400.0
@@ -39,9 +42,27 @@ def run(words: Words, **options: Any) -> Finished:
     return Finished(done.returncode, done.stdout, done.stderr)
 
 
+def run_prepared(words: Sequence[str], cwd: str | Path | None = None) -> Finished:
+    """Run `fleet-slip` as `run` does, in a process that has imported it already."""
+    prepared = server()
+    if prepared.environment != environment():
+        return run(words, cwd=cwd)
+    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
+        streams = (out.fileno(), err.fileno())
+        code = prepared.run(list(words), Path(cwd or "."), streams, PATIENCE_S)
+        return Finished(code, _text(out), _text(err))
+
+
+def _text(file: IO[bytes]) -> str:
+    """Return what a file holds, its ends of lines read as `subprocess` reads them."""
+    file.seek(0)
+    return file.read().decode().replace("\r\n", "\n").replace("\r", "\n")
+
+
 def run_on(root: object, *arguments: str | Path, **options: Any) -> Finished:
     """Run `fleet-slip --root ROOT ...`, which never shows a traceback."""
-    done = run([COMMAND, "--root", str(root), *arguments], **options)
+    words = [COMMAND, "--root", str(root), *map(str, arguments)]
+    done = run_prepared(words, **options) if options.keys() <= {"cwd"} else run(words, **options)
     assert "Traceback" not in done.stderr, done.stderr
     return done
 

@@ -1,0 +1,175 @@
+"""The command line in processes that need not import the program: it is half of what they cost.
+
+A server that has imported everything forks for each command. The process has arguments, folder and
+streams of its own, ends as one that was started anew, and can be killed; the environment is the
+server's, so that a command with another one is started anew.
+"""
+
+import atexit
+import contextlib
+import gc
+import importlib
+import json
+import os
+import pkgutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import traceback
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Never
+
+import fleet_slip
+from fleet_slip.cli.main import main as fleet_slip_main
+
+LATE = ("pandas", "matplotlib.figure")
+"""What libraries import at their first use."""
+
+
+@dataclass(frozen=True)
+class Server:
+    """A running server: where it listens, and the environment that its processes have."""
+
+    address: str
+    environment: dict[str, str]
+
+    def run(
+        self, words: list[str], folder: Path, streams: tuple[int, int], patience_s: float
+    ) -> int:
+        """Run a program's words in a folder, with two descriptors for what it says.
+
+        Returns how it ended, negative if by a signal, as of `subprocess`. Who loses patience or is
+        interrupted kills it.
+        """
+        with socket.socket(socket.AF_UNIX) as connection:
+            connection.settimeout(patience_s)
+            connection.connect(self.address)
+            asked = json.dumps({"words": words, "folder": str(folder)}).encode()
+            socket.send_fds(connection, [len(asked).to_bytes(4, "big") + asked], list(streams))
+            with connection.makefile("r") as answers:
+                process = int(answers.readline())
+                try:
+                    return int(answers.readline())
+                except BaseException:
+                    with contextlib.suppress(ProcessLookupError):
+                        os.kill(process, signal.SIGKILL)
+                    raise
+
+
+def environment() -> dict[str, str]:
+    """Return the environment of this process, without the name of the test that runs."""
+    return {name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"}
+
+
+@cache
+def server() -> Server:
+    """Return this process's server, which ends when this process does."""
+    address = str(Path(tempfile.mkdtemp(prefix="fleet-slip-tests-")) / "server")
+    process = subprocess.Popen(
+        [sys.executable, "-m", __name__, address],
+        cwd=Path(__file__).parents[2],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        env=environment(),
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline(), "the server of prepared processes did not start"
+    return Server(address, environment())
+
+
+def main(address: str) -> None:
+    """Serve until stdin closes. What a forked process is to do is done at the end of the module."""
+    for module in _modules():
+        importlib.import_module(module)
+    gc.freeze()
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(address)
+        listener.listen()
+        signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # those that wait for one command each
+        _end_with_parent()
+        sys.stdout.write("ready\n")
+        sys.stdout.flush()
+        while True:
+            connection, _ = listener.accept()
+            if not os.fork():
+                listener.close()
+                return _attend(connection)
+            connection.close()
+
+
+def _modules() -> Iterator[str]:
+    """Yield the modules of the program, and what libraries import late."""
+    for module in pkgutil.walk_packages(fleet_slip.__path__, "fleet_slip."):
+        if not module.name.endswith("__main__"):
+            yield module.name
+    yield from LATE
+
+
+def _end_with_parent() -> None:
+    """Fork a process that waits for the end of stdin and then ends its parent."""
+    parent = os.getpid()
+    if not os.fork():
+        os.read(0, 1)
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(parent, signal.SIGKILL)
+        os._exit(0)
+
+
+def _attend(connection: socket.socket) -> None:
+    """Fork one command and tell how it ended; in the forked process, return."""
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    begun, streams, *_ = socket.recv_fds(connection, 1 << 16, 2)
+    size = int.from_bytes(begun[:4], "big")
+    while len(begun) < 4 + size:
+        begun += connection.recv(1 << 16)
+    asked = json.loads(begun[4:])
+    process = os.fork()
+    if not process:
+        connection.close()
+        return _become(asked, streams)
+    connection.sendall(f"{process}\n".encode())
+    _, status = os.waitpid(process, 0)
+    connection.sendall(f"{os.waitstatus_to_exitcode(status)}\n".encode())
+    os._exit(0)
+
+
+def _become(asked: dict[str, Any], streams: list[int]) -> None:
+    """Take the streams, the folder and the words of a command."""
+    with Path(os.devnull).open() as nothing:
+        os.dup2(nothing.fileno(), 0)
+    for wanted, given in enumerate(streams, start=1):
+        os.dup2(given, wanted)
+        os.close(given)
+    os.chdir(asked["folder"])
+    sys.argv = asked["words"]
+    sys.modules["__main__"].__package__ = None  # or messages would say `python -m`
+    sys.path[0] = str(Path(sys.argv[0]).parent)
+
+
+def _run_command() -> Never:
+    """Run the command and end as the interpreter does, without taking every module apart."""
+    code = 1
+    try:
+        fleet_slip_main()
+        code = 0
+    except SystemExit as ended:
+        code = ended.code if isinstance(ended.code, int) else int(ended.code is not None)
+    except BaseException:
+        traceback.print_exc()
+    threading._shutdown()  # type: ignore[attr-defined]
+    atexit._run_exitfuncs()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
+    _run_command()
