@@ -54,6 +54,7 @@ def compile_program(manifest: Manifest) -> Program:
         unit=label.unit,
         scale=label.scale / Decimal(OUTPUT_COUNTS),
         bits=fixed.bits,
+        low_bits=fixed.low_bits,
         intercept=fixed.intercept,
         terms=tuple(zip(places, fixed.coefficients, strict=True)),
         error=fixed.error,

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 from fleet_slip.errors import UsageError
+from fleet_slip.export.c_checks import c_self_test
+from fleet_slip.export.c_source import c_header, c_prefix, c_source
 from fleet_slip.export.checks import Check, make_checks
 from fleet_slip.export.compile import compile_program
 from fleet_slip.export.document import document_of
@@ -13,7 +15,7 @@ from fleet_slip.export.program import Program
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.warehouse.tables import Warehouse
 
-Target = Literal["json"]
+Target = Literal["json", "c"]
 """What a version can be exported to."""
 
 
@@ -50,6 +52,16 @@ def _json(subject: Subject) -> dict[str, str]:
     return {f"{subject.stem}.json": render(content)}
 
 
+def _c(subject: Subject) -> dict[str, str]:
+    version, program = subject.version, subject.program
+    prefix = c_prefix(version)
+    return {
+        f"{prefix}.h": c_header(version, program),
+        f"{prefix}.c": c_source(version, program),
+        f"{prefix}_test.c": c_self_test(version, program, subject.checks),
+    }
+
+
 def render(content: Mapping[str, Any]) -> str:
     """Return a JSON document with a line for each of its parts, and for each tick."""
     return _rendered(content, 0) + "\n"
@@ -71,4 +83,4 @@ def _rendered(value: Any, depth: int) -> str:
     )
 
 
-_WRITERS: dict[str, Callable[[Subject], dict[str, str]]] = {"json": _json}
+_WRITERS: dict[str, Callable[[Subject], dict[str, str]]] = {"json": _json, "c": _c}

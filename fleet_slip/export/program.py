@@ -181,6 +181,7 @@ class Angle:
         name, column, unit: what is estimated.
         scale: physical value of one count.
         bits: of the fraction.
+        low_bits: of the lower part of each coefficient, where two words hold it.
         intercept: over 2^bits.
         terms: a column and its coefficient over 2^bits, for each term of the model.
         error: bound of the distance from the exact model, rounding included, in counts.
@@ -193,11 +194,18 @@ class Angle:
     unit: str
     scale: Decimal
     bits: int
+    low_bits: int
     intercept: int
     terms: tuple[tuple[int, int], ...]
     error: Fraction
     largest: int
     limit: int
+
+    @property
+    def parts(self) -> tuple[tuple[int, int], ...]:
+        """The upper and lower part of the intercept, then of each coefficient."""
+        whole = (self.intercept, *(coefficient for _, coefficient in self.terms))
+        return tuple(divmod(one, 1 << self.low_bits) for one in whole)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,130 @@
+"""The functions that an exported estimator in C is made of; each is written where it is called."""
+
+HELPERS = {
+    "within": """
+/* A value of a range; MISSING beyond it. */
+static int32_t within(int32_t value, int32_t least, int32_t most)
+{
+    return ((value < least) || (value > most)) ? MISSING : value;
+}
+""",
+    "clip": """
+static int32_t clip(int64_t value, int32_t limit)
+{
+    const int64_t most = limit;
+    return (value > most) ? limit : ((value < -most) ? -limit : (int32_t)value);
+}
+""",
+    "nearest_64": """
+/* value * numerator / divisor to the nearest, halves away from zero, within limit. */
+static int32_t nearest_64(int64_t value, int64_t numerator, int64_t divisor, int32_t limit)
+{
+    const int64_t size = (value < 0) ? -value : value;
+    const int64_t found = ((2 * size * numerator) + divisor) / (2 * divisor);
+    const int32_t kept = (found > (int64_t)limit) ? limit : (int32_t)found;
+    return (value < 0) ? -kept : kept;
+}
+""",
+    "nearest_32": """
+/* The same for what fits into 32 bits: value * numerator / divisor, halves away from zero. */
+static int32_t nearest_32(int32_t value, uint32_t numerator, uint32_t divisor, int32_t limit)
+{
+    const uint32_t size = (uint32_t)((value < 0) ? -value : value);
+    const uint32_t found = ((2U * size * numerator) + divisor) / (2U * divisor);
+    const int32_t kept = (found > (uint32_t)limit) ? limit : (int32_t)found;
+    return (value < 0) ? -kept : kept;
+}
+""",
+    "ago_16": """
+/* The value of so many ticks ago; at is where the next one will be written. */
+static int32_t ago_16(const int16_t *ring, uint32_t at, uint32_t length, uint32_t ticks)
+{
+    const int16_t value = ring[(at >= ticks) ? (at - ticks) : ((at + length) - ticks)];
+    return (value == INT16_MIN) ? MISSING : value;
+}
+""",
+    "ago_32": """
+/* The value of so many ticks ago; at is where the next one will be written. */
+static int32_t ago_32(const int32_t *ring, uint32_t at, uint32_t length, uint32_t ticks)
+{
+    return ring[(at >= ticks) ? (at - ticks) : ((at + length) - ticks)];
+}
+""",
+    "keep_16": """
+static void keep_16(int16_t *ring, uint32_t *at, uint32_t length, int32_t value)
+{
+    ring[*at] = (value == MISSING) ? INT16_MIN : (int16_t)value;
+    *at = ((*at + 1U) == length) ? 0U : (*at + 1U);
+}
+""",
+    "keep_32": """
+static void keep_32(int32_t *ring, uint32_t *at, uint32_t length, int32_t value)
+{
+    ring[*at] = value;
+    *at = ((*at + 1U) == length) ? 0U : (*at + 1U);
+}
+""",
+    "slide_32": """
+/* The oldest value leaves a window, the newest comes. */
+static void slide_32(int32_t *sum, uint32_t *values, int32_t oldest, int32_t newest)
+{
+    if (oldest != MISSING) {
+        *sum -= oldest;
+        *values -= 1U;
+    }
+    if (newest != MISSING) {
+        *sum += newest;
+        *values += 1U;
+    }
+}
+""",
+    "slide_64": """
+/* The oldest value leaves a window, the newest comes. */
+static void slide_64(int64_t *sum, uint32_t *values, int32_t oldest, int32_t newest)
+{
+    if (oldest != MISSING) {
+        *sum -= oldest;
+        *values -= 1U;
+    }
+    if (newest != MISSING) {
+        *sum += newest;
+        *values += 1U;
+    }
+}
+""",
+    "gather": """
+/* A value comes to all since the drive began, unless its sum could overflow. */
+static void gather(int64_t *sum, uint32_t *values, uint32_t most, int32_t value)
+{
+    if ((value != MISSING) && (*values < most)) {
+        *sum += value;
+        *values += 1U;
+    }
+}
+""",
+    "weight": """
+/* How far a gate is open, in parts of 1024; it stays open beyond its peak where high is MISSING. */
+static int32_t weight(int32_t at, int32_t low, int32_t peak, int32_t high)
+{
+    int32_t found = 1024;
+    if ((at == MISSING) || (at <= low)) {
+        found = 0;
+    } else if (at < peak) {
+        found = ((at - low) * 1024) / (peak - low);
+    } else if (high != MISSING) {
+        found = (at < high) ? (1024 - (((at - peak) * 1024) / (high - peak))) : 0;
+    } else {
+        /* open */
+    }
+    return found;
+}
+""",
+    "floor_shift": """
+/* value / 2^bits, rounded down: a negative number is not shifted, which C leaves open. */
+static int64_t floor_shift(int64_t value, uint32_t bits)
+{
+    return (value >= 0) ? (value >> bits) : (-1 - ((-1 - value) >> bits));
+}
+""",
+}
+"""By name, in the order in which they are written."""

@@ -1,0 +1,258 @@
+"""A program in C99: a header and a source, in integers alone, without allocation or recursion."""
+
+from collections.abc import Sequence
+
+from fleet_slip.catalogue.columns import LARGEST_FACT
+from fleet_slip.catalogue.signals import COUNT_MAX
+from fleet_slip.export.c_columns import ColumnWriter, missing_of, ring_width, sum_type, summed
+from fleet_slip.export.c_helpers import HELPERS
+from fleet_slip.export.c_names import field_names, literal, plain_text
+from fleet_slip.export.program import Numbered, Program
+from fleet_slip.models.model_version import ModelVersion
+
+INDENT = "    "
+
+
+def c_prefix(version: ModelVersion) -> str:
+    """Return what all names in the files begin with."""
+    return f"{version.manifest.label.signal}_{version.manifest.name}"
+
+
+def c_header(version: ModelVersion, program: Program) -> str:
+    """Return the header: what is given, what is kept from tick to tick, and two functions."""
+    prefix, upper = c_prefix(version), c_prefix(version).upper()
+    car = _car(program)
+    parts = [
+        _preamble(version, program),
+        f"#ifndef {upper}_H\n#define {upper}_H\n\n#include <stdbool.h>\n#include <stdint.h>\n",
+        f'#define {upper}_MODEL "{version.reference}"\n'
+        f'#define {upper}_SHA256 "{version.sha256}"\n'
+        f'#define {upper}_DRIVES_SHA256 "{version.manifest.trained_on.drives_sha256 or ""}"\n',
+        "/* A count that is missing; one beyond its range is, too. */\n"
+        f"#define {upper}_MISSING INT16_MIN\n",
+        _struct(
+            "Counts of one tick: physical = scale * count.", _sample(program), prefix, "sample"
+        ),
+    ]
+    if car:
+        parts += [
+            f"/* What a car does not know. */\n#define {upper}_UNKNOWN INT32_MIN\n",
+            _struct("What a car knows of itself.", car, prefix, "car"),
+        ]
+    return "\n".join(
+        [
+            *parts,
+            _struct("What is kept from tick to tick.", _state(program), prefix, "state"),
+            _functions(prefix, program),
+            "#endif\n",
+        ]
+    )
+
+
+def _functions(prefix: str, program: Program) -> str:
+    angle = program.angle
+    return (
+        f"/* Begins a drive. */\n{_start_line(prefix, program)};\n\n"
+        f"/* Takes the next tick, and writes {angle.column} in counts of {angle.scale:f}\n"
+        f" * {angle.unit}, within {float(angle.error):.12f} counts of the exact model.\n"
+        " * Returns whether there is an angle; else 0 is written. Call it at every tick: one\n"
+        f" * without a message is a sample of missing counts. */\n{_step_line(prefix)};\n"
+    )
+
+
+def _start_line(prefix: str, program: Program) -> str:
+    given = f", const {prefix}_car *car" if program.facts or program.numbers else ""
+    return f"void {prefix}_start({prefix}_state *state{given})"
+
+
+def _step_line(prefix: str) -> str:
+    given = f"const {prefix}_sample *sample, int32_t *angle"
+    return f"bool {prefix}_step({prefix}_state *state, {given})"
+
+
+def _sample(program: Program) -> list[str]:
+    return [
+        f"int16_t {field}; /* {one.scale:f} {plain_unit(one.unit)}, "
+        f"{one.min_count} to {one.max_count} */"
+        for one, field in zip(program.signals, field_names(program)["signals"], strict=True)
+    ]
+
+
+def _car(program: Program) -> list[str]:
+    fields = field_names(program)
+    return [
+        f"int32_t {field}; /* {'whole number' if one.equals is None else '1 or 0'} */"
+        for one, field in zip(program.facts, fields["facts"], strict=True)
+    ] + [
+        f"int32_t {field}; /* {one.grain:f} {plain_unit(one.unit)} */"
+        for one, field in zip(program.numbers, fields["numbers"], strict=True)
+    ]
+
+
+def c_source(version: ModelVersion, program: Program) -> str:
+    """Return the source that goes with the header."""
+    prefix, writer = c_prefix(version), ColumnWriter(program)
+    features = writer.sources()
+    start, step = _start(prefix, program, writer), _step(prefix, program, writer)
+    helpers = [text.strip("\n") + "\n" for name, text in HELPERS.items() if name in writer.used]
+    wide = any(isinstance(one, Numbered) for one in program.columns)
+    missing = "#define MISSING INT32_MIN\n" + ("#define MISSING_64 INT64_MIN\n" if wide else "")
+    return "\n".join(
+        [
+            _preamble(version, program),
+            f'#include "{prefix}.h"\n',
+            missing,
+            *helpers,
+            _tables(program),
+            "\n".join(features),
+            start,
+            step,
+        ]
+    )
+
+
+def plain_unit(unit: str) -> str:
+    """Return a unit as it may stand in a comment."""
+    return plain_text(unit.replace("/", " per ").replace("*", " "))
+
+
+def _preamble(version: ModelVersion, program: Program) -> str:
+    trained, angle = version.manifest.trained_on, program.angle
+    return (
+        f"/* {version.reference}: {angle.column}, exported by fleet-slip. Do not edit.\n"
+        f" * SHA-256 of the version: {version.sha256}\n"
+        f" * Trained on {trained.drives} drives, SHA-256 {trained.drives_sha256 or 'unknown'}\n"
+        " */"
+    )
+
+
+def _struct(comment: str, members: Sequence[str], prefix: str, name: str) -> str:
+    body = "\n".join(INDENT + member for member in members)
+    return f"/* {comment} */\ntypedef struct {{\n{body}\n}} {prefix}_{name};\n"
+
+
+def _state(program: Program) -> list[str]:
+    fields = field_names(program)
+    members = []
+    for place, one in enumerate(program.sources):
+        if one.ticks:
+            kind = f"int{ring_width(one)}_t"
+            members += [
+                f"{kind} ring_{place}[{one.ticks}]; /* {one.name} */",
+                f"uint32_t at_{place};",
+            ]
+    for key, (_, window) in summed(program).items():
+        members += [f"{sum_type(window)} sum_{key};", f"uint32_t values_{key};"]
+    members += [f"int32_t {field};" for field in (*fields["facts"], *fields["numbers"])]
+    return members or ["uint8_t nothing; /* this model looks back on nothing */"]
+
+
+def _start(prefix: str, program: Program, writer: ColumnWriter) -> str:
+    fields, lines = field_names(program), []
+    for place, one in enumerate(program.sources):
+        if one.ticks:
+            empty = "INT16_MIN" if ring_width(one) == 16 else "MISSING"
+            lines += [
+                f"for (uint32_t i = 0U; i < {one.ticks}U; i++) {{",
+                f"{INDENT}state->ring_{place}[i] = {empty};",
+                "}",
+                f"state->at_{place} = 0U;",
+            ]
+    for key in summed(program):
+        lines += [f"state->sum_{key} = 0;", f"state->values_{key} = 0U;"]
+    ranges = [(-LARGEST_FACT, LARGEST_FACT) if f.equals is None else (0, 1) for f in program.facts]
+    ranges += [(-COUNT_MAX, COUNT_MAX)] * len(program.numbers)
+    for field, (least, most) in zip((*fields["facts"], *fields["numbers"]), ranges, strict=True):
+        writer.used.add("within")
+        lines.append(f"state->{field} = within(car->{field}, {literal(least)}, {most});")
+    body = "\n".join(INDENT + line for line in lines or ["state->nothing = 0U;"])
+    return f"{_start_line(prefix, program)}\n{{\n{body}\n}}\n"
+
+
+def _tables(program: Program) -> str:
+    """Return the coefficients, each as an upper and a lower part."""
+    (_, *parts), bits = program.angle.parts, program.angle.low_bits
+    places = range(0, len(parts), 6)
+    rows = [
+        (",\n" + INDENT).join(
+            ", ".join(str(part[which]) for part in parts[i : i + 6]) for i in places
+        )
+        for which in (0, 1)
+    ]
+    size = len(parts)
+    return (
+        f"/* Coefficients over 2^{program.angle.bits}: upper * 2^{bits} + lower. */\n"
+        f"static const int32_t upper[{size}] = {{\n{INDENT}{rows[0]}\n}};\n\n"
+        f"static const int32_t lower[{size}] = {{\n{INDENT}{rows[1]}\n}};\n"
+    )
+
+
+def _step(prefix: str, program: Program, writer: ColumnWriter) -> str:
+    lines = [*writer.signals(), *writer.values(), *_slides(program, writer), *writer.columns()]
+    lines += [*_keeps(program, writer), *_dot(program, writer)]
+    if not any("state->" in line for line in lines):
+        lines.insert(-1, "(void)state;")
+    body = "\n".join(INDENT + line for line in lines)
+    return f"{_step_line(prefix)}\n{{\n{body}\n}}\n"
+
+
+def _slides(program: Program, writer: ColumnWriter) -> list[str]:
+    """Return statements that bring the sums of windows to this tick."""
+    found = []
+    for key, (_, one) in summed(program).items():
+        if one.over == "running_mean":
+            continue
+        width = "32" if sum_type(one) == "int32_t" else "64"
+        writer.used.add(f"slide_{width}")
+        oldest = writer.ago(one.source, one.ticks)
+        sums = f"&state->sum_{key}, &state->values_{key}"
+        found.append(f"slide_{width}({sums}, {oldest}, source_{one.source});")
+    return found
+
+
+def _keeps(program: Program, writer: ColumnWriter) -> list[str]:
+    """Return statements that write this tick into the rings."""
+    found = []
+    for place, one in enumerate(program.sources):
+        if one.ticks:
+            width = ring_width(one)
+            writer.used.add(f"keep_{width}")
+            ring = f"state->ring_{place}, &state->at_{place}"
+            found.append(f"keep_{width}({ring}, {one.ticks}U, source_{place});")
+    return found
+
+
+def _dot(program: Program, writer: ColumnWriter) -> list[str]:
+    """Return statements that add up the angle, as `fleet_slip.export.fixed_point` proves."""
+    angle, places = program.angle, [place for place, _ in program.angle.terms]
+    wide = any(isinstance(program.columns[place], Numbered) for place in places)
+    kind, missing = ("int64_t", "MISSING_64") if wide else ("int32_t", "MISSING")
+    terms = [
+        f"(column_{place} == MISSING) ? MISSING_64 : column_{place}"
+        if wide and missing_of(program, place) == "MISSING"
+        else f"column_{place}"
+        for place in places
+    ]
+    (high, low), *_ = angle.parts
+    shift = angle.bits - angle.low_bits
+    writer.used |= {"floor_shift", "clip"}
+    return [
+        f"const {kind} term[{len(terms)}] = {{",
+        *(f"{INDENT}{term}," for term in terms[:-1]),
+        f"{INDENT}{terms[-1]}",
+        "};",
+        f"int64_t high = {literal(high)};",
+        f"int64_t low = {literal(low)};",
+        "bool valid = true;",
+        f"for (uint32_t i = 0U; i < {len(terms)}U; i++) {{",
+        f"{INDENT}if (term[i] == {missing}) {{",
+        f"{INDENT * 2}valid = false;",
+        f"{INDENT}}} else {{",
+        f"{INDENT * 2}high += (int64_t)upper[i] * term[i];",
+        f"{INDENT * 2}low += (int64_t)lower[i] * term[i];",
+        f"{INDENT}}}",
+        "}",
+        f"high += floor_shift(low, {angle.low_bits}U) + {literal(2 ** (shift - 1))};",
+        f"*angle = valid ? clip(floor_shift(high, {shift}U), {angle.limit}) : 0;",
+        "return valid;",
+    ]

@@ -1,0 +1,93 @@
+"""Exported C, compiled by the system's compiler, and driven with counts."""
+
+import shutil
+import struct
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from fleet_slip.export.c_names import field_names
+from fleet_slip.export.c_source import c_header, c_prefix, c_source
+from fleet_slip.export.checks import Sample
+from fleet_slip.export.program import Car, Program
+from fleet_slip.models.model_version import ModelVersion
+
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror")
+SANITIZED = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+DEADLINE_S = 120
+
+needs_cc = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler, cc")
+
+NO_ANGLE = -(2**31)
+
+DRIVER = """
+#include <stdio.h>
+#include "PREFIX.h"
+
+int main(void)
+{
+    static PREFIX_state state;
+    PREFIX_sample sample;
+    int32_t angle;
+CAR
+    while (fread(&sample, sizeof sample, 1U, stdin) == 1U) {
+        if (!PREFIX_step(&state, &sample, &angle)) { angle = INT32_MIN; }
+        (void)fwrite(&angle, sizeof angle, 1U, stdout);
+    }
+    return 0;
+}
+"""
+
+GIVEN = """    PREFIX_car car;
+    if (fread(&car, sizeof car, 1U, stdin) != 1U) { return 1; }
+    PREFIX_start(&state, &car);"""
+
+
+def compile_c(folder: Path, files: Sequence[str], *options: str) -> Path:
+    """Compile files of a folder without a warning; return the program."""
+    words = ["cc", *STRICT, *options, *files, "-o", "program"]
+    done = subprocess.run(
+        words, cwd=folder, capture_output=True, text=True, check=False, timeout=DEADLINE_S
+    )
+    assert done.returncode == 0, done.stderr[:3000]
+    return folder / "program"
+
+
+def can_sanitize(folder: Path) -> bool:
+    """Whether the compiler has the sanitizers, and a program with them runs here."""
+    (folder / "empty.c").write_text("int main(void) { return 0; }\n")
+    words = ["cc", *SANITIZED, "empty.c", "-o", "empty"]
+    built = subprocess.run(words, cwd=folder, capture_output=True, check=False, timeout=DEADLINE_S)
+    if built.returncode:
+        return False
+    ran = subprocess.run([folder / "empty"], capture_output=True, check=False, timeout=DEADLINE_S)
+    return ran.returncode == 0
+
+
+def build_driver(folder: Path, version: ModelVersion, program: Program, *options: str) -> Path:
+    """Return a program that reads a car and samples, and writes angles."""
+    prefix = c_prefix(version)
+    has_car = bool(program.facts or program.numbers)
+    car = GIVEN if has_car else "    PREFIX_start(&state);"
+    driver = DRIVER.replace("CAR", car).replace("PREFIX", prefix)
+    (folder / f"{prefix}.h").write_text(c_header(version, program))
+    (folder / f"{prefix}.c").write_text(c_source(version, program))
+    (folder / "driver.c").write_text(driver)
+    return compile_c(folder, [f"{prefix}.c", "driver.c"], *options)
+
+
+def drive(driver: Path, program: Program, car: Car, samples: Sequence[Sample]) -> list[int | None]:
+    """Return the angles that a driver writes."""
+    known = [*car.fact_counts(program), *car.number_counts(program)]
+    given = struct.pack(f"{len(known)}i", *(NO_ANGLE if one is None else one for one in known))
+    width = len(field_names(program)["signals"])
+    counts = [-(2**15) if one is None else one for sample in samples for one in sample]
+    given += struct.pack(f"{width * len(samples)}h", *counts)
+    done = subprocess.run(
+        [driver], input=given, capture_output=True, check=False, timeout=DEADLINE_S
+    )
+    assert done.returncode == 0, done.stderr.decode()[:3000]
+    angles = struct.unpack(f"{len(samples)}i", done.stdout)
+    return [None if one == NO_ANGLE else one for one in angles]

@@ -1,0 +1,144 @@
+"""Exported C, compiled without a warning and run under sanitizers, computes what `score` does."""
+
+import subprocess
+from collections.abc import Mapping
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fleet_slip
+from fleet_slip.export.c_columns import LARGEST_UNSIGNED
+from fleet_slip.export.checks import Sample, angles_by_kernel, angles_of_columns
+from fleet_slip.export.compile import compile_program
+from fleet_slip.export.files import export_files
+from fleet_slip.export.program import Car, Program
+from fleet_slip.grams.columns import DriveCounts
+from fleet_slip.grams.drive_rows import read_drives
+from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.models.predictor import Predictor
+from tests.export.compiled import SANITIZED, build_driver, can_sanitize, compile_c, drive, needs_cc
+from tests.export.models import DEFINITIONS, model_of
+
+pytestmark = needs_cc
+
+SMALL = Fraction(1, 10**4)
+MODELS: Mapping[str, Mapping[str, Fraction]] = {
+    "every_kind": {name: SMALL * (-1) ** i for i, name in enumerate(DEFINITIONS)},
+    "signals": {"ay": Fraction(1, 3), "yaw_rate": Fraction(-22, 7)},
+    "features": {"curvature": Fraction(1, 3), "ay_signed_square": SMALL},
+    "a_lag": {"lag_2": Fraction(1)},
+    "numbers_alone": {"tyres": SMALL, "radius": SMALL},
+}
+CARS = (
+    Car({}, {}),
+    Car({"mass_kg": 1320.5, "vehicle_model": "suv"}, {"yaw_rate_offset": -32767}),
+    Car({"mass_kg": 1e9, "vehicle_model": "van"}, {"speed_ratio": 2003, "understeer": 32767}),
+    Car({"mass_kg": 900.0}, {"yaw_rate_offset": 3, "speed_ratio": -5, "understeer": 0}),
+)
+
+
+def hostile_drive(program: Program, ticks: int, seed: int) -> list[Sample]:
+    """Counts anywhere in 16 bits, in and beyond the ranges, with holes; long calm parts."""
+    random = np.random.default_rng(seed)
+    width = len(program.signals)
+    counts = random.integers(-(2**15), 2**15, (ticks, width))
+    calm = random.random(ticks) < 0.7
+    counts[calm] //= 40
+    ends = random.random((ticks, width)) < 0.1
+    counts[ends] = random.choice([-32768, -30000, 30000, 32767, 0, 1, -1], ends.sum())
+    counts[np.repeat(random.random(ticks // 10 + 1) < 0.1, 10)[:ticks]] = -32768
+    counts[: ticks // 5] = np.clip(counts[: ticks // 5], 20_000, 30_000)  # sums at their largest
+    return [tuple(None if one == -32768 else one for one in row) for row in counts.tolist()]
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_hostile_drives_give_the_angles_of_the_kernel(name: str, tmp_path: Path) -> None:
+    manifest = model_of(MODELS[name], Fraction(-1, 700), name)
+    program = compile_program(manifest)
+    version = ModelVersion(1, manifest, "0" * 64)
+    driver = build_driver(tmp_path, version, program, "-O2")
+    angles: set[int | None] = set()
+    for seed, car in enumerate(CARS):
+        samples = hostile_drive(program, 400, seed)
+        found = drive(driver, program, car, samples)
+        assert found == angles_by_kernel(manifest, program, car, samples)
+        angles |= {*found}
+    assert len(angles) > 10
+    assert None in angles
+
+
+def test_nothing_overflows_or_reads_beyond_its_memory(tmp_path: Path) -> None:
+    if not can_sanitize(tmp_path):
+        pytest.skip("the compiler's sanitizers are not here")
+    manifest = model_of(MODELS["every_kind"], Fraction(5), "every_kind")
+    program = compile_program(manifest)
+    version = ModelVersion(1, manifest, "0" * 64)
+    driver = build_driver(tmp_path, version, program, *SANITIZED)
+    for seed, car in enumerate(CARS):
+        samples = hostile_drive(program, 400, seed)
+        found = drive(driver, program, car, samples)
+        assert found == angles_by_kernel(manifest, program, car, samples)
+
+
+def test_whole_drives_give_the_angles_of_score(smoke_root: Path, tmp_path: Path) -> None:
+    fleet = fleet_slip.open(smoke_root)
+    version = fleet.model("smoke")
+    program, predictor = compile_program(version.manifest), Predictor.of(version.manifest)
+    driver = build_driver(tmp_path, version, program, "-O2")
+    (file, *_) = fleet.warehouse.logs.snapshot().files
+    drives = list(read_drives(fleet.warehouse, file, predictor.plan))
+    assert drives
+    for one in drives:
+        found = drive(driver, program, Car({}, {}), samples_of(program, one.counts))
+        assert found == angles_of_columns(program, predictor.columns.compute(one.counts))
+        estimate = predictor(one.counts) / float(program.angle.scale)
+        rounded = [None if np.isnan(x) else int(np.floor(x + 0.5)) for x in estimate]
+        assert found == rounded
+
+
+def samples_of(program: Program, drive: DriveCounts) -> list[Sample]:
+    """The ticks of a drive without holes."""
+    assert drive.whole
+    return list(zip(*(drive.counts[one.name].tolist() for one in program.signals), strict=True))
+
+
+def test_the_self_test_passes_and_notices_another_angle(smoke_root: Path, tmp_path: Path) -> None:
+    fleet = fleet_slip.open(smoke_root)
+    files = export_files(fleet.model("smoke"), fleet.warehouse, "c")
+    assert list(files) == ["sideslip_smoke.h", "sideslip_smoke.c", "sideslip_smoke_test.c"]
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    sources = [name for name in files if name.endswith(".c")]
+    assert result_of(compile_c(tmp_path, sources)) == (0, "smoke@1: 0 of 900 angles are wrong\n")
+    text = files["sideslip_smoke.c"]
+    (tmp_path / "sideslip_smoke.c").write_text(
+        text.replace("high += (int64_t)", "high -= (int64_t)")
+    )
+    code, printed = result_of(compile_c(tmp_path, sources))
+    assert code == 1
+    assert "0 of 900" not in printed.removeprefix("smoke@1: 900")
+
+
+def result_of(program: Path) -> tuple[int, str]:
+    done = subprocess.run([program], capture_output=True, text=True, check=False, timeout=60)
+    return done.returncode, done.stdout
+
+
+def test_the_source_has_no_floating_point_and_no_calls_of_a_library() -> None:
+    manifest = model_of(MODELS["every_kind"], Fraction(5), "every_kind")
+    files = export_files(ModelVersion(1, manifest, "0" * 64), None, "c")
+    text = files["sideslip_every_kind.h"] + files["sideslip_every_kind.c"]
+    for word in ("float", "double", "malloc", "stdlib", "math.h", "1e-"):
+        assert word not in text
+    assert text.count("#include <") == 2
+
+
+def test_quotients_take_64_bits_only_where_they_need_them() -> None:
+    text = export_files(ModelVersion(1, model_of({"mean_3": SMALL}), "0" * 64), None, "c")[
+        "sideslip_sideslip.c"
+    ]
+    assert "nearest_32" in text
+    assert "nearest_64" not in text
+    assert LARGEST_UNSIGNED > 2 * 3 * 32767 * 16 + 3
