@@ -37,6 +37,7 @@ from fleet_slip.regression.paired import compare_paired
 from fleet_slip.regression.winner import Shortfall, Worth
 from fleet_slip.resources import folder
 from fleet_slip.selection.compare import Selection
+from fleet_slip.words import number_of
 
 FLOOR_VARIABLE = "FLEET_SLIP_PUBLISH"
 """Environment variable: path of a TOML file that takes the place of configs/publish.toml."""
@@ -109,7 +110,8 @@ class Comparison:
             for one, shortfall in zip(self.incumbents, self.shortfalls, strict=True)
         )
         return (
-            f"on the same {challenger.rows:,} rows of {self.challenger.drives:,} drives, held out "
+            f"on the same {number_of(challenger.rows, 'row')} of "
+            f"{number_of(self.challenger.drives, 'drive')}, held out "
             f"in {len(self.challenger.folds)} groups by {self.by}, it has RMSE "
             f"{challenger.rmse_deg:.4f} deg and correlation {challenger.correlation:.4f}; {others}"
         )
@@ -154,11 +156,12 @@ def faults(manifest: Manifest, champion: Manifest | None) -> list[str]:
     if figures.rmse_deg > least.max_rmse_deg:
         found.append(f"its RMSE is {figures.rmse_deg:.4f} deg, above {least.max_rmse_deg} deg")
     if trained.drives < least.min_drives:
-        found.append(f"it was trained on {trained.drives:,} drives, fewer than {least.min_drives}")
-    if trained.vehicles is not None and trained.vehicles < least.min_vehicles:
         found.append(
-            f"it was trained on {trained.vehicles:,} cars, fewer than {least.min_vehicles}"
+            f"it was trained on {number_of(trained.drives, 'drive')}, fewer than {least.min_drives}"
         )
+    if trained.vehicles is not None and trained.vehicles < least.min_vehicles:
+        cars = number_of(trained.vehicles, "car")
+        found.append(f"it was trained on {cars}, fewer than {least.min_vehicles}")
     if champion is not None:
         found += _shrunk(manifest, champion, least.min_part_of_champion)
     return found

@@ -17,6 +17,7 @@ from fleet_slip.report.picture import Picture
 from fleet_slip.report.style import PALETTE
 from fleet_slip.report.table import ReportTable
 from fleet_slip.report.text import count, degrees, size
+from fleet_slip.words import number_of
 
 TEMPLATES = files("fleet_slip.report") / "templates"
 
@@ -102,7 +103,8 @@ def _tiles(data: ReportData, claims: Sequence[Judged]) -> list[Tile]:
             f"testable claims reproduced; {tally[Status.NOT_TESTABLE]} cannot be tested here",
         ),
         Tile(
-            count(cohort.rows), f"training rows of {data.version.manifest.trained_on.drives} drives"
+            count(cohort.rows),
+            f"training rows of {number_of(data.version.manifest.trained_on.drives, 'drive')}",
         ),
     ]
     nominal = data.evaluated.figures("nominal", data.choice)
@@ -131,7 +133,7 @@ def _provenance(data: ReportData) -> list[tuple[str, str]]:
         ("its SHA-256", data.version.sha256),
         ("signals", ", ".join(manifest.signals)),
         ("cohort", trained.cohort),
-        ("trained on", f"{trained.drives} drives, {count(trained.rows)} rows"),
+        ("trained on", f"{number_of(trained.drives, 'drive')}, {count(trained.rows)} rows"),
         (
             "table versions",
             f"logs {trained.logs_version}, grams {trained.grams_version} when it was published; "

@@ -9,6 +9,7 @@ from fleet_slip.report.coefficients import Coefficient, Coefficients
 from fleet_slip.report.data import ReportData
 from fleet_slip.report.table import Cell, ReportTable, table
 from fleet_slip.report.text import count, degrees, number, percent, scientific, size
+from fleet_slip.words import number_of
 
 SHOWN_MODELS = ("1", "2", "4", "5")
 """Model 3 hardly differs from model 2 anywhere."""
@@ -16,9 +17,9 @@ SHOWN_MODELS = ("1", "2", "4", "5")
 
 def coefficient_tables(data: ReportData) -> Iterator[ReportTable]:
     """Return a coefficient table for each model that has one."""
-    for number_of, found in enumerate(data.coefficients):
+    for place, found in enumerate(data.coefficients):
         yield table(
-            f"coefficients-{number_of + 1}",
+            f"coefficients-{place + 1}",
             f"Coefficients of {found.model}",
             [
                 "signal",
@@ -53,10 +54,10 @@ def _coefficient(row: Coefficient) -> list[str]:
 
 def _evidence(found: Coefficients) -> str:
     return (
-        f"{count(found.log_rows)} rows of {found.drives} drives. Rows at 100 Hz are not "
-        "independent: the cluster-robust standard errors take each {found.cluster} as one piece of "
-        "evidence; those by rows, which are far too small, stand beside. Effect of one std: "
-        "degrees of estimate for one standard deviation of the signal."
+        f"{count(found.log_rows)} rows of {number_of(found.drives, 'drive')}. Rows at 100 Hz are "
+        "not independent: the cluster-robust standard errors take each "
+        f"{found.cluster} as one piece of evidence; those by rows, which are far too small, stand "
+        "beside. Effect of one std: degrees of estimate for one standard deviation of the signal."
     )
 
 
