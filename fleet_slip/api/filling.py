@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from fleet_slip.grams.job import GramReport
     from fleet_slip.ingest.job import IngestReport
     from fleet_slip.ingest.mapping import Mapping
+    from fleet_slip.ingest.preview import Preview
     from fleet_slip.maintenance.migration import MigrationReport
     from fleet_slip.simulation.campaign import Campaign
     from fleet_slip.simulation.job import SimulationReport
@@ -104,6 +105,22 @@ class Filling(Rooted):
                     each(report)
                 told(1, len(paths))
         return [reports[str(path)] for path in paths]
+
+    def preview(
+        self, files: Iterable[Path | str] | Path | str, mapping: "str | Mapping"
+    ) -> "list[Preview]":
+        """Read measured files as `ingest` does, and store nothing.
+
+        A preview tells rows, drives, what would be rejected, the range of each signal, and what
+        looks wrong in the longest drive: a sign, a unit, swapped wheels, a delay of the label.
+        Raises like `ingest`.
+        """
+        from fleet_slip.ingest.mapping import load_mapping
+        from fleet_slip.ingest.preview import preview_file
+
+        plan = load_mapping(mapping) if isinstance(mapping, str) else mapping
+        paths = [files] if isinstance(files, Path | str) else files
+        return [preview_file(Path(file), plan) for file in paths]
 
     @record_call
     def gram(

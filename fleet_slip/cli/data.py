@@ -1,6 +1,7 @@
 """Commands that fill the warehouse: simulate, ingest, gram, check."""
 
 import logging
+import sys
 from concurrent.futures import Executor
 from datetime import date
 from pathlib import Path
@@ -19,6 +20,7 @@ from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.workers import Cluster, Threads
 from fleet_slip.errors import UsageError
 from fleet_slip.grams.statement import gram_statement
+from fleet_slip.runs.log import recording
 from fleet_slip.words import number_of
 
 if TYPE_CHECKING:
@@ -114,18 +116,28 @@ def _where_the_time_went(report: "SimulationReport") -> str:
     )
 
 
-@record_run
 def ingest(
     context: typer.Context,
     files: Annotated[
         list[Path],
         typer.Argument(
-            help="Measured logs: CSV, Parquet, MDF, MATLAB, CAN traces, DuckDB.", show_default=False
+            help="Measured logs: CSV, Parquet, MDF, MATLAB, CAN traces, DuckDB.",
+            show_default=False,
         ),
     ],
     mapping: Annotated[
         str, typer.Option(help="A mapping of configs/mappings, or the path of a TOML file.")
     ],
+    dry_run: Annotated[
+        bool,
+        typer.Option(
+            "--dry-run", help="Store nothing; show what would be, and what looks wrong (exit 10)."
+        ),
+    ] = False,
+    plot: Annotated[
+        Path | None,
+        typer.Option(help="With --dry-run and one file, draw its longest drive: .png, .svg, .pdf."),
+    ] = None,
     cluster: Cluster = None,
     json: Json = False,
 ) -> None:
@@ -134,9 +146,16 @@ def ingest(
     Rows that cannot be used go to the quarantine with a reason: fleet-slip sql "FROM quarantine"
     """
     fleet: Fleet = context.obj
-    reports = fleet.ingest(
-        files, mapping, workers=cluster, each=_warn_of_look_alikes if json else _say_ingested
-    )
+    if plot is not None and not (dry_run and len(files) == 1):
+        raise UsageError("--plot draws one file, with --dry-run.")
+    if dry_run:
+        from fleet_slip.cli.previews import show_previews  # noqa: PLC0415 - draws, takes a while
+
+        show_previews(fleet.preview(files, mapping), plot, json)
+        return
+    each = _warn_of_look_alikes if json else _say_ingested
+    with recording(fleet.root, "ingest", sys.argv[1:]):
+        reports = fleet.ingest(files, mapping, workers=cluster, each=each)
     if json:
         print_json(reports)
 

@@ -5,7 +5,7 @@ run faster than the left. Each of these is a witness; one that contradicts the o
 and a reversed difference of two wheels means that the two are swapped.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import count
 
@@ -13,19 +13,9 @@ import numpy as np
 
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalogue.turning import WITNESSES
 from fleet_slip.monitoring.moments import AT_ONCE, DriveBatches, MeanMoments
 from fleet_slip.regression.gram_table import GramTable
-
-WITNESSES: Mapping[str, Mapping[str, int]] = {
-    "ay": {"ay": 1},
-    "yaw_rate": {"yaw_rate": 1},
-    "steering_wheel": {"steering_wheel": 1},
-    "steer_fl": {"steer_fl": 1},
-    "steer_fr": {"steer_fr": 1},
-    "front wheels": {"wheel_fl": -1, "wheel_fr": 1},
-    "rear wheels": {"wheel_rl": -1, "wheel_rr": 1},
-}
-"""What is positive in a left turn, as a combination of signals."""
 
 FEWEST_WITNESSES = 3
 

@@ -1,0 +1,166 @@
+"""A car by the textbook is above suspicion; each way of logging it wrongly is not."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+from fleet_slip.arrays import FloatArray
+from fleet_slip.errors import AlarmError, UsageError
+from fleet_slip.ingest.suspicion import RADIUS_M, TRACK_M, WHEELS, find_suspicions
+from tests.support.reported import call
+
+Car = dict[str, FloatArray]
+
+
+def a_car(least_mps: float = 8.0) -> Car:
+    """One minute of a linear bicycle without load transfer, driven on bends both ways."""
+    time_s = np.arange(6000) / 100
+    speed = least_mps + 6 + 4 * np.sin(0.3 * time_s)
+    ax = np.gradient(speed, 0.01)
+    curvature = (0.02 + 0.04 * (least_mps < 4)) * (
+        np.sin(0.9 * time_s) + 0.4 * np.sin(2.3 * time_s)
+    )
+    yaw_rate, ay = curvature * speed, curvature * speed**2
+    road_wheel = 2.7 * curvature + 0.003 * ay
+    left, right = (1 - curvature * TRACK_M / 2, 1 + curvature * TRACK_M / 2)
+    longer = np.sqrt(1 + (2.7 * curvature) ** 2)
+    return {
+        "ax": ax,
+        "ay": ay,
+        "yaw_rate": yaw_rate,
+        "steering_wheel": 15 * road_wheel,
+        "wheel_fl": speed * left * longer / RADIUS_M,
+        "wheel_fr": speed * right * longer / RADIUS_M,
+        "wheel_rl": speed * left / RADIUS_M,
+        "wheel_rr": speed * right / RADIUS_M,
+        "sideslip": 1.4 * yaw_rate / speed - 0.004 * ay,
+    }
+
+
+def kinds(car: Car) -> set[tuple[str, tuple[str, ...]]]:
+    return {(one.kind, one.signals) for one in find_suspicions(car)}
+
+
+@pytest.mark.parametrize("least_mps", [2.5, 8.0, 20.0])
+def test_a_car_by_the_textbook_is_above_suspicion(least_mps: float) -> None:
+    car = a_car(least_mps)
+    assert kinds(car) == set()
+    noise = np.random.default_rng(1)
+    assert (
+        kinds({n: v + 0.02 * v.std() * noise.normal(size=v.size) for n, v in car.items()}) == set()
+    )
+
+
+@pytest.mark.parametrize("name", ["ax", "ay", "yaw_rate", "steering_wheel", "sideslip"])
+def test_a_sign(name: str) -> None:
+    car = a_car()
+    assert kinds({**car, name: -car[name]}) == {("sign", (name,))}
+
+
+def test_all_axes_reversed_are_told_by_the_wheels() -> None:
+    names = ("ay", "yaw_rate", "steering_wheel")
+    car = a_car()
+    reversed_axes = {**car, **{name: -car[name] for name in (*names, "sideslip")}}
+    assert kinds(reversed_axes) >= {("sign", (name,)) for name in names}
+
+
+@pytest.mark.parametrize("axle", ["f", "r"])
+def test_left_and_right_wheels_swapped(axle: str) -> None:
+    car, left, right = a_car(), f"wheel_{axle}l", f"wheel_{axle}r"
+    found = kinds({**car, left: car[right], right: car[left]})
+    assert ("swapped", (left, right)) in found
+    assert all(kind == "swapped" for kind, _ in found)
+
+
+def test_front_and_rear_wheels_swapped() -> None:
+    car = a_car(least_mps=2.5)
+    swapped = dict(zip(WHEELS, (car[n] for n in (*WHEELS[2:], *WHEELS[:2])), strict=True))
+    assert kinds({**car, **swapped}) == {("swapped", WHEELS)}
+
+
+@pytest.mark.parametrize(
+    ("name", "factor", "hint"),
+    [
+        ("yaw_rate", 57.3, "degrees and radians"),
+        ("ay", 1 / 9.81, "g and m/s^2"),
+        ("ax", 9.81, "g and m/s^2"),
+        ("wheel_rl", 3.6, "km/h and m/s"),
+    ],
+)
+def test_a_unit_that_lies(name: str, factor: float, hint: str) -> None:
+    car = a_car()
+    found = [s for s in find_suspicions({**car, name: factor * car[name]}) if s.kind == "unit"]
+    assert any(name in one.signals and hint in one.figure for one in found)
+
+
+def test_a_label_in_degrees() -> None:
+    car = a_car(20.0)
+    assert ("unit", ("sideslip",)) in kinds({**car, "sideslip": 57.3 * (car["sideslip"] + 0.02)})
+
+
+@pytest.mark.parametrize("delay", [-0.2, 0.08, 0.3])
+def test_a_delay_of_the_label(delay: float) -> None:
+    car = a_car()
+    late = {**car, "sideslip": np.roll(car["sideslip"], round(100 * delay))}
+    found = [one for one in find_suspicions(late) if one.kind == "delay"]
+    assert [one.value for one in found] == [pytest.approx(delay, abs=0.011)]
+    assert "delay_s" in found[0].remedy
+
+
+def test_a_signal_that_stands_still_or_is_absent() -> None:
+    car = a_car()
+    car["ay"] = np.full(6000, 0.3)
+    car["ax"] = np.full(6000, np.nan)
+    assert kinds(car) == {("stuck", ("ay",)), ("absent", ("ax",))}
+
+
+@pytest.mark.parametrize("change", [lambda v: v[:50], lambda v: 0 * v, lambda v: np.nan * v])
+def test_too_little_raises_no_more_than_what_is_plain(
+    change: Callable[[FloatArray], FloatArray],
+) -> None:
+    found = kinds({name: change(values) for name, values in a_car().items()})
+    assert {kind for kind, _ in found} <= {"stuck", "absent"}
+
+
+MAPPING = """name = "car"
+[time]
+rate_hz = 100
+[drive]
+day = 2024-05-31
+vehicle_id = "A7"
+vehicle_model = "sedan"
+[signals]
+"""
+
+
+def write_car(folder: Path, car: Car) -> tuple[str, str]:
+    units = {"ax": "m/s^2", "ay": "m/s^2", "yaw_rate": "rad/s"}
+    lines = [
+        f'{n} = {{ column = "{n}", unit = "{units.get(n, "rad/s" if n in WHEELS else "rad")}" }}'
+        for n in car
+    ]
+    (folder / "car.toml").write_text(MAPPING + "\n".join(lines))
+    pl.DataFrame(car).write_csv(folder / "car.csv")
+    return str(folder / "car.csv"), str(folder / "car.toml")
+
+
+def test_a_dry_run_shows_and_stores_nothing(tmp_path: Path) -> None:
+    file, mapping = write_car(tmp_path, a_car())
+    command = ("ingest", file, "--mapping", mapping, "--dry-run")
+    shown = call(tmp_path / "root", *command, "--plot", str(tmp_path / "car.png"))
+    assert "6,000 rows; left out by conditions 0; rejected 0; 1 drive of 6,000 ticks" in shown
+    assert (tmp_path / "car.png").read_bytes().startswith(b"\x89PNG")
+    assert not (tmp_path / "root").exists()
+    with pytest.raises(UsageError, match="--plot draws one file"):
+        call(tmp_path / "root", *command[:-1], "--plot", str(tmp_path / "car.png"))
+
+
+def test_a_dry_run_of_what_looks_wrong_calls_for_attention(tmp_path: Path) -> None:
+    car = a_car()
+    file, mapping = write_car(tmp_path, {**car, "ay": -car["ay"]})
+    with pytest.raises(AlarmError, match="1 thing to look at before ingesting") as caught:
+        call(tmp_path / "root", "ingest", file, "--mapping", mapping, "--dry-run", "--json")
+    assert caught.value.exit_code == 10
