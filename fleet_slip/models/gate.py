@@ -8,11 +8,9 @@ champions so far is compared as well.
 """
 
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 from pydantic import Field
@@ -35,12 +33,9 @@ from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.folds import Folds
 from fleet_slip.regression.paired import compare_paired
 from fleet_slip.regression.winner import Shortfall, Worth
-from fleet_slip.resources import folder
+from fleet_slip.resources import config_file
 from fleet_slip.selection.compare import Selection
 from fleet_slip.words import number_of
-
-FLOOR_VARIABLE = "FLEET_SLIP_PUBLISH"
-"""Environment variable: path of a TOML file that takes the place of configs/publish.toml."""
 
 
 class Floor(Config):
@@ -56,9 +51,8 @@ class Floor(Config):
 
 @cache
 def floor() -> Floor:
-    """Return the floor of `$FLEET_SLIP_PUBLISH`, else the one that ships with the package."""
-    chosen = os.environ.get(FLOOR_VARIABLE)
-    return load_config(Path(chosen) if chosen else folder("configs") / "publish.toml", Floor)
+    """Return what `publish.toml` asks for."""
+    return load_config(config_file("publish.toml"), Floor)
 
 
 LEAST_VEHICLES = 5

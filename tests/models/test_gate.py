@@ -17,6 +17,7 @@ from fleet_slip.models.counts_model import counts_model
 from fleet_slip.models.diff import compare_versions
 from fleet_slip.models.publish import Publication, manifest_of, publish
 from fleet_slip.models.versions import Registry
+from fleet_slip.resources import CONFIG_VARIABLE
 from fleet_slip.selection.request import SelectionRequest, answer_request
 from fleet_slip.warehouse.audit import Forgettable
 from fleet_slip.warehouse.tables import Warehouse
@@ -169,8 +170,8 @@ def test_a_person_sets_the_floor(
     usual = (Path(__file__).parents[2] / "configs" / "publish.toml").read_text()
     name = floor.partition(" ")[0]
     kept = "\n".join(line for line in usual.splitlines() if not line.startswith(name))
-    (tmp_path / "floor.toml").write_text(f"{kept}\n{floor}\n")
-    monkeypatch.setenv(gate.FLOOR_VARIABLE, str(tmp_path / "floor.toml"))
+    (tmp_path / "publish.toml").write_text(f"{kept}\n{floor}\n")
+    monkeypatch.setenv(CONFIG_VARIABLE, str(tmp_path))
     gate.floor.cache_clear()
     write(warehouse, "good", 48)
     try:
@@ -181,13 +182,15 @@ def test_a_person_sets_the_floor(
 
 
 def test_a_floor_that_cannot_be_read_lets_nothing_pass(
-    champion: Warehouse, monkeypatch: pytest.MonkeyPatch
+    champion: Warehouse, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write(champion, "more", 48)
-    monkeypatch.setenv(gate.FLOOR_VARIABLE, "absent.toml")
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "publish.toml").write_text("min_drives = 49\n")
+    monkeypatch.setenv(CONFIG_VARIABLE, str(tmp_path / "own"))
     gate.floor.cache_clear()
     try:
-        with pytest.raises(ConfigError, match=r"absent\.toml"):
+        with pytest.raises(ConfigError, match=r"publish\.toml"):
             publish_from(champion, force=True)
     finally:
         gate.floor.cache_clear()
