@@ -1,8 +1,8 @@
 """The part of a `Fleet` that publishes models, serves them and evaluates them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from fleet_slip.api.calls import ShowProgress, count_from_start, open_workers, record_call
 from fleet_slip.api.cohort import FleetCohort
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from fleet_slip.evaluation.evaluate import TrainRivals
+    from fleet_slip.export.estimator import Estimator
     from fleet_slip.export.files import Target
     from fleet_slip.files.documents import Document
     from fleet_slip.models.diff import Difference
@@ -213,6 +214,21 @@ class Serving(Rooted):
 
         folder = LocalFolder(output) if output else self.root / "report"
         return write_report(self.warehouse, self.resolve(model), folder)
+
+    def estimator(
+        self, model: str | ModelVersion, car: Mapping[str, Any] | None = None
+    ) -> "Estimator":
+        """Return a version that estimates a drive sample by sample, as a car does.
+
+        `car` is what the car knows of itself, by name: drive columns such as `mass_kg`, and what
+        its own drives tell of it, in SI units as the view `calibration` has them. What is not there
+        is not known.
+
+        Raises `InputError` for what the version does not use, and what `export` and `model` raise.
+        """
+        from fleet_slip.export.estimator import Estimator
+
+        return Estimator(self.resolve(model).manifest, car)
 
     def export(self, model: str | ModelVersion, to: "Target", output: Path) -> list[Path]:
         """Write a version as a program for elsewhere into a folder; return the files.

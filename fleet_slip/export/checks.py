@@ -13,6 +13,7 @@ import pyarrow as pa
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.signals import COUNT_MAX
 from fleet_slip.export.program import Car, CarFact, Input, Program
+from fleet_slip.grams.columns import DriveCounts
 from fleet_slip.grams.drive_rows import counts_of, read_drives
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predictor import Predictor
@@ -64,6 +65,14 @@ def angles_by_kernel(
 ) -> list[int | None]:
     """Return the angle of each tick, by the columns of the kernel and exact integers."""
     predictor = Predictor.of(manifest)
+    drive = drive_counts(program, predictor, car, samples)
+    return angles_of_columns(program, predictor.columns.compute(drive))
+
+
+def drive_counts(
+    program: Program, predictor: Predictor, car: Car, samples: Sequence[Sample]
+) -> DriveCounts:
+    """Return samples of consecutive ticks as a drive of the warehouse."""
     names = [one.name for one in program.signals]
     valid = [_valid(sample, program.signals) for sample in samples]
     counts = {
@@ -72,8 +81,7 @@ def angles_by_kernel(
     }
     rows = pa.table({"tick": np.arange(len(samples), dtype=np.int64), **counts})
     facts = {name: car.facts.get(name) for name in predictor.plan.facts}
-    drive = counts_of(rows, predictor.plan, facts, car.numbers)
-    return angles_of_columns(program, predictor.columns.compute(drive))
+    return counts_of(rows, predictor.plan, facts, car.numbers)
 
 
 def angles_of_columns(program: Program, columns: FloatArray) -> list[int | None]:
