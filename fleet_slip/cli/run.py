@@ -9,6 +9,7 @@ from fleet_slip.api.fleet import RUN_MODELS, Fleet
 from fleet_slip.api.run_report import RunReport
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.cli.data import Days, Through, last_day
+from fleet_slip.cli.next_steps import next_steps
 from fleet_slip.cli.options import Worth
 from fleet_slip.cli.output import Json, print_json, say
 from fleet_slip.cli.progress import progress_of_steps
@@ -73,6 +74,11 @@ def run(
         print_json(report)
     else:
         _print_report(report)
+        if (made := report.publication) and made.new and made.version.version == 1:
+            model = made.version.reference.partition("@")[0]
+            say("next:")
+            for line in next_steps(fleet, plan.name, model):
+                say(f"  {line}")
 
 
 def _print_report(report: RunReport) -> None:

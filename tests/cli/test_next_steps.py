@@ -1,0 +1,46 @@
+"""What the first run says to type next works as it stands."""
+
+import shlex
+from pathlib import Path
+
+import pytest
+
+from tests.support.commands import COMMAND, RunCommand, run_prepared
+
+
+@pytest.fixture(scope="module")
+def told(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
+    """A folder in which the program has run for the first time, and the lines after `next:`."""
+    folder = tmp_path_factory.mktemp("first")
+    done = run_prepared([COMMAND, "run", "--campaign", "smoke"], folder)
+    assert done.exit_code == 0, done.stderr
+    _, _, lines = done.stderr.partition("next:\n")
+    return folder, lines.splitlines()
+
+
+def test_each_command_can_be_typed(told: tuple[Path, list[str]]) -> None:
+    folder, lines = told
+    assert [shlex.split(line)[1] for line in lines] == ["sql", "show", "select", "evaluate"]
+    for line in lines[:-1]:
+        program, *arguments = shlex.split(line)
+        done = run_prepared([str(folder / program), *arguments], folder)
+        assert done.exit_code == 0, (line, done.stderr)
+        assert done.stdout
+
+
+def test_the_last_draws_the_report_of_the_model(told: tuple[Path, list[str]]) -> None:
+    _, lines = told
+    evaluate, report = lines[-1].split(" && ")
+    assert evaluate.endswith("evaluate --one-car smoke")
+    assert report.endswith("report --model smoke")
+
+
+def test_another_root_stands_in_them(run_command: RunCommand, tmp_path: Path) -> None:
+    done = run_command("run", "--campaign", "smoke", root=tmp_path / "my data")
+    assert f"--root '{tmp_path / 'my data'}' sql" in done.stderr
+
+
+def test_they_are_said_once(told: tuple[Path, list[str]]) -> None:
+    folder, _ = told
+    again = run_prepared([COMMAND, "run", "--campaign", "smoke"], folder)
+    assert "next:" not in again.stderr
