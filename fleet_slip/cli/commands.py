@@ -25,6 +25,7 @@ COMMANDS = {
     "run": "run",
     "simulate": "data",
     "ingest": "data",
+    "mapping": "mapping",
     "gram": "data",
     "check": "data",
     "select": "selecting",

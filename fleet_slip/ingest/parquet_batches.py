@@ -47,7 +47,8 @@ class ParquetSource:
 
     def channels(self) -> list[Channel]:
         """Return the columns."""
-        return [Channel(name) for name in (*self._schema.names, *self._keys)]
+        readable = [f.name for f in self._schema if is_readable(f.type)]
+        return [Channel(name) for name in (*readable, *self._keys)]
 
     def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
         """Yield rows. Raises `InputError`."""
@@ -101,6 +102,15 @@ def _require_sane_footer(stream: BinaryIO, file: Path) -> None:
         raise InputError(
             f"{shown(file)}: its footer is too large. Write fewer columns or row groups."
         )
+
+
+def is_readable(kind: pa.DataType) -> bool:
+    """Whether a column of this type is text, a number or a time."""
+    if pa.types.is_dictionary(kind):
+        kind = kind.value_type
+    tests = (_is_text, pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal)
+    times = (pa.types.is_date, pa.types.is_timestamp, pa.types.is_null)
+    return any(is_it(kind) for is_it in (*tests, *times))
 
 
 def _is_text(arrow_type: pa.DataType) -> bool:

@@ -10,18 +10,20 @@ import hashlib
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import polars as pl
 import pyarrow as pa
 
 from fleet_slip.errors import InputError
+from fleet_slip.ingest.can_bus import CanBus
 from fleet_slip.ingest.can_trace import open_can_trace
 from fleet_slip.ingest.columns import shown
 from fleet_slip.ingest.csv_batches import open_csv
+from fleet_slip.ingest.csv_format import CsvFormat
 from fleet_slip.ingest.duckdb_table import MAGIC as DUCKDB_MAGIC
 from fleet_slip.ingest.duckdb_table import MAGIC_AT as DUCKDB_AT
-from fleet_slip.ingest.duckdb_table import open_duckdb
+from fleet_slip.ingest.duckdb_table import DuckdbRows, open_duckdb
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.matlab import HDF5_AT, HDF5_MAGIC, MAT5_MAGIC, open_mat, open_mat73
 from fleet_slip.ingest.mdf import MAGICS as MDF_MAGICS
@@ -47,16 +49,40 @@ MAX_ROWS = 20_000_000
 """Rows of one file: 55 hours at 100 Hz. All of them are in memory once, as float64."""
 
 
+class Formats(Protocol):
+    """What must be known of a file's format beside the file, as a mapping says it."""
+
+    @property
+    def name(self) -> str:
+        """What says it, for messages."""
+        ...
+
+    @property
+    def csv(self) -> CsvFormat:
+        """Separator and decimal sign of text."""
+        ...
+
+    @property
+    def can(self) -> CanBus | None:
+        """The database of a CAN trace."""
+        ...
+
+    @property
+    def duckdb(self) -> DuckdbRows | None:
+        """The rows of a DuckDB file."""
+        ...
+
+
 @contextmanager
 def require_unchanged_file(file: Path) -> Iterator[None]:
     """Raise `InputError` if this is no regular file, or if it is written to while it is read."""
     if not file.is_file():
         what = "is not a regular file" if file.exists() else "no such file"
         raise InputError(f"{shown(file)}: {what}. Give the path of a file.")
-    with _file_errors(file):
+    with file_errors(file):
         before = file.stat()
     yield
-    with _file_errors(file):
+    with file_errors(file):
         after = file.stat()
     if (before.st_size, before.st_mtime_ns) != (after.st_size, after.st_mtime_ns):
         raise InputError(f"{shown(file)}: it changed while it was read. Wait until it is complete.")
@@ -64,7 +90,7 @@ def require_unchanged_file(file: Path) -> Iterator[None]:
 
 def file_digest(file: Path) -> "hashlib._Hash":
     """Return the SHA-256 of a file's bytes, open for more. Raises `InputError`."""
-    with _file_errors(file), file.open("rb") as stream:
+    with file_errors(file), file.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256")
 
 
@@ -75,7 +101,7 @@ def read_batches(file: Path, mapping: Mapping) -> Iterator[pl.DataFrame]:
     is larger than the limits of this module.
     """
     rows = 0
-    with _file_errors(file), open_source(file, mapping) as source:
+    with file_errors(file), open_source(file, mapping) as source:
         for batch in _one_table(source, file, mapping):
             rows += batch.height
             if rows > MAX_ROWS:
@@ -116,8 +142,8 @@ def _with_times(table: pl.DataFrame, own: str | None, time: str) -> pl.DataFrame
 
 
 @contextmanager
-def open_source(file: Path, mapping: Mapping) -> Iterator[Source]:
-    """Open a file, in the format that its first bytes and the mapping tell. Raises `InputError`."""
+def open_source(file: Path, formats: Formats) -> Iterator[Source]:
+    """Open a file, in the format that its first bytes tell. Raises `InputError`."""
     with file.open("rb") as stream:
         start = stream.read(HDF5_AT + len(HDF5_MAGIC))
     for magic, program in _ARCHIVES.items():
@@ -125,20 +151,20 @@ def open_source(file: Path, mapping: Mapping) -> Iterator[Source]:
             raise InputError(
                 f"{shown(file)}: it is an archive. Unpack it with {program} and give the files."
             )
-    with _opened(file, start, mapping) as source:
+    with _opened(file, start, formats) as source:
         yield source
 
 
-def _opened(file: Path, start: bytes, mapping: Mapping) -> AbstractContextManager[Source]:
+def _opened(file: Path, start: bytes, formats: Formats) -> AbstractContextManager[Source]:
     for is_it, open_it in _FORMATS:
         if is_it(start):
             return open_it(file)
     if start[DUCKDB_AT:].startswith(DUCKDB_MAGIC):
-        return open_duckdb(file, _wanted(mapping.duckdb, file, "duckdb", 'table = "…"', mapping))
+        return open_duckdb(file, _wanted(formats.duckdb, file, "duckdb", 'table = "…"', formats))
     suffix = file.suffix.lower()
-    if mapping.can is not None or start.startswith(BLF_MAGIC) or suffix in {".blf", ".asc"}:
+    if formats.can is not None or start.startswith(BLF_MAGIC) or suffix in {".blf", ".asc"}:
         return open_can_trace(
-            file, _wanted(mapping.can, file, "can", 'database = "….dbc"', mapping)
+            file, _wanted(formats.can, file, "can", 'database = "….dbc"', formats)
         )
     for suffixes, kind in _BINARY.items():
         if suffix in suffixes:
@@ -146,15 +172,15 @@ def _opened(file: Path, start: bytes, mapping: Mapping) -> AbstractContextManage
                 f"{shown(file)}: not {kind}, whatever its name says. Export it again, or name it "
                 "as what it is."
             )
-    return open_csv(file, mapping.csv)
+    return open_csv(file, formats.csv)
 
 
-def _wanted(told: Told | None, file: Path, table: str, key: str, mapping: Mapping) -> Told:
+def _wanted(told: Told | None, file: Path, table: str, key: str, formats: Formats) -> Told:
     """Return what the mapping says of a format that needs it. Raises `InputError`."""
     if told is None:
         raise InputError(
             f"{shown(file)}: this format needs [{table}] with {key} in the mapping "
-            f"{mapping.name!r}."
+            f"{formats.name!r}."
         )
     return told
 
@@ -170,7 +196,7 @@ _FORMATS: tuple[
 
 
 @contextmanager
-def _file_errors(file: Path) -> Iterator[None]:
+def file_errors(file: Path) -> Iterator[None]:
     """Turn what the operating system, Polars and pyarrow raise into an `InputError`."""
     try:
         yield
