@@ -79,7 +79,8 @@ def status_of(
 
     Data older than `max_age_hours`, and log files that old without Gram rows, are a problem; so are
     a command whose last run failed or was killed, a disk that is nearly full, and a champion that
-    cannot be loaded. Raises `StorageError` if there is no data root.
+    cannot be loaded. `jobs/last_runs.sql` says which failures are mere mistakes of a person. Raises
+    `StorageError` if there is no data root.
     """
     now = now or datetime.now(UTC)
     warehouse.require()

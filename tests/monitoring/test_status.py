@@ -7,7 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleet_slip.errors import StorageError
+from fleet_slip.errors import (
+    ConfigError,
+    FleetSlipError,
+    QuestionError,
+    RefusedError,
+    StorageError,
+    UsageError,
+)
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.job import update_grams
 from fleet_slip.monitoring.status import status_of
@@ -49,6 +56,42 @@ def test_the_last_run_of_each_command_counts(warehouse: Warehouse) -> None:
         assert running["command"] == "gram"
         assert status_of(warehouse).problems == ()
     assert status_of(warehouse).problems == ()
+
+
+def fail(warehouse: Warehouse, error: FleetSlipError, *arguments: str) -> None:
+    with pytest.raises(type(error)), recording(warehouse.root, "publish", arguments):
+        raise error
+
+
+@pytest.mark.parametrize("mistake", [UsageError, ConfigError, QuestionError, RefusedError])
+def test_what_a_person_mistyped_or_was_refused_is_no_failure_of_the_night(
+    warehouse: Warehouse, mistake: type[FleetSlipError]
+) -> None:
+    path_of(warehouse.root).mkdir()
+    fail(warehouse, mistake("no drive satisfies it"), "beta", "--cohort", "typo")
+    assert status_of(warehouse).problems == ()
+    with recording(warehouse.root, "publish", ["beta"]):
+        pass
+    fail(warehouse, mistake("no drive satisfies it"), "beta", "--cohort", "typo")
+    (last,) = status_of(warehouse).last_runs
+    assert last["state"] == "done"
+
+
+def test_what_worked_before_and_is_refused_now_is_one(warehouse: Warehouse) -> None:
+    path_of(warehouse.root).mkdir()
+    with recording(warehouse.root, "publish", ["beta"]):
+        pass
+    fail(warehouse, RefusedError("the champion is better"), "beta")
+    (problem,) = status_of(warehouse).problems
+    assert problem.endswith("failed with exit code 7: the champion is better")
+
+
+def test_a_typo_after_a_failure_does_not_hide_it(warehouse: Warehouse) -> None:
+    path_of(warehouse.root).mkdir()
+    fail(warehouse, StorageError("the disk is full"), "beta")
+    fail(warehouse, QuestionError("no such column"), "beta", "--cohort", "typo")
+    (problem,) = status_of(warehouse).problems
+    assert problem.endswith("the disk is full")
 
 
 def test_a_killed_run_is_known(warehouse: Warehouse) -> None:
