@@ -12,10 +12,11 @@ from fleet_slip.export.checks import Check, make_checks
 from fleet_slip.export.compile import compile_program
 from fleet_slip.export.document import document_of
 from fleet_slip.export.program import Program
+from fleet_slip.export.sql_source import sql_macro, sql_statement
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.warehouse.tables import Warehouse
 
-Target = Literal["json", "c"]
+Target = Literal["json", "c", "sql"]
 """What a version can be exported to."""
 
 
@@ -62,6 +63,15 @@ def _c(subject: Subject) -> dict[str, str]:
     }
 
 
+def _sql(subject: Subject) -> dict[str, str]:
+    version, program = subject.version, subject.program
+    prefix = c_prefix(version)
+    return {
+        f"{prefix}.sql": sql_statement(version, program),
+        f"{prefix}_macro.sql": sql_macro(version, program),
+    }
+
+
 def render(content: Mapping[str, Any]) -> str:
     """Return a JSON document with a line for each of its parts, and for each tick."""
     return _rendered(content, 0) + "\n"
@@ -83,4 +93,4 @@ def _rendered(value: Any, depth: int) -> str:
     )
 
 
-_WRITERS: dict[str, Callable[[Subject], dict[str, str]]] = {"json": _json, "c": _c}
+_WRITERS: dict[str, Callable[[Subject], dict[str, str]]] = {"json": _json, "c": _c, "sql": _sql}

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from decimal import Decimal
 from fractions import Fraction
 
+import numpy as np
 from hypothesis import strategies as st
 
 from fleet_slip.catalogue.columns import Definition, Fact, Gate, Number
@@ -121,3 +122,33 @@ def drives(program: Program) -> st.SearchStrategy[list[Sample]]:
     width = len(program.signals)
     hole = st.just((None,) * width)
     return st.lists(st.one_of(st.tuples(*[COUNT] * width), hole), min_size=1, max_size=12)
+
+
+SMALL = Fraction(1, 10**4)
+MODELS: Mapping[str, Mapping[str, Fraction]] = {
+    "every_kind": {name: SMALL * (-1) ** i for i, name in enumerate(DEFINITIONS)},
+    "signals": {"ay": Fraction(1, 3), "yaw_rate": Fraction(-22, 7)},
+    "features": {"curvature": Fraction(1, 3), "ay_signed_square": SMALL},
+    "a_lag": {"lag_2": Fraction(1)},
+    "numbers_alone": {"tyres": SMALL, "radius": SMALL},
+}
+CARS = (
+    Car({}, {}),
+    Car({"mass_kg": 1320.5, "vehicle_model": "suv"}, {"yaw_rate_offset": -32767}),
+    Car({"mass_kg": 1e9, "vehicle_model": "van"}, {"speed_ratio": 2003, "understeer": 32767}),
+    Car({"mass_kg": 900.0}, {"yaw_rate_offset": 3, "speed_ratio": -5, "understeer": 0}),
+)
+
+
+def hostile_drive(program: Program, ticks: int, seed: int) -> list[Sample]:
+    """Counts anywhere in 16 bits, in and beyond the ranges, with holes; long calm parts."""
+    random = np.random.default_rng(seed)
+    width = len(program.signals)
+    counts = random.integers(-(2**15), 2**15, (ticks, width))
+    calm = random.random(ticks) < 0.7
+    counts[calm] //= 40
+    ends = random.random((ticks, width)) < 0.1
+    counts[ends] = random.choice([-32768, -30000, 30000, 32767, 0, 1, -1], ends.sum())
+    counts[np.repeat(random.random(ticks // 10 + 1) < 0.1, 10)[:ticks]] = -32768
+    counts[: ticks // 5] = np.clip(counts[: ticks // 5], 20_000, 30_000)  # sums at their largest
+    return [tuple(None if one == -32768 else one for one in row) for row in counts.tolist()]

@@ -1,7 +1,6 @@
 """Exported C, compiled without a warning and run under sanitizers, computes what `score` does."""
 
 import subprocess
-from collections.abc import Mapping
 from fractions import Fraction
 from pathlib import Path
 
@@ -19,38 +18,9 @@ from fleet_slip.grams.drive_rows import read_drives
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.predictor import Predictor
 from tests.export.compiled import SANITIZED, build_driver, can_sanitize, compile_c, drive, needs_cc
-from tests.export.models import DEFINITIONS, model_of
+from tests.export.models import CARS, MODELS, SMALL, hostile_drive, model_of
 
 pytestmark = needs_cc
-
-SMALL = Fraction(1, 10**4)
-MODELS: Mapping[str, Mapping[str, Fraction]] = {
-    "every_kind": {name: SMALL * (-1) ** i for i, name in enumerate(DEFINITIONS)},
-    "signals": {"ay": Fraction(1, 3), "yaw_rate": Fraction(-22, 7)},
-    "features": {"curvature": Fraction(1, 3), "ay_signed_square": SMALL},
-    "a_lag": {"lag_2": Fraction(1)},
-    "numbers_alone": {"tyres": SMALL, "radius": SMALL},
-}
-CARS = (
-    Car({}, {}),
-    Car({"mass_kg": 1320.5, "vehicle_model": "suv"}, {"yaw_rate_offset": -32767}),
-    Car({"mass_kg": 1e9, "vehicle_model": "van"}, {"speed_ratio": 2003, "understeer": 32767}),
-    Car({"mass_kg": 900.0}, {"yaw_rate_offset": 3, "speed_ratio": -5, "understeer": 0}),
-)
-
-
-def hostile_drive(program: Program, ticks: int, seed: int) -> list[Sample]:
-    """Counts anywhere in 16 bits, in and beyond the ranges, with holes; long calm parts."""
-    random = np.random.default_rng(seed)
-    width = len(program.signals)
-    counts = random.integers(-(2**15), 2**15, (ticks, width))
-    calm = random.random(ticks) < 0.7
-    counts[calm] //= 40
-    ends = random.random((ticks, width)) < 0.1
-    counts[ends] = random.choice([-32768, -30000, 30000, 32767, 0, 1, -1], ends.sum())
-    counts[np.repeat(random.random(ticks // 10 + 1) < 0.1, 10)[:ticks]] = -32768
-    counts[: ticks // 5] = np.clip(counts[: ticks // 5], 20_000, 30_000)  # sums at their largest
-    return [tuple(None if one == -32768 else one for one in row) for row in counts.tolist()]
 
 
 @pytest.mark.parametrize("name", MODELS)
