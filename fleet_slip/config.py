@@ -1,5 +1,6 @@
 """Reads a TOML file into a pydantic model; says what is wrong with it by file, key and reason."""
 
+import re
 import tomllib
 from collections.abc import Mapping
 from decimal import Decimal
@@ -7,6 +8,7 @@ from importlib.resources.abc import Traversable
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic_core import ErrorDetails
 
 from fleet_slip.errors import ConfigError, StorageError
 
@@ -20,6 +22,37 @@ class Config(BaseModel):
 ConfigT = TypeVar("ConfigT", bound=Config)
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
+
+_TRIED = re.compile(r"[\[(]|^constrained-|^([A-Z][a-z]+){2,}$|^(str|int|float|decimal|bool)$")
+"""Matches what pydantic puts among the keys for a type that it tried."""
+
+_SAID = {
+    "missing": "is missing",
+    "extra_forbidden": "unknown key",
+    "string_type": "must be text",
+    "bool_type": "must be true or false",
+    "bool_parsing": "must be true or false",
+    "list_type": "must be a list",
+    "tuple_type": "must be a list",
+    "dict_type": "must be a table",
+    "model_type": "must be a table",
+    "model_attributes_type": "must be a table",
+    **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "must be a whole number"),
+    **dict.fromkeys(
+        ("float_type", "float_parsing", "decimal_type", "decimal_parsing"), "must be a number"
+    ),
+    **dict.fromkeys(
+        ("date_type", "date_parsing", "date_from_datetime_parsing"),
+        "must be a date such as 2024-05-31",
+    ),
+    "literal_error": "must be {expected}",
+    "greater_than": "must be greater than {gt}",
+    "greater_than_equal": "must be at least {ge}",
+    "less_than": "must be less than {lt}",
+    "less_than_equal": "must be at most {le}",
+    "finite_number": "must be a finite number",
+}
+"""What is said of a fault, by its type in pydantic; what is not listed keeps pydantic's words."""
 
 LONGEST_FILE_BYTES = 2**20
 FAULTS_SHOWN = 10
@@ -69,16 +102,35 @@ def parse_document(content: Mapping[str, Any], model: type[ModelT], name: str, k
 
 def faults_of(error: ValidationError) -> str:
     """Return what is wrong, key by key, on one line; of many faults the first."""
-    faults = [
-        f"{'.'.join(map(str, fault['loc'])) or 'file'}: {fault['msg']}"
-        for fault in error.errors(include_input=False, include_url=False)
-    ]
-    text = "; ".join(_shortened(fault) for fault in faults[:FAULTS_SHOWN])
+    wrong: dict[str, list[str]] = {}
+    for fault in error.errors(include_input=False, include_url=False):
+        told = wrong.setdefault(_key_of(fault), [])
+        if (said := _said(fault)) not in told:
+            told.append(said)
+    faults = [f"{key}: {', or '.join(told)}" for key, told in wrong.items()]
+    text = "; ".join(
+        fault if len(fault) <= LONGEST_FAULT else fault[:LONGEST_FAULT] + "…"
+        for fault in faults[:FAULTS_SHOWN]
+    )
     more = len(faults) - FAULTS_SHOWN
     return text + (f"; and {more:,} more" if more > 0 else "")
 
 
-def _shortened(fault: str) -> str:
-    text = fault.replace("Value error, ", "")
-    text = text.replace("Extra inputs are not permitted", "unknown key")
-    return text if len(text) <= LONGEST_FAULT else text[:LONGEST_FAULT] + "…"
+def _key_of(fault: ErrorDetails) -> str:
+    """Return the key at fault, without what pydantic adds for a type that it tried."""
+    place = fault["loc"]
+    unknown = len(place) - 1 if fault["type"] == "extra_forbidden" else None
+    keys = [
+        part
+        for number, part in enumerate(place)
+        if number == unknown or isinstance(part, int) or not _TRIED.search(part)
+    ]
+    return ".".join(map(str, keys)) or "file"
+
+
+def _said(fault: ErrorDetails) -> str:
+    """Return what is wrong, in words of our own; what a validator of ours says, as it is."""
+    told = _SAID.get(fault["type"])
+    if told is None:
+        return fault["msg"].replace("Value error, ", "").replace("Input should be", "must be")
+    return told.format(**fault.get("ctx", {}))

@@ -6,6 +6,7 @@ import pint
 
 _TERM = r"(?:°|[^\W\d]+\d?)(?:(?:\^|\*\*)-?\d)?"
 _UNIT = re.compile(rf"(?:1/)?{_TERM}(?:[*/ ]{_TERM})*")
+_POWER = re.compile(r"(?<=[^\W\d_])([2-9])(?!\w)")
 _LONGEST_UNIT = 40
 
 _NEEDS = {
@@ -38,6 +39,8 @@ def conversion_factor(unit: str, si_unit: str, quantity: str = "it") -> float:
         raise ValueError(f"is in {unit[:_LONGEST_UNIT]!r}, which is not a unit; {needs}")
     registry = pint.application_registry
     name = "standard_gravity" if unit == "g" and si_unit == "m/s^2" else unit
+    if name not in registry:  # a digit after a letter is a power, as in m/s2
+        name = _POWER.sub(r"^\1", name)
     try:
         root = registry.Quantity(1.0, name).to_root_units()
         wanted = registry.Quantity(1.0, si_unit).to_root_units()

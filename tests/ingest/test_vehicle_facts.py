@@ -58,10 +58,10 @@ def test_a_car_whose_model_nobody_says_is_an_error(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("cars", "message"),
     [
-        ("vehicle_id,mass_kg\nA7,heavy\n", "line 2: mass_kg: Input should be a valid number"),
-        ("vehicle_id,mass_kg\nA7,-3\n", "line 2: mass_kg: Input should be greater than 0"),
+        ("vehicle_id,mass_kg\nA7,heavy\n", "line 2: mass_kg: must be a number"),
+        ("vehicle_id,mass_kg\nA7,-3\n", "line 2: mass_kg: must be greater than 0"),
         ("vehicle_id,colour\nA7,red\n", "line 2: colour: unknown key"),
-        ("car,mass_kg\nA7,1\n", "vehicle_id: Field required"),
+        ("car,mass_kg\nA7,1\n", "vehicle_id: is missing"),
         ("vehicle_id\nA7\nA7\n", "the car 'A7' stands in it twice"),
         ("vehicle_id\n", "it has no row"),
         ("vehicle_id\nA7,1,2\n", "line 2"),
