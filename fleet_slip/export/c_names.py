@@ -12,12 +12,13 @@ def field_names(program: Program) -> dict[str, tuple[str, ...]]:
     """Return the fields of a sample and of a car, none of which is a keyword of C."""
     return {
         "signals": tuple(f"{one.name}_count" for one in program.signals),
-        "facts": _different([f"fact_{one.field}" for one in program.facts]),
+        "facts": different([f"fact_{one.field}" for one in program.facts]),
         "numbers": tuple(f"{one.name}_count" for one in program.numbers),
     }
 
 
-def _different(names: Sequence[str]) -> tuple[str, ...]:
+def different(names: Sequence[str]) -> tuple[str, ...]:
+    """Return names of which none stands twice."""
     seen: dict[str, int] = {}
     found = []
     for name in names:

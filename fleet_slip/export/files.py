@@ -9,14 +9,16 @@ from fleet_slip.errors import UsageError
 from fleet_slip.export.c_checks import c_self_test
 from fleet_slip.export.c_source import c_header, c_prefix, c_source
 from fleet_slip.export.checks import Check, make_checks
+from fleet_slip.export.checks_table import checks_csv
 from fleet_slip.export.compile import compile_program
+from fleet_slip.export.dbc import dbc_text
 from fleet_slip.export.document import document_of
 from fleet_slip.export.program import Program
 from fleet_slip.export.sql_source import sql_macro, sql_statement
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.warehouse.tables import Warehouse
 
-Target = Literal["json", "c", "sql"]
+Target = Literal["json", "c", "sql", "dbc"]
 """What a version can be exported to."""
 
 
@@ -69,6 +71,15 @@ def _sql(subject: Subject) -> dict[str, str]:
     return {
         f"{prefix}.sql": sql_statement(version, program),
         f"{prefix}_macro.sql": sql_macro(version, program),
+        f"{prefix}_checks.csv": checks_csv(program, subject.checks),
+    }
+
+
+def _dbc(subject: Subject) -> dict[str, str]:
+    prefix = c_prefix(subject.version)
+    return {
+        f"{prefix}.dbc": dbc_text(subject.version, subject.program),
+        f"{prefix}_checks.csv": checks_csv(subject.program, subject.checks),
     }
 
 
@@ -93,4 +104,9 @@ def _rendered(value: Any, depth: int) -> str:
     )
 
 
-_WRITERS: dict[str, Callable[[Subject], dict[str, str]]] = {"json": _json, "c": _c, "sql": _sql}
+_WRITERS: dict[str, Callable[[Subject], dict[str, str]]] = {
+    "json": _json,
+    "c": _c,
+    "sql": _sql,
+    "dbc": _dbc,
+}

@@ -110,6 +110,24 @@ def test_the_macro_gives_the_angles_of_score(smoke_root: Path) -> None:
 def test_the_statement_says_what_it_is_of() -> None:
     manifest = model_of(dict.fromkeys(DEFINITIONS, Fraction(1, 10**6)))
     files = export_files(ModelVersion(3, manifest, "ab" * 32), None, "sql")
-    for text in files.values():
+    for text in (files["sideslip_sideslip.sql"], files["sideslip_sideslip_macro.sql"]):
         assert text.startswith("-- sideslip@3: sideslip_rad")
         assert "ab" * 32 in text
+
+
+def test_the_table_of_checks_holds(tmp_path: Path) -> None:
+    """Every kind of column: `car` of the check `extremes` knows all facts and numbers."""
+    manifest = model_of(MODELS["every_kind"], name="every_kind")
+    files = export_files(ModelVersion(1, manifest, "0" * 64), None, "sql")
+    checks = tmp_path / "checks.csv"
+    checks.write_text(files["sideslip_every_kind_checks.csv"])
+    with duckdb.connect() as database:
+        database.execute(f"CREATE TABLE checks AS FROM read_csv('{checks}')")
+        database.execute(files["sideslip_every_kind_macro.sql"])
+        rows, right, angles = database.sql(
+            "SELECT count(*), count(*) FILTER (angle IS NOT DISTINCT FROM expected_angle), "
+            "count(DISTINCT angle) FROM checks JOIN sideslip_every_kind('checks') "
+            "USING (drive_id, tick)"
+        ).fetchall()[0]
+    assert rows == right == 600
+    assert angles > 50

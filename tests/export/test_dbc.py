@@ -1,0 +1,74 @@
+"""Exported DBC files, read by cantools: a drive that goes over the bus gives the same angles."""
+
+from collections.abc import Sequence
+from fractions import Fraction
+
+import cantools
+import pytest
+from cantools.database.can.database import Database
+
+from fleet_slip.export.checks import Sample, angles_by_kernel
+from fleet_slip.export.compile import compile_program
+from fleet_slip.export.dbc import MISSING
+from fleet_slip.export.files import export_files
+from fleet_slip.export.program import Car, Program
+from fleet_slip.models.model_version import ModelVersion
+from tests.export.models import DEFINITIONS, hostile_drive, model_of
+
+VERSION = ModelVersion(7, model_of(dict.fromkeys(DEFINITIONS, Fraction(1, 10**6))), "12ab34" * 10)
+PROGRAM = compile_program(VERSION.manifest)
+
+
+@pytest.fixture(scope="module")
+def bus() -> Database:
+    text = export_files(VERSION, None, "dbc")["sideslip_sideslip.dbc"]
+    found = cantools.database.load_string(text, "dbc")
+    assert isinstance(found, Database)
+    return found
+
+
+def over_the_bus(bus: Database, program: Program, sample: Sample) -> Sample:
+    """Encode counts as physical values in messages; return the counts of the decoded ones."""
+    counts: dict[str, int] = {}
+    names = [one.name for one in program.signals]
+    known = [MISSING if count is None else count for count in sample]
+    given = dict(zip(names, known, strict=True))
+    for message in bus.messages[:-1]:
+        raw = {signal.name: given[signal.name] for signal in message.signals}
+        data = message.encode(raw, scaling=False, strict=False)
+        assert len(data) <= 8
+        decoded = message.decode(data, scaling=False)
+        assert isinstance(decoded, dict)
+        counts |= {name: int(str(value)) for name, value in decoded.items()}
+    return tuple(counts[one.name] for one in program.signals)
+
+
+def test_a_drive_over_the_bus_gives_the_same_angles(bus: Database) -> None:
+    samples: Sequence[Sample] = hostile_drive(PROGRAM, 100, 5)
+    received = [over_the_bus(bus, PROGRAM, sample) for sample in samples]
+    car = Car({"mass_kg": 1500.0, "vehicle_model": "suv"}, {})
+    manifest = VERSION.manifest
+    found = angles_by_kernel(manifest, PROGRAM, car, received)
+    assert found == angles_by_kernel(manifest, PROGRAM, car, samples)
+    assert len({*found}) > 10
+
+
+def test_signals_have_the_scales_units_and_ranges_of_the_catalogue(bus: Database) -> None:
+    by_name = {signal.name: signal for message in bus.messages for signal in message.signals}
+    for one in PROGRAM.signals:
+        signal = by_name[one.name]
+        assert signal.scale == float(one.scale)
+        assert signal.unit == one.unit
+        assert signal.minimum == float(one.min_count * one.scale)
+        assert signal.maximum == float(one.max_count * one.scale)
+
+
+def test_the_angle_s_message_says_the_angle_and_of_which_version(bus: Database) -> None:
+    message = bus.get_message_by_name("sideslip_estimate")
+    data = message.encode({"sideslip": -0.12345, "valid": 1, "model_sha256": 0x12AB34})
+    decoded = message.decode(data)
+    assert decoded == {"sideslip": -0.12345, "valid": 1, "model_sha256": 0x12AB34}
+    comment = message.get_signal_by_name("model_sha256").comment
+    assert comment is not None
+    assert str(0x12AB34) in comment
+    assert "sideslip@7" in comment
