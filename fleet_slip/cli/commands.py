@@ -21,48 +21,61 @@ from typer.main import get_group
 MARKUP: Final = "markdown"
 """What the help texts are written in."""
 
-COMMANDS = {
-    "run": "run",
-    "simulate": "data",
-    "ingest": "data",
-    "mapping": "mapping",
-    "gram": "data",
-    "check": "data",
-    "select": "selecting",
-    "publish": "publishing",
-    "models": "models",
-    "show": "models",
-    "promote": "models",
-    "rollback": "models",
-    "pin": "models",
-    "unpin": "models",
-    "diff": "comparing",
-    "export": "exporting",
-    "score": "evaluate",
-    "diagnose": "diagnosing",
-    "features": "statistics",
-    "config": "configs",
-    "what-if": "statistics",
-    "regimes": "statistics",
-    "shrink": "statistics",
-    "evaluate": "evaluate",
-    "report": "report",
-    "status": "status",
-    "quality": "operations",
-    "calibrate": "calibrating",
-    "monitor": "operations",
-    "migrate": "operations",
-    "verify": "maintenance",
-    "compact": "maintenance",
-    "vacuum": "maintenance",
-    "forget": "maintenance",
-    "retain": "maintenance",
-    "keygen": "signing",
-    "sign": "signing",
-    "sql": "query",
-    "shell": "query",
+GROUPS = {
+    "Begin with": {
+        "run": "run",
+        "sql": "query",
+        "select": "selecting",
+        "publish": "publishing",
+        "show": "models",
+    },
+    "Data": {
+        "simulate": "data",
+        "mapping": "mapping",
+        "ingest": "data",
+        "gram": "data",
+        "check": "data",
+        "features": "statistics",
+        "config": "configs",
+        "shell": "query",
+    },
+    "Models": {
+        "models": "models",
+        "diff": "comparing",
+        "promote": "models",
+        "rollback": "models",
+        "pin": "models",
+        "unpin": "models",
+        "export": "exporting",
+        "keygen": "signing",
+        "sign": "signing",
+    },
+    "Accuracy": {
+        "score": "evaluate",
+        "evaluate": "evaluate",
+        "report": "report",
+        "diagnose": "diagnosing",
+        "regimes": "statistics",
+        "shrink": "statistics",
+        "what-if": "statistics",
+    },
+    "Operations": {
+        "status": "status",
+        "quality": "operations",
+        "calibrate": "calibrating",
+        "monitor": "operations",
+        "verify": "maintenance",
+        "compact": "maintenance",
+        "vacuum": "maintenance",
+        "forget": "maintenance",
+        "retain": "maintenance",
+        "migrate": "operations",
+    },
 }
-"""The module of `fleet_slip.cli` that has each command as a function, in the order of the list."""
+"""The commands in the groups and the order of `--help`, and the module of `fleet_slip.cli` that has
+each as a function."""
+
+COMMANDS = {name: module for group in GROUPS.values() for name, module in group.items()}
 
 
 class CommandGroup(TyperGroup):
@@ -71,9 +84,15 @@ class CommandGroup(TyperGroup):
     def __init__(self, **settings: Any) -> None:
         """Add a command that has nothing but its docstring for each of `COMMANDS`."""
         super().__init__(**settings)
-        for name, module in COMMANDS.items():
-            text = docstrings(module)[_function(name)]
-            self.add_command(TyperCommand(name, help=text, rich_markup_mode=self.rich_markup_mode))
+        for group, commands in GROUPS.items():
+            for name, module in commands.items():
+                command = TyperCommand(
+                    name,
+                    help=docstrings(module)[_function(name)],
+                    rich_markup_mode=self.rich_markup_mode,
+                    rich_help_panel=group,
+                )
+                self.add_command(command)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Put the command that is called in the place of its docstring."""

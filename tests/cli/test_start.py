@@ -57,6 +57,13 @@ def test_every_command_is_listed_in_its_own_words() -> None:
         assert (entry.help or "").strip()
 
 
+def test_help_groups_the_commands_and_begins_with_five() -> None:
+    commands = CommandGroup(rich_markup_mode=MARKUP).commands.values()
+    panels = [vars(one)["rich_help_panel"] for one in commands]
+    assert panels == sorted(panels, key=panels.index)  # each group in one piece
+    assert panels[:6] == ["Begin with"] * 5 + ["Data"]
+
+
 def test_summaries_are_read_without_running_a_module() -> None:
     program = (
         "import sys; from fleet_slip.cli.commands import COMMANDS, docstrings;"
