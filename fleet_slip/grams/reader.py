@@ -95,9 +95,10 @@ class GramReader:
         database = self._connected(grams, logs)
         self._logs, self._grams = logs, grams
         if not grams.rows:
+            fill = "fleet-slip simulate CAMPAIGN (or fleet-slip ingest FILE --mapping M), then "
             raise DataError(
-                f"{self._warehouse.root}: there are no Gram rows yet. Run: fleet-slip simulate "
-                "CAMPAIGN (or fleet-slip ingest FILE --mapping M), then fleet-slip gram."
+                f"{self._warehouse.root}: there are no Gram rows yet. "
+                f"Run: {'' if logs.rows else fill}fleet-slip gram."
             )
         identity = features().identity(feature_set)
         opened = OpenedGrams(database, identity, logs.version or 0, grams.version or 0)

@@ -212,3 +212,9 @@ def test_a_reader_reads_again_what_came_after_the_table(tmp_path: Path) -> None:
             sum_cohort(reader, Folding())
         write_fleet(warehouse, 20)
         assert sum_cohort(reader, Folding()).drive_count == 20
+
+
+def test_where_there_are_logs_the_next_command_is_gram_alone(warehouse: Warehouse) -> None:
+    land(warehouse, "a", log_rows("a", random_counts(np.random.default_rng(1), 50)))
+    with pytest.raises(DataError, match=r"no Gram rows yet\. Run: fleet-slip gram\.$"):
+        sum_cohort(warehouse, Folding())
