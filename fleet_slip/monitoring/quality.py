@@ -3,11 +3,13 @@
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from datetime import date
+from math import ceil
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
+from fleet_slip.arrays import BoolArray
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
@@ -109,10 +111,10 @@ def _day_and_drive(finding: SensorFault) -> tuple[date, str]:
 
 
 def examine(cohort: Cohort, limits: QualityThresholds | None = None) -> QualityReport:
-    """Examine each drive of a cohort, beside the drives of its vehicle model.
+    """Examine each drive of a cohort, beside other drives of its car and of its vehicle model.
 
     First for what no car does (`find_implausible`), then by comparison with its peers, if it has
-    `min_drives` of them.
+    `min_drives` of them; see `_peer_groups`.
     """
     limits = limits or thresholds().quality
     drives = compared = 0
@@ -122,16 +124,41 @@ def examine(cohort: Cohort, limits: QualityThresholds | None = None) -> QualityR
         faults |= _saturated(table, metadata, limits)
         in_order = np.array([drive not in faults for drive in range(len(table))])
         if in_order.sum() >= limits.min_drives:
-            compared += len(table)
             turned = find_reversed_labels(table, in_order, catalogue().label)
             in_order[list(turned)] = False
             faults |= turned
-        if in_order.sum() >= limits.min_drives:
-            faults |= _unlike_peers(table, in_order, limits)
+        beside_peers = np.zeros(len(table), dtype=np.bool_)
+        for group in _peer_groups(metadata, limits.min_drives):
+            if in_order[group].sum() >= limits.min_drives:
+                beside_peers[group] = True
+                found = _unlike_peers(table, group, in_order, limits)
+                faults |= {drive: fault for drive, fault in found.items() if drive not in faults}
         drives += len(table)
+        compared += int(beside_peers.sum())
         findings += _findings(metadata, faults)
     findings.sort(key=_day_and_drive)
     return QualityReport(drives, compared, tuple(findings))
+
+
+def _peer_groups(metadata: pa.Table, enough: int) -> Iterator[BoolArray]:
+    """Yield which drives to compare with one another: those of a car, and those of many cars.
+
+    A car with enough drives is compared with itself, which shows what differs between its drives.
+    Among other cars it counts by no more drives than they have, the first by name, so that a car
+    that is logged every day does not say alone what is usual; that shows what is wrong with all of
+    its drives.
+    """
+    ids, cars = (np.array(metadata[n].to_pylist(), dtype=str) for n in ("drive_id", "vehicle_id"))
+    of_car = np.unique(cars, return_inverse=True)[1]
+    counts = np.bincount(of_car)
+    for car in np.flatnonzero(counts >= enough):
+        yield of_car == car
+    if len(counts) > 1:
+        few = counts[counts < enough]
+        most = max(ceil(enough / len(counts)), int(np.median(few)) if len(few) else 1)
+        number = np.empty(len(cars), dtype=np.int64)  # of each drive among those of its car
+        number[np.lexsort((ids, of_car))] = np.concatenate([np.arange(n) for n in counts])
+        yield (counts[of_car] < enough) | (number < most)
 
 
 def _groups(cohort: Cohort, min_rows: int) -> Iterator[tuple[GramTable, pa.Table]]:
@@ -157,14 +184,15 @@ def _saturated(table: GramTable, metadata: pa.Table, limits: QualityThresholds) 
 
 
 def _unlike_peers(
-    table: GramTable, in_order: "np.ndarray[Any, np.dtype[np.bool_]]", limits: QualityThresholds
+    table: GramTable, group: BoolArray, in_order: BoolArray, limits: QualityThresholds
 ) -> dict[int, Fault]:
-    peers, suspects = settle(table, in_order, catalogue().label, limits)
-    at = np.flatnonzero(suspects)
-    if not len(at):
+    """Return the faults of the drives of a group that are not as the others of it."""
+    members = table.take(group)
+    peers, suspects = settle(members, in_order[group], catalogue().label, limits)
+    if not suspects.any():
         return {}
-    faults = peers.explain(DriveBatches.of(table, suspects))
-    return dict(zip(at.tolist(), faults, strict=True))
+    faults = peers.explain(DriveBatches.of(members, suspects))
+    return dict(zip(np.flatnonzero(group)[suspects].tolist(), faults, strict=True))
 
 
 def _findings(metadata: pa.Table, faults: dict[int, Fault]) -> list[SensorFault]:

@@ -105,6 +105,34 @@ def test_a_label_that_is_reversed_for_one_car_is_found(warehouse: Warehouse, tur
     }
 
 
+def two_kinds_of_cars(warehouse: Warehouse, often: Callable[[Signals], None]) -> QualityReport:
+    """Examine 60 drives of one car, whose sensors have no offsets, and one each of 30 others."""
+    rng = np.random.default_rng(6)
+    rows = []
+    for i in range(60):
+        one = broken(drive(rng), often)
+        rows.append(log_rows(f"often-{i:02d}", counts(one), vehicle_id="often"))
+    for i in range(30):
+        one = broken(drive(rng), add("ay", rng.normal(0, 0.3)))
+        one = broken(one, add("yaw_rate", rng.normal(0, 0.02)))
+        rows.append(log_rows(f"once-{i:02d}", counts(one), vehicle_id=f"car-{i:02d}"))
+    land(warehouse, "all", *rows)
+    update_grams(warehouse)
+    return examine(load_cohort(warehouse))
+
+
+def test_a_car_that_drives_every_day_does_not_say_what_is_usual(warehouse: Warehouse) -> None:
+    report = two_kinds_of_cars(warehouse, lambda _: None)
+    assert (report.drives, report.compared, report.findings) == (90, 90, ())
+
+
+def test_what_is_wrong_in_all_drives_of_a_car_shows_beside_other_cars(warehouse: Warehouse) -> None:
+    report = two_kinds_of_cars(warehouse, add("steering_wheel", 0.3))
+    (finding,) = report.findings
+    assert (finding.drive_id, finding.fault.kind) == ("often-00", "biased")
+    assert finding.fault.signals == ("steering_wheel",)
+
+
 def test_drives_in_order_raise_no_alarm(warehouse: Warehouse) -> None:
     fleet(warehouse, lambda _: None)
     report = examine(load_cohort(warehouse))
