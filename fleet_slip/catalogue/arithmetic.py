@@ -124,5 +124,6 @@ class _Builder:
             "-": sum(sizes),
             "*": sizes[0] * sizes[-1],
             "sign": 1,
+            "//": sizes[0] // max(1, self.steps[operands[-1]].value),
         }.get(function, sizes[0])
         return Step(function, operands), bound

@@ -19,7 +19,9 @@ class _Grammar:
 
 
 _DECLARED = _Grammar(
-    _FUNCTIONS, re.compile(r"[a-z0-9_+\-*() ]+"), "integer arithmetic of + - * ( )"
+    _FUNCTIONS,
+    re.compile(r"(?:[a-z0-9_+\-*() ]|// [1-9][0-9]*(?![0-9]))+"),
+    "integer arithmetic of + - * ( ) and // NUMBER",
 )
 """What `configs/features.toml` may say."""
 

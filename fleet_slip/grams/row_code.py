@@ -73,7 +73,9 @@ class _Expression:
         self._code, self._arithmetic = code, arithmetic
         self._integers = arithmetic.needs_integers
         self._known: dict[int, Value | _Constant] = {}
-        self._guarded = None if arithmetic.guard is None else self._guard(arithmetic.guard)
+        self._guarded: int | None = None
+        if arithmetic.guard is not None:
+            self._guarded = self._guard(arithmetic.guard)
 
     def result(self) -> Value:
         """Return the result, in binary64, NaN where the row has no value.

@@ -50,6 +50,10 @@ DRAWN_SCENARIOS = (
     "style_sporty",
     "style_limit",
 )
+MOST_TERMS = 60
+"""Of a larger model, neither standard errors nor what each column buys are shown: hundreds of rows
+tell nothing, and take an hour to compute."""
+
 SAME = 1e-6
 """Relative difference below which two figures of the same estimates are the same."""
 
@@ -83,10 +87,10 @@ class ReportData:
         evaluated: its latest evaluation.
         trained: its cohort, and the models of Table I on it.
         runs: drives of the evaluation's scenarios with the estimates that figures show.
-        coefficients: of the paper's choice, then of the published model if that is another.
+        coefficients: of the paper's choice, then of the published model if it is another and small.
         histogram: held-out estimates of all training rows by the paper's choice.
         ordering: what the order of the signals is worth.
-        memory: what columns over time are worth; None if the published model has none.
+        memory: what columns over time are worth; None if the model has none, or too many.
         tables: of the warehouse.
         campaigns: of the drives that the model was trained on.
         configs: checksums of what determines the results.
@@ -142,7 +146,7 @@ def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
         histogram=held_out_histogram(warehouse, trained.selection, choice),
         ordering=compare_orders(cohort, tuple(dict.fromkeys(models[-1].signals))),
         memory=weigh_memory(own, manifest, trained.selection.folds, runs)
-        if looks_back(manifest)
+        if looks_back(manifest) and len(manifest.terms) <= MOST_TERMS
         else None,
         tables=_tables(warehouse),
         campaigns=tuple(sorted(set(cohort.drives["campaign"].to_pylist()))),
@@ -205,7 +209,8 @@ def _coefficients(trained: TrainedModels, own: Cohort) -> tuple[Coefficients, ..
     cohort, published = trained.selection.cohort, trained.version
     choice = next(m for m in trained.selection.models if m.name == THE_PAPERS_CHOICE)
     tables = [coefficient_table(cohort, f"model {choice.name}", choice.signals)]
-    if set(published.manifest.signals) != set(choice.signals):
+    signals = published.manifest.signals
+    if set(signals) != set(choice.signals) and len(signals) <= MOST_TERMS:
         tables.append(coefficient_table(own, published.reference, published.manifest.signals))
     return tuple(tables)
 

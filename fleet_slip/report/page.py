@@ -14,6 +14,7 @@ from fleet_slip.report.claims.claim import Status
 from fleet_slip.report.data import ReportData
 from fleet_slip.report.drawing import inline_svgs
 from fleet_slip.report.picture import Picture
+from fleet_slip.report.road_pictures import standings
 from fleet_slip.report.style import PALETTE
 from fleet_slip.report.table import ReportTable
 from fleet_slip.report.text import count, degrees, size
@@ -58,8 +59,11 @@ def render(data: ReportData, shown: Sequence[Picture]) -> str:
         version=data.version,
         evaluation=data.evaluated.document,
         paper=[one for one in drawn if one.picture.key.startswith("figure-")],
-        beyond=[one for one in drawn if not one.picture.key.startswith(("figure-", "memory-"))],
+        beyond=[
+            one for one in drawn if not one.picture.key.startswith(("figure-", "memory-", "road-"))
+        ],
         memory=[one for one in drawn if one.picture.key.startswith("memory-")],
+        roads=[one for one in drawn if one.picture.key.startswith("road-")],
         table_one=paper_tables.table_one(data),
         table_two=paper_tables.table_two(data),
         targets=list(paper_tables.targets(data)),
@@ -85,7 +89,12 @@ def missing_scenarios(data: ReportData) -> list[str]:
 
 def _further(data: ReportData) -> list[ReportTable]:
     learned = tables.rivals(data)
-    return [tables.scenarios(data), *tables.fleets(data), *([learned] if learned else [])]
+    return [
+        tables.scenarios(data),
+        standings(data),
+        *tables.fleets(data),
+        *([learned] if learned else []),
+    ]
 
 
 def _tally(claims: Sequence[Judged]) -> dict[Status, int]:

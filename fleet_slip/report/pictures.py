@@ -16,6 +16,7 @@ from fleet_slip.report.figures.track_map import Map, error_map
 from fleet_slip.report.histogram import Histogram
 from fleet_slip.report.memory_pictures import memory_pictures
 from fleet_slip.report.picture import Picture
+from fleet_slip.report.road_pictures import road_pictures
 from fleet_slip.report.text import count, degrees, listed, number, percent
 
 STYLES = ("style_gentle", "nominal", "style_brisk", "style_sporty", "style_limit")
@@ -28,7 +29,12 @@ FILTER_LABELS = {"kalman": "Kalman filter", "kalman_tuned": "Kalman filter, tune
 
 def draw_pictures(data: ReportData) -> tuple[Picture, ...]:
     """Return all figures whose drives were evaluated."""
-    return (*_of_the_paper(data), *_beyond_the_paper(data), *memory_pictures(data))
+    return (
+        *_of_the_paper(data),
+        *_beyond_the_paper(data),
+        *memory_pictures(data),
+        *road_pictures(data),
+    )
 
 
 def model_line(data: ReportData, number_in_table: str) -> Line:
@@ -223,6 +229,9 @@ def _lateral(data: ReportData, runs: Mapping[str, EvaluatedScenario]) -> Iterato
         return
     wanted = [n for n in ("1", "2", "4") if n in data.evaluated.models]
     lines = [model_line(data, n) for n in wanted]
+    published = data.version.reference
+    if published in data.evaluated.estimators:
+        lines.append(Line(published, published, "model_3"))
     if "kalman_tuned" in data.evaluated.estimators:
         lines.append(Line("kalman_tuned", "Kalman, tuned", "kalman_tuned"))
     trained_to = data.histogram.trained_to_mps2(TRAINED_SHARE)

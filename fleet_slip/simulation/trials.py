@@ -23,15 +23,16 @@ TESTED = 0
 
 
 class Mostly(Uniform):
-    """The usual value with a probability, and otherwise anything of a range."""
+    """The usual value, or range, with a probability, and otherwise anything of a wider range."""
 
-    usual: NotNegative
+    usual: NotNegative | Uniform
     share: float = Field(ge=0, le=1)
 
     def draw(self, generator: np.random.Generator) -> float:
-        """Draw one number; two numbers are drawn from the generator whichever is taken."""
+        """Draw one number; as many are drawn from the generator whichever is taken."""
         chosen, other = generator.random(), super().draw(generator)
-        return self.usual if chosen < self.share else other
+        usual = self.usual.draw(generator) if isinstance(self.usual, Uniform) else self.usual
+        return usual if chosen < self.share else other
 
 
 class Manoeuvres(Config):
@@ -65,9 +66,9 @@ class Manoeuvres(Config):
 class TrialPlan(Plan):
     """One car on every road, at every speed and load, and now and then one of other cars.
 
-    The first vehicle is the tested one. Its load, tyres, road and noise are mostly the usual ones;
-    its speeds are planned for a lateral acceleration up to a share of the friction that the road
-    offers. Beyond one the driver expects more than there is.
+    The first vehicle is the tested one. Its load, tyres, road, noise and speeds are mostly the
+    usual ones; speeds are planned for a lateral acceleration up to a share of the friction that the
+    road offers. Beyond one the driver expects more than there is.
     """
 
     kind: Literal["trials"]
@@ -83,7 +84,7 @@ class TrialPlan(Plan):
     sensor_bias_std: SensorBiases
     """Of the other cars."""
     adhesion: Mostly
-    lateral_mps2: Uniform
+    lateral_mps2: Mostly
     friction_use: Uniform
     acceleration: Uniform
     """Over `acceleration_mps2`."""

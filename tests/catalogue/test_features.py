@@ -13,6 +13,7 @@ import pyarrow as pa
 import pytest
 
 from fleet_slip.catalogue import features as features_module
+from fleet_slip.catalogue.arithmetic import parse
 from fleet_slip.catalogue.column_sql import with_features
 from fleet_slip.catalogue.feature_sets import lag_signals
 from fleet_slip.catalogue.features import features, load_features
@@ -23,7 +24,10 @@ from fleet_slip.grams import aggregation
 from fleet_slip.grams import job as gram_job
 from fleet_slip.grams import statement as gram_statement
 from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.column_plan import ColumnPlan
+from fleet_slip.grams.columns import DriveColumns, DriveCounts
 from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.row_code import RowColumn
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.gram_table import GramTable
 from fleet_slip.resources import folder
@@ -68,9 +72,20 @@ def rear_speed(row: Row) -> Fraction:
     return RADIUS_M * (row["wheel_rl"] + row["wheel_rr"]) / 2
 
 
-def understeer(row: Row) -> Fraction | None:
-    load = 1 + abs(row["ay"])
-    return excess(row) / load if rear_speed(row) * load >= 3 else None
+def steering_surplus(row: Row) -> Fraction | None:
+    """2.63 m and K of the file in the whole numbers that stand for them; squares are truncated."""
+    ay = 1000 * abs(row["ay"])
+    load = 1 + Fraction(ay * ay // 100, 10_000)
+    wheels = row["wheel_rl"] + row["wheel_rr"]
+    if wheels * load < Fraction("19.35"):
+        return None
+    wheelbase = Fraction(16_967_742, 5_000_000)
+    steer = (row["steer_fl"] + row["steer_fr"]) / 2
+    straight = steer - wheelbase * (row["wheel_rr"] - row["wheel_rl"]) / wheels
+    beyond = 5000 * row["ay"] * straight - Fraction(14 * ay * ay, 10**6)
+    beyond -= Fraction(ay * (ay * ay // 65536) ** 2 // 9, 10**6)
+    coasting = int(row["ax"] > Fraction("-0.5")) + int(row["ax"] >= Fraction("-0.5"))
+    return coasting * beyond / load / 10_000
 
 
 PHYSICS: dict[str, Callable[[Row], Fraction | None]] = {
@@ -94,7 +109,8 @@ PHYSICS: dict[str, Callable[[Row], Fraction | None]] = {
     "ay_speed": lambda row: row["ay"] * speed(row),
     "ay_ax": lambda row: row["ay"] * row["ax"],
     "steering_excess": lambda row: excess(row) if rear_speed(row) >= 3 else None,
-    "understeer": understeer,
+    "steering_surplus": steering_surplus,
+    "ay_size": lambda row: abs(row["ay"]),
     "rear_curvature": lambda row: rear_curvature(row) if rear_speed(row) >= 3 else None,
     "rear_ay": lambda row: rear_turn(row) * rear_speed(row),
     "rear_ay_speed": lambda row: rear_turn(row) * rear_speed(row) ** 2,
@@ -116,6 +132,17 @@ def counts(rows: int, seed: int) -> dict[str, Any]:
     return random_counts(np.random.default_rng(seed), rows)
 
 
+def computed_by_kernel(logged: dict[str, Any]) -> dict[str, list[float | None]]:
+    known = features().features
+    rows = {name: RowColumn(name, parse(one.sql), one.limit) for name, one in known.items()}
+    drive = DriveCounts(np.arange(len(logged["ay"])), {name: logged[name] for name in INPUTS})
+    columns = DriveColumns(ColumnPlan.of(tuple(known), rows, {}), drive).compute()
+    return {
+        name: [None if np.isnan(value) else value for value in column]
+        for name, column in zip(known, columns, strict=True)
+    }
+
+
 def test_every_feature_is_its_physical_definition_rounded_and_clipped() -> None:
     logged = counts(400, 7)
     # Ordinary driving too, where the guarded quotients exist and nothing is clipped.
@@ -128,6 +155,9 @@ def test_every_feature_is_its_physical_definition_rounded_and_clipped() -> None:
         database.register("log_counts", pa.table(logged))
         query = f"SELECT * FROM {with_features('log_counts', definitions, limits)}"
         found: pa.Table = database.sql(query).to_arrow_table()
+    by_kernel = computed_by_kernel(logged)
+    for name in definitions:
+        np.testing.assert_array_equal(by_kernel[name], found[name].to_pylist(), err_msg=name)
     exact = {name: catalogue()[name].exact_scale for name in INPUTS}
     clipped = 0
     for i, row in enumerate(found.to_pylist()):

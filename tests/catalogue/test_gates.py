@@ -107,6 +107,7 @@ def test_faults_are_named(tmp_path: Path, text: str, words: str) -> None:
 
 def test_a_family_in_a_model_list_stands_for_its_members() -> None:
     models = {model.name: model.signals for model in load_model_list("gated").model}
-    gates = [name for name in models["both"] if name not in models["no gate"]]
-    assert gates == [*features().members("excess"), *features().members("road")]
-    assert set(models["excess"]) | set(models["road"]) == set(models["both"])
+    gates = [name for name in models["all"] if name not in models["no gate"]]
+    families = ("excess", "road", "cornering")
+    assert gates == [name for family in families for name in features().members(family)]
+    assert set().union(*(models[family] for family in families)) == set(models["all"])

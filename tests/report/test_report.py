@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleet_slip.catalogue.features import input_scales
+from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.errors import DataError
+from fleet_slip.evaluation.ranking import LEAST_COVERAGE
 from fleet_slip.evaluation.results import keep
 from fleet_slip.files.documents import Document
 from fleet_slip.files.local_folder import LocalFolder
@@ -27,10 +28,13 @@ from fleet_slip.report.claims.claim import Status
 from fleet_slip.report.claims.conditions import noise_is_slight
 from fleet_slip.report.data import ReportData
 from fleet_slip.report.drawing import png_file, svg_file
+from fleet_slip.report.gates import gates_of, opening
 from fleet_slip.report.histogram import ANGLE_DEG, held_out_coefficients
 from fleet_slip.report.memory import by_length, looks_back
 from fleet_slip.report.page import render
 from fleet_slip.report.pictures import draw_pictures
+from fleet_slip.report.road_pictures import road_pictures, standings
+from fleet_slip.report.style import DESK
 from fleet_slip.report.text import number
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
@@ -298,3 +302,44 @@ def test_a_model_of_one_instant_has_no_figures_on_memory(data: ReportData) -> No
     assert not [one for one in draw_pictures(replace(data, memory=None)) if "memory" in one.key]
     plain = [term for term in data.version.manifest.terms if term.logged]
     assert not looks_back(data.version.manifest.model_copy(update={"terms": tuple(plain)}))
+
+
+def test_the_standings_mark_the_smallest_error_of_each_drive(data: ReportData) -> None:
+    shown = standings(data)
+    names = shown.head[1:]
+    for drive, *cells in shown.rows:
+        found = {name: data.evaluated.figures(drive.text, name) for name in names}
+        errors = {
+            name: one.rmse_deg
+            for name, one in found.items()
+            if one and one.rmse_deg is not None and one.coverage >= LEAST_COVERAGE
+        }
+        marked = [name for name, cell in zip(names, cells, strict=True) if cell.mark == "good"]
+        least = min(errors.values())
+        assert marked == [name for name in names if errors.get(name) == least]
+
+
+def test_gates_are_found_in_a_manifest_with_all_their_knots(data: ReportData) -> None:
+    """Weights at the knots of what opens a gate, on the slippery drive: closed, then open."""
+    known = features()
+    members = known.members("excess")
+    terms = tuple(
+        data.version.manifest.terms[0].model_copy(
+            update={"signal": name, "definition": known.definition(name)}
+        )
+        for name in members
+    )
+    manifest = data.version.manifest.model_copy(update={"terms": terms})
+    ((name, (by, knots)),) = gates_of(manifest).items()
+    assert name == "steering_excess over 32 ticks"
+    assert [float(count * known.of("steering_excess_mean_32").scale) for count in knots] == [
+        float(knot) for knot in known.gates["excess"].knots
+    ]
+    (share,) = opening(manifest, data.runs["adhesion_0_4"]).values()
+    assert by.ticks == 32
+    assert np.nanmin(share) == 0.0
+    assert np.nanmax(share) == 1.0
+    assert [one.key for one in road_pictures(data)] == []
+    gated = replace(data, version=replace(data.version, manifest=manifest))
+    (picture,) = road_pictures(gated)
+    assert picture.draw(DESK).axes[1].get_title() == f"gate by {name}"

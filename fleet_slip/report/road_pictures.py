@@ -1,0 +1,85 @@
+"""Figures on roads and hard driving: what gates do, and who is best where."""
+
+from collections.abc import Iterator, Sequence
+
+from fleet_slip.evaluation.errors import ErrorFigures
+from fleet_slip.evaluation.ranking import LEAST_COVERAGE
+from fleet_slip.report.data import ReportData
+from fleet_slip.report.figures.gates import angle_and_gates
+from fleet_slip.report.figures.series import Line
+from fleet_slip.report.gates import opening
+from fleet_slip.report.picture import Picture
+from fleet_slip.report.table import Cell, ReportTable, table
+from fleet_slip.report.text import degrees, number, percent
+
+SLIPPERY = "adhesion_0_4"
+
+
+def road_pictures(data: ReportData) -> Iterator[Picture]:
+    """Return the slippery drive with the gates of the published model; none without gates."""
+    if SLIPPERY not in data.runs:
+        return
+    run, manifest = data.runs[SLIPPERY], data.version.manifest
+    gates = opening(manifest, run)
+    if not gates:
+        return
+    line = Line(data.version.reference, data.version.reference, "model_3")
+    figures = run.results[line.estimator].whole
+    one_instant = run.results[data.choice].whole
+    title = "Adhesion 0.4 and the gates"
+    caption = (
+        f"{line.label} is several linear models with a blend between them: root mean square error "
+        f"{degrees(figures.rmse_deg)}, {degrees(one_instant.rmse_deg)} by the paper's model. "
+        "Beneath: how far each gate is open, from its first knot to its last. Where the car is "
+        "unstable is shaded."
+    )
+    yield Picture(
+        "road-gates",
+        title,
+        caption,
+        f"{title}: the true and the estimated angle over time, a strip for each gate. {caption}",
+        lambda size: angle_and_gates(run, line, gates, size),
+    )
+
+
+def standings(data: ReportData) -> ReportTable:
+    """Return the RMSE of every estimator on every test drive, the smallest marked."""
+    evaluated = data.evaluated
+    left_out = set(evaluated.models.values()) - {data.choice}
+    names = [name for name in evaluated.estimators if name not in left_out]
+    rows: list[list[str | Cell]] = [
+        [scenario, *_row([evaluated.figures(scenario, name) for name in names])]
+        for scenario in evaluated.scenarios
+    ]
+    return table(
+        "standings",
+        "Every estimator on every test drive: root mean square error in degrees",
+        ["test drive", *names],
+        rows,
+        note=f"Green: the smallest of the row. {_won(data)}A percentage: the share of the drive "
+        "with an estimate; such do not compete.",
+    )
+
+
+def _row(found: Sequence[ErrorFigures | None]) -> list[Cell]:
+    errors = [one.rmse_deg if one and one.coverage >= LEAST_COVERAGE else None for one in found]
+    least = min((error for error in errors if error is not None), default=None)
+    cells = []
+    for one, error in zip(found, errors, strict=True):
+        if error is None and one is not None and one.rmse_deg is not None:
+            cells.append(Cell(f"{number(one.rmse_deg)} ({percent(one.coverage)})"))
+        else:
+            best = error is not None and error == least
+            cells.append(Cell(number(error), "good" if best else ""))
+    return cells
+
+
+def _won(data: ReportData) -> str:
+    found = data.evaluated.document.content.get("ranking")
+    if found is None:
+        return ""
+    return (
+        f"Among all without satellite navigation {found['estimator']} wins {found['won']} of "
+        f"{found['drives']} drives, and comes within {found['close_ratio']} times the winner in "
+        f"{found['close']} more. "
+    )

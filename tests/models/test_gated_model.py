@@ -1,0 +1,104 @@
+"""A model with gates from the command line: selected, published, scored and evaluated."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from fleet_slip.catalogue.features import features
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.cli.main import app
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.job import update_grams
+from fleet_slip.models.versions import Registry
+from fleet_slip.regression import exact
+from fleet_slip.regression.figures import error_sums
+from fleet_slip.warehouse.tables import Warehouse
+from tests.support.once import made_once
+
+PLAIN = "ay_mean_16, curvature_mean_8, steering_mean_16, rear_ay_mean_16, course_sum_64"
+LIST = """\
+description = "With gates and without"
+features = "gated"
+[folds]
+by = "drive"
+count = 2
+[[model]]
+name = "plain"
+signals = [{plain}]
+[[model]]
+name = "gated"
+signals = [{plain}, "ax_mean", "yaw_rate_mean", {gates}]
+"""
+
+
+def call(root: Path, *words: str) -> Any:
+    result = CliRunner().invoke(app, ["--root", str(root), *words, "--json"])
+    if result.exception is not None:
+        raise result.exception
+    return json.loads(result.stdout)
+
+
+@pytest.fixture(scope="module")
+def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("lists") / "gates.toml"
+    plain = ", ".join(f'"{name}"' for name in PLAIN.split(", "))
+    low = [name for name in features().members("excess") if name.endswith(("_1", "_2"))]
+    gates = ", ".join(f'"{name}"' for name in low)  # the drives are too gentle for the upper knots
+    file.write_text(LIST.format(plain=plain, gates=gates))
+    return file
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path, models: Path) -> Path:
+    def make(root: Path) -> None:
+        shutil.copytree(smoke_root, root)
+        update_grams(Warehouse(LocalFolder(root)), feature_set="gated")
+        call(root, "publish", "roads", "--models", str(models), "--worth", "0.0001deg")
+
+    return made_once(tmp_path_factory, "gated_model", make)
+
+
+def test_select_says_what_the_gate_buys(root: Path, models: Path) -> None:
+    plain, gated = call(root, "select", "--models", str(models))["models"]
+    assert len(gated["signals"]) >= exact.MANY_INPUTS
+    assert gated["rmse_deg"] < plain["rmse_deg"]
+
+
+def test_gates_stand_in_the_manifest_as_they_are_defined(root: Path) -> None:
+    manifest = Registry(LocalFolder(root / "models")).resolve("roads").manifest
+    gates = [term.definition.gate for term in manifest.terms if term.definition]
+    opened = [gate for gate in gates if gate]
+    assert {gate.by.of for gate in opened} == {"steering_excess"}
+    assert manifest.selected_by.model == "gated"
+    assert len(opened) == 2 * len(features().gates["excess"].columns)
+
+
+def test_score_finds_the_error_that_the_gram_rows_say(root: Path) -> None:
+    """Every row of every drive, computed again from the logs, against sums of Gram rows."""
+    warehouse = Warehouse(LocalFolder(root))
+    manifest = Registry(LocalFolder(root / "models")).resolve("roads").manifest
+    cohort = load_cohort(warehouse, "true", "gated")
+    total = cohort.serving(manifest.signals).table.total()
+    fitted = exact.fit(total, manifest.signals, manifest.label.signal)
+    figures = error_sums(fitted.model, total).figures(
+        catalogue()[manifest.label.signal].exact_scale
+    )
+    scored = call(root, "score", "roads", "--cohort", "true")
+    assert scored["rows"] == figures.rows
+    assert scored["rmse_deg"] == pytest.approx(figures.rmse_deg, rel=1e-9)
+
+
+@pytest.mark.slow
+def test_evaluate_ranks_it_among_the_filters(root: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(root, tmp_path / "data")
+    found = call(copy, "evaluate", "--one-car", "roads", "--scenario", "nominal")
+    ours = found["scenarios"][0]["results"]["roads@1"]
+    assert ours["coverage"] == 1.0
+    assert ours["rmse_deg"] < found["scenarios"][0]["results"]["roads@1/4"]["rmse_deg"]
+    assert found["ranking"]["estimator"] == "roads@1"
+    assert "excess" in str(found["estimators"]["roads@1"]["signals"])
