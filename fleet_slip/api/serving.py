@@ -215,6 +215,21 @@ class Serving(Rooted):
         folder = LocalFolder(output) if output else self.root / "report"
         return write_report(self.warehouse, self.resolve(model), folder)
 
+    @record_call
+    def import_model(self, file: Path, *, sign_key: Path | None = None) -> ModelVersion:
+        """Bring a version in that another data root exported to JSON; return it.
+
+        It becomes the next version of the model of its name, to which nothing points until
+        `promote`, and says where it comes from. The latest version is returned if it is the same
+        estimator. `sign_key` is the private key that signs the version.
+
+        Raises `InputError` for a file that is no such export or was changed, `RefusedError` if a
+        signal means something else here, and `ConfigError` for a key that cannot be used.
+        """
+        from fleet_slip.export.importing import import_version
+
+        return import_version(self.registry(sign_key), file)
+
     def estimator(
         self, model: str | ModelVersion, car: Mapping[str, Any] | None = None
     ) -> "Estimator":

@@ -1,5 +1,6 @@
 """Commands that serve models: models, show, promote, rollback, pin, unpin."""
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -7,8 +8,10 @@ import typer
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.cli.output import Json, print_json, print_table, say
 from fleet_slip.cli.recorded import record_run
+from fleet_slip.cli.signing import signing_key
+from fleet_slip.errors import UsageError
 from fleet_slip.models.aliases import CHAMPION
-from fleet_slip.models.manifest import ModelTerm
+from fleet_slip.models.manifest import ImportedFrom, ModelTerm
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.on_board import cost_on_board
 from fleet_slip.words import number_of
@@ -22,12 +25,20 @@ Alias = Annotated[str, typer.Option(help="The alias to move.")]
 def models(
     context: typer.Context,
     name: Annotated[
-        str | None, typer.Argument(help="Show one model's versions and history.")
+        str | None,
+        typer.Argument(
+            help="Show one model's versions and history. Or: import, and a FILE that export --to "
+            "json wrote, to bring its version in."
+        ),
     ] = None,
+    file: Annotated[Path | None, typer.Argument(help="The file to import.")] = None,
     json: Json = False,
 ) -> None:
-    """List the published model versions."""
+    """List the published model versions, or bring one in from elsewhere: models import FILE."""
     fleet: Fleet = context.obj
+    if file is not None:
+        _import_model(fleet, name, file, json)
+        return
     rows = fleet.models(name).to_pylist()
     if json:
         print_json(rows)
@@ -79,6 +90,19 @@ def models(
         )
 
 
+def _import_model(fleet: Fleet, word: str | None, file: Path, json: bool) -> None:
+    if word != "import":
+        raise UsageError(f"{word!r}: a file is for import. Run: fleet-slip models import {file}")
+    version = fleet.import_model(file, sign_key=signing_key(None))
+    origin = version.manifest.imported_from
+    if json:
+        told = origin.model_dump() if origin else None
+        print_json({"model": version.reference, "sha256": version.sha256, "imported_from": told})
+        return
+    came = f"imported from {origin.reference}" if origin else "is there already, made here"
+    say(f"{version.reference}: {came}. To use it: fleet-slip promote {version.reference}")
+
+
 def show(context: typer.Context, reference: Reference, json: Json = False) -> None:
     """Show one model version: coefficients, figures, and the data that made it."""
     version: ModelVersion = context.obj.model(reference)
@@ -109,6 +133,10 @@ def _definition_row(term: ModelTerm) -> list[str]:
         str(one.bits),
         ", ".join(times).strip(),
     ]
+
+
+def _origin(origin: ImportedFrom) -> str:
+    return f"from {origin.reference} of another data root, sha256 {origin.sha256}"
 
 
 def _print_version(version: ModelVersion) -> None:
@@ -175,6 +203,7 @@ def _print_version(version: ModelVersion) -> None:
                 f"model {manifest.selected_by.model} of {manifest.selected_by.model_list}",
             ],
             ["why", manifest.selected_by.reason],
+            *([["imported", _origin(origin)]] if (origin := manifest.imported_from) else []),
             ["sha256", version.sha256],
         ],
         left=2,

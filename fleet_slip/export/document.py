@@ -3,6 +3,7 @@
 Whole numbers that may need more than 53 bits are texts.
 """
 
+import base64
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -30,8 +31,13 @@ SCHEMA = 1
 """Number of the schema: it changes if an implementation of before would compute something else."""
 
 
-def document_of(version: ModelVersion, program: Program, checks: Sequence[Check]) -> dict[str, Any]:
-    """Return the document of a published version; `sha256` is of everything else in it."""
+def document_of(
+    version: ModelVersion, program: Program, checks: Sequence[Check], drives: bytes | None
+) -> dict[str, Any]:
+    """Return the document of a published version; `sha256` is of everything else in it.
+
+    `drives` is the content of the file about the drives that trained it.
+    """
     content: dict[str, Any] = {
         "format": FORMAT,
         "schema": SCHEMA,
@@ -39,6 +45,7 @@ def document_of(version: ModelVersion, program: Program, checks: Sequence[Check]
             "reference": version.reference,
             "sha256": version.sha256,
             "drives_sha256": version.manifest.trained_on.drives_sha256,
+            "drives": None if drives is None else base64.b64encode(drives).decode("ascii"),
             "manifest": version.manifest.model_dump(mode="json"),
         },
         "program": program_content(program),

@@ -16,6 +16,8 @@ from fleet_slip.export.document import document_of
 from fleet_slip.export.program import Program
 from fleet_slip.export.sql_source import sql_macro, sql_statement
 from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.models.trained_drives import read_drives_file
+from fleet_slip.models.versions import Registry
 from fleet_slip.warehouse.tables import Warehouse
 
 Target = Literal["json", "c", "sql", "dbc"]
@@ -24,11 +26,12 @@ Target = Literal["json", "c", "sql", "dbc"]
 
 @dataclass(frozen=True)
 class Subject:
-    """A version that is exported, its program, and checks of it."""
+    """A version that is exported, its program, checks of it, and the hashes of its drives."""
 
     version: ModelVersion
     program: Program
     checks: tuple[Check, ...]
+    drives: bytes | None
 
     @property
     def stem(self) -> str:
@@ -40,18 +43,22 @@ def export_files(version: ModelVersion, warehouse: Warehouse | None, to: str) ->
     """Return the texts of an export by the names of their files.
 
     The checks in it have the first ticks of a drive of the warehouse, if there is one. Raises
-    `UsageError` for an unknown target, and what `compile_program` raises.
+    `UsageError` for an unknown target, what `compile_program` raises, and `StorageError` if the
+    hashes of its drives are gone.
     """
     if to not in _WRITERS:
         raise UsageError(f"{to!r}: export to one of {', '.join(get_args(Target))}.")
     program = compile_program(version.manifest)
-    return _WRITERS[to](
-        Subject(version, program, make_checks(version.manifest, program, warehouse))
-    )
+    checks = make_checks(version.manifest, program, warehouse)
+    drives = None
+    if warehouse is not None:
+        folder = Registry(warehouse.root / "models").folder_of(version.manifest.name)
+        drives = read_drives_file(folder, version.manifest)
+    return _WRITERS[to](Subject(version, program, checks, drives))
 
 
 def _json(subject: Subject) -> dict[str, str]:
-    content = document_of(subject.version, subject.program, subject.checks)
+    content = document_of(subject.version, subject.program, subject.checks, subject.drives)
     return {f"{subject.stem}.json": render(content)}
 
 

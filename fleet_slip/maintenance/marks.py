@@ -78,7 +78,8 @@ def _may_have_seen(
         return True
     try:
         manifest = registry.load(name, number).manifest
-        if manifest.trained_on.grams_version >= without:
+        here = manifest.imported_from is None
+        if here and manifest.trained_on.grams_version >= without:
             return False
         kept = read_trained_drives(registry.folder_of(name), manifest)
         return kept is None or not kept <= present.hashed_for(name)

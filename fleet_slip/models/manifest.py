@@ -188,8 +188,19 @@ class SelectedBy(Config):
     config_sha256: str
 
 
+class ImportedFrom(Config):
+    """The version of another data root that a version was imported from."""
+
+    reference: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,40}@[1-9][0-9]{0,8}$")]
+    sha256: Sha256
+
+
 class Manifest(Config):
-    """One model version, complete."""
+    """One model version, complete.
+
+    A version that was imported was made of the tables of another data root: what it says of their
+    versions tells nothing of the tables here.
+    """
 
     format: Literal[1] = 1
     name: Identifier
@@ -201,6 +212,9 @@ class Manifest(Config):
     trained_on: TrainedOn
     selected_by: SelectedBy
     package_version: str
+    imported_from: Annotated[
+        ImportedFrom | None, Field(exclude_if=lambda origin: origin is None)
+    ] = None
 
     @model_validator(mode="after")
     def _agrees(self) -> "Manifest":

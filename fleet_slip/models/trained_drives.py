@@ -40,7 +40,18 @@ def keep_drives(versions: Folder, content: bytes) -> None:
 def read_trained_drives(versions: Folder, manifest: Manifest) -> frozenset[int] | None:
     """Return the salted hashes of a version's drives; None if it is from before they were kept.
 
-    Raises `StorageError` if they are gone or damaged.
+    Raises what `read_drives_file` raises.
+    """
+    content = read_drives_file(versions, manifest)
+    if content is None:
+        return None
+    return frozenset(np.frombuffer(content, dtype=">u8").tolist())
+
+
+def read_drives_file(versions: Folder, manifest: Manifest) -> bytes | None:
+    """Return the content of the file of a version's drives; None if it is from before it was kept.
+
+    Raises `StorageError` if it is gone or damaged.
     """
     expected = manifest.trained_on.drives_sha256
     if expected is None:
@@ -51,7 +62,7 @@ def read_trained_drives(versions: Folder, manifest: Manifest) -> frozenset[int] 
             f"{versions}/{_file_name(expected)}: its bytes do not match the checksum in its name. "
             "Restore the file from a backup."
         )
-    return frozenset(np.frombuffer(content, dtype=">u8").tolist())
+    return content
 
 
 def hash_drives(name: str, drives: Collection[str]) -> frozenset[int]:

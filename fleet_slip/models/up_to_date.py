@@ -29,7 +29,7 @@ def is_up_to_date(
         chosen.config_sha256,
         manifest.package_version,
     )
-    return made_from == (
+    return manifest.imported_from is None and made_from == (
         cohort,
         features().identity(model_list.features),
         warehouse.logs.snapshot().version,

@@ -161,6 +161,11 @@ def _judged(day: Day, mean: Limits, std: Limits) -> Day:
 
 def _last_training_day(warehouse: Warehouse, version: ModelVersion) -> date | None:
     """Return the newest day of the logs as they were when the model was trained."""
+    if version.manifest.imported_from is not None:
+        raise DataError(
+            f"{version.reference} was trained in another data root. Say which day is the first new "
+            "one."
+        )
     logs = warehouse.logs
     number = version.manifest.trained_on.logs_version
     try:

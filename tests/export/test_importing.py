@@ -1,0 +1,167 @@
+"""A version that is exported and imported elsewhere is the same estimator, and says its origin."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import fleet_slip
+from fleet_slip.canonical import canonical_json, sha256_of
+from fleet_slip.cli.main import app
+from fleet_slip.errors import DataError, InputError, RefusedError, UsageError
+from fleet_slip.maintenance.verification import Verification
+from fleet_slip.maintenance.verify_documents import verify_models
+from fleet_slip.models.trained_drives import read_trained_drives
+from fleet_slip.models.up_to_date import is_up_to_date
+from fleet_slip.monitoring.monitor import monitor
+
+Document = dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def exported(smoke_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    (file,) = fleet_slip.open(smoke_root).export("smoke", "json", tmp_path_factory.mktemp("out"))
+    return file
+
+
+def test_an_imported_version_is_the_same_estimator(
+    exported: Path, smoke_root: Path, tmp_path: Path
+) -> None:
+    home, away = fleet_slip.open(smoke_root), fleet_slip.open(tmp_path / "away")
+    made, brought = home.model("smoke"), away.import_model(exported)
+    assert brought.reference == "smoke@1"
+    origin = brought.manifest.imported_from
+    assert origin is not None
+    assert (origin.reference, origin.sha256) == ("smoke@1", made.sha256)
+    assert brought.manifest.model_copy(update={"imported_from": None}) == made.manifest
+    folders = [fleet.registry().folder_of("smoke") for fleet in (home, away)]
+    one, other = (read_trained_drives(folder, made.manifest) for folder in folders)
+    assert one == other
+    assert away.import_model(exported) == brought
+    assert away.registry().versions("smoke") == [1]
+    assert away.registry().champion("smoke") is None
+    away.promote("smoke@1")
+    frame = home.sql("FROM log WHERE tick < 50 AND drive_id = 'smoke-2024-05-01-0003'").pl()
+    assert away.model("smoke").predict(frame).equals(made.predict(frame))
+
+
+def test_the_tables_here_are_not_those_that_made_it(
+    exported: Path, smoke_root: Path, tmp_path: Path
+) -> None:
+    """Their numbers would be taken for those of tables here, by chance the same."""
+    home, away = fleet_slip.open(smoke_root), fleet_slip.open(tmp_path / "away")
+    brought, made = away.import_model(exported), home.model("smoke")
+    trained = made.manifest.trained_on
+    arguments = (home.warehouse, trained.cohort, "estimator", "0.005deg")
+    assert is_up_to_date(made.manifest, *arguments)
+    assert not is_up_to_date(brought.manifest, *arguments)
+    with pytest.raises(DataError, match="another data root"):
+        monitor(home.warehouse, brought)
+    report = Verification()
+    verify_models(away.warehouse, {}, report)
+    assert report.findings == []
+
+
+def test_an_import_of_an_import_names_the_first_origin(
+    exported: Path, smoke_root: Path, tmp_path: Path
+) -> None:
+    second, third = (fleet_slip.open(tmp_path / name) for name in ("second", "third"))
+    second.import_model(exported)
+    (file,) = second.export("smoke@1", "json", tmp_path)
+    origin = third.import_model(file).manifest.imported_from
+    assert origin is not None
+    assert origin.sha256 == fleet_slip.open(smoke_root).model("smoke").sha256
+
+
+def sealed(document: Document) -> Document:
+    """A document whose checksum is right again."""
+    content = {key: value for key, value in document.items() if key != "sha256"}
+    return {**content, "sha256": sha256_of(canonical_json(content))}
+
+
+def without_drives(document: Document) -> Document:
+    document["model"]["drives"] = None
+    return sealed(document)
+
+
+def with_another_coefficient(document: Document) -> Document:
+    document["model"]["manifest"]["trained_on"]["rows"] += 1
+    return sealed(document)
+
+
+def with_another_name(document: Document) -> Document:
+    document["model"]["reference"] = "other@1"
+    return sealed(document)
+
+
+def of_tomorrow(document: Document) -> Document:
+    return sealed({**document, "schema": 2})
+
+
+def flipped(document: Document) -> Document:
+    document["checks"][0]["angles"][7] += 1
+    return document
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (without_drives, "lacks the hashes"),
+        (with_another_coefficient, "is not that of"),
+        (with_another_name, "is not that of"),
+        (of_tomorrow, "schema 2"),
+        (flipped, "changed or damaged"),
+        (lambda document: document["program"], "no exported version"),
+        (lambda document: [document], "no exported version"),
+        (lambda _: None, "no exported version"),
+    ],
+)
+def test_what_is_no_sound_export_is_refused_and_nothing_is_written(
+    change: Callable[[Document], Any], said: str, exported: Path, tmp_path: Path
+) -> None:
+    file = tmp_path / "changed.json"
+    file.write_text(json.dumps(change(json.loads(exported.read_text()))))
+    away = fleet_slip.open(tmp_path / "away")
+    with pytest.raises(InputError, match=said):
+        away.import_model(file)
+    assert away.registry().names() == []
+
+
+def test_a_file_that_is_not_there_or_not_json_is_said(tmp_path: Path) -> None:
+    away, file = fleet_slip.open(tmp_path / "away"), tmp_path / "x"
+    with pytest.raises(InputError, match="cannot be read"):
+        away.import_model(file)
+    file.write_bytes(b"\xff\x00[[[[")
+    with pytest.raises(InputError, match="no exported version"):
+        away.import_model(file)
+
+
+def test_other_ranges_of_signals_are_refused(exported: Path, tmp_path: Path) -> None:
+    document = json.loads(exported.read_text())
+    document["program"]["signals"][0]["max"] -= 1
+    file = tmp_path / "changed.json"
+    file.write_text(json.dumps(sealed(document)))
+    with pytest.raises(RefusedError, match="other scales or ranges"):
+        fleet_slip.open(tmp_path / "away").import_model(file)
+
+
+def test_the_command_imports_and_show_says_from_where(
+    exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = ["--root", str(tmp_path / "away")]
+    assert ended(*root, "models", "import", str(exported), "--json") == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["model"] == "smoke@1"
+    assert said["imported_from"]["reference"] == "smoke@1"
+    assert ended(*root, "show", "smoke@1") == 0
+    assert "from smoke@1 of another data root" in capsys.readouterr().out
+    with pytest.raises(UsageError, match="a file is for import"):
+        ended(*root, "models", "smoke", str(exported))
+
+
+def ended(*words: str) -> object:
+    with pytest.raises(SystemExit) as end:
+        app(list(words))
+    return end.value.code
