@@ -78,18 +78,23 @@ class Filling(Rooted):
         """Bring measured logs in through a mapping of columns, units and axes.
 
         `mapping` is the name of one that ships, the path of a TOML file, or a `Mapping`. Rows that
-        cannot be used go to the view `quarantine` with a reason. Returns a report of each file, in
-        the order given; `each` is called with it once the file is committed. Progress is in files.
-        Without a cluster the files are read one after the other.
+        cannot be used go to the view `quarantine` with a reason. Of a folder all logs are taken, at
+        any depth, but for those that have landed before and have not changed. Returns a report of
+        each file that was read, in their order; `each` is called with it once the file is
+        committed. Progress is in files. Without a cluster they are read one after the other.
 
-        Raises `ConfigError` for a mapping that is not valid and `InputError` for a file that cannot
-        be read, of which then nothing is written; `StorageError` and `ClusterError`.
+        Raises `ConfigError` for a mapping that is not valid; `InputError`, when all others are in,
+        for files that cannot be used, of which nothing is written; `StorageError` and
+        `ClusterError`.
         """
+        from fleet_slip.ingest.folders import KnownFiles, find_logs
         from fleet_slip.ingest.job import ingest_files
         from fleet_slip.ingest.mapping import load_mapping
 
         plan = load_mapping(mapping) if isinstance(mapping, str) else mapping
-        paths = [Path(files)] if isinstance(files, Path | str) else [Path(file) for file in files]
+        given = [Path(files)] if isinstance(files, Path | str) else [Path(file) for file in files]
+        paths = find_logs(given)
+        known = KnownFiles.of(self.warehouse, plan) if paths != given else None
         told = count_from_start(progress)
         reports = {}
         with open_workers(self.root, workers) as executor, step("ingest") as figures:
@@ -98,13 +103,19 @@ class Filling(Rooted):
                 paths = [path.absolute() for path in paths]
             figures.rows = 0
             warehouse = within_reach(self.warehouse, executor)
-            for report in ingest_files(warehouse, paths, plan, elsewhere):
-                reports[report.file] = report
-                figures.rows += report.counts.ticks if report.new else 0
-                if each is not None:
-                    each(report)
-                told(1, len(paths))
-        return [reports[str(path)] for path in paths]
+            wanted = paths if known is None else known.without_landed(paths, warehouse)
+            told(len(paths) - len(wanted), len(paths))
+            try:
+                for report in ingest_files(warehouse, wanted, plan, elsewhere, known):
+                    reports[report.file] = report
+                    figures.rows += report.counts.ticks if report.new else 0
+                    if each is not None:
+                        each(report)
+                    told(1, len(paths))
+            finally:
+                if known is not None:
+                    known.save()
+        return [reports[str(path)] for path in wanted]
 
     def preview(
         self, files: Iterable[Path | str] | Path | str, mapping: "str | Mapping"

@@ -3,6 +3,7 @@
 import logging
 import sys
 from concurrent.futures import Executor
+from contextlib import ExitStack
 from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -121,7 +122,8 @@ def ingest(
     files: Annotated[
         list[Path],
         typer.Argument(
-            help="Measured logs: CSV, Parquet, MDF, MATLAB, CAN traces, DuckDB.",
+            help="Measured logs (CSV, Parquet, MDF, MATLAB, CAN traces, DuckDB), or folders of "
+            "them, of which what is new is taken.",
             show_default=False,
         ),
     ],
@@ -153,11 +155,28 @@ def ingest(
 
         show_previews(fleet.preview(files, mapping), plot, json)
         return
-    each = _warn_of_look_alikes if json else _say_ingested
-    with recording(fleet.root, "ingest", sys.argv[1:]):
-        reports = fleet.ingest(files, mapping, workers=cluster, each=each)
+    folders = any(file.is_dir() for file in files)
+    each = _warn_of_look_alikes if json or folders else _say_ingested
+    with recording(fleet.root, "ingest", sys.argv[1:]), ExitStack() as shown:
+        show = shown.enter_context(progress("ingest", "files")) if folders else None
+        reports = fleet.ingest(files, mapping, workers=cluster, each=each, progress=show)
     if json:
         print_json(reports)
+    elif folders:
+        say(_summed_up(reports))
+
+
+def _summed_up(reports: "list[IngestReport]") -> str:
+    new = [report for report in reports if report.new]
+    if not new:
+        return "nothing new"
+    held = sum(sum(report.counts.quarantined.values()) for report in new)
+    return (
+        f"{number_of(len(new), 'new file')}: {number_of(sum(r.counts.ticks for r in new), 'row')} "
+        f"in {number_of(sum(r.counts.drives for r in new), 'drive')}"
+        + (f"; in quarantine: {number_of(held, 'row')}" if held else "")
+        + _left_out(sum(report.drives_forgotten for report in new))
+    )
 
 
 def _say_ingested(report: "IngestReport") -> None:

@@ -1,0 +1,119 @@
+"""Finds measured logs in folders, and remembers which files of this machine have landed.
+
+What is remembered is a cache, of this machine and beside no data: a file's path, size and time of
+change tell its digest, so that thousands of files need not be read to find nothing new. Whether
+that digest is in the warehouse is asked of the warehouse. Losing the cache costs time alone.
+"""
+
+import json
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+from fleet_slip.delta import Snapshot
+from fleet_slip.errors import InputError
+from fleet_slip.ingest.columns import shown
+from fleet_slip.ingest.landing import unit_of
+from fleet_slip.ingest.mapping import Mapping
+from fleet_slip.warehouse.tables import Warehouse
+
+SUFFIXES = (
+    ".csv", ".csv.gz", ".csv.zst", ".parquet", ".pq", ".mf4", ".mdf", ".mat", ".h5", ".hdf5",
+    ".blf", ".asc", ".log", ".trc", ".duckdb", ".ddb",
+)  # fmt: skip
+
+
+def find_logs(paths: Iterable[Path]) -> list[Path]:
+    """Return files as they are given, and those in folders that have the suffix of a log, sorted.
+
+    Hidden files and folders are passed over. Raises `InputError` for a folder without any.
+    """
+    found: list[Path] = []
+    for path in paths:
+        if not path.is_dir():
+            found.append(path)
+            continue
+        inside = sorted(_logs_below(path))
+        if not inside:
+            raise InputError(
+                f"{shown(path)}: no file in this folder has the suffix of a log: "
+                f"{', '.join(SUFFIXES)}."
+            )
+        found += inside
+    return found
+
+
+def _logs_below(folder: Path) -> Iterator[Path]:
+    for parent, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        for name in names:
+            if name.lower().endswith(SUFFIXES) and not name.startswith("."):
+                yield Path(parent, name)
+
+
+@dataclass
+class KnownFiles:
+    """Which content the files of this machine had when they landed through a mapping.
+
+    Attributes:
+        digests: size, time of change and digest by absolute path.
+    """
+
+    cache: Path
+    digests: dict[str, tuple[int, int, str]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, warehouse: Warehouse, mapping: Mapping) -> "KnownFiles":
+        """Return what is remembered for a data root and a mapping."""
+        about = sha256(f"{warehouse.root.uri}\n{mapping.canonical_json()}".encode()).hexdigest()
+        cache = _cache_folder() / f"{about[:32]}.json"
+        with suppress(OSError, ValueError, TypeError):
+            kept: dict[str, Any] = json.loads(cache.read_bytes())
+            return cls(cache, {path: (int(s), int(t), str(d)) for path, (s, t, d) in kept.items()})
+        return cls(cache)
+
+    def without_landed(self, files: Iterable[Path], warehouse: Warehouse) -> list[Path]:
+        """Return the files that are not in the logs, as far as size and time of change tell."""
+        snapshot = warehouse.logs.snapshot()
+        return [file for file in files if not self._has_landed(file, snapshot)]
+
+    def _has_landed(self, file: Path, snapshot: Snapshot) -> bool:
+        known = self.digests.get(os.path.abspath(file))  # noqa: PTH100 - much the faster
+        if known is None:
+            return False
+        try:
+            found = file.stat()
+        except OSError:
+            return False
+        unchanged = (found.st_size, found.st_mtime_ns) == known[:2]
+        return unchanged and snapshot.landed(unit_of(known[2]).name) is not None
+
+    def digest_of(self, file: Path) -> str | None:
+        """Return the digest of what a path had when it landed, None if it never did."""
+        known = self.digests.get(os.path.abspath(file))  # noqa: PTH100
+        return None if known is None else known[2]
+
+    def remember(self, file: Path, digest: str) -> None:
+        """Keep in mind that a file has landed."""
+        with suppress(OSError):
+            found = file.stat()
+            path = os.path.abspath(file)  # noqa: PTH100
+            self.digests[path] = (found.st_size, found.st_mtime_ns, digest)
+
+    def save(self) -> None:
+        """Write the cache; what cannot be written is not kept."""
+        with suppress(OSError):
+            self.cache.parent.mkdir(parents=True, exist_ok=True)
+            draft = self.cache.with_suffix(f".{os.getpid()}")
+            draft.write_text(json.dumps(self.digests))
+            draft.replace(self.cache)
+
+
+def _cache_folder() -> Path:
+    service = os.environ.get("CACHE_DIRECTORY", "").partition(":")[0]
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")  # noqa: PTH111
+    return Path(service or Path(home, "fleet-slip"), "ingested")

@@ -1,0 +1,185 @@
+"""Folders of logs: what is new comes in, together; what is wrong does not hold up the rest."""
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fleet_slip.delta import Snapshot
+from fleet_slip.errors import InputError
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.ingest import job
+from fleet_slip.warehouse.tables import Warehouse
+from tests.support.measured import csv_text, good_columns
+from tests.support.reported import call
+
+MAPPING = """name = "car"
+[time]
+column = "t"
+unit = "s"
+[drive]
+day = {day}
+vehicle_id = "A7"
+vehicle_model = "sedan"
+[signals]
+ax = {{ column = "ax", unit = "m/s^2" }}
+sideslip = {{ column = "beta", unit = "deg" }}
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A landing folder of five logs, in folders of their own; the cache is the test's."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.delenv("CACHE_DIRECTORY", raising=False)
+    (tmp_path / "car.toml").write_text(MAPPING.format(day="2024-05-31"))
+    for i in range(5):
+        write_log(tmp_path / "landing" / f"day {i % 2}" / f"{i}.csv", rows=20 + i)
+    (tmp_path / "landing" / "notes.txt").write_text("none of it")
+    write_log(tmp_path / "landing" / ".hidden" / "6.csv", rows=26)
+    return tmp_path / "landing"
+
+
+def write_log(file: Path, rows: int) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(csv_text(good_columns(rows)))
+
+
+def ingest(folder: Path, *paths: Path) -> list[dict[str, Any]]:
+    """Ingest into the root beside a folder; return the reports."""
+    root, mapping = folder.parent / "root", folder.parent / "car.toml"
+    names = map(str, paths or (folder,))
+    printed = call(root, "ingest", *names, "--mapping", str(mapping), "--json")
+    return list(json.loads(printed))
+
+
+def drives(folder: Path) -> dict[str, int]:
+    """Rows by drive."""
+    warehouse = Warehouse(LocalFolder(folder.parent / "root"))
+    found: dict[str, int] = {}
+    for file in warehouse.logs.snapshot().files:
+        for name in warehouse.logs.read(file.path, ["drive_id"])["drive_id"].to_pylist():
+            found[name] = found.get(name, 0) + 1
+    return found
+
+
+def test_the_logs_of_a_folder_land_together_and_once(folder: Path) -> None:
+    reports = ingest(folder)
+    assert [report["new"] for report in reports] == [True] * 5
+    assert [Path(report["file"]).name for report in reports] == [
+        "0.csv", "2.csv", "4.csv", "1.csv", "3.csv",
+    ]  # fmt: skip
+    assert sorted(drives(folder).values()) == [20, 21, 22, 23, 24]
+    snapshot = Warehouse(LocalFolder(folder.parent / "root")).logs.snapshot()
+    assert (len(snapshot.files), snapshot.version) == (1, 1)
+    assert ingest(folder) == []
+    write_log(folder / "new.csv", rows=40)
+    assert [Path(report["file"]).name for report in ingest(folder)] == ["new.csv"]
+    assert len(drives(folder)) == 6
+
+
+def test_what_lands_does_not_depend_on_batches_or_order(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ingest(folder)
+    together = drives(folder)
+    monkeypatch.setattr(job, "BATCH_FILES", 2)
+    (folder.parent / "root").rename(folder.parent / "first")
+    files = sorted(folder.glob("day */*.csv"), key=lambda file: -file.stat().st_size)
+    assert len(ingest(folder, *files)) == 5
+    assert drives(folder) == together
+
+
+def test_without_the_cache_nothing_lands_twice(folder: Path) -> None:
+    ingest(folder)
+    for cache in (folder.parent / "cache").rglob("*.json"):
+        cache.write_text("[damaged")
+    assert [report["new"] for report in ingest(folder)] == [False] * 5
+    assert ingest(folder) == []
+    assert len(drives(folder)) == 5
+
+
+def test_a_cache_of_what_is_not_in_the_warehouse_is_not_believed(folder: Path) -> None:
+    ingest(folder)
+    (folder.parent / "root").rename(folder.parent / "elsewhere")
+    assert [report["new"] for report in ingest(folder)] == [True] * 5
+
+
+def test_a_file_of_another_time_and_the_same_content_is_not_new(folder: Path) -> None:
+    ingest(folder)
+    os.utime(folder / "day 0" / "0.csv", (1, 1))
+    (report,) = ingest(folder)
+    assert not report["new"]
+    assert ingest(folder) == []
+
+
+def test_a_file_that_has_grown_would_count_twice_and_is_refused(folder: Path) -> None:
+    ingest(folder)
+    file = folder / "day 1" / "1.csv"
+    write_log(file, rows=50)
+    with pytest.raises(InputError, match="it has changed since it was ingested") as caught:
+        ingest(folder)
+    assert any(name in str(caught.value) for name in drives(folder))
+    assert sorted(drives(folder).values()) == [20, 21, 22, 23, 24]
+    file.rename(folder / "whole.csv")
+    assert [report["new"] for report in ingest(folder)] == [True]
+
+
+def test_files_that_cannot_be_used_do_not_hold_up_the_rest(folder: Path) -> None:
+    (folder / "bad.csv").write_text("t,ax\n0,1\n")
+    with pytest.raises(InputError, match=r"bad\.csv: no column 'beta'"):
+        ingest(folder)
+    assert len(drives(folder)) == 5
+    (folder / "empty.csv").write_text("")
+    with pytest.raises(InputError, match="2 files cannot be used; all others are in"):
+        ingest(folder)
+    (folder / "bad.csv").unlink()
+    write_log(folder / "empty.csv", rows=33)
+    assert len(ingest(folder)) == 1
+
+
+def test_the_same_content_twice_lands_once(folder: Path) -> None:
+    write_log(folder / "copy.csv", rows=20)
+    assert sorted(report["new"] for report in ingest(folder)) == [False, *[True] * 5]
+    assert len(drives(folder)) == 5
+    assert ingest(folder) == []
+
+
+def test_a_batch_of_which_another_process_lands_a_part_is_written_again(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    commit = Snapshot.commit
+    (folder / "bad rows.csv").write_text(csv_text(good_columns(30)) + "oops,1,2\n")
+
+    def meanwhile(self: Snapshot, change: Any) -> None:
+        monkeypatch.setattr(Snapshot, "commit", commit)
+        assert len(ingest(folder, folder / "day 0" / "2.csv", folder / "bad rows.csv")) == 2
+        commit(self, change)
+
+    monkeypatch.setattr(Snapshot, "commit", meanwhile)
+    reports = ingest(folder)
+    assert sum(report["new"] for report in reports) == 4
+    assert sorted(drives(folder).values()) == [20, 21, 22, 23, 24, 30]
+    warehouse = Warehouse(LocalFolder(folder.parent / "root"))
+    assert warehouse.quarantine.snapshot().rows == 1
+    written = {path.name for path in (folder.parent / "root" / "logs").glob("*/*.parquet")}
+    assert written == {file.path.rpartition("/")[2] for file in warehouse.logs.snapshot().files}
+
+
+def test_a_folder_without_logs_is_an_error(folder: Path) -> None:
+    (folder.parent / "empty").mkdir()
+    with pytest.raises(InputError, match=r"no file in this folder has the suffix of a log: \.csv"):
+        ingest(folder, folder.parent / "empty")
+
+
+def test_quarantine_rows_of_a_batch_are_those_of_its_files(folder: Path) -> None:
+    for i in (0, 3):
+        with (folder / f"day {i % 2}" / f"{i}.csv").open("a") as stream:
+            stream.write("oops,1,2\n")
+    ingest(folder)
+    warehouse = Warehouse(LocalFolder(folder.parent / "root"))
+    (file,) = warehouse.quarantine.snapshot().files
+    found = warehouse.quarantine.read(file.path)
+    assert sorted(found["file"].to_pylist()) == ["0.csv", "3.csv"]
