@@ -29,6 +29,8 @@ def calibrate(
     Offsets of gyroscope, accelerometer and steering, tyre radius, steering and understeer, each
     with its uncertainty and how fast it shrinks with drives. Needs the Gram rows of: **fleet-slip
     gram --features calibration**. SQL sees the same: **fleet-slip sql "FROM calibration"**
+
+    Example: **fleet-slip calibrate**
     """
     found: Calibration = context.obj.calibrate(cohort)
     if json:

@@ -15,7 +15,10 @@ from fleet_slip.words import number_of
 
 
 def diff(context: typer.Context, one: Reference, other: Reference, json: Json = False) -> None:
-    """Tell two model versions apart: their data, signals, coefficients and figures."""
+    """Tell two model versions apart: their data, signals, coefficients and figures.
+
+    Example: **fleet-slip diff waterford@1 waterford@2**
+    """
     found = context.obj.diff(one, other)
     if json:
         print_json(found)

@@ -12,6 +12,8 @@ def config(json: Json = False) -> None:
 
     A folder given with --config or $FLEET_SLIP_CONFIG is laid over the shipped one: its files take
     the place of shipped ones of the same name, and add to them.
+
+    Example: **fleet-slip --config my_configs config**
     """
     catalogue()
     features()  # what is not valid is said here, before anything is listed

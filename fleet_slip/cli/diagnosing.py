@@ -47,6 +47,8 @@ def diagnose(
 
     Standard errors by drives, or by cars where there are several, are the ones to believe: at
     100 Hz a row says little that the one before did not say, and a car's drives share its biases.
+
+    Example: **fleet-slip diagnose waterford**
     """
     result = context.obj.cohort(cohort).diagnose(
         model,

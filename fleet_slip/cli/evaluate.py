@@ -49,7 +49,10 @@ def score(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Evaluate a model on the rows of a cohort: also the largest error and percentiles."""
+    """Evaluate a model on the rows of a cohort: also the largest error and percentiles.
+
+    Example: **fleet-slip score waterford --cohort "speed_factor > 0.9"**
+    """
     version = context.obj.model(reference)
     if sql:
         typer.echo(score_statement(version.manifest, cohort))
@@ -90,6 +93,8 @@ def evaluate(
     """Evaluate models on the paper's test drives and on others; simulates those that are missing.
 
     The results are kept as a JSON document below evaluations/ in the data root.
+
+    Example: **fleet-slip evaluate --one-car waterford --scenario nominal**
     """
     with progress("simulate scenarios", "rows") as show:
         kept = context.obj.evaluate(

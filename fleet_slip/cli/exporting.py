@@ -19,7 +19,10 @@ def export(
     ] = Path(),
     json: Json = False,
 ) -> None:
-    """Write a version as a program for elsewhere, with checks: vectors of inputs and angles."""
+    """Write a version as a program for elsewhere, with checks: vectors of inputs and angles.
+
+    Example: **fleet-slip export waterford --to c --output export**
+    """
     written = context.obj.export(reference, to, output)
     if json:
         print_json({"files": [str(path) for path in written]})

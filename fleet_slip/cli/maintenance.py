@@ -47,6 +47,8 @@ def verify(
     """Verify every byte against its checksum, and everything against everything else.
 
     Exits with 9 if there is damage that was not repaired.
+
+    Example: **fleet-slip verify --full**
     """
     fleet: Fleet = context.obj
     # What repairs changes the warehouse; what only looks leaves no record.
@@ -115,7 +117,10 @@ def compact(
     ] = TARGET_ROWS,
     json: Json = False,
 ) -> None:
-    """Turn the small log files of each day into large ones. Readers and jobs are not disturbed."""
+    """Turn the small log files of each day into large ones. Readers and jobs are not disturbed.
+
+    Example: **fleet-slip compact**
+    """
     with progress("compact", "days") as show:
         report = context.obj.compact(target_rows, progress=show)
     if json:
@@ -145,7 +150,10 @@ def vacuum(
     ] = False,
     json: Json = False,
 ) -> None:
-    """Remove replaced files and leftovers of killed jobs when they are old enough."""
+    """Remove replaced files and leftovers of killed jobs when they are old enough.
+
+    Example: **fleet-slip vacuum --dry-run**
+    """
     fleet: Fleet = context.obj
     report = (fleet.preview_vacuum if dry_run else fleet.vacuum)(retention_hours)
     if json:
@@ -180,6 +188,8 @@ def forget(
 
     No job brings it back, nor one that is under way: its rows are left out, until --allow.
     `fleet-slip run` retrains. With --now it exits with 12 while anything may be left: repeat it.
+
+    Example: **fleet-slip forget --vehicle car-7 --now**
     """
     if (vehicle is None) == (drive is None):
         raise typer.BadParameter("give one of --vehicle and --drive.")
@@ -236,7 +246,10 @@ def retain(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Forget drives that are older than the retention says, then vacuum. For a schedule."""
+    """Forget drives that are older than the retention says, then vacuum. For a schedule.
+
+    Example: **fleet-slip retain**
+    """
     with progress("retain", "files") as show:
         report = context.obj.retain(config, progress=show)
     if json:

@@ -36,6 +36,8 @@ def mapping(
 
     Channels are guessed by name, unit and values; signs, and which wheel is which, by how the car
     moves. Each guess has its reason as a comment, for a person to check.
+
+    Example: **fleet-slip mapping suggest drive.mf4**
     """
     from fleet_slip.ingest.can_bus import CanBus, read_can_database  # noqa: PLC0415 - takes a while
     from fleet_slip.ingest.draft import draft_mapping  # noqa: PLC0415

@@ -34,7 +34,10 @@ def models(
     file: Annotated[Path | None, typer.Argument(help="The file to import.")] = None,
     json: Json = False,
 ) -> None:
-    """List the published model versions, or bring one in from elsewhere: models import FILE."""
+    """List the published model versions, or bring one in from elsewhere: models import FILE.
+
+    Example: **fleet-slip models**
+    """
     fleet: Fleet = context.obj
     if file is not None:
         _import_model(fleet, name, file, json)
@@ -104,7 +107,10 @@ def _import_model(fleet: Fleet, word: str | None, file: Path, json: bool) -> Non
 
 
 def show(context: typer.Context, reference: Reference, json: Json = False) -> None:
-    """Show one model version: coefficients, figures, and the data that made it."""
+    """Show one model version: coefficients, figures, and the data that made it.
+
+    Example: **fleet-slip show waterford**
+    """
     version: ModelVersion = context.obj.model(reference)
     if json:
         content = version.manifest.model_dump(mode="json")
@@ -216,7 +222,10 @@ def promote(
     reference: Annotated[str, typer.Argument(help="NAME@VERSION to point the alias at.")],
     alias: Alias = CHAMPION,
 ) -> None:
-    """Point an alias, the champion unless told otherwise, at a version."""
+    """Point an alias, the champion unless told otherwise, at a version.
+
+    Example: **fleet-slip promote waterford@2**
+    """
     version = context.obj.promote(reference, alias)
     say(f"{version.manifest.name}@{alias} is now version {version.version}")
 
@@ -230,6 +239,8 @@ def rollback(
     """Point an alias back at the version that it had before; no publication moves it from there.
 
     Until promote or unpin.
+
+    Example: **fleet-slip rollback waterford**
     """
     version = context.obj.rollback(name, alias)
     say(
@@ -244,7 +255,10 @@ def pin(
     name: Annotated[str, typer.Argument(help="Name of the model.")],
     alias: Alias = CHAMPION,
 ) -> None:
-    """Keep an alias where it is: publications become candidates, until promote or unpin."""
+    """Keep an alias where it is: publications become candidates, until promote or unpin.
+
+    Example: **fleet-slip pin waterford**
+    """
     version = context.obj.pin(name, alias)
     say(f"{name}@{alias} is pinned to version {version.version}")
 
@@ -255,6 +269,9 @@ def unpin(
     name: Annotated[str, typer.Argument(help="Name of the model.")],
     alias: Alias = CHAMPION,
 ) -> None:
-    """Let publications move an alias again, after pin or rollback."""
+    """Let publications move an alias again, after pin or rollback.
+
+    Example: **fleet-slip unpin waterford**
+    """
     version = context.obj.unpin(name, alias)
     say(f"{name}@{alias} is version {version.version}; the next publication may move it")

@@ -29,6 +29,8 @@ def quality(
     """Find stuck, saturated, biased, noisy, scaled, reversed and swapped sensors, drive by drive.
 
     Reads Gram rows only. Exit code 10 if a drive's sensors are not in order.
+
+    Example: **fleet-slip quality --cohort "day >= '2024-05-02'"**
     """
     found: QualityReport = context.obj.quality(cohort)
     if json:
@@ -83,6 +85,8 @@ def monitor(
     """Chart a model's error on each day since it was trained, with control limits.
 
     Reads Gram rows only. Exit code 10 if a new day is beyond the limits.
+
+    Example: **fleet-slip monitor waterford --since 2024-05-03**
     """
     chart: Chart = context.obj.monitor(reference, cohort, since=_first_new_day(since))
     if plot:
@@ -132,6 +136,8 @@ def migrate(context: typer.Context, json: Json = False) -> None:
     """Bring the logs to the signal catalogue: add columns, convert counts to other scales.
 
     See docs/schema.md before widening a scale. It can be repeated after any interruption.
+
+    Example: **fleet-slip migrate**
     """
     with progress("migrate", "rows") as show:
         report = context.obj.migrate(progress=show)

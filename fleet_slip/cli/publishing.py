@@ -36,6 +36,8 @@ def publish(
     """Select on a cohort and make the winner the next version of a model, and its champion.
 
     The options are those of select.
+
+    Example: **fleet-slip publish wet --cohort "adhesion < 0.8"**
     """
     require_model_name(name)
     with step("select"):

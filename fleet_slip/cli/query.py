@@ -51,6 +51,8 @@ def sql(
 
     Every column is described in the view dictionary. A query can read the warehouse, and nothing
     else.
+
+    Example: **fleet-slip sql "SELECT vehicle_id, count(*) AS drives FROM drives GROUP BY ALL"**
     """
     fleet: Fleet = context.obj
     text = _read_stdin() if query == "-" else query
@@ -112,7 +114,10 @@ def _representation_errors() -> Iterator[None]:
 
 
 def shell(context: typer.Context) -> None:
-    """Type SQL queries against the warehouse, one after the other. End with .quit or Ctrl-D."""
+    """Type SQL queries against the warehouse, one after the other. End with .quit or Ctrl-D.
+
+    Example: **fleet-slip shell**
+    """
     import readline  # noqa: F401, PLC0415 - gives input() history and editing
 
     limit_memory()

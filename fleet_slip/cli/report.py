@@ -23,6 +23,8 @@ def report(
     """Write one page that lays our figures beside the paper's, from the latest evaluation.
 
     The page needs nothing but itself; the same figures stand beside it as SVG and PNG files.
+
+    Example: **fleet-slip report --model waterford**
     """
     written = context.obj.report(model, output)
     if json:

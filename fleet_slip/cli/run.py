@@ -48,6 +48,8 @@ def run(
     It can be repeated at any time, and after any interruption: what is done is not done again. A
     second run of the campaign at the same time waits for the first. A nightly run appends the next
     day with --through today.
+
+    Example: **fleet-slip run --campaign smoke**
     """
     from fleet_slip.simulation.campaign import load_campaign  # noqa: PLC0415 - the simulator takes a while
 

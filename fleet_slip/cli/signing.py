@@ -28,7 +28,10 @@ def signing_key(given: Path | None) -> Path | None:
 def keygen(
     file: Annotated[Path, typer.Argument(help="Where to write the private key; FILE.pub is made.")],
 ) -> None:
-    """Make a key to sign model versions with. Keep it where versions are made, and nowhere else."""
+    """Make a key to sign model versions with. Keep it where versions are made, and nowhere else.
+
+    Example: **fleet-slip keygen release**
+    """
     public = make_keys(file)
     say(f"{file}: the private key. Sign with: export {SIGNING_VARIABLE}={file}")
     say(f"{public}: the public key. Demand signatures with: export {VERIFY_VARIABLE}={public}")
@@ -39,7 +42,10 @@ def sign(
     reference: Annotated[str, typer.Argument(help="NAME@VERSION")],
     sign_key: SignKey = None,
 ) -> None:
-    """Sign a version that was published without a signature."""
+    """Sign a version that was published without a signature.
+
+    Example: **fleet-slip sign waterford@1 --sign-key release.key**
+    """
     key = signing_key(sign_key)
     if key is None:
         raise UsageError(f"no key to sign with. Give --sign-key FILE, or set ${SIGNING_VARIABLE}.")

@@ -41,6 +41,8 @@ def features(
     Features are integer functions of the logged counts, such as yaw rate over speed. Compute the
     Gram rows of a set with: **fleet-slip gram --features NAME**, then use it with: **fleet-slip
     select --features NAME**
+
+    Example: **fleet-slip features --sql ay_mean_16**
     """
     known = known_features()
     if sql is not None:
@@ -130,7 +132,7 @@ def what_if(
 
     Bias and noise come on top of what the logs have. Shown too: the best model for such sensors.
 
-    **fleet-slip what-if waterford --noise ay=0.2 --bias yaw_rate=0.02**
+    Example: **fleet-slip what-if waterford --noise ay=0.2 --bias yaw_rate=0.02**
     """
     noises, biases = quantities(noise, "--noise"), quantities(bias, "--bias")
     result = _cohort(context, cohort).what_if(
@@ -196,6 +198,8 @@ def regimes(
 
     One model for all rows is cross-validated against one for each regime. Needs Gram rows by
     regime: **fleet-slip gram --features regimes**
+
+    Example: **fleet-slip regimes --over speed**
     """
     divided_by = [name.strip() for name in over.split(",")] if over else []
     result = _cohort(context, cohort).regimes(
@@ -251,6 +255,8 @@ def shrink(
 
     Penalties are chosen by cross-validation inside each training fold. With many drives for each
     signal there is little to shrink; with few drives, or many features, it shows here.
+
+    Example: **fleet-slip shrink --signals ay,yaw_rate**
     """
     found = _cohort(context, cohort).shrink(
         signals, features=feature_set or PLAIN, by=by, folds=folds, naive=naive, cluster=cluster

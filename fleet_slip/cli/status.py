@@ -21,6 +21,8 @@ def status(
     """Tell the warehouse's health: freshness, backlog, last runs, disk, champions.
 
     Exit code 10 if something calls for attention.
+
+    Example: **fleet-slip status --max-age-hours 26**
     """
     found: WarehouseStatus = context.obj.status(max_age_hours)
     if json:

@@ -2,6 +2,8 @@
 
 import inspect
 import json
+import re
+import shlex
 import sys
 from dataclasses import fields
 from pathlib import Path
@@ -55,6 +57,17 @@ def test_every_command_is_listed_in_its_own_words() -> None:
         assert command.name == name
         assert command.help == entry.help
         assert (entry.help or "").strip()
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_help_of_a_command_has_an_example_that_can_be_typed(name: str) -> None:
+    command = load_command(name)
+    examples = re.findall(r"\*\*(fleet-slip .+?)\*\*", command.help or "")
+    own = [words for words in map(shlex.split, examples) if name in words]
+    assert own, examples
+    for words in own:
+        given = words[words.index(name) + 1 :]
+        command.make_context(name, given).close()  # raises for what it does not know
 
 
 def test_help_groups_the_commands_and_begins_with_five() -> None:
