@@ -1,15 +1,16 @@
 """The command line in processes of their own, none of which lasts for ever."""
 
 import json
+import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
-from tests.support.prepared import environment, server
+from tests.support.prepared import server, without_test
 
 COMMAND = str(Path(sys.executable).with_name("fleet-slip"))
 PATIENCE_S = 400.0
@@ -42,14 +43,17 @@ def run(words: Words, **options: Any) -> Finished:
     return Finished(done.returncode, done.stdout, done.stderr)
 
 
-def run_prepared(words: Sequence[str], cwd: str | Path | None = None) -> Finished:
-    """Run `fleet-slip` as `run` does, in a process that has imported it already."""
+def run_prepared(
+    words: Sequence[str], cwd: str | Path | None = None, env: Mapping[str, str] | None = None
+) -> Finished:
+    """Run `fleet-slip` as `run` does, in a process that has imported it already if that can be."""
+    environment = without_test(os.environ if env is None else env)
     prepared = server()
-    if prepared.environment != environment():
-        return run(words, cwd=cwd)
+    if not prepared.can_run_in(environment):
+        return run(words, cwd=cwd, env=env)
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         streams = (out.fileno(), err.fileno())
-        code = prepared.run(list(words), Path(cwd or "."), streams, PATIENCE_S)
+        code = prepared.run(list(words), Path(cwd or "."), environment, streams, PATIENCE_S)
         return Finished(code, _text(out), _text(err))
 
 
@@ -62,7 +66,8 @@ def _text(file: IO[bytes]) -> str:
 def run_on(root: object, *arguments: str | Path, **options: Any) -> Finished:
     """Run `fleet-slip --root ROOT ...`, which never shows a traceback."""
     words = [COMMAND, "--root", str(root), *map(str, arguments)]
-    done = run_prepared(words, **options) if options.keys() <= {"cwd"} else run(words, **options)
+    prepared = options.keys() <= {"cwd", "env"}
+    done = run_prepared(words, **options) if prepared else run(words, **options)
     assert "Traceback" not in done.stderr, done.stderr
     return done
 

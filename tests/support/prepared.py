@@ -1,8 +1,8 @@
 """The command line in processes that need not import the program: it is half of what they cost.
 
-A server that has imported everything forks for each command. The process has arguments, folder and
-streams of its own, ends as one that was started anew, and can be killed; the environment is the
-server's, so that a command with another one is started anew.
+A server that has imported everything forks for each command. The process has arguments, folder,
+environment and streams of its own, ends as one that was started anew, and can be killed. Variables
+that may be read while importing must be those of the server.
 """
 
 import atexit
@@ -19,7 +19,7 @@ import sys
 import tempfile
 import threading
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -27,6 +27,9 @@ from typing import Any, Never
 
 import fleet_slip
 from fleet_slip.cli.main import main as fleet_slip_main
+
+READ_LATE = ("AWS_", "FLEET_SLIP_")
+"""How variables begin that nothing reads while importing."""
 
 LATE = ("pandas", "matplotlib.figure")
 """What libraries import at their first use."""
@@ -39,8 +42,19 @@ class Server:
     address: str
     environment: dict[str, str]
 
+    def can_run_in(self, wanted: Mapping[str, str]) -> bool:
+        """Whether an environment differs in nothing that is read while importing."""
+        both = {*self.environment.items(), *wanted.items()}
+        shared = self.environment.items() & wanted.items()
+        return all(name.startswith(READ_LATE) for name, _ in both - shared)
+
     def run(
-        self, words: list[str], folder: Path, streams: tuple[int, int], patience_s: float
+        self,
+        words: list[str],
+        folder: Path,
+        environment: Mapping[str, str],
+        streams: tuple[int, int],
+        patience_s: float,
     ) -> int:
         """Run a program's words in a folder, with two descriptors for what it says.
 
@@ -50,7 +64,8 @@ class Server:
         with socket.socket(socket.AF_UNIX) as connection:
             connection.settimeout(patience_s)
             connection.connect(self.address)
-            asked = json.dumps({"words": words, "folder": str(folder)}).encode()
+            given = {"words": words, "folder": str(folder), "environment": dict(environment)}
+            asked = json.dumps(given).encode()
             socket.send_fds(connection, [len(asked).to_bytes(4, "big") + asked], list(streams))
             with connection.makefile("r") as answers:
                 process = int(answers.readline())
@@ -62,9 +77,9 @@ class Server:
                     raise
 
 
-def environment() -> dict[str, str]:
-    """Return the environment of this process, without the name of the test that runs."""
-    return {name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"}
+def without_test(environment: Mapping[str, str]) -> dict[str, str]:
+    """Return an environment without the name of the test that runs."""
+    return {name: value for name, value in environment.items() if name != "PYTEST_CURRENT_TEST"}
 
 
 @cache
@@ -77,11 +92,11 @@ def server() -> Server:
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
-        env=environment(),
+        env=without_test(os.environ),
     )
     assert process.stdout is not None
     assert process.stdout.readline(), "the server of prepared processes did not start"
-    return Server(address, environment())
+    return Server(address, without_test(os.environ))
 
 
 def main(address: str) -> None:
@@ -148,6 +163,8 @@ def _become(asked: dict[str, Any], streams: list[int]) -> None:
         os.dup2(given, wanted)
         os.close(given)
     os.chdir(asked["folder"])
+    os.environ.clear()
+    os.environ.update(asked["environment"])
     sys.argv = asked["words"]
     sys.modules["__main__"].__package__ = None  # or messages would say `python -m`
     sys.path[0] = str(Path(sys.argv[0]).parent)
