@@ -70,3 +70,30 @@ def _run(prefix: str, program: Program, number: int, check: Check) -> str:
         "        } else {\n            /* right */\n        }\n"
         "    }\n    return wrong;\n}\n"
     )
+
+
+def c_fuzz_target(version: ModelVersion, program: Program) -> str:
+    """Return a fuzz target for libFuzzer: a car, then samples, of any bytes."""
+    prefix = c_prefix(version)
+    known, given = "", ""
+    if program.facts or program.numbers:
+        known = (
+            f"    {prefix}_car car;\n    if (size < sizeof car) {{ return 0; }}\n"
+            "    (void)memcpy(&car, data, sizeof car);\n    at = sizeof car;\n"
+        )
+        given = ", &car"
+    return (
+        f"/* Fuzz target of {version.reference}: clang -fsanitize=fuzzer,address,undefined */\n"
+        "#include <stddef.h>\n#include <stdlib.h>\n#include <string.h>\n\n"
+        f'#include "{prefix}.h"\n\n'
+        "int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);\n\n"
+        "int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)\n{\n"
+        f"    static {prefix}_state state;\n    {prefix}_sample sample;\n"
+        f"    size_t at = 0U;\n{known}"
+        f"    {prefix}_start(&state{given});\n"
+        "    for (; (size - at) >= sizeof sample; at += sizeof sample) {\n"
+        "        int32_t angle;\n        (void)memcpy(&sample, &data[at], sizeof sample);\n"
+        f"        if ((!{prefix}_step(&state, &sample, &angle)) && (angle != 0)) {{\n"
+        "            abort(); /* where there is none, 0 is written */\n        }\n"
+        "    }\n    return 0;\n}\n"
+    )

@@ -94,6 +94,7 @@ class ColumnWriter:
                 bounds.append(sizes[0] * sizes[-1])
                 texts.append(literal(bounds[-1]))
             else:
+                self.used |= {"sign"} & {step.function}
                 value, bound = operation(step.function, operands, sizes)
                 bounds.append(bound)
                 if step.function == "//" and not operands[1].isdigit():
@@ -144,7 +145,7 @@ class ColumnWriter:
             times = f"{denominator}U" if count == "1" else f"{denominator}U * {count}"
             return f"nearest_32({total}, {numerator}U, {times}, {limit})"
         self.used.add("nearest_64")
-        times = str(denominator) if count == "1" else f"(int64_t){denominator} * {count}"
+        times = str(denominator) if count == "1" else f"(int64_t){denominator} * (int64_t){count}"
         return f"nearest_64({total}, {numerator}, {times}, {limit})"
 
     def ago(self, source: int, ticks: int) -> str:
@@ -157,7 +158,7 @@ class ColumnWriter:
     def _factor(self, place: int, one: Factor) -> str:
         fact = f"state->{self._fields['facts'][one.fact]}"
         of = f"column_{one.of}"
-        total = f"(int64_t){of} * ({fact} - {literal(one.less)})"
+        total = f"(int64_t){of} * {_less(fact, one.less)}"
         self.used.add("nearest_64")
         call = f"nearest_64({total}, {one.numerator}, {one.denominator}, {one.limit})"
         missing = f"(({of} == MISSING) || ({fact} == MISSING))"
@@ -177,13 +178,17 @@ class ColumnWriter:
     def _numbered(self, place: int, one: Numbered) -> str:
         number = f"state->{self._fields['numbers'][one.number]}"
         stand_in = "0" if one.running is None else f"column_{one.running}"
-        factor = f"(({number} == MISSING) ? {stand_in} : {number} - {literal(one.less)})"
+        factor = f"(({number} == MISSING) ? {stand_in} : {_less(number, one.less)})"
         of = f"column_{one.of}"
         missing = f"({of} == {missing_of(self.program, one.of)})"
         if one.running is not None:
             missing = f"({missing} || (({number} == MISSING) && ({stand_in} == MISSING)))"
         value = f"(int64_t){factor}" if one.alone else f"(int64_t){of} * {factor}"
         return f"const int64_t column_{place} = {missing} ? MISSING_64 : {value};"
+
+
+def _less(value: str, less: int) -> str:
+    return f"({value} - {literal(less)})" if less else value
 
 
 def missing_of(program: Program, place: int) -> str:
@@ -229,7 +234,7 @@ def operation(function: str, operands: list[str], sizes: list[int]) -> tuple[str
         case "abs":
             return f"({a} < 0) ? -{a} : {a}", bound
         case "sign":
-            return f"({a} > 0) ? 1 : (({a} < 0) ? -1 : 0)", bound
+            return f"sign({a})", bound
         case "//":
             # C truncates as SQL does; the type of the result must hold the dividend.
             both = max(sizes) > LARGEST_32 >= bound

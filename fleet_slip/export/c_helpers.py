@@ -15,6 +15,20 @@ static int32_t clip(int64_t value, int32_t limit)
     return (value > most) ? limit : ((value < -most) ? -limit : (int32_t)value);
 }
 """,
+    "sign": """
+static int32_t sign(int64_t value)
+{
+    int32_t found = 0;
+    if (value > 0) {
+        found = 1;
+    } else if (value < 0) {
+        found = -1;
+    } else {
+        /* zero */
+    }
+    return found;
+}
+""",
     "nearest_64": """
 /* value * numerator / divisor to the nearest, halves away from zero, within limit. */
 static int32_t nearest_64(int64_t value, int64_t numerator, int64_t divisor, int32_t limit)
@@ -39,15 +53,17 @@ static int32_t nearest_32(int32_t value, uint32_t numerator, uint32_t divisor, i
 /* The value of so many ticks ago; at is where the next one will be written. */
 static int32_t ago_16(const int16_t *ring, uint32_t at, uint32_t length, uint32_t ticks)
 {
-    const int16_t value = ring[(at >= ticks) ? (at - ticks) : ((at + length) - ticks)];
-    return (value == INT16_MIN) ? MISSING : value;
+    const uint32_t turn = (at >= ticks) ? 0U : length;
+    const int16_t value = ring[(at + turn) - ticks];
+    return (value == INT16_MIN) ? MISSING : (int32_t)value;
 }
 """,
     "ago_32": """
 /* The value of so many ticks ago; at is where the next one will be written. */
 static int32_t ago_32(const int32_t *ring, uint32_t at, uint32_t length, uint32_t ticks)
 {
-    return ring[(at >= ticks) ? (at - ticks) : ((at + length) - ticks)];
+    const uint32_t turn = (at >= ticks) ? 0U : length;
+    return ring[(at + turn) - ticks];
 }
 """,
     "keep_16": """
@@ -123,7 +139,8 @@ static int32_t weight(int32_t at, int32_t low, int32_t peak, int32_t high)
 /* value / 2^bits, rounded down: a negative number is not shifted, which C leaves open. */
 static int64_t floor_shift(int64_t value, uint32_t bits)
 {
-    return (value >= 0) ? (value >> bits) : (-1 - ((-1 - value) >> bits));
+    const uint64_t size = (uint64_t)((value >= 0) ? value : (-1 - value)) >> bits;
+    return (value >= 0) ? (int64_t)size : (-1 - (int64_t)size);
 }
 """,
 }

@@ -96,14 +96,15 @@ def c_source(version: ModelVersion, program: Program) -> str:
     start, step = _start(prefix, program, writer), _step(prefix, program, writer)
     helpers = [text.strip("\n") + "\n" for name, text in HELPERS.items() if name in writer.used]
     wide = any(isinstance(one, Numbered) for one in program.columns)
-    missing = "#define MISSING INT32_MIN\n" + ("#define MISSING_64 INT64_MIN\n" if wide else "")
+    missing = "#define MISSING INT32_MIN\n" + (
+        f"#define MISSING_64 {literal(-(2**62))}\n" if wide else ""
+    )
     return "\n".join(
         [
             _preamble(version, program),
             f'#include "{prefix}.h"\n',
             missing,
             *helpers,
-            _tables(program),
             "\n".join(features),
             start,
             step,
@@ -169,26 +170,27 @@ def _start(prefix: str, program: Program, writer: ColumnWriter) -> str:
     return f"{_start_line(prefix, program)}\n{{\n{body}\n}}\n"
 
 
-def _tables(program: Program) -> str:
+def _tables(program: Program) -> list[str]:
     """Return the coefficients, each as an upper and a lower part."""
     (_, *parts), bits = program.angle.parts, program.angle.low_bits
-    places = range(0, len(parts), 6)
-    rows = [
-        (",\n" + INDENT).join(
-            ", ".join(str(part[which]) for part in parts[i : i + 6]) for i in places
-        )
-        for which in (0, 1)
-    ]
-    size = len(parts)
-    return (
-        f"/* Coefficients over 2^{program.angle.bits}: upper * 2^{bits} + lower. */\n"
-        f"static const int32_t upper[{size}] = {{\n{INDENT}{rows[0]}\n}};\n\n"
-        f"static const int32_t lower[{size}] = {{\n{INDENT}{rows[1]}\n}};\n"
-    )
+    lines = [f"/* Coefficients over 2^{program.angle.bits}: upper * 2^{bits} + lower. */"]
+    for which, name in enumerate(("upper", "lower")):
+        rows = [
+            ", ".join(str(part[which]) for part in parts[i : i + 6])
+            for i in range(0, len(parts), 6)
+        ]
+        lines += [
+            f"static const int32_t {name}[{len(parts)}] = {{",
+            *(f"{INDENT}{row}," for row in rows[:-1]),
+            f"{INDENT}{rows[-1]}",
+            "};",
+        ]
+    return lines
 
 
 def _step(prefix: str, program: Program, writer: ColumnWriter) -> str:
-    lines = [*writer.signals(), *writer.values(), *_slides(program, writer), *writer.columns()]
+    lines = [*_tables(program), *writer.signals(), *writer.values()]
+    lines += [*_slides(program, writer), *writer.columns()]
     lines += [*_keeps(program, writer), *_dot(program, writer)]
     if not any("state->" in line for line in lines):
         lines.insert(-1, "(void)state;")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 from fleet_slip.errors import UsageError
-from fleet_slip.export.c_checks import c_self_test
+from fleet_slip.export.c_checks import c_fuzz_target, c_self_test
 from fleet_slip.export.c_source import c_header, c_prefix, c_source
 from fleet_slip.export.checks import Check, make_checks
 from fleet_slip.export.checks_table import checks_csv
@@ -69,6 +69,7 @@ def _c(subject: Subject) -> dict[str, str]:
         f"{prefix}.h": c_header(version, program),
         f"{prefix}.c": c_source(version, program),
         f"{prefix}_test.c": c_self_test(version, program, subject.checks),
+        f"{prefix}_fuzz.c": c_fuzz_target(version, program),
     }
 
 

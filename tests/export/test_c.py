@@ -52,6 +52,37 @@ def test_nothing_overflows_or_reads_beyond_its_memory(tmp_path: Path) -> None:
         assert found == angles_by_kernel(manifest, program, car, samples)
 
 
+FUZZ = """
+#include <stddef.h>
+#include <stdint.h>
+#include <stdio.h>
+
+int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
+
+int main(void)
+{
+    static uint8_t data[100000];
+    return LLVMFuzzerTestOneInput(data, fread(data, 1U, sizeof data, stdin));
+}
+"""
+
+
+def test_no_bytes_make_the_fuzz_target_overflow(tmp_path: Path) -> None:
+    """With bytes from numpy; with clang, libFuzzer calls the same target."""
+    if not can_sanitize(tmp_path):
+        pytest.skip("the compiler's sanitizers are not here")
+    manifest = model_of(MODELS["every_kind"], Fraction(5), "any")
+    files = export_files(ModelVersion(1, manifest, "0" * 64), None, "c")
+    for name, text in {**files, "main.c": FUZZ}.items():
+        (tmp_path / name).write_text(text)
+    sources = ["sideslip_any.c", "sideslip_any_fuzz.c", "main.c"]
+    target = compile_c(tmp_path, sources, *SANITIZED)
+    for seed, size in enumerate((0, 5, 19, 100_000, 99_999)):
+        data = np.random.default_rng(seed).bytes(size)
+        done = subprocess.run([target], input=data, capture_output=True, check=False, timeout=60)
+        assert done.returncode == 0, done.stderr[:2000]
+
+
 def test_whole_drives_give_the_angles_of_score(smoke_root: Path, tmp_path: Path) -> None:
     fleet = fleet_slip.open(smoke_root)
     version = fleet.model("smoke")
@@ -77,10 +108,10 @@ def samples_of(program: Program, drive: DriveCounts) -> list[Sample]:
 def test_the_self_test_passes_and_notices_another_angle(smoke_root: Path, tmp_path: Path) -> None:
     fleet = fleet_slip.open(smoke_root)
     files = export_files(fleet.model("smoke"), fleet.warehouse, "c")
-    assert list(files) == ["sideslip_smoke.h", "sideslip_smoke.c", "sideslip_smoke_test.c"]
+    assert list(files) == [f"sideslip_smoke{end}" for end in (".h", ".c", "_test.c", "_fuzz.c")]
     for name, text in files.items():
         (tmp_path / name).write_text(text)
-    sources = [name for name in files if name.endswith(".c")]
+    sources = ["sideslip_smoke.c", "sideslip_smoke_test.c"]
     assert result_of(compile_c(tmp_path, sources)) == (0, "smoke@1: 0 of 900 angles are wrong\n")
     text = files["sideslip_smoke.c"]
     (tmp_path / "sideslip_smoke.c").write_text(
