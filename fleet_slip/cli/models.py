@@ -42,6 +42,8 @@ def models(
     if file is not None:
         _import_model(fleet, name, file, json)
         return
+    if name == "import" and name not in fleet.registry().names():
+        raise UsageError("which file? Run: fleet-slip models import FILE")
     rows = fleet.models(name).to_pylist()
     if json:
         print_json(rows)

@@ -159,6 +159,8 @@ def test_the_command_imports_and_show_says_from_where(
     assert "from smoke@1 of another data root" in capsys.readouterr().out
     with pytest.raises(UsageError, match="a file is for import"):
         ended(*root, "models", "smoke", str(exported))
+    with pytest.raises(UsageError, match=r"which file\?"):
+        ended(*root, "models", "import")
 
 
 def ended(*words: str) -> object:
