@@ -15,6 +15,8 @@ from fleet_slip.ingest.columns import describe_missing, shown
 from fleet_slip.ingest.source import BASE, OWN_TIME, Channel, as_column, reading_with
 
 MAGICS = (b"MDF     ", b"UnFinMF ")
+_LARGEST_BLOCK, _LARGEST_RATIO = 2**30, 20_000
+"""Bytes of one block of data, and how many times its size one may become."""
 _TIME_SYNC = 1
 _EARLIEST_S = 10**8
 """A start before 1973 is none: loggers without a clock write 0."""
@@ -53,6 +55,10 @@ class MdfSource:
         """Read channels of a group; what the file marks as invalid is null."""
         self._require_times(number, next(iter(indices)))
         group = self._mdf.groups[number]
+        for index in (self._mdf.masters_db[number], *indices.values()):
+            self._require_inside(number, index)
+        for block in group.get_data_blocks() if hasattr(group, "get_data_blocks") else ():
+            self._require_size(block)
         with reading_with(self._file, "asammdf"):
             signals = self._mdf.select([(None, number, index) for index in indices.values()])
         expected = group.channel_group.cycles_nr
@@ -79,6 +85,33 @@ class MdfSource:
             raise InputError(
                 f"{shown(self._file)}: channel {name!r} is of group {number}, which has no times "
                 "(it is over an angle, a distance or an index). Map another channel."
+            )
+
+    def _require_inside(self, number: int, index: int) -> None:
+        """Raise `InputError` for a channel outside of its record: asammdf would read beyond it."""
+        group, channel = self._mdf.groups[number], self._mdf.groups[number].channels[index]
+        cg = group.channel_group
+        start = getattr(channel, "start_offset", None)  # MDF 3 counts bits
+        if start is None:
+            start = 8 * channel.byte_offset + channel.bit_offset
+            within = channel.pos_invalidation_bit < 8 * cg.invalidation_bytes_nr
+            flagged = within or not cg.invalidation_bytes_nr
+        else:
+            start += 8 * getattr(channel, "additional_byte_offset", 0)
+            flagged = True
+        if not flagged or start + channel.bit_count > 8 * cg.samples_byte_nr:
+            raise InputError(
+                f"{shown(self._file)}: channel {channel.name!r} lies outside of the records of its "
+                "group: the file is damaged. Copy it again."
+            )
+
+    def _require_size(self, block: Any) -> None:
+        """Raise `InputError` for a block that states an absurd size: asammdf would believe it."""
+        largest = min(_LARGEST_BLOCK, _LARGEST_RATIO * max(block.compressed_size, 1))
+        if block.original_size > largest or block.compressed_size > self._file.stat().st_size:
+            raise InputError(
+                f"{shown(self._file)}: a block says that it has {block.original_size:,} bytes: the "
+                "file is damaged. Copy it again."
             )
 
     def _find(self, name: str) -> tuple[int, int]:

@@ -162,6 +162,25 @@ def test_a_truncated_mdf_file_is_refused(
     assert capfd.readouterr().err == ""
 
 
+@pytest.mark.parametrize(
+    ("block", "offset", "value", "message"),
+    [
+        (b"##CN", 92, 60_000, "lies outside of the records of its group: the file is damaged"),
+        (b"##DZ", 32, 2**60, "a block says that it has 1,152,921,504,606,846,976 bytes"),
+    ],
+)
+def test_a_damaged_mdf_file_does_not_lead_its_reader_astray(
+    tmp_path: Path, block: bytes, offset: int, value: int, message: str
+) -> None:
+    file = write_mdf(tmp_path, [a_x(), beta()], compression=2)
+    data = bytearray(file.read_bytes())
+    at = data.rindex(block) + offset
+    size = 4 if block == b"##CN" else 8
+    data[at : at + size] = value.to_bytes(size, "little")
+    file.write_bytes(data)
+    assert message in failure(file, mdf_mapping())
+
+
 def test_mdf_errors_name_the_channel_and_the_way_out(tmp_path: Path) -> None:
     text = Signal(np.array([b"on"] * 100), TIME_S, name="text", encoding="utf-8")
     file = write_mdf(tmp_path, [a_x(), beta(), text])
