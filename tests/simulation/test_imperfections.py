@@ -100,7 +100,7 @@ def test_imperfections_change_nothing_else_that_is_drawn(tmp_path: Path) -> None
     [
         ("load_position_m = -1.0\n", "needs a sprung_mass_kg"),
         ("[imperfections.car]\nlash = 1\n", "imperfections.car.lash: unknown key"),
-        ("[imperfections.sensors]\nwheel_pulses_per_turn = -4\n", "greater than or equal to 0"),
+        ("[imperfections.sensors]\nwheel_pulses_per_turn = -4\n", "must be at least 0"),
     ],
 )
 def test_scenarios_that_cannot_be_are_refused(tmp_path: Path, text: str, reason: str) -> None:
