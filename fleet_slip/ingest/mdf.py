@@ -53,12 +53,12 @@ class MdfSource:
 
     def _read(self, number: int, indices: dict[str, int]) -> pl.DataFrame:
         """Read channels of a group; what the file marks as invalid is null."""
-        self._require_times(number, next(iter(indices)))
+        name = next(iter(indices))
+        self._require_times(number, name)
         group = self._mdf.groups[number]
         for index in (self._mdf.masters_db[number], *indices.values()):
             self._require_inside(number, index)
-        for block in group.get_data_blocks() if hasattr(group, "get_data_blocks") else ():
-            self._require_size(block)
+        self._require_data(number, name)
         with reading_with(self._file, "asammdf"):
             signals = self._mdf.select([(None, number, index) for index in indices.values()])
         expected = group.channel_group.cycles_nr
@@ -105,13 +105,26 @@ class MdfSource:
                 "group: the file is damaged. Copy it again."
             )
 
-    def _require_size(self, block: Any) -> None:
-        """Raise `InputError` for a block that states an absurd size: asammdf would believe it."""
-        largest = min(_LARGEST_BLOCK, _LARGEST_RATIO * max(block.compressed_size, 1))
-        if block.original_size > largest or block.compressed_size > self._file.stat().st_size:
+    def _require_data(self, number: int, name: str) -> None:
+        """Raise `InputError` for a group that states absurd sizes: asammdf would believe them."""
+        group, there = self._mdf.groups[number], self._file.stat().st_size
+        whole = there
+        if hasattr(group, "get_data_blocks"):  # MDF 3 has no compressed blocks
+            blocks = list(group.get_data_blocks())
+            whole = sum(block.original_size for block in blocks)
+            for block in blocks:
+                largest = min(_LARGEST_BLOCK, _LARGEST_RATIO * max(block.compressed_size, 1))
+                if block.original_size > largest or block.compressed_size > there:
+                    raise InputError(
+                        f"{shown(self._file)}: a block says that it has {block.original_size:,} "
+                        "bytes: the file is damaged. Copy it again."
+                    )
+        samples, size = group.channel_group.cycles_nr, group.channel_group.samples_byte_nr
+        if samples * size > whole:
             raise InputError(
-                f"{shown(self._file)}: a block says that it has {block.original_size:,} bytes: the "
-                "file is damaged. Copy it again."
+                f"{shown(self._file)}: the group of {name!r} says that it has {samples:,} samples "
+                f"of {size:,} bytes, and there are {whole:,}: it is truncated or damaged. Copy it "
+                "again."
             )
 
     def _find(self, name: str) -> tuple[int, int]:

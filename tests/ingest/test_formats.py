@@ -166,6 +166,7 @@ def test_a_truncated_mdf_file_is_refused(
     ("block", "offset", "value", "message"),
     [
         (b"##CN", 92, 60_000, "lies outside of the records of its group: the file is damaged"),
+        (b"##CG", 80, 10**9, "says that it has 1,000,000,000 samples of 18 bytes"),
         (b"##DZ", 32, 2**60, "a block says that it has 1,152,921,504,606,846,976 bytes"),
     ],
 )
