@@ -104,7 +104,8 @@ class Filling(Rooted):
             figures.rows = 0
             warehouse = within_reach(self.warehouse, executor)
             wanted = paths if known is None else known.without_landed(paths, warehouse)
-            told(len(paths) - len(wanted), len(paths))
+            if landed := len(paths) - len(wanted):
+                told(landed, len(paths))
             try:
                 for report in ingest_files(warehouse, wanted, plan, elsewhere, known):
                     reports[report.file] = report

@@ -239,8 +239,8 @@ def _lateral(data: ReportData, runs: Mapping[str, EvaluatedScenario]) -> Iterato
     caption = (
         f"Five dry test drives of the training car, from a gentle driver to a racing one. "
         f"{percent(TRAINED_SHARE, 1)} of the training rows lie below {trained_to:.1f} m/s² "
-        "(shaded). Beyond, tyres are no longer linear, and a linear model that has not seen it cannot "
-        "follow; the Kalman filter, which integrates accelerations, does."
+        "(shaded). Beyond, tyres are no longer linear, and a linear model that has not seen it "
+        "cannot follow; the Kalman filter, which integrates accelerations, does."
     )
     yield Picture(
         "lateral-acceleration",
