@@ -2,6 +2,8 @@
 
 import contextlib
 import resource
+import threading
+import time
 import uuid
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -65,16 +67,32 @@ def limit_memory() -> None:
 def interruptible(database: duckdb.DuckDBPyConnection, work: Callable[[], Result]) -> Result:
     """Do work with a connection so that Ctrl-C ends it, in the middle of an operator, too.
 
-    DuckDB asks whether to stop between tasks only, and a recursive query is one task.
+    DuckDB asks whether to stop between tasks only, and a recursive query is one task. It forgets an
+    interruption that comes before the query begins, so that it is told again until the work ends.
     """
-    with ThreadPoolExecutor(1) as pool:
-        answer = pool.submit(work)
+    under_way, stopped = threading.Event(), threading.Event()
+
+    def unless_stopped() -> Result:
+        under_way.set()
         try:
+            if stopped.is_set():
+                raise KeyboardInterrupt
+            return work()
+        finally:
+            under_way.clear()
+
+    with ThreadPoolExecutor(1) as pool:
+        try:
+            answer = pool.submit(unless_stopped)
             # Where a library has set a handler that restarts system calls, a signal ends no wait.
             while not wait([answer], LOOK_S).done:
                 pass
         except KeyboardInterrupt:
-            database.interrupt()
+            stopped.set()
+            while under_way.is_set():
+                with contextlib.suppress(KeyboardInterrupt):
+                    database.interrupt()
+                    time.sleep(LOOK_S)
             raise
         return answer.result()
 

@@ -6,6 +6,7 @@ import os
 import resource
 import signal
 import threading
+import time
 from pathlib import Path
 
 import duckdb
@@ -212,13 +213,13 @@ def test_any_text_is_a_reading_query_or_refused(words: list[str] | str) -> None:
             assert statement.type in {duckdb.StatementType.SELECT, duckdb.StatementType.EXPLAIN}
 
 
-@pytest.mark.parametrize(
-    "endless",
-    [
-        "WITH RECURSIVE r AS (SELECT 1 AS n UNION ALL SELECT n FROM r) SELECT count(*) FROM r",
-        "SELECT count(*) FROM range(10000000) a, range(1000000) b WHERE a.range * b.range % 7 = 1",
-    ],
+ENDLESS = (
+    "WITH RECURSIVE r AS (SELECT 1 AS n UNION ALL SELECT n FROM r) SELECT count(*) FROM r",
+    "SELECT count(*) FROM range(10000000) a, range(1000000) b WHERE a.range * b.range % 7 = 1",
 )
+
+
+@pytest.mark.parametrize("endless", ENDLESS)
 def test_an_endless_query_can_be_interrupted(root: Path, endless: str) -> None:
     with connect(root) as database:
         timer = threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT))
@@ -226,6 +227,29 @@ def test_an_endless_query_can_be_interrupted(root: Path, endless: str) -> None:
         with pytest.raises(KeyboardInterrupt), database_errors("the query"):
             interruptible(database, database.sql(endless).fetchall)
         timer.join()
+
+
+@pytest.mark.timeout(60)
+def test_an_interruption_before_the_query_begins_is_not_lost(root: Path) -> None:
+    with connect(root) as database:
+        relation = database.sql(ENDLESS[-1])
+        begun = threading.Event()
+
+        def work() -> object:
+            begun.set()
+            time.sleep(0.5)  # DuckDB forgets what interrupts it now
+            return relation.fetchall()
+
+        def interrupt() -> None:
+            begun.wait()
+            time.sleep(0.1)
+            os.kill(os.getpid(), signal.SIGINT)
+
+        other = threading.Thread(target=interrupt)
+        other.start()
+        with pytest.raises(KeyboardInterrupt), database_errors("the query"):
+            interruptible(database, work)
+        other.join()
 
 
 def test_one_value_cannot_take_all_memory(root: Path, run_command: RunCommand) -> None:
