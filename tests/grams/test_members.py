@@ -1,0 +1,55 @@
+"""Which drives and cars have some signals, and a part of a cohort whose drives have not all."""
+
+import numpy as np
+import pyarrow as pa
+
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.members import Members, hash_numbers
+from fleet_slip.warehouse.tables import Warehouse
+from tests.support.logs import land, log_rows, random_counts
+
+DRIVES = {"ax,ay": ["a", "b"], "ax,ay,yaw_rate": ["b", "c"]}
+"""Drive b has rows of both kinds."""
+
+
+def hashes(names: list[str]) -> list[int]:
+    return sorted(hash_numbers(pa.array(names)).tolist())
+
+
+def members() -> Members:
+    drives = {signals: hash_numbers(pa.array(names)) for signals, names in DRIVES.items()}
+    cars = {signals: hash_numbers(pa.array(["car-1"])) for signals in DRIVES}
+    return Members(drives, cars)
+
+
+def test_drives_with_signals_are_those_of_rows_that_have_them_all() -> None:
+    assert members().drives_with(["ay", "ax"]).tolist() == hashes(["a", "b", "c"])
+    assert members().drives_with(["ay", "yaw_rate"]).tolist() == hashes(["b", "c"])
+    assert members().drives_with(["yaw"]).tolist() == []
+
+
+def test_a_car_counts_once() -> None:
+    assert members().count_vehicles_with(["ax"]) == 1
+    assert members().count_vehicles_with(["steering_wheel"]) == 0
+
+
+def test_a_part_of_a_cohort_has_the_tables_of_its_drives_alone(warehouse: Warehouse) -> None:
+    rng = np.random.default_rng(1)
+    whole = [log_rows(f"whole-{i}", random_counts(rng, 40)) for i in range(2)]
+    fewer = []
+    for i in range(3):
+        counts = random_counts(rng, 40)
+        del counts["ax"]
+        fewer.append(log_rows(f"fewer-{i}", counts))
+    land(warehouse, "one", *whole, *fewer)
+    update_grams(warehouse)
+    cohort = load_cohort(warehouse)
+    assert sorted(map(len, cohort.tables)) == [2, 3]
+    ids = np.array(cohort.drives["drive_id"].to_pylist())
+    part = cohort.part(ids == "fewer-1")
+    assert part.drives["drive_id"].to_pylist() == ["fewer-1"]
+    (table,) = part.tables
+    assert len(table) == 1
+    assert "ax" not in table.signals
+    assert cohort.part(np.char.startswith(ids, "whole")).tables[0].n.tolist() == [40, 40]
