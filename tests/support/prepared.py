@@ -12,6 +12,7 @@ import importlib
 import json
 import os
 import pkgutil
+import shutil
 import signal
 import socket
 import subprocess
@@ -85,7 +86,9 @@ def without_test(environment: Mapping[str, str]) -> dict[str, str]:
 @cache
 def server() -> Server:
     """Return this process's server, which ends when this process does."""
-    address = str(Path(tempfile.mkdtemp(prefix="fleet-slip-tests-")) / "server")
+    folder = tempfile.mkdtemp(prefix="fleet-slip-tests-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    address = str(Path(folder) / "server")
     process = subprocess.Popen(
         [sys.executable, "-m", __name__, address],
         cwd=Path(__file__).parents[2],
