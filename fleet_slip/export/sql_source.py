@@ -10,15 +10,7 @@ from collections.abc import Iterable
 from fleet_slip.catalogue.columns import LARGEST_FACT, WEIGHT
 from fleet_slip.catalogue.signals import COUNT_MAX
 from fleet_slip.export.c_columns import sum_key, summed
-from fleet_slip.export.program import (
-    CarFact,
-    Factor,
-    Gated,
-    Numbered,
-    Program,
-    Source,
-    Window,
-)
+from fleet_slip.export.program import CarFact, Factor, Gated, Numbered, Program, Source, Window
 from fleet_slip.models.model_version import ModelVersion
 
 ROWS = "log"
