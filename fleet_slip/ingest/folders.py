@@ -2,7 +2,8 @@
 
 What is remembered is a cache, of this machine and beside no data: a file's path, size and time of
 change tell its digest, so that thousands of files need not be read to find nothing new. Whether
-that digest is in the warehouse is asked of the warehouse. Losing the cache costs time alone.
+that digest is in the warehouse is asked of the warehouse. Losing the cache costs time, and the
+notice that a file has changed since it landed, so that its drives would count twice.
 """
 
 import json
