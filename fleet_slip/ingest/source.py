@@ -74,7 +74,7 @@ def reading_with(file: Path, package: str) -> Iterator[Any]:
         ) from None
     try:
         yield module
-    except FleetSlipError:
+    except (FleetSlipError, MemoryError):
         raise
     except Exception as error:
         reason = shown(str(error).strip().split("\n")[0][:200]) or type(error).__name__

@@ -16,6 +16,7 @@ from asammdf import MDF, Signal
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest import Mapping, MeasuredLog, read_measured
+from fleet_slip.ingest.source import reading_with
 from tests.support.measured import a_mapping, ticks
 
 START = datetime(2024, 5, 31, 12, tzinfo=UTC)
@@ -322,3 +323,10 @@ def test_a_package_that_is_absent_is_named_with_its_extra(
     monkeypatch.setitem(__import__("sys").modules, "asammdf", None)
     message = failure(file, mdf_mapping())
     assert "asammdf, which is not installed. Run: pip install 'fleet-slip[logs]'" in message
+
+
+def test_a_lack_of_memory_is_not_blamed_on_the_file(tmp_path: Path) -> None:
+    with pytest.raises(MemoryError), reading_with(tmp_path / "log.mf4", "json"):
+        raise MemoryError
+    with pytest.raises(InputError, match="json cannot read it"), reading_with(tmp_path, "json"):
+        raise IndexError
