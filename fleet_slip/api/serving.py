@@ -252,15 +252,16 @@ class Serving(Rooted):
         checks: inputs, among them the first ticks of a drive of the logs, and the angles.
 
         Raises `RefusedError` if no bound of the angle's error can be stated or counts mean
-        something else now, `UsageError` for an unknown target, and what `model` raises.
+        something else now, `UsageError` for an unknown target, `ConfigError` if what it needs is
+        not installed, and what `model` raises.
         """
         from fleet_slip.export.files import export_files
         from fleet_slip.files.local_folder import LocalFolder
 
         folder = LocalFolder(output)
         files = export_files(self.resolve(model), self.warehouse, to)
-        for name, text in files.items():
-            folder.put(name, text.encode("utf-8"))
+        for name, content in files.items():
+            folder.put(name, content)
         return [output / name for name in files]
 
     def registry(self, sign_key: Path | None = None) -> Registry:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
-from fleet_slip.errors import UsageError
+from fleet_slip.errors import ConfigError, UsageError
 from fleet_slip.export.c_checks import c_fuzz_target, c_self_test
 from fleet_slip.export.c_source import c_header, c_prefix, c_source
 from fleet_slip.export.checks import Check, make_checks
@@ -20,7 +20,7 @@ from fleet_slip.models.trained_drives import read_drives_file
 from fleet_slip.models.versions import Registry
 from fleet_slip.warehouse.tables import Warehouse
 
-Target = Literal["json", "c", "sql", "dbc"]
+Target = Literal["json", "c", "sql", "dbc", "onnx"]
 """What a version can be exported to."""
 
 
@@ -39,12 +39,12 @@ class Subject:
         return f"{self.version.manifest.name}-{self.version.version}"
 
 
-def export_files(version: ModelVersion, warehouse: Warehouse | None, to: str) -> dict[str, str]:
-    """Return the texts of an export by the names of their files.
+def export_files(version: ModelVersion, warehouse: Warehouse | None, to: str) -> dict[str, bytes]:
+    """Return the contents of an export by the names of their files.
 
     The checks in it have the first ticks of a drive of the warehouse, if there is one. Raises
     `UsageError` for an unknown target, what `compile_program` raises, and `StorageError` if the
-    hashes of its drives are gone.
+    hashes of its drives are gone. `ConfigError` says that a library is not installed.
     """
     if to not in _WRITERS:
         raise UsageError(f"{to!r}: export to one of {', '.join(get_args(Target))}.")
@@ -54,7 +54,11 @@ def export_files(version: ModelVersion, warehouse: Warehouse | None, to: str) ->
     if warehouse is not None:
         folder = Registry(warehouse.root / "models").folder_of(version.manifest.name)
         drives = read_drives_file(folder, version.manifest)
-    return _WRITERS[to](Subject(version, program, checks, drives))
+    contents = _WRITERS[to](Subject(version, program, checks, drives))
+    return {
+        name: content.encode("utf-8") if isinstance(content, str) else content
+        for name, content in contents.items()
+    }
 
 
 def _json(subject: Subject) -> dict[str, str]:
@@ -91,6 +95,22 @@ def _dbc(subject: Subject) -> dict[str, str]:
     }
 
 
+def _onnx(subject: Subject) -> dict[str, str | bytes]:
+    try:
+        from fleet_slip.export.onnx_graph import onnx_model  # noqa: PLC0415 - it is optional
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"ONNX needs the package {error.name}. Run: pip install 'fleet-slip[onnx]'"
+        ) from None
+    version, program = subject.version, subject.program
+    prefix = c_prefix(version)
+    return {
+        f"{prefix}_float32.onnx": onnx_model(version, program, "float32"),
+        f"{prefix}_float64.onnx": onnx_model(version, program, "float64"),
+        f"{prefix}_checks.csv": checks_csv(program, subject.checks),
+    }
+
+
 def render(content: Mapping[str, Any]) -> str:
     """Return a JSON document with a line for each of its parts, and for each tick."""
     return _rendered(content, 0) + "\n"
@@ -112,9 +132,10 @@ def _rendered(value: Any, depth: int) -> str:
     )
 
 
-_WRITERS: dict[str, Callable[[Subject], dict[str, str]]] = {
+_WRITERS: dict[str, Callable[[Subject], Mapping[str, str | bytes]]] = {
     "json": _json,
     "c": _c,
     "sql": _sql,
     "dbc": _dbc,
+    "onnx": _onnx,
 }

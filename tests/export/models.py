@@ -11,9 +11,18 @@ from fleet_slip.catalogue.columns import Definition, Fact, Gate, Number
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.export.checks import Sample
+from fleet_slip.export.files import export_files
 from fleet_slip.export.program import Car, Program
 from fleet_slip.models.manifest import Manifest, ModelTerm
+from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.warehouse.tables import Warehouse
 from tests.support.manifests import manifest
+
+
+def export_texts(version: ModelVersion, warehouse: Warehouse | None, to: str) -> dict[str, str]:
+    """The files of an export that consists of texts."""
+    return {name: text.decode() for name, text in export_files(version, warehouse, to).items()}
+
 
 COURSE = features().features["course_difference"]
 SPEED = Definition(of="wheel_fl", over="mean", ticks=4, bits=16)

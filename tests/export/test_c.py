@@ -11,14 +11,13 @@ import fleet_slip
 from fleet_slip.export.c_columns import LARGEST_UNSIGNED
 from fleet_slip.export.checks import Sample, angles_by_kernel, angles_of_columns
 from fleet_slip.export.compile import compile_program
-from fleet_slip.export.files import export_files
 from fleet_slip.export.program import Car, Program
 from fleet_slip.grams.columns import DriveCounts
 from fleet_slip.grams.drive_rows import read_drives
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.predictor import Predictor
 from tests.export.compiled import SANITIZED, build_driver, can_sanitize, compile_c, drive, needs_cc
-from tests.export.models import CARS, MODELS, SMALL, hostile_drive, model_of
+from tests.export.models import CARS, MODELS, SMALL, export_texts, hostile_drive, model_of
 
 pytestmark = needs_cc
 
@@ -72,7 +71,7 @@ def test_no_bytes_make_the_fuzz_target_overflow(tmp_path: Path) -> None:
     if not can_sanitize(tmp_path):
         pytest.skip("the compiler's sanitizers are not here")
     manifest = model_of(MODELS["every_kind"], Fraction(5), "any")
-    files = export_files(ModelVersion(1, manifest, "0" * 64), None, "c")
+    files = export_texts(ModelVersion(1, manifest, "0" * 64), None, "c")
     for name, text in {**files, "main.c": FUZZ}.items():
         (tmp_path / name).write_text(text)
     sources = ["sideslip_any.c", "sideslip_any_fuzz.c", "main.c"]
@@ -107,7 +106,7 @@ def samples_of(program: Program, drive: DriveCounts) -> list[Sample]:
 
 def test_the_self_test_passes_and_notices_another_angle(smoke_root: Path, tmp_path: Path) -> None:
     fleet = fleet_slip.open(smoke_root)
-    files = export_files(fleet.model("smoke"), fleet.warehouse, "c")
+    files = export_texts(fleet.model("smoke"), fleet.warehouse, "c")
     assert list(files) == [f"sideslip_smoke{end}" for end in (".h", ".c", "_test.c", "_fuzz.c")]
     for name, text in files.items():
         (tmp_path / name).write_text(text)
@@ -129,7 +128,7 @@ def result_of(program: Path) -> tuple[int, str]:
 
 def test_the_source_has_no_floating_point_and_no_calls_of_a_library() -> None:
     manifest = model_of(MODELS["every_kind"], Fraction(5), "every_kind")
-    files = export_files(ModelVersion(1, manifest, "0" * 64), None, "c")
+    files = export_texts(ModelVersion(1, manifest, "0" * 64), None, "c")
     text = files["sideslip_every_kind.h"] + files["sideslip_every_kind.c"]
     for word in ("float", "double", "malloc", "stdlib", "math.h", "1e-"):
         assert word not in text
@@ -137,7 +136,7 @@ def test_the_source_has_no_floating_point_and_no_calls_of_a_library() -> None:
 
 
 def test_quotients_take_64_bits_only_where_they_need_them() -> None:
-    text = export_files(ModelVersion(1, model_of({"mean_3": SMALL}), "0" * 64), None, "c")[
+    text = export_texts(ModelVersion(1, model_of({"mean_3": SMALL}), "0" * 64), None, "c")[
         "sideslip_sideslip.c"
     ]
     assert "nearest_32" in text

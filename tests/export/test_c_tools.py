@@ -7,10 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from fleet_slip.export.files import export_files
 from fleet_slip.models.model_version import ModelVersion
 from tests.export.compiled import STRICT
-from tests.export.models import MODELS, model_of
+from tests.export.models import MODELS, export_texts, model_of
 
 DEVIATIONS = {"misra-c2012-15.5", "misra-c2012-2.5"}
 """Both are advisory: a feature returns where a value is missing, and the header names the version.
@@ -20,7 +19,7 @@ docs/export.md says so."""
 @pytest.fixture(params=MODELS)
 def folder(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     manifest = model_of(MODELS[request.param], Fraction(-1, 700), "any")
-    for name, text in export_files(ModelVersion(1, manifest, "0" * 64), None, "c").items():
+    for name, text in export_texts(ModelVersion(1, manifest, "0" * 64), None, "c").items():
         (tmp_path / name).write_text(text)
     return tmp_path
 

@@ -10,10 +10,9 @@ from cantools.database.can.database import Database
 from fleet_slip.export.checks import Sample, angles_by_kernel
 from fleet_slip.export.compile import compile_program
 from fleet_slip.export.dbc import MISSING
-from fleet_slip.export.files import export_files
 from fleet_slip.export.program import Car, Program
 from fleet_slip.models.model_version import ModelVersion
-from tests.export.models import DEFINITIONS, hostile_drive, model_of
+from tests.export.models import DEFINITIONS, export_texts, hostile_drive, model_of
 
 VERSION = ModelVersion(7, model_of(dict.fromkeys(DEFINITIONS, Fraction(1, 10**6))), "12ab34" * 10)
 PROGRAM = compile_program(VERSION.manifest)
@@ -21,7 +20,7 @@ PROGRAM = compile_program(VERSION.manifest)
 
 @pytest.fixture(scope="module")
 def bus() -> Database:
-    text = export_files(VERSION, None, "dbc")["sideslip_sideslip.dbc"]
+    text = export_texts(VERSION, None, "dbc")["sideslip_sideslip.dbc"]
     found = cantools.database.load_string(text, "dbc")
     assert isinstance(found, Database)
     return found

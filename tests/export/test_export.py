@@ -14,17 +14,17 @@ from fleet_slip.cli.main import app
 from fleet_slip.errors import QuestionError, UsageError
 from fleet_slip.export.checks import angles_of_columns
 from fleet_slip.export.compile import compile_program
-from fleet_slip.export.files import export_files
 from fleet_slip.files.documents import checksum
 from fleet_slip.grams.drive_rows import read_drives
 from fleet_slip.models.predictor import Predictor
 from tests.export import plain
+from tests.export.models import export_texts
 
 
 @pytest.fixture(scope="module")
 def document(smoke_root: Path) -> Any:
     fleet = fleet_slip.open(smoke_root)
-    ((name, text),) = export_files(fleet.model("smoke"), fleet.warehouse, "json").items()
+    ((name, text),) = export_texts(fleet.model("smoke"), fleet.warehouse, "json").items()
     assert name == "smoke-1.json"
     return json.loads(text)
 
@@ -84,7 +84,7 @@ def test_the_document_proves_what_it_is_of(smoke_root: Path, document: Any) -> N
 
 def test_an_export_is_the_same_again(smoke_root: Path) -> None:
     fleet = fleet_slip.open(smoke_root)
-    one, other = (export_files(fleet.model("smoke"), fleet.warehouse, "json") for _ in range(2))
+    one, other = (export_texts(fleet.model("smoke"), fleet.warehouse, "json") for _ in range(2))
     assert one == other
 
 

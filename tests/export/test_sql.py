@@ -15,10 +15,9 @@ import pytest
 import fleet_slip
 from fleet_slip.export.checks import Sample, angles_by_kernel
 from fleet_slip.export.compile import compile_program
-from fleet_slip.export.files import export_files
 from fleet_slip.export.program import Car, Program
 from fleet_slip.models.model_version import ModelVersion
-from tests.export.models import CARS, DEFINITIONS, MODELS, hostile_drive, model_of
+from tests.export.models import CARS, DEFINITIONS, MODELS, export_texts, hostile_drive, model_of
 
 TEXTS = {"mass_kg": pl.Float64, "vehicle_model": pl.String}
 
@@ -84,7 +83,7 @@ def test_hostile_drives_give_the_angles_of_the_kernel(name: str) -> None:
     }
     there = set(log.select("drive_id", "tick").rows())
     expected = {key: angle for key, angle in angles.items() if key in there}
-    files = export_files(ModelVersion(1, manifest, "0" * 64), None, "sql")
+    files = export_texts(ModelVersion(1, manifest, "0" * 64), None, "sql")
     statement = files[f"sideslip_{name}.sql"]
     assert by_duckdb(statement, log) == expected
     assert by_sqlite(statement, log) == expected
@@ -94,7 +93,7 @@ def test_hostile_drives_give_the_angles_of_the_kernel(name: str) -> None:
 def test_the_macro_gives_the_angles_of_score(smoke_root: Path) -> None:
     fleet = fleet_slip.open(smoke_root)
     version = fleet.model("smoke")
-    macro = export_files(version, fleet.warehouse, "sql")["sideslip_smoke_macro.sql"]
+    macro = export_texts(version, fleet.warehouse, "sql")["sideslip_smoke_macro.sql"]
     log = fleet.sql("SELECT * FROM log WHERE drive_id = 'smoke-2024-05-01-0003'").pl().sort("tick")
     with duckdb.connect() as database:
         database.register("my_log", log.to_arrow())
@@ -109,7 +108,7 @@ def test_the_macro_gives_the_angles_of_score(smoke_root: Path) -> None:
 
 def test_the_statement_says_what_it_is_of() -> None:
     manifest = model_of(dict.fromkeys(DEFINITIONS, Fraction(1, 10**6)))
-    files = export_files(ModelVersion(3, manifest, "ab" * 32), None, "sql")
+    files = export_texts(ModelVersion(3, manifest, "ab" * 32), None, "sql")
     for text in (files["sideslip_sideslip.sql"], files["sideslip_sideslip_macro.sql"]):
         assert text.startswith("-- sideslip@3: sideslip_rad")
         assert "ab" * 32 in text
@@ -118,7 +117,7 @@ def test_the_statement_says_what_it_is_of() -> None:
 def test_the_table_of_checks_holds(tmp_path: Path) -> None:
     """Every kind of column: `car` of the check `extremes` knows all facts and numbers."""
     manifest = model_of(MODELS["every_kind"], name="every_kind")
-    files = export_files(ModelVersion(1, manifest, "0" * 64), None, "sql")
+    files = export_texts(ModelVersion(1, manifest, "0" * 64), None, "sql")
     checks = tmp_path / "checks.csv"
     checks.write_text(files["sideslip_every_kind_checks.csv"])
     with duckdb.connect() as database:

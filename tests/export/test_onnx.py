@@ -1,0 +1,124 @@
+"""Exported ONNX graphs, run by onnxruntime: the exact model within the stated error."""
+
+from collections.abc import Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+
+import fleet_slip
+from fleet_slip.errors import ConfigError
+from fleet_slip.export.checks import Sample, drive_counts
+from fleet_slip.export.compile import compile_program
+from fleet_slip.export.files import export_files
+from fleet_slip.export.onnx_graph import UNKNOWN, FloatName, error_bound
+from fleet_slip.export.program import Car, Program
+from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.models.predictor import Predictor
+from tests.export.models import CARS, MODELS, hostile_drive, model_of
+
+
+def open_session(version: ModelVersion, kind: str) -> onnxruntime.InferenceSession:
+    content = export_files(version, None, "onnx")[f"sideslip_{version.manifest.name}_{kind}.onnx"]
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+
+
+def run_drives(
+    session: onnxruntime.InferenceSession, program: Program, cars: Sequence[Car], drives: Any
+) -> Any:
+    """Drive cars side by side, shape (cars, ticks, signals) with NaN; return (cars, ticks)."""
+    told = {
+        "facts": [car.fact_counts(program) for car in cars],
+        "numbers": [car.number_counts(program) for car in cars],
+    }
+    given: dict[str, Any] = {}
+    for one in session.get_inputs():
+        if one.name in told:
+            values = [[UNKNOWN if n is None else n for n in row] for row in told[one.name]]
+            given[one.name] = np.array(values, np.int64)
+        elif one.name != "signals":
+            empty = UNKNOWN if one.name.startswith("ring") else 0
+            given[one.name] = np.full((len(cars), one.shape[1]), empty, np.int64)
+    names = [one.name for one in session.get_outputs()]
+    angles = []
+    for tick in range(drives.shape[1]):
+        computed = session.run(None, {**given, "signals": drives[:, tick]})
+        found = dict(zip(names, computed, strict=True))
+        angles.append(found.pop("angle")[:, 0])
+        given |= {name.removesuffix("_next"): value for name, value in found.items()}
+    return np.array(angles).T
+
+
+def in_si(program: Program, samples: Sequence[Sample], dtype: str) -> Any:
+    counts = np.array([[np.nan if n is None else n for n in row] for row in samples], float)
+    return (counts * [float(one.scale) for one in program.signals]).astype(dtype)
+
+
+@pytest.mark.parametrize("kind", ["float32", "float64"])
+@pytest.mark.parametrize("name", MODELS)
+def test_hostile_drives_are_within_the_stated_error(name: str, kind: FloatName) -> None:
+    manifest = model_of(MODELS[name], Fraction(-1, 700), name)
+    program, predictor = compile_program(manifest), Predictor.of(manifest)
+    version = ModelVersion(1, manifest, "0" * 64)
+    samples = [hostile_drive(program, 250, seed) for seed in range(len(CARS))]
+    expected = np.array(
+        [
+            predictor(drive_counts(program, predictor, car, drive))
+            for car, drive in zip(CARS, samples, strict=True)
+        ]
+    )
+    drives = np.array([in_si(program, drive, kind) for drive in samples])
+    found = run_drives(open_session(version, kind), program, CARS, drives)
+    assert found.dtype == kind
+    assert np.array_equal(np.isnan(found), np.isnan(expected))
+    assert 10 < np.isfinite(found).sum() < found.size
+    bound = error_bound(version, program, kind)
+    assert np.nanmax(np.abs(found - expected)) <= bound + 1e-12  # of `predict`, in float64
+    assert bound < (1e-3 if kind == "float32" else 1e-11) * np.nanmax(np.abs(expected))
+
+
+def test_a_whole_drive_is_that_of_predict(smoke_root: Path) -> None:
+    fleet = fleet_slip.open(smoke_root)
+    version = fleet.model("smoke")
+    program = compile_program(version.manifest)
+    drive = fleet.sql(
+        "SELECT * FROM log WHERE drive_id = 'smoke-2024-05-01-0003' AND tick < 600 ORDER BY tick"
+    ).pl()
+    predicted = version.predict(drive).to_numpy()
+    signals = drive.select([one.column for one in program.signals]).to_numpy()[None]
+    in_64 = run_drives(open_session(version, "float64"), program, CARS[:1], signals)[0]
+    assert np.abs(in_64 - predicted).max() < 1e-14
+    in_32 = run_drives(
+        open_session(version, "float32"), program, CARS[:1], signals.astype(np.float32)
+    )[0]
+    assert 0 < np.abs(in_32 - predicted).max() < 1e-6
+
+
+def test_the_files_say_what_they_are_of(smoke_root: Path) -> None:
+    fleet = fleet_slip.open(smoke_root)
+    version = fleet.model("smoke")
+    files = export_files(version, fleet.warehouse, "onnx")
+    assert [*files] == [
+        f"sideslip_smoke_{end}" for end in ("float32.onnx", "float64.onnx", "checks.csv")
+    ]
+    model = onnx.load_from_string(files["sideslip_smoke_float32.onnx"])
+    said = {one.key: one.value for one in model.metadata_props}
+    assert (said["model"], said["sha256"]) == ("smoke@1", version.sha256)
+    assert said["drives_sha256"] == version.manifest.trained_on.drives_sha256
+    program = compile_program(version.manifest)
+    assert said["error"] == f"{error_bound(version, program, 'float32'):.3g} rad"
+    assert files == export_files(version, fleet.warehouse, "onnx")
+
+
+def test_without_the_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "onnx", None)
+    monkeypatch.delitem(__import__("sys").modules, "fleet_slip.export.onnx_graph")
+    version = ModelVersion(1, model_of(MODELS["signals"]), "0" * 64)
+    with pytest.raises(ConfigError, match=r"onnx. Run: pip install 'fleet-slip\[onnx\]'"):
+        export_files(version, None, "onnx")
