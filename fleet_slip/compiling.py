@@ -1,25 +1,37 @@
 """How the functions of this package are compiled: to the same bits on every machine."""
 
-import contextlib
 import functools
-import hashlib
-import logging
-import pickle
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, TypeVar, cast
 
-import numba
-from numba.core.caching import FunctionCache, IndexDataCacheFile, NullCache
-from numba.core.serialize import dumps
+from fleet_slip.extras import missing
 
-LOGGER = logging.getLogger("fleet_slip")
-
-DIGEST_BYTES = hashlib.sha256().digest_size
+try:
+    import numba
+except ModuleNotFoundError:  # of an extra: what is compiled says so when it is called
+    numba = None  # type: ignore[assignment]
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-equation = numba.njit(error_model="numpy", forceinline=True)
+
+def _compiler(**options: Any) -> Callable[[Function], Function]:
+    def compile_later(function: Function) -> Function:
+        return cast(Function, numba.njit(**options)(function) if numba else _refusing(function))
+
+    return compile_later
+
+
+def _refusing(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return what stands for a function that cannot be compiled here."""
+
+    @functools.wraps(function)
+    def refuse(*_: Any, **__: Any) -> Any:
+        raise missing("compiled", "this runs as compiled code, which", "numba")
+
+    return refuse
+
+
+equation = _compiler(error_model="numpy", forceinline=True)
 """Compiles a pure function that is inlined where it is called, so that loops over lanes vectorise.
 
 Without `fastmath` the compiler neither reorders nor fuses operations, and of floating point only
@@ -28,10 +40,10 @@ IEEE 754 rounds in one way. Division by zero gives an infinity, not an exception
 branch in the loop.
 """
 
-inner_loop = numba.njit(nogil=True, error_model="numpy")
+inner_loop = _compiler(nogil=True, error_model="numpy")
 """Compiles a loop that compiled code calls, to the same bits as an equation."""
 
-exact_loop = numba.njit(nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
+exact_loop = _compiler(nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
 """Compiles a loop over integers whose every product and sum is below 2^53 in size.
 
 They are exact in any order, so that the compiler may change the order, and fuse operations.
@@ -45,110 +57,9 @@ def kernel(function: Function) -> Function:
     cache folder. Where none of these can be written, every process compiles anew, and a remark says
     so. It is never kept in a data root: to load it is to execute it, and others may write there.
     """
-    compiled: Any = numba.njit(nogil=True, error_model="numpy")(function)
-    try:
-        compiled._cache = _KeptCode(function)
-    except RuntimeError:  # numba found no folder
-        compiled._cache = _NoFolder()
-    return cast(Function, compiled)
+    compiled = inner_loop(function)
+    if numba:
+        from fleet_slip.kept_code import keep  # noqa: PLC0415 - it needs numba
 
-
-class _KeptCode(FunctionCache):
-    """Compiled code on disk. A full disk or a damaged file costs the time to compile, no more."""
-
-    def __init__(self, function: Callable[..., Any]) -> None:
-        """Take the function. Raises `RuntimeError` if there is no folder."""
-        super().__init__(function)  # type: ignore[no-untyped-call]
-        self._cache_file = _CheckedFiles(  # type: ignore[no-untyped-call]
-            self.cache_path,
-            f"{self._impl.filename_base}.checked",
-            (self._impl.locator.get_source_stamp(), _sources_stamp(function.__code__.co_filename)),
-        )
-
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return the code for a signature, None if there is none that can be used."""
-        try:
-            return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
-        except _USELESS as error:
-            _remark(f"{self.cache_path}: the compiled code is damaged ({type(error).__name__})")
-            with contextlib.suppress(OSError):
-                self.flush()  # type: ignore[no-untyped-call]
-            return None
-
-    def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep the code for a signature if the disk takes it."""
-        try:
-            super().save_overload(sig, data)  # type: ignore[no-untyped-call]
-        except OSError as error:
-            _remark(f"{self.cache_path}: compiled code cannot be kept ({error.strerror})")
-
-
-@functools.cache
-def _sources_stamp(file: str) -> str:
-    """Return a checksum of a source file, of those beside it, and of this one.
-
-    Compiled code has the functions and constants of other files in it; numba looks at its own file
-    alone, and would go on with what is no longer written in the others.
-    """
-    digest = hashlib.sha256()
-    for source in [*sorted(Path(file).parent.glob("*.py")), Path(__file__)]:
-        digest.update(source.read_bytes())
-    return digest.hexdigest()
-
-
-class _DamagedCodeError(Exception):
-    """A file of compiled code is not what was written."""
-
-
-_USELESS = (_DamagedCodeError, ImportError, AttributeError, RuntimeError)
-"""What loading raises at a damaged file, a name that is gone, and code that LLVM does not read."""
-
-
-class _CheckedFiles(IndexDataCacheFile):
-    """Files that begin with the checksum of the rest.
-
-    Without one, code with a flipped bit is executed, and computes something else or ends the
-    process; and what unpickling it raises can be anything.
-    """
-
-    def _save_index(self, overloads: Any) -> None:
-        stamped = dumps((self._source_stamp, overloads))  # type: ignore[no-untyped-call]
-        self._save_data(self._index_name, (self._version, stamped))  # type: ignore[no-untyped-call]
-
-    def _load_index(self) -> Any:
-        try:
-            version, stamped = self._load_data(self._index_name)
-        except FileNotFoundError:
-            return {}
-        if version != self._version:  # of numba: the rest may name what it does not have
-            return {}
-        stamp, overloads = pickle.loads(stamped)  # noqa: S301 - as far as numba's own trust goes
-        return overloads if stamp == self._source_stamp else {}
-
-    def _load_data(self, name: str) -> Any:
-        content = Path(self._data_path(name)).read_bytes()  # type: ignore[no-untyped-call]
-        digest, pickled = content[:DIGEST_BYTES], content[DIGEST_BYTES:]
-        if hashlib.sha256(pickled).digest() != digest:
-            raise _DamagedCodeError(name)
-        return pickle.loads(pickled)  # noqa: S301 - of the user's own folder, and undamaged
-
-    def _dump(self, obj: Any) -> bytes:
-        pickled: bytes = super()._dump(obj)  # type: ignore[no-untyped-call]
-        return hashlib.sha256(pickled).digest() + pickled
-
-
-class _NoFolder(NullCache):
-    """No place for compiled code."""
-
-    def save_overload(self, sig: Any, cres: Any) -> None:  # noqa: ARG002
-        """Keep nothing, and say so."""
-        _remark("there is no folder where compiled code can be kept")
-
-
-@functools.cache
-def _remark(what: str) -> None:
-    LOGGER.warning(
-        "%s: it is compiled anew, which takes seconds every time. Set NUMBA_CACHE_DIR to a folder "
-        "that this user alone can write.",
-        what,
-    )
+        keep(compiled, function)
+    return compiled

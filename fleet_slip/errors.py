@@ -92,3 +92,9 @@ class ClusterError(FleetSlipError):
     """The cluster cannot be reached or used, or its workers died of a task."""
 
     exit_code = 11
+
+
+class ExtraError(FleetSlipError):
+    """A package that only some commands need is not installed."""
+
+    exit_code = 13

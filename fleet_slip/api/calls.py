@@ -11,7 +11,7 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from fleet_slip.api.root import Rooted
 from fleet_slip.compute.tasks import LocalThreads
-from fleet_slip.errors import ConfigError
+from fleet_slip.extras import needed
 from fleet_slip.files.folder import Folder
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.progress import Progress, no_progress
@@ -104,12 +104,8 @@ def open_workers(root: Folder, workers: Workers) -> Iterator[Executor]:
 
 
 def _cluster(address: str, root: Folder) -> Any:
-    try:
-        from fleet_slip.compute.cluster import cluster_executor  # an extra, and slow
-    except ModuleNotFoundError as error:
-        raise ConfigError(
-            f"a cluster needs the package {error.name}: pip install 'fleet-slip[cluster]'"
-        ) from None
+    with needed("cluster", "a cluster"):
+        from fleet_slip.compute.cluster import cluster_executor  # slow
     return cluster_executor(address, absolute(root))
 
 

@@ -1,12 +1,14 @@
 """What `Fleet.run` did."""
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from fleet_slip.grams.job import GramReport
 from fleet_slip.models.publish import Publication
 from fleet_slip.selection.request import RequestedSelection
-from fleet_slip.simulation.job import SimulationReport
+
+if TYPE_CHECKING:  # it brings a compiler
+    from fleet_slip.simulation.job import SimulationReport
 
 
 @dataclass(frozen=True)
@@ -19,7 +21,7 @@ class RunReport:
     """
 
     campaign: str
-    simulation: SimulationReport
+    simulation: "SimulationReport"
     gram: GramReport
     gram_features: GramReport | None
     selection: RequestedSelection | None

@@ -9,6 +9,7 @@ from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.root import Rooted
 from fleet_slip.catalogue.sources import ALL_DRIVES
 from fleet_slip.errors import UsageError
+from fleet_slip.extras import needed
 from fleet_slip.models.aliases import CHAMPION
 from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.model_version import ModelVersion
@@ -210,7 +211,9 @@ class Serving(Rooted):
         has not been evaluated, or not on today's data, and what `model` raises.
         """
         from fleet_slip.files.local_folder import LocalFolder
-        from fleet_slip.report.write import write_report
+
+        with needed("report", "the report"):
+            from fleet_slip.report.write import write_report
 
         folder = LocalFolder(output) if output else self.root / "report"
         return write_report(self.warehouse, self.resolve(model), folder)

@@ -29,8 +29,8 @@ app = typer.Typer(
     epilog=(
         "Exit codes: 0 done, 1 a bug, 2 wrong usage, 3 a config file, 4 input data, 5 the data "
         "cannot answer, 6 storage, 7 refused, 8 a conflict with another process, 9 damage "
-        "found, 10 something calls for attention, 11 a cluster, 12 not all done yet, 130 "
-        "interrupted."
+        "found, 10 something calls for attention, 11 a cluster, 12 not all done yet, 13 a "
+        "package of an extra is missing, 130 interrupted."
     ),
 )
 

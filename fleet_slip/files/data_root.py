@@ -7,6 +7,7 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 from fleet_slip.errors import StorageError
+from fleet_slip.extras import needed
 from fleet_slip.files.folder import Folder
 
 DEFAULT_ROOT = Path("data")
@@ -76,11 +77,6 @@ def _at_url(url: str) -> Folder:
             "or az://CONTAINER/PATH, with letters, digits and any of _ . = + - in the path. "
             "Credentials are not part of it: they come from the environment."
         )
-    try:
-        from fleet_slip.files.object_folder import ObjectFolder  # noqa: PLC0415 - the library is optional
-    except ImportError:
-        raise StorageError(
-            "a data root on an object store needs the library obstore. Run: "
-            "pip install 'fleet-slip[objects]'"
-        ) from None
+    with needed("objects", "a data root on an object store"):
+        from fleet_slip.files.object_folder import ObjectFolder  # noqa: PLC0415 - of the extra
     return ObjectFolder(found["bucket"], found["path"].strip("/"))

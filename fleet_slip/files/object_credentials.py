@@ -14,6 +14,7 @@ from os import environ
 from typing import TYPE_CHECKING, Any
 
 from fleet_slip.errors import StorageError
+from fleet_slip.extras import needed
 
 if TYPE_CHECKING:
     from botocore.credentials import Credentials
@@ -66,14 +67,10 @@ def aws_profile() -> AwsProfile | None:
     """
     if environ.get("AWS_ACCESS_KEY_ID"):
         return None
-    try:
-        # Optional, and a fifth of a second to import.
+    with needed("objects", "a file of credentials"):
+        # A fifth of a second to import.
         from botocore.exceptions import BotoCoreError, ProfileNotFound  # noqa: PLC0415
         from botocore.session import Session  # noqa: PLC0415
-    except ImportError:
-        raise StorageError(
-            "credentials in files need the library botocore. Run: pip install 'fleet-slip[objects]'"
-        ) from None
     session = Session()
     try:
         credentials = session.get_credentials()

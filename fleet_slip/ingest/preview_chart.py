@@ -6,6 +6,7 @@ import numpy as np
 
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.errors import ConfigError
+from fleet_slip.extras import needed
 from fleet_slip.files.storage_errors import storage_errors
 from fleet_slip.ingest.preview import Preview
 
@@ -15,8 +16,9 @@ def draw_preview(preview: Preview, file: Path) -> None:
 
     Raises `ConfigError` for an unknown suffix, and `StorageError` if it cannot be written.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 - takes a while
-    from matplotlib.figure import Figure  # noqa: PLC0415
+    with needed("report", "a picture of a measured log"):
+        from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 - takes a while
+        from matplotlib.figure import Figure  # noqa: PLC0415
 
     names = list(preview.longest)
     figure = Figure(figsize=(10, 1.3 * len(names) + 0.8), layout="constrained")

@@ -16,6 +16,7 @@ import numpy as np
 import polars as pl
 
 from fleet_slip.errors import FleetSlipError, InputError
+from fleet_slip.extras import needed
 from fleet_slip.ingest.columns import shown
 
 OWN_TIME = "\0time"
@@ -64,14 +65,8 @@ def reading_with(file: Path, package: str) -> Iterator[Any]:
 
     Its authors raise whatever a damaged file leads to, so that there is no list to catch.
     """
-    try:
+    with needed("logs", f"{shown(file)}: its format"):
         module = import_module(package)
-    except ImportError:
-        name = package.replace(".", "-").split("-io")[0]
-        raise InputError(
-            f"{shown(file)}: its format is read by the package {name}, which is not installed. "
-            "Run: pip install 'fleet-slip[logs]'"
-        ) from None
     try:
         yield module
     except (FleetSlipError, MemoryError):

@@ -15,6 +15,7 @@ from pathlib import Path
 from types import ModuleType
 
 from fleet_slip.errors import ConfigError, RefusedError, StorageError
+from fleet_slip.extras import needed
 from fleet_slip.files.folder import Folder
 
 SIGNING_VARIABLE = "FLEET_SLIP_SIGNING_KEY"
@@ -140,10 +141,6 @@ def _write_new(path: Path, content: bytes, mode: int) -> None:
 
 
 def _ed25519() -> ModuleType:
-    try:
-        from fleet_slip.models import ed25519  # noqa: PLC0415 - the library is optional
-    except ImportError:
-        raise ConfigError(
-            "signatures need the library cryptography. Run: pip install 'fleet-slip[signing]'"
-        ) from None
+    with needed("signing", "a signature"):
+        from fleet_slip.models import ed25519  # noqa: PLC0415 - of the extra
     return ed25519

@@ -1,10 +1,11 @@
-"""Draws a control chart. Needs matplotlib, which is an optional dependency."""
+"""Draws a control chart."""
 
 from datetime import date
 from pathlib import Path
 from typing import Any
 
 from fleet_slip.errors import ConfigError
+from fleet_slip.extras import needed
 from fleet_slip.files.storage_errors import storage_errors
 from fleet_slip.monitoring.monitor import Chart, Limits
 
@@ -16,16 +17,12 @@ BEYOND = ("beyond the limits", "tab:red")
 def draw(chart: Chart, file: Path) -> None:
     """Draw mean and standard deviation of the error over the days, with their limits.
 
-    The suffix of the file says the format. Raises `ConfigError` without matplotlib or for an
-    unknown suffix, and `StorageError` if the file cannot be written.
+    The suffix of the file says the format. Raises `ConfigError` for an unknown suffix,
+    `ExtraError` without matplotlib, and `StorageError` if the file cannot be written.
     """
-    try:
+    with needed("report", "a chart"):
         from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
         from matplotlib.figure import Figure  # noqa: PLC0415
-    except ImportError:
-        raise ConfigError(
-            "a chart needs matplotlib. Install it with: pip install matplotlib"
-        ) from None
     figure = Figure(figsize=(9, 5.5), layout="constrained")
     FigureCanvasAgg(figure)
     above, below = figure.subplots(2, sharex=True)

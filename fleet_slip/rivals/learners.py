@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.errors import ConfigError
+from fleet_slip.extras import needed
 
 SEED = 0
 
@@ -186,10 +186,5 @@ def _require_scikit_learn() -> None:
 
 
 def _scikit_learn(module: str) -> Any:
-    try:
+    with needed("rivals", "training the rivals"):
         return import_module(f"sklearn.{module}")
-    except ImportError:
-        raise ConfigError(
-            "scikit-learn, which the rivals need, is not installed. Run: "
-            "pip install 'fleet-slip[rivals]'"
-        ) from None

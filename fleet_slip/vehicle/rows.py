@@ -7,9 +7,12 @@ overlap, and a loop over lanes that reads, computes and writes becomes vector in
 from collections.abc import Callable
 from typing import Any
 
-from llvmlite import ir  # type: ignore[import-untyped]
-from numba import types
-from numba.extending import intrinsic
+from fleet_slip.extras import needed
+
+with needed("compiled", "simulating drives"):
+    from llvmlite import ir  # type: ignore[import-untyped]
+    from numba import types
+    from numba.extending import intrinsic
 
 LANES = 8
 """Lanes of the kernel: one or two of a processor's vectors."""

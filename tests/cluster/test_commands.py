@@ -195,7 +195,7 @@ def test_without_dask_the_option_says_what_to_install(tmp_path: Path) -> None:
     options = ["--root", str(tmp_path), "gram", "--cluster", "tcp://x:1"]
     command = [sys.executable, "-c", program, *options]
     done = run(command)
-    assert done.exit_code == 3
+    assert done.exit_code == 13
     assert "pip install 'fleet-slip[cluster]'" in done.stderr
 
 

@@ -8,7 +8,7 @@ from types import ModuleType
 
 import pytest
 
-from fleet_slip import compiling
+from fleet_slip import kept_code
 from fleet_slip.vehicle import kernel as lanes
 
 SOURCE = """
@@ -22,7 +22,7 @@ def half(x):
 
 @pytest.fixture(autouse=True)
 def remarks_of_this_test(monkeypatch: pytest.MonkeyPatch) -> None:
-    compiling._remark.cache_clear()
+    kept_code._remark.cache_clear()
     monkeypatch.setattr(logging.getLogger("fleet_slip"), "propagate", True)
 
 
@@ -92,7 +92,7 @@ def test_code_with_a_flipped_bit_is_not_executed(
             flipped = bytearray(content)
             flipped[bit // 8] ^= 1 << bit % 8
             file.write_bytes(flipped)
-            with pytest.raises(compiling._DamagedCodeError):
+            with pytest.raises(kept_code._DamagedCodeError):
                 half._cache._cache_file._load_data(file.name)
     assert load(tmp_path).half(3.0) == 1.5
     assert "damaged" in caplog.text

@@ -1,0 +1,104 @@
+"""The core alone: what it does without the packages of the extras, and what it says of the rest."""
+
+import json
+import re
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+from tests.support.commands import run
+
+REPOSITORY = Path(__file__).parents[2]
+PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
+EXTRAS = PROJECT["optional-dependencies"]
+MODULES = {"scikit-learn": "sklearn", "python-can": "can", "highway-env": "highway_env"}
+BROUGHT = {"gymnasium", "pandas", "pygame"}
+"""What the packages of the extras bring, and nothing else does."""
+
+PROGRAM = """
+import json, sys
+absent = set(json.loads(sys.argv[1]))
+class Absent:
+    def find_spec(self, name, *_):
+        if name.partition(".")[0] in absent:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+sys.meta_path.insert(0, Absent())
+from fleet_slip.cli.main import main
+codes = []
+for words in json.loads(sys.argv[2]):
+    sys.argv = ["fleet-slip", *words]
+    try:
+        main()
+    except SystemExit as ended:
+        codes.append(ended.code)
+sys.exit(str(codes))
+"""
+
+
+def of_extras(*extras: str) -> list[str]:
+    """The modules that no package of the core brings, or those of some extras."""
+    stated = [t for name in extras or EXTRAS for t in EXTRAS[name]]
+    names = {Requirement(text).name for text in stated}
+    return sorted({MODULES.get(name, name) for name in names} | (set() if extras else BROUGHT))
+
+
+def given(absent: list[str], *commands: list[str]) -> tuple[list[int], str]:
+    """Give commands in a process in which some modules are missing.
+
+    Returns their exit codes, and what they said.
+    """
+    words = [sys.executable, "-c", PROGRAM, json.dumps(absent), json.dumps(commands)]
+    *said, codes = run(words).stderr.splitlines()
+    return json.loads(codes), "\n".join(said)
+
+
+@pytest.fixture(scope="module")
+def root(smoke_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    copy = tmp_path_factory.mktemp("core") / "data"
+    run(["cp", "-r", str(smoke_root), str(copy)])
+    return copy
+
+
+def test_querying_and_selecting_need_the_core_alone(root: Path) -> None:
+    at = ["--root", str(root)]
+    asked = [
+        [*at, "sql", "SELECT count(*) FROM log"],
+        [*at, "gram"],
+        [*at, "select"],
+        [*at, "select", "--all-subsets"],
+        [*at, "publish", "core", "--nested", "ay,yaw_rate,ax,steer_fl"],
+        [*at, "show", "core"],
+        [*at, "score", "core"],
+        [*at, "quality"],
+        [*at, "verify"],
+        [*at, "status"],
+    ]
+    codes, said = given(of_extras(), *asked)
+    assert codes == [0] * len(asked), said
+
+
+@pytest.mark.parametrize(
+    ("extra", "words"),
+    [
+        ("compiled", ["simulate", "smoke"]),
+        ("compiled", ["export", "smoke", "--to", "c"]),
+        ("report", ["report", "--model", "smoke"]),
+        ("objects", ["--root", "s3://bucket/data", "status"]),
+        ("signing", ["keygen", "key.pem"]),
+    ],
+)
+def test_what_needs_more_says_which_extra(root: Path, extra: str, words: list[str]) -> None:
+    at = [] if "--root" in words else ["--root", str(root)]
+    codes, said = given(of_extras(extra), [*at, *words])
+    assert codes == [13], said
+    assert f"which is not installed. Run: pip install 'fleet-slip[{extra}]'" in said
+
+
+def test_every_extra_that_is_named_is_one() -> None:
+    sources = "".join(path.read_text() for path in (REPOSITORY / "fleet_slip").rglob("*.py"))
+    named = set(re.findall(r'(?:needed|missing)\(\s*"(\w+)"', sources))
+    assert named
+    assert named <= EXTRAS.keys()
