@@ -12,8 +12,8 @@ Numbers of a car come from all its drives, the tested ones too: they need no lab
 (`--cohort "day >= '2024-06-08'" --calibrated-by "day < '2024-06-08'"`), as they are on board.
 
 Rivals: the extended Kalman filter with the parameters of the car's class, with its true mass, and
-told everything (mass, tyres, adhesion), each also without the offsets that calibrate tells; the
-network and the trees on the signals of Table I, on a sample of rows.
+told everything (mass, tyres, adhesion), each also without the offsets that calibrate tells; a
+network, boosted trees and neuro-fuzzy rules on what the models get, on a sample of rows.
 """
 
 import argparse
@@ -38,8 +38,10 @@ from fleet_slip.grams.folding import Folding
 from fleet_slip.observers import ekf
 from fleet_slip.observers.signals import DriveSignals, read_drive
 from fleet_slip.regression.crossval import cross_validate_inputs
-from fleet_slip.rivals.compare import all_signals
-from fleet_slip.rivals.learners import LEARNERS, one_thread
+from fleet_slip.rivals.compare import all_signals, cross_validate_learner
+from fleet_slip.rivals.inputs import Inputs
+from fleet_slip.rivals.learner import one_thread
+from fleet_slip.rivals.learners import ANFIS, PERCEPTRON, TREES
 from fleet_slip.rivals.sample import draw_sample
 from fleet_slip.simulation.campaign import DriveSpec, load_campaign
 from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
@@ -49,6 +51,8 @@ from fleet_slip.warehouse.tables import Warehouse
 FOLDS = 10
 SET = "fleet"
 RUNNING = ("yaw_rate_bias", "ay_bias")
+LEARNED = ("Table I, model 4", "windows", "windows, all own numbers, mass and model")
+"""The models whose inputs the learned rivals get, too."""
 
 
 def models() -> dict[str, tuple[str, ...]]:
@@ -158,34 +162,25 @@ def errors_of_filters(
 
 
 def errors_of_learners(
-    warehouse: Warehouse, cohort: str
+    warehouse: Warehouse, cohort: str, found: Calibration
 ) -> Iterator[tuple[str, int, float, float]]:
-    """Yield the same of the network and the trees, on a sample of rows."""
-    signals = all_signals()
+    """Yield the same of networks, trees and neuro-fuzzy rules, on a sample of rows."""
     loaded = load_cohort(warehouse, cohort)
-    sample = draw_sample(warehouse, loaded, signals)
-    car_of = dict(
-        zip(
-            loaded.drives["drive_id"].to_pylist(),
-            loaded.drives["vehicle_id"].to_pylist(),
-            strict=True,
-        )
-    )
+    sets = {name: models()[name] for name in LEARNED}
+    every = Inputs.of_catalogue(tuple(dict.fromkeys(name for one in sets.values() for name in one)))
+    sample = draw_sample(warehouse, loaded, every, numbers=found.counts())
+    drives = loaded.drives.select(["drive_id", "vehicle_id"]).to_pylist()
+    car_of = {one["drive_id"]: one["vehicle_id"] for one in drives}
     cars = [car_of[drive] for drive in sample.drive_id.tolist()]
     folds = assign_folds(cars, "vehicle", FOLDS)
-    for learner in LEARNERS:
-        if learner.name not in {"mlp", "trees"}:
-            continue
-        estimates = np.full(len(sample.inputs), np.nan)
-        with one_thread():
-            for fold in range(len(folds.names)):
-                test = folds.fold == fold
-                fitted = learner.fit(sample.inputs[~test], sample.sideslip_rad[~test])
-                estimates[test] = fitted.predict(sample.inputs[test])
-        error = estimates - sample.sideslip_rad
-        rmse = float(np.degrees(np.sqrt(np.mean(error**2))))
-        correlation = float(np.corrcoef(estimates, sample.sideslip_rad)[0, 1])
-        yield learner.description, len(signals), rmse, correlation
+    for name, inputs in sets.items():
+        for learner in (PERCEPTRON, TREES, ANFIS):
+            with one_thread():
+                figures = cross_validate_learner(learner, sample.of(inputs), sample, folds)
+            if figures.rmse_deg is None or figures.correlation is None:
+                raise RuntimeError(f"{learner.name} estimates nothing")
+            about = f"{learner.name}: {name}"
+            yield about, len(inputs), figures.rmse_deg, figures.correlation
 
 
 def main() -> None:
@@ -203,7 +198,7 @@ def main() -> None:
     rows = [errors_of_models(warehouse, options.cohort, found)]
     if not options.no_rivals:
         rows += [
-            errors_of_learners(warehouse, options.cohort),
+            errors_of_learners(warehouse, options.cohort, found),
             errors_of_filters(warehouse, options.cohort, found),
         ]
     for part in rows:

@@ -184,7 +184,7 @@ def fixed_estimators(
 def published_angle(published: LinearEstimate | ColumnEstimate, log: DriveLog) -> FloatArray:
     """Return what a published model estimates in a car that knows its metadata."""
     if isinstance(published, ColumnEstimate):
-        return published.in_car(log.metadata)(signals_of(log))
+        return replace(published, facts=log.metadata)(signals_of(log))
     return published(signals_of(log))
 
 

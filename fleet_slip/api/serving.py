@@ -177,8 +177,8 @@ class Serving(Rooted):
 
         The models of Table I are fitted on the cohort of each and evaluated beside it. `scenarios`
         are names of those that ship or paths of TOML files, by default all that ship. `rivals`
-        trains neural networks and trees as well, with scikit-learn. Progress is in simulated rows.
-        Returns the document that is kept below `evaluations/`.
+        trains networks, trees and neuro-fuzzy rules as well, with scikit-learn. Progress is in
+        simulated rows. Returns the document that is kept below `evaluations/`.
 
         Raises `ConfigError` for a scenario that is not valid, `DataError`, `RefusedError` for a
         scenario that was changed since its drive was simulated, and what `model` raises.

@@ -85,7 +85,11 @@ def evaluate(
     scenario: Scenarios = None,
     rivals: Annotated[
         bool,
-        typer.Option("--rivals", help="Also train neural networks and trees. Needs scikit-learn."),
+        typer.Option(
+            "--rivals",
+            help="Also train networks, trees and neuro-fuzzy rules, on the model's columns too. "
+            "Takes minutes, and needs scikit-learn.",
+        ),
     ] = False,
     threads: Threads = None,
     json: Json = False,

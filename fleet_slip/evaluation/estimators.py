@@ -8,6 +8,7 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.evaluation.evaluated_drives import EvaluatedDrive
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.columns import DriveCounts
 from fleet_slip.models.manifest import Manifest
@@ -88,9 +89,9 @@ class ColumnEstimate:
     predictor: Predictor
     facts: Mapping[str, Any] = field(default_factory=dict)
 
-    def in_car(self, facts: Mapping[str, Any]) -> "ColumnEstimate":
-        """Return the estimator in a car that knows its facts."""
-        return replace(self, facts=facts)
+    def in_drive(self, drive: EvaluatedDrive) -> "ColumnEstimate":
+        """Return the estimator in the car of a drive, which knows its facts."""
+        return replace(self, facts=drive.facts)
 
     def __call__(self, signals: Signals) -> FloatArray:
         """Return the estimate at each tick; there is one row for every tick."""

@@ -5,16 +5,16 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from fleet_slip.arrays import FloatArray
 from fleet_slip.evaluation.comparison import FleetComparison, compare_fleets
-from fleet_slip.evaluation.estimators import Estimate, Signals, TrainedModels, train_models
-from fleet_slip.evaluation.filters import FilterEstimate, filter_bank
+from fleet_slip.evaluation.estimators import Estimate, TrainedModels, train_models
+from fleet_slip.evaluation.filters import Bank, FilterEstimate, filter_bank
 from fleet_slip.evaluation.gps_noise import GpsSweep, sweep_gps_noise
 from fleet_slip.evaluation.ranking import Ranking, rank
 from fleet_slip.evaluation.results import document
 from fleet_slip.evaluation.runs import EvaluatedScenario, run_all
 from fleet_slip.evaluation.targets import Check, check_filter_targets, check_targets
 from fleet_slip.grams.cohort import Cohort
+from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.simulation.scenario import Scenario, load_scenario
 from fleet_slip.warehouse.tables import Warehouse
@@ -27,8 +27,9 @@ class Rival(Protocol):
     def name(self) -> str:
         """Name among the estimators."""
 
-    def estimate(self, signals: Signals) -> FloatArray:
-        """Estimate side-slip in rad of a drive; NaN where an input is null."""
+    @property
+    def estimate(self) -> Estimate:
+        """What estimates side-slip in rad of a drive; NaN where an input is null."""
 
     def description(self) -> Mapping[str, Any]:
         """Return what a document says of it as an estimator."""
@@ -37,8 +38,8 @@ class Rival(Protocol):
         """Return what a document says of its accuracy and cost."""
 
 
-TrainRivals = Callable[[Warehouse, Cohort], Sequence[Rival]]
-"""Trains the rivals on the rows of a cohort."""
+TrainRivals = Callable[[Warehouse, Cohort, Manifest, Bank], Sequence[Rival]]
+"""Trains the rivals on the rows of a cohort, also on the columns of a published model."""
 
 
 @dataclass(frozen=True)
@@ -106,17 +107,18 @@ def train_competitors(
     """
     first = train_models(warehouse, one_car)
     others = tuple(train_models(warehouse, version) for version in fleets)
-    learned = tuple(train_rivals(warehouse, first.selection.cohort)) if train_rivals else ()
     estimators: dict[str, Estimate] = {}
     descriptions: dict[str, Mapping[str, Any]] = {}
     for trained in (first, *others):
         estimators |= trained.estimators()
         descriptions |= trained.descriptions()
-    bank = filter_bank(warehouse, first.selection.cohort, load_scenario("nominal").car, executor)
+    cohort = first.selection.cohort
+    bank = filter_bank(warehouse, cohort, load_scenario("nominal").car, executor)
+    learned = train_rivals(warehouse, cohort, one_car.manifest, bank) if train_rivals else ()
     return Competitors(
         one_car=first,
         fleets=others,
-        rivals=learned,
+        rivals=tuple(learned),
         estimators=estimators | bank.estimators | {one.name: one.estimate for one in learned},
         descriptions=(
             descriptions | bank.descriptions | {one.name: one.description() for one in learned}

@@ -16,12 +16,12 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.config import Config
 from fleet_slip.evaluation.estimators import Signals
+from fleet_slip.evaluation.evaluated_drives import EvaluatedDrive
 from fleet_slip.files.documents import DocumentFolder
 from fleet_slip.grams.cohort import Cohort
 from fleet_slip.observers import ekf, kalman, luenberger, sliding_mode
 from fleet_slip.observers.signals import DriveSignals, LabelledDrive, read_drive
 from fleet_slip.observers.tuning import tune
-from fleet_slip.simulation.scenario import Scenario
 from fleet_slip.vehicle.parameters import VehicleParameters
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
@@ -74,8 +74,9 @@ class FilterEstimate:
     parameters: Config
     car: VehicleParameters
 
-    def in_scenario(self, scenario: Scenario) -> "FilterEstimate":
+    def in_drive(self, drive: EvaluatedDrive) -> "FilterEstimate":
         """Return the filter as it is told of the car, and of the road if it is told everything."""
+        scenario = drive.scenario
         if not self.filter.told:
             return replace(self, car=scenario.vehicle)
         told = self.parameters.model_copy(update={"adhesion": scenario.adhesion})
@@ -109,8 +110,9 @@ def rebuild(name: str, about: Mapping[str, Any], car: VehicleParameters) -> Filt
 
 @dataclass(frozen=True)
 class Bank:
-    """All filters with the parameters that they have, by name."""
+    """All filters with the parameters that they have, by name, and the drives they are tuned on."""
 
+    tuned_on: tuple[str, ...]
     estimators: dict[str, FilterEstimate]
     descriptions: dict[str, dict[str, Any]]
 
@@ -125,12 +127,12 @@ def filter_bank(
     """
     chosen = tuning_drives(cohort, car)
     drives: list[LabelledDrive] = []
-    bank = Bank({}, {})
+    bank = Bank(chosen, {}, {})
     for one in FILTERS:
         key = _key(one, chosen, car)
         found = _kept(warehouse, one, key)
         if found is None:
-            drives = drives or _read(warehouse, chosen)
+            drives = drives or read_labelled(warehouse, chosen)
             found = _tune(warehouse, one, key, drives, car, executor)
         tuned = type(one.parameters).model_validate(found["parameters"])
         for name, parameters in ((one.name, one.parameters), (f"{one.name}_tuned", tuned)):
@@ -197,6 +199,7 @@ def _tune(
     return content
 
 
-def _read(warehouse: Warehouse, names: Sequence[str]) -> list[LabelledDrive]:
+def read_labelled(warehouse: Warehouse, names: Sequence[str]) -> list[LabelledDrive]:
+    """Return drives with their labels, to train with."""
     with connect(warehouse.root) as database:
         return [read_drive(database, name) for name in names]

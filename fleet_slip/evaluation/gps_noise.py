@@ -113,8 +113,7 @@ def rmse_deg(drive: EvaluatedDrive, one: FilterEstimate, velocity_std_mps: float
     """
     stated = drive.scenario.sensors.gps.velocity_std_mps
     believed = {name: getattr(one.parameters, name) * velocity_std_mps / stated for name in STATED}
-    told = replace(one, parameters=one.parameters.model_copy(update=believed))
-    told = told.in_scenario(drive.scenario)
+    told = replace(one, parameters=one.parameters.model_copy(update=believed)).in_drive(drive)
     generator = np.random.default_rng(SEED)
     squares = []
     for _ in range(DRAWS):

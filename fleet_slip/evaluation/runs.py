@@ -3,15 +3,15 @@
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.evaluation.errors import ErrorFigures, error_figures
-from fleet_slip.evaluation.estimators import ColumnEstimate, Estimate
+from fleet_slip.evaluation.estimators import Estimate
 from fleet_slip.evaluation.evaluated_drives import EvaluatedDrive, load_drives
-from fleet_slip.evaluation.filters import FilterEstimate
 from fleet_slip.evaluation.stability import CRITERION, find_unstable
 from fleet_slip.grams.job import update_grams
 from fleet_slip.progress import Progress, no_progress
@@ -22,6 +22,14 @@ from fleet_slip.warehouse.tables import Warehouse
 
 GPS_OUTAGE_S = 1.0
 """Time without a fix after which satellite navigation counts as lost."""
+
+
+@runtime_checkable
+class InDrive(Protocol):
+    """An estimator that is told something of the car, or of the road, before a drive."""
+
+    def in_drive(self, drive: EvaluatedDrive) -> Estimate:
+        """Return the estimator for a drive."""
 
 
 @dataclass(frozen=True)
@@ -92,10 +100,8 @@ def evaluate_drive(drive: EvaluatedDrive, estimators: Mapping[str, Estimate]) ->
 def _estimates(drive: EvaluatedDrive, estimate: Estimate) -> FloatArray:
     """Return the estimates; none where the drive lacks what the estimator needs to begin."""
     try:
-        if isinstance(estimate, ColumnEstimate):
-            estimate = estimate.in_car(drive.facts)
-        elif isinstance(estimate, FilterEstimate):
-            estimate = estimate.in_scenario(drive.scenario)
+        if isinstance(estimate, InDrive):
+            estimate = estimate.in_drive(drive)
         return estimate(drive.signals)
     except (DataError, QuestionError):
         return np.full(len(drive.time_s), np.nan)

@@ -1,23 +1,29 @@
 """Cross-validates the rivals on the regression's folds, and measures what they cost."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.evaluation.errors import ErrorFigures, error_figures
-from fleet_slip.evaluation.estimators import TABLE_ONE, Signals
+from fleet_slip.evaluation.estimators import TABLE_ONE
+from fleet_slip.evaluation.evaluate import Rival
+from fleet_slip.evaluation.filters import Bank, read_labelled
+from fleet_slip.grams.calibration import calibrate
 from fleet_slip.grams.cohort import Cohort
-from fleet_slip.rivals.learners import LEARNERS, Fitted, Learner, one_thread
+from fleet_slip.models.manifest import Manifest
+from fleet_slip.regression.folds import FoldAssignment
+from fleet_slip.rivals.inputs import Inputs, LearnedEstimate
+from fleet_slip.rivals.learner import Fitted, Learner, one_thread
+from fleet_slip.rivals.learners import LEARNERS, OF_WINDOWS
 from fleet_slip.rivals.sample import Sample, draw_sample
+from fleet_slip.rivals.tree_filter import BASE, GROUP, train_tree_filter
 from fleet_slip.selection.model_list import load_model_list
 from fleet_slip.warehouse.tables import Warehouse
-
-GROUP = "rivals"
 
 TWO_SIGNALS = ("ay", "yaw_rate")
 """The inputs of the first neural network that the paper cites, [5]."""
@@ -35,13 +41,12 @@ def all_signals() -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class TrainedRival:
-    """One learner on one set of signals.
+    """One learner on one set of inputs.
 
     Attributes:
-        name: learner and number of signals.
+        name: learner, and number of signals or `windows`.
         learner: what was fitted.
-        signals: its inputs.
-        fitted: fit to the whole sample.
+        estimate: fit to the whole sample, as an estimator of a drive.
         cross_validated: figures on drives that it was not fitted on, pooled over the folds.
         rows: rows of the sample.
         training_s: time to fit the whole sample.
@@ -51,81 +56,95 @@ class TrainedRival:
 
     name: str
     learner: Learner
-    signals: tuple[str, ...]
-    fitted: Fitted
+    estimate: LearnedEstimate
     cross_validated: ErrorFigures
     rows: int
     training_s: float
     one_estimate_us: float
     each_of_many_us: float
 
-    def estimate(self, signals: Signals) -> FloatArray:
-        """Estimate side-slip in rad of a drive; NaN where an input is null."""
-        inputs = np.stack([signals[catalogue()[name].column] for name in self.signals], axis=1)
-        complete = np.isfinite(inputs).all(axis=1)
-        estimates = np.full(len(inputs), np.nan)
-        if complete.any():
-            with one_thread():
-                estimates[complete] = self.fitted.predict(inputs[complete])
-        return estimates
-
     def description(self) -> dict[str, Any]:
         """Return what a JSON document says of it as an estimator."""
-        return {"kind": "rival", "group": GROUP, "signals": list(self.signals)}
+        return {"kind": "rival", "group": GROUP, "signals": list(self.estimate.inputs.names)}
 
     def as_dict(self) -> dict[str, Any]:
         """Return what a JSON document says of its accuracy and cost."""
         return {
             "name": self.name,
             "learner": self.learner.description,
-            "signals": list(self.signals),
+            "signals": list(self.estimate.inputs.names),
             "rows": self.rows,
             "cross_validated": self.cross_validated.as_dict(),
             "training_s": self.training_s,
-            "size_bytes": self.fitted.size_bytes,
+            "size_bytes": self.estimate.fitted.size_bytes,
             "one_estimate_us": self.one_estimate_us,
             "each_of_many_us": self.each_of_many_us,
         }
 
 
-def train_rivals(warehouse: Warehouse, cohort: Cohort) -> tuple[TrainedRival, ...]:
-    """Fit and cross-validate every learner on both sets of signals."""
-    sample = draw_sample(warehouse, cohort, all_signals())
-    sets = (TWO_SIGNALS, all_signals())
-    with one_thread():
-        return tuple(train(learner, sample, signals) for learner in LEARNERS for signals in sets)
+def train_rivals(
+    warehouse: Warehouse, cohort: Cohort, manifest: Manifest, bank: Bank
+) -> tuple[Rival, ...]:
+    """Fit and cross-validate every learner on two sets of signals and on a published model's.
 
-
-def train(learner: Learner, sample: Sample, signals: tuple[str, ...]) -> TrainedRival:
-    """Fit and cross-validate one learner, and measure it."""
-    inputs = sample.of(tuple(catalogue()[name].column for name in signals))
-    started = time.perf_counter()
-    fitted = learner.fit(inputs, sample.sideslip_rad)
-    training_s = time.perf_counter() - started
-    many = inputs[:MANY_ROWS]
-    singles = [
-        _seconds(fitted.predict, inputs[i : i + 1]) for i in range(min(SINGLE_ESTIMATES, len(many)))
+    All are fitted on one sample of rows, whose columns are those of the model's Gram rows. The
+    filter with a tree is fitted on the drives that filters are tuned on.
+    """
+    every = Inputs.of_model(manifest, all_signals())
+    numbers = calibrate(warehouse).counts() if every.columns.numbers else None
+    sample = draw_sample(warehouse, cohort, every, numbers=numbers)
+    sets: list[tuple[str, Inputs, Sequence[Learner]]] = [
+        (str(len(names)), Inputs.of_signals(names), LEARNERS)
+        for names in (TWO_SIGNALS, all_signals())
     ]
+    if set(every.names) != set(all_signals()):
+        sets.append(("windows", every, OF_WINDOWS))
+    with one_thread(), ThreadPoolExecutor(1) as executor:
+        learned = [
+            train(learner, sample, inputs, suffix)
+            for suffix, inputs, learners in sets
+            for learner in learners
+        ]
+        drives = read_labelled(warehouse, bank.tuned_on)
+        return (*learned, train_tree_filter(bank.estimators[BASE], drives, executor))
+
+
+def train(learner: Learner, sample: Sample, inputs: Inputs, suffix: str) -> TrainedRival:
+    """Fit and cross-validate one learner, and measure it."""
+    values = sample.of(inputs.names)
+    started = time.perf_counter()
+    fitted = learner.fit(values, sample.sideslip_rad, sample.drive_id)
+    training_s = time.perf_counter() - started
+    one_us, each_us = time_estimates(fitted, values)
     return TrainedRival(
-        name=f"{learner.name}_{len(signals)}",
+        name=f"{learner.name}_{suffix}",
         learner=learner,
-        signals=signals,
-        fitted=fitted,
-        cross_validated=cross_validate_learner(learner, inputs, sample),
-        rows=len(inputs),
+        estimate=LearnedEstimate(inputs, fitted),
+        cross_validated=cross_validate_learner(learner, values, sample, sample.folds(FOLDS)),
+        rows=len(values),
         training_s=training_s,
-        one_estimate_us=float(np.median(singles)) * 1e6,
-        each_of_many_us=_seconds(fitted.predict, many) / len(many) * 1e6,
+        one_estimate_us=one_us,
+        each_of_many_us=each_us,
     )
 
 
-def cross_validate_learner(learner: Learner, inputs: FloatArray, sample: Sample) -> ErrorFigures:
-    """Return the figures on rows of drives that each fold's fit has not seen."""
-    folds = sample.folds(FOLDS)
+def time_estimates(fitted: Fitted, values: FloatArray) -> tuple[float, float]:
+    """Return the microseconds of one estimate by itself, and of each of many at once."""
+    many = values[:MANY_ROWS]
+    singles = [
+        _seconds(fitted.predict, values[i : i + 1]) for i in range(min(SINGLE_ESTIMATES, len(many)))
+    ]
+    return float(np.median(singles)) * 1e6, _seconds(fitted.predict, many) / len(many) * 1e6
+
+
+def cross_validate_learner(
+    learner: Learner, inputs: FloatArray, sample: Sample, folds: FoldAssignment
+) -> ErrorFigures:
+    """Return the figures on rows that each fold's fit has not seen."""
     estimates = np.full(len(inputs), np.nan)
     for fold in range(len(folds.names)):
         test = folds.fold == fold
-        fitted = learner.fit(inputs[~test], sample.sideslip_rad[~test])
+        fitted = learner.fit(inputs[~test], sample.sideslip_rad[~test], sample.drive_id[~test])
         estimates[test] = fitted.predict(inputs[test])
     return error_figures(estimates, sample.sideslip_rad, np.ones(len(inputs), dtype=np.bool_))
 

@@ -1,22 +1,22 @@
 """A sample of a cohort's rows: what a Gram matrix does without, and these rivals cannot."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohort import Cohort, assign_folds
+from fleet_slip.grams.drive_rows import read_drives
+from fleet_slip.grams.expansion import CarCounts
+from fleet_slip.grams.reader import cohort_files
 from fleet_slip.regression.folds import FoldAssignment
-from fleet_slip.resources import read_sql
-from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
-from fleet_slip.views import connect
-from fleet_slip.warehouse.database import reading_files
+from fleet_slip.rivals.inputs import Inputs
+from fleet_slip.rivals.learner import Names
 from fleet_slip.warehouse.tables import Warehouse
 
-SAMPLE_ROWS = 20_000
+SAMPLE_ROWS = 60_000
 """Rows of a sample, about. Neighbours at 100 Hz say almost the same, so that little is lost."""
 
 
@@ -25,20 +25,20 @@ class Sample:
     """Rows evenly spaced in time over all drives.
 
     Attributes:
-        columns: SI columns of the inputs.
-        inputs: shape (rows, columns).
+        names: of the inputs.
+        inputs: physical values, shape (rows, inputs).
         sideslip_rad: shape (rows,).
         drive_id: the drive of each row.
     """
 
-    columns: tuple[str, ...]
+    names: tuple[str, ...]
     inputs: FloatArray
     sideslip_rad: FloatArray
-    drive_id: NDArray[np.str_]
+    drive_id: Names
 
-    def of(self, columns: tuple[str, ...]) -> FloatArray:
-        """Return some of the inputs, shape (rows, columns)."""
-        return self.inputs[:, [self.columns.index(column) for column in columns]]
+    def of(self, names: tuple[str, ...]) -> FloatArray:
+        """Return some of the inputs, shape (rows, inputs)."""
+        return self.inputs[:, [self.names.index(name) for name in names]]
 
     def folds(self, count: int) -> FoldAssignment:
         """Divide the rows as the regression's cross-validation divides the drives."""
@@ -46,31 +46,37 @@ class Sample:
 
 
 def draw_sample(
-    warehouse: Warehouse, cohort: Cohort, signals: tuple[str, ...], rows: int = SAMPLE_ROWS
+    warehouse: Warehouse,
+    cohort: Cohort,
+    inputs: Inputs,
+    rows: int = SAMPLE_ROWS,
+    numbers: CarCounts | None = None,
 ) -> Sample:
-    """Draw about so many rows of a cohort that have the signals and the label.
+    """Draw about so many rows of a cohort that have all inputs and the label.
 
-    Raises `DataError` if there is none.
+    The columns are those of the cohort's Gram rows, computed over whole drives by the same code;
+    `numbers` are what the cars' drives told of them. Raises `DataError` if there is no such row.
     """
-    names = (*signals, catalogue().label)
-    columns = [catalogue()[name].column for name in names]
-    statement = read_sql("jobs", "sample.sql").format(
-        columns=",\n    ".join(columns),
-        complete=" AND ".join(f"{column} IS NOT NULL" for column in columns),
-        samples_per_second=SAMPLE_RATE_HZ,
-    )
-    parameters = {
-        "drives": sorted(set(cohort.drives["drive_id"].to_pylist())),
-        "stride": max(1, cohort.rows // rows),
-    }
-    with connect(warehouse.root) as database, reading_files(database, "drawing a sample"):
-        found = database.sql(statement, params=parameters).to_arrow_table()
-    if not found.num_rows:
-        raise DataError(f"no row of {cohort.condition.text!r} has all of {', '.join(names)}.")
-    values = np.stack([found[column].to_numpy() for column in columns], axis=1)
-    return Sample(
-        columns=tuple(columns[:-1]),
-        inputs=values[:, :-1],
-        sideslip_rad=values[:, -1],
-        drive_id=np.array(found["drive_id"].to_pylist()),
-    )
+    with_label = inputs.beside(catalogue().label)
+    plan = with_label.columns.plan
+    wanted = set(cohort.drives["drive_id"].to_pylist())
+    stride = max(1, cohort.rows // rows)
+    parts: list[FloatArray] = []
+    names: list[str] = []
+    files = cohort_files(warehouse, cohort.condition)
+    for file in (one for one in warehouse.logs.snapshot().files if one.path in files):
+        for drive in read_drives(warehouse, file, plan):
+            if drive.drive_id not in wanted:
+                continue
+            told = (numbers or {}).get(str(drive.metadata["vehicle_id"]), {})
+            values = with_label.values(replace(drive.counts, numbers=told))
+            values = values[drive.counts.ticks % stride == 0]
+            parts.append(values[np.isfinite(values).all(axis=1)])
+            names.extend([drive.drive_id] * len(parts[-1]))
+    if not names:
+        raise DataError(
+            f"no row of {cohort.condition.text!r} has all of {', '.join(with_label.names)}."
+        )
+    order = np.argsort(np.array(names), kind="stable")
+    found = np.concatenate(parts)[order]
+    return Sample(inputs.names, found[:, :-1], found[:, -1], np.array(names)[order])

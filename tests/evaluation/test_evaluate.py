@@ -163,11 +163,15 @@ def test_rivals_run_on_the_same_drives(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("fleet_slip.rivals.compare.LEARNERS", LEARNERS[:1])
+    monkeypatch.setattr("fleet_slip.rivals.compare.OF_WINDOWS", LEARNERS[:1])
+    monkeypatch.setattr("fleet_slip.observers.tuning.LAST_FACTOR", 4.0)
     copy = tmp_path / "data"
     shutil.copytree(root, copy)
     content = call(copy, "evaluate", "--one-car", "smoke", "--scenario", "nominal", "--rivals")
     rivals = {rival["name"]: rival for rival in content["rivals"]}
-    assert set(rivals) <= set(content["scenarios"][0]["results"])
+    results = content["scenarios"][0]["results"]
+    assert set(rivals) <= set(results)
+    assert results["ekf_tree"]["rmse_deg"] < 2 * results["ekf_class_tuned"]["rmse_deg"]
     # The same signals and drives as model 4, and a sample of its rows instead of all of them.
     exact = content["estimators"]["smoke@1/4"]["cross_validated"]
     sampled = rivals["regression_8"]["cross_validated"]
