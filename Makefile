@@ -2,11 +2,13 @@
 # `make test` adds what the checks need, and passes every check that needs Python alone.
 # `make test-all` installs outside programs, such as a browser, and passes the checks that need them.
 # `make report` does what `make run` does, then writes ./data/report/report.html.
+# `make report MODEL=gated` adds hard driving, slippery roads and a fleet before, and tells of the model with gates: ten minutes.
 # `make docs` builds the pages as a site, ./site/index.html; a warning is an error.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 CAMPAIGN ?= waterford
+MODEL ?= $(CAMPAIGN)
 ROOT ?= data
 # Tests start the program hundreds of times: its compiled modules are kept, whatever the environment says.
 export PYTHONDONTWRITEBYTECODE :=
@@ -14,14 +16,25 @@ export PYTHONDONTWRITEBYTECODE :=
 # uv installs in seconds where it is there; pip comes with Python.
 INSTALL := $(if $(shell command -v uv),uv pip install --python $(BIN)/python,$(BIN)/python -m pip install)
 
-.PHONY: run report test test-all lint docs setup bench clean
+.PHONY: run report gated test test-all lint docs setup bench clean
 
 run: setup
 	$(BIN)/fleet-slip --root $(ROOT) run --campaign $(CAMPAIGN)
 
-report: run
-	$(BIN)/fleet-slip --root $(ROOT) evaluate --one-car $(CAMPAIGN)
-	$(BIN)/fleet-slip --root $(ROOT) report --model $(CAMPAIGN)
+report: run $(filter gated,$(MODEL))
+	$(BIN)/fleet-slip --root $(ROOT) evaluate --one-car $(MODEL)
+	$(BIN)/fleet-slip --root $(ROOT) report --model $(MODEL)
+
+gated: run
+	$(BIN)/fleet-slip --root $(ROOT) simulate proving_ground
+	$(BIN)/fleet-slip --root $(ROOT) simulate fleet --days 7
+	$(BIN)/fleet-slip --root $(ROOT) gram
+	$(BIN)/fleet-slip --root $(ROOT) gram --features gated --cohort "campaign IN ('waterford', 'proving_ground')"
+	$(BIN)/fleet-slip --root $(ROOT) gram --features calibration --cohort "campaign = 'fleet'"
+	$(BIN)/fleet-slip --root $(ROOT) gram --features fleet --cohort "campaign = 'fleet'"
+	$(BIN)/fleet-slip --root $(ROOT) show gated > /dev/null 2>&1 || \
+	$(BIN)/fleet-slip --root $(ROOT) publish gated --models gated --cohort "lost_control_s IS NULL AND track = 'waterford_hills' \
+	  AND (campaign = 'waterford' OR campaign = 'proving_ground' AND vehicle_model = 'd_class_sedan')"
 
 test: lint
 	$(BIN)/pytest -n 2

@@ -23,6 +23,7 @@ from fleet_slip.evaluation.runs import EvaluatedScenario, run_all
 from fleet_slip.evaluation.targets import THE_PAPERS_CHOICE
 from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.report.cars import Cars, weigh_cars
 from fleet_slip.report.coefficients import Coefficients, coefficient_table
 from fleet_slip.report.evaluated import Evaluated, latest_of
 from fleet_slip.report.histogram import Histogram, held_out_histogram
@@ -91,6 +92,7 @@ class ReportData:
         histogram: held-out estimates of all training rows by the paper's choice.
         ordering: what the order of the signals is worth.
         memory: what columns over time are worth; None if the model has none, or too many.
+        cars: what a car's own numbers are worth; None without a fleet in the data root.
         tables: of the warehouse.
         campaigns: of the drives that the model was trained on.
         configs: checksums of what determines the results.
@@ -105,6 +107,7 @@ class ReportData:
     histogram: Histogram
     ordering: Ordering
     memory: Memory | None
+    cars: Cars | None
     tables: tuple[TableSize, ...]
     campaigns: tuple[str, ...]
     configs: tuple[ConfigHash, ...]
@@ -148,6 +151,7 @@ def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
         memory=weigh_memory(own, manifest, trained.selection.folds, runs)
         if looks_back(manifest) and len(manifest.terms) <= MOST_TERMS
         else None,
+        cars=weigh_cars(warehouse),
         tables=_tables(warehouse),
         campaigns=tuple(sorted(set(cohort.drives["campaign"].to_pylist()))),
         configs=_configs(scenarios),

@@ -22,6 +22,9 @@ from fleet_slip.words import number_of
 
 TEMPLATES = files("fleet_slip.report") / "templates"
 
+SECTIONS = ("figure-", "memory-", "road-", "fleet-")
+"""What the keys of pictures begin with that have sections of their own."""
+
 
 @dataclass(frozen=True)
 class Drawn:
@@ -59,11 +62,10 @@ def render(data: ReportData, shown: Sequence[Picture]) -> str:
         version=data.version,
         evaluation=data.evaluated.document,
         paper=[one for one in drawn if one.picture.key.startswith("figure-")],
-        beyond=[
-            one for one in drawn if not one.picture.key.startswith(("figure-", "memory-", "road-"))
-        ],
+        beyond=[one for one in drawn if not one.picture.key.startswith(SECTIONS)],
         memory=[one for one in drawn if one.picture.key.startswith("memory-")],
         roads=[one for one in drawn if one.picture.key.startswith("road-")],
+        fleet=[one for one in drawn if one.picture.key.startswith("fleet-")],
         table_one=paper_tables.table_one(data),
         table_two=paper_tables.table_two(data),
         targets=list(paper_tables.targets(data)),

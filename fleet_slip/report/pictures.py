@@ -13,6 +13,7 @@ from fleet_slip.report.figures.lateral import error_by_acceleration
 from fleet_slip.report.figures.series import Block, Line, side_slip
 from fleet_slip.report.figures.speed import KMH_PER_MPS, speed
 from fleet_slip.report.figures.track_map import Map, error_map
+from fleet_slip.report.fleet_pictures import fleet_pictures
 from fleet_slip.report.histogram import Histogram
 from fleet_slip.report.memory_pictures import memory_pictures
 from fleet_slip.report.picture import Picture
@@ -34,6 +35,7 @@ def draw_pictures(data: ReportData) -> tuple[Picture, ...]:
         *_beyond_the_paper(data),
         *memory_pictures(data),
         *road_pictures(data),
+        *fleet_pictures(data.cars),
     )
 
 
