@@ -40,8 +40,8 @@ test: lint
 	$(BIN)/pytest -n 2
 
 test-all: $(VENV)/.dev-installed
-	-tests/tools/install
-	$(BIN)/pytest -n 2 -rs --tools
+	-PATH="$(abspath $(BIN)):$$PATH" tests/tools/install
+	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/pytest -n 2 -rs --tools
 
 lint: $(VENV)/.dev-installed
 	$(BIN)/ruff check .

@@ -13,6 +13,7 @@ from fleet_slip.export.checks_table import checks_csv
 from fleet_slip.export.compile import compile_program
 from fleet_slip.export.dbc import dbc_text
 from fleet_slip.export.document import document_of
+from fleet_slip.export.fmu import fmu
 from fleet_slip.export.program import Program
 from fleet_slip.export.sql_source import sql_macro, sql_statement
 from fleet_slip.models.model_version import ModelVersion
@@ -20,7 +21,7 @@ from fleet_slip.models.trained_drives import read_drives_file
 from fleet_slip.models.versions import Registry
 from fleet_slip.warehouse.tables import Warehouse
 
-Target = Literal["json", "c", "sql", "dbc", "onnx"]
+Target = Literal["json", "c", "sql", "dbc", "onnx", "fmu"]
 """What a version can be exported to."""
 
 
@@ -111,6 +112,15 @@ def _onnx(subject: Subject) -> dict[str, str | bytes]:
     }
 
 
+def _fmu(subject: Subject) -> dict[str, bytes]:
+    version, program = subject.version, subject.program
+    prefix, checks = c_prefix(version), checks_csv(program, subject.checks)
+    return {
+        f"{prefix}_fmi2.fmu": fmu(version, program, checks, 2),
+        f"{prefix}_fmi3.fmu": fmu(version, program, checks, 3),
+    }
+
+
 def render(content: Mapping[str, Any]) -> str:
     """Return a JSON document with a line for each of its parts, and for each tick."""
     return _rendered(content, 0) + "\n"
@@ -138,4 +148,5 @@ _WRITERS: dict[str, Callable[[Subject], Mapping[str, str | bytes]]] = {
     "sql": _sql,
     "dbc": _dbc,
     "onnx": _onnx,
+    "fmu": _fmu,
 }

@@ -1,0 +1,242 @@
+/* An exported estimator as an FMU for co-simulation, FMI 2.0.
+ *
+ * Types and functions as the standard defines them (fmi-standard.org, 2.0.4). */
+#include "fmi_instance.h"
+
+typedef enum { fmi2OK, fmi2Warning, fmi2Discard, fmi2Error, fmi2Fatal, fmi2Pending } fmi2Status;
+typedef void *fmi2Component;
+typedef const char *fmi2String;
+typedef unsigned int fmi2ValueReference;
+typedef int fmi2Boolean;
+typedef struct {
+    void (*logger)(void *, fmi2String, fmi2Status, fmi2String, fmi2String, ...);
+    void *(*allocateMemory)(size_t, size_t);
+    void (*freeMemory)(void *);
+    void (*stepFinished)(void *, fmi2Status);
+    void *componentEnvironment;
+} fmi2CallbackFunctions;
+
+#define REFERENCES fmi2Component c, const fmi2ValueReference references[], size_t many
+
+static fmi2Status told(bool good)
+{
+    return good ? fmi2OK : fmi2Error;
+}
+
+EXPORTED const char *fmi2GetTypesPlatform(void) { return "default"; }
+EXPORTED const char *fmi2GetVersion(void) { return "2.0"; }
+
+EXPORTED fmi2Status fmi2SetDebugLogging(fmi2Component c, fmi2Boolean on, size_t many,
+                                        const fmi2String categories[])
+{
+    (void)c; (void)on; (void)many; (void)categories;
+    return fmi2OK;
+}
+
+EXPORTED fmi2Component fmi2Instantiate(fmi2String name, int kind, fmi2String token,
+                                       fmi2String resources, const fmi2CallbackFunctions *functions,
+                                       fmi2Boolean visible, fmi2Boolean logging)
+{
+    (void)resources; (void)visible; (void)logging;
+    if ((kind != 1) || (token == NULL) || (strcmp(token, TOKEN) != 0)) {
+        if ((functions != NULL) && (functions->logger != NULL)) {
+            functions->logger(functions->componentEnvironment, name, fmi2Error, "error",
+                              "it is for co-simulation, and its GUID must be that of its files");
+        }
+        return NULL;
+    }
+    instance *one = malloc(sizeof *one);
+    if (one != NULL) {
+        clear(one);
+        begin(one);
+    }
+    return one;
+}
+
+EXPORTED void fmi2FreeInstance(fmi2Component c) { free(c); }
+
+EXPORTED fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean defined, double tolerance,
+                                        double start, fmi2Boolean stops, double stop)
+{
+    (void)c; (void)defined; (void)tolerance; (void)start; (void)stops; (void)stop;
+    return fmi2OK;
+}
+
+EXPORTED fmi2Status fmi2EnterInitializationMode(fmi2Component c) { (void)c; return fmi2OK; }
+EXPORTED fmi2Status fmi2ExitInitializationMode(fmi2Component c) { begin(c); return fmi2OK; }
+EXPORTED fmi2Status fmi2Terminate(fmi2Component c) { (void)c; return fmi2OK; }
+
+EXPORTED fmi2Status fmi2Reset(fmi2Component c)
+{
+    clear(c);
+    begin(c);
+    return fmi2OK;
+}
+
+EXPORTED fmi2Status fmi2GetReal(REFERENCES, double values[])
+{
+    bool good = true;
+    for (size_t i = 0U; i < many; i++) { good = get_real(c, references[i], &values[i]) && good; }
+    return told(good);
+}
+
+EXPORTED fmi2Status fmi2SetReal(REFERENCES, const double values[])
+{
+    bool good = true;
+    for (size_t i = 0U; i < many; i++) { good = set_real(c, references[i], values[i]) && good; }
+    return told(good);
+}
+
+EXPORTED fmi2Status fmi2GetInteger(REFERENCES, int values[])
+{
+    const instance *one = c;
+    for (size_t i = 0U; i < many; i++) {
+        if (!is_told(references[i])) { return fmi2Error; }
+        values[i] = one->told[references[i] - SIGNALS];
+    }
+    return fmi2OK;
+}
+
+EXPORTED fmi2Status fmi2SetInteger(REFERENCES, const int values[])
+{
+    instance *one = c;
+    for (size_t i = 0U; i < many; i++) {
+        if (!is_told(references[i])) { return fmi2Error; }
+        one->told[references[i] - SIGNALS] = values[i];
+    }
+    return fmi2OK;
+}
+
+EXPORTED fmi2Status fmi2GetBoolean(REFERENCES, fmi2Boolean values[])
+{
+    const instance *one = c;
+    for (size_t i = 0U; i < many; i++) {
+        if (references[i] != VALID_REFERENCE) { return fmi2Error; }
+        values[i] = one->valid ? 1 : 0;
+    }
+    return fmi2OK;
+}
+
+EXPORTED fmi2Status fmi2SetBoolean(REFERENCES, const fmi2Boolean values[])
+{
+    (void)c; (void)references; (void)values;
+    return told(many == 0U);
+}
+
+EXPORTED fmi2Status fmi2GetString(REFERENCES, fmi2String values[])
+{
+    (void)c; (void)references; (void)values;
+    return told(many == 0U);
+}
+
+EXPORTED fmi2Status fmi2SetString(REFERENCES, const fmi2String values[])
+{
+    (void)c; (void)references; (void)values;
+    return told(many == 0U);
+}
+
+EXPORTED fmi2Status fmi2GetFMUstate(fmi2Component c, void **state)
+{
+    if (*state == NULL) { *state = malloc(sizeof(instance)); }
+    if (*state == NULL) { return fmi2Error; }
+    (void)memcpy(*state, c, sizeof(instance));
+    return fmi2OK;
+}
+
+EXPORTED fmi2Status fmi2SetFMUstate(fmi2Component c, void *state)
+{
+    (void)memcpy(c, state, sizeof(instance));
+    return fmi2OK;
+}
+
+EXPORTED fmi2Status fmi2FreeFMUstate(fmi2Component c, void **state)
+{
+    (void)c;
+    free(*state);
+    *state = NULL;
+    return fmi2OK;
+}
+
+EXPORTED fmi2Status fmi2SerializedFMUstateSize(fmi2Component c, void *state, size_t *size)
+{
+    (void)c; (void)state;
+    *size = sizeof(instance);
+    return fmi2OK;
+}
+
+EXPORTED fmi2Status fmi2SerializeFMUstate(fmi2Component c, void *state, char bytes[], size_t size)
+{
+    (void)c;
+    if (size != sizeof(instance)) { return fmi2Error; }
+    (void)memcpy(bytes, state, size);
+    return fmi2OK;
+}
+
+EXPORTED fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const char bytes[], size_t size,
+                                            void **state)
+{
+    if (size != sizeof(instance)) { return fmi2Error; }
+    const fmi2Status made = fmi2GetFMUstate(c, state);
+    if (made == fmi2OK) { (void)memcpy(*state, bytes, size); }
+    return made;
+}
+
+EXPORTED fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReference of[],
+                                                 size_t many, const fmi2ValueReference by[],
+                                                 size_t more, const double by_values[],
+                                                 double values[])
+{
+    (void)c; (void)of; (void)many; (void)by; (void)more; (void)by_values; (void)values;
+    return fmi2Error;
+}
+
+EXPORTED fmi2Status fmi2SetRealInputDerivatives(REFERENCES, const int orders[],
+                                                const double values[])
+{
+    (void)c; (void)references; (void)many; (void)orders; (void)values;
+    return fmi2Error;
+}
+
+EXPORTED fmi2Status fmi2GetRealOutputDerivatives(REFERENCES, const int orders[], double values[])
+{
+    (void)c; (void)references; (void)many; (void)orders; (void)values;
+    return fmi2Error;
+}
+
+EXPORTED fmi2Status fmi2DoStep(fmi2Component c, double time, double step, fmi2Boolean keeps)
+{
+    (void)time; (void)keeps;
+    return told(advance(c, step));
+}
+
+EXPORTED fmi2Status fmi2CancelStep(fmi2Component c) { (void)c; return fmi2Error; }
+
+EXPORTED fmi2Status fmi2GetStatus(fmi2Component c, int kind, fmi2Status *value)
+{
+    (void)c; (void)kind; (void)value;
+    return fmi2Discard;
+}
+
+EXPORTED fmi2Status fmi2GetRealStatus(fmi2Component c, int kind, double *value)
+{
+    (void)c; (void)kind; (void)value;
+    return fmi2Discard;
+}
+
+EXPORTED fmi2Status fmi2GetIntegerStatus(fmi2Component c, int kind, int *value)
+{
+    (void)c; (void)kind; (void)value;
+    return fmi2Discard;
+}
+
+EXPORTED fmi2Status fmi2GetBooleanStatus(fmi2Component c, int kind, fmi2Boolean *value)
+{
+    (void)c; (void)kind; (void)value;
+    return fmi2Discard;
+}
+
+EXPORTED fmi2Status fmi2GetStringStatus(fmi2Component c, int kind, fmi2String *value)
+{
+    (void)c; (void)kind; (void)value;
+    return fmi2Discard;
+}
