@@ -4,7 +4,8 @@
 
 For each model: time of a C step over a drive of the logs (gcc -O2; the best of some rounds), bytes
 of its state, of its code and of its constants (-Os), of the stack of a step, time of a step of
-`fleet.estimator`, and samples a second of `predict`. Needs `cc` and `size`.
+`fleet.estimator`, and samples a second of `predict`. Needs `cc` and `size`. With
+`arm-none-eabi-gcc` and `qemu-system-arm`, also what it costs on a Cortex-M4.
 """
 
 import argparse
@@ -18,8 +19,10 @@ from pathlib import Path
 from typing import Any
 
 import fleet_slip
+from benchmarks.cortex_m import can_measure, measure_cortex_m
 from fleet_slip.export.c_source import c_header, c_prefix, c_source
 from fleet_slip.export.compile import compile_program
+from fleet_slip.export.files import export_files
 from fleet_slip.models.model_version import ModelVersion
 
 DRIVER = """
@@ -76,6 +79,10 @@ def measure(fleet: fleet_slip.Fleet, version: ModelVersion, seconds: float) -> d
     ).pl()
     with tempfile.TemporaryDirectory() as folder:
         board = in_c(Path(folder), fleet, version)
+        if can_measure():
+            files = export_files(version, fleet.warehouse, "c")
+            texts = {name: content.decode() for name, content in files.items()}
+            board["cortex_m4"] = measure_cortex_m(Path(folder), c_prefix(version), texts)
     estimator = fleet.estimator(version)
     rows = drive.select(estimator.columns).to_dicts()
     estimator.step(rows[0])

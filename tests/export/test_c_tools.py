@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.cortex_m import measure_cortex_m, run_self_test
 from fleet_slip.models.model_version import ModelVersion
 from tests.export.compiled import STRICT
 from tests.export.models import MODELS, export_texts, model_of
@@ -44,3 +45,37 @@ def test_it_keeps_the_rules_of_misra_but_those_that_are_listed(folder: Path) -> 
     told = run(folder, "cppcheck", *checks, "sideslip_any.c")
     broken = set(re.findall(r"\[(\S+)\]$", told, re.M))
     assert broken <= DEVIATIONS, told
+
+
+@pytest.mark.tools("arm-none-eabi-gcc", "qemu-system-arm")
+def test_the_self_test_passes_on_a_cortex_m(tmp_path: Path) -> None:
+    """Four columns with windows take less than 4 kB of code and 2 kB of memory."""
+    names = ("mean_3", "mean_5", "sum_4", "course")
+    manifest = model_of(dict.fromkeys(names, Fraction(1, 10**4)), Fraction(-1, 700), "any")
+    files = export_texts(ModelVersion(1, manifest, "0" * 64), None, "c")
+    found = measure_cortex_m(tmp_path, "sideslip_any", files)
+    assert run_self_test(tmp_path) == 0
+    assert found["with_divisions_of_64_bits_bytes"] < 4096
+    assert found["state_bytes"] + found["largest_frame_bytes"] < 2048
+    assert 100 < found["most_instructions"] < 3000
+
+
+@pytest.mark.tools("arm-none-eabi-gcc", "qemu-system-arm")
+def test_a_wrong_angle_is_noticed_on_a_cortex_m(folder: Path) -> None:
+    source = (folder / "sideslip_any.c").read_text()
+    files = {path.name: path.read_text() for path in folder.glob("*.[ch]")}
+    measure_cortex_m(folder, "sideslip_any", files)
+    files["sideslip_any.c"] = source.replace("high += (int64_t)", "high -= (int64_t)")
+    with pytest.raises(subprocess.CalledProcessError):
+        measure_cortex_m(folder, "sideslip_any", files)
+
+
+@pytest.mark.tools("clang")
+def test_libfuzzer_finds_nothing(folder: Path) -> None:
+    fuzzed = ("-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all", "-g", "-O1")
+    words = ("clang", *STRICT, *fuzzed, "sideslip_any.c", "sideslip_any_fuzz.c", "-o", "fuzz")
+    built = subprocess.run(words, cwd=folder, capture_output=True, text=True, check=False)
+    if "libclang_rt.fuzzer" in built.stderr:
+        pytest.skip("clang's runtime of libFuzzer is not here: apt-get install libclang-rt-14-dev")
+    assert built.returncode == 0, built.stderr
+    run(folder, "./fuzz", "-seed=1", "-runs=20000", "-max_len=4000", "-rss_limit_mb=512")
