@@ -6,6 +6,7 @@ import typer
 
 from fleet_slip.catalogue.sources import ALL_DRIVES
 from fleet_slip.cli.comparing import score_against
+from fleet_slip.cli.evaluation_summary import print_summary
 from fleet_slip.cli.evaluation_tables import print_evaluation
 from fleet_slip.cli.models import Reference
 from fleet_slip.cli.options import Cohort
@@ -92,11 +93,16 @@ def evaluate(
         ),
     ] = False,
     threads: Threads = None,
+    everything: Annotated[
+        bool,
+        typer.Option("--all", help="Print all estimators, sections and requirements."),
+    ] = False,
     json: Json = False,
 ) -> None:
     """Evaluate models on the paper's test drives and on others; simulates those that are missing.
 
-    The results are kept as a JSON document below evaluations/ in the data root.
+    Prints who wins each test drive; all of it with --all. The results are kept as a JSON document
+    below evaluations/ in the data root.
 
     Example: **fleet-slip evaluate --one-car waterford --scenario nominal**
     """
@@ -113,5 +119,8 @@ def evaluate(
     if json:
         print_json({"number": kept.number, "sha256": kept.sha256, **content})
     else:
-        print_evaluation(content)
+        if everything:
+            print_evaluation(content)
+        else:
+            print_summary(content, one_car)
         say(f"kept as evaluations/{kept.number}.json")

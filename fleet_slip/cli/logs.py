@@ -3,6 +3,7 @@
 import json
 import logging
 import sys
+import textwrap
 from datetime import UTC, datetime
 from enum import StrEnum
 from typing import Any
@@ -28,13 +29,28 @@ def stderr() -> Console:
     return Console(stderr=True, highlight=False, emoji=False, soft_wrap=True)
 
 
+def wrapped(text: str, width: int) -> str:
+    """Return text whose lines break between words; a line that is indented is kept to be copied."""
+    return "\n".join(
+        line
+        if len(line) <= width or line.startswith("  ")
+        else textwrap.fill(line, width, break_long_words=False, break_on_hyphens=False)
+        for line in text.split("\n")
+    )
+
+
 class PeopleHandler(logging.Handler):
-    """Prints remarks as they are. Events, which have figures and no sentence, are left out."""
+    """Prints remarks, on a terminal in lines that it can show.
+
+    Events, which have figures and no sentence, are left out.
+    """
 
     def emit(self, record: logging.LogRecord) -> None:
         """Print a remark."""
         if not hasattr(record, "event"):
-            stderr().print(printable(record.getMessage()), markup=False)
+            text, console = printable(record.getMessage()), stderr()
+            shown = wrapped(text, console.width) if console.is_terminal else text
+            console.print(shown, markup=False)
 
 
 class JsonHandler(logging.Handler):

@@ -10,10 +10,12 @@ from decimal import Decimal
 from typing import Annotated, Any
 
 import typer
+from rich.cells import cell_len
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from fleet_slip.cli.logs import wrapped
 from fleet_slip.errors import printable
 from fleet_slip.runs.log import LOGGER
 
@@ -59,22 +61,68 @@ def _for_json(value: Any) -> Any:
 
 
 def print_text(text: str) -> None:
-    """Print a line for people on stdout, as it is."""
+    """Print text for people on stdout; a terminal is shown lines that break between words."""
+    _print_lines(wrapped(text, stdout().width) if sys.stdout.isatty() else text)
+
+
+def _print_lines(text: str) -> None:
     print(text, flush=True)  # noqa: T201 - this is the one place that prints
 
 
 def print_table(
     title: str, header: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1
 ) -> None:
-    """Print a table; the first `left` columns are text, the others are numbers."""
-    table = Table(box=None, pad_edge=False, header_style="bold", show_header=any(header))
-    for i, name in enumerate(header):
-        table.add_column(name, justify="left" if i < left else "right", overflow="fold")
-    for row in rows:
-        table.add_row(*(Text(printable(cell)) for cell in row))
+    """Print a table; the first `left` columns are text, the others are numbers.
+
+    Words and numbers are never broken. Where a terminal is too narrow for that, every row becomes a
+    paragraph with a line for each column.
+    """
+    shown = [[printable(cell) for cell in row] for row in rows]
+    console = stdout()
+    widths = _fit_columns(header, shown, console.width)
+    if widths is None:
+        table = _paragraphs(header, shown)
+    else:
+        table = Table(box=None, pad_edge=False, header_style="bold", show_header=any(header))
+        for i, (name, width) in enumerate(zip(header, widths, strict=True)):
+            table.add_column(name, justify="left" if i < left else "right", width=width)
+        for row in shown:
+            table.add_row(*map(Text, row))
     if title:
         print_text(title)
-    console = stdout()
     with console.capture() as captured:
         console.print(table)
-    print_text("\n".join(line.rstrip() for line in captured.get().splitlines()))
+    _print_lines("\n".join(line.rstrip() for line in captured.get().splitlines()))
+
+
+GAP = 2
+"""Spaces between two columns."""
+
+
+def _fit_columns(
+    header: Sequence[str], rows: Sequence[Sequence[str]], width: int
+) -> list[int] | None:
+    """Return how wide each column is, none less than its longest word; None if they do not fit."""
+    columns = [[name, *(row[i] for row in rows)] for i, name in enumerate(header)]
+    wished = [max(map(cell_len, cells)) for cells in columns]
+    widths = [max((cell_len(w) for c in cells for w in c.split()), default=1) for cells in columns]
+    left = width - sum(widths) - GAP * (len(widths) - 1)
+    if left < 0:
+        return None
+    while left and widths != wished:
+        neediest = max(range(len(widths)), key=lambda i: wished[i] - widths[i])
+        widths[neediest] += 1
+        left -= 1
+    return widths
+
+
+def _paragraphs(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+    """Return a table of two columns: what a figure is called, and the figure."""
+    table = Table(box=None, pad_edge=False, show_header=False)
+    table.add_column(justify="left", style="bold", no_wrap=True)
+    table.add_column(justify="left", overflow="fold")
+    for row in rows:
+        for name, cell in zip(header, row, strict=True):
+            table.add_row(name, Text(cell))
+        table.add_row("", "")
+    return table

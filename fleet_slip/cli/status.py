@@ -1,10 +1,11 @@
 """The command that tells the warehouse's health."""
 
+import logging
 from typing import Annotated, Any
 
 import typer
 
-from fleet_slip.cli.output import Json, print_json, print_table
+from fleet_slip.cli.output import Json, print_json, print_table, say
 from fleet_slip.errors import AlarmError
 from fleet_slip.monitoring.status import WarehouseStatus
 from fleet_slip.words import number_of
@@ -30,7 +31,10 @@ def status(
     else:
         _print_status(found)
     if found.problems:
-        raise AlarmError("; ".join(found.problems))
+        for problem in found.problems:
+            say(f"- {problem}", logging.ERROR)
+        count = number_of(len(found.problems), "matter")
+        raise AlarmError(f"{count}, above, to be looked after.")
 
 
 def _print_status(found: WarehouseStatus) -> None:

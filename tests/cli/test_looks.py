@@ -1,0 +1,137 @@
+"""What a terminal of 80, 100 and 160 columns shows: no word is broken, and nothing is cut off."""
+
+import contextlib
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from rich.text import Text
+
+from fleet_slip.cli.evaluation_summary import print_summary
+from fleet_slip.cli.main import app
+from fleet_slip.cli.output import print_table, print_text
+from fleet_slip.errors import AlarmError
+
+Shown = Callable[..., list[str]]
+
+WIDTHS = [80, 100, 160]
+COMMANDS = [
+    "models",
+    "show smoke",
+    "select",
+    "select --all-subsets",
+    "select --nested ay,yaw_rate,ax",
+    "quality",
+    "status",
+    "features",
+    "config",
+    "diagnose smoke",
+]
+
+
+@pytest.fixture(params=WIDTHS)
+def shown(
+    request: pytest.FixtureRequest,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> Shown:
+    """Return the lines that a terminal shows of what a function prints."""
+
+    def look(show: Callable[[], object], columns: int = request.param) -> list[str]:
+        monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
+        monkeypatch.setenv("COLUMNS", str(columns))
+        show()
+        lines = Text.from_ansi(capsys.readouterr().out).plain.splitlines()
+        assert lines
+        assert [line for line in lines if len(line) > columns] == []
+        return lines
+
+    return look
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_word_is_whole(smoke_root: Path, shown: Shown, command: str) -> None:
+    def give() -> None:
+        words = ["--root", str(smoke_root), "--log", "text", *command.split()]
+        with contextlib.suppress(AlarmError):
+            app(words, standalone_mode=False)
+
+    words = {word for line in shown(give) for word in line.split()}
+    assert words <= {word for line in shown(give, 2000) for word in line.split()}
+
+
+HEADER = ["model", "signals", "drives", "RMSE deg"]
+ROWS = [["2", "ax ay yaw_rate steering_wheel", "96", "0.0735"], ["ours", "", "", "0.0302"]]
+
+
+def table(width: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> str:
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
+    monkeypatch.setenv("COLUMNS", str(width))
+    print_table("", HEADER, ROWS, left=2)
+    return Text.from_ansi(capsys.readouterr().out).plain
+
+
+def test_a_table_shrinks_between_words_and_then_becomes_paragraphs(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert (
+        table(80, monkeypatch, capsys)
+        == """\
+model  signals                        drives  RMSE deg
+2      ax ay yaw_rate steering_wheel      96    0.0735
+ours                                            0.0302
+"""
+    )
+    assert (
+        table(40, monkeypatch, capsys)
+        == """\
+                                    RMSE
+model  signals            drives     deg
+2      ax ay yaw_rate         96  0.0735
+       steering_wheel
+ours                              0.0302
+"""
+    )
+    assert table(30, monkeypatch, capsys).splitlines()[:6] == [
+        "model     2",
+        "signals   ax ay yaw_rate",
+        "          steering_wheel",
+        "drives    96",
+        "RMSE deg  0.0735",
+        "",
+    ]
+
+
+def test_prose_breaks_between_words_and_commands_do_not(shown: Shown) -> None:
+    lines = shown(lambda: print_text("a model of the fleet " * 20))
+    assert " ".join(lines).split() == ("a model of the fleet " * 20).split()
+
+
+def test_an_evaluation_is_a_screen(shown: Shown) -> None:
+    standing = {"scenario": "nominal", "winner": "ekf", "winner_rmse_deg": 0.1, "rmse_deg": 0.2}
+    ranking = {
+        "estimator": "ours@1",
+        "least_coverage": 0.99,
+        "close_ratio": 1.25,
+        "drives": 1,
+        "won": 0,
+        "close": 0,
+        "standings": [{**standing, "ratio": 2.0}],
+    }
+    result = {"rmse_deg": 0.2, "coverage": 0.35}
+    scenario = {
+        "name": "nominal",
+        "truth": {"sideslip_std_deg": 0.7},
+        "results": {"ours@1": result},
+    }
+    content = {
+        "ranking": ranking,
+        "scenarios": [scenario],
+        "checks": [{"reached": False}, {"reached": True}],
+    }
+    text = " ".join(" ".join(shown(lambda: print_summary(content, "ours"))).split())
+    assert "nominal ekf 0.100 0.200 2.00" in text
+    assert "furthest from it on nominal: 0.200 deg, where the side-slip varies by 0.70 deg" in text
+    assert "on part of the rows; estimated: nominal 35%." in text
+    assert "Of 2 requirements of the paper's scenarios, its own models miss 1." in text
+    assert "fleet-slip evaluate --one-car ours --all" in text
