@@ -119,10 +119,10 @@ def _fit_columns(
 def _paragraphs(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
     """Return a table of two columns: what a figure is called, and the figure."""
     table = Table(box=None, pad_edge=False, show_header=False)
-    table.add_column(justify="left", style="bold", no_wrap=True)
+    table.add_column(justify="left", no_wrap=True)
     table.add_column(justify="left", overflow="fold")
     for row in rows:
         for name, cell in zip(header, row, strict=True):
-            table.add_row(name, Text(cell))
+            table.add_row(Text(name, style="bold"), Text(cell))
         table.add_row("", "")
     return table
