@@ -248,8 +248,17 @@ class Serving(Rooted):
 
         return Estimator(self.resolve(model).manifest, car)
 
-    def export(self, model: str | ModelVersion, to: "Target", output: Path) -> list[Path]:
+    def export(
+        self,
+        model: str | ModelVersion,
+        to: "Target",
+        output: Path,
+        *,
+        with_gram: bool = False,
+    ) -> list[Path]:
         """Write a version as a program for elsewhere into a folder; return the files.
+
+        `with_gram` adds to C what counts Gram rows in the car, whose messages `receive` takes.
 
         Every export carries the version's checksum, the hash of the drives that made it, and
         checks: inputs, among them the first ticks of a drive of the logs, and the angles.
@@ -262,7 +271,7 @@ class Serving(Rooted):
         from fleet_slip.files.local_folder import LocalFolder
 
         folder = LocalFolder(output)
-        files = export_files(self.resolve(model), self.warehouse, to)
+        files = export_files(self.resolve(model), self.warehouse, to, with_gram=with_gram)
         for name, content in files.items():
             folder.put(name, content)
         return [output / name for name in files]

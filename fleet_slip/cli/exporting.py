@@ -17,13 +17,17 @@ def export(
     output: Annotated[
         Path, typer.Option(help="Folder to write into; files of the same names are replaced.")
     ] = Path(),
+    with_gram: Annotated[
+        bool,
+        typer.Option("--with-gram", help="With --to c: also what counts Gram rows in the car."),
+    ] = False,
     json: Json = False,
 ) -> None:
     """Write a version as a program for elsewhere, with checks: vectors of inputs and angles.
 
     Example: **fleet-slip export waterford --to c --output export**
     """
-    written = context.obj.export(reference, to, output)
+    written = context.obj.export(reference, to, output, with_gram=with_gram)
     if json:
         print_json({"files": [str(path) for path in written]})
         return

@@ -7,6 +7,7 @@ from typing import Any, Literal, get_args
 
 from fleet_slip.errors import ConfigError, UsageError
 from fleet_slip.export.c_checks import c_fuzz_target, c_self_test
+from fleet_slip.export.c_gram import c_gram_header, c_gram_source
 from fleet_slip.export.c_source import c_header, c_prefix, c_source
 from fleet_slip.export.checks import Check, make_checks
 from fleet_slip.export.checks_table import checks_csv
@@ -33,6 +34,7 @@ class Subject:
     program: Program
     checks: tuple[Check, ...]
     drives: bytes | None
+    with_gram: bool = False
 
     @property
     def stem(self) -> str:
@@ -40,8 +42,12 @@ class Subject:
         return f"{self.version.manifest.name}-{self.version.version}"
 
 
-def export_files(version: ModelVersion, warehouse: Warehouse | None, to: str) -> dict[str, bytes]:
+def export_files(
+    version: ModelVersion, warehouse: Warehouse | None, to: str, *, with_gram: bool = False
+) -> dict[str, bytes]:
     """Return the contents of an export by the names of their files.
+
+    `with_gram` adds to C what counts Gram rows in the car.
 
     The checks in it have the first ticks of a drive of the warehouse, if there is one. Raises
     `UsageError` for an unknown target, what `compile_program` raises, and `StorageError` if the
@@ -49,13 +55,15 @@ def export_files(version: ModelVersion, warehouse: Warehouse | None, to: str) ->
     """
     if to not in _WRITERS:
         raise UsageError(f"{to!r}: export to one of {', '.join(get_args(Target))}.")
+    if with_gram and to != "c":
+        raise UsageError("only an export to c can have Gram rows: --to c --with-gram.")
     program = compile_program(version.manifest)
     checks = make_checks(version.manifest, program, warehouse)
     drives = None
     if warehouse is not None:
         folder = Registry(warehouse.root / "models").folder_of(version.manifest.name)
         drives = read_drives_file(folder, version.manifest)
-    contents = _WRITERS[to](Subject(version, program, checks, drives))
+    contents = _WRITERS[to](Subject(version, program, checks, drives, with_gram))
     return {
         name: content.encode("utf-8") if isinstance(content, str) else content
         for name, content in contents.items()
@@ -70,11 +78,16 @@ def _json(subject: Subject) -> dict[str, str]:
 def _c(subject: Subject) -> dict[str, str]:
     version, program = subject.version, subject.program
     prefix = c_prefix(version)
+    gram = {
+        f"{prefix}_gram.h": c_gram_header(prefix),
+        f"{prefix}_gram.c": c_gram_source(prefix),
+    }
     return {
         f"{prefix}.h": c_header(version, program),
         f"{prefix}.c": c_source(version, program),
         f"{prefix}_test.c": c_self_test(version, program, subject.checks),
         f"{prefix}_fuzz.c": c_fuzz_target(version, program),
+        **(gram if subject.with_gram else {}),
     }
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.cortex_m import measure_cortex_m, run_self_test
+from fleet_slip.export.files import export_files
 from fleet_slip.models.model_version import ModelVersion
 from tests.export.compiled import STRICT
 from tests.export.models import MODELS, export_texts, model_of
@@ -20,8 +21,9 @@ docs/export.md says so."""
 @pytest.fixture(params=MODELS)
 def folder(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     manifest = model_of(MODELS[request.param], Fraction(-1, 700), "any")
-    for name, text in export_texts(ModelVersion(1, manifest, "0" * 64), None, "c").items():
-        (tmp_path / name).write_text(text)
+    version = ModelVersion(1, manifest, "0" * 64)
+    for name, text in export_files(version, None, "c", with_gram=True).items():
+        (tmp_path / name).write_bytes(text)
     return tmp_path
 
 
@@ -36,13 +38,14 @@ def run(folder: Path, *words: str) -> str:
 @pytest.mark.tools("clang")
 def test_clang_has_no_warning_and_the_self_test_passes(folder: Path) -> None:
     run(folder, "clang", *STRICT, "sideslip_any.c", "sideslip_any_test.c", "-o", "self_test")
+    run(folder, "clang", *STRICT, "-c", "sideslip_any_gram.c")
     assert "0 of 600 angles are wrong" in run(folder, "./self_test")
 
 
 @pytest.mark.tools("cppcheck")
 def test_it_keeps_the_rules_of_misra_but_those_that_are_listed(folder: Path) -> None:
     checks = ("--std=c99", "--addon=misra", "--enable=warning,style,portability", "-q")
-    told = run(folder, "cppcheck", *checks, "sideslip_any.c")
+    told = run(folder, "cppcheck", *checks, "sideslip_any.c", "sideslip_any_gram.c")
     broken = set(re.findall(r"\[(\S+)\]$", told, re.M))
     assert broken <= DEVIATIONS, told
 

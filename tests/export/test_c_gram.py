@@ -1,0 +1,172 @@
+"""Gram rows counted by exported C are those of the warehouse's job, bit for bit."""
+
+import struct
+import zlib
+from collections.abc import Sequence
+from fractions import Fraction
+from pathlib import Path
+from subprocess import run
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fleet_slip
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.errors import UsageError
+from fleet_slip.export.files import export_files
+from fleet_slip.grams.messages import Message, message_size, read_messages, signals_definition
+from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.regression.gram import Gram
+from tests.export.compiled import SANITIZED, can_sanitize, compile_c, needs_cc
+from tests.export.models import MODELS, model_of
+
+pytestmark = needs_cc
+
+SIGNALS = catalogue().gram_signals
+MISSING = -(2**15)
+
+DRIVER = """
+#include <stdio.h>
+#include "sideslip_any_gram.h"
+
+int main(void)
+{
+    static sideslip_any_gram gram;
+    static uint8_t message[SIDESLIP_ANY_GRAM_LONGEST_MESSAGE];
+    struct { uint8_t vehicle[16]; uint64_t start_s; uint64_t rows; } drive;
+    while (fread(&drive, sizeof drive, 1U, stdin) == 1U) {
+        sideslip_any_gram_start(&gram);
+        for (uint64_t i = 0U; i < drive.rows; i++) {
+            sideslip_any_gram_sample sample;
+            if (fread(&sample, sizeof sample, 1U, stdin) != 1U) { return 1; }
+            sideslip_any_gram_add(&gram, &sample);
+        }
+        uint32_t size = 0U;
+        uint32_t part = 0U;
+        do {
+            size = sideslip_any_gram_message(&gram, part, drive.vehicle, drive.start_s, message);
+            (void)fwrite(message, 1U, size, stdout);
+            part++;
+        } while (size > 0U);
+    }
+    return 0;
+}
+"""
+
+
+def build_counter(folder: Path, *options: str) -> Path:
+    """A program that reads drives and writes messages."""
+    version = ModelVersion(1, model_of(MODELS["signals"], name="any"), "0" * 64)
+    for name, content in export_files(version, None, "c", with_gram=True).items():
+        (folder / name).write_bytes(content)
+    (folder / "driver.c").write_text(DRIVER)
+    return compile_c(folder, ["sideslip_any_gram.c", "driver.c"], *options)
+
+
+@pytest.fixture(scope="module")
+def counter(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build_counter(tmp_path_factory.mktemp("counter"), "-O2")
+
+
+def count_drives(counter: Path, drives: Sequence[tuple[str, int, Any]]) -> bytes:
+    """The messages of drives: a car, when it began, and counts, shape (rows, signals)."""
+    given = b"".join(
+        struct.pack("<16sQQ", car.encode(), start_s, len(counts))
+        + np.asarray(counts, np.int16).tobytes()
+        for car, start_s, counts in drives
+    )
+    return run([counter], input=given, capture_output=True, check=True, timeout=60).stdout
+
+
+def parts_of(content: bytes) -> dict[tuple[str, ...], Gram]:
+    """The Grams of the messages of one drive, by signals."""
+    found = {}
+    for _, message in read_messages(content):
+        assert isinstance(message, Message)
+        names = tuple(name for i, name in enumerate(SIGNALS) if message.mask >> i & 1)
+        numbers = np.frombuffer(message.numbers, "<i8").tolist()
+        k = len(names)
+        found[names] = Gram(names, message.rows, tuple(numbers[:k]), tuple(numbers[k:]))
+    return found
+
+
+def test_simulated_drives_have_the_gram_rows_of_the_warehouse(
+    smoke_root: Path, counter: Path
+) -> None:
+    fleet = fleet_slip.open(smoke_root)
+    rows = (
+        fleet.sql("SELECT * FROM grams WHERE feature_set = 'signals' ORDER BY drive_id")
+        .to_arrow_table()
+        .to_pylist()
+    )
+    assert len(rows) > 3
+    for row in rows[:4]:
+        counts = fleet.sql(
+            f"SELECT {', '.join(SIGNALS)} FROM log_counts WHERE drive_id = '{row['drive_id']}'"
+        ).fetchnumpy()
+        drive = np.column_stack([np.ma.filled(counts[name], MISSING) for name in SIGNALS])
+        content = count_drives(counter, [("VIN1", 1_700_000_000, drive)])
+        names = tuple(row["signals"].split(","))
+        whole = Gram(names, row["n"], tuple(row["sums"]), tuple(row["products"]))
+        assert parts_of(content) == {names: whole}
+        assert len(content) == message_size(len(SIGNALS)) == 676
+
+
+def test_each_set_of_signals_has_a_message_and_extremes_are_exact(counter: Path) -> None:
+    random = np.random.default_rng(5)
+    counts = random.choice([-32767, 32767, 30000, -30000, 0, 1, -1], (5000, len(SIGNALS)))
+    limits = [(catalogue()[name].min_count, catalogue()[name].max_count) for name in SIGNALS]
+    low, high = (np.array(one) for one in zip(*limits, strict=True))
+    counts = np.clip(counts, low, high)
+    counts[:1000, 0] = MISSING
+    counts[1000:1500, [2, 5]] = MISSING
+    counts[1500:1600] = MISSING
+    content = count_drives(counter, [("VIN1", 7, counts)])
+    found = parts_of(content)
+    assert sum(one.n for one in found.values()) == 5000
+    for names, gram in found.items():
+        at = [SIGNALS.index(name) for name in names]
+        others = [i for i in range(len(SIGNALS)) if i not in at]
+        mine = np.all(counts[:, at] != MISSING, axis=1)
+        mine &= np.all(counts[:, others] == MISSING, axis=1)
+        assert gram == Gram.from_counts(names, counts[mine][:, at])
+    assert len(found) == 4
+
+
+def test_rows_of_more_sets_of_signals_are_counted_as_lost(counter: Path) -> None:
+    counts = np.zeros((60, len(SIGNALS)), np.int16)
+    for row in range(60):
+        counts[row, row % 6] = MISSING
+    messages = [m for _, m in read_messages(count_drives(counter, [("VIN1", 7, counts)]))]
+    assert [(m.rows, m.lost, m.place, m.parts) for m in messages if isinstance(m, Message)] == [
+        (10, 20, place, 4) for place in range(4)
+    ]
+
+
+def test_the_layout_is_what_the_page_says(counter: Path) -> None:
+    counts = np.ones((3, len(SIGNALS)), np.int16)
+    content = count_drives(counter, [("VIN-17", 1_700_000_000, counts)])
+    assert content[:8] == b"FSGR\x01\x00" + len(content).to_bytes(2, "little")
+    assert int.from_bytes(content[8:16], "little") == signals_definition()
+    assert content[16:32] == b"VIN-17".ljust(16, b"\0")
+    assert content[32:36] == b"\0\0\x01\0"
+    assert struct.unpack_from("<QIII", content, 36) == (1_700_000_000, 2**11 - 1, 3, 0)
+    assert set(np.frombuffer(content[56:-4], "<i8").tolist()) == {3}
+    assert zlib.crc32(content[:-4]) == int.from_bytes(content[-4:], "little")
+
+
+def test_nothing_overflows(tmp_path: Path) -> None:
+    if not can_sanitize(tmp_path):
+        pytest.skip("the compiler's sanitizers are not here")
+    sanitized = build_counter(tmp_path, *SANITIZED)
+    counts = np.random.default_rng(1).integers(-(2**15), 2**15, (3000, len(SIGNALS)))
+    assert count_drives(sanitized, [("VIN", 2**64 - 1, counts)])
+
+
+def test_gram_rows_go_with_c_alone() -> None:
+    version = ModelVersion(1, model_of(MODELS["signals"], Fraction(0), "any"), "0" * 64)
+    with pytest.raises(UsageError, match="--to c --with-gram"):
+        export_files(version, None, "json", with_gram=True)
+    names = [*export_files(version, None, "c", with_gram=True)]
+    assert names[-2:] == ["sideslip_any_gram.h", "sideslip_any_gram.c"]
