@@ -12,8 +12,9 @@ Numbers of a car come from all its drives, the tested ones too: they need no lab
 (`--cohort "day >= '2024-06-08'" --calibrated-by "day < '2024-06-08'"`), as they are on board.
 
 Rivals: the extended Kalman filter with the parameters of the car's class, with its true mass, and
-told everything (mass, tyres, adhesion), each also without the offsets that calibrate tells; a
-network, boosted trees and neuro-fuzzy rules on what the models get, on a sample of rows.
+told everything (mass, tyres, adhesion), each also without the offsets that calibrate tells, and
+without a state for its accelerometer's bias; a network, boosted trees and neuro-fuzzy rules on what
+the models get, on a sample of rows.
 """
 
 import argparse
@@ -122,6 +123,13 @@ CARS: Mapping[str, Callable[[DriveSpec], VehicleParameters]] = {
 }
 
 
+STATES: Mapping[str, ekf.EkfNoise] = {
+    "": ekf.EkfNoise(),
+    ", bias not in its state": ekf.EkfNoise(ay_bias_std_mps2=0.0),
+}
+"""A filter that estimates its accelerometer's bias itself needs nobody to tell it."""
+
+
 def without_offsets(signals: DriveSignals, found: Calibration, car: str) -> DriveSignals:
     numbers = found.cars.get(car, {})
     yaw_rate, ay = numbers.get("yaw_rate_offset"), numbers.get("ay_offset")
@@ -150,10 +158,11 @@ def errors_of_filters(
             truths.append(drive.sideslip_rad[moving])
             corrected = without_offsets(drive.signals, found, spec.vehicle_id)
             for name, make in CARS.items():
-                for how, signals in (("", drive.signals), (", without offsets", corrected)):
-                    angle = ekf.estimate(signals, make(spec), ekf.EkfNoise())
-                    error = (angle - drive.sideslip_rad)[moving]
-                    errors.setdefault(f"EKF told {name}{how}", []).append(error)
+                for state, noise in STATES.items():
+                    for how, signals in (("", drive.signals), (", without offsets", corrected)):
+                        angle = ekf.estimate(signals, make(spec), noise)
+                        error = (angle - drive.sideslip_rad)[moving]
+                        errors.setdefault(f"EKF told {name}{state}{how}", []).append(error)
     truth = np.concatenate(truths)
     for name, parts in errors.items():
         error = np.concatenate(parts)
