@@ -58,13 +58,26 @@ class Inputs:
 
     @classmethod
     def of_model(cls, manifest: Manifest, signals: Sequence[str]) -> "Inputs":
-        """Return logged signals, and then what a published model sees and they are not."""
+        """Return logged signals, and then what a published model sees and they are not.
+
+        Of a gated column, the column without its gate, and the counts of what opens the gate: the
+        product of both is what these learners make themselves.
+        """
         scales = {name: float(catalogue()[name].scale) for name in signals}
+        definitions: dict[str, Definition] = {}
         for term in manifest.terms:
-            scale = catalogue()[term.signal].scale if term.logged else term.scale
-            scales.setdefault(term.signal, float(scale))
+            scale = float(catalogue()[term.signal].scale if term.logged else term.scale)
+            one = term.definition
+            if one is None:
+                scales.setdefault(term.signal, scale)
+                continue
+            for part in one.parts:
+                if part not in definitions.values():
+                    name = term.signal if part == one else _name(part, scales)
+                    definitions[name] = part
+                    scales[name] = 1.0 if one.gate and part == one.gate.by else scale
         rows = {name: RowColumn(name, parse(sql)) for name, sql in manifest.features.items()}
-        return cls(scales, rows, manifest.definitions)
+        return cls(scales, rows, definitions)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -87,6 +100,12 @@ class Inputs:
         """
         scales = np.array(list(self.scales.values()))
         return np.asarray((self.columns.compute(drive) * scales[:, None]).T)
+
+
+def _name(column: Definition, taken: Mapping[str, float]) -> str:
+    """Return a name for a column that a model has behind a gate only."""
+    name = f"{column.of}_{column.over or 'now'}_{column.ticks}"
+    return name if name not in taken else f"{name}_{len(taken)}"
 
 
 @dataclass(frozen=True)

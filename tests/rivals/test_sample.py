@@ -5,9 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.columns import DriveCounts
+from fleet_slip.models.versions import Registry
 from fleet_slip.rivals.inputs import Inputs, LearnedEstimate
 from fleet_slip.rivals.learner import Fitted
 from fleet_slip.rivals.sample import draw_sample
@@ -74,3 +77,24 @@ def test_a_rival_sees_on_a_drive_what_it_was_trained_on(
     np.testing.assert_array_equal(
         estimate(signals)[::stride], sample.inputs[sample.drive_id == drive_id, 3]
     )
+
+
+def test_of_a_gated_model_a_rival_sees_columns_and_what_opens_the_gates(smoke_root: Path) -> None:
+    known = features()
+    manifest = Registry(LocalFolder(smoke_root / "models")).resolve("smoke").manifest
+    gated = [name for name in known.members("excess") if name.startswith("rear_ay_mean_16_")]
+    assert len(gated) > 2
+    first = manifest.terms[0]
+    terms = tuple(
+        first.model_copy(update={"signal": name, "definition": known.definition(name)})
+        for name in ("rear_ay_mean_16", *gated)
+    )
+    found = Inputs.of_model(manifest.model_copy(update={"terms": terms}), SIGNALS)
+    assert found.names == (*SIGNALS, "rear_ay_mean_16", "steering_excess_mean_32")
+    generator = np.random.default_rng(6)
+    counts = {name: generator.integers(2000, 6000, 40) for name in catalogue().inputs}
+    drive = DriveCounts(np.arange(40), counts)
+    alone = Inputs.of_catalogue(("rear_ay_mean_16", "steering_excess_mean_32"))
+    expected = alone.columns.compute(drive)
+    assert (np.ptp(expected, axis=1) > 0).all()
+    np.testing.assert_array_equal(found.columns.compute(drive)[2:], expected)
