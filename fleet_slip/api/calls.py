@@ -89,7 +89,7 @@ def count_from_start(show: ShowProgress | None) -> Progress:
 def open_workers(root: Folder, workers: Workers) -> Iterator[Executor]:
     """Yield the executor that `workers` means; one that is given is not closed.
 
-    Raises `ConfigError` if a cluster is wanted and Dask is not installed, and what
+    Raises `ExtraError` if a cluster is wanted and Dask is not installed, and what
     `cluster_executor` raises.
     """
     context: Any

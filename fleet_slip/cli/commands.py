@@ -61,6 +61,7 @@ GROUPS = {
     },
     "Operations": {
         "status": "status",
+        "doctor": "status",
         "quality": "operations",
         "calibrate": "calibrating",
         "monitor": "operations",

@@ -105,13 +105,13 @@ def _fit_columns(
     """Return how wide each column is, none less than its longest word; None if they do not fit."""
     columns = [[name, *(row[i] for row in rows)] for i, name in enumerate(header)]
     wished = [max(map(cell_len, cells)) for cells in columns]
-    widths = [max((cell_len(w) for c in cells for w in c.split()), default=1) for cells in columns]
+    widths = [max((cell_len(w) for c in cells for w in c.split()), default=0) for cells in columns]
     left = width - sum(widths) - GAP * (len(widths) - 1)
     if left < 0:
         return None
     while left and widths != wished:
-        neediest = max(range(len(widths)), key=lambda i: wished[i] - widths[i])
-        widths[neediest] += 1
+        wanting = [i for i in range(len(widths)) if widths[i] < wished[i]]
+        widths[min(wanting, key=widths.__getitem__)] += 1  # many narrow columns before a wide one
         left -= 1
     return widths
 

@@ -1,12 +1,15 @@
-"""The command that tells the warehouse's health."""
+"""Commands that tell the health of the warehouse, and of the machine: status, doctor."""
 
 import logging
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import typer
 
 from fleet_slip.cli.output import Json, print_json, print_table, say
+from fleet_slip.cli.workers import Cluster
 from fleet_slip.errors import AlarmError
+from fleet_slip.monitoring.fitness import Fitness
 from fleet_slip.monitoring.status import WarehouseStatus
 from fleet_slip.words import number_of
 
@@ -30,11 +33,32 @@ def status(
         print_json(found)
     else:
         _print_status(found)
-    if found.problems:
-        for problem in found.problems:
-            say(f"- {problem}", logging.ERROR)
-        count = number_of(len(found.problems), "matter")
-        raise AlarmError(f"{count}, above, to be looked after.")
+    _complain(found.problems)
+
+
+def doctor(context: typer.Context, cluster: Cluster = None, json: Json = False) -> None:
+    """Tell whether this machine, the data root and a cluster are fit for the work.
+
+    Writes a probe of a few bytes to the data root, and deletes it. Exit code 10 if something is not
+    fit; an extra that is not installed is no fault.
+
+    Example: **fleet-slip --root s3://BUCKET/PATH doctor**
+    """
+    found: Fitness = context.obj.examine(cluster)
+    if json:
+        print_json(found)
+    else:
+        rows = [[one.subject, "" if one.fit else "not fit", one.found] for one in found.examined]
+        print_table("", ["", "", "found"], rows, left=3)
+    _complain(found.problems)
+
+
+def _complain(problems: Sequence[str]) -> None:
+    """Say what calls for attention, a line each, if anything does."""
+    for problem in problems:
+        say(f"- {problem}", logging.ERROR)
+    if problems:
+        raise AlarmError(f"{number_of(len(problems), 'matter')}, above, to be looked after.")
 
 
 def _print_status(found: WarehouseStatus) -> None:

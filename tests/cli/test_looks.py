@@ -85,9 +85,8 @@ ours                                            0.0302
     assert (
         table(40, monkeypatch, capsys)
         == """\
-                                    RMSE
-model  signals            drives     deg
-2      ax ay yaw_rate         96  0.0735
+model  signals          drives  RMSE deg
+2      ax ay yaw_rate       96    0.0735
        steering_wheel
 ours                              0.0302
 """

@@ -1,0 +1,178 @@
+"""Whether this machine, a data root and a cluster are fit for the work."""
+
+import contextlib
+import os
+import resource
+import sys
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, metadata, version
+from typing import Any
+
+from fleet_slip.errors import FleetSlipError, StorageError
+from fleet_slip.files.folder import TEMPORARY_PREFIX, Folder
+from fleet_slip.limits import OPEN_FILES, memory_bytes
+
+MEMORY_BYTES = 2**30
+"""The largest command that was measured, `verify` of files of a million rows, takes 828 MiB."""
+FILES_WISHED = 1024
+DISK_BYTES = 10**9
+CLOCK_S = 60.0
+"""A clock that is so far from the store's makes files younger or older than they are."""
+
+
+@dataclass(frozen=True)
+class Examined:
+    """One thing that was looked at: what was found, and what to do if it is not fit."""
+
+    subject: str
+    found: str
+    advice: str = ""
+
+    @property
+    def fit(self) -> bool:
+        """Whether nothing has to be done."""
+        return not self.advice
+
+
+@dataclass(frozen=True)
+class Fitness:
+    """All that was looked at."""
+
+    examined: tuple[Examined, ...]
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """What is not fit, with what to do about it."""
+        return tuple(f"{one.subject}: {one.advice}" for one in self.examined if not one.fit)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `doctor --json` prints."""
+        return {"examined": [{**vars(one), "fit": one.fit} for one in self.examined]}
+
+
+def examine(root: Folder, count_workers: Callable[[], int] | None = None) -> Fitness:
+    """Look at the machine, at the data root and, where one is asked for, at a cluster.
+
+    A probe of a few bytes is written to the root and deleted again. What fails is a finding;
+    nothing is raised.
+    """
+    found = [*_machine(), _compiled_code(), *_root(root)]
+    if count_workers is not None:
+        found.append(_cluster(count_workers))
+    return Fitness((*found, *_extras()))
+
+
+def _machine() -> Iterator[Examined]:
+    yield Examined("Python", ".".join(map(str, sys.version_info[:3])))
+    yield Examined("processors", str(len(os.sched_getaffinity(0))))
+    memory = memory_bytes()
+    yield Examined(
+        "memory",
+        f"{memory / 2**30:.1f} GiB",
+        "" if memory >= MEMORY_BYTES else "give the process 1 GiB, which large commands take.",
+    )
+    files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    few = files != resource.RLIM_INFINITY and files < FILES_WISHED
+    yield Examined(
+        "open files",
+        f"{files:,}" if files != resource.RLIM_INFINITY else "no limit",
+        f"{OPEN_FILES} are needed; raise the limit: ulimit -n {FILES_WISHED}" if few else "",
+    )
+
+
+def _compiled_code() -> Examined:
+    subject = "folder of compiled code"
+    try:
+        from fleet_slip.kept_code import find_folder  # noqa: PLC0415 - of the extra
+    except ModuleNotFoundError:
+        return Examined(subject, "nothing is compiled: the extra `compiled` is not installed")
+    folder = find_folder()
+    if folder is None:
+        return Examined(
+            subject,
+            "none",
+            "every process compiles anew, for seconds. Set NUMBA_CACHE_DIR to a folder that this "
+            "user alone can write.",
+        )
+    return Examined(subject, folder)
+
+
+def _root(root: Folder) -> Iterator[Examined]:
+    subject = f"data root {root}"
+    try:
+        skew = _probe(root)
+    except FleetSlipError as error:
+        yield Examined(subject, "not usable", str(error))
+        return
+    yield Examined(subject, "files can be made once, read, listed and deleted")
+    yield Examined(
+        "clock",
+        f"{abs(skew):.0f} s from that of the data root",
+        "" if abs(skew) <= CLOCK_S else "set the clock of this machine, or of the store.",
+    )
+    disk = root.free_bytes()
+    if disk is not None:
+        free, size = disk
+        yield Examined(
+            "disk",
+            f"{free / 1e9:,.1f} of {size / 1e9:,.1f} GB are free",
+            "" if free >= DISK_BYTES else "make room: a full disk stops every job.",
+        )
+
+
+def _probe(root: Folder) -> float:
+    """Do what jobs do; return how far this machine's clock is before the root's, s."""
+    path, content = f"{TEMPORARY_PREFIX}doctor-{uuid.uuid4().hex}", os.urandom(64)
+    began = time.time()
+    try:
+        if not root.create(path, content) or root.create(path, b"other"):
+            raise StorageError("it does not keep a file from being made twice: commits get lost.")
+        if root.read(path) != content:
+            raise StorageError("what was written is not what is read.")
+        mine = [file for file in root.files() if file.path == path]
+        if not mine:
+            raise StorageError("a file that was written is not listed.")
+    finally:
+        with contextlib.suppress(FleetSlipError):
+            root.delete(path)
+    return began - mine[0].modified_ns / 1e9
+
+
+def _cluster(count_workers: Callable[[], int]) -> Examined:
+    try:
+        workers = count_workers()
+    except FleetSlipError as error:
+        return Examined("cluster", "not usable", str(error))
+    none = "start workers: docs/cluster.md"
+    return Examined("cluster", f"{workers} workers, of this version", "" if workers else none)
+
+
+def _extras() -> Iterator[Examined]:
+    """Yield which optional parts are installed; that one is missing is no problem."""
+    about = metadata("fleet-slip")
+    for extra in about.get_all("Provides-Extra") or ():
+        packages = [
+            line.partition(";")[0].strip()
+            for line in about.get_all("Requires-Dist") or ()
+            if f"extra == '{extra}'" in line
+        ]
+        names = [_name(package) for package in packages]
+        absent = [name for name in names if not _is_installed(name)]
+        found = "installed" if not absent else f"not installed: {', '.join(absent)}"
+        yield Examined(f"extra {extra}", found)
+
+
+def _name(requirement: str) -> str:
+    end = next((i for i, c in enumerate(requirement) if not (c.isalnum() or c in "-_.")), None)
+    return requirement[:end]
+
+
+def _is_installed(package: str) -> bool:
+    try:
+        version(package)
+    except PackageNotFoundError:
+        return False
+    return True
