@@ -21,8 +21,9 @@ from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.fold_sums import sum_cohort
 from fleet_slip.grams.reader import GramReader
 from fleet_slip.regression.exact import fit
+from fleet_slip.selection.answer import answer_request
 from fleet_slip.selection.model_list import load_model_list
-from fleet_slip.selection.request import SelectionRequest, answer_request
+from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.warehouse.tables import Warehouse
 
 ROUNDS = 7

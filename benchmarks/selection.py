@@ -20,7 +20,8 @@ from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.delta import Change
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.selection.request import SelectionRequest, answer_request
+from fleet_slip.selection.answer import answer_request
+from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.warehouse.tables import Warehouse
 
 DRIVES_PER_FILE = 500

@@ -95,7 +95,7 @@ def orders(training: Training, fold: IntArray) -> None:
     figure, axes = plt.subplots(figsize=(6.4, 3.4))
     for name in RANKINGS:
         order = rank(name, total, NINE, LABEL)
-        models = cross_validate_nested(training.folds, order, LABEL, SCALES)
+        models = cross_validate_nested(training, order, LABEL)
         print(f"  {name:<17} {' '.join(order)}")
         if name in {"declared", "correlation", "backward", "lars"}:
             rmse = [model.pooled.rmse_deg for model in models]
@@ -143,7 +143,7 @@ def uncertainty(training: Training, fold: IntArray) -> None:
     print(" ", percentile_interval(bootstrap_correlations(products, 1000, seed=1)))
     repeated = repeated_cross_validation(training.drives, 5, 100, seed=1)
     print(f"  100 repeats: {repeated.mean:.5f} +- {repeated.spread:.5f}")
-    final = cross_validate_nested(folds, NINE, LABEL, SCALES)[-1]
+    final = cross_validate_nested(training, NINE, LABEL)[-1]
     for factor in (0, 1, 2):
         noise = {"ax": 0.1 * factor, "ay": 0.1 * factor, "yaw_rate": 0.01 * factor}
         after = disturb(final.sums, final.counts, SCALES, noise=noise).figures(SCALES[LABEL])

@@ -53,6 +53,7 @@ class FleetCohort(Rooted):
         all_subsets: bool = False,
         naive: bool = False,
         cluster: "ClusterUnit | None" = None,
+        intercept: bool = True,
         search: str | None = None,
         most: int | None = None,
         bootstrap: int | None = None,
@@ -77,6 +78,7 @@ class FleetCohort(Rooted):
             naive: take rows for independent evidence, not drives or cars.
             cluster: what is independent evidence, `vehicle` or `drive`; by default cars where there
                 are several.
+            intercept: whether models have one; without it they go through the origin.
             search: search among the inputs of `nested`, or all, in every fold, as by `exchange`.
             most: the most columns of `search`.
             bootstrap: draw the drives so many times for an interval of the winner's correlation.
@@ -85,7 +87,8 @@ class FleetCohort(Rooted):
         Raises `UsageError` for options that do not go together or a list that is not valid, and
         `DataError` if no model can be fitted.
         """
-        from fleet_slip.selection.request import SelectionRequest, answer_request
+        from fleet_slip.selection.answer import answer_request
+        from fleet_slip.selection.request import SelectionRequest
 
         request = SelectionRequest(
             cohort=self.condition,
@@ -101,6 +104,7 @@ class FleetCohort(Rooted):
             all_subsets=all_subsets,
             naive=naive,
             cluster=cluster,
+            intercept=intercept,
             search=search,
             most=most,
             bootstrap=bootstrap,
@@ -147,6 +151,7 @@ class FleetCohort(Rooted):
             against=self._load(examined.feature_set, against) if against else None,
             sensor_noise=sensor_noise,
             cluster=cluster,
+            intercept=examined.intercept,
         )
 
     def what_if(
@@ -184,7 +189,9 @@ class FleetCohort(Rooted):
         else:
             inputs = examined.inputs(cohort)
             one = fit(cohort.serving(inputs).table.total(), inputs, catalogue().label).model
-        return what_if(cohort, one, bias=bias or {}, noise=noise or {})
+        return what_if(
+            cohort, one, bias=bias or {}, noise=noise or {}, intercept=examined.intercept
+        )
 
     def regimes(
         self,
@@ -194,21 +201,25 @@ class FleetCohort(Rooted):
         features: str = "regimes",
         by: "FoldKey" = "drive",
         folds: int | str | None = None,
+        worth: str = "0.005deg",
     ) -> "RegimeComparison":
         """Return a model's error by speed and lateral acceleration, and whether to split it there.
 
         One model for all rows is cross-validated against one for each regime. `signals` are inputs
         separated by commas, by default all; `over` the regimes to divide by, by default all of the
-        feature set `features`, whose Gram rows `fleet.gram("regimes")` makes.
+        feature set `features`, whose Gram rows `fleet.gram("regimes")` makes; `worth` the smallest
+        gain in RMSE for which a split is advised, as in `select`.
 
         Raises `DataError` for a feature set without such regimes.
         """
+        from fleet_slip.selection.inputs import WHOLE_SET, inputs_of
         from fleet_slip.selection.regimes import compare_regimes
-        from fleet_slip.selection.request import WHOLE_SET, inputs_of
+        from fleet_slip.selection.worth import parse_worth
 
+        gain = parse_worth(worth)
         folding, cohort = _folding(by, folds), self._load(features)
         inputs = inputs_of(cohort, signals or WHOLE_SET)
-        return compare_regimes(cohort, inputs, folding, over)
+        return compare_regimes(cohort, inputs, folding, over, gain)
 
     def shrink(
         self,
@@ -226,7 +237,7 @@ class FleetCohort(Rooted):
         the feature set `features` separated by commas, by default all; with `naive` rows are
         independent evidence, else what `cluster` says, as in `select`.
         """
-        from fleet_slip.selection.request import WHOLE_SET, inputs_of
+        from fleet_slip.selection.inputs import WHOLE_SET, inputs_of
         from fleet_slip.selection.shrinkage import compare_shrinkage
 
         folding, cohort = _folding(by, folds), self._load(features)

@@ -8,7 +8,7 @@ from fleet_slip.errors import QuestionError, UsageError
 from fleet_slip.grams.cohort import Cohort
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.versions import Registry
-from fleet_slip.selection.request import WHOLE_SET, inputs_of
+from fleet_slip.selection.inputs import WHOLE_SET, inputs_of
 
 
 @dataclass(frozen=True)
@@ -18,6 +18,11 @@ class Examined:
     feature_set: str
     named: str | None
     version: ModelVersion | None
+
+    @property
+    def intercept(self) -> bool:
+        """Whether the model has one; inputs that are named alone have."""
+        return self.version is None or not self.version.manifest.through_origin
 
     def inputs(self, cohort: Cohort) -> tuple[str, ...]:
         """Return the inputs; all that the cohort has, if that was asked for."""

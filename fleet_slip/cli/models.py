@@ -151,11 +151,15 @@ def _print_version(version: ModelVersion) -> None:
     manifest = version.manifest
     figures, trained = manifest.cross_validation, manifest.trained_on
     label = manifest.label
+    constant = [["intercept", label.unit, repr(manifest.intercept), ""]]
     print_table(
-        f"{version.reference}: {label.column} = intercept + sum of coefficient * signal",
+        f"{version.reference}: {label.column} = "
+        + ("" if manifest.through_origin else "intercept + ")
+        + "sum of coefficient * signal"
+        + (", through the origin" if manifest.through_origin else ""),
         ["signal", "unit", "coefficient", "per count"],
         [
-            ["intercept", label.unit, repr(manifest.intercept), ""],
+            *([] if manifest.through_origin else constant),
             *(
                 [
                     term.column,

@@ -76,6 +76,10 @@ SELECTION: dict[str, Any] = {
         "tyres, or drive. Default: vehicle where there are several, else drive.",
         show_default=False,
     ),
+    "intercept": typer.Option(
+        help="Whether models have an intercept. Without it they go through the origin: a car that "
+        "drives straight on then has no side-slip, and no sensor an offset."
+    ),
     "search": typer.Option(
         "--search",
         help=f"Search among the inputs of --nested, or all: {', '.join(METHODS)}; the search is "

@@ -13,7 +13,8 @@ from fleet_slip.cli.options import selection_options
 from fleet_slip.cli.output import Json, print_json, print_table, say, stdout
 from fleet_slip.grams.folding import BANDS, PARTS, ROW_FOLDS
 from fleet_slip.regression.crossval import CrossValidation
-from fleet_slip.regression.nested_choice import CROSS_VALIDATION, NestedChoice
+from fleet_slip.regression.evidence import Evidence
+from fleet_slip.regression.nested_choice import CROSS_VALIDATION, NestedChoice, NestedDistances
 from fleet_slip.selection.compare import Selection
 from fleet_slip.selection.request import RequestedSelection, SelectionRequest
 from fleet_slip.selection.search import SearchChoice
@@ -22,6 +23,8 @@ from fleet_slip.words import number_of
 
 MANY_SIGNALS = 30
 """Of more, a table names families."""
+
+DISTANCES = ("contribution A", "D to full", "expected D")
 
 FIGURES = ("drives", "correlation", "RMSE deg", "mean deg", "std deg", "condition")
 
@@ -58,11 +61,14 @@ def print_selection(selection: Selection[Any]) -> None:
     listed = selection.choice is None
     if selection.choice is not None:
         _print_choice(selection.choice)
+    if isinstance(selection.distances, NestedDistances):
+        _print_distances(selection.distances)
     print_table(
         f"{number_of(selection.cohort.drive_count, 'drive')}, "
         f"{number_of(selection.cohort.rows, 'row')}"
         + ("" if where == TRAINING_DRIVES else f" where {where}")
-        + f"; {number_of(len(selection.models[0].folds), 'fold')} by {selection.folds.by}",
+        + f"; {number_of(len(selection.models[0].folds), 'fold')} by {selection.folds.by}"
+        + ("" if selection.intercept else "; no intercept"),
         ["model", *(["signals"] if listed else []), *FIGURES],
         [
             [model.name, *([_columns_of(model, selection)] if listed else []), *_figures(model)]
@@ -77,6 +83,8 @@ def print_selection(selection: Selection[Any]) -> None:
             "folds of rows leak: each test row's neighbours at 100 Hz are training rows, so that "
             "these figures are those of the fit, not of prediction. Compare with --by drive."
         )
+    if isinstance(selection.distances, str):
+        say(f"the distances of the nested models cannot be told: {selection.distances}")
     for name, reason in selection.skipped.items():
         say(f"model {name} was left out: {reason}")
     stdout().print(
@@ -141,16 +149,29 @@ def _figures(model: CrossValidation) -> list[str]:
     ]
 
 
-def _print_choice(choice: SearchChoice) -> None:
-    worth = (
-        f"taking {choice.evidence.kind} for independent, the cohort is worth "
-        f"{choice.evidence.rows:,.0f} rows"
+def _worth(evidence: Evidence) -> str:
+    return f"taking {evidence.kind} for independent, the cohort is worth {evidence.rows:,.0f} rows"
+
+
+def _print_distances(found: NestedDistances) -> None:
+    print_table(
+        f"distance D of equation (2) by the number of signals; {_worth(found.evidence)}",
+        ["", "added", *DISTANCES],
+        _distance_rows(found.order, found.evidence),
+        left=2,
     )
+    stdout().print(
+        f"without any signal: RMSE {found.null.pooled.rmse_deg:.4f} deg.\n", markup=False
+    )
+
+
+def _print_choice(choice: SearchChoice) -> None:
+    worth = _worth(choice.evidence)
     if choice.nested is not None:
         nested = choice.nested
         print_table(
             f"order by {choice.rule.ranking}; {worth}",
-            ["", "added", "contribution A", "D to full", "expected D", _criterion_name(choice)],
+            ["", "added", *DISTANCES, _criterion_name(choice)],
             _order_rows(nested),
             left=2,
         )
@@ -179,19 +200,24 @@ def _criterion_name(choice: SearchChoice) -> str:
 
 
 def _order_rows(nested: NestedChoice) -> Iterator[list[str]]:
-    """Return a line for each of the k+1 models, the empty one first.
+    """Return a line for each of the k+1 models, with the criterion's value."""
+    lines = _distance_rows(nested.order, nested.evidence)
+    for j, (line, value) in enumerate(zip(lines, nested.values, strict=True)):
+        mark = " <" if j == nested.size else "  "
+        yield [*line, f"{value:,.4f}{mark}"]
+
+
+def _distance_rows(order: Sequence[str], evidence: Evidence) -> Iterator[list[str]]:
+    """Return a line for each of the k+1 models of an order, the empty one first.
 
     The distance D is that of the paper's equation (2), in units of the noise: from the full model,
     and as it is to be expected from the true one.
     """
-    evidence = nested.evidence
-    columns = zip(nested.values, evidence.excess(), evidence.distances(), strict=True)
-    for j, (value, to_full, expected) in enumerate(columns):
-        added = nested.order[j - 1] if j else "(none)"
+    columns = zip(evidence.excess(), evidence.distances(), strict=True)
+    for j, (to_full, expected) in enumerate(columns):
+        added = order[j - 1] if j else "(none)"
         contribution = f"{evidence.contributions[j - 1]:,.1f}" if j else ""
-        mark = " <" if j == nested.size else "  "
-        figures = [contribution, f"{to_full:,.1f}", f"{expected:,.1f}"]
-        yield [str(j), added, *figures, f"{value:,.4f}{mark}"]
+        yield [str(j), added, contribution, f"{to_full:,.1f}", f"{expected:,.1f}"]
 
 
 def _print_honest(honest: CrossValidation) -> None:

@@ -1,5 +1,6 @@
 """Commands that examine models on Gram rows: features, what-if, regimes, shrink."""
 
+import math
 from typing import Annotated
 
 import typer
@@ -9,7 +10,7 @@ from fleet_slip.catalogue.feature_sets import PLAIN, FeatureSet
 from fleet_slip.catalogue.features import column_query
 from fleet_slip.catalogue.features import features as known_features
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.cli.options import Cluster, Cohort, FoldCount, Naive
+from fleet_slip.cli.options import Cluster, Cohort, FoldCount, Naive, Worth
 from fleet_slip.cli.output import Json, print_json, print_table, stdout
 from fleet_slip.cli.subject import FeatureSetOption, Model, Signals, quantities
 from fleet_slip.grams.folding import FoldKey
@@ -17,6 +18,7 @@ from fleet_slip.regression.figures import Figures
 from fleet_slip.regression.inference import INTERCEPT
 from fleet_slip.selection.regimes import RegimeComparison
 from fleet_slip.selection.what_if import WhatIf
+from fleet_slip.selection.worth import WORTH
 from fleet_slip.words import number_of
 
 By = Annotated[FoldKey, typer.Option(help="What a fold is made of.")]
@@ -192,6 +194,7 @@ def regimes(
     ] = "regimes",
     by: By = "drive",
     folds: FoldCount = None,
+    worth: Worth = WORTH,
     json: Json = False,
 ) -> None:
     """Show a model's error by speed and lateral acceleration, and whether to split it there.
@@ -203,7 +206,7 @@ def regimes(
     """
     divided_by = [name.strip() for name in over.split(",")] if over else []
     result = _cohort(context, cohort).regimes(
-        signals, over=divided_by, features=feature_set, by=by, folds=folds
+        signals, over=divided_by, features=feature_set, by=by, folds=folds, worth=worth
     )
     if json:
         print_json({"cohort": cohort, **result.as_dict()})
@@ -234,8 +237,11 @@ def _print_regimes(result: RegimeComparison, by: str) -> None:
     better = "a model for each regime" if result.split_wins else "one model for all"
     stdout().print(
         f"one model: correlation {one.correlation:.4f}, RMSE {one.rmse_deg:.4f} deg; one for each "
-        f"regime: {own.correlation:.4f}, {own.rmse_deg:.4f} deg. Gain in correlation over the "
-        f"folds: {result.gain:+.4f} +- {result.gain_standard_error:.4f}. Choose {better}.",
+        f"regime: {own.correlation:.4f}, {own.rmse_deg:.4f} deg. Over the folds, splitting adds "
+        f"{result.gain:+.4f} +- {result.gain_standard_error:.4f} to the correlation and takes "
+        f"{math.degrees(result.rmse_gain):.4f} +- "
+        f"{math.degrees(result.rmse_gain_standard_error):.4f} deg from the RMSE; worth having is "
+        f"{result.worth}. Choose {better}.",
         markup=False,
     )
 

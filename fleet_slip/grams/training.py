@@ -39,21 +39,26 @@ class DriveFolds:
 
 
 def clustered_moments(
-    served: Served, cluster: ClusterUnit | None = None, cars: Sequence[str] = ()
+    served: Served,
+    cluster: ClusterUnit | None = None,
+    cars: Sequence[str] = (),
+    *,
+    intercept: bool = True,
 ) -> DriveMoments:
     """Return the moments of each drive, and which of them are one piece of evidence.
 
     By default the coarser there is: cars where there are several, else drives. Clusters are
     numbered by their place among `cars`, by default those of these drives, so that two cohorts can
-    share them.
+    share them. For fits without an intercept the moments are about zero.
     """
+    table = served.table if intercept else served.table.about_origin()
     owners = served.drives["vehicle_id"].to_pylist()
     cars = cars or owners
     if (cluster or ("vehicle" if len(set(cars)) > 1 else "drive")) == "drive":
-        return DriveMoments.of(served.table)
+        return DriveMoments.of(table)
     number = {car: i for i, car in enumerate(sorted(set(cars)))}
     of_drive = np.array([number[car] for car in owners], dtype=np.int64)
-    return DriveMoments.of(served.table, of_drive, "vehicle")
+    return DriveMoments.of(table, of_drive, "vehicle")
 
 
 def drive_folds(
@@ -63,6 +68,7 @@ def drive_folds(
     *,
     naive: bool = False,
     cluster: ClusterUnit | None = None,
+    intercept: bool = True,
 ) -> DriveFolds:
     """Divide the drives that have all the inputs into folds.
 
@@ -79,11 +85,14 @@ def drive_folds(
         served.drives[FOLD_KEYS[folding.by]].to_pylist(), folding.by, folding.count
     )
     folds = CohortFolds.of([served.table], assignment).serving(inputs, catalogue().label)
-    moments = None if naive else clustered_moments(served, cluster)
-    return DriveFolds(served, assignment.fold, Training(folds, moments, input_scales()))
+    moments = None if naive else clustered_moments(served, cluster, intercept=intercept)
+    training = Training(folds, moments, input_scales(), intercept)
+    return DriveFolds(served, assignment.fold, training)
 
 
-def row_training(cohort: Cohort, inputs: Sequence[str], folding: Folding) -> Training:
+def row_training(
+    cohort: Cohort, inputs: Sequence[str], folding: Folding, *, intercept: bool = True
+) -> Training:
     """Return folds of rows; rows then count as independent. Raises `DataError`."""
     folds: Folds = cohort.folds(folding.by, folding.count).serving(inputs, catalogue().label)
-    return Training(folds, None, input_scales())
+    return Training(folds, None, input_scales(), intercept)

@@ -85,7 +85,8 @@ def _flat(manifest: Manifest) -> dict[str, Any]:
         mode="json", include={"trained_on", "cross_validation", "selected_by"}
     )
     inner = {f"{part}.{name}": value for part in parts for name, value in parts[part].items()}
-    return {"package_version": manifest.package_version, **inner}
+    own = {"package_version": manifest.package_version, "through_origin": manifest.through_origin}
+    return {**own, **inner}
 
 
 def _terms(one: ModelVersion, other: ModelVersion) -> list[Term]:

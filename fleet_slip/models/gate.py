@@ -125,9 +125,8 @@ def compare(selection: Selection[Any], incumbents: Sequence[ModelVersion]) -> Co
     cars = selection.cohort.members.count_vehicles_with((*signals, label))
     by: FoldKey = "vehicle" if cars >= LEAST_VEHICLES else "drive"
     groups = selection.cohort.folds(by, GROUPS).serving(signals, label, sparse=True)
-    challenger = cross_validate(
-        selection.winner.model.name, groups, least_squares(inputs, label), input_scales()
-    )
+    procedure = least_squares(inputs, label, intercept=selection.intercept)
+    challenger = cross_validate(selection.winner.model.name, groups, procedure, input_scales())
     others = tuple(_as_it_is(version, groups) for version in incumbents)
     worth = Worth(math.radians(floor().worth_deg))
     shortfalls = tuple(compare_paired(challenger, other, worth) for other in others)

@@ -207,6 +207,8 @@ class Manifest(Config):
     label: ModelLabel
     intercept: FiniteFloat
     intercept_exact: ExactFraction
+    through_origin: Annotated[bool, Field(exclude_if=lambda origin: not origin)] = False
+    """Whether it was fitted without an intercept, which is then zero."""
     terms: tuple[ModelTerm, ...] = Field(min_length=1)
     cross_validation: CrossValidated
     trained_on: TrainedOn
@@ -219,6 +221,8 @@ class Manifest(Config):
     @model_validator(mode="after")
     def _agrees(self) -> "Manifest":
         _require_rounded(self.intercept, self.intercept_exact)
+        if self.through_origin and self.intercept_exact:
+            raise ValueError("says that it goes through the origin, but has an intercept")
         return self
 
     @property

@@ -62,6 +62,7 @@ def manifest_of(selection: RequestedSelection, name: str) -> Manifest:
         ),
         intercept=winner.model.offset,
         intercept_exact=winner.model.intercept,
+        through_origin=not selection.intercept,
         terms=tuple(
             _term(signal, exact)
             for signal, exact in zip(winner.signals, winner.model.coefficients, strict=True)

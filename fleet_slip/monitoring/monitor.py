@@ -19,9 +19,11 @@ from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.errors import DataError, StorageError
 from fleet_slip.grams.day_sums import sum_days
 from fleet_slip.models.counts_model import counts_model
+from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.monitoring.thresholds import MonitorThresholds, thresholds
-from fleet_slip.regression.exact import LinearModel, fit
+from fleet_slip.regression.crossval import least_squares
+from fleet_slip.regression.exact import LinearModel
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.special import student_t_quantile
@@ -122,7 +124,7 @@ def monitor(
             f"{condition.text!r}, too few to tell what is usual. {limits.min_training_days} "
             "days are needed. Choose another cohort, or a later first new day."
         )
-    models = _models(counts_model(manifest), grams, training)
+    models = _models(manifest, grams, training)
     found = [
         _day(day, gram, count, model, known)
         for day, gram, count, model, known in zip(
@@ -137,13 +139,15 @@ def monitor(
 
 
 def _models(
-    champion: LinearModel, grams: Sequence[Gram], training: Sequence[bool]
+    manifest: Manifest, grams: Sequence[Gram], training: Sequence[bool]
 ) -> list[LinearModel]:
     """Return the model that predicts each day: of a training day, the one made without it."""
     own = [gram for gram, known in zip(grams, training, strict=True) if known]
     total = sum(own[1:], own[0])
+    champion = counts_model(manifest)
+    refit = least_squares(champion.signals, champion.label, intercept=not manifest.through_origin)
     return [
-        fit(total - gram, champion.signals, champion.label).model if known else champion
+        refit(total - gram) if known else champion
         for gram, known in zip(grams, training, strict=True)
     ]
 

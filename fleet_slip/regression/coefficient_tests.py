@@ -31,18 +31,23 @@ class ChowTest:
     p: float
 
 
-def chow_test(groups: Sequence[Gram], inputs: Sequence[str], label: str) -> ChowTest:
+def chow_test(
+    groups: Sequence[Gram], inputs: Sequence[str], label: str, *, intercept: bool = True
+) -> ChowTest:
     """Compare one model for all groups with one for each.
 
     F = ((RSS_pool - sum RSS_p) / ((P-1)(k+1))) / (sum RSS_p / (n - P(k+1))).
     Raises `DataError` if there is one group only, or too few rows.
     """
-    count, size = len(groups), len(inputs) + 1
+    count, size = len(groups), len(inputs) + intercept
     if count < 2:
         raise DataError("a Chow test compares at least two groups of drives.")
     total = sum(groups[1:], groups[0])
-    apart = sum((fit(group, inputs, label).rss for group in groups), Fraction(0))
-    together = fit(total, inputs, label).rss
+
+    def rss(group: Gram) -> Fraction:
+        return fit(group, inputs, label, intercept=intercept).rss
+
+    apart, together = sum(map(rss, groups), Fraction(0)), rss(total)
     numerator, denominator = (count - 1) * size, total.n - count * size
     if denominator <= 0 or apart == 0:
         raise DataError("a Chow test needs noise and more rows than coefficients.")
@@ -77,14 +82,18 @@ def wald_test(
     independent. Clusters of the same number are the same car. Raises `DataError` with fewer
     clusters than coefficients.
     """
-    size, unit = one.size + 1, one_drives.unit
-    here, there = cluster_influences(one, one_drives), cluster_influences(other, other_drives)
+    unit, first = one_drives.unit, int(not one.has_intercept)
+    size = one.size + 1 - first
+    here, there = (
+        cluster_influences(fitted, drives)[first:]
+        for fitted, drives in ((one, one_drives), (other, other_drives))
+    )
     if min(here.shape[1], there.shape[1]) <= size:
         raise DataError(
             f"comparing {size} coefficients by {unit}s needs more than {size} {unit}s in each "
             "cohort."
         )
-    gap = [a - b for a, b in zip(_numbers(one), _numbers(other), strict=True)]
+    gap = [a - b for a, b in zip(_numbers(one)[first:], _numbers(other)[first:], strict=True)]
     moved = _side_by_side((here, one_drives), (there, other_drives))
     covariance, drives = moved @ moved.T, moved.shape[1]
     spread = np.sqrt(np.diag(covariance))

@@ -78,9 +78,9 @@ class CrossValidation:
         }
 
 
-def least_squares(inputs: Sequence[str], label: str) -> Procedure:
+def least_squares(inputs: Sequence[str], label: str, *, intercept: bool = True) -> Procedure:
     """Return the procedure that fits the label on given inputs."""
-    return lambda gram: fit(gram, inputs, label).model
+    return lambda gram: fit(gram, inputs, label, intercept=intercept).model
 
 
 def cross_validate(
@@ -117,14 +117,20 @@ def assemble(
 
 
 def cross_validate_inputs(
-    name: str, cohort: CohortFolds, inputs: Sequence[str], label: str, scales: Scales
+    name: str,
+    cohort: CohortFolds,
+    inputs: Sequence[str],
+    label: str,
+    scales: Scales,
+    *,
+    intercept: bool = True,
 ) -> CrossValidation:
     """Cross-validate ordinary least squares on given inputs, over every drive that has them.
 
     Raises `DataError` if no drive has all the inputs, or if they are linearly dependent.
     """
     folds = cohort.serving(inputs, label)
-    return cross_validate(name, folds, least_squares(inputs, label), scales)
+    return cross_validate(name, folds, least_squares(inputs, label, intercept=intercept), scales)
 
 
 def held_out_errors(model: LinearModel, training: Gram, test: Gram) -> ErrorSums:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -86,6 +86,17 @@ class Evidence:
             float(full.rss),
             "vehicles" if drives.unit == "vehicle" else "drives",
         )
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what a JSON document needs."""
+        return {
+            "contributions": list(self.contributions),
+            "distances_to_full": self.excess().tolist(),
+            "expected_distances": list(self.distances()),
+            "evidence": self.kind,
+            "effective_rows": self.rows,
+            "design_effect": self.design_effect,
+        }
 
     @property
     def inputs(self) -> int:

@@ -130,6 +130,13 @@ class Gram:
             tuple(self.products[p] for p in packed_positions(tuple(at))),
         )
 
+    def about_origin(self) -> "Gram":
+        """Return the Gram of a mirror of the rows beside them, at the same number of rows.
+
+        All sums are zero, and the products the same: a fit to it has no intercept.
+        """
+        return Gram(self.signals, self.n, (0,) * len(self.sums), self.products)
+
     def combine(self, combinations: Mapping[str, Mapping[str, int]]) -> "Gram":
         """Return the Gram of integer linear combinations of the signals, T'GT.
 

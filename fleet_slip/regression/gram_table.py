@@ -95,6 +95,10 @@ class GramTable:
         )
         return GramTable(self.signals, self.n, self.sums - n * u, products)
 
+    def about_origin(self) -> "GramTable":
+        """Return the table of `Gram.about_origin` of each drive."""
+        return GramTable(self.signals, self.n, np.zeros_like(self.sums), self.products)
+
     def _sum(self) -> Gram:
         return Gram(
             self.signals,

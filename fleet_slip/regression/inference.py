@@ -120,7 +120,8 @@ def infer_by_clusters(fitted: Fit, drives: DriveMoments, scales: Scales) -> Infe
     """
     covariance = cluster_covariance(fitted, drives)
     units = [float(unit) for unit in _units(fitted, scales)]
-    errors = [math.sqrt(v) * u for v, u in zip(np.diag(covariance), units, strict=True)]
+    variances = np.diag(covariance)[int(not fitted.has_intercept) :]
+    errors = [math.sqrt(v) * u for v, u in zip(variances, units, strict=True)]
     sigma2 = noise_variance(fitted)
     return _inference(
         fitted, scales, sigma2, errors, degrees=len(drives.clusters) - 1, kind="cluster"

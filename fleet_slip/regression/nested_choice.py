@@ -5,7 +5,7 @@ the whole choice again inside every training fold: ranking, evidence, criterion 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from fleet_slip.regression.drive_moments import DriveMoments
 from fleet_slip.regression.evidence import Evidence
 from fleet_slip.regression.exact import Fit, Scales
 from fleet_slip.regression.folds import Folds
+from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.nested import nested_fits
 from fleet_slip.regression.ranking import rank
 from fleet_slip.regression.winner import DEFAULT_WORTH, Worth, choose
@@ -78,12 +79,30 @@ class NestedChoice:
             "order": list(self.order),
             "signals": list(self.signals),
             "criterion_values": list(self.values),
-            "contributions": list(self.evidence.contributions),
-            "distances_to_full": self.evidence.excess().tolist(),
-            "expected_distances": list(self.evidence.distances()),
-            "evidence": self.evidence.kind,
-            "effective_rows": self.evidence.rows,
-            "design_effect": self.evidence.design_effect,
+            **self.evidence.as_dict(),
+        }
+
+
+@dataclass(frozen=True)
+class NestedDistances:
+    """How far the k+1 nested models of a given order are from the full and from the true one.
+
+    Attributes:
+        order: the signals.
+        evidence: their contributions, and with these the distance D of equation (2).
+        null: the model without any signal, cross-validated.
+    """
+
+    order: tuple[str, ...]
+    evidence: Evidence
+    null: CrossValidation
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what a JSON document needs."""
+        return {
+            "order": list(self.order),
+            **self.evidence.as_dict(),
+            "null": self.null.as_dict(),
         }
 
 
@@ -95,11 +114,33 @@ class Training:
         folds: their folds; the criteria use the total, cross-validation the folds.
         drives: per-drive moments of the same rows; None takes rows for independent.
         scales: physical value of one count of each signal.
+        intercept: whether models have one; without it the moments of the drives are about zero.
     """
 
     folds: Folds
     drives: DriveMoments | None
     scales: Scales
+    intercept: bool = True
+
+    @property
+    def total(self) -> Gram:
+        """The Gram to rank and search on."""
+        return self.folds.total if self.intercept else self.folds.total.about_origin()
+
+    def nested_fits(self, order: Sequence[str], label: str) -> list[Fit]:
+        """Return the k+1 nested fits of an order. Raises `DataError` for dependent signals."""
+        return nested_fits(self.folds.total, order, label, intercept=self.intercept)
+
+    def evidence(self, fits: Sequence[Fit]) -> Evidence:
+        """Return what the rows say of the nested models of an order; raises like `Evidence`."""
+        if self.drives is None:
+            return Evidence.naive(fits)
+        return Evidence.clustered(fits, self.drives)
+
+    def cross_validate(self, name: str, inputs: Sequence[str], label: str) -> CrossValidation:
+        """Cross-validate least squares on given inputs."""
+        procedure = least_squares(inputs, label, intercept=self.intercept)
+        return cross_validate(name, self.folds, procedure, self.scales)
 
 
 def select_nested(
@@ -110,15 +151,11 @@ def select_nested(
     Raises `DataError` for dependent signals or a label without noise, and `QuestionError` for an
     unknown rule.
     """
-    total = training.folds.total
-    order = rank(rule.ranking, total, inputs, label)
-    fits = nested_fits(total, order, label)
-    if training.drives is None:
-        evidence = Evidence.naive(fits)
-    else:
-        evidence = Evidence.clustered(fits, training.drives)
+    order = rank(rule.ranking, training.total, inputs, label)
+    fits = training.nested_fits(order, label)
+    evidence = training.evidence(fits)
     if rule.criterion == CROSS_VALIDATION:
-        models = cross_validate_nested(training.folds, order, label, training.scales)
+        models = cross_validate_nested(training, order, label)
         size = len(choose(models, rule.worth).model.signals)
         values = tuple(-model.correlation for model in models)
     else:
@@ -127,12 +164,22 @@ def select_nested(
     return NestedChoice(order, size, fits[size], evidence, values)
 
 
+def measure_distances(training: Training, order: Sequence[str], label: str) -> NestedDistances:
+    """Return the distances of the nested models of an order as it is given.
+
+    Raises `DataError` for dependent signals or a label without noise.
+    """
+    evidence = training.evidence(training.nested_fits(order, label))
+    null = training.cross_validate("none", (), label)
+    return NestedDistances(tuple(order), evidence, null)
+
+
 def cross_validate_nested(
-    folds: Folds, order: Sequence[str], label: str, scales: Scales
+    training: Training, order: Sequence[str], label: str
 ) -> list[CrossValidation]:
     """Cross-validate the k+1 nested models of a given order; model j is called "first j"."""
     return [
-        cross_validate(f"first {size}", folds, least_squares(order[:size], label), scales)
+        training.cross_validate(f"first {size}", order[:size], label)
         for size in range(len(order) + 1)
     ]
 
@@ -164,6 +211,6 @@ def _without(training: Training, fold: IntArray, number: int) -> Training:
         raise QuestionError("choosing inside the training folds needs at least three folds.")
     drives = training.drives
     rest = training.folds.without(number, int(np.count_nonzero(fold != number)))
-    return Training(
-        rest, drives.take(fold != number) if drives is not None else None, training.scales
+    return replace(
+        training, folds=rest, drives=drives.take(fold != number) if drives is not None else None
     )

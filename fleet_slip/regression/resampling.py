@@ -94,8 +94,14 @@ def bootstrap_coefficients(drives: DriveMoments, replicates: int, seed: int) -> 
     return to_counts(drives, solve(totals))
 
 
-def solve(totals: FloatArray) -> FloatArray:
-    """Solve for (constant, inputs) in each matrix of moments with the label last."""
+def solve(totals: FloatArray, *, intercept: bool = True) -> FloatArray:
+    """Solve for (constant, inputs) in each matrix of moments with the label last.
+
+    Without an intercept the constant is zero.
+    """
+    if not intercept:
+        slopes = solve(totals[..., 1:, 1:])
+        return np.concatenate([np.zeros_like(slopes[..., :1]), slopes], axis=-1)
     try:
         return np.asarray(np.linalg.solve(totals[..., :-1, :-1], totals[..., :-1, -1:])[..., 0])
     except np.linalg.LinAlgError:
@@ -137,11 +143,12 @@ class RepeatedCrossValidation:
 
 
 def repeated_cross_validation(
-    drives: DriveMoments, folds: int, repeats: int, seed: int
+    drives: DriveMoments, folds: int, repeats: int, seed: int, *, intercept: bool = True
 ) -> RepeatedCrossValidation:
     """Cross-validate least squares on all inputs with `repeats` random deals into folds.
 
-    Raises `DataError` if there are fewer drives than folds.
+    Without an intercept the moments must be about zero, as `DriveMoments.of` makes them if it is
+    not to centre. Raises `DataError` if there are fewer drives than folds.
     """
     if len(drives) < folds:
         raise DataError(
@@ -156,7 +163,8 @@ def repeated_cross_validation(
         member = (fold[:, None, :] == np.arange(folds)[:, None]).astype(np.float64)
         totals = member.reshape(size * folds, -1) @ drives.packed
         for tests in drives.matrix(totals).reshape(size, folds, drives.size, drives.size):
-            figures.append(_correlation_and_rmse(tests, solve(tests.sum(axis=0) - tests)))
+            solutions = solve(tests.sum(axis=0) - tests, intercept=intercept)
+            figures.append(_correlation_and_rmse(tests, solutions))
     correlations, rmse = np.array(figures).T
     return RepeatedCrossValidation(correlations, rmse * float(drives.spread[-1]))
 

@@ -56,15 +56,17 @@ class Coefficients:
     log_rows: int
 
 
-def coefficient_table(cohort: Cohort, model: str, inputs: Sequence[str]) -> Coefficients:
+def coefficient_table(
+    cohort: Cohort, model: str, inputs: Sequence[str], *, intercept: bool = True
+) -> Coefficients:
     """Fit the label on the inputs over all drives of a cohort that have them.
 
     Raises `DataError` if no drive has them, or there is one only.
     """
     label = catalogue().label
     served = cohort.serving(inputs)
-    moments = clustered_moments(served)
-    fitted = fit(served.table.total(), inputs, label)
+    moments = clustered_moments(served, intercept=intercept)
+    fitted = fit(served.table.total(), inputs, label, intercept=intercept)
     scales = input_scales()
     robust, naive = infer_by_clusters(fitted, moments, scales), infer_classically(fitted, scales)
     inflation = variance_inflation(fitted.gram, inputs)

@@ -215,7 +215,8 @@ def _coefficients(trained: TrainedModels, own: Cohort) -> tuple[Coefficients, ..
     tables = [coefficient_table(cohort, f"model {choice.name}", choice.signals)]
     signals = published.manifest.signals
     if set(signals) != set(choice.signals) and len(signals) <= MOST_TERMS:
-        tables.append(coefficient_table(own, published.reference, published.manifest.signals))
+        intercept = not published.manifest.through_origin
+        tables.append(coefficient_table(own, published.reference, signals, intercept=intercept))
     return tuple(tables)
 
 

@@ -85,10 +85,12 @@ def weigh_memory(
 ) -> Memory:
     """Weigh the columns of a published model, given the cohort with the Gram rows of its set."""
     search = Search(method="exchange", most=len(manifest.terms))  # as configs/models/estimator.toml
-    searched = search_models(cohort, cohort.inputs, folding, search)
+    searched = search_models(
+        cohort, cohort.inputs, folding, search, intercept=not manifest.through_origin
+    )
     folds = cohort.folds(folding.by, folding.count)
-    whole = _refit(folds, manifest.signals)
-    columns = _without(folds, {name: [name] for name in manifest.signals}, manifest.signals)
+    whole = _refit(folds, manifest, manifest.signals)
+    columns = _without(folds, manifest, {name: [name] for name in manifest.signals})
     return Memory(
         searched=searched,
         on_drives={
@@ -98,7 +100,7 @@ def weigh_memory(
         },
         rmse_deg=whole.pooled.rmse_deg,
         columns=tuple(sorted(columns, key=lambda one: -one.rmse_deg)),
-        windows=tuple(_without(folds, by_length(manifest), manifest.signals)),
+        windows=tuple(_without(folds, manifest, by_length(manifest))),
     )
 
 
@@ -119,16 +121,23 @@ def _length(ticks: float) -> str:
 
 
 def _without(
-    folds: CohortFolds, groups: Mapping[str, Sequence[str]], signals: Sequence[str]
+    folds: CohortFolds, manifest: Manifest, groups: Mapping[str, Sequence[str]]
 ) -> Iterator[Without]:
     for name, left_out in groups.items():
-        kept = [signal for signal in signals if signal not in left_out]
+        kept = [signal for signal in manifest.signals if signal not in left_out]
         if kept:
-            yield Without(name, len(left_out), _refit(folds, kept).pooled.rmse_deg)
+            yield Without(name, len(left_out), _refit(folds, manifest, kept).pooled.rmse_deg)
 
 
-def _refit(folds: CohortFolds, signals: Sequence[str]) -> CrossValidation:
-    return cross_validate_inputs("", folds, signals, catalogue().label, input_scales())
+def _refit(folds: CohortFolds, manifest: Manifest, signals: Sequence[str]) -> CrossValidation:
+    return cross_validate_inputs(
+        "",
+        folds,
+        signals,
+        catalogue().label,
+        input_scales(),
+        intercept=not manifest.through_origin,
+    )
 
 
 def _errors_on(

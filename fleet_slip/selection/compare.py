@@ -14,6 +14,7 @@ from fleet_slip.grams.fold_sums import SummedCohort
 from fleet_slip.grams.folding import ROW_FOLDS, Folding
 from fleet_slip.regression.crossval import CrossValidation, cross_validate_inputs
 from fleet_slip.regression.folds import CohortFolds
+from fleet_slip.regression.nested_choice import NestedDistances
 from fleet_slip.regression.winner import DEFAULT_WORTH, Winner, Worth
 from fleet_slip.selection.model_list import CandidateModel, Search
 from fleet_slip.selection.search import SearchChoice
@@ -36,6 +37,9 @@ class Selection(Generic[AnyCohort]):
         choice: how an order or a subset was chosen; None for a list of models.
         searched: the models of a search, which are among `models`; None without one.
         uncertainty: how sure the winner's figures are, if that was asked for.
+        distances: how far the nested models of an order are from the full and from the true one, or
+            why that cannot be told; None unless an order was asked for.
+        intercept: whether the models have one; without it they go through the origin.
     """
 
     cohort: AnyCohort
@@ -46,6 +50,8 @@ class Selection(Generic[AnyCohort]):
     choice: SearchChoice | None = None
     searched: SearchedModels | None = None
     uncertainty: Uncertainty | None = None
+    distances: NestedDistances | str | None = None
+    intercept: bool = True
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `select --json` prints."""
@@ -60,6 +66,7 @@ class Selection(Generic[AnyCohort]):
             "feature_set": features().identity(self.cohort.feature_set),
             "drives": self.cohort.drive_count,
             "rows": self.cohort.rows,
+            "intercept": self.intercept,
             "folds": {
                 "by": self.folds.by,
                 "count": len(self.models[0].folds),
@@ -73,6 +80,10 @@ class Selection(Generic[AnyCohort]):
             document["choice"] = self.choice.as_dict()
         if self.searched is not None:
             document["search"] = self.searched.as_dict()
+        if isinstance(self.distances, str):
+            document["nested"] = {"left_out": self.distances}
+        elif self.distances is not None:
+            document["nested"] = self.distances.as_dict()
         if self.uncertainty is not None:
             document["uncertainty"] = asdict(self.uncertainty)
         return document
@@ -85,32 +96,46 @@ def select(
     worth: Worth = DEFAULT_WORTH,
     search: Search | None = None,
     inputs: Sequence[str] = (),
+    *,
+    intercept: bool = True,
 ) -> Selection[AnyCohort]:
     """Cross-validate each candidate, and what a search finds among inputs; choose the winner.
 
-    A candidate that needs signals which no drive of the cohort has, or whose signals are linearly
-    dependent, is skipped with the reason. Raises `DataError` if none is left.
+    Without an intercept all models go through the origin. A candidate that needs signals which no
+    drive of the cohort has, or whose signals are linearly dependent, is skipped with the reason.
+    Raises `DataError` if none is left.
     """
     divided = cohort.folds(folds.by, folds.count)
     models: list[CrossValidation] = []
     skipped: dict[str, str] = {}
     for candidate in candidates:
         try:
-            models.append(validate(candidate, divided))
+            models.append(validate(candidate, divided, intercept=intercept))
         except (DataError, QuestionError) as error:
             skipped[candidate.name] = str(error)
-    searched = search_models(cohort, inputs, folds, search) if search else None
+    searched = None
+    if search:
+        searched = search_models(cohort, inputs, folds, search, intercept=intercept)
     if searched is not None:
         models += searched.models
     if not models:
         reasons = "; ".join(f"model {name}: {reason}" for name, reason in skipped.items())
         raise DataError(f"no candidate can be fitted on the cohort. {reasons}")
     winner = choose_by(search, models, worth)
-    return Selection(cohort, folds, tuple(models), winner, skipped, searched=searched)
+    return Selection(
+        cohort, folds, tuple(models), winner, skipped, searched=searched, intercept=intercept
+    )
 
 
-def validate(candidate: CandidateModel, folds: CohortFolds) -> CrossValidation:
+def validate(
+    candidate: CandidateModel, folds: CohortFolds, *, intercept: bool = True
+) -> CrossValidation:
     """Cross-validate one candidate by exact least squares in each fold."""
     return cross_validate_inputs(
-        candidate.name, folds, candidate.signals, catalogue().label, input_scales()
+        candidate.name,
+        folds,
+        candidate.signals,
+        catalogue().label,
+        input_scales(),
+        intercept=intercept,
     )

@@ -142,6 +142,7 @@ def diagnose(
     against: Cohort | None = None,
     sensor_noise: Mapping[str, float] | None = None,
     cluster: ClusterUnit | None = None,
+    intercept: bool = True,
 ) -> Diagnosis:
     """Fit the inputs to the drives of a cohort that have them all, and examine the fit.
 
@@ -151,13 +152,14 @@ def diagnose(
     label, scales = catalogue().label, input_scales()
     served = cohort.serving(inputs)
     there = against.serving(inputs) if against else None
-    moments = clustered_moments(served, cluster, _cars(served, there))
+    moments = clustered_moments(served, cluster, _cars(served, there), intercept=intercept)
     total = served.table.total()
-    fits = nested_fits(total, inputs, label)
+    fits = nested_fits(total, inputs, label, intercept=intercept)
     fitted = fits[-1]
     free = None
     if sensor_noise:
-        free = fit_errors_in_variables(total, inputs, label, sensor_noise, scales).physical(scales)
+        seen = total if intercept else total.about_origin()
+        free = fit_errors_in_variables(seen, inputs, label, sensor_noise, scales).physical(scales)
     return Diagnosis(
         fitted=fitted,
         drives=len(served.table),
@@ -202,12 +204,13 @@ def _compare(
             f"the two cohorts share {number_of(len(shared), 'drive')}, such as {min(shared)}: a "
             f"comparison needs different drives. Add to the cohort: AND NOT ({condition})"
         )
-    other_moments = clustered_moments(there, moments.unit, _cars(here, there))
-    other = fit(there.table.total(), inputs, label)
-    enough = min(len(one.clusters) for one in (moments, other_moments)) > len(inputs) + 1
+    intercept = fitted.has_intercept
+    other_moments = clustered_moments(there, moments.unit, _cars(here, there), intercept=intercept)
+    other = fit(there.table.total(), inputs, label, intercept=intercept)
+    enough = min(len(one.clusters) for one in (moments, other_moments)) > len(inputs) + intercept
     return CohortComparison(
         condition,
         infer_by_clusters(other, other_moments, input_scales()),
-        chow_test([fitted.gram, other.gram], inputs, label),
+        chow_test([fitted.gram, other.gram], inputs, label, intercept=intercept),
         wald_test(fitted, moments, other, other_moments) if enough else None,
     )

@@ -19,6 +19,7 @@ from fleet_slip.regression.drive_moments import require_serving_drives
 from fleet_slip.regression.exact import LinearModel, fit
 from fleet_slip.regression.figures import ErrorSums, Figures
 from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.winner import DEFAULT_WORTH, Worth
 
 ROWS_PER_COEFFICIENT = 100
 """A regime with fewer training rows, one second of driving a coefficient, uses the pooled model."""
@@ -51,6 +52,9 @@ class RegimeComparison:
         pooled, split: figures over all rows.
         gain: mean over the folds of what splitting adds to the correlation.
         gain_standard_error: of the gain, over the same folds.
+        rmse_gain: what splitting takes away from the RMSE over all rows, rad.
+        rmse_gain_standard_error: of that, over the same folds.
+        worth: the smallest gain in RMSE that is worth the coefficients of a split.
     """
 
     signals: tuple[str, ...]
@@ -61,11 +65,20 @@ class RegimeComparison:
     split: Figures
     gain: float
     gain_standard_error: float
+    rmse_gain: float
+    rmse_gain_standard_error: float
+    worth: Worth
 
     @property
     def split_wins(self) -> bool:
-        """Whether splitting gains more than one standard error: it costs many coefficients."""
-        return self.gain > self.gain_standard_error
+        """Whether what splitting gains is worth it, and real: it costs many coefficients."""
+        best = min(self.pooled.rmse, self.split.rmse)
+        return self.rmse_gain >= self.worth.of(best) and self.real
+
+    @property
+    def real(self) -> bool:
+        """Whether splitting gains more than one standard error."""
+        return self.rmse_gain > self.rmse_gain_standard_error
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `regimes --json` prints."""
@@ -77,6 +90,9 @@ class RegimeComparison:
             "split": self.split.as_dict(),
             "gain": self.gain,
             "gain_standard_error": self.gain_standard_error,
+            "rmse_gain_deg": math.degrees(self.rmse_gain),
+            "rmse_gain_standard_error_deg": math.degrees(self.rmse_gain_standard_error),
+            "worth": str(self.worth),
             "winner": "split" if self.split_wins else "pooled",
             "regimes": [
                 {
@@ -124,12 +140,17 @@ def band_order(cohort: Cohort, names: Sequence[str]) -> list[str]:
 
 
 def compare_regimes(
-    cohort: Cohort, inputs: Sequence[str], folding: Folding, over: Sequence[str] = ()
+    cohort: Cohort,
+    inputs: Sequence[str],
+    folding: Folding,
+    over: Sequence[str] = (),
+    worth: Worth = DEFAULT_WORTH,
 ) -> RegimeComparison:
     """Cross-validate one model for all regimes and one for each, on drives that have the inputs.
 
-    Raises `QuestionError` for a feature set without regimes, and `DataError` for absent signals or
-    empty folds.
+    A split is advised if what it gains in RMSE is worth it, and larger than one standard error of
+    the gain, paired over the same folds. Raises `QuestionError` for a feature set without regimes,
+    and `DataError` for absent signals or empty folds.
     """
     if folding.by in (ROW_FOLDS, PARTS):
         raise QuestionError("rows are divided by regime already: fold by drive, or by vehicle.")
@@ -167,19 +188,24 @@ def compare_regimes(
     by_fold = [[s for (_, f), s in sums.items() if f == fold] for fold in range(grid.folds)]
     pooled_folds = [_total([s[0] for s in fold]) for fold in by_fold]
     split_folds = [_total([s[1] for s in fold]) for fold in by_fold]
-    gains = [
-        after.figures(unit).correlation - before.figures(unit).correlation
+    pairs = [
+        (before.figures(unit), after.figures(unit))
         for before, after in zip(pooled_folds, split_folds, strict=True)
     ]
+    gains = [after.correlation - before.correlation for before, after in pairs]
+    together, apart = _total(pooled_folds).figures(unit), _total(split_folds).figures(unit)
     return RegimeComparison(
         signals=tuple(inputs),
         drives=len(cohort.serving(inputs).table),
         folds=grid.folds,
         regimes=tuple(found),
-        pooled=_total(pooled_folds).figures(unit),
-        split=_total(split_folds).figures(unit),
+        pooled=together,
+        split=apart,
         gain=math.fsum(gains) / len(gains),
         gain_standard_error=_standard_error(gains),
+        rmse_gain=together.rmse - apart.rmse,
+        rmse_gain_standard_error=_standard_error([a.rmse - b.rmse for a, b in pairs]),
+        worth=worth,
     )
 
 

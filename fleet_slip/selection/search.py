@@ -6,24 +6,23 @@ from typing import Any
 
 import numpy as np
 
-from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.cohort import Cohort
 from fleet_slip.grams.folding import ROW_FOLDS, Folding
 from fleet_slip.grams.training import drive_folds, row_training
 from fleet_slip.regression.criteria import CRITERIA
-from fleet_slip.regression.crossval import CrossValidation, cross_validate, least_squares
+from fleet_slip.regression.crossval import CrossValidation
 from fleet_slip.regression.drive_moments import ClusterUnit
 from fleet_slip.regression.evidence import Evidence
-from fleet_slip.regression.nested import nested_fits
 from fleet_slip.regression.nested_choice import (
     CROSS_VALIDATION,
     FEWEST_FOLDS,
+    NestedDistances,
     Rule,
-    Training,
     cross_validate_nested,
     cross_validate_selection,
+    measure_distances,
     select_nested,
 )
 from fleet_slip.regression.nested_choice import NestedChoice as NestedSelection
@@ -103,6 +102,7 @@ def select_ranked(
     *,
     naive: bool = False,
     cluster: ClusterUnit | None = None,
+    intercept: bool = True,
 ) -> SearchResult:
     """Rank the inputs and choose one of the nested models, on the drives that have them all.
 
@@ -111,12 +111,15 @@ def select_ranked(
     """
     label = catalogue().label
     if folding.by == ROW_FOLDS:
-        training, fold = row_training(cohort, inputs, folding), np.empty(0, dtype=np.int64)
+        training = row_training(cohort, inputs, folding, intercept=intercept)
+        fold = np.empty(0, dtype=np.int64)
     else:
-        ready = drive_folds(cohort, inputs, folding, naive=naive, cluster=cluster)
+        ready = drive_folds(
+            cohort, inputs, folding, naive=naive, cluster=cluster, intercept=intercept
+        )
         training, fold = ready.training, ready.fold
     chosen = select_nested(training, inputs, label, rule)
-    models = cross_validate_nested(training.folds, chosen.order, label, training.scales)[1:]
+    models = cross_validate_nested(training, chosen.order, label)[1:]
     honest = None
     if len(training.folds.grams) >= FEWEST_FOLDS:
         honest = cross_validate_selection("the choice itself", training, fold, inputs, label, rule)
@@ -136,6 +139,7 @@ def select_subsets(
     *,
     naive: bool = False,
     cluster: ClusterUnit | None = None,
+    intercept: bool = True,
 ) -> SearchResult:
     """Find the best subset of every size and choose one of them.
 
@@ -143,20 +147,16 @@ def select_subsets(
     """
     label = catalogue().label
     if folding.by == ROW_FOLDS:
-        training = row_training(cohort, inputs, folding)
+        training = row_training(cohort, inputs, folding, intercept=intercept)
     else:
-        training = drive_folds(cohort, inputs, folding, naive=naive, cluster=cluster).training
-    total = training.folds.total
-    results = best_subsets(total, inputs, label)
-    evidence = _evidence(training, inputs)
+        training = drive_folds(
+            cohort, inputs, folding, naive=naive, cluster=cluster, intercept=intercept
+        ).training
+    results = best_subsets(training.total, inputs, label)
+    evidence = training.evidence(training.nested_fits(inputs, label))
     picks = pick_sizes(results, evidence)
     models = [
-        cross_validate(
-            f"best {result.best.size}",
-            training.folds,
-            least_squares(result.best.model.signals, label),
-            input_scales(),
-        )
+        training.cross_validate(f"best {result.best.size}", result.best.model.signals, label)
         for result in results[1:]
     ]
     rule = replace(rule, ranking=ALL_SUBSETS)
@@ -168,11 +168,24 @@ def select_subsets(
     return SearchResult(tuple(models), winner, choice)
 
 
-def _evidence(training: Training, inputs: Sequence[str]) -> Evidence:
-    fits = nested_fits(training.folds.total, inputs, catalogue().label)
-    if training.drives is None:
-        return Evidence.naive(fits)
-    return Evidence.clustered(fits, training.drives)
+def try_distances(
+    cohort: Cohort,
+    inputs: Sequence[str],
+    folding: Folding,
+    *,
+    cluster: ClusterUnit | None = None,
+    intercept: bool = True,
+) -> NestedDistances | str:
+    """Return the distances of the nested models of an order as given, or why there are none.
+
+    They are of the drives that have all its signals; folds other than of drives, dependent signals
+    and a single drive allow none.
+    """
+    try:
+        ready = drive_folds(cohort, inputs, folding, cluster=cluster, intercept=intercept)
+        return measure_distances(ready.training, inputs, catalogue().label)
+    except (DataError, QuestionError) as error:
+        return str(error)
 
 
 def _winner(models: Sequence[CrossValidation], size: int, rule: Rule, evidence: Evidence) -> Winner:

@@ -45,7 +45,12 @@ class SearchedModels:
 
 
 def search_models(
-    cohort: Cohort | SummedCohort, inputs: Sequence[str], folding: Folding, search: Search
+    cohort: Cohort | SummedCohort,
+    inputs: Sequence[str],
+    folding: Folding,
+    search: Search,
+    *,
+    intercept: bool = True,
 ) -> SearchedModels:
     """Search among the inputs on the drives that have them all.
 
@@ -53,11 +58,15 @@ def search_models(
     """
     label = catalogue().label
     folds = cohort.folds(folding.by, folding.count).serving(inputs, label)
-    chosen = _fits(folds.total, inputs, label, search)
+
+    def fits(gram: Gram) -> list[Fit]:
+        return _fits(gram if intercept else gram.about_origin(), inputs, label, search)
+
+    chosen = fits(folds.total)
     tests: list[list[ErrorSums]] = [[] for _ in chosen]
     for fold in folds.grams:
         training = folds.total - fold
-        for sums, fitted in zip(tests, _fits(training, inputs, label, search), strict=False):
+        for sums, fitted in zip(tests, fits(training), strict=False):
             sums.append(held_out_errors(fitted.model, training, fold))
     models = tuple(
         _model(folds, sums, fitted, search)

@@ -6,9 +6,8 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.grams.cohort import Cohort
 from fleet_slip.grams.folding import EACH, Folding
 from fleet_slip.grams.training import drive_folds
-from fleet_slip.regression.crossval import CrossValidation
-from fleet_slip.regression.drive_moments import ClusterUnit
-from fleet_slip.regression.exact import fit
+from fleet_slip.regression.crossval import CrossValidation, least_squares
+from fleet_slip.regression.drive_moments import ClusterUnit, DriveMoments
 from fleet_slip.regression.resampling import (
     Interval,
     bootstrap_correlations,
@@ -47,6 +46,7 @@ def estimate_uncertainty(
     bootstrap: int | None,
     repeat: int | None,
     cluster: ClusterUnit | None = None,
+    intercept: bool = True,
 ) -> Uncertainty:
     """Draw the drives with replacement `bootstrap` times, deal the folds anew `repeat` times.
 
@@ -59,12 +59,16 @@ def estimate_uncertainty(
     interval = None
     if bootstrap:
         splits = ready.training.folds.splits()
-        models = [fit(training, model.signals, label).model for training, _ in splits]
+        refit = least_squares(model.signals, label, intercept=intercept)
+        models = [refit(training) for training, _ in splits]
         products = held_out_products(ready.moments, ready.fold, models)
         interval = percentile_interval(bootstrap_correlations(products, bootstrap, SEED))
     repeated = None
     if repeat and folding.count != EACH:
-        repeated = repeated_cross_validation(ready.moments, folding.count, repeat, SEED)
+        moments = ready.moments if intercept else DriveMoments.of(ready.served.table, centred=False)
+        repeated = repeated_cross_validation(
+            moments, folding.count, repeat, SEED, intercept=intercept
+        )
     return Uncertainty(
         interval,
         ready.moments.unit,

@@ -47,6 +47,7 @@ def what_if(
     *,
     bias: Mapping[str, float],
     noise: Mapping[str, float],
+    intercept: bool = True,
 ) -> WhatIf:
     """Return the figures to expect once bias and white noise come on top of what is logged.
 
@@ -64,7 +65,8 @@ def what_if(
     def after(one: LinearModel) -> Figures:
         return disturb(error_sums(one, total), one, scales, bias=bias, noise=noise).figures(unit)
 
-    refitted = fit_noise_matched(total, model.signals, model.label, noise, scales)
+    seen = total if intercept else total.about_origin()
+    refitted = fit_noise_matched(seen, model.signals, model.label, noise, scales)
     return WhatIf(
         len(served.table),
         error_sums(model, total).figures(unit),

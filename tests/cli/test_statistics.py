@@ -1,5 +1,6 @@
 """Selection, diagnostics and what-if by command, and against a campaign with worse sensors."""
 
+import json
 import math
 import re
 import shutil
@@ -228,9 +229,16 @@ def test_regimes_compare_one_model_with_one_for_each(
         "select", "--nested", "ay,steer_fl,yaw_rate", "--json", root=every_set
     ).json["models"][-1]
     assert report["pooled"]["correlation"] == pytest.approx(whole["correlation"], rel=1e-12)
-    assert report["winner"] == (
-        "split" if report["gain"] > report["gain_standard_error"] else "pooled"
+    gain = report["rmse_gain_deg"]
+    assert gain == pytest.approx(
+        report["pooled"]["rmse_deg"] - report["split"]["rmse_deg"], rel=1e-6
     )
+    real = gain > report["rmse_gain_standard_error_deg"]
+    assert report["winner"] == ("split" if real and gain >= 0.005 else "pooled")
+    assert report["worth"] == "0.005 deg"
+    asked = run_command(*arguments, "--worth", "2%", "--json", root=every_set).json
+    assert asked["worth"] == "2 % of the best"
+    assert run_command(*arguments, "--worth", "much", root=every_set).exit_code == 2
     assert "Choose" in run_command(*arguments, root=every_set).stdout
 
 
@@ -329,3 +337,67 @@ def test_one_model_is_taken_without_a_list(run_command: RunCommand, every_set: P
     assert done.exit_code in (3, 5)
     assert "vx is not an input" in done.stderr
     assert run_command("select", "--model", "ax", "--search", "lars", root=every_set).exit_code != 0
+
+
+def test_nested_models_have_their_distances_from_the_null_one_on(
+    run_command: RunCommand, every_set: Path
+) -> None:
+    arguments = ("select", "--nested", "ax,ay,yaw_rate,steer_fl")
+    plain = run_command(*arguments, "--json", root=every_set).json
+    ranked = run_command(*arguments, "--rank", "declared", "--json", root=every_set).json
+    found = plain["nested"]
+    for name in ("contributions", "distances_to_full", "expected_distances", "effective_rows"):
+        assert found[name] == ranked["choice"][name]
+    assert found["order"] == ["ax", "ay", "yaw_rate", "steer_fl"]
+    assert len(found["expected_distances"]) == 5
+    assert found["distances_to_full"][-1] == 0
+    assert found["null"]["signals"] == []
+    assert found["null"]["rmse_deg"] > plain["models"][-1]["rmse_deg"]
+    table = run_command(*arguments, root=every_set).stdout
+    assert "distance D of equation (2)" in table
+    assert re.search(r"^0 +\(none\)", table, re.MULTILINE)
+    by_cars = run_command(*arguments, "--cluster", "vehicle", root=every_set)
+    assert "cluster-robust errors need at least two vehicles" in by_cars.stderr
+    leaking = run_command(*arguments, "--by", "row", "--json", root=every_set).json
+    assert "Fold by drive" in leaking["nested"]["left_out"]
+
+
+def test_a_model_through_the_origin_is_published_as_one(
+    run_command: RunCommand, every_set: Path, tmp_path: Path
+) -> None:
+    root = tmp_path / "copy"
+    shutil.copytree(every_set, root)
+    chosen = ("--model", "ay,yaw_rate,steering_wheel")
+    usual = run_command("select", *chosen, "--json", root=root).json
+    selected = run_command("select", *chosen, "--no-intercept", "--json", root=root).json
+    assert (usual["intercept"], selected["intercept"]) == (True, False)
+    assert usual["models"][0]["intercept"] != 0 == selected["models"][0]["intercept"]
+    run_command("publish", "straight", *chosen, "--no-intercept", root=root)
+    shown = run_command("show", "straight", "--json", root=root).json
+    assert shown["through_origin"] is True
+    assert shown["intercept"] == 0
+    coefficients = {one["signal"]: one["coefficient"] for one in shown["terms"]}
+    assert coefficients == selected["models"][0]["coefficients"]
+    assert "through the origin" in run_command("show", "straight", root=root).stdout
+    by_rows = run_command("diagnose", "straight", "--json", root=root).json["by_rows"]
+    assert {one["name"]: one["value"] for one in by_rows} == coefficients
+    better = run_command("what-if", "straight", "--noise", "ay=1", "--json", root=root).json
+    assert better["refitted"]["intercept"] == 0
+    run_command("export", "straight", "--to", "json", "--output", str(tmp_path), root=root)
+    exported = json.loads((tmp_path / "straight-1.json").read_text())
+    assert exported["model"]["manifest"]["through_origin"] is True
+    assert exported["program"]["angle"]["intercept"] == "0"
+    scored = run_command("score", "straight", "--json", root=root).json
+    with fleet_slip.connect(root) as database:
+        terms = " + ".join(
+            f"{value!r} * {one}"
+            for one, value in zip(
+                ("ay_mps2", "yaw_rate_rad_s", "steering_wheel_rad"),
+                coefficients.values(),
+                strict=True,
+            )
+        )
+        by_hand = database.execute(
+            f"SELECT degrees(sqrt(avg(({terms} - sideslip_rad) ** 2))) FROM log"
+        ).fetchone()
+    assert by_hand == (pytest.approx(scored["rmse_deg"], rel=1e-9),)

@@ -17,9 +17,10 @@ from fleet_slip.grams.fold_sums import sum_cohort
 from fleet_slip.grams.folding import FoldCount, Folding, FoldKey
 from fleet_slip.grams.job import update_grams
 from fleet_slip.grams.reader import GramReader
+from fleet_slip.selection.answer import answer_request
 from fleet_slip.selection.compare import select
 from fleet_slip.selection.model_list import load_model_list
-from fleet_slip.selection.request import SelectionRequest, answer_request
+from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.views import VIEWS, connect, needed_views
 from fleet_slip.warehouse.condition import parse_condition
 from fleet_slip.warehouse.tables import Warehouse

@@ -29,7 +29,8 @@ from fleet_slip.maintenance.verify import verify
 from fleet_slip.models.publish import manifest_of, publish
 from fleet_slip.models.versions import Registry
 from fleet_slip.runs.log import recording
-from fleet_slip.selection.request import SelectionRequest, answer_request
+from fleet_slip.selection.answer import answer_request
+from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.job import simulate_batches
 from fleet_slip.warehouse.audit import Audit, Forgettable

@@ -89,7 +89,7 @@ def test_the_choice_is_made_again_inside_every_training_fold() -> None:
 def test_nested_models_are_cross_validated_in_order() -> None:
     training, _ = training_of(sparse_drives(2), clustered=False)
     order = ("x4", "x2", "x1", "x3", "x5")
-    models = cross_validate_nested(training.folds, order, "y", training.scales)
+    models = cross_validate_nested(training, order, "y")
     assert [model.signals for model in models] == [order[:j] for j in range(6)]
     alone = cross_validate("x", training.folds, least_squares(order[:2], "y"), training.scales)
     assert models[2].pooled == alone.pooled

@@ -19,7 +19,7 @@ from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.inference import infer_by_clusters
 from fleet_slip.regression.lars import fit_lasso, lars_path, lasso_path, lasso_path_of_moments
 from fleet_slip.regression.leaps import best_by_leaps
-from fleet_slip.regression.nested import nested_fits, nested_models
+from fleet_slip.regression.nested import nested_fits
 from fleet_slip.regression.ranking import RANKINGS, rank, replacement_sets
 from fleet_slip.regression.subsets import all_rss, best_subsets, candidates, signals_of
 from tests.support.counts import dense_fit, gram_of, names, random_drives, table_of, unit_scales
@@ -300,22 +300,6 @@ def test_independent_rows_have_about_as_many_effective_rows() -> None:
     moments = DriveMoments.of(table_of([gram_of(counts) for counts in drives]))
     fits = nested_fits(gram_of(np.concatenate(drives)), ["x1", "x2", "x3"], "y")
     assert Evidence.clustered(fits, moments).design_effect == pytest.approx(1, abs=0.2)
-
-
-def test_nested_models_carry_the_full_models_noise() -> None:
-    counts = np.concatenate(random_drives(12))
-    gram = gram_of(counts)
-    models = nested_models(gram, ["x2", "x4", "x1", "x3"], "y", unit_scales(4))
-    assert [model.signals for model in models][2] == ("x2", "x4")
-    sigma2 = dense_fit(counts)[1] / (len(counts) - 5)
-    for model in models:
-        assert model.inference.residual_std == pytest.approx(np.sqrt(sigma2))
-    drop = dense_fit(counts[:, [1, 4]])[1] - dense_fit(counts[:, [1, 3, 4]])[1]
-    assert models[2].contribution == pytest.approx(drop / sigma2, rel=1e-7)
-    assert models[-1].distance == pytest.approx(4)
-    document = models[1].as_dict()
-    assert document["signals"] == ["x2"]
-    assert [e["name"] for e in document["estimates"]] == ["intercept", "x2"]
 
 
 def test_a_label_without_noise_is_an_error() -> None:

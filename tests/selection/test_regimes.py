@@ -1,5 +1,7 @@
 """One model for all regimes, or one for each."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import assign_folds
 from fleet_slip.grams.folding import Folding
+from fleet_slip.regression.winner import Worth
 from fleet_slip.selection.regimes import (
     ROWS_PER_COEFFICIENT,
     band_order,
@@ -103,6 +106,19 @@ def test_the_gain_is_the_mean_over_the_folds_with_its_standard_error() -> None:
     assert found.gain_standard_error == pytest.approx(
         np.std(gains, ddof=1) / len(gains) ** 0.5, rel=1e-6
     )
+
+
+def test_a_split_must_be_worth_its_coefficients() -> None:
+    cohort = cohort_of(divided((0.3, 0.2, 0.5, 0.0)), feature_set="regimes")
+    found = compare_regimes(cohort, INPUTS, FIVE)
+    assert found.rmse_gain == pytest.approx(found.pooled.rmse - found.split.rmse)
+    assert found.rmse_gain > found.rmse_gain_standard_error > 0
+    worths = [Worth(found.rmse_gain * factor) for factor in (0.99, 1.01)]
+    chosen = [compare_regimes(cohort, INPUTS, FIVE, worth=worth) for worth in worths]
+    assert [one.split_wins for one in chosen] == [True, False]
+    share = Worth(found.rmse_gain / found.split.rmse * 1.01, relative=True)
+    assert not compare_regimes(cohort, INPUTS, FIVE, worth=share).split_wins
+    assert not replace(found, rmse_gain_standard_error=2 * found.rmse_gain).split_wins
 
 
 def signed_r(estimate: np.ndarray, truth: np.ndarray) -> float:

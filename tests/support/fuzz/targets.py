@@ -37,8 +37,9 @@ from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.score import score
 from fleet_slip.models.versions import Registry
 from fleet_slip.resources import find_config, folder
+from fleet_slip.selection.answer import answer_request
 from fleet_slip.selection.model_list import load_model_list
-from fleet_slip.selection.request import SelectionRequest, answer_request
+from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.simulation.track import load_track

@@ -1,0 +1,203 @@
+"""Selects as it was asked for: which Gram rows are read, and what is done with them."""
+
+from dataclasses import replace
+from typing import Any
+
+from fleet_slip.canonical import canonical_json, sha256_of
+from fleet_slip.catalogue.feature_sets import PLAIN
+from fleet_slip.catalogue.features import features
+from fleet_slip.errors import QuestionError, UsageError
+from fleet_slip.grams.cohort import Cohort, load_cohort
+from fleet_slip.grams.fold_sums import SummedCohort, sum_cohort
+from fleet_slip.grams.folding import EACH, ROW_FOLDS, Folding, make_folding
+from fleet_slip.regression.nested_choice import Rule
+from fleet_slip.regression.stepwise import METHODS
+from fleet_slip.selection.compare import Selection, select
+from fleet_slip.selection.inputs import WHOLE_SET, inputs_of, require_inputs
+from fleet_slip.selection.model_list import (
+    CandidateModel,
+    ModelList,
+    Search,
+    load_model_list,
+    nested_candidates,
+)
+from fleet_slip.selection.request import DEFAULT_MODELS, RequestedSelection, SelectionRequest
+from fleet_slip.selection.search import (
+    require_criterion,
+    select_ranked,
+    select_subsets,
+    try_distances,
+)
+from fleet_slip.selection.uncertainty import estimate_uncertainty
+from fleet_slip.selection.worth import WORTH, parse_worth
+from fleet_slip.warehouse.tables import Warehouse
+
+GIVEN = "given"
+"""The name of a model whose inputs were asked for one by one."""
+
+
+def answer_request(warehouse: Warehouse, request: SelectionRequest) -> RequestedSelection:
+    """Select as asked. Raises `UsageError` for options that do not go together."""
+    request.check()
+    named = request.nested or request.ordered or request.search
+    name = request.models or (None if named else DEFAULT_MODELS)
+    model_list = _given(request) or (load_model_list(name) if name else None)
+    folds = _folding(request, model_list)
+    feature_set = _feature_set(request, model_list)
+    distances = bool(request.nested and not request.ordered and not _search_of(request, model_list))
+    if not (request.ordered or request.resampled or distances):
+        return _compare_listed(
+            sum_cohort(warehouse, folds, request.cohort, feature_set), request, model_list, folds
+        )
+    cohort = load_cohort(warehouse, request.cohort, feature_set)
+    answer = (
+        _search(cohort, request, folds)
+        if request.ordered
+        else _compare_listed(cohort, request, model_list, folds)
+    )
+    if distances:
+        inputs = inputs_of(cohort, request.nested or WHOLE_SET)
+        measured = try_distances(
+            cohort, inputs, folds, cluster=request.cluster, intercept=request.intercept
+        )
+        answer = replace(answer, distances=measured)
+    if not request.resampled:
+        return answer
+    figures = estimate_uncertainty(
+        cohort,
+        answer.winner.model,
+        folds,
+        bootstrap=request.bootstrap,
+        repeat=request.repeat,
+        cluster=request.cluster,
+        intercept=request.intercept,
+    )
+    return replace(answer, uncertainty=figures)
+
+
+def _given(request: SelectionRequest) -> ModelList | None:
+    """Return the one model that was asked for, if there is one, as a list."""
+    if request.model is None:
+        return None
+    feature_set = request.features or PLAIN
+    signals = require_inputs(request.model.split(","), feature_set)
+    model = CandidateModel(name=GIVEN, signals=signals)
+    return ModelList(description="One model", features=feature_set, model=(model,))
+
+
+def _folding(request: SelectionRequest, model_list: ModelList | None) -> Folding:
+    listed = model_list.folds if model_list else Folding()
+    folding = make_folding(request.by or listed.by, request.folds, listed.count)
+    if request.repeat and folding.count == EACH:
+        raise UsageError("repeat deals the folds anew, and folds of each drive have one deal only.")
+    return folding
+
+
+def _feature_set(request: SelectionRequest, model_list: ModelList | None) -> str:
+    named = request.features or (model_list.features if model_list else PLAIN)
+    if request.by == ROW_FOLDS and named == PLAIN:
+        return next(name for name, one in features().sets.items() if one.row_folds)
+    return named
+
+
+def _compare_listed(
+    cohort: Cohort | SummedCohort,
+    request: SelectionRequest,
+    model_list: ModelList | None,
+    folds: Folding,
+) -> RequestedSelection:
+    listed = model_list.model if model_list else ()
+    search, worth = _search_of(request, model_list), parse_worth(request.worth)
+    inputs = inputs_of(cohort, request.nested or WHOLE_SET) if search else ()
+    nested = (
+        nested_candidates(inputs_of(cohort, request.nested))
+        if request.nested and not search
+        else ()
+    )
+    if search and not listed:
+        selection = select(cohort, (), folds, worth, search, inputs, intercept=request.intercept)
+        content = {"inputs": list(inputs), **search.model_dump()}
+        label = f"search:{search.method} {search.most}"
+        checksum = _checksum(sha256_of(canonical_json(content)), request.worth, request.intercept)
+        return RequestedSelection.of(selection, label, checksum)
+    described = ModelList(
+        description=model_list.description if model_list else "Nested models of an order",
+        features=cohort.feature_set,
+        folds=folds,
+        model=(*listed, *nested),
+        search=search,
+    )
+    usual = GIVEN if request.model else DEFAULT_MODELS
+    name = request.models or (usual if listed else None)
+    label = "+".join(filter(None, [name, f"nested:{request.nested}" if nested else None]))
+    selection = select(
+        cohort, described.model, folds, worth, search, inputs, intercept=request.intercept
+    )
+    checksum = _checksum(described.sha256, request.worth, request.intercept)
+    return RequestedSelection.of(selection, label, checksum)
+
+
+def checksum_of_list(model_list: ModelList, worth: str) -> str | None:
+    """Return the `config_sha256` of a selection from a list as it stands.
+
+    None for a list that is nothing but a search, whose selection depends on the cohort's inputs.
+    """
+    return _checksum(model_list.sha256, worth, True) if model_list.model else None
+
+
+def _checksum(compared: str, worth: str, intercept: bool) -> str:
+    """Return the checksum of what is compared, and of what else is asked for and not usual."""
+    unusual: dict[str, Any] = {}
+    if parse_worth(worth) != parse_worth(WORTH):
+        unusual["worth"] = worth
+    if not intercept:
+        unusual["intercept"] = False
+    return sha256_of(canonical_json({"compared": compared, **unusual})) if unusual else compared
+
+
+def _search_of(request: SelectionRequest, model_list: ModelList | None) -> Search | None:
+    """Return how to search: as asked for, else as the list says, if at all."""
+    if request.search:
+        if request.search not in METHODS:
+            raise QuestionError(f"unknown search {request.search!r}. Known: {', '.join(METHODS)}.")
+        asked = {"method": request.search, **({"most": request.most} if request.most else {})}
+        return Search.model_validate(asked)
+    return model_list.search if model_list else None
+
+
+def _search(cohort: Cohort, request: SelectionRequest, folds: Folding) -> RequestedSelection:
+    nested = request.nested or WHOLE_SET
+    inputs = inputs_of(cohort, nested)
+    criterion = require_criterion(request.criterion or "cv")
+    rule = Rule(request.rank or "declared", criterion, parse_worth(request.worth))
+    choose = select_subsets if request.all_subsets else select_ranked
+    found = choose(
+        cohort,
+        inputs,
+        folds,
+        rule,
+        naive=request.naive,
+        cluster=request.cluster,
+        intercept=request.intercept,
+    )
+    rule = found.choice.rule
+    described = ModelList(
+        description="Inputs to choose from",
+        features=cohort.feature_set,
+        folds=folds,
+        model=(CandidateModel(name="inputs", signals=inputs),),
+    )
+    content = {"inputs": described.sha256, "ranking": rule.ranking, "criterion": rule.criterion}
+    content |= {"evidence": found.choice.evidence.kind}
+    selection = Selection(
+        cohort,
+        folds,
+        found.models,
+        found.winner,
+        {},
+        choice=found.choice,
+        intercept=request.intercept,
+    )
+    label = f"nested:{nested} {rule.ranking} {rule.criterion}"
+    checksum = _checksum(sha256_of(canonical_json(content)), WORTH, request.intercept)
+    return RequestedSelection.of(selection, label, checksum)

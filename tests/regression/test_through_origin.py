@@ -1,0 +1,111 @@
+"""Models without an intercept, against least squares on the rows and statsmodels."""
+
+import numpy as np
+import pytest
+import statsmodels.api as sm
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fleet_slip.regression.coefficient_tests import chow_test, wald_test
+from fleet_slip.regression.drive_moments import DriveMoments
+from fleet_slip.regression.evidence import Evidence
+from fleet_slip.regression.exact import fit
+from fleet_slip.regression.inference import infer_by_clusters, infer_classically
+from fleet_slip.regression.nested import nested_fits
+from fleet_slip.regression.ranking import rank
+from fleet_slip.regression.resampling import repeated_cross_validation
+from fleet_slip.regression.subsets import best_subsets
+from tests.support.counts import Matrix, gram_of, names, random_drives, table_of, unit_scales
+
+INPUTS = names(4)[:-1]
+
+
+def offset_drives(seed: int, offset: int = 500) -> list[Matrix]:
+    """Drives whose signals are far from zero on average, so that an intercept matters."""
+    return [counts + offset for counts in random_drives(seed)]
+
+
+def through_origin(counts: Matrix) -> Matrix:
+    x, y = counts[:, :-1].astype(float), counts[:, -1].astype(float)
+    return np.asarray(np.linalg.lstsq(x, y, rcond=None)[0])
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 10**6))
+def test_coefficients_and_both_kinds_of_errors_are_those_of_statsmodels(seed: int) -> None:
+    parts = offset_drives(seed)
+    counts = np.concatenate(parts)
+    fitted = fit(gram_of(counts), INPUTS, "y", intercept=False)
+    model = sm.OLS(counts[:, -1].astype(float), counts[:, :-1].astype(float))
+    groups = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    moments = DriveMoments.of(table_of([gram_of(part) for part in parts]).about_origin())
+    ours = [
+        infer_classically(fitted, unit_scales(4)),
+        infer_by_clusters(fitted, moments, unit_scales(4)),
+    ]
+    theirs = [model.fit(), model.fit(cov_type="cluster", cov_kwds={"groups": groups})]
+    for mine, other in zip(ours, theirs, strict=True):
+        assert [estimate.name for estimate in mine.estimates] == list(INPUTS)
+        values = [estimate.value for estimate in mine.estimates]
+        np.testing.assert_allclose(values, other.params, rtol=1e-8, atol=1e-9)
+        errors = [estimate.standard_error for estimate in mine.estimates]
+        np.testing.assert_allclose(errors, other.bse, rtol=1e-8)
+
+
+def test_the_evidence_of_the_last_signal_is_its_squared_t_value() -> None:
+    parts = offset_drives(3)
+    gram = gram_of(np.concatenate(parts))
+    moments = DriveMoments.of(table_of([gram_of(part) for part in parts]).about_origin())
+    fits = nested_fits(gram, INPUTS, "y", intercept=False)
+    robust = infer_by_clusters(fits[-1], moments, unit_scales(4))
+    last = Evidence.clustered(fits, moments).contributions[-1]
+    assert last == pytest.approx(robust.estimates[-1].t ** 2, rel=1e-9)
+
+
+def test_the_best_subsets_and_orders_are_those_of_the_rows() -> None:
+    counts = np.concatenate(offset_drives(4))
+    gram = gram_of(counts).about_origin()
+
+    def rss(columns: list[int]) -> float:
+        part = counts[:, [*columns, 4]]
+        return float(np.sum((part[:, -1] - part[:, :-1] @ through_origin(part)) ** 2))
+
+    for result in best_subsets(gram, INPUTS, "y")[1:]:
+        best = result.best
+        assert best.model.intercept == 0
+        mine = [INPUTS.index(name) for name in best.model.signals]
+        assert float(best.rss) == pytest.approx(rss(mine), rel=1e-9)
+        others = [rss([i for i in range(4) if mask >> i & 1]) for mask in range(1, 16)]
+        sizes = [mask.bit_count() for mask in range(1, 16)]
+        least = min(r for r, size in zip(others, sizes, strict=True) if size == best.size)
+        assert float(best.rss) == pytest.approx(least, rel=1e-9)
+    alone = min(range(4), key=lambda i: rss([i]))
+    assert rank("forward", gram, INPUTS, "y")[0] == INPUTS[alone]
+
+
+def test_repeated_folds_hold_out_rows_that_no_constant_was_fitted_to() -> None:
+    parts = offset_drives(5)
+    moments = DriveMoments.of(table_of([gram_of(part) for part in parts]), centred=False)
+    folds = len(parts)  # every deal leaves out each drive once
+    found = repeated_cross_validation(moments, folds, 2, 1, intercept=False)
+    estimates = []
+    for i, part in enumerate(parts):
+        rest = np.concatenate([other for j, other in enumerate(parts) if j != i])
+        estimates.append(part[:, :-1] @ through_origin(rest))
+    truth = np.concatenate(parts)[:, -1]
+    correlation = np.corrcoef(np.concatenate(estimates), truth)[0, 1]
+    assert found.correlations == pytest.approx([correlation] * 2, rel=1e-9)
+
+
+def test_two_cohorts_of_one_law_are_compared_without_a_constant() -> None:
+    parts = offset_drives(6)
+    halves = parts[:6], parts[6:]
+    grams = [gram_of(np.concatenate(half)) for half in halves]
+    chow = chow_test(grams, INPUTS, "y", intercept=False)
+    assert (chow.numerator, chow.denominator) == (4, grams[0].n + grams[1].n - 8)
+    tables = [table_of([gram_of(part) for part in half]).about_origin() for half in halves]
+    moments = [DriveMoments.of(table) for table in tables]
+    fits = [fit(gram, INPUTS, "y", intercept=False) for gram in grams]
+    wald = wald_test(fits[0], moments[0], fits[1], moments[1])
+    assert (wald.numerator, wald.denominator) == (4, 10)
+    assert 0 <= wald.p <= 1
