@@ -9,7 +9,7 @@ from fleet_slip.canonical import canonical_json, sha256_of
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import SCENARIO
-from fleet_slip.errors import DataError
+from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.evaluation.estimators import (
     TABLE_ONE,
     Estimate,
@@ -22,7 +22,10 @@ from fleet_slip.evaluation.filters import rebuild
 from fleet_slip.evaluation.runs import EvaluatedScenario, run_all
 from fleet_slip.evaluation.targets import THE_PAPERS_CHOICE
 from fleet_slip.grams.cohort import Cohort, load_cohort
+from fleet_slip.grams.folding import BANDS, Folding
 from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.regression.crossval import CrossValidation
+from fleet_slip.regression.nested_choice import NestedDistances
 from fleet_slip.report.cars import Cars, weigh_cars
 from fleet_slip.report.coefficients import Coefficients, coefficient_table
 from fleet_slip.report.evaluated import Evaluated, latest_of
@@ -30,7 +33,9 @@ from fleet_slip.report.histogram import Histogram, held_out_histogram
 from fleet_slip.report.memory import Memory, looks_back, weigh_memory
 from fleet_slip.report.ordering import Ordering, compare_orders
 from fleet_slip.resources import config_file
+from fleet_slip.selection.compare import Selection, select
 from fleet_slip.selection.model_list import load_model_list
+from fleet_slip.selection.search import try_distances
 from fleet_slip.simulation.scenario import Scenario, load_scenario, shipped_scenarios
 from fleet_slip.views import connect
 from fleet_slip.warehouse.database import reading_files
@@ -91,6 +96,10 @@ class ReportData:
         coefficients: of the paper's choice, then of the published model if it is another and small.
         histogram: held-out estimates of all training rows by the paper's choice.
         ordering: what the order of the signals is worth.
+        by_speed: the models of Table I with whole bands of speed left out, by name; empty where all
+            drives are of one speed.
+        distances: of the nested models of all signals in their declared order, or why there are
+            none.
         memory: what columns over time are worth; None if the model has none, or too many.
         cars: what a car's own numbers are worth; None without a fleet in the data root.
         tables: of the warehouse.
@@ -106,6 +115,8 @@ class ReportData:
     coefficients: tuple[Coefficients, ...]
     histogram: Histogram
     ordering: Ordering
+    by_speed: Mapping[str, CrossValidation]
+    distances: NestedDistances | str
     memory: Memory | None
     cars: Cars | None
     tables: tuple[TableSize, ...]
@@ -140,6 +151,7 @@ def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
     own = _own_cohort(warehouse, trained)
     manifest = version.manifest
     choice = next(model for model in models if model.name == THE_PAPERS_CHOICE)
+    signals = tuple(dict.fromkeys(models[-1].signals))
     return ReportData(
         version=version,
         evaluated=evaluated,
@@ -147,7 +159,9 @@ def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
         runs=runs,
         coefficients=_coefficients(trained, own),
         histogram=held_out_histogram(warehouse, trained.selection, choice),
-        ordering=compare_orders(cohort, tuple(dict.fromkeys(models[-1].signals))),
+        ordering=compare_orders(cohort, signals),
+        by_speed=_by_speed(trained.selection),
+        distances=try_distances(cohort, signals, trained.selection.folds),
         memory=weigh_memory(own, manifest, trained.selection.folds, runs)
         if looks_back(manifest) and len(manifest.terms) <= MOST_TERMS
         else None,
@@ -200,6 +214,16 @@ def _changed(evaluated: Evaluated, what: str) -> str:
         f"{what} has changed since evaluation {evaluated.document.number}. Run: fleet-slip "
         f"evaluate --one-car {evaluated.group}"
     )
+
+
+def _by_speed(selection: Selection) -> dict[str, CrossValidation]:
+    """Return the same models with as many whole bands of speed left out, one after another."""
+    bands = Folding(by=BANDS, count=selection.folds.count)
+    try:
+        found = select(selection.cohort, load_model_list(TABLE_ONE).model, bands)
+    except (DataError, QuestionError):
+        return {}
+    return {model.name: model for model in found.models}
 
 
 def _own_cohort(warehouse: Warehouse, trained: TrainedModels) -> Cohort:

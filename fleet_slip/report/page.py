@@ -68,6 +68,7 @@ def render(data: ReportData, shown: Sequence[Picture]) -> str:
         fleet=[one for one in drawn if one.picture.key.startswith("fleet-")],
         table_one=paper_tables.table_one(data),
         table_two=paper_tables.table_two(data),
+        distances=paper_tables.distances(data),
         targets=list(paper_tables.targets(data)),
         further=_further(data),
         coefficients=list(tables.coefficient_tables(data)),

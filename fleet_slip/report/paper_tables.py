@@ -34,20 +34,72 @@ def table_one(data: ReportData) -> ReportTable:
                 "good" if model.correlation >= PAPER_TABLE_ONE.get(model.name, 1) else "",
             ),
             f"± {number(model.standard_error, 4)}",
-            degrees(model.pooled.error_std_deg),
+            degrees(model.pooled.rmse_deg),
+            *_by_speed(data, model.name),
         ]
         for model in data.trained.selection.models
     ]
     winner = data.trained.selection.winner.reason
+    head = ["model", "signals", "paper", "ours", "standard error", "RMSE"]
+    if data.by_speed:
+        head += ["by speed", "RMSE by speed"]
     return table(
         "table-1",
         "Table I. Properties of the estimation models: cross-validated correlation",
-        ["model", "signals", "paper", "ours", "standard error", "error std"],
+        head,
         rows,
         left=2,
         note=(
             f"{folding.count} folds by {folding.by}, "
             f"{count(data.trained.selection.cohort.rows)} rows. {winner}"
+            + (BY_SPEED if data.by_speed else "")
+        ),
+    )
+
+
+BY_SPEED = (
+    " By speed: whole bands of the drives' speed are left out one after another, so that no model "
+    "has seen the speeds it is tested at. Folds by drive interpolate between neighbours."
+)
+
+
+def _by_speed(data: ReportData, name: str) -> list[str]:
+    if not data.by_speed:
+        return []
+    found = data.by_speed.get(name)
+    if found is None:
+        return [number(None), number(None)]
+    return [number(found.correlation, 4), degrees(found.pooled.rmse_deg)]
+
+
+def distances(data: ReportData) -> ReportTable | None:
+    """Return the distance D of equation (2) of each nested model; None if it cannot be told."""
+    found = data.distances
+    if isinstance(found, str):
+        return None
+    evidence = found.evidence
+    expected = evidence.distances()
+    least = min(range(len(expected)), key=lambda j: expected[j])
+    return table(
+        "distances",
+        "Distance D of equation (2) of the nested models, all signals in their declared order",
+        ["signals", "added", "contribution A", "D from the full model", "expected D from the true"],
+        [
+            [
+                str(j),
+                found.order[j - 1] if j else "none",
+                number(evidence.contributions[j - 1] if j else None, 1),
+                number(to_full, 1),
+                Cell(number(expected[j], 1), "good" if j == least else ""),
+            ]
+            for j, to_full in enumerate(evidence.excess())
+        ],
+        left=2,
+        note=(
+            f"In units of the noise, taking {evidence.kind} for independent: the rows are worth "
+            f"{count(round(evidence.rows))}. A is what a signal adds; without any effect it is 1 "
+            "on average. Green: the smallest expected distance, which is the smallest C_p. Without "
+            f"any signal the RMSE is {degrees(found.null.pooled.rmse_deg)}."
         ),
     )
 

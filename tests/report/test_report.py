@@ -35,11 +35,15 @@ from fleet_slip.report.page import render
 from fleet_slip.report.pictures import draw_pictures
 from fleet_slip.report.road_pictures import road_pictures, standings
 from fleet_slip.report.style import DESK
-from fleet_slip.report.text import number
+from fleet_slip.report.text import degrees, number
+from fleet_slip.selection.compare import validate
+from fleet_slip.selection.model_list import CandidateModel
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand
 from tests.support.reported import Reported, call
+
+MINUS = "\N{MINUS SIGN}"
 
 pytestmark = pytest.mark.slow
 
@@ -110,6 +114,36 @@ def test_the_same_data_give_the_same_bytes(reported: Reported, data: ReportData)
     density = next(picture for picture in shown if picture.key == "density")
     assert png_file(density) == (reported.figures / "density.png").read_bytes()
     assert svg_file(density) == (reported.figures / "density.svg").read_text(encoding="utf-8")
+
+
+def test_table_one_shows_folds_by_drive_and_by_whole_bands_of_speed(data: ReportData) -> None:
+    selection = data.trained.selection
+    bands = selection.cohort.folds("speed", selection.folds.count)
+    table = paper_tables.table_one(data)
+    assert table.head[-2:] == ["by speed", "RMSE by speed"]
+    for row, model in zip(table.rows, selection.models, strict=True):
+        again = validate(CandidateModel(name="x", signals=model.signals), bands)
+        assert row[3].text == number(model.correlation, 4)
+        assert [cell.text for cell in row[-2:]] == [
+            number(again.correlation, 4),
+            degrees(again.pooled.rmse_deg),
+        ]
+        assert row[-1].text != row[-3].text
+    bare = paper_tables.table_one(replace(data, by_speed={}))
+    assert {len(row) for row in bare.rows} == {len(bare.head)} == {len(table.head) - 2}
+
+
+def test_the_distances_are_those_of_every_nested_model_and_the_null_one(data: ReportData) -> None:
+    table = paper_tables.distances(data)
+    assert table is not None
+    assert [row[0].text for row in table.rows] == [str(j) for j in range(len(table.rows))]
+    assert len(table.rows) == 1 + len(data.trained.selection.models[-1].signals)
+    assert table.rows[0][1].text == "none"
+    assert table.rows[-1][3].text == "0.0"
+    expected = [float(row[4].text.replace(MINUS, "-")) for row in table.rows]
+    (least,) = [j for j, row in enumerate(table.rows) if row[4].mark == "good"]
+    assert expected[least] == min(expected)
+    assert paper_tables.distances(replace(data, distances="too few drives")) is None
 
 
 def test_table_two_has_the_evaluations_numbers(data: ReportData) -> None:
