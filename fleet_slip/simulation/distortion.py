@@ -9,8 +9,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.compiling import kernel
+from fleet_slip.compiling import equation, kernel
 from fleet_slip.simulation.imperfections import Imperfections
+from fleet_slip.simulation.lags import Delay, LowPass
+from fleet_slip.simulation.pulses import Pulses
 from fleet_slip.vehicle.driver import SAMPLE_S
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2
 
@@ -75,21 +77,19 @@ class Distortion:
         """
         sensors, car = self._flaws.sensors, self._flaws.car
         r, turning = truth["yaw_rate_rad_s"], truth["yaw_acceleration_rad_s2"]
-        x, y = sensors.inertial_x_m, sensors.inertial_y_m
-        ax = truth["ax_mps2"] - r * r * x - turning * y
-        ay = truth["ay_mps2"] + turning * x - r * r * y
-        per_ay = math.radians(car.roll_gradient_deg_per_g) / GRAVITY_MPS2
-        per_ax = math.radians(car.pitch_gradient_deg_per_g) / GRAVITY_MPS2
-        roll = per_ay * truth["leaning_ay_mps2"] + math.radians(sensors.inertial_roll_deg)
-        pitch = per_ax * truth["leaning_ax_mps2"] + math.radians(sensors.inertial_pitch_deg)
-        yaw = math.radians(sensors.inertial_yaw_deg)
-        ax = _cosine(pitch) * ax + GRAVITY_MPS2 * _sine(pitch)
-        ay = _cosine(roll) * ay + GRAVITY_MPS2 * _sine(roll)
-        return {
-            "ax_mps2": ax + yaw * ay,
-            "ay_mps2": ay - yaw * ax,
-            "yaw_rate_rad_s": _cosine(roll) * r,
-        }
+        place = sensors.inertial_x_m, sensors.inertial_y_m
+        turned = (
+            math.radians(sensors.inertial_roll_deg),
+            math.radians(sensors.inertial_pitch_deg),
+            math.radians(sensors.inertial_yaw_deg),
+        )
+        lean = (
+            math.radians(car.roll_gradient_deg_per_g) / GRAVITY_MPS2,
+            math.radians(car.pitch_gradient_deg_per_g) / GRAVITY_MPS2,
+        )
+        moving = truth["ax_mps2"], truth["ay_mps2"], r, turning
+        leaning = truth["leaning_ax_mps2"], truth["leaning_ay_mps2"]
+        return dict(zip(INERTIAL, _feel(moving, leaning, place, turned, lean), strict=True))
 
     def _angles(self, truth: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
         sensors = self._flaws.sensors
@@ -117,82 +117,65 @@ class Distortion:
         heading, self._heading_rad = _wander(noise[0], self._heading_rad, correlation_s)
         error_x, self._gps_x = _wander(noise[1], self._gps_x, correlation_s)
         error_y, self._gps_y = _wander(noise[2], self._gps_y, correlation_s)
-        heading *= math.radians(sensors.gps_heading_std_deg)
-        return {
-            "gps_vx_mps": vx + heading * vy + sensors.gps_velocity_std_mps * error_x,
-            "gps_vy_mps": vy - heading * vx + sensors.gps_velocity_std_mps * error_y,
-        }
+        errors = heading, error_x, error_y
+        std = math.radians(sensors.gps_heading_std_deg), sensors.gps_velocity_std_mps
+        return dict(zip(GPS, _turned_velocity(vx, vy, errors, std), strict=True))
 
 
-def _sine(angle: FloatArray) -> FloatArray:
-    """Return the sine of angles below 0.3 rad to 2e-5, the same bits everywhere."""
-    return angle * (1 - angle * angle / 6)
+@equation
+def _sine(angle: float) -> float:
+    """Return the sine of an angle below 0.3 rad to 2e-5, the same bits everywhere."""
+    return angle * (1.0 - angle * angle / 6.0)
 
 
-def _cosine(angle: FloatArray) -> FloatArray:
-    return 1 - angle * angle / 2
+@equation
+def _cosine(angle: float) -> float:
+    return 1.0 - angle * angle / 2.0
 
 
-class Delay:
-    """A signal that comes late; between samples it is linear, before the first one constant."""
-
-    def __init__(self, latency_s: float) -> None:
-        """Take the latency."""
-        self._ticks = latency_s / SAMPLE_S
-        self._before: FloatArray | None = None
-
-    def apply(self, values: FloatArray) -> FloatArray:
-        """Return the next block, delayed."""
-        if self._ticks == 0.0:
-            return values
-        whole = math.floor(self._ticks)
-        part = self._ticks - whole
-        if self._before is None:
-            self._before = np.full(whole + 1, values[0])
-        known = np.append(self._before, values)
-        self._before = known[-(whole + 1) :]
-        end = len(known)
-        return (1 - part) * known[1 : end - whole] + part * known[: end - whole - 1]
-
-
-class LowPass:
-    """A low-pass of first order, by the trapezoidal rule."""
-
-    def __init__(self, bandwidth_hz: float) -> None:
-        """Take the frequency at which the gain is −3 dB; 0 for no low-pass."""
-        half = math.pi * bandwidth_hz * SAMPLE_S
-        self._gain = half / (1 + half)
-        self._last: tuple[float, float] | None = None
-
-    def apply(self, values: FloatArray) -> FloatArray:
-        """Return the next block, filtered."""
-        if self._gain == 0.0:
-            return values
-        before, output = self._last or (values[0], values[0])
-        filtered = _low_pass(values, float(before), float(output), self._gain)
-        self._last = (values[-1], filtered[-1])
-        return filtered
+@kernel
+def _feel(
+    moving: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+    leaning: tuple[FloatArray, FloatArray],
+    place: tuple[float, float],
+    turned: tuple[float, float, float],
+    lean: tuple[float, float],
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the accelerations and the yaw rate that the unit feels, see `_accelerations`."""
+    ax, ay, rate, turning = moving
+    leaning_ax, leaning_ay = leaning
+    (x, y), (roll, pitch, yaw), (per_ay, per_ax) = place, turned, lean
+    ticks = len(ax)
+    felt_ax, felt_ay, felt_rate = np.empty(ticks), np.empty(ticks), np.empty(ticks)
+    for i in range(ticks):
+        r = rate[i]
+        here_x = ax[i] - r * r * x - turning[i] * y
+        here_y = ay[i] + turning[i] * x - r * r * y
+        phi, theta = per_ay * leaning_ay[i] + roll, per_ax * leaning_ax[i] + pitch
+        level_x = _cosine(theta) * here_x + GRAVITY_MPS2 * _sine(theta)
+        level_y = _cosine(phi) * here_y + GRAVITY_MPS2 * _sine(phi)
+        felt_ax[i] = level_x + yaw * level_y
+        felt_ay[i] = level_y - yaw * level_x
+        felt_rate[i] = _cosine(phi) * r
+    return felt_ax, felt_ay, felt_rate
 
 
-class Pulses:
-    """A wheel speed sensor that times the pulses of an encoder.
-
-    At every sample it reports the pulses since the last report over their time; where none came, no
-    more than that one comes right now. Pulses stand where the encoder's teeth are.
-    """
-
-    def __init__(self, places: FloatArray) -> None:
-        """Take how far each pulse of a turn stands from its place, over their distance."""
-        self._places = places
-        self._state = np.zeros(5)
-        self._begun = False
-
-    def apply(self, speed_rad_s: FloatArray) -> FloatArray:
-        """Return the next block as the sensor reports it."""
-        if not self._begun:
-            self._state[:] = 0.0, 0.0, 0.0, speed_rad_s[0], speed_rad_s[0]
-            self._begun = True
-        return _timed_pulses(speed_rad_s, self._places, self._state)
+@kernel
+def _turned_velocity(
+    vx: FloatArray,
+    vy: FloatArray,
+    errors: tuple[FloatArray, FloatArray, FloatArray],
+    std: tuple[float, float],
+) -> tuple[FloatArray, FloatArray]:
+    """Return velocity with errors of heading and of both components, given their deviations."""
+    heading, error_x, error_y = errors
+    heading_std, velocity_std = std
+    seen_x, seen_y = np.empty(len(vx)), np.empty(len(vx))
+    for i in range(len(vx)):
+        angle = heading[i] * heading_std
+        seen_x[i] = vx[i] + angle * vy[i] + velocity_std * error_x[i]
+        seen_y[i] = vy[i] - angle * vx[i] + velocity_std * error_y[i]
+    return seen_x, seen_y
 
 
 @kernel
@@ -206,43 +189,3 @@ def _wander(noise: FloatArray, start: float, correlation_s: float) -> tuple[Floa
         values[i] = value
         value = decay * value + kick * noise[i]
     return values, value
-
-
-@kernel
-def _low_pass(values: FloatArray, before: float, output: float, gain: float) -> FloatArray:
-    filtered = np.empty(len(values))
-    for i in range(len(values)):
-        output += gain * (values[i] + before - 2.0 * output)
-        before = values[i]
-        filtered[i] = output
-    return filtered
-
-
-@kernel
-def _timed_pulses(speed: FloatArray, places: FloatArray, state: FloatArray) -> FloatArray:
-    """Fill in what the sensor reports.
-
-    `state` is the turned angle in pulses, the last pulse's number, the samples since it came, the
-    speed before, and the report.
-    """
-    turned, last, since, before, report = state
-    count = len(places)
-    per_sample = count * SAMPLE_S / (2.0 * math.pi)
-    reports = np.empty(len(speed))
-    for i in range(len(speed)):
-        step = 0.5 * (before + speed[i]) * per_sample
-        turned += step
-        since += 1.0
-        pulse = math.floor(turned)
-        while pulse > last and turned < pulse + places[int(pulse) % count]:
-            pulse -= 1.0
-        if pulse > last and step > 0.0:
-            ago = (turned - pulse - places[int(pulse) % count]) / step
-            report = (pulse - last) / (max(since - ago, 1e-3) * per_sample)
-            last, since = pulse, ago
-        elif since > 0.0:
-            report = min(report, 1.0 / (since * per_sample))
-        reports[i] = report
-        before = speed[i]
-    state[0], state[1], state[2], state[3], state[4] = turned, last, since, before, report
-    return reports

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.simulation.distortion import Delay, Distortion, LowPass, Pulses
+from fleet_slip.simulation.distortion import Distortion
 from fleet_slip.simulation.imperfections import Imperfections, SensorImperfections
+from fleet_slip.simulation.lags import Delay, LowPass
+from fleet_slip.simulation.pulses import Pulses
 from fleet_slip.vehicle.imperfections import CarImperfections
 from fleet_slip.vehicle.lane_blocks import CHANNELS, IMPERFECT_CHANNELS
 
