@@ -13,7 +13,7 @@ from fleet_slip.compiling import equation, kernel
 from fleet_slip.simulation.imperfections import Imperfections
 from fleet_slip.simulation.lags import Delay, LowPass
 from fleet_slip.simulation.pulses import Pulses
-from fleet_slip.vehicle.driver import SAMPLE_S
+from fleet_slip.simulation.wander import Wander
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2
 
 WHEELS = ("wheel_fl_rad_s", "wheel_fr_rad_s", "wheel_rl_rad_s", "wheel_rr_rad_s")
@@ -51,8 +51,7 @@ class Distortion:
             for name in WHEELS
             if pulses
         }
-        self._heading_rad, self._gps_x, self._gps_y = 0.0, 0.0, 0.0
-        self._begun = False
+        self._gps: Wander | None = None
 
     def apply(self, truth: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
         """Return the next block as the sensors see it, with satellite velocity besides."""
@@ -109,15 +108,8 @@ class Distortion:
         vx, vy = truth["vx_mps"], truth["vy_mps"]
         if not (sensors.gps_heading_std_deg or sensors.gps_velocity_std_mps):
             return {"gps_vx_mps": vx, "gps_vy_mps": vy}
-        ticks, correlation_s = len(vx), sensors.gps_correlation_s
-        noise = self._generator.standard_normal((3, ticks))
-        if not self._begun:
-            self._heading_rad, self._gps_x, self._gps_y = self._generator.standard_normal(3)
-            self._begun = True
-        heading, self._heading_rad = _wander(noise[0], self._heading_rad, correlation_s)
-        error_x, self._gps_x = _wander(noise[1], self._gps_x, correlation_s)
-        error_y, self._gps_y = _wander(noise[2], self._gps_y, correlation_s)
-        errors = heading, error_x, error_y
+        self._gps = self._gps or Wander(3, sensors.gps_correlation_s, self._generator)
+        errors = self._gps.next(len(vx))
         std = math.radians(sensors.gps_heading_std_deg), sensors.gps_velocity_std_mps
         return dict(zip(GPS, _turned_velocity(vx, vy, errors, std), strict=True))
 
@@ -164,7 +156,7 @@ def _feel(
 def _turned_velocity(
     vx: FloatArray,
     vy: FloatArray,
-    errors: tuple[FloatArray, FloatArray, FloatArray],
+    errors: FloatArray,
     std: tuple[float, float],
 ) -> tuple[FloatArray, FloatArray]:
     """Return velocity with errors of heading and of both components, given their deviations."""
@@ -176,16 +168,3 @@ def _turned_velocity(
         seen_x[i] = vx[i] + angle * vy[i] + velocity_std * error_x[i]
         seen_y[i] = vy[i] - angle * vx[i] + velocity_std * error_y[i]
     return seen_x, seen_y
-
-
-@kernel
-def _wander(noise: FloatArray, start: float, correlation_s: float) -> tuple[FloatArray, float]:
-    """Return a Gauss-Markov process of standard deviation 1, and where the next block starts."""
-    decay = 1.0 - SAMPLE_S / correlation_s
-    kick = math.sqrt(1.0 - decay * decay)
-    values = np.empty(len(noise))
-    value = start
-    for i in range(len(noise)):
-        values[i] = value
-        value = decay * value + kick * noise[i]
-    return values, value

@@ -65,7 +65,9 @@ def _along(track: Track, station_m: FloatArray, generator: np.random.Generator) 
     values = generator.standard_normal(knots)
     values = values - np.sum(values) / knots
     at_m = np.arange(knots) * (track.length_m / knots)
-    return np.interp(station_m, at_m, values, period=track.length_m if track.closed else None)
+    if track.closed:
+        at_m, values = np.append(at_m, track.length_m), np.append(values, values[0])
+    return np.interp(station_m, at_m, values)
 
 
 @kernel
