@@ -37,7 +37,7 @@ GROUPS = {
         "check": "reducing",
         "features": "statistics",
         "config": "configs",
-        "shell": "query",
+        "shell": "shell",
     },
     "Models": {
         "models": "models",

@@ -1,10 +1,11 @@
-"""Commands that read the warehouse in SQL: sql, shell."""
+"""The command that asks the warehouse a query: sql."""
 
 import contextlib
 import logging
 import shutil
 import sys
 from collections.abc import Iterator
+from enum import StrEnum
 from typing import Annotated
 
 import pyarrow as pa
@@ -15,7 +16,7 @@ from pyarrow.csv import write_csv
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.api.session import Session
 from fleet_slip.cli.output import Json, print_json, say
-from fleet_slip.errors import FleetSlipError, QuestionError
+from fleet_slip.errors import QuestionError
 from fleet_slip.warehouse.database import limit_memory
 
 ROWS_SHOWN = 40
@@ -50,7 +51,7 @@ def sql(
     """Query the warehouse: log (SI), log_counts, drives, grams, models, quarantine, dictionary.
 
     Every column is described in the view dictionary. A query can read the warehouse, and nothing
-    else.
+    else. A table shows the columns that fit; name some to see others, or ask for --csv or --json.
 
     Example: **fleet-slip sql "SELECT vehicle_id, count(*) AS drives FROM drives GROUP BY ALL"**
     """
@@ -59,14 +60,30 @@ def sql(
     if not unsafe:
         limit_memory()
     opened = (fleet.unlocked_session if unsafe else fleet.session)(text)
-    with opened as session, _representation_errors():
-        if not (json or csv):
+    with opened as session:
+        answer(session, text, Form.JSON if json else Form.CSV if csv else Form.TABLE, exact=exact)
+
+
+class Form(StrEnum):
+    """How an answer is printed."""
+
+    TABLE = "table"
+    CSV = "csv"
+    JSON = "json"
+
+
+def answer(session: Session, text: str, form: Form, *, exact: bool = False) -> None:
+    """Print the answer to a query; `exact` leaves texts of CSV as they are."""
+    with _representation_errors():
+        if form is Form.TABLE:
             _show(session, text)
-        elif json:
+        elif form is Form.JSON:
             print_json(session.table(text).to_pylist())
         else:
             rows = session.table(text)
+            sys.stdout.flush()
             write_csv(rows if exact else _mark_formulas(rows), sys.stdout.buffer)
+            sys.stdout.buffer.flush()
 
 
 def _read_stdin() -> str:
@@ -111,41 +128,3 @@ def _representation_errors() -> Iterator[None]:
         raise QuestionError(
             f"the result cannot be printed: {error}. Cast the column, such as: CAST(sums AS TEXT)"
         ) from None
-
-
-def shell(context: typer.Context) -> None:
-    """Type SQL queries against the warehouse, one after the other. End with .quit or Ctrl-D.
-
-    Example: **fleet-slip shell**
-    """
-    import readline  # noqa: F401, PLC0415 - gives input() history and editing
-
-    limit_memory()
-    with context.obj.session() as session:
-        say("Views: log, log_counts, drives, grams, models, quarantine, dictionary. End: .quit")
-        while (text := _read_statement()) is not None:
-            try:
-                if text.strip():
-                    with _representation_errors():
-                        _show(session, text)
-            except FleetSlipError as error:
-                say(f"error: {error}")
-            except KeyboardInterrupt:
-                say("interrupted")
-
-
-def _read_statement() -> str | None:
-    """Read lines until one ends with a semicolon; None at the end of the input."""
-    lines: list[str] = []
-    while True:
-        try:
-            line = input("   ...> " if lines else "slip> ")
-        except EOFError:
-            return "\n".join(lines) or None
-        except KeyboardInterrupt:
-            return ""
-        if not lines and line.strip() in (".quit", ".exit", "quit", "exit"):
-            return None
-        lines.append(line)
-        if line.rstrip().endswith(";") or not line.strip():
-            return "\n".join(lines)

@@ -297,17 +297,6 @@ def test_help_teaches_and_version_is_told(run_command: RunCommand) -> None:
     assert run_command().exit_code == 2
 
 
-def test_the_shell_answers_statements_and_survives_mistakes(
-    run_command: RunCommand, smoke_root: Path
-) -> None:
-    typed = "SELECT count(*) AS drives\nFROM drives;\nSELEC;\nSELECT 41 + 1 AS answer;\n.quit\n"
-    done = run_command("shell", root=smoke_root, input=typed)
-    assert done.exit_code == 0
-    assert "answer" in done.stdout
-    assert "42" in done.stdout
-    assert "error: not valid SQL" in done.stderr
-
-
 def test_json_is_alone_on_stdout(run_command: RunCommand, smoke_root: Path) -> None:
     for command in (["models"], ["select"], ["run", "--campaign", "smoke"], ["show", "smoke"]):
         assert json.loads(run_command(*command, "--json", root=smoke_root).stdout)
