@@ -33,7 +33,7 @@ gated: run
 	$(BIN)/fleet-slip --root $(ROOT) gram --features calibration --cohort "campaign = 'fleet'"
 	$(BIN)/fleet-slip --root $(ROOT) gram --features fleet --cohort "campaign = 'fleet'"
 	$(BIN)/fleet-slip --root $(ROOT) show gated > /dev/null 2>&1 || \
-	$(BIN)/fleet-slip --root $(ROOT) publish gated --models gated --cohort "lost_control_s IS NULL AND track = 'waterford_hills' \
+	$(BIN)/fleet-slip --root $(ROOT) publish gated --models gated --cohort "lost_control_s IS NULL \
 	  AND (campaign = 'waterford' OR campaign = 'proving_ground' AND vehicle_model = 'd_class_sedan')"
 
 test: lint

@@ -17,7 +17,7 @@ from fleet_slip.report.fleet_pictures import fleet_pictures
 from fleet_slip.report.histogram import Histogram
 from fleet_slip.report.memory_pictures import memory_pictures
 from fleet_slip.report.picture import Picture
-from fleet_slip.report.road_pictures import road_pictures
+from fleet_slip.report.road_pictures import road_pictures, standings_picture
 from fleet_slip.report.text import count, degrees, listed, number, percent
 
 STYLES = ("style_gentle", "nominal", "style_brisk", "style_sporty", "style_limit")
@@ -189,6 +189,7 @@ def _beyond_the_paper(data: ReportData) -> Iterator[Picture]:
         yield _map(data, shown)
     yield _density(data, data.histogram)
     yield from _lateral(data, data.runs)
+    yield standings_picture(data)
     if data.evaluated.gps_noise is not None:
         yield _over_gps_noise(data, data.evaluated.gps_noise)
 

@@ -4,9 +4,11 @@ from collections.abc import Iterator, Sequence
 
 from fleet_slip.evaluation.errors import ErrorFigures
 from fleet_slip.evaluation.ranking import LEAST_COVERAGE
+from fleet_slip.evaluation.targets import THE_PAPERS_CHOICE
 from fleet_slip.report.data import ReportData
 from fleet_slip.report.figures.gates import angle_and_gates
 from fleet_slip.report.figures.series import Line
+from fleet_slip.report.figures.standings import Named, points_by_drive
 from fleet_slip.report.gates import opening
 from fleet_slip.report.picture import Picture
 from fleet_slip.report.table import Cell, ReportTable, table
@@ -42,11 +44,50 @@ def road_pictures(data: ReportData) -> Iterator[Picture]:
     )
 
 
+def standings_picture(data: ReportData) -> Picture:
+    """Return every estimator on every test drive as points."""
+    evaluated = data.evaluated
+    choices = [
+        Named(data.version.reference, data.version.reference, "model_3"),
+        Named(data.choice, f"Model {THE_PAPERS_CHOICE}", "model_4"),
+        Named("ekf_class_tuned", "EKF told the class, tuned", "kalman"),
+        Named("ekf_told_tuned", "EKF told everything, tuned", "model_2"),
+    ]
+    shown = _compared(data)
+    errors = {
+        scenario: {
+            name: one.rmse_deg
+            for name in shown
+            if (one := evaluated.figures(scenario, name))
+            and one.rmse_deg
+            and one.coverage >= LEAST_COVERAGE
+        }
+        for scenario in evaluated.scenarios
+    }
+    title = "Every estimator on every test drive"
+    caption = (
+        f"The further to the left, the better. {_won(data)}Who has estimates for less than "
+        f"{percent(LEAST_COVERAGE)} of a drive is not drawn there."
+    )
+    return Picture(
+        "test-drives",
+        title,
+        caption,
+        f"{title}: a row for each test drive, a point for the error of each estimator. {caption}",
+        lambda size: points_by_drive(errors, [n for n in choices if n.estimator in shown], size),
+    )
+
+
+def _compared(data: ReportData) -> list[str]:
+    """Return the estimators that stand beside each other: of Table I the paper's choice alone."""
+    left_out = set(data.evaluated.models.values()) - {data.choice}
+    return [name for name in data.evaluated.estimators if name not in left_out]
+
+
 def standings(data: ReportData) -> ReportTable:
     """Return the RMSE of every estimator on every test drive, the smallest marked."""
     evaluated = data.evaluated
-    left_out = set(evaluated.models.values()) - {data.choice}
-    names = [name for name in evaluated.estimators if name not in left_out]
+    names = _compared(data)
     rows: list[list[str | Cell]] = [
         [scenario, *_row([evaluated.figures(scenario, name) for name in names])]
         for scenario in evaluated.scenarios

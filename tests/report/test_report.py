@@ -34,7 +34,7 @@ from fleet_slip.report.memory import by_length, looks_back
 from fleet_slip.report.page import render
 from fleet_slip.report.pictures import draw_pictures
 from fleet_slip.report.road_pictures import road_pictures, standings
-from fleet_slip.report.style import DESK
+from fleet_slip.report.style import DESK, PHONE
 from fleet_slip.report.text import degrees, number
 from fleet_slip.selection.compare import validate
 from fleet_slip.selection.model_list import CandidateModel
@@ -351,6 +351,33 @@ def test_the_standings_mark_the_smallest_error_of_each_drive(data: ReportData) -
         marked = [name for name, cell in zip(names, cells, strict=True) if cell.mark == "good"]
         least = min(errors.values())
         assert marked == [name for name in names if errors.get(name) == least]
+
+
+def test_every_estimator_has_a_point_on_every_test_drive(data: ReportData) -> None:
+    (picture,) = [one for one in draw_pictures(data) if one.key == "test-drives"]
+    names = standings(data).head[1:]
+    for size in (DESK, PHONE):
+        (axes,) = picture.draw(size).axes
+        drawn = [
+            (float(x), int(y))
+            for line in axes.get_lines()
+            for x, y in zip(*map(np.asarray, line.get_data()), strict=True)
+        ]
+        expected = [
+            (one.rmse_deg, place)
+            for place, drive in enumerate(data.evaluated.scenarios)
+            for name in names
+            if (one := data.evaluated.figures(drive, name))
+            and one.rmse_deg is not None
+            and one.coverage >= LEAST_COVERAGE
+        ]
+        assert sorted(drawn) == sorted(expected)
+        own = next(one for one in axes.get_lines() if one.get_label() == data.version.reference)
+        places = [np.asarray(own.get_xdata())[i] for i in range(len(data.evaluated.scenarios))]
+        for place, drive in zip(places, data.evaluated.scenarios, strict=True):
+            found = data.evaluated.figures(drive, data.version.reference)
+            assert found is not None
+            assert place == found.rmse_deg
 
 
 def test_gates_are_found_in_a_manifest_with_all_their_knots(data: ReportData) -> None:
