@@ -53,17 +53,19 @@ def weigh_cars(warehouse: Warehouse) -> Cars | None:
     campaign = largest_fleet(warehouse)
     if campaign is None:
         return None
-    try:
-        cohort = load_cohort(warehouse, f"{TRAINING_DRIVES} AND campaign = '{campaign}'", SET)
-    except DataError:  # no Gram rows of the set
-        return None
+    quoted = campaign.replace("'", "''")
     one = features().feature_set(SET)
-    own = [name for name in one.calibrated if name in cohort.inputs]
-    if not own:
+    try:
+        cohort = load_cohort(warehouse, f"{TRAINING_DRIVES} AND campaign = '{quoted}'", SET)
+        known = [name for name in one.inputs if name in cohort.inputs]
+        before = [name for name in known if name not in {*one.calibrated, *features().factors}]
+        own = [name for name in one.calibrated if name in known]
+        if not own:  # no Gram rows of the set that numbers come from
+            return None
+        without, of_all = errors_by_car(cohort, before)
+        with_own, of_all_with = errors_by_car(cohort, [*before, *own])
+    except DataError:  # no Gram rows of the set, or cars that lack what it needs
         return None
-    before = [name for name in one.inputs if name not in {*one.calibrated, *features().factors}]
-    without, of_all = errors_by_car(cohort, before)
-    with_own, of_all_with = errors_by_car(cohort, [*before, *own])
     cars = sorted(set(without) & set(with_own), key=lambda car: without[car])
     return Cars(
         campaign=campaign,

@@ -1,6 +1,7 @@
 """A fleet car by car: the error in each car by models of the others, and its picture."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -10,15 +11,24 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.cohort import Cohort, assign_folds
+from fleet_slip.grams.job import update_grams
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.gram_table import GramTable
-from fleet_slip.report.cars import FOLDS, Cars, errors_by_car, weigh_cars
+from fleet_slip.report.cars import (
+    FEWEST_CARS,
+    FOLDS,
+    Cars,
+    errors_by_car,
+    largest_fleet,
+    weigh_cars,
+)
 from fleet_slip.report.data import ReportData
 from fleet_slip.report.page import render
 from fleet_slip.report.pictures import draw_pictures
 from fleet_slip.report.style import DESK, PHONE
 from fleet_slip.warehouse.condition import parse_condition
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.logs import land, log_rows, random_counts
 from tests.support.reported import Reported
 
 SIGNALS = ("ay", "yaw_rate", "sideslip")
@@ -76,6 +86,17 @@ def test_one_car_is_no_fleet(reported: Reported, data: ReportData) -> None:
     assert weigh_cars(Warehouse(LocalFolder(reported.root))) is None
     assert data.cars is None
     assert not [one for one in draw_pictures(data) if one.key.startswith("fleet-")]
+
+
+def test_a_fleet_without_gram_rows_is_not_drawn(tmp_path: Path) -> None:
+    warehouse = Warehouse(LocalFolder(tmp_path))
+    counts = random_counts(np.random.default_rng(2), 30)
+    numbers = range(FEWEST_CARS)
+    drives = [log_rows(f"{n}", counts, vehicle_id=f"car {n}", campaign="it's") for n in numbers]
+    land(warehouse, "one", *drives)
+    update_grams(warehouse)
+    assert largest_fleet(warehouse) == "it's"
+    assert weigh_cars(warehouse) is None
 
 
 def test_a_fleet_has_a_section_with_its_picture(reported: Reported, data: ReportData) -> None:
