@@ -79,6 +79,19 @@ def test_a_rival_sees_on_a_drive_what_it_was_trained_on(
     )
 
 
+def test_a_sample_has_the_numbers_that_a_cars_drives_tell(warehouse: Warehouse) -> None:
+    cohort = load_cohort(warehouse, "campaign = 'smoke'")
+    (car,) = set(cohort.drives["vehicle_id"].to_pylist())
+    offset = Inputs.of_catalogue(("ay_offset_alone",))
+    told = draw_sample(warehouse, cohort, offset, rows=500, numbers={car: {"ay_offset": 37}})
+    number = features().time_columns["ay_offset_alone"].definition.number
+    assert number is not None
+    expected = (37 - number.less) * offset.scales["ay_offset_alone"]
+    np.testing.assert_allclose(told.inputs, expected)
+    running = draw_sample(warehouse, cohort, offset, rows=500, numbers={"another": {}})
+    assert np.ptp(running.inputs) > 0
+
+
 def test_of_a_gated_model_a_rival_sees_columns_and_what_opens_the_gates(smoke_root: Path) -> None:
     known = features()
     manifest = Registry(LocalFolder(smoke_root / "models")).resolve("smoke").manifest
