@@ -170,18 +170,21 @@ class Filling(Rooted):
             figures.rows = report.rows_read
         return report
 
-    def check(self, files: int = 4, *, progress: ShowProgress | None = None) -> "CheckReport":
+    def check(
+        self, files: int = 4, *, begin: int = 0, progress: ShowProgress | None = None
+    ) -> "CheckReport":
         """Compute the Gram rows of some log files three ways and compare them, bit for bit.
 
         By the SQL statement, by float64 matrix products in which every partial sum is an exact
-        integer, and by Python integers; and with the stored rows. Progress is in files.
+        integer, and by Python integers; and with the stored rows. The files are evenly chosen, and
+        those of the next number `begin` are the next ones. Progress is in files.
 
         Raises `StorageError` naming the first drive whose Gram rows differ, and `DataError` if
         there is nothing to check.
         """
         from fleet_slip.grams.check import check_grams
 
-        return check_grams(self.warehouse, files, count_from_start(progress))
+        return check_grams(self.warehouse, files, count_from_start(progress), begin)
 
     @record_call
     def migrate(self, *, progress: ShowProgress | None = None) -> "MigrationReport":

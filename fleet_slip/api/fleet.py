@@ -12,7 +12,6 @@ from fleet_slip.api.filling import Filling
 from fleet_slip.api.tending import Tending
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.errors import RefusedError
 from fleet_slip.models.manifest import require_model_name
 from fleet_slip.runs.log import step
 
@@ -21,8 +20,7 @@ if TYPE_CHECKING:
 
     from fleet_slip.api.run_report import RunReport
     from fleet_slip.api.session import Session
-    from fleet_slip.models.publish import Publication
-    from fleet_slip.selection.request import RequestedSelection
+    from fleet_slip.monitoring.night_report import NightReport
     from fleet_slip.simulation.campaign import Campaign
 
 RUN_MODELS = "estimator"
@@ -108,6 +106,7 @@ class Fleet(Filling, Tending):
 
         Raises what `simulate`, `gram`, `FleetCohort.select` and `publish` raise.
         """
+        from fleet_slip.api.retraining import Training
         from fleet_slip.api.run_report import RunReport
         from fleet_slip.selection.model_list import load_model_list
         from fleet_slip.selection.worth import parse_worth
@@ -138,13 +137,14 @@ class Fleet(Filling, Tending):
                         progress=_of_step(progress, f"gram {feature_set}"),
                     )
             refusal, selection = "", None
-            publication = self._made_already(model_name, condition, models, worth)
+            training = Training(model_name, condition, models, worth, sign_key)
+            publication = training.made_already(self)
             if publication is None:
                 with step("select"):
-                    selection = self.cohort(condition).select(models=models, worth=worth)
+                    selection = training.select(self)
                 with step("publish"):
-                    publication, refusal = self._publish_if_not_worse(
-                        model_name, selection, sign_key
+                    publication, refusal = training.publish_if_not_worse(
+                        self, selection, replace_marked=True
                     )
         return RunReport(
             campaign=chosen.name,
@@ -157,34 +157,56 @@ class Fleet(Filling, Tending):
             seconds=round(time.monotonic() - begun, 3),
         )
 
-    def _made_already(
-        self, name: str, cohort: str, models: str, worth: str
-    ) -> "Publication | None":
-        """Return the champion if a selection would come to it again, whatever it looks at."""
-        from fleet_slip.maintenance.marks import marked_models
-        from fleet_slip.models.publish import Publication
-        from fleet_slip.models.up_to_date import is_up_to_date
+    @record_call
+    def nightly(
+        self,
+        landing: Path | str,
+        mapping: str,
+        name: str,
+        *,
+        cohort: str = TRAINING_DRIVES,
+        models: str = RUN_MODELS,
+        worth: str = "0.005deg",
+        candidate: bool = False,
+        retention: str | None = None,
+        night: date | None = None,
+        sign_key: Path | None = None,
+        workers: Workers = None,
+        progress: ShowStep | None = None,
+        waiting: Callable[[], None] = lambda: None,
+    ) -> "NightReport":
+        """Do all that a night with real cars asks for, and tell how each step went.
 
-        champion = self.registry().champion(name)
-        if champion is None or champion.reference in marked_models(self.root):
-            return None
-        if not is_up_to_date(champion.manifest, self.warehouse, cohort, models, worth):
-            return None
-        return Publication(champion, False, "The champion was made from the same data and list.")
+        Ingest what is new in the folder `landing` through a mapping, forget what is too old, update
+        Gram rows, examine sensors, chart the champion's error, train again without the faulty
+        drives, and verify some log files, the next ones on the next night. The winner becomes
+        champion of the model `name` if it is not worse, else, or if `candidate`, a candidate. A
+        night that was killed and is given again ends where it would have ended; `night` is its
+        date, today unless told otherwise. A second one of the model on this machine waits for the
+        first; `waiting` is called once before.
 
-    def _publish_if_not_worse(
-        self, name: str, selection: "RequestedSelection", sign_key: Path | None
-    ) -> "tuple[Publication | None, str]":
-        from fleet_slip.maintenance.marks import marked_models
+        What goes wrong in a step is in the report, whose `problem` is what a command fails with;
+        later steps go on where they can. Raises `UsageError` for a name that no model may have or a
+        worth that is none, and `StorageError` if the night cannot be recorded.
+        """
+        from fleet_slip.api.nightly import Night
+        from fleet_slip.api.retraining import Training
+        from fleet_slip.selection.worth import parse_worth
 
-        champion = self.registry().champion(name)
-        # What was trained on forgotten drives is replaced, even if the new model is worse.
-        tainted = champion and champion.reference in marked_models(self.root)
-        try:
-            published = self.publish(name, selection, force=bool(tainted), sign_key=sign_key)
-        except RefusedError as error:
-            return None, str(error)
-        return published, ""
+        parse_worth(worth)
+        training = Training(require_model_name(name), cohort, models, worth, sign_key)
+        with self.root.exclusive(f".nightly-{name}.lock", waiting):
+            return Night(
+                fleet=self,
+                landing=Path(landing),
+                mapping=mapping,
+                training=training,
+                night=night or date.today(),
+                candidate=candidate,
+                retention=retention,
+                workers=workers,
+                progress=progress,
+            ).run()
 
 
 def _of_step(progress: ShowStep | None, name: str) -> Callable[[int, int], None] | None:

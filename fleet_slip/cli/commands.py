@@ -60,6 +60,7 @@ GROUPS = {
         "what-if": "statistics",
     },
     "Operations": {
+        "nightly": "nightly",
         "status": "status",
         "doctor": "status",
         "quality": "operations",

@@ -45,17 +45,18 @@ def check_grams(
     warehouse: Warehouse,
     count: int,
     progress: Progress = no_progress,
+    begin: int = 0,
 ) -> CheckReport:
     """Check the Gram rows of evenly chosen log files.
 
-    Raises `StorageError` naming the first drive whose Grams differ, and `DataError` if there
+    `begin` numbers the sample: that of the next number is of the next files, until all had their
+    turn. Raises `StorageError` naming the first drive whose Grams differ, and `DataError` if there
     is nothing to check.
     """
     logs = warehouse.logs.snapshot()
     if not logs.files:
         raise DataError(f"{warehouse.root}: no logs yet. Run: fleet-slip simulate CAMPAIGN")
-    step = max(1, len(logs.files) // count)
-    chosen = logs.files[::step][:count]
+    chosen = _evenly(logs.files, count, begin)
     stored = stored_grams(warehouse)
     drives = by_integers = rows = wide_drives = 0
     wide = _computed_wide_sets(warehouse)
@@ -71,11 +72,15 @@ def check_grams(
     for name in wide:
         missing = find_backlog(logs, warehouse.grams.snapshot(), features().identity(name)).missing
         computed = [file for file in logs.files if file not in missing]
-        every = max(1, len(computed) // count)
-        wide_drives += sum(
-            _check_wide(warehouse, f, name) for f in computed[::every][: max(1, count // SQL_COSTS)]
-        )
+        some = _evenly(computed, max(1, count // SQL_COSTS), begin)
+        wide_drives += sum(_check_wide(warehouse, file, name) for file in some)
     return CheckReport(len(chosen), rows, drives, by_integers, wide, wide_drives)
+
+
+def _evenly(files: Sequence[TableFile], count: int, begin: int) -> list[TableFile]:
+    """Return some of the files, evenly chosen, from the one of the number `begin` on."""
+    many = len(files)
+    return [files[(begin + i * many // count) % many] for i in range(min(count, many))]
 
 
 def _computed_wide_sets(warehouse: Warehouse) -> tuple[str, ...]:

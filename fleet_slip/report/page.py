@@ -3,9 +3,7 @@
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 
-from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
 
 from fleet_slip.report import paper_tables, tables
@@ -15,12 +13,10 @@ from fleet_slip.report.data import ReportData
 from fleet_slip.report.drawing import inline_svgs
 from fleet_slip.report.picture import Picture
 from fleet_slip.report.road_pictures import standings
-from fleet_slip.report.style import PALETTE
 from fleet_slip.report.table import ReportTable
+from fleet_slip.report.templating import fill_in
 from fleet_slip.report.text import count, degrees, size
 from fleet_slip.words import number_of
-
-TEMPLATES = files("fleet_slip.report") / "templates"
 
 SECTIONS = ("figure-", "memory-", "road-", "fleet-")
 """What the keys of pictures begin with that have sections of their own."""
@@ -44,21 +40,13 @@ class Tile:
 
 def render(data: ReportData, shown: Sequence[Picture]) -> str:
     """Return the page."""
-    environment = Environment(
-        loader=FunctionLoader(lambda name: (TEMPLATES / name).read_text(encoding="utf-8")),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     drawn = [
         Drawn(one, {kind: Markup(svg) for kind, svg in inline_svgs(one).items()})  # noqa: S704
         for one in shown
     ]
     claims = judge_claims(data)
-    page = environment.get_template("report.html.j2").render(
-        css=Markup((TEMPLATES / "report.css").read_text(encoding="utf-8")),  # noqa: S704
-        palette={name.replace("_", "-"): tone for name, tone in PALETTE.items()},
+    return fill_in(
+        "report.html.j2",
         version=data.version,
         evaluation=data.evaluated.document,
         paper=[one for one in drawn if one.picture.key.startswith("figure-")],
@@ -82,7 +70,6 @@ def render(data: ReportData, shown: Sequence[Picture]) -> str:
         configs=data.configs,
         commands=_commands(data),
     )
-    return page + "\n"
 
 
 def missing_scenarios(data: ReportData) -> list[str]:

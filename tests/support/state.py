@@ -9,7 +9,7 @@ from fleet_slip.models.versions import Registry
 from fleet_slip.warehouse.tables import Warehouse
 
 
-def state(root: Path) -> dict[str, Any]:
+def state(root: Path, model: str = "smoke") -> dict[str, Any]:
     """All that a data root holds, apart from the moments at which it was written."""
     warehouse = Warehouse(LocalFolder(root))
     files = {
@@ -20,7 +20,7 @@ def state(root: Path) -> dict[str, Any]:
     registry = Registry(LocalFolder(root / "models"))
     return {
         "files": {Path(path).relative_to(root): digest for path, digest in files.items()},
-        "versions": [registry.load("smoke", n).sha256 for n in registry.versions("smoke")],
-        "aliases": registry.history("smoke").aliases(),
-        "moves": [(move.command, move.version) for move in registry.history("smoke").moves()],
+        "versions": [registry.load(model, n).sha256 for n in registry.versions(model)],
+        "aliases": registry.history(model).aliases(),
+        "moves": [(move.command, move.version) for move in registry.history(model).moves()],
     }

@@ -1,0 +1,245 @@
+"""A night with real cars: what is new comes in, is examined, and trains the model again."""
+
+import time
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import dataclass, field, replace
+from datetime import date
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fleet_slip.api.calls import ShowProgress, Workers
+from fleet_slip.api.retraining import Training
+from fleet_slip.catalogue.feature_sets import PLAIN
+from fleet_slip.errors import DataError, FleetSlipError, InputError
+from fleet_slip.ingest.folders import find_logs
+from fleet_slip.ingest.mapping import load_mapping
+from fleet_slip.models.aliases import CANDIDATE
+from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.monitoring.night_report import NightReport, NightStep, State
+from fleet_slip.runs.log import step
+from fleet_slip.runs.nights import Beginning, Nights, hash_drive, without_drives
+from fleet_slip.selection.model_list import load_model_list
+from fleet_slip.words import number_of
+
+if TYPE_CHECKING:
+    from fleet_slip.api.fleet import Fleet, ShowStep
+    from fleet_slip.monitoring.monitor import Chart
+    from fleet_slip.monitoring.quality import SensorFault
+
+SAMPLE_FILES = 4
+"""Log files that a night verifies; the next night takes the next ones."""
+SHOWN_NIGHTS = 30
+
+NEEDS = {
+    "quality": ("gram",),
+    "monitor": ("gram", "quality"),
+    "publish": ("gram", "quality"),
+    "verify": ("gram",),
+}
+"""Steps that ask for what others make. No model is trained on drives that were not examined."""
+
+TIMED = {"ingest", "retain", "gram"}
+"""Steps whose calls put themselves into the history of runs."""
+
+Told = tuple[State, str]
+
+
+@dataclass
+class Night:
+    """One night of a model. `run` does the steps in their order, and goes on where it can.
+
+    Files that cannot be used do not hold up the others; a step that needs one that failed is left
+    out.
+    """
+
+    fleet: "Fleet"
+    landing: Path
+    mapping: str
+    training: Training
+    night: date
+    candidate: bool = False
+    retention: str | None = None
+    workers: Workers = None
+    progress: "ShowStep | None" = None
+    before: Beginning = field(init=False)
+    steps: list[NightStep] = field(default_factory=list)
+    faults: "tuple[SensorFault, ...]" = ()
+    chart: "Chart | None" = None
+
+    def run(self) -> NightReport:
+        """Do the night and record it."""
+        began = time.monotonic()
+        nights = Nights(self.fleet.root, self.training.name)
+        self.before = nights.begin(self.night, self._now())
+        for name, work in {
+            "ingest": self._ingest,
+            "retain": self._retain,
+            "gram": self._gram,
+            "quality": self._quality,
+            "monitor": self._monitor,
+            "publish": self._publish,
+            "verify": self._verify,
+        }.items():
+            self._do(name, work)
+        now = self._now()
+        report = NightReport(
+            model=self.training.name,
+            night=self.night,
+            root=str(self.fleet.root),
+            steps=tuple(self.steps),
+            before=self.before,
+            drives=now.drives,
+            rows=now.rows,
+            quarantined=now.quarantined,
+            champion=now.champion,
+            candidate=self._candidate(),
+            faults=self.faults,
+            chart=self.chart,
+            past=tuple(islice(nights.ended(self.night), SHOWN_NIGHTS)),
+            seconds=round(time.monotonic() - began, 3),
+        )
+        nights.end(report.as_past())
+        return report
+
+    def _do(self, name: str, work: Callable[[], Told]) -> None:
+        """Do a step, unless what it needs is not there; keep what came of it."""
+        began = time.monotonic()
+        if reason := self._hindrance(name):
+            self.steps.append(NightStep(name, "left out", reason, 0.0))
+            return
+        error = None
+        try:
+            with nullcontext() if name in TIMED else step(name):
+                state, told = work()
+        except FleetSlipError as failure:
+            state, told, error = "failed", str(failure), failure
+        seconds = round(time.monotonic() - began, 3)
+        self.steps.append(NightStep(name, state, told, seconds, error))
+
+    def _hindrance(self, name: str) -> str:
+        """Return why a step cannot be done."""
+        if name != "ingest" and not self.fleet.warehouse.logs.snapshot().rows:
+            return "No drive has landed yet."
+        undone = [one.name for one in self.steps if one.state in ("failed", "left out")]
+        missing = [one for one in NEEDS.get(name, ()) if one in undone]
+        return f"{missing[0]} was not done." if missing else ""
+
+    def _now(self) -> Beginning:
+        """Return what the root has at this moment."""
+        warehouse, champion = self.fleet.warehouse, None
+        if self.fleet.root.exists():
+            champion = self.fleet.registry().champion(self.training.name)
+        grams = warehouse.grams.snapshot()
+        drives: set[str] = set()
+        for file in grams.files:
+            drives.update(warehouse.grams.read(file.path, ["drive_id"])["drive_id"].to_pylist())
+        return Beginning(
+            champion=champion.reference if champion else None,
+            drives=len(drives),
+            rows=warehouse.logs.snapshot().rows,
+            quarantined=warehouse.quarantine.snapshot().rows,
+        )
+
+    def _candidate(self) -> str | None:
+        pointed = self.fleet.registry().history(self.training.name).pointed_at(CANDIDATE)
+        return f"{self.training.name}@{pointed}" if pointed else None
+
+    def _shown(self, name: str) -> ShowProgress | None:
+        show = self.progress
+        return None if show is None else lambda done, total: show(name, done, total)
+
+    def _ingest(self) -> Told:
+        mapping = load_mapping(self.mapping)
+        if not self.landing.is_dir():
+            raise InputError(
+                f"{self.landing}: no such folder. Name the folder where logs land, or mount it."
+            )
+        try:
+            find_logs([self.landing])
+        except InputError:  # a night in which no car came home is no fault
+            never = not self.before.rows
+            return ("attention" if never else "done"), "No log is in the folder."
+        reports = self.fleet.ingest(
+            self.landing, mapping, workers=self.workers, progress=self._shown("ingest")
+        )
+        rows = self.fleet.warehouse.logs.snapshot().rows - self.before.rows
+        told = f"{number_of(rows, 'new row')}."
+        alike = {name for one in reports for names in one.look_alikes for name in names}
+        if alike:
+            return "attention", f"{told} Names that look the same: {', '.join(sorted(alike))}."
+        return "done", told
+
+    def _gram(self) -> Told:
+        for name in dict.fromkeys((PLAIN, load_model_list(self.training.models).features)):
+            self.fleet.gram(
+                name,
+                cohort=None if name == PLAIN else self.training.cohort,
+                workers=self.workers,
+                progress=self._shown(f"gram {name}"),
+            )
+        return "done", f"Of {number_of(self._now().drives, 'drive')}."
+
+    def _quality(self) -> Told:
+        found = self.fleet.quality(self.training.cohort)
+        self.faults = found.findings
+        hashes = [hash_drive(self.training.name, one.drive_id) for one in self.faults]
+        cohort = without_drives(self.training.cohort, self.training.name, hashes)
+        self.training = replace(self.training, cohort=cohort)
+        new = len(set(hashes) - self.before.known)
+        told = (
+            f"{number_of(found.drives, 'drive')} examined: {new} newly not in order, "
+            f"{len(hashes)} in all, which train no model."
+        )
+        return "attention" if new else "done", told
+
+    def _monitor(self) -> Told:
+        champion = self.before.champion
+        if champion is None:
+            return "left out", "There was no champion yet."
+        version: ModelVersion = self.fleet.model(champion)
+        try:
+            self.chart = self.fleet.monitor(version, self.training.cohort)
+        except DataError as error:
+            return "left out", str(error)
+        new = [day for day in self.chart.days if not day.training]
+        told = f"{champion} on {number_of(len(new), 'new day')}: "
+        if alarms := self.chart.alarms:
+            days = ", ".join(f"{day.day} ({' and '.join(day.alarms)})" for day in alarms)
+            return "attention", f"{told}beyond its limits on {days}."
+        return "done", f"{told}within its limits."
+
+    def _publish(self) -> Told:
+        if made := self.training.made_already(self.fleet):
+            return "done", f"{made.version.reference} is up to date."
+        selection = self.training.select(self.fleet)
+        name, key = self.training.name, self.training.sign_key
+        publication, refusal = None, ""
+        if not self.candidate:
+            publication, refusal = self.training.publish_if_not_worse(
+                self.fleet, selection, replace_marked=False
+            )
+        if publication is None:
+            publication = self.fleet.publish(name, selection, candidate=True, sign_key=key)
+        told = f"{publication.version.reference}: {publication.reason}"
+        return "attention" if refusal else "done", told
+
+    def _verify(self) -> Told:
+        checked = self.fleet.check(
+            SAMPLE_FILES,
+            begin=self.night.toordinal(),
+            progress=self._shown("verify"),
+        )
+        return "done", (
+            f"{number_of(checked.rows, 'row')} of {number_of(checked.files, 'file')} are what was "
+            "written, and their Gram rows what they must be."
+        )
+
+    def _retain(self) -> Told:
+        report = self.fleet.retain(self.retention, progress=self._shown("retain"))
+        forgotten, removed = report.forgotten.drives, len(report.vacuumed.files)
+        return "done", (
+            f"{number_of(forgotten, 'drive')} before {report.before} forgotten, "
+            f"{number_of(removed, 'old file')} removed."
+        )

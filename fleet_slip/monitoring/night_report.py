@@ -1,0 +1,160 @@
+"""What a night came to: `Fleet.nightly` returns it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import date
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+
+from fleet_slip.errors import AlarmError, FleetSlipError
+from fleet_slip.runs.nights import Beginning, PastNight, hash_drive
+from fleet_slip.words import number_of
+
+if TYPE_CHECKING:
+    from fleet_slip.monitoring.monitor import Chart
+    from fleet_slip.monitoring.quality import SensorFault
+
+State: TypeAlias = Literal["done", "attention", "failed", "left out"]
+
+
+@dataclass(frozen=True)
+class NightStep:
+    """One step of a night.
+
+    Attributes:
+        state: whether it was done, calls for attention, failed, or could not be asked for.
+        told: what it did or found, in a sentence.
+        error: what it failed with.
+    """
+
+    name: str
+    state: State
+    told: str
+    seconds: float
+    error: FleetSlipError | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the step for a JSON document."""
+        told = {"name": self.name, "state": self.state, "told": self.told}
+        return {**told, "exit_code": self.error.exit_code if self.error else None}
+
+
+@dataclass(frozen=True)
+class NightReport:
+    """The summary of a night. All but `seconds` is the same if the night was killed on its way.
+
+    Attributes:
+        before: what the root had when the night first began.
+        faults: the drives whose sensors are not in order; `new_faults` came with this night.
+        chart: the errors of the champion of before on the days since it was trained, if there are
+            enough days to tell what is usual.
+        past: the nights before, the newest first.
+    """
+
+    model: str
+    night: date
+    root: str
+    steps: tuple[NightStep, ...]
+    before: Beginning
+    drives: int
+    rows: int
+    quarantined: int
+    champion: str | None
+    candidate: str | None
+    faults: "tuple[SensorFault, ...]"
+    chart: "Chart | None"
+    past: Sequence[PastNight]
+    seconds: float
+
+    @property
+    def new_faults(self) -> "tuple[SensorFault, ...]":
+        """The faulty drives that the night before did not know of."""
+        known = self.before.known
+        return tuple(
+            one for one in self.faults if hash_drive(self.model, one.drive_id) not in known
+        )
+
+    @property
+    def problem(self) -> FleetSlipError | None:
+        """The first failure, else what calls for attention; None after a good night."""
+        told = f"the night of {self.night}"
+        for step in self.steps:
+            if step.error is not None:
+                return type(step.error)(f"{told}: {step.name} failed: {step.error}")
+        calling = [f"{one.name}: {one.told}" for one in self.steps if one.state == "attention"]
+        return AlarmError(f"{told}: {' '.join(calling)}") if calling else None
+
+    @property
+    def exit_code(self) -> int:
+        """That of the first failure, 10 if something calls for attention, else 0."""
+        return self.problem.exit_code if self.problem else 0
+
+    @property
+    def verdict(self) -> str:
+        """How the night went, in a few words."""
+        failed = [step.name for step in self.steps if step.state == "failed"]
+        calling = [step.name for step in self.steps if step.state == "attention"]
+        if failed:
+            return f"{' and '.join(failed)} failed"
+        return f"{' and '.join(calling)} call for attention" if calling else "all went well"
+
+    @property
+    def gained(self) -> str:
+        """What the night brought in."""
+        rows, drives = self.rows - self.before.rows, self.drives - self.before.drives
+        held = self.quarantined - self.before.quarantined
+        told = f"{number_of(drives, 'drive')}, {number_of(rows, 'row')}"
+        return f"{told}; in quarantine: {number_of(held, 'row')}" if held else told
+
+    def as_past(self) -> PastNight:
+        """Return the night as the record keeps it."""
+        return PastNight(
+            self.night,
+            self.exit_code,
+            self.drives,
+            self.rows,
+            self.champion,
+            {step.name: step.state for step in self.steps},
+            frozenset(hash_drive(self.model, one.drive_id) for one in self.faults),
+        )
+
+    def as_text(self) -> str:
+        """Return the summary for people, lines of text."""
+        wide = max(len(step.name) for step in self.steps)
+        mark = {"done": "ok", "attention": "LOOK", "failed": "FAILED", "left out": "-"}
+        lines = [
+            f"{self.model}, night of {self.night}: {self.verdict} (exit code {self.exit_code})",
+            f"new: {self.gained}; champion: {self.champion or 'none'}"
+            + (f", was {self.before.champion}" if self._moved else ""),
+            *(f"  {one.name:<{wide}}  {mark[one.state]:<6}  {one.told}" for one in self.steps),
+            *(
+                f"  {one.drive_id}: {one.fault.kind} {' '.join(one.fault.signals)}"
+                for one in self.new_faults
+            ),
+        ]
+        return "\n".join(line.rstrip() for line in lines)
+
+    @property
+    def _moved(self) -> bool:
+        return self.before.champion not in (None, self.champion)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `nightly --json` prints."""
+        return {
+            "model": self.model,
+            "night": self.night,
+            "exit_code": self.exit_code,
+            "verdict": self.verdict,
+            "drives": self.drives,
+            "new_drives": self.drives - self.before.drives,
+            "rows": self.rows,
+            "new_rows": self.rows - self.before.rows,
+            "new_rows_quarantined": self.quarantined - self.before.quarantined,
+            "champion": self.champion,
+            "champion_before": self.before.champion,
+            "candidate": self.candidate,
+            "steps": [step.as_dict() for step in self.steps],
+            "faults": [one.as_dict() for one in self.faults],
+            "new_faults": [one.drive_id for one in self.new_faults],
+            "alarms": [str(day.day) for day in self.chart.alarms] if self.chart else [],
+            "seconds": self.seconds,
+        }

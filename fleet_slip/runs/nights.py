@@ -1,0 +1,130 @@
+"""The record of nights: where each began, and how it ended.
+
+    nights/1.json, 2.json, ...   numbered documents, two of a night: its beginning and its end
+
+A night that was killed and is given again starts from the beginning that is there, so that it tells
+the whole night and judges the model that was champion before it. Faulty drives stand here as
+hashes: the record outlives what is forgotten.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from datetime import date
+from hashlib import sha256
+from typing import Any
+
+from fleet_slip.files.documents import DocumentFolder
+from fleet_slip.files.folder import Folder
+
+FOLDER = "nights"
+HASH_CHARACTERS = 16
+
+
+@dataclass(frozen=True)
+class Beginning:
+    """What a data root had when a night began.
+
+    Attributes:
+        champion: the version that was champion, NAME@VERSION.
+        known: hashes of the drives whose sensors were not in order after the night before.
+    """
+
+    champion: str | None
+    drives: int
+    rows: int
+    quarantined: int
+    known: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True)
+class PastNight:
+    """How a night ended; `steps` are the state of each by name."""
+
+    night: date
+    exit_code: int
+    drives: int
+    rows: int
+    champion: str | None
+    steps: Mapping[str, str]
+    faulty: frozenset[str] = frozenset()
+
+
+def hash_drive(model: str, drive_id: str) -> str:
+    """Return what stands for a drive in the record and in conditions: 16 hexadecimal digits.
+
+    Salted with the model's name. In SQL it is `left(sha256('MODEL ' || drive_id), 16)`.
+    """
+    return sha256(f"{model} {drive_id}".encode()).hexdigest()[:HASH_CHARACTERS]
+
+
+@dataclass(frozen=True)
+class Nights:
+    """The nights of one model in a data root."""
+
+    root: Folder
+    model: str
+
+    def begin(self, night: date, now: Beginning) -> Beginning:
+        """Record the beginning of a night; return the one that is there, if the night has one."""
+        for content in self._newest_first():
+            if content["night"] < night.isoformat():
+                break
+            if content["night"] == night.isoformat() and content["event"] == "begun":
+                return Beginning(
+                    content["champion"],
+                    content["drives"],
+                    content["rows"],
+                    content["quarantined"],
+                    frozenset(content["known"]),
+                )
+        before = next(self.ended(before=night), None)
+        known = before.faulty if before else frozenset()
+        begun = Beginning(now.champion, now.drives, now.rows, now.quarantined, known)
+        self._append("begun", night, {**vars(begun), "known": sorted(begun.known)})
+        return begun
+
+    def end(self, past: PastNight) -> None:
+        """Record how a night ended."""
+        content = {**vars(past), "steps": dict(past.steps), "faulty": sorted(past.faulty)}
+        self._append("ended", content.pop("night"), content)
+
+    def ended(self, before: date | None = None) -> Iterator[PastNight]:
+        """Yield the nights that ended, the newest first and each once, as it ended at last."""
+        seen = {before.isoformat()} if before else set()
+        for content in self._newest_first():
+            late = before is not None and content["night"] > before.isoformat()
+            if content["event"] == "ended" and content["night"] not in seen and not late:
+                seen.add(content["night"])
+                yield PastNight(
+                    date.fromisoformat(content["night"]),
+                    content["exit_code"],
+                    content["drives"],
+                    content["rows"],
+                    content["champion"],
+                    content["steps"],
+                    frozenset(content["faulty"]),
+                )
+
+    def _documents(self) -> DocumentFolder:
+        return DocumentFolder(self.root / FOLDER)
+
+    def _newest_first(self) -> Iterator[Mapping[str, Any]]:
+        documents = self._documents()
+        for number in reversed(documents.numbers()):
+            content = documents.read(number).content
+            if content["model"] == self.model:
+                yield content
+
+    def _append(self, event: str, night: date, content: Mapping[str, Any]) -> None:
+        known = {"event": event, "model": self.model, "night": night.isoformat()}
+        self._documents().append({**known, **content})
+
+
+def without_drives(cohort: str, model: str, hashes: Iterable[str]) -> str:
+    """Return a condition that also leaves out the drives of these hashes."""
+    listed = ", ".join(f"'{one}'" for one in sorted(hashes))
+    if not listed:
+        return cohort
+    return (
+        f"({cohort}) AND left(sha256('{model} ' || drive_id), {HASH_CHARACTERS}) NOT IN ({listed})"
+    )

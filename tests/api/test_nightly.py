@@ -1,0 +1,272 @@
+"""Nights with real cars: logs that land day by day, and what goes wrong with them."""
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import date, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import fleet_slip
+from fleet_slip.api.nightly import Night
+from fleet_slip.errors import UsageError
+from fleet_slip.models.gate import floor
+from fleet_slip.monitoring.night_report import NightReport
+from tests.support.commands import Finished, run_on, start_on
+from tests.support.landing import Landing
+from tests.support.once import made_once
+from tests.support.state import state
+
+FIRST = date(2026, 10, 5)
+OPTIONS = ("--models", "table1")
+DRIVES = (4, 2, 2)
+"""How many land on each day."""
+
+
+def day_of(night: int) -> date:
+    return FIRST + timedelta(days=night)
+
+
+def land(landing: Landing, night: int, **changes: str) -> Path:
+    begin = sum(DRIVES[:night])
+    drives = landing.drives()[begin : begin + DRIVES[night]]
+    return landing.land(f"night-{night}", drives, day_of(night), **changes)
+
+
+def configs(folder: Path, old: str, new: str) -> str:
+    """Return a folder of configs whose gate is another."""
+    shipped = Path(fleet_slip.__file__).parents[1] / "configs/publish.toml"
+    text = shipped.read_text()
+    assert old in text
+    folder.mkdir(parents=True)
+    (folder / "publish.toml").write_text(text.replace(old, new))
+    return str(folder)
+
+
+@contextmanager
+def gate(folder: Path, old: str, new: str) -> Iterator[None]:
+    """Publish by another gate, here and in commands."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("FLEET_SLIP_CONFIG", configs(folder, old, new))
+        floor.cache_clear()
+        yield
+    floor.cache_clear()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def forgiving(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """A gate that lets small differences pass: of so few drives they are large."""
+    own = tmp_path_factory.mktemp("forgiving") / "configs"
+    with gate(own, "worth_deg = 0.005", "worth_deg = 1.0  "):
+        yield
+
+
+@pytest.fixture(scope="module")
+def two_nights(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Path:
+    """A folder with the landing folder, and a root, `data`, after two nights."""
+
+    def make(folder: Path) -> None:
+        landing = Landing(folder / "landing", smoke_root)
+        landing.prepare()
+        for night in range(2):
+            land(landing, night)
+            assert give(folder, night).problem is None
+
+    return made_once(tmp_path_factory, "two-nights", make)
+
+
+@pytest.fixture
+def place(two_nights: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(two_nights, tmp_path / "place"))
+
+
+@pytest.fixture
+def landing(place: Path, smoke_root: Path) -> Landing:
+    return Landing(place / "landing", smoke_root)
+
+
+def give(place: Path, night: int, **options: Any) -> NightReport:
+    fleet = fleet_slip.open(place / "data")
+    mapping = str(place / "landing.toml")
+    chosen = {"models": "table1", "night": day_of(night), **options}
+    return fleet.nightly(place / "landing", mapping, "smoke", **chosen)
+
+
+def command(place: Path, night: int, *options: str) -> list[str]:
+    words = ["nightly", "--landing", f"{place / 'landing'}", "--model", "smoke", *OPTIONS]
+    mapping = [] if "--mapping" in options else ["--mapping", f"{place / 'landing.toml'}"]
+    return [*words, *mapping, "--night", f"{day_of(night)}", *options]
+
+
+def run_night(place: Path, night: int, *options: str) -> Finished:
+    return run_on(place / "data", *command(place, night, *options))
+
+
+def figures(report: NightReport) -> dict[str, Any]:
+    """What a summary says, but for how it came to that."""
+    told = report.as_dict()
+    del told["seconds"]
+    return {**told, "steps": [(one.name, one.state) for one in report.steps]}
+
+
+def test_a_night_brings_in_what_is_new_and_writes_its_summary(
+    place: Path, landing: Landing, tmp_path: Path
+) -> None:
+    land(landing, 2)
+    done = run_night(place, 2, "--json", "--output", str(tmp_path / "out"))
+    assert done.exit_code == 0, done.stderr
+    told = done.json
+    assert (told["drives"], told["new_drives"], told["champion"]) == (8, 2, "smoke@3")
+    assert told["champion_before"] == "smoke@2"
+    assert {step["state"] for step in told["steps"]} == {"done", "left out"}
+    assert json.loads((tmp_path / f"out/{day_of(2)}.json").read_text()) == told
+    assert "2 drives" in (tmp_path / f"out/{day_of(2)}.txt").read_text()
+    assert f"Night of {day_of(2)}: all went well" in (tmp_path / f"out/{day_of(2)}.html").read_text(
+        encoding="utf-8"
+    )
+    again = give(place, 3).as_text()
+    assert "0 new rows" in again
+    assert "smoke@3 is up to date" in again
+
+
+class Killed(BaseException):
+    """The end of a process, as far as it can be told from within."""
+
+
+@pytest.mark.parametrize("step", ["_retain", "_publish", "_candidate"])
+def test_a_night_that_is_killed_and_given_again_ends_at_the_same_place(
+    place: Path, landing: Landing, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, step: str
+) -> None:
+    land(landing, 2)
+    twin = Path(shutil.copytree(place, tmp_path / "twin"))
+    undisturbed = give(twin, 2)
+
+    def kill(_: Night) -> None:
+        raise Killed
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(Night, step, kill)
+        give(place, 2)
+    again = give(place, 2)
+    assert figures(again) == figures(undisturbed)
+    assert state(place / "data") == state(twin / "data")
+    assert not fleet_slip.open(place / "data").verify().damage
+
+
+def test_a_process_that_is_killed_leaves_a_night_that_can_be_given_again(
+    place: Path, landing: Landing
+) -> None:
+    land(landing, 2)
+    process = start_on(place / "data", "--log", "json", *command(place, 2))
+    assert process.stderr
+    for line in process.stderr:
+        if '"step": "gram"' in line:
+            break
+    process.kill()
+    process.communicate()
+    assert process.returncode < 0
+    again = give(place, 2)
+    assert (again.exit_code, again.drives, again.champion) == (0, 8, "smoke@3")
+    assert again.drives - again.before.drives == 2
+
+
+def test_a_file_that_cannot_be_used_does_not_hold_up_the_others(
+    place: Path, landing: Landing
+) -> None:
+    land(landing, 2)
+    (place / "landing/torn.parquet").write_bytes(b"PAR1 half a file")
+    report = give(place, 2)
+    assert (report.exit_code, report.champion, report.drives) == (4, "smoke@3", 8)
+    assert "ingest failed" in str(report.problem)
+    assert "torn.parquet" in str(report.problem)
+
+
+def test_with_a_wrong_mapping_what_is_there_is_looked_after(place: Path, landing: Landing) -> None:
+    land(landing, 2)
+    wrong = place / "wrong.toml"
+    wrong.write_text(landing.mapping.read_text().replace('"m/s^2"', '"furlongs"'))
+    done = run_night(place, 2, "--mapping", str(wrong), "--json")
+    assert done.exit_code == 3
+    assert "furlongs" in done.stderr
+    states = {step["name"]: step["state"] for step in done.json["steps"]}
+    assert states["ingest"] == "failed"
+    assert states["verify"] == states["quality"] == "done"
+    mended = give(place, 2)
+    assert (mended.exit_code, mended.drives - mended.before.drives) == (0, 2)
+
+
+def test_a_broken_sensor_is_told_once_and_trains_no_model(place: Path, landing: Landing) -> None:
+    land(landing, 2, yaw_rate_rad_s="0.01")
+    first = give(place, 2)
+    assert first.exit_code == 10
+    assert len(first.new_faults) == 2
+    assert {fault.fault.signals for fault in first.new_faults} == {("yaw_rate",)}
+    assert all(fault.drive_id in first.as_text() for fault in first.new_faults)
+    assert first.champion == "smoke@2"
+    second = give(place, 3)
+    assert second.exit_code == 0
+    assert (len(second.faults), second.new_faults) == (2, ())
+    record = "".join(file.read_text() for file in (place / "data/nights").iterdir())
+    assert first.new_faults[0].drive_id not in record
+
+
+def test_a_worse_winner_becomes_a_candidate_and_calls_for_attention(
+    place: Path, landing: Landing
+) -> None:
+    land(landing, 2)
+    with gate(place / "configs", "min_correlation = 0.5", "min_correlation = 0.999999"):
+        report, again = give(place, 2), give(place, 2)
+    assert report.exit_code == 10
+    assert (report.champion, report.candidate) == ("smoke@2", "smoke@3")
+    assert "publish: smoke@3" in str(report.problem)
+    assert (again.exit_code, again.candidate) == (10, "smoke@3")
+
+
+def refused(place: Path, night: int, **options: Any) -> tuple[int, str]:
+    report = give(place, night, **options)
+    return report.exit_code, str(report.problem)
+
+
+@pytest.mark.parametrize(
+    ("options", "exit_code", "told"),
+    [
+        ({"cohort": "no such thing"}, 5, "quality failed"),
+        ({"models": "no-such-list"}, 3, "gram failed"),
+        ({"retention": "no-such-file"}, 3, "retain failed"),
+    ],
+)
+def test_a_step_that_fails_is_named(
+    place: Path, options: dict[str, Any], exit_code: int, told: str
+) -> None:
+    code, problem = refused(place, 2, **options)
+    assert code == exit_code
+    assert told in problem
+
+
+def test_before_anything_has_landed_it_says_so(tmp_path: Path, smoke_root: Path) -> None:
+    landing = Landing(tmp_path / "landing", smoke_root)
+    landing.prepare()
+    report = give(tmp_path, 0)
+    assert report.exit_code == 10
+    assert "No log is in the folder" in report.as_text()
+    shutil.rmtree(landing.folder)
+    assert refused(tmp_path, 0)[0] == 4
+
+
+def test_what_means_nothing_is_refused_before_anything_is_written(
+    run_command: Callable[..., Finished], tmp_path: Path
+) -> None:
+    done = run_command(
+        *("nightly", "--landing", ".", "--mapping", "m", "--model", "m", "--night", "yesterday")
+    )
+    assert done.exit_code == 2
+    assert "--night yesterday: not a date" in done.stderr
+    fleet = fleet_slip.open(tmp_path / "data")
+    with pytest.raises(UsageError, match="no/name"):
+        fleet.nightly(tmp_path, "m", "no/name")
+    with pytest.raises(UsageError, match="much"):
+        fleet.nightly(tmp_path, "m", "name", worth="much")
+    assert not (tmp_path / "data").exists()
