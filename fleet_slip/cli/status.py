@@ -6,9 +6,9 @@ from typing import Annotated, Any
 
 import typer
 
-from fleet_slip.cli.output import Json, print_json, print_table, say
+from fleet_slip.cli.output import Json, print_json, print_table, print_text, say
 from fleet_slip.cli.workers import Cluster
-from fleet_slip.errors import AlarmError
+from fleet_slip.errors import AlarmError, UsageError
 from fleet_slip.monitoring.fitness import Fitness
 from fleet_slip.monitoring.status import WarehouseStatus
 from fleet_slip.words import number_of
@@ -20,6 +20,10 @@ def status(
         float | None,
         typer.Option(min=0, help="Data, or a backlog, older than this is a problem."),
     ] = None,
+    prometheus: Annotated[
+        bool,
+        typer.Option("--prometheus", help="Print metrics, for the textfile collector of a node."),
+    ] = False,
     json: Json = False,
 ) -> None:
     """Tell the warehouse's health: freshness, backlog, last runs, disk, champions.
@@ -28,8 +32,14 @@ def status(
 
     Example: **fleet-slip status --max-age-hours 26**
     """
+    if json and prometheus:
+        raise UsageError("give one of --json and --prometheus.")
     found: WarehouseStatus = context.obj.status(max_age_hours)
-    if json:
+    if prometheus:
+        from fleet_slip.monitoring.prometheus import as_openmetrics  # noqa: PLC0415 - seldom asked
+
+        print_text(as_openmetrics(found).removesuffix("\n"))
+    elif json:
         print_json(found)
     else:
         _print_status(found)
