@@ -13,15 +13,23 @@ import stat
 import sys
 import tempfile
 from collections.abc import Iterator
+from datetime import date
 from pathlib import Path
 
 import pytest
 
 from tests.support import commands
 from tests.support.commands import COMMAND, Finished
+from tests.support.landing import Landing
 
 UNIT = Path(__file__).parents[2] / "jobs/schedule/fleet-slip.service"
 NOBODY = 65534
+DIRECTORIES = {
+    "StateDirectory": ("/var/lib", "state", "STATE_DIRECTORY"),
+    "CacheDirectory": ("/var/cache", "cache", "CACHE_DIRECTORY"),
+    "LogsDirectory": ("/var/log", "logs", "LOGS_DIRECTORY"),
+}
+"""Where systemd makes a folder that the service may write, and what tells it."""
 
 
 def can_confine() -> bool:
@@ -55,14 +63,14 @@ def folder() -> Iterator[Path]:
 def confined(service: dict[str, str], folder: Path, arguments: list[str], **extra: str) -> str:
     """Return a script that does in a mount namespace what systemd does for the service."""
     assert service["ProtectSystem"] == "strict"
-    state = Path(service["ReadWritePaths"])
     lines = ["set -e"]
     environment = dict([service["Environment"].split("=", 1)]) | extra
-    places = {state: folder / "state"}
-    if "CacheDirectory" in service:
-        cache = Path("/var/cache") / service["CacheDirectory"]
-        places[cache] = folder / "cache"
-        environment["CACHE_DIRECTORY"] = str(cache)
+    places: dict[Path, Path] = {}
+    for setting, (parent, kept, variable) in DIRECTORIES.items():
+        if setting in service:
+            place = Path(parent) / service[setting]
+            places[place] = folder / kept
+            environment[variable] = str(place)
     for place, real in places.items():
         real.mkdir(exist_ok=True)
         os.chown(real, NOBODY, NOBODY)
@@ -108,15 +116,22 @@ def run(script: str) -> Finished:
 JOB = ["run", "--campaign", "smoke", "--days", "1", "--json"]
 
 
-def test_the_service_does_its_job_and_keeps_its_compiled_code(
-    service: dict[str, str], folder: Path
+def test_the_service_does_its_night_and_keeps_its_compiled_code(
+    service: dict[str, str], folder: Path, smoke_root: Path
 ) -> None:
-    done = run(confined(service, folder, JOB))
+    landing = Landing(folder / "landing", smoke_root)
+    landing.prepare()
+    landing.land("first", landing.drives()[:4], date(2026, 10, 5))
+    words = shlex.split(service["ExecStart"])[1:]
+    words[words.index("--landing") + 1] = str(landing.folder)
+    words[words.index("--mapping") + 1] = str(landing.mapping)
+    done = run(confined(service, folder, [*words, "--models", "table1", "--json"]))
     assert done.exit_code == 0, done.stderr
-    assert json.loads(done.stdout)["publish"]["new"]
+    assert json.loads(done.stdout)["champion"] == "fleet@1"
     assert "compiled" not in done.stderr
-    assert (folder / "state/models/smoke/versions/1.json").stat().st_uid == NOBODY
+    assert (folder / "state/models/fleet/versions/1.json").stat().st_uid == NOBODY
     assert list((folder / "cache").rglob("*.nbi"))
+    assert {file.suffix for file in (folder / "logs").iterdir()} == {".txt", ".json", ".html"}
 
 
 def test_without_a_cache_folder_it_does_its_job_and_says_what_that_costs(
