@@ -242,7 +242,7 @@ def build_wheel_forces(brush: bool, spinning: bool) -> Callable[..., WheelForces
 
 
 @equation
-def _spin(
+def spin_rate(
     force: WheelForce, spin: float, load: float, drive: float, brake: float, c: Constants
 ) -> WheelRate:
     """Return the rate of a wheel under drive and brake forces at its rim, I dω/dt = Σ torques.
@@ -273,10 +273,10 @@ def driven_spins(
     drive_f, drive_r = c.drive_front * drive, c.drive_rear * drive
     brake_f, brake_r = c.brake_front * brake, c.brake_rear * brake
     return WheelRates(
-        _spin(force.fl, x.wheel_fl, load.fl, drive_f, brake_f, c),
-        _spin(force.fr, x.wheel_fr, load.fr, drive_f, brake_f, c),
-        _spin(force.rl, x.wheel_rl, load.rl, drive_r, brake_r, c),
-        _spin(force.rr, x.wheel_rr, load.rr, drive_r, brake_r, c),
+        spin_rate(force.fl, x.wheel_fl, load.fl, drive_f, brake_f, c),
+        spin_rate(force.fr, x.wheel_fr, load.fr, drive_f, brake_f, c),
+        spin_rate(force.rl, x.wheel_rl, load.rl, drive_r, brake_r, c),
+        spin_rate(force.rr, x.wheel_rr, load.rr, drive_r, brake_r, c),
     )
 
 

@@ -1,0 +1,208 @@
+"""`gymnasium.make("fleet_slip/SideSlip-v0")`: what a stability controller sees, and may do.
+
+A car is steered through a sine with dwell (FMVSS 126: a sine of 0.7 Hz that rests for 0.5 s at its
+second peak). A controller brakes single wheels. It sees the signals that a fleet logs, as their
+sensors report them: noisy, biased, in counts. The side-slip angle is in `info`, not among them.
+
+Importing this module makes the environment known to gymnasium.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any, SupportsFloat
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box
+from numpy.typing import NDArray
+
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
+from fleet_slip.errors import UsageError
+from fleet_slip.simulation.braking import Brakes, move
+from fleet_slip.vehicle.integration import FIRST_ORDER, SECOND_ORDER, STEP_S, Slopes
+from fleet_slip.vehicle.parameters import constants, load_vehicle
+from fleet_slip.vehicle.state import Controls, State
+
+Observation = NDArray[np.float32]
+WHEELS = ("fl", "fr", "rl", "rr")
+
+TICK_S = float(SAMPLE_TIME_S)
+STRONGEST_BRAKE_N = 5000.0
+"""Brake force at the rim of a wheel for an action of 1."""
+BRAKE_LAG_S = 0.03
+"""How the hydraulic follows, a first-order lag."""
+SINE_HZ = 0.7
+DWELL_S = 0.5
+BEGIN_S = 0.5
+LAST_S = 5.0
+LOST_SLIP_RAD = math.radians(60)
+LOST_SPEED_MPS = 0.5
+COMFORTABLE_SLIP_RAD = math.radians(5)
+BRAKING_COSTS = 0.05
+
+BIAS_STD = {"ax": 0.15, "ay": 0.15, "yaw_rate": 0.01}
+"""Standard deviation between cars of what a sensor is off by, in SI units."""
+NOISE_STD = {
+    "ax": 0.1,
+    "ay": 0.1,
+    "yaw_rate": 0.01,
+    "steering_wheel": 0.002,
+    "steer_fl": 0.0002,
+    "steer_fr": 0.0002,
+    **{f"wheel_{wheel}": 0.02 for wheel in WHEELS},
+}
+"""The paper's initial noise, section III.A, in SI units."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One manoeuvre: how fast, how far the steering wheel turns, on what road."""
+
+    speed_mps: float
+    steering_rad: float
+    adhesion: float
+
+    def steering_at(self, time_s: float) -> float:
+        """Return the angle of the steering wheel at a time in s: a sine with dwell, left first."""
+        phase = (time_s - BEGIN_S) * SINE_HZ
+        if phase >= 0.75:
+            phase = max(0.75, phase - DWELL_S * SINE_HZ)
+        return self.steering_rad * math.sin(2 * math.pi * phase) if 0 <= phase <= 1 else 0.0
+
+
+class SideSlipEnv(gymnasium.Env[Observation, Observation]):
+    """A sine with dwell; actions brake wheels.
+
+    Observation: the inputs of the signal catalogue in SI units, float32 of shape (10,), in the
+    order of `signals`. Action: how hard to brake the wheels fl, fr, rl, rr, float32 of shape (4,)
+    from 0 to 1, for the next 10 ms. Reward: minus the square of the side-slip angle in units of 5
+    degrees, and a little for braking. An episode is terminated when the car has spun or stopped.
+
+    `info` has what no series sensor measures: `sideslip_rad`, `vx_mps`, `vy_mps`, and the
+    `adhesion`, `time_s` and noiseless `yaw_rate_rad_s`.
+    """
+
+    metadata = {"render_modes": []}  # noqa: RUF012 - as gymnasium declares it
+
+    def __init__(
+        self,
+        vehicle: str = "d_class_sedan",
+        speed_mps: tuple[float, float] = (20.0, 30.0),
+        steering_rad: tuple[float, float] = (1.0, 3.5),
+        adhesion: tuple[float, float] = (0.4, 1.0),
+        sensors: bool = True,
+    ) -> None:
+        """Choose the car and the ranges that trials are drawn from.
+
+        `speed_mps` in m/s, `steering_rad` the amplitude at the steering wheel in rad. Without
+        `sensors` the signals are true. Raises `ConfigError` for an unknown car and `UsageError`
+        for a range that is none.
+        """
+        for name, (least, most) in {
+            "speed_mps": speed_mps,
+            "steering_rad": steering_rad,
+            "adhesion": adhesion,
+        }.items():
+            if not 0 < least <= most < math.inf:
+                raise UsageError(
+                    f"{name} = ({least}, {most}): give the least and the most, above 0."
+                )
+        known = catalogue()
+        self.signals = tuple(known.inputs)
+        self._scales = np.array([float(known[name].scale) for name in self.signals])
+        self._limits = np.array([float(known[name].max) for name in self.signals])
+        self._noise = np.array([NOISE_STD[name] for name in self.signals])
+        self._bias_std = np.array([BIAS_STD.get(name, 0.0) for name in self.signals])
+        limits = self._limits.astype(np.float32)
+        self.observation_space = Box(-limits, limits, dtype=np.float32)
+        self.action_space = Box(0.0, 1.0, (len(WHEELS),), np.float32)
+        self._ranges = (speed_mps, steering_rad, adhesion)
+        self._vehicle, self._sensors = load_vehicle(vehicle), sensors
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Draw a trial; `options` may fix `speed_mps`, `steering_rad`, `adhesion`.
+
+        The side of the first turn is drawn too, unless the steering is fixed.
+        """
+        super().reset(seed=seed)
+        speed, steering, adhesion = (self.np_random.uniform(*one) for one in self._ranges)
+        side = 1.0 if self.np_random.random() < 0.5 else -1.0
+        drawn = {"speed_mps": speed, "steering_rad": side * steering, "adhesion": adhesion}
+        self.trial = Trial(**{**drawn, **(options or {})})
+        self._constants = constants(self._vehicle, self.trial.adhesion)
+        rolling = self.trial.speed_mps * self._constants.inverse_radius
+        zeros = (0.0,) * 6
+        self._state = State(self.trial.speed_mps, *zeros, *(rolling,) * 4)
+        self._slopes = Slopes(*(0.0 for _ in Slopes._fields))
+        self._brakes = np.zeros(len(WHEELS))
+        self._bias = self._bias_std * self.np_random.standard_normal(len(self.signals))
+        self._ticks, self._felt = 0, (0.0, 0.0)
+        return self._observe(), self._info()
+
+    def step(
+        self, action: Observation
+    ) -> tuple[Observation, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Drive on for 10 ms."""
+        demanded = np.clip(np.asarray(action, dtype=float), 0.0, 1.0)
+        self._brakes += (demanded - self._brakes) * (1 - math.exp(-TICK_S / BRAKE_LAG_S))
+        moved = move(
+            self._state,
+            self._slopes,
+            Controls(self.trial.steering_at(self._time_s), 0.0),
+            Brakes(*(float(STRONGEST_BRAKE_N * share) for share in self._brakes)),
+            self._constants,
+            STEP_S,
+            round(TICK_S / STEP_S),
+            SECOND_ORDER if self._ticks else FIRST_ORDER,
+        )
+        self._state, self._slopes = moved.state, moved.slopes
+        self._felt = (moved.ax, moved.ay)
+        self._ticks += 1
+        slip = self._sideslip
+        lost = abs(slip) > LOST_SLIP_RAD or self._state.vx < LOST_SPEED_MPS
+        reward = -((slip / COMFORTABLE_SLIP_RAD) ** 2) - BRAKING_COSTS * float(np.mean(demanded))
+        over = self._time_s >= LAST_S
+        return self._observe(), reward, bool(lost), bool(over), self._info()
+
+    @property
+    def _time_s(self) -> float:
+        return self._ticks * TICK_S
+
+    @property
+    def _sideslip(self) -> float:
+        return math.atan2(self._state.vy, self._state.vx)
+
+    def _observe(self) -> Observation:
+        """Return the signals as sensors report them: biased, noisy, in counts, within range."""
+        x, c = self._state, self._constants
+        tangent = c.steer_per_wheel * x.steering_wheel
+        true = {
+            "ax": self._felt[0],
+            "ay": self._felt[1],
+            "yaw_rate": x.yaw_rate,
+            "steering_wheel": x.steering_wheel,
+            "steer_fl": math.atan2(tangent, 1 - c.ackermann * tangent),
+            "steer_fr": math.atan2(tangent, 1 + c.ackermann * tangent),
+            **{f"wheel_{wheel}": getattr(x, f"wheel_{wheel}") for wheel in WHEELS},
+        }
+        values = np.array([true[name] for name in self.signals])
+        if self._sensors:
+            values += self._bias + self._noise * self.np_random.standard_normal(len(values))
+            values = np.round(values / self._scales) * self._scales
+        observed: Observation = np.clip(values, -self._limits, self._limits).astype(np.float32)
+        return observed
+
+    def _info(self) -> dict[str, Any]:
+        return {
+            "sideslip_rad": self._sideslip,
+            "vx_mps": float(self._state.vx),
+            "vy_mps": float(self._state.vy),
+            "yaw_rate_rad_s": float(self._state.yaw_rate),
+            "adhesion": self.trial.adhesion,
+            "time_s": self._time_s,
+        }
+
+
+gymnasium.register("fleet_slip/SideSlip-v0", f"{__name__}:{SideSlipEnv.__name__}")
