@@ -122,7 +122,11 @@ def _exit_code_of_app() -> int:
 
 
 def _choose_code_folder() -> None:
-    """Keep compiled code in the cache folder that systemd made for a service, if it did."""
+    """Keep compiled code, and what matplotlib knows of fonts, in the cache folder of a service.
+
+    systemd makes it; a service has no home.
+    """
     folder = os.environ.get("CACHE_DIRECTORY", "").partition(":")[0]
     if folder:
         os.environ.setdefault("NUMBA_CACHE_DIR", folder)
+        os.environ.setdefault("MPLCONFIGDIR", folder)

@@ -125,7 +125,7 @@ def test_the_service_does_its_night_and_keeps_its_compiled_code(
     words = shlex.split(service["ExecStart"])[1:]
     words[words.index("--landing") + 1] = str(landing.folder)
     words[words.index("--mapping") + 1] = str(landing.mapping)
-    done = run(confined(service, folder, [*words, "--models", "table1", "--json"]))
+    done = run(confined(service, folder, [*words, "--json"]))
     assert done.exit_code == 0, done.stderr
     assert json.loads(done.stdout)["champion"] == "fleet@1"
     assert "compiled" not in done.stderr
