@@ -55,7 +55,7 @@ class Control:
         """Return the brakes for the next tick."""
         rolling = 1 / CAR.tyre.rolling_radius_m
         wheels = [sample[f"wheel_{name}_rad_s"] for name in environment.WHEELS]
-        speed = max(np.mean(wheels) / rolling, 2.0)
+        speed = max(float(np.mean(wheels)) / rolling, 2.0)
         steer = (sample["steer_fl_rad"] + sample["steer_fr_rad"]) / 2
         asked = speed * steer / (HANDLING.wheelbase + HANDLING.understeer * speed**2)
         most = GRIP_SHARE * max(abs(sample["ay_mps2"]), LEAST_MPS2) / speed

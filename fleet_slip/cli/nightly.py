@@ -16,6 +16,7 @@ from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.signing import SignKey, signing_key
 from fleet_slip.cli.workers import Cluster, Threads
 from fleet_slip.errors import UsageError
+from fleet_slip.extras import needed
 from fleet_slip.selection.worth import WORTH
 
 
@@ -91,7 +92,8 @@ def nightly(
             waiting=lambda: say(f"{model}: waiting for another night"),
         )
     if output is not None:
-        from fleet_slip.report.night_page import write_summary  # noqa: PLC0415 - draws
+        with needed("report", "a summary in files"):
+            from fleet_slip.report.night_page import write_summary  # noqa: PLC0415 - draws
 
         write_summary(report, output)
     if json:

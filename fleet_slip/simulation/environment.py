@@ -11,17 +11,20 @@ import math
 from dataclasses import dataclass
 from typing import Any, SupportsFloat
 
-import gymnasium
 import numpy as np
-from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.errors import UsageError
+from fleet_slip.extras import needed
 from fleet_slip.simulation.braking import Brakes, move
 from fleet_slip.vehicle.integration import FIRST_ORDER, SECOND_ORDER, STEP_S, Slopes
 from fleet_slip.vehicle.parameters import constants, load_vehicle
 from fleet_slip.vehicle.state import Controls, State
+
+with needed("highway", "an environment for controllers"):
+    import gymnasium
+    from gymnasium.spaces import Box
 
 Observation = NDArray[np.float32]
 WHEELS = ("fl", "fr", "rl", "rr")
