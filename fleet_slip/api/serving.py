@@ -219,6 +219,43 @@ class Serving(Rooted):
         return write_report(self.warehouse, self.resolve(model), folder)
 
     @record_call
+    def watch(
+        self,
+        what: str,
+        model: str | ModelVersion,
+        output: Path,
+        *,
+        from_s: float = 0.0,
+        until_s: float | None = None,
+        threads: int | None = None,
+    ) -> Path:
+        """Write a drive as a page that plays, or as a film: .html, .mp4 or .gif; return the file.
+
+        `what` is the name of a scenario that ships, the path of one, or a drive of the logs. The
+        test drive of a scenario is simulated if it is not there. Of the drive the part from
+        `from_s` until `until_s` is shown, in seconds.
+
+        Raises `UsageError` for another suffix or an empty part, `QuestionError` if there is no such
+        drive, `ExtraError` without the extra `watch`, and what `model` raises.
+        """
+        with needed("watch", "a page or a film of a drive"):
+            from fleet_slip.report.film import write_film
+            from fleet_slip.report.frames import drive_frames, is_scenario, scenario_frames
+            from fleet_slip.report.watch_page import write_page
+
+        writers = {".html": write_page, ".mp4": write_film, ".gif": write_film}
+        if output.suffix not in writers:
+            raise UsageError(f"{output}: the suffix says the format: {', '.join(writers)}.")
+        version = self.resolve(model)
+        if is_scenario(what):
+            with open_workers(self.root, threads) as executor:
+                frames = scenario_frames(self.warehouse, what, version, executor)
+        else:
+            frames = drive_frames(self.warehouse, what, version)
+        writers[output.suffix](frames.part(from_s, until_s), output)
+        return output
+
+    @record_call
     def import_model(self, file: Path, *, sign_key: Path | None = None) -> ModelVersion:
         """Bring a version in that another data root exported to JSON; return it.
 

@@ -54,6 +54,8 @@ GROUPS = {
         "score": "evaluate",
         "evaluate": "evaluate",
         "report": "report",
+        "watch": "watching",
+        "explore": "exploring",
         "diagnose": "diagnosing",
         "regimes": "statistics",
         "shrink": "statistics",

@@ -1,6 +1,7 @@
 """How far each gate of a published model is open on a drive, as the car sees it."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -26,6 +27,13 @@ def gates_of(manifest: Manifest) -> dict[str, tuple[Definition, list[int]]]:
 
 
 def opening(manifest: Manifest, run: EvaluatedScenario) -> Mapping[str, FloatArray]:
+    """Return how far each gate is open on a test drive; see `gates_on`."""
+    return gates_on(manifest, run.drive.signals, run.drive.facts)
+
+
+def gates_on(
+    manifest: Manifest, signals: Mapping[str, FloatArray], facts: Mapping[str, Any]
+) -> Mapping[str, FloatArray]:
     """Return by gate how far it is open at each tick, shape (ticks,): 0 at the first knot, 1 at
     the last, and equally far from knot to knot."""
     gates = gates_of(manifest)
@@ -34,8 +42,7 @@ def opening(manifest: Manifest, run: EvaluatedScenario) -> Mapping[str, FloatArr
     names = tuple(f"gate_{number}" for number in range(len(gates)))
     bys = [by for by, _ in gates.values()]
     plan = ColumnPlan.of(names, {}, dict(zip(names, bys, strict=True)))
-    drive = run.drive
-    columns = DriveColumns(plan, as_counts(drive.signals, plan.signals, drive.facts)).compute()
+    columns = DriveColumns(plan, as_counts(signals, plan.signals, facts)).compute()
     return {
         name: np.interp(column, knots, np.linspace(0, 1, len(knots)))
         for (name, (_, knots)), column in zip(gates.items(), columns, strict=True)

@@ -73,7 +73,13 @@ def _steps(report: NightReport) -> ReportTable:
         [one.name, Cell(one.state, MARKS[one.state]), one.told, f"{one.seconds:.1f}"]
         for one in report.steps
     ]
-    return table("night-steps", "What was done", ["step", "state", "", "seconds"], rows, left=3)
+    return table(
+        "night-steps",
+        "What was done",
+        ["step", "state", "what came of it", "seconds"],
+        rows,
+        left=3,
+    )
 
 
 def _faults(report: NightReport) -> ReportTable | None:
@@ -102,7 +108,7 @@ def _past(report: NightReport) -> ReportTable | None:
         more = "" if earlier is None else f"{one.drives - earlier.drives:+,}"
         told = Cell("; ".join(found) or "all went well", "miss" if found else "good")
         rows.append([str(one.night), told, str(one.exit_code), more, one.champion or "none"])
-    head = ["night", "", "exit code", "drives", "champion"]
+    head = ["night", "how it went", "exit code", "drives", "champion"]
     return table("nights", f"The last {number_of(len(rows), 'night')}", head, rows, left=2)
 
 

@@ -1,0 +1,179 @@
+"""A data root to look at and to play with: `fleet-slip explore` opens it in the browser.
+
+A marimo notebook (https://marimo.io). `marimo edit` shows and changes its code.
+"""
+
+import marimo
+
+app = marimo.App(width="medium", app_title="fleet-slip explore")
+
+
+@app.cell
+def _():
+    import altair as alt
+    import marimo as mo
+    import matplotlib as mpl
+    import numpy as np
+    import polars as pl
+    from matplotlib.figure import Figure
+
+    import fleet_slip
+    from fleet_slip.errors import FleetSlipError
+    from fleet_slip.report.figures.control import control_chart
+    from fleet_slip.report.frames import drive_frames
+    from fleet_slip.report.style import DESK, STYLE, colour
+    from fleet_slip.words import number_of
+
+    return (
+        DESK, STYLE, Figure, FleetSlipError, alt, colour, control_chart, drive_frames, fleet_slip,
+        mo, mpl, np, number_of, pl,
+    )  # fmt: skip
+
+
+@app.cell
+def _(fleet_slip, mo, number_of):
+    fleet = fleet_slip.open(mo.cli_args().get("root"))
+    with fleet.session() as session:
+        drives = session.sql("SELECT * FROM drives ORDER BY drive_id").pl()
+        trained = session.sql("SELECT DISTINCT name FROM models ORDER BY 1").pl()["name"].to_list()
+    found = f"{number_of(drives.height, 'drive')}, {number_of(len(trained), 'model')}"
+    mo.md(f"# {fleet.root}\n\n{found}")
+    return drives, fleet, trained
+
+
+@app.cell
+def _(drives, mo, pl):
+    training = drives.filter(pl.col("source") != "scenario")
+    numbers = [
+        name
+        for name, kind in drives.schema.items()
+        if (kind.is_numeric() or kind.is_temporal()) and training[name].n_unique() > 1
+    ]
+    across = mo.ui.dropdown(numbers, value=numbers[0], label="across")
+    up = mo.ui.dropdown(numbers, value=numbers[min(1, len(numbers) - 1)], label="up")
+    mo.vstack([mo.md("## A cohort by mouse\n\nDraw a box around drives."), mo.hstack([across, up])])
+    return across, training, up
+
+
+@app.cell
+def _(across, alt, mo, training, up):
+    chart = mo.ui.altair_chart(
+        alt.Chart(training)
+        .mark_circle(size=70, opacity=0.6)
+        .encode(
+            x=alt.X(across.value, scale=alt.Scale(zero=False)),
+            y=alt.Y(up.value, scale=alt.Scale(zero=False)),
+            color="vehicle_model",
+            tooltip=["drive_id", "vehicle_id", across.value, up.value],
+        )
+        .properties(height=280, width="container")
+    )
+    chart
+    return (chart,)
+
+
+@app.cell
+def _(FleetSlipError, chart, fleet, mo, number_of, pl, training):
+    chosen = chart.value if len(chart.value) else training
+    listed = ", ".join("'" + name.replace("'", "''") + "'" for name in chosen["drive_id"].unique())
+    try:
+        compared = fleet.cohort(f"source <> 'scenario' AND drive_id IN ({listed})").select()
+        results = pl.DataFrame(
+            [
+                {
+                    "model": one.name,
+                    "signals": " ".join(one.signals),
+                    "correlation": round(one.pooled.correlation, 4),
+                    "RMSE deg": round(one.pooled.rmse_deg, 4),
+                }
+                for one in compared.models
+            ]
+        )
+        told = mo.vstack([mo.md(f"{compared.winner.reason}"), mo.ui.table(results)])
+    except FleetSlipError as error:
+        told = mo.callout(str(error), kind="warn")
+    mo.vstack([mo.md(f"**{number_of(chosen['drive_id'].n_unique(), 'drive')}**"), told])
+    return
+
+
+@app.cell
+def _(drives, mo, trained):
+    name = mo.ui.dropdown(trained, value=trained[0] if trained else None, label="model")
+    drive = mo.ui.dropdown(
+        sorted(drives["drive_id"].unique()), value=drives["drive_id"][0], label="drive"
+    )
+    mo.vstack([mo.md("## Where it errs"), mo.hstack([name, drive])])
+    return drive, name
+
+
+@app.cell
+def _(Figure, colour, drive, drive_frames, fleet, mo, name, np):
+    mo.stop(name.value is None, mo.md("No model yet: `fleet-slip publish`."))
+    frames = drive_frames(fleet.warehouse, drive.value, fleet.model(name.value))
+    error = frames.estimate_deg - frames.sideslip_deg
+    bound = max(float(np.nanquantile(abs(error), 0.99)), 0.01)
+    error_map = Figure(figsize=(9, 4.5), layout="constrained")
+    _axes = error_map.subplots()
+    _axes.plot(*frames.track, color=colour("grid"), linewidth=6, zorder=0)
+    _seen = _axes.scatter(
+        frames.x_m, frames.y_m, c=error, cmap="RdBu", vmin=-bound, vmax=bound, s=6
+    )
+    _axes.set_aspect("equal")
+    _axes.axis("off")
+    error_map.colorbar(_seen, label="error, deg", shrink=0.7)
+    error_map
+    return
+
+
+@app.cell
+def _(fleet, mo, name, number_of, pl):
+    mo.stop(name.value is None)
+    versions = fleet.registry()
+    terms = pl.DataFrame(
+        [
+            {"version": number, "input": term.signal, "coefficient": term.coefficient}
+            for number in versions.versions(name.value)
+            for term in versions.load(name.value, number).manifest.terms
+        ]
+    )
+    counted = number_of(terms["version"].n_unique(), "version")
+    mo.md(f"## Coefficients over {counted} of {name.value}")
+    return (terms,)
+
+
+@app.cell
+def _(alt, mo, terms):
+    mo.ui.altair_chart(
+        alt.Chart(terms)
+        .mark_line(point=True)
+        .encode(
+            x="version:O",
+            y=alt.Y("coefficient", scale=alt.Scale(zero=False)),
+            row=alt.Row("input", header=alt.Header(labelAngle=0, labelAlign="left")),
+        )
+        .properties(height=60, width=500)
+        .resolve_scale(y="independent"),
+        chart_selection=False,
+        legend_selection=False,
+    )
+    return
+
+
+@app.cell
+def _(DESK, FleetSlipError, STYLE, control_chart, fleet, mo, mpl, name):
+    mo.stop(name.value is None)
+    days = [day for (day,) in fleet.sql("SELECT DISTINCT day FROM drives ORDER BY 1").fetchall()]
+    try:
+        _since = days[len(days) // 2] if len(days) > 8 else None
+        with mpl.rc_context(STYLE):
+            drift = control_chart(fleet.monitor(name.value, since=_since), DESK)
+    except FleetSlipError as error:
+        drift = mo.callout(str(error), kind="warn")
+    mo.vstack(
+        [mo.md("## Drift\n\nThe error on each day, beside the limits of the first half."), drift]
+    )
+    return
+
+
+if __name__ == "__main__":
+    app.run()
