@@ -8,3 +8,12 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 ObjectArray = NDArray[np.object_]
 """Python objects, such as integers that never overflow."""
+
+
+def is_finite(values: FloatArray) -> bool:
+    """Whether neither a NaN nor an infinity is among values, which makes their sum so.
+
+    The sum of finite values so large that it is infinite is taken for one.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        return bool(np.isfinite(values.sum()))

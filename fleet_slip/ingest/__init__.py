@@ -1,7 +1,8 @@
 """Brings measured logs in: a file and a mapping become counts at 100 Hz."""
 
 from fleet_slip.ingest.mapping import Mapping, load_mapping
-from fleet_slip.ingest.measured import IngestCounts, MeasuredLog, read_measured
+from fleet_slip.ingest.measured import MeasuredLog, read_measured
+from fleet_slip.ingest.stream import IngestCounts
 
 __all__ = [
     "IngestCounts",

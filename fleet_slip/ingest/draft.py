@@ -22,8 +22,7 @@ from fleet_slip.ingest.guessing import (
     parts_of,
 )
 from fleet_slip.ingest.mapping import Mapping
-from fleet_slip.ingest.measured import read_measured
-from fleet_slip.ingest.preview import signals_of_longest_drive
+from fleet_slip.ingest.preview import preview_file
 from fleet_slip.ingest.profile import FileProfile, Profile, sample_rate_hz
 from fleet_slip.ingest.suspicion import WHEELS, Suspicion, find_suspicions
 
@@ -125,7 +124,7 @@ def _drive(
     file: Path, profile: FileProfile, time: TimeGuess, guesses: dict[str, Guess]
 ) -> dict[str, FloatArray]:
     mapping = as_mapping(profile, time, guesses)
-    return signals_of_longest_drive(read_measured(file, mapping), mapping)
+    return preview_file(file, mapping).longest
 
 
 def _guess_time(profile: FileProfile, guesses: dict[str, Guess]) -> TimeGuess:

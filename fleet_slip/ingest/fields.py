@@ -5,16 +5,18 @@ for a pattern, or be anything but a name.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date, datetime
+from decimal import Decimal
 from typing import Literal
 
 import polars as pl
 
+from fleet_slip.arrays import is_finite
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.csv_batches import EXTRA_FIELDS
-from fleet_slip.ingest.mapping import FromColumn, Mapping
+from fleet_slip.ingest.mapping import FromColumn, Mapping, is_number
 from fleet_slip.ingest.time_bases import DISORDER, HELD
 from fleet_slip.ingest.units import conversion_factor
 
@@ -42,7 +44,8 @@ class Field:
     """One thing to take from a row, or a condition on it.
 
     `value` is made of raw columns; `problem`, null where all is well, may also use the value under
-    the field's name, so that a text is parsed once.
+    the field's name, so that a text is parsed once. `is_sound` looks at a whole batch that has the
+    values: where it holds no row has the problem, and looking at each is saved.
     """
 
     name: str
@@ -50,6 +53,7 @@ class Field:
     raw: pl.Expr
     value: pl.Expr
     problem: pl.Expr
+    is_sound: Callable[[pl.DataFrame], bool] = lambda _: False
 
 
 def fields_of(mapping: Mapping, schema: pl.Schema) -> list[Field]:
@@ -71,10 +75,13 @@ def fields_of(mapping: Mapping, schema: pl.Schema) -> list[Field]:
     names = [name for name in catalogue().signals if name in mapping.signals]
     signals = [_signal(name, schema, mapping) for name in names]
     nothing = pl.all_horizontal([pl.col(name).is_null() for name in names])
-    fields += [*signals, _condition(nothing, "no_value", pl.lit(None, pl.String))]
+    no_value = _condition(nothing, "no_value", pl.lit(None, pl.String))
+    somewhere = replace(no_value, is_sound=lambda rows: any(map(_is_whole, rows[names])))
+    fields += [*signals, somewhere]
     if RAW + EXTRA_FIELDS in schema:
-        extra = pl.col(RAW + EXTRA_FIELDS)
-        fields.append(_condition(extra.is_not_null(), "extra_fields", extra))
+        name = RAW + EXTRA_FIELDS
+        extra = _condition(pl.col(name).is_not_null(), "extra_fields", pl.col(name))
+        fields.append(replace(extra, is_sound=lambda rows: rows[name].null_count() == rows.height))
     return fields
 
 
@@ -106,6 +113,10 @@ def find_problems(*cases: tuple[pl.Expr, str]) -> pl.Expr:
     )
 
 
+def _is_whole(column: pl.Series) -> bool:
+    return not column.null_count()
+
+
 def _condition(condition: pl.Expr, reason: str, raw: pl.Expr) -> Field:
     return Field("", "condition", raw, raw, find_problems((condition, reason)))
 
@@ -131,7 +142,27 @@ def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> Field:
         (~value.is_finite(), "not_finite"),
         (outside, "out_of_range"),
     )
-    return Field(name, "signal", raw, source.looked_up(number) * gain + bias, problem)
+    si_value = source.looked_up(number)
+    if (gain, bias) != (1.0, 0.0):  # which would change nothing but the sign of zero
+        si_value = si_value * gain + bias
+
+    def is_sound(rows: pl.DataFrame) -> bool:
+        found = rows[name]
+        if source.table or (found.null_count() and schema[RAW + source.column] == pl.String):
+            return False
+        return _lies_within(found, signal.min_count - 0.5, signal.max_count + 0.5, signal.scale)
+
+    return Field(name, "signal", raw, si_value, problem, is_sound)
+
+
+def _lies_within(values: pl.Series, low: float, high: float, scale: Decimal) -> bool:
+    """Whether all values are finite, and their counts between two limits, which are outside."""
+    present = values.drop_nulls().to_numpy()
+    if not present.size:
+        return True
+    # Dividing keeps the order of what it rounds.
+    least, most = float(present.min()) / float(scale), float(present.max()) / float(scale)
+    return is_finite(present) and low < least and most < high
 
 
 def _positive(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Field:
@@ -192,7 +223,12 @@ def _time(column: str, schema: pl.Schema, mapping: Mapping) -> Field:
         (~value.is_finite(), "not_finite"),
     )
     time_s = number * conversion_factor(unit, "s")
-    return Field("time", "time", raw, time_s, problem)
+
+    def is_sound(rows: pl.DataFrame) -> bool:
+        found = rows["time"]
+        return not found.null_count() and is_finite(found.to_numpy())
+
+    return Field("time", "time", raw, time_s, problem, is_sound)
 
 
 def _timestamp(column: str, schema: pl.Schema, mapping: Mapping) -> Field:
@@ -224,19 +260,11 @@ def _number(column: str, schema: pl.Schema, mapping: Mapping) -> tuple[pl.Expr, 
                 text = text.str.replace(",", ".", literal=True)
             return raw, text.cast(pl.Float64, strict=False), text.is_not_null()
         case pl.Float64:
-            absent = [float(text) for text in mapping.missing if _is_number(text)]
+            absent = [float(text) for text in mapping.missing if is_number(text)]
             number = pl.when(~raw.is_in(absent)).then(raw) if absent else raw
             return raw, number, pl.lit(value=False)
         case other:
             raise _unfit(column, other, "numbers")
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _without_missing(text: pl.Expr, mapping: Mapping) -> pl.Expr:

@@ -1,25 +1,22 @@
 """Writes what a batch of measured files became, and commits it as one."""
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
 
 import pyarrow as pa
-import pyarrow.compute as pc
 from deltalake.transaction import AddAction
 
 from fleet_slip.delta import Change, Snapshot, Table, Unit, retry_conflicts
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import shown
-from fleet_slip.ingest.forgotten import KeptRows, without_forgotten
 from fleet_slip.ingest.mapping import Mapping
-from fleet_slip.ingest.measured import IngestCounts, read_measured
+from fleet_slip.ingest.stream import IngestCounts, MeasuredStream, open_measured
+from fleet_slip.ingest.writing import FILE_ROWS, DataFiles, FileWriter, TableName, WrittenFile
 from fleet_slip.warehouse.audit import Audit
 from fleet_slip.warehouse.tables import Warehouse
-
-TableName: TypeAlias = Literal["quarantine", "logs"]
 
 
 @dataclass(frozen=True)
@@ -91,33 +88,70 @@ def write_batch(
     """
     outcomes: list[FileOutcome] = []
     failures: list[InputError] = []
-    rows: dict[TableName, dict[str, pa.Table]] = {"quarantine": {}, "logs": {}}
     snapshots: dict[TableName, Snapshot] = {
         "quarantine": warehouse.quarantine.snapshot(),
         "logs": warehouse.logs.snapshot(),
     }
-    for asked in files:
-        try:
-            log = read_measured(asked.file, mapping)
-            _require_not_grown(asked, log.digest, snapshots["logs"], mapping)
-        except InputError as error:
-            failures.append(error)
-            continue
-        outcome = FileOutcome(asked.file, log.digest, log.counts, log.look_alikes)
-        if log.digest not in rows["logs"] and not _landed(snapshots["logs"], log.digest):
-            kept = without_forgotten(log, Audit(warehouse.root))
-            outcome = _of_kept(outcome, kept)
-            tables: dict[TableName, pa.Table] = {"quarantine": kept.quarantine, "logs": kept.logs}
-            for name, table in tables.items():
-                if table.num_rows and not _landed(snapshots[name], log.digest):
-                    rows[name][log.digest] = table
-        outcomes.append(outcome)
-    return WrittenBatch(
-        tuple(outcomes),
-        tuple(failures),
-        _write(warehouse.quarantine, rows["quarantine"], by_day=False),
-        _write(warehouse.logs, rows["logs"], by_day=True),
-    )
+    with ThreadPoolExecutor(1) as thread:
+        parts: dict[TableName, _PartInTheMaking] = {
+            "quarantine": _PartInTheMaking(DataFiles(warehouse.quarantine, thread, by_day=False)),
+            "logs": _PartInTheMaking(DataFiles(warehouse.logs, thread, by_day=True)),
+        }
+        for asked in files:
+            try:
+                with open_measured(asked.file, mapping) as stream:
+                    _require_not_grown(asked, stream.digest, snapshots["logs"], mapping)
+                    missing = [
+                        name
+                        for name, part in parts.items()
+                        if not part.has(stream.digest)
+                        and not _landed(snapshots[name], stream.digest)
+                    ]
+                    missing = missing if "logs" in missing else []
+                    written = FileWriter(warehouse, stream, missing, thread).write()
+            except InputError as error:
+                failures.append(error)
+                continue
+            outcomes.append(_outcome(asked.file, stream, written, new="logs" in missing))
+            for name in missing:
+                parts[name].add(stream.digest, written.rest.get(name), written.files[name])
+        done = {name: part.finish() for name, part in parts.items()}
+    return WrittenBatch(tuple(outcomes), tuple(failures), done["quarantine"], done["logs"])
+
+
+class _PartInTheMaking:
+    """The rows of small files, which are written together, and data files of large ones."""
+
+    def __init__(self, together: DataFiles) -> None:
+        self._together = together
+        self._rows: dict[str, pa.Table] = {}
+        self._digests: list[str] = []
+        self._files: list[AddAction] = []
+
+    def has(self, digest: str) -> bool:
+        return digest in self._digests
+
+    def add(self, digest: str, rest: pa.Table | None, files: tuple[AddAction, ...]) -> None:
+        if rest is not None:
+            self._rows[digest] = rest
+        if rest is not None or files:
+            self._digests.append(digest)
+        self._files += files
+        if sum(rows.num_rows for rows in self._rows.values()) >= FILE_ROWS:
+            self._write()
+
+    def finish(self) -> Part:
+        if self._rows:
+            self._write()
+        units = tuple(map(unit_of, sorted(self._digests)))
+        return Part(units, (*self._files, *self._together.files()))
+
+    def _write(self) -> None:
+        """Write the rows of files in the order of their digests: so drives are in that of names."""
+        digests = sorted(self._rows)
+        whole = pa.concat_tables(self._rows[digest] for digest in digests).unify_dictionaries()
+        self._together.write(f"measured-{_digest(digests)[:24]}", whole)
+        self._rows = {}
 
 
 def _require_not_grown(asked: AskedFile, digest: str, logs: Snapshot, mapping: Mapping) -> None:
@@ -132,14 +166,17 @@ def _require_not_grown(asked: AskedFile, digest: str, logs: Snapshot, mapping: M
     )
 
 
-def _of_kept(outcome: FileOutcome, kept: KeptRows) -> FileOutcome:
-    drives = outcome.counts.drives - kept.left_out
+def _outcome(file: Path, stream: MeasuredStream, written: WrittenFile, *, new: bool) -> FileOutcome:
+    counts = stream.counts()
+    outcome = FileOutcome(file, stream.digest, counts, stream.look_alikes())
+    if not new:
+        return outcome
     return replace(
         outcome,
-        vehicles=kept.vehicles,
-        drives=kept.drives,
-        left_out=kept.left_out,
-        counts=replace(outcome.counts, drives=drives, ticks=kept.logs.num_rows),
+        vehicles=frozenset(written.vehicles),
+        drives=frozenset(written.drives),
+        left_out=written.left_out,
+        counts=replace(counts, drives=counts.drives - written.left_out, ticks=written.ticks),
     )
 
 
@@ -147,25 +184,8 @@ def _landed(snapshot: Snapshot, digest: str) -> bool:
     return snapshot.landed(unit_of(digest).name) is not None
 
 
-def _write(table: Table, rows: dict[str, pa.Table], *, by_day: bool) -> Part:
-    """Write the rows of files, in the order of their digests: so drives are in that of names."""
-    if not rows:
-        return Part()
-    digests = sorted(rows)
-    whole = pa.concat_tables(rows[digest] for digest in digests).unify_dictionaries()
-    parts = _by_day(whole) if by_day else {None: whole}
-    name = f"measured-{_digest(digests)[:24]}"
-    files = tuple(table.write_file(name, part, day) for day, part in parts.items())
-    return Part(tuple(map(unit_of, digests)), files)
-
-
 def _digest(digests: list[str]) -> str:
     return digests[0] if len(digests) == 1 else sha256("".join(digests).encode()).hexdigest()
-
-
-def _by_day(rows: pa.Table) -> dict[Any, pa.Table]:
-    days = rows["day"].unique().to_pylist()
-    return {day: rows.filter(pc.equal(rows["day"], pa.scalar(day, pa.date32()))) for day in days}
 
 
 class Landing:

@@ -12,6 +12,7 @@ from fleet_slip.catalogue.signals import Identifier, catalogue
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import ConfigError
 from fleet_slip.ingest.can_bus import CanBus, read_can_database
+from fleet_slip.ingest.csv_batches import PlainNumbers
 from fleet_slip.ingest.csv_format import CsvFormat
 from fleet_slip.ingest.duckdb_table import DuckdbRows
 from fleet_slip.ingest.names import Name, PositiveFloat
@@ -169,6 +170,17 @@ class Mapping(Config):
         names += [condition.column for condition in self.where]
         return list(dict.fromkeys(name for name in names if name is not None))
 
+    @property
+    def plain_numbers(self) -> PlainNumbers:
+        """Columns of which only the number counts, not how it is written."""
+        if len(self.time_bases()) > 1:
+            return PlainNumbers()
+        numbers = {signal.column for signal in self.signals.values()}
+        if self.time.column is not None and self.time.unit is not None:
+            numbers.add(self.time.column)
+        columns = frozenset(numbers - set(self.common_columns()))
+        return PlainNumbers(columns, tuple(float(text) for text in self.missing if is_number(text)))
+
     def vehicle_facts(self) -> tuple[VehicleFacts, ...]:
         """Return what is known of each car. Raises `ConfigError` if its file was not read."""
         if isinstance(self.vehicles, str):
@@ -178,6 +190,15 @@ class Mapping(Config):
     def canonical_json(self) -> str:
         """The mapping as JSON that does not depend on the order or layout of its TOML file."""
         return canonical_ascii(self.model_dump(mode="json"))
+
+
+def is_number(text: str) -> bool:
+    """Whether a text that means "no value" is also a number."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _reads_back(timestamp_format: str) -> bool:

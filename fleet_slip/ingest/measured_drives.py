@@ -34,19 +34,16 @@ _FROM_MAPPING = ("vehicle_id", "vehicle_model", "track", "mass_kg", "adhesion", 
 
 @dataclass(frozen=True)
 class MeasuredDrive:
-    """One uninterrupted stretch of a file: where its rows are and what is known of it."""
+    """One uninterrupted stretch of a file on ticks.
+
+    Attributes:
+        metadata: what is known of it, by column of `logs`.
+        counts: an int16 array for each signal.
+    """
 
     drive_id: str
-    rows: slice
     metadata: dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Ticked:
-    """The samples of one drive on ticks: an int16 array of counts for each signal."""
-
     method: Method
-    start_s: float
     ticks: NDArray[np.int32]
     counts: dict[str, pa.Array]
 
@@ -56,49 +53,43 @@ def drive_id(prefix: str, group: int, stretch: int = 1) -> str:
     return f"{prefix}-{group + 1}" + (f"-{stretch}" if stretch > 1 else "")
 
 
-def cut(rows: pl.DataFrame, prefix: str, metadata: Sequence[dict[str, Any]]) -> list[MeasuredDrive]:
-    """Return the drives in rows that are sorted by `group` and `part`, sorted by their names."""
-    parts = rows["part"].to_numpy()
-    starts = np.flatnonzero(np.diff(parts, prepend=parts[0] - 1))
-    ends = [*starts[1:].tolist(), len(parts)]
-    drives, previous, stretch = [], -1, 0
-    for start, end in zip(starts.tolist(), ends, strict=True):
-        group = rows["group"][start]
-        stretch = stretch + 1 if group == previous else 1
-        previous = group
-        name = drive_id(prefix, group, stretch)
-        drives.append(MeasuredDrive(name, slice(start, end), metadata[group]))
-    return sorted(drives, key=lambda drive: drive.drive_id)
-
-
-def to_ticks(rows: pl.DataFrame, mapping: Mapping, intervals_s: dict[int, float]) -> Ticked:
+def to_ticks(
+    rows: pl.DataFrame,
+    mapping: Mapping,
+    intervals_s: dict[int, float],
+    name: str,
+    known: dict[str, Any],
+) -> MeasuredDrive:
     """Bring one drive's signals, SI units at times in s, to counts at 100 Hz.
 
     Ticks at which no signal has a value are left out. `intervals_s` are the usual times between
-    the samples of each time base.
+    the samples of each time base; `known` is what the drive's rows say of it. Raises `InputError`
+    for what nobody says.
     """
     start_s = float(rows["time"][0])
     resampler = _build_resampler(rows["time"].to_numpy() - start_s, intervals_s)
     method, ticks = resampler.method, resampler.ticks
     counts, somewhere = {}, np.zeros(ticks.size, dtype=np.bool_)
-    for name, source in mapping.signals.items():
+    for signal, source in mapping.signals.items():
         samples, own = rows, resampler
         if len(intervals_s) > 1:
-            samples = rows.filter(pl.col(name).is_not_null())
+            samples = rows.filter(pl.col(signal).is_not_null())
             own = _on_own_times(samples, start_s, resampler, intervals_s)
-        values = samples[name].to_numpy().astype(np.float64)
+        values = samples[signal].to_numpy()
         longest = source.longest_gap_s or mapping.time.longest_gap_s
         bring = partial(own.resample, longest_gap_s=longest) if source.interpolate else own.place
         resample = partial(bring, delay_s=source.delay_s)
         between_samples = (method != "snap" or source.delay_s) and source.interpolate
-        angle = between_samples and name == catalogue().label
+        angle = between_samples and signal == catalogue().label
         values = _on_the_circle(resample, values) if angle else resample(values)
-        somewhere |= ~np.isnan(values)
+        if not somewhere.all():
+            somewhere |= ~np.isnan(values)
         # Rounding clips a resampled value's last bit, no more: the rest is in quarantine.
-        counts[name] = round_to_counts(values, catalogue()[name])
+        counts[signal] = round_to_counts(values, catalogue()[signal])
     if not somewhere.all():
-        counts = {name: array.filter(pa.array(somewhere)) for name, array in counts.items()}
-    return Ticked(method, start_s, ticks[somewhere].astype(np.int32), counts)
+        counts = {key: array.filter(pa.array(somewhere)) for key, array in counts.items()}
+    kept = ticks[somewhere].astype(np.int32)
+    return MeasuredDrive(name, _metadata(name, known, start_s, mapping), method, kept, counts)
 
 
 def _build_resampler(time_s: FloatArray, intervals_s: dict[int, float]) -> Resampler:
@@ -128,44 +119,51 @@ def _on_the_circle(resample: Callable[[FloatArray], FloatArray], angle: FloatArr
     return np.asarray(resampled - 2 * np.pi * np.rint(resampled / (2 * np.pi)), dtype=np.float64)
 
 
-def log_table(
-    drives: Sequence[MeasuredDrive], ticked: Sequence[Ticked], mapping: Mapping
-) -> pa.Table:
+def log_table(drives: Sequence[MeasuredDrive], mapping: Mapping) -> pa.Table:
     """Return the rows of `logs` for these drives; strings are dictionary-encoded."""
-    sizes = [drive.ticks.size for drive in ticked]
-    of_drive = pa.array(np.repeat(np.arange(len(drives), dtype=np.int32), sizes))
-    metadata = [_metadata(d, t, mapping) for d, t in zip(drives, ticked, strict=True)]
-    schema = catalogue().log_schema
+    sizes = [drive.ticks.size for drive in drives]
     columns = {}
-    for field in schema:
+    for field in catalogue().log_schema:
         if field.name == "tick":
-            columns[field.name] = pa.chunked_array([drive.ticks for drive in ticked], field.type)
+            columns[field.name] = pa.chunked_array([drive.ticks for drive in drives], field.type)
         elif field.name in mapping.signals:
-            columns[field.name] = pa.chunked_array([drive.counts[field.name] for drive in ticked])
+            columns[field.name] = pa.chunked_array([drive.counts[field.name] for drive in drives])
         elif field.name in catalogue().signals:
-            columns[field.name] = pa.nulls(len(of_drive), field.type)
+            columns[field.name] = pa.nulls(sum(sizes), field.type)
         else:
-            values = pa.array([of.get(field.name) for of in metadata], field.type)
-            encoded = values.dictionary_encode() if pa.types.is_string(field.type) else values
-            columns[field.name] = encoded.take(of_drive)
+            values = pa.array([drive.metadata.get(field.name) for drive in drives], field.type)
+            columns[field.name] = _repeat(values, sizes)
     return pa.table(columns)
 
 
-def _metadata(drive: MeasuredDrive, ticked: Ticked, mapping: Mapping) -> dict[str, Any]:
+def _repeat(values: pa.Array, times: Sequence[int]) -> pa.Array:
+    """Return each value as often as it is told; texts as codes of a dictionary."""
+    if pa.types.is_string(values.type):
+        encoded = values.dictionary_encode()
+        codes = _repeat(encoded.indices, times)
+        return pa.DictionaryArray.from_arrays(codes, encoded.dictionary)
+    if values.null_count == len(values):
+        return pa.nulls(sum(times), values.type)
+    if values.null_count:
+        return values.take(pa.array(np.repeat(np.arange(len(values)), times)))
+    return pa.array(np.repeat(values.to_numpy(zero_copy_only=False), times), values.type)
+
+
+def _metadata(name: str, told: dict[str, Any], start_s: float, mapping: Mapping) -> dict[str, Any]:
     """Return what is known of a drive, by column of `logs`. Raises `InputError`."""
-    given = {name: getattr(mapping.drive, name) for name in _FROM_MAPPING}
-    known = {name: value for name, value in given.items() if not isinstance(value, FromColumn)}
+    given = {key: getattr(mapping.drive, key) for key in _FROM_MAPPING}
+    known = {key: value for key, value in given.items() if not isinstance(value, FromColumn)}
     if given["day"] is None:  # then time is in timestamps, or those of the file's own clock
-        if mapping.time.own_clock and ticked.start_s < _EARLIEST_S:
+        if mapping.time.own_clock and start_s < _EARLIEST_S:
             raise InputError("its clock does not tell the date. Give it in the mapping: drive.day.")
         known["day"] = date.fromordinal(
-            date(1970, 1, 1).toordinal() + int(ticked.start_s // _SECONDS_PER_DAY)
+            date(1970, 1, 1).toordinal() + int(start_s // _SECONDS_PER_DAY)
         )
-    known |= {name: value for name, value in drive.metadata.items() if name in given}
+    known |= {key: value for key, value in told.items() if key in given}
     return {
         **known,
         **_facts_of(mapping, known),
-        "drive_id": drive.drive_id,
+        "drive_id": name,
         "source": SOURCE,
         "campaign": mapping.name,
         "saturated": 0,  # what is outside its range is quarantined, not clipped

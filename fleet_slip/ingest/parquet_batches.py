@@ -16,7 +16,7 @@ from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import require_columns, shown
 from fleet_slip.ingest.source import Channel
 
-BATCH_ROWS = 2**17
+BATCH_ROWS = 2**16
 """Parquet is read in batches of this many rows."""
 
 MAX_FOOTER_BYTES = 2**24
@@ -34,10 +34,10 @@ class ParquetSource:
 
     has_clock = False
 
-    def __init__(self, file: Path, stream: BinaryIO, max_rows: int) -> None:
-        """Take the file's path, its bytes, and how many rows are read at most."""
+    def __init__(self, file: Path, stream: BinaryIO) -> None:
+        """Take the file's path and its bytes."""
         _require_sane_footer(stream, file)
-        self._file, self._stream, self._max_rows = file, stream, max_rows
+        self._file, self._stream = file, stream
         self._schema = pq.ParquetFile(stream).schema_arrow
         self._keys = {
             name: text
@@ -55,15 +55,15 @@ class ParquetSource:
         require_columns(self._file, [*self._schema.names, *self._keys], columns)
         inside = [name for name in columns if name not in self._keys]
         keys = [pl.lit(self._keys[name]).alias(name) for name in columns if name in self._keys]
-        for batch in _parquet_batches(self._stream, self._file, inside, self._max_rows):
+        for batch in _parquet_batches(self._stream, self._file, inside):
             yield batch.with_columns(keys)
 
 
 @contextmanager
-def open_parquet(file: Path, max_rows: int) -> Iterator[ParquetSource]:
+def open_parquet(file: Path) -> Iterator[ParquetSource]:
     """Open a Parquet file. Raises `InputError`."""
     with file.open("rb") as stream:
-        yield ParquetSource(file, stream, max_rows)
+        yield ParquetSource(file, stream)
 
 
 def partition_keys(file: Path) -> dict[str, str]:
@@ -73,16 +73,11 @@ def partition_keys(file: Path) -> dict[str, str]:
 
 
 def _parquet_batches(
-    stream: BinaryIO, file: Path, columns: Sequence[str], max_rows: int
+    stream: BinaryIO, file: Path, columns: Sequence[str]
 ) -> Iterator[pl.DataFrame]:
     schema = pq.ParquetFile(stream).schema_arrow
     texts = [name for name in columns if _is_text(schema.field(name).type)]
     parquet = pq.ParquetFile(stream, read_dictionary=texts, page_checksum_verification=True)
-    if parquet.metadata.num_rows > max_rows:
-        raise InputError(
-            f"{shown(file)}: {parquet.metadata.num_rows:,} rows, at most {max_rows:,} are read. "
-            "Split the file."
-        )
     for batch in parquet.iter_batches(BATCH_ROWS, columns=list(columns)):
         plain = {name: plain_column(batch.column(name), name, file) for name in columns}
         yield pl.DataFrame(pa.table(plain))

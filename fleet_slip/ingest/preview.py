@@ -11,7 +11,8 @@ import pyarrow.compute as pc
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.ingest.mapping import Mapping
-from fleet_slip.ingest.measured import IngestCounts, MeasuredLog, read_measured
+from fleet_slip.ingest.measured_drives import MeasuredDrive
+from fleet_slip.ingest.stream import IngestCounts, open_measured
 from fleet_slip.ingest.suspicion import Suspicion, find_suspicions
 
 MOST_TICKS = 200_000
@@ -53,33 +54,54 @@ class Preview:
 
 def preview_file(file: Path, mapping: Mapping) -> Preview:
     """Read a file through a mapping, and look at what came out. Raises `InputError`."""
-    log = read_measured(file, mapping)
-    ranges = tuple(_range(log.drives, name) for name in mapping.signals)
-    longest = signals_of_longest_drive(log, mapping)
-    return Preview(str(file), log.counts, ranges, tuple(find_suspicions(longest)), longest)
+    longest: MeasuredDrive | None = None
+    found = {name: _Found() for name in mapping.signals}
+    with open_measured(file, mapping) as stream:
+        for piece in stream.pieces():
+            for drive in piece.drives:
+                if longest is None or drive.ticks.size > longest.ticks.size:
+                    longest = drive
+                for name, counts in drive.counts.items():
+                    found[name].add(counts)
+    signals = signals_of(longest) if longest is not None else {}
+    ranges = tuple(_range(name, found[name]) for name in mapping.signals)
+    return Preview(str(file), stream.counts(), ranges, tuple(find_suspicions(signals)), signals)
 
 
-def signals_of_longest_drive(log: MeasuredLog, mapping: Mapping) -> dict[str, FloatArray]:
-    """Return the signals of a log's longest drive in SI units, NaN where there is no value."""
-    names = log.drives["drive_id"].combine_chunks()
-    counts = pc.value_counts(names)
-    longest = counts[int(np.argmax(counts.field("counts").to_numpy()))]["values"]
-    rows = log.drives.filter(pc.equal(names, longest))
-    ticks = rows["tick"].to_numpy()
-    kept = ticks - ticks[0] < MOST_TICKS
+def signals_of(drive: MeasuredDrive) -> dict[str, FloatArray]:
+    """Return the signals of a drive's begin in SI units, NaN where there is no value."""
+    ticks = drive.ticks - drive.ticks[0]
+    kept = ticks < MOST_TICKS
     signals = {}
-    for name in mapping.signals:
-        values = np.full(int(ticks[kept][-1] - ticks[0]) + 1, np.nan)
-        counts_of = pc.cast(rows[name], pa.float64()).to_numpy()
-        values[ticks[kept] - ticks[0]] = counts_of[kept] * float(catalogue()[name].scale)
+    for name, counts in drive.counts.items():
+        values = np.full(int(ticks[kept][-1]) + 1, np.nan)
+        numbers = pc.cast(counts, pa.float64()).to_numpy(zero_copy_only=False)
+        values[ticks[kept]] = numbers[kept] * float(catalogue()[name].scale)
         signals[name] = values
     return signals
 
 
-def _range(drives: pa.Table, name: str) -> SignalRange:
-    signal, column = catalogue()[name], drives[name]
-    found = pc.min_max(column).as_py()
+@dataclass
+class _Found:
+    """Counts of a signal so far."""
+
+    low: int | None = None
+    high: int | None = None
+    values: int = 0
+    ticks: int = 0
+
+    def add(self, counts: pa.Array) -> None:
+        self.ticks += len(counts)
+        self.values += len(counts) - counts.null_count
+        ends = pc.min_max(counts).as_py()
+        if ends["min"] is not None:
+            self.low = ends["min"] if self.low is None else min(self.low, ends["min"])
+            self.high = ends["max"] if self.high is None else max(self.high, ends["max"])
+
+
+def _range(name: str, found: _Found) -> SignalRange:
+    signal = catalogue()[name]
     low, high = (
-        np.nan if found[key] is None else found[key] * float(signal.scale) for key in ("min", "max")
+        np.nan if end is None else end * float(signal.scale) for end in (found.low, found.high)
     )
-    return SignalRange(name, signal.unit, low, high, column.null_count / max(len(column), 1))
+    return SignalRange(name, signal.unit, low, high, 1 - found.values / max(found.ticks, 1))

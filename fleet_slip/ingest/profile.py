@@ -13,6 +13,7 @@ import polars as pl
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.can_bus import CanBus
+from fleet_slip.ingest.csv_batches import PlainNumbers
 from fleet_slip.ingest.csv_format import CsvFormat
 from fleet_slip.ingest.duckdb_table import DuckdbRows
 from fleet_slip.ingest.reading import file_errors, open_source, require_unchanged_file
@@ -32,6 +33,7 @@ class FileFormats:
     can: CanBus | None = None
     duckdb: DuckdbRows | None = None
     name: str = "mapping suggest"
+    plain_numbers: PlainNumbers = field(default_factory=PlainNumbers)
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from typing import Any
 
 import polars as pl
 
+from fleet_slip.arrays import BoolArray
 from fleet_slip.ingest.fields import LONGEST_TEXT, REASONS, Field
 
 _PROBLEM = "problem"
@@ -12,31 +13,38 @@ _PROBLEM = "problem"
 class DriveKeys:
     """Numbers the combinations of drive metadata in a file, from 0, in order of appearance."""
 
-    def __init__(self, fields: list[Field]) -> None:
-        """Collect keys for the fields of kind `key`; without any, the whole file is number 0."""
-        self._fields = [field for field in fields if field.kind == "key"]
+    def __init__(self) -> None:
+        """Begin without any."""
         self._numbers: dict[tuple[Any, ...], int] = {}
+        self.metadata: list[dict[str, Any]] = []
+        """What each number stands for."""
 
     def __len__(self) -> int:
         """Return how many there are so far."""
         return len(self._numbers)
 
-    def number(self, batch: pl.DataFrame) -> pl.DataFrame:
-        """Add `group` to a batch with values: the row's number, null where its key is faulty."""
-        if not self._fields:
+    def number(self, batch: pl.DataFrame, fields: list[Field]) -> pl.DataFrame:
+        """Add `group` to a batch with values: the row's number, null where its key is faulty.
+
+        A key are the fields of the kind `key`; without any, the whole file is number 0.
+        """
+        of_key = [field for field in fields if field.kind == "key"]
+        if not of_key:
+            self.metadata = self.metadata or [{}]
             return batch.with_columns(pl.lit(0, pl.Int32).alias("group"))
-        names = [field.name for field in self._fields]
-        sound = pl.all_horizontal([field.problem.is_null() for field in self._fields])
+        names = [field.name for field in of_key]
+        sound = pl.all_horizontal([field.problem.is_null() for field in of_key])
         keys = batch.filter(sound).select(names).unique(maintain_order=True)
-        numbers = [self._numbers.setdefault(key, len(self._numbers)) for key in keys.rows()]
+        numbers = [self._number(dict(zip(names, key, strict=True))) for key in keys.rows()]
         keys = keys.with_columns(pl.Series("group", numbers, pl.Int32))
         joined = batch.join(keys, on=names, how="left", nulls_equal=True, maintain_order="left")
         return joined.with_columns(pl.when(sound).then("group").alias("group"))
 
-    def metadata(self) -> list[dict[str, Any]]:
-        """Return the metadata that each number stands for."""
-        names = [field.name for field in self._fields]
-        return [dict(zip(names, key, strict=True)) for key in self._numbers] if names else [{}]
+    def _number(self, key: dict[str, Any]) -> int:
+        number = self._numbers.setdefault(tuple(key.values()), len(self._numbers))
+        if number == len(self.metadata):
+            self.metadata.append(key)
+        return number
 
 
 def with_values(batch: pl.DataFrame, fields: list[Field]) -> pl.DataFrame:
@@ -51,14 +59,32 @@ def check_rows(batch: pl.DataFrame, fields: list[Field]) -> tuple[pl.DataFrame, 
     signals in SI units; and the bad ones, with `row`, `group`, `reason`, `signal` and `value`. The
     first problem of a row counts.
     """
-    codes = [field.problem + len(REASONS) * i for i, field in enumerate(fields)]
-    checked = batch.with_columns(pl.coalesce(codes).alias(_PROBLEM))
     values = [field.name for field in fields if field.kind in {"time", "signal"}]
     kept = ["row", "group", *({"base"} & set(batch.columns)), *values]
+    codes = [
+        field.problem + len(REASONS) * i
+        for i, field in enumerate(fields)
+        if not field.is_sound(batch)
+    ]
+    if not codes:
+        return batch.select(kept), no_rows()
+    checked = batch.with_columns(pl.coalesce(codes).alias(_PROBLEM))
     good = checked.filter(pl.col(_PROBLEM).is_null()).select(kept)
     bad = checked.filter(pl.col(_PROBLEM).is_not_null())
     explained = [_explain(rows, fields) for rows in bad.partition_by(_PROBLEM)]
     return good, pl.concat([no_rows(), *explained])
+
+
+def describe_refused(rows: pl.DataFrame, which: BoolArray | None, reason: str) -> pl.DataFrame:
+    """Return rows as bad ones, because of their time: those of a mask, or all."""
+    bad = rows if which is None else rows.filter(pl.Series(which))
+    return bad.select(
+        pl.col("row"),
+        pl.col("group"),
+        pl.lit(reason).alias("reason"),
+        pl.lit("time").alias("signal"),
+        pl.col("time").cast(pl.String).alias("value"),
+    )
 
 
 def no_rows() -> pl.DataFrame:

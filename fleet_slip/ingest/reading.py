@@ -19,7 +19,7 @@ from fleet_slip.errors import InputError
 from fleet_slip.ingest.can_bus import CanBus
 from fleet_slip.ingest.can_trace import open_can_trace
 from fleet_slip.ingest.columns import shown
-from fleet_slip.ingest.csv_batches import open_csv
+from fleet_slip.ingest.csv_batches import PlainNumbers, open_csv
 from fleet_slip.ingest.csv_format import CsvFormat
 from fleet_slip.ingest.duckdb_table import MAGIC as DUCKDB_MAGIC
 from fleet_slip.ingest.duckdb_table import MAGIC_AT as DUCKDB_AT
@@ -45,9 +45,6 @@ _NO_CLOCK = "this format has no clock of its own: write column or rate_hz under 
 
 Told = TypeVar("Told")
 
-MAX_ROWS = 20_000_000
-"""Rows of one file: 55 hours at 100 Hz. All of them are in memory once, as float64."""
-
 
 class Formats(Protocol):
     """What must be known of a file's format beside the file, as a mapping says it."""
@@ -60,6 +57,11 @@ class Formats(Protocol):
     @property
     def csv(self) -> CsvFormat:
         """Separator and decimal sign of text."""
+        ...
+
+    @property
+    def plain_numbers(self) -> PlainNumbers:
+        """Which columns of text are numbers, wherever they are used."""
         ...
 
     @property
@@ -97,16 +99,10 @@ def file_digest(file: Path) -> "hashlib._Hash":
 def read_batches(file: Path, mapping: Mapping) -> Iterator[pl.DataFrame]:
     """Yield the columns of a file that a mapping uses, in the file's order, in bounded batches.
 
-    Raises `InputError` if the file cannot be read, a column is missing or ambiguous, or the file
-    is larger than the limits of this module.
+    Raises `InputError` if the file cannot be read, or a column is missing or ambiguous.
     """
-    rows = 0
     with file_errors(file), open_source(file, mapping) as source:
-        for batch in _one_table(source, file, mapping):
-            rows += batch.height
-            if rows > MAX_ROWS:
-                raise InputError(f"{shown(file)}: more than {MAX_ROWS:,} rows. Split the file.")
-            yield batch
+        yield from _one_table(source, file, mapping)
 
 
 def _one_table(source: Source, file: Path, mapping: Mapping) -> Iterator[pl.DataFrame]:
@@ -172,7 +168,7 @@ def _opened(file: Path, start: bytes, formats: Formats) -> AbstractContextManage
                 f"{shown(file)}: not {kind}, whatever its name says. Export it again, or name it "
                 "as what it is."
             )
-    return open_csv(file, formats.csv)
+    return open_csv(file, formats.csv, formats.plain_numbers)
 
 
 def _wanted(told: Told | None, file: Path, table: str, key: str, formats: Formats) -> Told:
@@ -188,7 +184,7 @@ def _wanted(told: Told | None, file: Path, table: str, key: str, formats: Format
 _FORMATS: tuple[
     tuple[Callable[[bytes], bool], Callable[[Path], AbstractContextManager[Source]]], ...
 ] = (
-    (lambda start: start.startswith(PARQUET_MAGIC), lambda file: open_parquet(file, MAX_ROWS)),
+    (lambda start: start.startswith(PARQUET_MAGIC), open_parquet),
     (lambda start: start.startswith(MDF_MAGICS), open_mdf),
     (lambda start: start.startswith(MAT5_MAGIC), open_mat),
     (lambda start: HDF5_MAGIC in (start[: len(HDF5_MAGIC)], start[HDF5_AT:]), open_mat73),

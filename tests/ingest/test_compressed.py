@@ -8,7 +8,7 @@ import pyarrow as pa
 import pytest
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import read_measured
+from fleet_slip.ingest import csv_batches, read_measured
 from fleet_slip.ingest.csv_batches import BLOCK_BYTES
 from tests.support.measured import a_mapping, csv_text, good_columns, read_text
 
@@ -57,6 +57,14 @@ def test_a_flipped_bit_is_noticed_by_the_checksum_of_gzip(tmp_path: Path) -> Non
 def test_what_would_not_fit_into_memory_is_refused_while_it_unfolds(
     tmp_path: Path, compress: Compress
 ) -> None:
-    bomb = compress(TEXT + b"9" * (3 * BLOCK_BYTES))
+    bomb = compress(TEXT + b"9" * (6 * BLOCK_BYTES))
     assert len(bomb) < BLOCK_BYTES / 100
     assert "a line is longer than" in failure(tmp_path, bomb)
+
+
+def test_lines_without_end_in_a_small_file_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(csv_batches, "MOST_BYTES", 10_000)
+    bomb = gzip.compress(TEXT + b"1,1,1\n" * 100_000)
+    assert "unfolds to more than 200 times its size" in failure(tmp_path, bomb)

@@ -28,7 +28,7 @@ def cars(rows: pa.Table) -> set[str]:
 
 def test_without_a_record_all_rows_are_kept(tmp_path: Path) -> None:
     log = two_cars(tmp_path)
-    kept = without_forgotten(log, Audit(LocalFolder(tmp_path / "data")))
+    kept = without_forgotten(log.drives, log.quarantine, Audit(LocalFolder(tmp_path / "data")))
     assert (kept.logs.num_rows, kept.quarantine.num_rows) == (
         log.drives.num_rows,
         log.quarantine.num_rows,
@@ -45,7 +45,7 @@ def test_the_rows_of_what_was_forgotten_are_left_out(
     value = "a" if kind == "vehicle" else of_a[0]["drive_id"]
     audit = Audit(LocalFolder(tmp_path / "data"))
     audit.begin(Forgettable(kind, value), 1, [], {})
-    kept = without_forgotten(log, audit)
+    kept = without_forgotten(log.drives, log.quarantine, audit)
     assert cars(log.drives) == cars(log.quarantine) == {"a", "b"}
     assert cars(kept.logs) == cars(kept.quarantine) == {"b"}
     assert kept.logs.num_rows == log.drives.num_rows - len(of_a)

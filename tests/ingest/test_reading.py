@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import csv_batches, measured, read_measured, reading
+from fleet_slip.ingest import checking, csv_batches, read_measured, reading
 from fleet_slip.ingest.parquet_batches import open_parquet
 from tests.support.measured import a_mapping, csv_text, good_columns, read_text, reasons, ticks
 
@@ -135,7 +135,7 @@ def test_a_file_that_grows_while_it_is_read_is_refused(
         yield from reading.read_batches(*arguments)
         file.write_bytes(GOOD.encode() + b"0.20,1,1\n")
 
-    monkeypatch.setattr(measured, "read_batches", grow)
+    monkeypatch.setattr(checking, "read_batches", grow)
     assert "it changed while it was read" in failure(file)
 
 
@@ -216,12 +216,6 @@ def test_text_in_parquet_that_is_not_utf8_is_refused(tmp_path: Path) -> None:
     assert "UTF8" in failure(write(tmp_path, data.replace(b"needle", b"\xffeedle"), "bad.parquet"))
 
 
-def test_more_rows_than_fit_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reading, "MAX_ROWS", 19)
-    assert "20 rows, at most 19" in failure(parquet(tmp_path))
-    assert "more than 19 rows" in failure(write(tmp_path, GOOD.encode()))
-
-
 @pytest.mark.parametrize(
     "column",
     [
@@ -237,7 +231,7 @@ def test_a_time_beyond_the_calendar_is_no_time(
     table = pa.table({"time": column})
     file = tmp_path / "log.parquet"
     pq.write_table(table, file)
-    with open_parquet(file, 2) as source:
+    with open_parquet(file) as source:
         (batch,) = source.batches(["time"])
     assert [value is None for value in batch["time"]] == [True, False]
     assert capfd.readouterr().err == ""

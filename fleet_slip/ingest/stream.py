@@ -1,0 +1,312 @@
+"""From a measured file to drives in counts, piece by piece: few drives are in memory at once."""
+
+import os
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+import pyarrow as pa
+
+from fleet_slip.canonical import canonical_ascii
+from fleet_slip.errors import InputError
+from fleet_slip.ingest.checking import Block, RowChecker
+from fleet_slip.ingest.columns import shown
+from fleet_slip.ingest.drive_cutter import (
+    LONGEST_DRIVE_S,
+    DriveCutter,
+    sample_intervals_s,
+)
+from fleet_slip.ingest.look_alikes import find_look_alikes
+from fleet_slip.ingest.mapping import Mapping
+from fleet_slip.ingest.measured_drives import MeasuredDrive, drive_id, to_ticks
+from fleet_slip.ingest.open_drives import MAX_OPEN_ROWS, OpenDrives
+from fleet_slip.ingest.parquet_batches import partition_keys
+from fleet_slip.ingest.quarantine import describe_refused, no_rows
+from fleet_slip.ingest.read_ahead import read_ahead
+from fleet_slip.ingest.reading import file_digest, require_unchanged_file
+from fleet_slip.ingest.resampling import STEP_S, TIME_EPSILON_S
+from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA
+from fleet_slip.words import number_of
+
+RATE_ROWS = 2**17
+"""The usual time between rows is that of the first ones of a file, so many at least."""
+FEWEST_STEPS = 1000
+MAX_DRIVES = 10_000
+"""Short drives in one file. More means that time or the drive's column is not what is said."""
+SHORT_ROWS = 1000
+MAX_TICKS = 40_000_000
+"""Length of all drives of one file together, in ticks, where rows are few for it."""
+MOST_TICKS_A_ROW = 1000
+
+
+@dataclass(frozen=True)
+class IngestCounts:
+    """What became of a file's rows.
+
+    `rows_read == rows_left_out + rows_kept + sum(quarantined.values())`.
+    """
+
+    rows_read: int
+    rows_left_out: int
+    """Rows that do not meet the mapping's conditions."""
+    rows_kept: int
+    quarantined: dict[str, int]
+    """Rejected rows by reason."""
+    drives: int
+    drives_resampled: int
+    ticks: int
+    """Rows of the result; equal to `rows_kept` where nothing was resampled."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Drives of a file that have ended, and rows that were refused meanwhile.
+
+    Attributes:
+        drives: in an order that depends on the file and the mapping only.
+        refused: `row`, `group`, `reason`, `signal` and `value`.
+    """
+
+    drives: list[MeasuredDrive]
+    refused: pl.DataFrame
+
+
+@dataclass
+class Totals:
+    """What became of a file's rows so far."""
+
+    rows_kept: int = 0
+    quarantined: Counter[str] = field(default_factory=Counter)
+    drives: int = 0
+    drives_resampled: int = 0
+    ticks: int = 0
+    samples: Counter[str] = field(default_factory=Counter)
+    """Values of each signal in the file's rows; `values` are those on ticks."""
+    values: Counter[str] = field(default_factory=Counter)
+
+    def add(self, rows: pl.DataFrame, drive: MeasuredDrive) -> None:
+        """Count a drive that was made of rows."""
+        self.rows_kept += rows.height
+        self.drives += 1
+        self.drives_resampled += drive.method != "snap"
+        self.ticks += drive.ticks.size
+        for name, counts in drive.counts.items():
+            self.samples[name] += rows.height - rows[name].null_count()
+            self.values[name] += len(counts) - counts.null_count
+
+
+class MeasuredStream:
+    """A measured file, open for reading through a mapping.
+
+    The result depends on the file's bytes and the mapping only, not on its path (but for keys in
+    the names of folders, `car=A7`, that the mapping uses), nor on how it is read. Drives are called
+    `<mapping>-<digest>-<number>`, and `-2`, `-3` … follow where a gap in time cut one.
+    """
+
+    def __init__(self, file: Path, mapping: Mapping, digest: str) -> None:
+        """Take the file, the mapping, and the digest of both."""
+        self.file, self.mapping, self.digest = file, mapping, digest
+        self.prefix = f"{mapping.name}-{digest[:12]}"
+        self.checker = RowChecker(file, mapping)
+        self.totals = Totals()
+        self._open = OpenDrives()
+        self._stretches: Counter[int] = Counter()
+        self._first_refused: dict[str, Any] | None = None
+
+    def pieces(self) -> Iterator[Piece]:
+        """Yield what the file becomes, in order, once. Raises `InputError`, at its end too."""
+        with closing(read_ahead(self.checker.blocks())) as blocks:
+            early, intervals_s = self._usual_intervals(blocks)
+            longest_s = LONGEST_DRIVE_S * min(1.0, *(one / STEP_S for one in intervals_s.values()))
+            cutter = DriveCutter(self.mapping.time, longest_s)
+            for block in chain(early, blocks):
+                yield self._piece(cutter, block, intervals_s)
+            yield self._piece(cutter, _no_more(block), intervals_s, last=True)
+        self._require_usable()
+
+    def _usual_intervals(self, blocks: Iterator[Block]) -> tuple[list[Block], dict[int, float]]:
+        """Return the first blocks, and the usual time between samples of each time base in them.
+
+        It is that of rows up to a number that is the same however a file is cut into blocks. Of a
+        file with several time bases all rows are one block.
+        """
+        early: list[Block] = []
+        enough = RATE_ROWS
+        for block in blocks:
+            early.append(block)
+            while block.read >= enough and "base" not in block.rows.columns:
+                first = _trial(self.mapping, early, enough)
+                if first["part"].is_duplicated().sum() > FEWEST_STEPS:
+                    return early, sample_intervals_s(first)
+                enough += RATE_ROWS
+        if "base" in early[0].rows.columns:
+            early = [_one_block(early)]
+        return early, sample_intervals_s(_trial(self.mapping, early, early[-1].read))
+
+    def _piece(
+        self,
+        cutter: DriveCutter,
+        block: Block,
+        intervals_s: dict[int, float],
+        *,
+        last: bool = False,
+    ) -> Piece:
+        rows, misplaced = cutter.cut(block.rows, last=last)
+        refused = [block.refused, misplaced]
+        self._open.add(rows)
+        drives = []
+        for ended in self._open.take([*cutter.ended, *(cutter.open_parts() if last else ())]):
+            if ended["time"][-1] - ended["time"][0] < STEP_S - TIME_EPSILON_S:
+                refused.append(describe_refused(ended, None, "too_short"))
+            else:
+                drives.append(self._drive(ended, intervals_s))
+        if self._open.number_of_rows > MAX_OPEN_ROWS:
+            raise InputError(
+                f"{shown(self.file)}: more than {MAX_OPEN_ROWS:,} rows of drives that alternate, "
+                "and none of them ends. Sort the file by drive and time."
+            )
+        bad = pl.concat(refused)
+        self._note_refused(bad)
+        return Piece(drives, bad)
+
+    def _drive(self, rows: pl.DataFrame, intervals_s: dict[int, float]) -> MeasuredDrive:
+        group = rows["group"][0]
+        self._stretches[group] += 1
+        name = drive_id(self.prefix, group, self._stretches[group])
+        try:
+            metadata = self.checker.keys.metadata[group]
+            drive = to_ticks(rows, self.mapping, intervals_s, name, metadata)
+        except InputError as error:
+            raise InputError(f"{shown(self.file)}: {error}") from None
+        self.totals.add(rows, drive)
+        self._require_sane_drives()
+        return drive
+
+    def _note_refused(self, refused: pl.DataFrame) -> None:
+        self.totals.quarantined.update(refused["reason"])
+        if refused.height:
+            first = refused.row(refused["row"].arg_min() or 0, named=True)
+            self._first_refused = min(self._first_refused or first, first, key=lambda r: r["row"])
+
+    def _require_sane_drives(self) -> None:
+        totals = self.totals
+        if totals.drives > MAX_DRIVES and totals.rows_kept < SHORT_ROWS * totals.drives:
+            raise InputError(
+                f"{shown(self.file)}: it falls into more than {MAX_DRIVES:,} drives, of "
+                f"{totals.rows_kept / totals.drives:.0f} rows on average. Check time, split_gap_s "
+                f"and the drive's column in the mapping {self.mapping.name!r}."
+            )
+        if totals.ticks > MAX_TICKS and totals.ticks > MOST_TICKS_A_ROW * totals.rows_kept:
+            raise InputError(
+                f"{shown(self.file)}: {totals.rows_kept:,} rows last {totals.ticks:,} ticks of "
+                "100 Hz. Check the unit of time and split_gap_s in the mapping "
+                f"{self.mapping.name!r}."
+            )
+
+    def _require_usable(self) -> None:
+        totals, name = self.totals, self.mapping.name
+        if not totals.rows_kept and self._first_refused is not None:
+            reasons = ", ".join(f"{n:,} {reason}" for reason, n in totals.quarantined.most_common())
+            first = self._first_refused
+            example = f"{first['signal'] or 'the row'} = {first['value']!r} in row {first['row']}"
+            raise InputError(
+                f"{shown(self.file)}: none of its "
+                f"{number_of(totals.quarantined.total(), 'row')} is usable ({reasons}; first: "
+                f"{example}). Check columns, units and time in the mapping {name!r}."
+            )
+        if not totals.ticks:
+            raise InputError(
+                f"{shown(self.file)}: no row is on a tick of 100 Hz, and longest_gap_s = "
+                f"{self.mapping.time.longest_gap_s:g} forbids to interpolate. Raise it in the "
+                f"mapping {name!r} if the signals change slowly enough."
+            )
+        for signal, source in self.mapping.signals.items():
+            if totals.samples[signal] and not totals.values[signal]:
+                raise InputError(
+                    f"{shown(self.file)}: {signal} has "
+                    f"{number_of(totals.samples[signal], 'value')} in {source.column!r}, and none "
+                    "is on a tick of 100 Hz: they are further apart than longest_gap_s. Give the "
+                    f"signal in the mapping {name!r} a longest_gap_s of its own, or interpolate = "
+                    "false."
+                )
+
+    def quarantine_table(self, refused: Sequence[pl.DataFrame]) -> pa.Table:
+        """Return refused rows as those of the table `quarantine`, in the file's order."""
+        bad = pl.concat(refused).sort("row", maintain_order=True)
+        name = os.fsencode(self.file.name).decode("utf-8", "replace")
+        groups = bad["group"].unique().drop_nulls()
+        ids = {group: drive_id(self.prefix, group) for group in groups}
+        stated = self.mapping.drive.vehicle_id
+        vehicle = stated if isinstance(stated, str) else None
+        metadata = self.checker.keys.metadata
+        vehicles = {str(group): metadata[group].get("vehicle_id", vehicle) for group in groups}
+        frame = bad.select(
+            pl.lit(name).alias("file"),
+            "row",
+            pl.col("group").replace_strict(ids, return_dtype=pl.String).alias("drive_id"),
+            pl.col("group")
+            .cast(pl.String)
+            .replace_strict(vehicles, return_dtype=pl.String)
+            .fill_null(pl.lit(vehicle, pl.String))
+            .alias("vehicle_id"),
+            "reason",
+            "signal",
+            "value",
+        )
+        return frame.to_arrow().cast(QUARANTINE_SCHEMA)
+
+    def counts(self) -> IngestCounts:
+        """Return what became of the rows, once all pieces were taken."""
+        totals = self.totals
+        return IngestCounts(
+            rows_read=self.checker.rows,
+            rows_left_out=self.checker.left_out,
+            rows_kept=totals.rows_kept,
+            quarantined=dict(sorted(totals.quarantined.items())),
+            drives=totals.drives,
+            drives_resampled=totals.drives_resampled,
+            ticks=totals.ticks,
+        )
+
+    def look_alikes(self) -> tuple[tuple[str, ...], ...]:
+        """Return names of drives or cars in the file that differ only in their Unicode form."""
+        told = {value for key in self.checker.keys.metadata for value in key.values()}
+        return find_look_alikes({value for value in told if isinstance(value, str)})
+
+
+@contextmanager
+def open_measured(file: Path, mapping: Mapping) -> Iterator[MeasuredStream]:
+    """Open a measured file. Raises `InputError`, if it changes until the end too."""
+    with require_unchanged_file(file):
+        yield MeasuredStream(file, mapping, _identity(file, mapping))
+
+
+def _identity(file: Path, mapping: Mapping) -> str:
+    digest = file_digest(file)
+    used = {name for names in mapping.time_bases().values() for name in names}
+    if keys := {key: text for key, text in partition_keys(file).items() if key in used}:
+        digest.update(canonical_ascii(keys).encode())
+    digest.update(mapping.canonical_json().encode())
+    return digest.hexdigest()
+
+
+def _trial(mapping: Mapping, blocks: list[Block], until: int) -> pl.DataFrame:
+    """Return the rows of the first blocks up to a number, cut into parts."""
+    rows = pl.concat([block.rows for block in blocks])
+    if until < blocks[-1].read:
+        rows = rows.filter(pl.col("row") <= until)
+    return DriveCutter(mapping.time).cut(rows, last="base" in rows.columns)[0]
+
+
+def _one_block(blocks: list[Block]) -> Block:
+    rows, refused = (pl.concat(frames) for frames in zip(*(b[:2] for b in blocks), strict=True))
+    return Block(rows, refused, blocks[-1].read)
+
+
+def _no_more(block: Block) -> Block:
+    return Block(block.rows.clear(), no_rows(), block.read)

@@ -1,0 +1,189 @@
+"""Writes what a measured file becomes to data files of bounded size. Nothing is committed."""
+
+import os
+from collections.abc import Collection, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from itertools import count
+from tempfile import TemporaryFile
+from typing import IO, Any, Literal, TypeAlias
+
+import polars as pl
+import pyarrow as pa
+import pyarrow.compute as pc
+from deltalake.transaction import AddAction
+
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.delta import Table
+from fleet_slip.ingest.forgotten import without_forgotten
+from fleet_slip.ingest.measured_drives import MeasuredDrive, log_table
+from fleet_slip.ingest.stream import MeasuredStream
+from fleet_slip.warehouse.audit import Audit
+from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA, Warehouse
+
+FILE_ROWS = 2**18
+"""A data file is written as soon as it has so many rows; its last drive may make it larger."""
+
+TableName: TypeAlias = Literal["quarantine", "logs"]
+
+
+class DataFiles:
+    """Rows of one table on their way to data files, one file a day, written by a thread."""
+
+    def __init__(self, table: Table, thread: ThreadPoolExecutor, *, by_day: bool) -> None:
+        """Take the table and the only thread that writes."""
+        self._table, self._thread, self._by_day = table, thread, by_day
+        self._written: list[Future[list[AddAction]]] = []
+
+    def write(self, name: str, rows: pa.Table) -> None:
+        """Write rows, while the caller goes on; the rows before are written then."""
+        if self._written:
+            self._written[-1].result()
+        self._written.append(self._thread.submit(self._write, name, rows))
+
+    def files(self) -> tuple[AddAction, ...]:
+        """Return the files, all written."""
+        return tuple(file for future in self._written for file in future.result())
+
+    def discard(self) -> None:
+        """Delete all that was written."""
+        written = [future for future in self._written if future.exception() is None]
+        self._table.discard(file for future in written for file in future.result())
+
+    def _write(self, name: str, rows: pa.Table) -> list[AddAction]:
+        parts = _by_day(rows) if self._by_day else {None: rows}
+        return [self._table.write_file(name, part, day) for day, part in parts.items()]
+
+
+class RefusedRows:
+    """Rows for the quarantine until the end of their file; of many, most are in a temporary file.
+
+    Only then is it known whether a drive that they are of was forgotten.
+    """
+
+    def __init__(self, stream: MeasuredStream) -> None:
+        """Take the file that the rows are of."""
+        self._stream = stream
+        self._rows: list[pl.DataFrame] = []
+        self._number = 0
+        self._spilled: IO[bytes] | None = None
+
+    def add(self, rows: pl.DataFrame) -> None:
+        """Keep rows."""
+        self._rows.append(rows)
+        self._number += rows.height
+        if self._number >= FILE_ROWS:
+            self._spilled = self._spilled or TemporaryFile()  # noqa: SIM115 - closed with this
+            with pa.ipc.new_stream(self._spilled, QUARANTINE_SCHEMA) as sink:
+                sink.write_table(self._stream.quarantine_table(self._rows))
+            self._rows, self._number = [], 0
+
+    def tables(self) -> Iterator[pa.Table]:
+        """Yield the rows, and let go of them."""
+        if self._spilled is not None:
+            with self._spilled as file:
+                end = file.seek(0, os.SEEK_END)
+                file.seek(0)
+                while file.tell() < end:
+                    yield pa.ipc.open_stream(file).read_all()
+        if self._number:
+            yield self._stream.quarantine_table(self._rows)
+
+
+@dataclass
+class WrittenFile:
+    """What a measured file became.
+
+    Attributes:
+        rest: rows that wait for those of other files: those of a small file, or the last.
+        vehicles, drives: whose rows they are.
+        left_out: drives that were forgotten.
+    """
+
+    rest: dict[TableName, pa.Table] = field(default_factory=dict)
+    files: dict[TableName, tuple[AddAction, ...]] = field(default_factory=dict)
+    vehicles: set[str] = field(default_factory=set)
+    drives: set[str] = field(default_factory=set)
+    left_out: int = 0
+    ticks: int = 0
+
+
+class FileWriter:
+    """Writes one measured file, those tables of it that have not landed."""
+
+    def __init__(
+        self,
+        warehouse: Warehouse,
+        stream: MeasuredStream,
+        missing: Collection[TableName],
+        thread: ThreadPoolExecutor,
+    ) -> None:
+        """Take an open file, the tables that miss it, and the only thread that writes."""
+        self._stream, self._missing = stream, missing
+        self._audit = Audit(warehouse.root)
+        self._large: dict[TableName, DataFiles] = {
+            "quarantine": DataFiles(warehouse.quarantine, thread, by_day=False),
+            "logs": DataFiles(warehouse.logs, thread, by_day=True),
+        }
+        self._names = count(1)
+        self._result = WrittenFile()
+
+    def write(self) -> WrittenFile:
+        """Read the file, and write all but its last rows. Raises `InputError`; nothing is left."""
+        try:
+            self._read()
+        except BaseException:
+            for files in self._large.values():
+                files.discard()
+            raise
+        self._result.files = {name: files.files() for name, files in self._large.items()}
+        return self._result
+
+    def _read(self) -> None:
+        refused = RefusedRows(self._stream)
+        waiting: list[MeasuredDrive] = []
+        for piece in self._stream.pieces():
+            refused.add(piece.refused)
+            for drive in piece.drives:
+                waiting.append(drive)
+                if sum(one.ticks.size for one in waiting) >= FILE_ROWS:
+                    self._pass_on("logs", self._logs(waiting), last=False)
+                    waiting = []
+        if waiting:
+            self._pass_on("logs", self._logs(waiting), last=True)
+        nothing = catalogue().log_schema.empty_table()
+        tables = refused.tables()
+        table = next(tables, None)
+        while table is not None:
+            kept = without_forgotten(nothing, table, self._audit, frozenset(self._result.drives))
+            self._result.vehicles |= kept.vehicles
+            table = next(tables, None)
+            self._pass_on("quarantine", kept.quarantine, last=table is None)
+
+    def _logs(self, drives: list[MeasuredDrive]) -> pa.Table:
+        """Return rows of drives that may land."""
+        drives = sorted(drives, key=lambda drive: drive.drive_id)
+        table = log_table(drives, self._stream.mapping)
+        kept = without_forgotten(table, QUARANTINE_SCHEMA.empty_table(), self._audit)
+        self._result.vehicles |= kept.vehicles
+        self._result.drives |= kept.drives
+        self._result.left_out += kept.left_out
+        self._result.ticks += kept.logs.num_rows
+        return kept.logs
+
+    def _pass_on(self, name: TableName, rows: pa.Table, *, last: bool) -> None:
+        if not rows.num_rows or name not in self._missing:
+            return
+        if last:
+            self._result.rest[name] = rows
+        else:
+            self._large[name].write(
+                f"measured-{self._stream.digest[:24]}-{next(self._names)}", rows
+            )
+
+
+def _by_day(rows: pa.Table) -> dict[Any, pa.Table]:
+    days = rows["day"].unique().to_pylist()
+    if len(days) == 1:
+        return {days[0]: rows}
+    return {day: rows.filter(pc.equal(rows["day"], pa.scalar(day, pa.date32()))) for day in days}

@@ -1,0 +1,211 @@
+"""The same rows and drives, in whatever blocks a file is read; plain numbers as by way of text."""
+
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pyarrow as pa
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fleet_slip.errors import InputError
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.ingest import csv_batches, drive_cutter, open_drives, read_measured, stream, writing
+from fleet_slip.ingest.csv_batches import PlainNumbers, open_csv
+from fleet_slip.ingest.csv_format import CsvFormat
+from fleet_slip.ingest.drive_cutter import DriveCutter
+from fleet_slip.ingest.job import ingest_file
+from fleet_slip.ingest.read_ahead import read_ahead
+from fleet_slip.warehouse.tables import Warehouse
+from tests.support.measured import a_mapping, csv_text, good_columns, read_columns, ticks
+
+times = st.lists(
+    st.tuples(
+        st.integers(0, 2),
+        st.one_of(st.integers(0, 60).map(lambda i: i / 100), st.sampled_from([7.0, 1e300, -9.0])),
+    ),
+    min_size=1,
+    max_size=40,
+)
+
+
+def cut(
+    rows: list[tuple[int, float]], sizes: list[int], longest_s: float
+) -> tuple[list[list[int]], list[tuple[int, str]]]:
+    """The rows of each part, in the order in which parts end; and the refused ones."""
+    cutter = DriveCutter(a_mapping().time, longest_s)
+    frame = pl.DataFrame(
+        {
+            "row": range(1, len(rows) + 1),
+            "group": pl.Series([group for group, _ in rows], dtype=pl.Int32),
+            "time": [time for _, time in rows],
+        }
+    )
+    parts: dict[int, list[int]] = {}
+    refused, order, at = [], [], 0
+    for size in [*sizes, len(rows)]:
+        found, bad = cutter.cut(frame.slice(at, size), last=False)
+        at += size
+        for part, row in found.select("part", "row").iter_rows():
+            parts.setdefault(part, []).append(row)
+        refused += list(bad.select("row", "reason").iter_rows())
+        order += cutter.ended
+    found, bad = cutter.cut(frame.clear(), last=True)
+    for part, row in found.select("part", "row").iter_rows():
+        parts.setdefault(part, []).append(row)
+    refused += list(bad.select("row", "reason").iter_rows())
+    order += [*cutter.ended, *cutter.open_parts()]
+    return [parts[part] for part in order if part in parts], sorted(refused)
+
+
+@settings(max_examples=60)
+@given(times, st.lists(st.integers(1, 9), max_size=12), st.sampled_from([0.05, 0.2, 1e9]))
+def test_blocks_change_nothing(
+    rows: list[tuple[int, float]], sizes: list[int], longest_s: float
+) -> None:
+    whole = cut(rows, [], longest_s)
+    assert cut(rows, sizes, longest_s) == whole
+    kept = [row for part in whole[0] for row in part]
+    assert sorted(kept + [row for row, _ in whole[1]]) == list(range(1, len(rows) + 1))
+    for part in whole[0]:
+        moments = [rows[row - 1][1] for row in part]
+        assert moments == sorted(set(moments))
+        assert moments[-1] - moments[0] < longest_s
+        assert len({rows[row - 1][0] for row in part}) == 1
+
+
+def test_a_drive_that_lasts_too_long_is_cut(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stream, "LONGEST_DRIVE_S", 0.5)
+    log = read_columns(tmp_path, good_columns(60))
+    name = f"test-{log.digest[:12]}-1"
+    assert log.drives["drive_id"].to_pylist() == [name] * 50 + [f"{name}-2"] * 10
+    assert ticks(log) == [*range(50), *range(10)]
+    fast = {"t": [i / 1000 for i in range(600)], "ax": [1] * 600, "beta": [1] * 600}
+    assert read_columns(tmp_path, fast).counts.drives == 12
+
+
+@pytest.mark.parametrize("rows", [1, 7])
+def test_the_usual_rate_does_not_depend_on_blocks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rows: int
+) -> None:
+    t = [*(i / 100 for i in range(30)), *(0.3 + i / 1000 for i in range(300))]
+    columns = {"t": t, "ax": [1] * 330, "beta": [1] * 330}
+    monkeypatch.setattr(stream, "RATE_ROWS", 20)
+    monkeypatch.setattr(stream, "FEWEST_STEPS", 10)
+    whole = read_columns(tmp_path, columns)
+    monkeypatch.setattr(csv_batches, "BLOCK_BYTES", 12 * rows)
+    assert read_columns(tmp_path, columns).drives.equals(whole.drives)
+    assert whole.counts.drives_resampled == 1
+
+
+@pytest.mark.parametrize(("limit", "files"), [(1, 3), (40, 2), (10_000, 1)])
+def test_what_lands_does_not_depend_on_the_size_of_data_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: int, files: int
+) -> None:
+    monkeypatch.setattr(writing, "FILE_ROWS", limit)
+    columns = good_columns(90)
+    columns["t"] = [f"{i / 100 + 5 * (i // 30):.2f}" for i in range(90)]
+    columns["ax"][3] = columns["ax"][70] = "x"
+    (tmp_path / "log.csv").write_text(csv_text(columns))
+    warehouse = Warehouse(LocalFolder(tmp_path / "data"))
+    report = ingest_file(warehouse, tmp_path / "log.csv", a_mapping())
+    assert (report.counts.drives, report.counts.ticks) == (3, 88)
+    logs, refused = (
+        pa.concat_tables(table.read(file.path) for file in table.snapshot().files)
+        for table in (warehouse.logs, warehouse.quarantine)
+    )
+    assert len(warehouse.logs.snapshot().files) == files
+    whole = read_measured(tmp_path / "log.csv", a_mapping())
+    order = [("drive_id", "ascending"), ("tick", "ascending")]
+    logs = logs.set_column(0, "drive_id", logs["drive_id"].cast(pa.string())).sort_by(order)
+    assert logs["ax"].to_pylist() == whole.drives["ax"].to_pylist()
+    assert sorted(refused["row"].to_pylist()) == [4, 71]
+    assert not ingest_file(warehouse, tmp_path / "log.csv", a_mapping()).new
+
+
+def test_nothing_is_left_of_a_file_that_fails_at_its_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(writing, "FILE_ROWS", 1)
+    monkeypatch.setattr(csv_batches, "BLOCK_BYTES", 100)
+    columns = good_columns(90)
+    columns["t"] = [f"{i / 100 + 5 * (i // 30):.2f}" for i in range(90)]
+    (tmp_path / "log.csv").write_bytes(csv_text(columns).encode() + b"0.1,\xff,1\n")
+    warehouse = Warehouse(LocalFolder(tmp_path / "data"))
+    with pytest.raises(InputError, match="not UTF-8"):
+        ingest_file(warehouse, tmp_path / "log.csv", a_mapping())
+    assert not list((tmp_path / "data").rglob("*.parquet"))
+
+
+def test_drives_that_alternate_for_ever_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(open_drives, "MAX_OPEN_ROWS", 19)
+    monkeypatch.setattr(stream, "MAX_OPEN_ROWS", 19)
+    with pytest.raises(InputError, match="Sort the file by drive and time"):
+        read_columns(tmp_path, good_columns(20) | {})
+
+
+numbers = st.one_of(
+    st.floats().map(str),
+    st.integers().map(str),
+    st.sampled_from(["", " 1", "1 ", "+1", "1.", ".5", "-.5", "1e5", "1E+5", "1_0", "0x1", "inf"]),
+    st.sampled_from(["nan", "NaN", "-99", "-99.0", "1,5", "1,5,2", "1.5,2", "true", "1d", "--1"]),
+    st.text("0123456789.eE+- ", max_size=9),
+)
+
+
+@settings(max_examples=60)
+@given(st.lists(numbers, min_size=1, max_size=6), st.booleans())
+def test_plain_numbers_are_those_of_their_texts(
+    tmp_path_factory: pytest.TempPathFactory, texts: list[str], comma: bool
+) -> None:
+    file = tmp_path_factory.mktemp("numbers") / "log.csv"
+    file.write_text("a;b\n" + "".join(f"{text};x\n" for text in texts))
+    form = CsvFormat(separator=";", decimal_comma=comma)
+
+    def read(plain: PlainNumbers | None) -> pl.Series:
+        with open_csv(file, form, plain) as source:
+            return pl.concat(source.batches(["a"]))["a"]
+
+    found = read(PlainNumbers(frozenset({"a"}), (-99.0, float("nan"))))
+    told = read(None)
+    if found.dtype == pl.String:
+        assert found.equals(told)
+        return
+    plain = told.str.strip_chars()
+    plain = plain.str.replace(",", ".", literal=True) if comma else plain
+    expected = plain.cast(pl.Float64, strict=False)
+    assert found.to_numpy().tobytes() == expected.to_numpy().tobytes()
+    assert np.isfinite(found.to_numpy()).all()
+
+
+def test_items_are_read_ahead_in_order_and_errors_come_in_their_place() -> None:
+    taken: list[int] = []
+
+    def items() -> Any:
+        for i in range(4):
+            taken.append(i)
+            yield i
+        raise ValueError("end")
+
+    ahead = read_ahead(items())
+    assert next(ahead) == 0
+    assert next(ahead) == 1
+    ahead.close()
+    assert taken in ([0, 1], [0, 1, 2])
+    seen = []
+    with pytest.raises(ValueError, match="end"):
+        for item in read_ahead(items()):
+            seen.append(item)
+    assert seen == [0, 1, 2, 3]
+    assert not [t for t in threading.enumerate() if t.name.startswith("read-ahead")]
+
+
+def test_the_longest_drive_is_said_in_the_docs() -> None:
+    assert pytest.approx(87 * 60, abs=60) == drive_cutter.LONGEST_DRIVE_S
