@@ -187,7 +187,8 @@ class Campaign(Config):
             if isinstance(plan, TrialPlan):
                 assignment = plan.assignment(number, self.sensors, of_car, of_drive)
             else:
-                assignment = plan.assignment(self.sensors, of_car, of_drive)
+                days = (day - self.first_day).days
+                assignment = plan.assignment(self.sensors, of_car, of_drive, days)
         return DriveSpec(
             drive_id=drive_id,
             vehicle_id=vehicle_id,

@@ -199,9 +199,16 @@ class FleetPlan(Plan):
         return number % self.cars
 
     def assignment(
-        self, sensors: Sensors, of_car: np.random.Generator, of_drive: np.random.Generator
+        self,
+        sensors: Sensors,
+        of_car: np.random.Generator,
+        of_drive: np.random.Generator,
+        days: int = 0,
     ) -> CarOnRoad:
-        """Draw a car from one generator and its drive from another, in a fixed order."""
+        """Draw a car from one generator and its drive from another, in a fixed order.
+
+        `days` have passed since the first one, and have worn the tyres.
+        """
         vehicle = self.vehicles[of_car.integers(len(self.vehicles))]
         mass_kg = vehicle.body.sprung_mass_kg * self.load.draw(of_car)
         stiffness, radius = self.tyre_stiffness.draw(of_car), self.tyre_radius.draw(of_car)
@@ -213,12 +220,16 @@ class FleetPlan(Plan):
         ranges = self.imperfections or ImperfectionRanges()
         place = ranges.load_position_m
         vehicle = vehicle.with_sprung_mass(mass_kg, place.draw(of_car) if place else None)
+        flaws = ranges.draw(of_car, of_drive)
+        stiffer, smaller = ranges.wear(of_car, days)
         return CarOnRoad(
-            vehicle=vehicle.with_tyres(stiffness_factor=stiffness, rolling_radius_factor=radius),
+            vehicle=vehicle.with_tyres(
+                stiffness_factor=stiffness * stiffer, rolling_radius_factor=radius * smaller
+            ),
             sensors=sensors,
             track=track,
             adhesion=adhesion,
             limits=self.limits(lateral_mps2, adhesion),
             speed_factor=speed_factor,
-            flaws=ranges.draw(of_car, of_drive),
+            flaws=flaws,
         )

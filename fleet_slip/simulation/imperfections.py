@@ -110,6 +110,11 @@ class Range(Config):
         return float(generator.uniform(self.min, self.max))
 
 
+WORN_STIFFNESS, WORN_RADIUS = 1.1, 0.98
+"""Cornering stiffness and rolling radius of a tyre without tread, over those of a new one: 8 mm
+less on 325 mm, and shorter blocks, which give way less (the scenario `tyres_worn`)."""
+
+
 class ImperfectionRanges(Config):
     """From what each car's imperfections, and each drive's road, are drawn.
 
@@ -119,6 +124,10 @@ class ImperfectionRanges(Config):
 
     load_position_m: Range | None = None
     """Where load sits, before the centre of gravity of the car without it; None: at that place."""
+    tread_wear_per_100_days: Range | None = Field(
+        default=None, exclude_if=lambda wear: wear is None
+    )
+    """Share of the tread that a car's tyres lose; new ones follow where none is left."""
     car: dict[str, Range] = Field(default={})
     sensors: dict[str, Range] = Field(default={})
     road: dict[str, Range] = Field(default={})
@@ -129,6 +138,19 @@ class ImperfectionRanges(Config):
             for kind, ranges in self._kinds():
                 kind.model_validate({name: _end(kind, name, r, end) for name, r in ranges.items()})
         return self
+
+    @model_validator(mode="after")
+    def _tread_does_not_grow(self) -> "ImperfectionRanges":
+        if self.tread_wear_per_100_days and self.tread_wear_per_100_days.min < 0:
+            raise ValueError("tread_wear_per_100_days: a tread does not grow")
+        return self
+
+    def wear(self, of_car: np.random.Generator, days: int) -> tuple[float, float]:
+        """Return what so many days have made of a car's stiffness and rolling radius: factors."""
+        if self.tread_wear_per_100_days is None:
+            return 1.0, 1.0
+        worn = self.tread_wear_per_100_days.draw(of_car) * days / 100 % 1.0
+        return 1.0 + (WORN_STIFFNESS - 1.0) * worn, 1.0 + (WORN_RADIUS - 1.0) * worn
 
     def _kinds(self) -> list[tuple[type[Config], dict[str, Range]]]:
         return [

@@ -217,3 +217,27 @@ def test_the_realistic_fleet_s_cars_understeer_as_cars_do() -> None:
         speeds_kmh.append(3.6 * np.sqrt(known.wheelbase / known.understeer))
     assert 65 < np.median(speeds_kmh) < 100
     assert np.mean(np.array(speeds_kmh) < 65) < 0.05
+
+
+def test_tyres_wear_from_day_to_day_and_new_ones_follow(tmp_path: Path) -> None:
+    """At half a tread in 100 days, 100 days are 5 % of stiffness and 1 % of radius."""
+    file = tmp_path / "campaign.toml"
+    wear = "[plan.imperfections]\ntread_wear_per_100_days = { min = 0.5, max = 0.5 }\n"
+    text = FLEET.replace("cars = 300", "cars = 1").replace(
+        "drives_per_day = 48", "drives_per_day = 1"
+    )
+    text = text.replace("number_of_days = 25", "number_of_days = 201")
+    file.write_text(text.replace("[plan.load]", f"{wear}[plan.load]"))
+    campaign = load_campaign(str(file))
+    tyres = [drive.vehicle.tyre for day in campaign.days() for drive in campaign.drives(day)]
+    new, old = tyres[0], tyres[100]
+    assert old.peak_stiffness_n / new.peak_stiffness_n == pytest.approx(1.05)
+    assert old.rolling_radius_m / new.rolling_radius_m == pytest.approx(0.99)
+    assert tyres[199].rolling_radius_m < old.rolling_radius_m
+    assert tyres[200] == new
+    plain = tmp_path / "plain.toml"
+    plain.write_text(text)
+    (first,) = load_campaign(str(plain)).drives(campaign.days()[0])
+    assert first.vehicle.tyre == new
+    with pytest.raises(ValidationError, match="a tread does not grow"):
+        ImperfectionRanges(tread_wear_per_100_days=Range(min=-0.1, max=0.1))
