@@ -1,9 +1,9 @@
 """Where the time of `simulate` goes, stage by stage, and what the kernel's inner loops are made of.
 
-    python -m benchmarks.simulator_profile [--loop loop.s]
+    python -m benchmarks.simulator_profile [--campaign fleet_realistic] [--loop loop.s]
 
-Stages: one file of the `fleet` campaign, time of the processor on one thread, the best of several
-rounds. Instructions: counted in the kernel's assembly. `--loop` writes the longest loop, a step of
+Stages: one file of a campaign, time of the processor on one thread, the best of several rounds.
+Instructions: counted in the kernel's assembly. `--loop` writes the longest loop, a step of
 four cars, for a simulator of the processor's pipeline:
 
     llvm-mca -mcpu=znver3 --bottleneck-analysis loop.s
@@ -60,27 +60,36 @@ def stages(batch: Batch, warehouse: Warehouse) -> tuple[int, dict[str, float]]:
     logs = simulate_logs(batch.drives)
     rows = tabulate(batch, logs)
     signals = list(catalogue().signals)
-    truths = [dict(vars(truth)) for truth in simulate_drives(lanes)]
-    for truth in truths:
-        del truth["lost_control_tick"]
+    blocks = [
+        (block.drive, {name: values.copy() for name, values in block.channels.items()})
+        for block in simulate_blocks(lanes)
+    ]
 
     def measure() -> None:
-        for spec, truth in zip(batch.drives, truths, strict=True):
-            recorder = Recorder(spec.sensors, spec.generator())
-            recorder.record(truth)
+        recorders = [Recorder(s.sensors, s.generator(), s.distortion()) for s in batch.drives]
+        for drive, truth in blocks:
+            recorders[drive].record(truth)
+
+    def distort() -> None:
+        sensors = [spec.distortion() for spec in batch.drives]
+        for drive, truth in blocks:
+            if one := sensors[drive]:
+                one.apply(truth)
 
     noise = np.empty(len(rows), dtype=np.float32)
     generator = batch.drives[0].generator()
     noisy = len(batch.drives[0].sensors.bias_and_std)
     encoded = warehouse.logs.encode(rows)
     draw_s = noisy * best(lambda: generator.standard_normal(out=noise, dtype=np.float32))
+    distort_s = best(distort)
     others = [name for name in rows.schema.names if name not in signals]
     return len(rows), {
-        "plan a day: cars, roads, speeds": best(lambda: load_campaign("fleet").batches(DAY)),
+        "plan a day: cars, roads, speeds": best(lambda: load_campaign(batch.campaign).batches(DAY)),
         "roads of the drives": best(lambda: [lane_drive(spec) for spec in batch.drives]),
         "kernel": best(lambda: drive(lanes)),
         "sensors: draw the noise": draw_s,
-        "sensors: add it, round, clip": best(measure) - draw_s,
+        "sensors: imperfections": distort_s,
+        "sensors: add it, round, clip": best(measure) - draw_s - distort_s,
         "tabulate": best(lambda: tabulate(batch, logs)),
         "encode: signals": best(lambda: warehouse.logs.encode(rows.select(signals))),
         "encode: tick and metadata": best(lambda: warehouse.logs.encode(rows.select(others))),
@@ -146,14 +155,17 @@ def print_instructions(assembly: str) -> None:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--campaign", default="fleet")
     parser.add_argument("--loop", type=Path, help="file for the assembly of the longest loop")
     arguments = parser.parse_args()
-    batch = load_campaign("fleet").batches(DAY)[0]
+    batch = load_campaign(arguments.campaign).batches(DAY)[0]
     with tempfile.TemporaryDirectory() as folder:
         rows, seconds = stages(batch, Warehouse(LocalFolder(Path(folder))))
     print(f"{rows:,} rows of {len(batch.drives)} drives\n{'stage':34}{'ms':>8}{'ns a row':>10}")
     for name, spent in seconds.items():
         print(f"{name:34}{1e3 * spent:8.0f}{1e9 * spent / rows:10.1f}")
+    measured = [spent for name, spent in seconds.items() if "(" not in name]
+    print(f"{'together':34}{1e3 * sum(measured):8.0f}{1e9 * sum(measured) / rows:10.1f}")
     assembly = compiled_assembly()
     print_instructions(assembly)
     if arguments.loop:

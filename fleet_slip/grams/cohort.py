@@ -106,10 +106,10 @@ class Cohort:
     def folds(self, by: FoldKey, count: FoldCount) -> CohortFolds:
         """Divide the cohort into folds, of whole drives unless by `row`.
 
-        By `drive`: hashed into `count` folds. By another key of `FOLD_KEYS`: one fold for each
-        value, or hashed into `count` folds if there are more values than that; by `speed`, cut into
-        `count` bands. With `EACH`, every drive or value is a fold. By `part` or `row`: the parts or
-        the folds of single rows that the feature set made. Raises `QuestionError` if it made none.
+        By `drive` or another key of `FOLD_KEYS`: one fold for each value, or hashed into `count`
+        folds if there are more values than that; by `speed`, cut into `count` bands. With `EACH`,
+        every drive or value is a fold. By `part` or `row`: the parts or the folds of single rows
+        that the feature set made. Raises `QuestionError` if it made none.
         """
         require_divided(self.feature_set, by, count)
         values = self.drives[FOLD_KEYS[by]].to_pylist()
@@ -213,7 +213,7 @@ def assign_folds(values: Sequence[Any], by: str, count: FoldCount) -> FoldAssign
         return by_band(values, count)
     if by == ROW_FOLDS:
         return by_value([(int(value) - 1) % count + 1 for value in values])
-    if by == "drive" or len(set(values)) > count:
+    if len(set(values)) > count:
         return by_hash([str(value) for value in values], count)
     return by_value(values)
 

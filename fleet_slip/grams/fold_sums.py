@@ -26,7 +26,6 @@ from fleet_slip.grams.cohort import (
 )
 from fleet_slip.grams.expansion import Expansion, expansion_of
 from fleet_slip.grams.folding import (
-    EACH,
     FOLD_KEYS,
     FoldCount,
     Folding,
@@ -132,13 +131,15 @@ def _folding(
 ) -> tuple[list[str], FoldOf]:
     """Return the names of all folds that there may be, and what tells the fold of a Gram row."""
     count = folding.count
-    if folding.by == "drive" and count != EACH:
-        names = [str(fold + 1) for fold in range(count)]
-        return names, lambda _, drives: (drives % count).astype(np.int64)
+    few = count if folding.by == "drive" and isinstance(count, int) else None
     key = FOLD_KEYS[folding.by]
     text = opened.statement("cohort_sums.sql", condition)
+    query = f"SELECT DISTINCT {key} FROM ({text}){f' LIMIT {few + 1}' if few else ''}"
     with asking(opened.database, condition):
-        found = opened.database.sql(f"SELECT DISTINCT {key} FROM ({text})").to_arrow_table()
+        found = opened.database.sql(query).to_arrow_table()
+    if few and len(found) > few:
+        names = [str(fold + 1) for fold in range(few)]
+        return names, lambda _, drives: (drives % few).astype(np.int64)
     values = found[key].combine_chunks()
     if not len(values):
         raise empty_cohort_error(opened.database, condition)

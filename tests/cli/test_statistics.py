@@ -327,6 +327,22 @@ def test_a_number_of_folds_that_cannot_be_is_named(
     assert f"error: folds = {asked}: choose a number from 2 to 1000" in done.stderr
 
 
+@pytest.mark.parametrize("extra", [(), ("--rank", "t")])
+def test_as_many_folds_as_drives_leave_out_each(
+    run_command: RunCommand, every_set: Path, extra: tuple[str, ...]
+) -> None:
+    """Hashed, some folds would have two drives and others none."""
+    five = ("select", "--cohort", "drive_id < 'smoke-2024-05-02-0001'", *extra, "--json")
+    found = run_command(*five, "--folds", "5", root=every_set).json
+    assert (found["drives"], found["folds"]["count"]) == (5, 5)
+    each = run_command(*five, "--folds", "each", root=every_set).json
+    assert found["models"] == each["models"]
+    many = run_command("select", "--folds", "1000", *extra, "--json", root=every_set).json
+    assert many["folds"]["count"] == many["drives"] == 8
+    fewer = run_command(*five, "--folds", "3", root=every_set).json
+    assert fewer["folds"]["count"] <= 3
+
+
 def test_one_model_is_taken_without_a_list(run_command: RunCommand, every_set: Path) -> None:
     given = run_command("select", "--model", "ax, ay,yaw_rate", "--json", root=every_set).json
     listed = run_command("select", "--json", root=every_set).json

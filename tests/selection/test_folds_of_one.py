@@ -9,7 +9,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError
 from fleet_slip.grams import cohort as cohorts
 from fleet_slip.grams.cohort import assign_folds
-from fleet_slip.grams.folding import EACH, Folding
+from fleet_slip.grams.folding import EACH, FoldCount, Folding
 from fleet_slip.selection.compare import select
 from fleet_slip.selection.model_list import CandidateModel
 from tests.support.cohorts import INPUTS, LABEL, cohort_of, driven
@@ -37,11 +37,12 @@ def test_figures_are_those_of_leaving_each_out_on_the_rows(by: str) -> None:
     assert found.correlation == pytest.approx(np.corrcoef(predicted, rows[:, -1])[0, 1], rel=1e-9)
 
 
-def test_five_drives_are_five_folds() -> None:
-    """Hashed into five folds, some share one."""
+@pytest.mark.parametrize("count", [5, 6, 1000, EACH])
+def test_five_drives_are_five_folds(count: FoldCount) -> None:
+    """Hashed into five folds, some would share one; into four, they are."""
     names = [f"drive-{i}" for i in range(5)]
-    assert len(assign_folds(names, "drive", EACH).names) == 5
-    assert len(assign_folds(names, "drive", 5).names) < 5
+    assert assign_folds(names, "drive", count).names == tuple(names)
+    assert set(assign_folds(names, "drive", 4).names) <= set("1234")
 
 
 def test_more_folds_than_can_be_fitted_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
