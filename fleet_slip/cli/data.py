@@ -11,6 +11,7 @@ import typer
 
 from fleet_slip.api.calls import open_workers
 from fleet_slip.api.fleet import Fleet
+from fleet_slip.cli.completing import complete_config
 from fleet_slip.cli.output import Json, print_json, say
 from fleet_slip.cli.progress import progress
 from fleet_slip.cli.recorded import record_run
@@ -24,7 +25,11 @@ if TYPE_CHECKING:
     from fleet_slip.simulation.job import SimulationReport
 
 CampaignName = Annotated[
-    str, typer.Argument(help="A campaign of configs/campaigns, or the path of a TOML file.")
+    str,
+    typer.Argument(
+        help="A campaign of configs/campaigns, or the path of a TOML file.",
+        autocompletion=complete_config("campaigns"),
+    ),
 ]
 Through = Annotated[
     str | None,

@@ -6,6 +6,7 @@ import typer
 
 from fleet_slip.catalogue.sources import ALL_DRIVES
 from fleet_slip.cli.comparing import score_against
+from fleet_slip.cli.completing import complete_config, complete_model
 from fleet_slip.cli.evaluation_summary import print_summary
 from fleet_slip.cli.evaluation_tables import print_evaluation
 from fleet_slip.cli.models import Reference
@@ -22,7 +23,8 @@ OneCar = Annotated[
     str,
     typer.Option(
         help="NAME, NAME@VERSION or NAME@ALIAS of a model. It is evaluated, and the models of "
-        "Table I on the cohort that it was trained on."
+        "Table I on the cohort that it was trained on.",
+        autocompletion=complete_model,
     ),
 ]
 FleetModels = Annotated[
@@ -34,6 +36,7 @@ Scenarios = Annotated[
     typer.Option(
         "--scenario",
         help="A scenario of configs/scenarios, or a TOML file. May be repeated. Default: all.",
+        autocompletion=complete_config("scenarios"),
         show_default=False,
     ),
 ]

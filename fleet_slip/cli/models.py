@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from fleet_slip.api.fleet import Fleet
+from fleet_slip.cli.completing import complete_model
 from fleet_slip.cli.output import Json, print_json, print_table, say
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.signing import signing_key
@@ -17,7 +18,11 @@ from fleet_slip.models.on_board import cost_on_board
 from fleet_slip.words import number_of
 
 Reference = Annotated[
-    str, typer.Argument(help="NAME, NAME@VERSION or NAME@ALIAS. NAME alone is its champion.")
+    str,
+    typer.Argument(
+        help="NAME, NAME@VERSION or NAME@ALIAS. NAME alone is its champion.",
+        autocompletion=complete_model,
+    ),
 ]
 Alias = Annotated[str, typer.Option(help="The alias to move.")]
 
@@ -225,7 +230,10 @@ def _print_version(version: ModelVersion) -> None:
 @record_run
 def promote(
     context: typer.Context,
-    reference: Annotated[str, typer.Argument(help="NAME@VERSION to point the alias at.")],
+    reference: Annotated[
+        str,
+        typer.Argument(help="NAME@VERSION to point the alias at.", autocompletion=complete_model),
+    ],
     alias: Alias = CHAMPION,
 ) -> None:
     """Point an alias, the champion unless told otherwise, at a version.
@@ -239,7 +247,7 @@ def promote(
 @record_run
 def rollback(
     context: typer.Context,
-    name: Annotated[str, typer.Argument(help="Name of the model.")],
+    name: Annotated[str, typer.Argument(help="Name of the model.", autocompletion=complete_model)],
     alias: Alias = CHAMPION,
 ) -> None:
     """Point an alias back at the version that it had before; no publication moves it from there.
@@ -258,7 +266,7 @@ def rollback(
 @record_run
 def pin(
     context: typer.Context,
-    name: Annotated[str, typer.Argument(help="Name of the model.")],
+    name: Annotated[str, typer.Argument(help="Name of the model.", autocompletion=complete_model)],
     alias: Alias = CHAMPION,
 ) -> None:
     """Keep an alias where it is: publications become candidates, until promote or unpin.
@@ -272,7 +280,7 @@ def pin(
 @record_run
 def unpin(
     context: typer.Context,
-    name: Annotated[str, typer.Argument(help="Name of the model.")],
+    name: Annotated[str, typer.Argument(help="Name of the model.", autocompletion=complete_model)],
     alias: Alias = CHAMPION,
 ) -> None:
     """Let publications move an alias again, after pin or rollback.

@@ -8,6 +8,7 @@ from typing import Annotated, Any, TypeVar
 
 import typer
 
+from fleet_slip.cli.completing import complete_config, complete_feature_set
 from fleet_slip.regression.criteria import CRITERIA
 from fleet_slip.regression.drive_moments import ClusterUnit
 from fleet_slip.regression.ranking import RANKINGS
@@ -24,6 +25,7 @@ SELECTION: dict[str, Any] = {
     "models": typer.Option(
         help=f"A model list of configs/models, or a TOML file. Default: {DEFAULT_MODELS}, unless "
         "--nested or an option that searches is given.",
+        autocompletion=complete_config("models"),
         show_default=False,
     ),
     "model": typer.Option(
@@ -37,7 +39,8 @@ SELECTION: dict[str, Any] = {
     ),
     "features": typer.Option(
         help="Feature set of configs/features.toml, computed before with: fleet-slip gram "
-        "--features NAME. Default: what the list says, else the logged signals."
+        "--features NAME. Default: what the list says, else the logged signals.",
+        autocompletion=complete_feature_set,
     ),
     "by": typer.Option(
         help="What a fold is made of. Default: what the list says. By row is WEKA's way and leaks."

@@ -4,6 +4,7 @@ from typing import Annotated
 
 import typer
 
+from fleet_slip.cli.completing import complete_model
 from fleet_slip.cli.options import RESAMPLING, selection_options
 from fleet_slip.cli.output import Json, print_json, say
 from fleet_slip.cli.recorded import record_run
@@ -19,7 +20,10 @@ from fleet_slip.selection.request import SelectionRequest
 @selection_options(without=RESAMPLING)
 def publish(
     context: typer.Context,
-    name: Annotated[str, typer.Argument(help="Name of the model, such as sideslip.")],
+    name: Annotated[
+        str,
+        typer.Argument(help="Name of the model, such as sideslip.", autocompletion=complete_model),
+    ],
     request: SelectionRequest,
     force: Annotated[
         bool, typer.Option("--force", help="Publish even what is worse than the champion.")

@@ -10,6 +10,7 @@ from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features as known_features
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.cli.completing import complete_feature_set
 from fleet_slip.cli.output import Json, print_json, print_table, say
 from fleet_slip.cli.progress import progress
 from fleet_slip.cli.recorded import record_run
@@ -31,6 +32,7 @@ def gram(
         str,
         typer.Option(
             "--features",
+            autocompletion=complete_feature_set,
             help="A feature set of configs/features.toml; signals is the logged signals "
             "themselves, all is every set.",
         ),

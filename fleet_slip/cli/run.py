@@ -8,6 +8,7 @@ from fleet_slip.api.calls import open_workers
 from fleet_slip.api.fleet import RUN_MODELS, Fleet
 from fleet_slip.api.run_report import RunReport
 from fleet_slip.catalogue.feature_sets import PLAIN
+from fleet_slip.cli.completing import complete_config
 from fleet_slip.cli.data import Days, Through, last_day
 from fleet_slip.cli.next_steps import next_steps
 from fleet_slip.cli.options import Worth
@@ -28,7 +29,11 @@ DEFAULT_CAMPAIGN = "waterford"
 def run(
     context: typer.Context,
     campaign: Annotated[
-        str, typer.Option(help="A campaign of configs/campaigns, or the path of a TOML file.")
+        str,
+        typer.Option(
+            help="A campaign of configs/campaigns, or the path of a TOML file.",
+            autocompletion=complete_config("campaigns"),
+        ),
     ] = DEFAULT_CAMPAIGN,
     days: Days = None,
     through: Through = None,
@@ -36,7 +41,11 @@ def run(
         str | None, typer.Option(help="Name of the model. Default: the campaign's.")
     ] = None,
     models: Annotated[
-        str, typer.Option(help="A model list of configs/models, or a TOML file.")
+        str,
+        typer.Option(
+            help="A model list of configs/models, or a TOML file.",
+            autocompletion=complete_config("models"),
+        ),
     ] = RUN_MODELS,
     worth: Worth = WORTH,
     threads: Threads = None,

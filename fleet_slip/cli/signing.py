@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from fleet_slip.cli.completing import complete_model
 from fleet_slip.cli.output import say
 from fleet_slip.errors import UsageError
 from fleet_slip.models.signing import SIGNING_VARIABLE, VERIFY_VARIABLE, make_keys
@@ -39,7 +40,7 @@ def keygen(
 
 def sign(
     context: typer.Context,
-    reference: Annotated[str, typer.Argument(help="NAME@VERSION")],
+    reference: Annotated[str, typer.Argument(help="NAME@VERSION", autocompletion=complete_model)],
     sign_key: SignKey = None,
 ) -> None:
     """Sign a version that was published without a signature.
