@@ -37,6 +37,7 @@ GROUPS = {
         "check": "reducing",
         "features": "statistics",
         "config": "configs",
+        "init": "beginning",
         "shell": "shell",
     },
     "Models": {
