@@ -15,6 +15,7 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.config import Config
+from fleet_slip.errors import DataError
 from fleet_slip.evaluation.estimators import Signals
 from fleet_slip.evaluation.evaluated_drives import EvaluatedDrive
 from fleet_slip.files.documents import DocumentFolder
@@ -22,6 +23,7 @@ from fleet_slip.grams.cohort import Cohort
 from fleet_slip.observers import ekf, kalman, luenberger, sliding_mode
 from fleet_slip.observers.signals import DriveSignals, LabelledDrive, read_drive
 from fleet_slip.observers.tuning import tune
+from fleet_slip.runs.log import LOGGER
 from fleet_slip.vehicle.parameters import VehicleParameters
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
@@ -122,7 +124,8 @@ def filter_bank(
 ) -> Bank:
     """Return each filter as it is and tuned on drives of a cohort that the car made.
 
-    Tuned parameters are kept below `tuned/` in the data root, and sought again only for other
+    A filter that the drives lack something for is tuned on none, and a remark says so. Tuned
+    parameters are kept below `tuned/` in the data root, and sought again only for other
     drives, another car or another program.
     """
     chosen = tuning_drives(cohort, car)
@@ -133,12 +136,17 @@ def filter_bank(
         found = _kept(warehouse, one, key)
         if found is None:
             drives = drives or read_labelled(warehouse, chosen)
-            found = _tune(warehouse, one, key, drives, car, executor)
-        tuned = type(one.parameters).model_validate(found["parameters"])
-        for name, parameters in ((one.name, one.parameters), (f"{one.name}_tuned", tuned)):
+            try:
+                found = _tune(warehouse, one, key, drives, car, executor)
+            except DataError as error:  # its drives have no fix, no wheel speeds, no steering
+                LOGGER.warning("%s competes as it is, for it cannot be tuned: %s", one.name, error)
+        on = list(chosen) if found else []
+        tuned = type(one.parameters).model_validate(found["parameters"]) if found else None
+        both = {one.name: one.parameters, f"{one.name}_tuned": tuned or one.parameters}
+        for name, parameters in both.items():
             bank.estimators[name] = FilterEstimate(one, parameters, car)
             bank.descriptions[name] = bank.estimators[name].description()
-        bank.descriptions[f"{one.name}_tuned"]["tuned_on"] = list(chosen)
+        bank.descriptions[f"{one.name}_tuned"]["tuned_on"] = on
     return bank
 
 

@@ -2,7 +2,7 @@
 
 import hashlib
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from fleet_slip.canonical import canonical_json, sha256_of
@@ -127,7 +127,22 @@ class ReportData:
     @property
     def choice(self) -> str:
         """Estimator's name of the model that the paper settles on."""
-        return self.evaluated.models[THE_PAPERS_CHOICE]
+        return self.evaluated.models[self.choice_number]
+
+    @property
+    def choice_number(self) -> str:
+        """Its number in Table I; of the last that the training drives have the signals for."""
+        return _choose(list(self.evaluated.models))
+
+
+def _choose(names: Sequence[str]) -> str:
+    """Return the paper's choice, or the last model where the drives lack signals of that."""
+    return THE_PAPERS_CHOICE if THE_PAPERS_CHOICE in names else names[-1]
+
+
+def _paper_choice(models: Sequence[CrossValidation]) -> CrossValidation:
+    chosen = _choose([model.name for model in models])
+    return next(model for model in models if model.name == chosen)
 
 
 def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
@@ -150,7 +165,7 @@ def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
     cohort, models = trained.selection.cohort, trained.selection.models
     own = _own_cohort(warehouse, trained)
     manifest = version.manifest
-    choice = next(model for model in models if model.name == THE_PAPERS_CHOICE)
+    choice = _paper_choice(models)
     signals = tuple(dict.fromkeys(models[-1].signals))
     return ReportData(
         version=version,
@@ -235,7 +250,7 @@ def _own_cohort(warehouse: Warehouse, trained: TrainedModels) -> Cohort:
 
 def _coefficients(trained: TrainedModels, own: Cohort) -> tuple[Coefficients, ...]:
     cohort, published = trained.selection.cohort, trained.version
-    choice = next(m for m in trained.selection.models if m.name == THE_PAPERS_CHOICE)
+    choice = _paper_choice(trained.selection.models)
     tables = [coefficient_table(cohort, f"model {choice.name}", choice.signals)]
     signals = published.manifest.signals
     if set(signals) != set(choice.signals) and len(signals) <= MOST_TERMS:

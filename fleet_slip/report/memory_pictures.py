@@ -99,7 +99,7 @@ def _dearest_window(memory: Memory) -> str:
 
 def _on_the_track(data: ReportData) -> Picture:
     run, published = data.runs["nominal"], data.version.reference
-    label = next(k for k, v in data.evaluated.models.items() if v == data.choice)
+    label = data.choice_number
     maps = [
         Map(f"Model {label}, one instant", run, data.choice),
         Map(f"{published}, with memory", run, published),

@@ -108,11 +108,12 @@ def _tiles(data: ReportData, claims: Sequence[Judged]) -> list[Tile]:
     ]
     nominal = data.evaluated.figures("nominal", data.choice)
     if nominal is not None and nominal.error_std_deg is not None:
-        paper = paper_tables.PAPER_TABLE_TWO["4"][1]
+        number = data.choice_number
+        paper = paper_tables.PAPER_TABLE_TWO[number][1]
         tiles.append(
             Tile(
                 degrees(nominal.error_std_deg),
-                f"error std of model 4 on the nominal drive; the paper: {degrees(paper)}",
+                f"error std of model {number} on the nominal drive; the paper: {degrees(paper)}",
             )
         )
     logs = data.tables[0]

@@ -50,7 +50,7 @@ def model_line(data: ReportData, number_in_table: str) -> Line:
 
 def choice_line(data: ReportData) -> Line:
     """Return how the model that the paper settles on is drawn."""
-    return model_line(data, next(k for k, v in data.evaluated.models.items() if v == data.choice))
+    return model_line(data, data.choice_number)
 
 
 def _has(data: ReportData, *scenarios: str) -> bool:
@@ -62,6 +62,8 @@ def _of_the_paper(data: ReportData) -> Iterator[Picture]:
         nominal = data.runs["nominal"]
         for part, numbers in (("a", ("1", "2")), ("b", ("3", "4", "5"))):
             lines = tuple(model_line(data, n) for n in numbers if n in data.evaluated.models)
+            if not lines:  # the training drives have no signals for any of these
+                continue
             yield _series(
                 f"figure-1{part}",
                 f"Figure 1({part}). {listed([line.label for line in lines])}: side-slip angle on "

@@ -4,7 +4,6 @@ from collections.abc import Iterator, Sequence
 
 from fleet_slip.evaluation.errors import ErrorFigures
 from fleet_slip.evaluation.ranking import LEAST_COVERAGE
-from fleet_slip.evaluation.targets import THE_PAPERS_CHOICE
 from fleet_slip.report.data import ReportData
 from fleet_slip.report.figures.gates import angle_and_gates
 from fleet_slip.report.figures.series import Line
@@ -49,7 +48,7 @@ def standings_picture(data: ReportData) -> Picture:
     evaluated = data.evaluated
     choices = [
         Named(data.version.reference, data.version.reference, "model_3"),
-        Named(data.choice, f"Model {THE_PAPERS_CHOICE}", "model_4"),
+        Named(data.choice, f"Model {data.choice_number}", "model_4"),
         Named("ekf_class_tuned", "EKF told the class, tuned", "kalman"),
         Named("ekf_told_tuned", "EKF told everything, tuned", "model_2"),
     ]

@@ -6,6 +6,8 @@ from enum import StrEnum
 
 from fleet_slip.evaluation.errors import ErrorFigures
 from fleet_slip.report.data import ReportData
+from fleet_slip.report.paper_tables import PAPER_TABLE_TWO
+from fleet_slip.report.text import listed
 
 SLIGHT = 1.5
 """Largest ratio of root mean square errors that counts as slight, or as close.
@@ -63,6 +65,12 @@ class Claim:
 
     def judge(self, data: ReportData) -> Verdict:
         """Return the verdict; not testable where the evaluation lacks what it needs."""
+        absent = [name for name in PAPER_TABLE_TWO if name not in data.evaluated.models]
+        if absent:
+            return not_testable(
+                "The drives that the model was trained on lack signals of model "
+                f"{listed(absent)} of Table I, which the paper's statements are about."
+            )
         try:
             return self.decide(data)
         except NotEvaluatedError as lacking:
