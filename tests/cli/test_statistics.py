@@ -417,3 +417,17 @@ def test_a_model_through_the_origin_is_published_as_one(
             f"SELECT degrees(sqrt(avg(({terms} - sideslip_rad) ** 2))) FROM log"
         ).fetchone()
     assert by_hand == (pytest.approx(scored["rmse_deg"], rel=1e-9),)
+
+
+def test_a_cohort_is_divided_whose_files_alone_have_gram_rows_by_regime(
+    run_command: RunCommand, smoke_root: Path, tmp_path: Path
+) -> None:
+    root = tmp_path / "copy"
+    shutil.copytree(smoke_root, root)
+    first = ("--cohort", "day = '2024-05-01'")
+    assert run_command("gram", "--features", "regimes", *first, root=root).exit_code == 0
+    asked = ("regimes", "--signals", "ay,steer_fl", "--json")
+    assert run_command(*asked, *first, root=root).json["drives"] == 4
+    refused = run_command(*asked, root=root)
+    assert refused.exit_code != 0
+    assert "has not been computed for 2 of 4 log files" in refused.stderr

@@ -8,6 +8,7 @@ from fleet_slip.simulation.distortion import Distortion
 from fleet_slip.simulation.imperfections import Imperfections, SensorImperfections
 from fleet_slip.simulation.lags import Delay, LowPass
 from fleet_slip.simulation.pulses import Pulses
+from fleet_slip.simulation.wander import Wander
 from fleet_slip.vehicle.imperfections import CarImperfections
 from fleet_slip.vehicle.lane_blocks import CHANNELS, IMPERFECT_CHANNELS
 
@@ -171,3 +172,22 @@ def test_a_drive_in_two_blocks_is_the_drive_in_one() -> None:
         found = parted.apply({name: values[part] for name, values in of.items()})
         for name, values in found.items():
             np.testing.assert_array_equal(values, whole[name][part], err_msg=name)
+
+
+def test_lasting_errors_have_their_spread_and_forget_in_their_time() -> None:
+    errors = Wander(4, 2.0, np.random.default_rng(5)).next(200_000)
+    assert np.std(errors, axis=1) == pytest.approx(np.ones(4), rel=0.1)
+    for tau_s in (1.0, 2.0):
+        ticks = int(tau_s * 100)
+        found = [np.corrcoef(one[:-ticks], one[ticks:])[0, 1] for one in errors]
+        assert np.mean(found) == pytest.approx(np.exp(-tau_s / 2.0), abs=0.05)
+    assert abs(np.corrcoef(errors)[0, 1]) < 0.15
+    assert np.abs(np.diff(errors)).max() < 0.2  # no jump from one sample to the next
+
+
+@pytest.mark.parametrize("cuts", [(1, 9, 1, 10, 11, 7, 300), (339,), (10, 10, 319)])
+def test_lasting_errors_do_not_depend_on_blocks(cuts: tuple[int, ...]) -> None:
+    whole = Wander(3, 10.0, np.random.default_rng(6)).next(400)
+    pieces = Wander(3, 10.0, np.random.default_rng(6))
+    parts = np.concatenate([pieces.next(ticks) for ticks in cuts], axis=1)
+    np.testing.assert_array_equal(parts, whole[:, : sum(cuts)])
