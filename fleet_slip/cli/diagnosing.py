@@ -74,6 +74,11 @@ def _print_diagnosis(result: Diagnosis) -> None:
         _coefficient_rows(result),
         left=2,
     )
+    if result.cluster == "row":
+        say(
+            "there is one drive only: its rows are taken for independent evidence, which they are "
+            "not at 100 Hz, so that the standard errors are far too small."
+        )
     if result.serial is not None:
         found = result.serial
         stdout().print(

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Literal
 
 from fleet_slip.catalogue.feature_sets import LAG, lag_signals
 from fleet_slip.catalogue.features import input_scales
@@ -72,7 +72,8 @@ class Diagnosis:
     Attributes:
         fitted: exact fit, in counts.
         drives: number of drives that serve it.
-        cluster: what counts as independent in `robust` and `evidence`.
+        cluster: what counts as independent in `robust` and `evidence`; rows where there is one
+            drive only, and nothing better.
         naive, robust: coefficients in SI units, rows or clusters counting as independent.
         inflation: variance inflation of each input.
         condition_number: of the inputs' correlation matrix.
@@ -84,7 +85,7 @@ class Diagnosis:
 
     fitted: Fit
     drives: int
-    cluster: ClusterUnit
+    cluster: ClusterUnit | Literal["row"]
     naive: Inference
     robust: Inference
     inflation: Mapping[str, float]
@@ -100,7 +101,7 @@ class Diagnosis:
             "signals": list(self.fitted.model.signals),
             "drives": self.drives,
             "cluster": self.cluster,
-            "clusters": self.robust.degrees_of_freedom + 1,
+            "clusters": self.robust.degrees_of_freedom + 1 if self.cluster != "row" else 1,
             "rows": self.fitted.gram.n,
             "effective_rows": self.evidence.rows,
             "design_effect": self.evidence.design_effect,
@@ -152,7 +153,10 @@ def diagnose(
     label, scales = catalogue().label, input_scales()
     served = cohort.serving(inputs)
     there = against.serving(inputs) if against else None
+    if cluster is None and any(len({*_cars(one)}) == 1 for one in (served, there) if one):
+        cluster = "drive"  # several cars in all, but one only in a cohort
     moments = clustered_moments(served, cluster, _cars(served, there), intercept=intercept)
+    alone = _is_alone(moments)
     total = served.table.total()
     fits = nested_fits(total, inputs, label, intercept=intercept)
     fitted = fits[-1]
@@ -163,18 +167,30 @@ def diagnose(
     return Diagnosis(
         fitted=fitted,
         drives=len(served.table),
-        cluster=moments.unit,
+        cluster="row" if alone else moments.unit,
         naive=infer_classically(fitted, scales),
-        robust=infer_by_clusters(fitted, moments, scales),
+        robust=_infer(fitted, moments),
         inflation=variance_inflation(total, inputs),
         condition_number=condition_number(total, inputs),
-        evidence=Evidence.clustered(fits, moments),
+        evidence=Evidence.naive(fits) if alone else Evidence.clustered(fits, moments),
         serial=_serial(fitted, lagged) if lagged else None,
         comparison=_compare(served, fitted, moments, against.condition.text, there)
         if against and there
         else None,
         noise_free=free,
     )
+
+
+def _is_alone(moments: DriveMoments) -> bool:
+    """Return whether there is a single drive, which tells nothing of how drives differ."""
+    return moments.unit == "drive" and len(moments) == 1
+
+
+def _infer(fitted: Fit, moments: DriveMoments) -> Inference:
+    """Return errors by drives or cars; of a single drive by rows, for want of anything better."""
+    if _is_alone(moments):
+        return infer_classically(fitted, input_scales())
+    return infer_by_clusters(fitted, moments, input_scales())
 
 
 def _serial(fitted: Fit, lagged: Cohort) -> SerialDiagnosis:
@@ -210,7 +226,7 @@ def _compare(
     enough = min(len(one.clusters) for one in (moments, other_moments)) > len(inputs) + intercept
     return CohortComparison(
         condition,
-        infer_by_clusters(other, other_moments, input_scales()),
+        _infer(other, other_moments),
         chow_test([fitted.gram, other.gram], inputs, label, intercept=intercept),
         wald_test(fitted, moments, other, other_moments) if enough else None,
     )

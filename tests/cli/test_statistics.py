@@ -431,3 +431,21 @@ def test_a_cohort_is_divided_whose_files_alone_have_gram_rows_by_regime(
     refused = run_command(*asked, root=root)
     assert refused.exit_code != 0
     assert "has not been computed for 2 of 4 log files" in refused.stderr
+
+
+def test_single_drives_are_compared_by_rows_with_a_warning(
+    run_command: RunCommand, smoke_root: Path
+) -> None:
+    asked = ("diagnose", "--signals", "ay,steer_fl", "--cohort", "drive_id LIKE '%05-01-0000'")
+    other = ("--against", "drive_id LIKE '%05-01-0001'")
+    done = run_command(*asked, *other, root=smoke_root)
+    assert done.exit_code == 0
+    assert "there is one drive only" in done.stderr
+    assert "Chow, by rows" in done.stdout
+    assert "Wald" not in done.stdout
+    found = run_command(*asked, *other, "--json", root=smoke_root).json
+    assert (found["cluster"], found["clusters"]) == ("row", 1)
+    assert found["by_clusters"] == found["by_rows"]
+    assert found["against"]["wald_clusters_independent"] is None
+    by_cars = run_command(*asked, "--cluster", "vehicle", root=smoke_root)
+    assert "take drives for independent" in by_cars.stderr

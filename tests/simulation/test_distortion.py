@@ -181,7 +181,7 @@ def test_lasting_errors_have_their_spread_and_forget_in_their_time() -> None:
         ticks = int(tau_s * 100)
         found = [np.corrcoef(one[:-ticks], one[ticks:])[0, 1] for one in errors]
         assert np.mean(found) == pytest.approx(np.exp(-tau_s / 2.0), abs=0.05)
-    assert abs(np.corrcoef(errors)[0, 1]) < 0.15
+    assert abs(np.corrcoef(errors[0], errors[1])[0, 1]) < 0.15
     assert np.abs(np.diff(errors)).max() < 0.2  # no jump from one sample to the next
 
 
