@@ -143,8 +143,11 @@ class Night:
         )
 
     def _candidate(self) -> str | None:
-        pointed = self.fleet.registry().history(self.training.name).pointed_at(CANDIDATE)
-        return f"{self.training.name}@{pointed}" if pointed else None
+        """Return the candidate, unless a later version is champion."""
+        registry, name = self.fleet.registry(), self.training.name
+        pointed, champion = registry.history(name).pointed_at(CANDIDATE), registry.champion(name)
+        waits = pointed and (champion is None or pointed > champion.version)
+        return f"{name}@{pointed}" if waits else None
 
     def _shown(self, name: str) -> ShowProgress | None:
         show = self.progress

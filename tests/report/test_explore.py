@@ -17,8 +17,9 @@ def executed(root: Path, folder: Path) -> tuple[int, str, str]:
     """Return the exit code, what was said, and the page."""
     program = shutil.which("marimo")
     assert program
-    page = folder / "explore.html"
-    words = ["export", "html", str(NOTEBOOK), "--output", str(page), "--", "--root", str(root)]
+    page, notebook = folder / "explore.html", folder / "explore.py"
+    shutil.copy(NOTEBOOK, notebook)  # marimo keeps something beside it
+    words = ["export", "html", str(notebook), "--output", str(page), "--", "--root", str(root)]
     done = run([program, *words])
     text = page.read_text(encoding="utf-8") if page.exists() else ""
     return done.exit_code, done.stderr, text

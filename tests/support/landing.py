@@ -57,7 +57,9 @@ class Landing:
     def drives(self) -> list[str]:
         """Return the drives that can land, by day and number."""
         with fleet_slip.connect(self.source) as database:
-            found = database.sql("SELECT DISTINCT drive_id FROM log ORDER BY 1").fetchall()
+            found = database.sql(
+                "SELECT DISTINCT drive_id FROM log WHERE source <> 'scenario' ORDER BY 1"
+            ).fetchall()
         return [name for (name,) in found]
 
     def land(self, name: str, drives: Iterable[str], day: date, **changes: str) -> Path:

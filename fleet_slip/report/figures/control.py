@@ -40,7 +40,7 @@ def control_chart(chart: Chart, size: Size) -> Figure:
         loc="right" if size.wide else "left",
         **({} if size.wide else {"y": 1.14}),
     )
-    locator: Any = AutoDateLocator(maxticks=10 if size.wide else 4)  # type: ignore[no-untyped-call]
+    locator: Any = AutoDateLocator(minticks=2, maxticks=10 if size.wide else 5)  # type: ignore[no-untyped-call]
     below.xaxis.set_major_locator(locator)
     below.xaxis.set_major_formatter(ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]
     return figure
