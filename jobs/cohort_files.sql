@@ -2,6 +2,6 @@
 -- The condition may use any column of the view "drives".
 SELECT DISTINCT file
 FROM grams
-WHERE feature_set = 'signals' AND (
+WHERE feature_set = 'signals' AND NOT starts_with(file, 'received/') AND (
     {condition}
 )

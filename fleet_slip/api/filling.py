@@ -20,6 +20,7 @@ from fleet_slip.runs.log import step
 if TYPE_CHECKING:
     from fleet_slip.grams.check import CheckReport
     from fleet_slip.grams.job import GramReport
+    from fleet_slip.grams.receiving import ReceiveReport
     from fleet_slip.ingest.job import IngestReport
     from fleet_slip.ingest.mapping import Mapping
     from fleet_slip.ingest.preview import Preview
@@ -64,6 +65,38 @@ class Filling(Rooted):
             )
             figures.rows, figures.size_bytes = report.rows, report.size_bytes
         return report
+
+    @record_call
+    def receive(
+        self,
+        files: Iterable[Path | str] | Path | str,
+        *,
+        each: "Callable[[ReceiveReport], None] | None" = None,
+        progress: ShowProgress | None = None,
+    ) -> "list[ReceiveReport]":
+        """Take in messages of cars that send Gram rows, no logs; return a report of each file.
+
+        A file is messages one behind the other. Of a folder all files are taken, at any depth.
+        A file lands once, and so does a message. What is damaged, impossible or contradicts what is
+        there goes to the view `quarantine` with a reason. `each` is called with a report once its
+        file has landed. Progress is in files.
+
+        Raises `InputError` for a file that cannot be read; `StorageError`; and `ConflictError` if
+        other processes keep changing the tables.
+        """
+        from fleet_slip.grams.receiving import find_messages, receive_files
+
+        given = [Path(files)] if isinstance(files, Path | str) else [Path(file) for file in files]
+        paths = find_messages(given)
+        reports = []
+        with step("receive") as figures:
+            figures.rows = 0
+            for report in receive_files(self.warehouse, paths, count_from_start(progress)):
+                reports.append(report)
+                figures.rows += report.rows
+                if each is not None:
+                    each(report)
+        return reports
 
     @record_call
     def ingest(

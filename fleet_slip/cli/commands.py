@@ -33,6 +33,7 @@ GROUPS = {
         "simulate": "data",
         "mapping": "mapping",
         "ingest": "data",
+        "receive": "receiving",
         "gram": "reducing",
         "check": "reducing",
         "features": "statistics",

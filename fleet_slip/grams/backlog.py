@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import pyarrow.compute as pc
 
 from fleet_slip.catalogue.feature_sets import PLAIN
+from fleet_slip.catalogue.sources import RECEIVED_FILES
 from fleet_slip.delta import (
     Snapshot,
     TableFile,
@@ -44,10 +45,15 @@ def named_files(grams: Snapshot, identity: str) -> tuple[set[str], set[str]]:
     named: set[str] = set()
     for file in grams.files:
         rows = grams.table.read(file.path, ["feature_set", "file"])
-        named.update(rows["file"].unique().to_pylist())
+        named.update(name for name in rows["file"].unique().to_pylist() if _has_log(name))
         mine = rows.filter(pc.equal(rows["feature_set"], identity))
         done.update(mine["file"].unique().to_pylist())
     return done, named
+
+
+def _has_log(file: str) -> bool:
+    """Whether a Gram row is of a log file, rather than sent by a car."""
+    return not file.startswith(RECEIVED_FILES)
 
 
 def _about_to_land(logs: Snapshot, paths: Collection[str]) -> set[str]:

@@ -17,6 +17,7 @@ from fleet_slip.errors import DataError, StorageError
 from fleet_slip.grams.aggregation import aggregate, by_sql
 from fleet_slip.grams.backlog import find_backlog
 from fleet_slip.grams.job import unit_name
+from fleet_slip.grams.received_rows import is_received
 from fleet_slip.grams.wide import wide_grams
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.regression.gram import Gram
@@ -152,11 +153,15 @@ def _in_one_order(grams: DriveGrams) -> DriveGrams:
 def stored_grams(
     warehouse: Warehouse, files: Sequence[TableFile] | None = None
 ) -> dict[str, DriveGrams]:
-    """Return the stored Gram rows of the logged signals, by log file; of some files, or all."""
+    """Return the stored Gram rows of the logged signals, by log file; of some files, or all.
+
+    Those that came without a log are left out.
+    """
     by_file: dict[str, DriveGrams] = defaultdict(dict)
     for gram_file in warehouse.grams.snapshot().files if files is None else files:
         every = warehouse.grams.read(gram_file.path)
-        rows = every.filter(pc.equal(every["feature_set"], PLAIN))
+        plain = pc.equal(every["feature_set"], PLAIN)
+        rows = every.filter(pc.and_(plain, pc.invert(is_received(every))))
         for file in rows["file"].unique().to_pylist():
             by_file[file] |= grams_of(rows.filter(pc.equal(rows["file"], file)))
     return by_file

@@ -26,7 +26,7 @@ from fleet_slip.grams.folding import (
     FoldCount,
     FoldKey,
 )
-from fleet_slip.grams.members import Members, hash_numbers
+from fleet_slip.grams.members import Members, hash_numbers, received_among
 from fleet_slip.grams.reader import GramReader, open_grams
 from fleet_slip.regression.drive_moments import serving_drives
 from fleet_slip.regression.folds import CohortFolds, FoldAssignment, by_band, by_hash, by_value
@@ -93,7 +93,9 @@ class Cohort:
         stops = np.cumsum([len(table) for table in self.tables])[:-1]
         names = [",".join(table.signals) for table in self.tables]
         drives = dict(zip(names, np.split(hashes, stops), strict=True))
-        return Members(drives, dict(zip(names, np.split(cars, stops), strict=True)))
+        came = np.split(received_among(self.drives), stops)
+        received = {name: drives[name][mask] for name, mask in zip(names, came, strict=True)}
+        return Members(drives, dict(zip(names, np.split(cars, stops), strict=True)), received)
 
     @property
     def inputs(self) -> tuple[str, ...]:

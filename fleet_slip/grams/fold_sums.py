@@ -31,7 +31,7 @@ from fleet_slip.grams.folding import (
     Folding,
     FoldKey,
 )
-from fleet_slip.grams.members import Members, hash_numbers
+from fleet_slip.grams.members import Members, hash_numbers, received_among
 from fleet_slip.grams.reader import GramReader, OpenedGrams, open_grams
 from fleet_slip.regression.folds import CohortFolds
 from fleet_slip.regression.gram import Gram
@@ -162,6 +162,7 @@ class _Sums:
     tables: dict[str, list[Gram]] = field(default_factory=dict)
     drives: dict[str, list[NDArray[np.uint64]]] = field(default_factory=dict)
     vehicles: dict[str, list[NDArray[np.uint64]]] = field(default_factory=dict)
+    received: dict[str, list[NDArray[np.uint64]]] = field(default_factory=dict)
     used: set[int] = field(default_factory=set)
     divided: bool = False
     """Whether a drive may have several Gram rows of the same signals."""
@@ -169,7 +170,7 @@ class _Sums:
     def add(self, batch: pa.RecordBatch) -> None:
         """Add a batch of Gram rows."""
         drives = hash_numbers(batch["drive_id"])
-        folds = self.fold_of(batch, drives)
+        folds, came = self.fold_of(batch, drives), received_among(batch)
         self.used.update(np.unique(folds).tolist())
         self.divided |= batch["part"].null_count < len(batch)
         for signals, table, here in self.expansion.tables(batch):
@@ -181,6 +182,7 @@ class _Sums:
             self.drives.setdefault(signals, []).append(drives[here])
             cars = hash_numbers(batch["vehicle_id"].filter(pa.array(here)).unique())
             self.vehicles.setdefault(signals, []).append(cars)
+            self.received.setdefault(signals, []).append(drives[here & came])
 
     @property
     def _one_each(self) -> bool:
@@ -192,7 +194,8 @@ class _Sums:
         """Which drives and cars the Gram rows are of."""
         drives = {signals: np.concatenate(parts) for signals, parts in self.drives.items()}
         cars = {signals: np.concatenate(parts) for signals, parts in self.vehicles.items()}
-        return Members(drives, cars)
+        came = {signals: np.concatenate(parts) for signals, parts in self.received.items()}
+        return Members(drives, cars, came)
 
     @property
     def drive_count(self) -> int:

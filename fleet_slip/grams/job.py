@@ -21,6 +21,7 @@ from fleet_slip.grams.backlog import Backlog, find_backlog
 from fleet_slip.grams.gram_files import files_to_rewrite, rows_to_keep, write_rows
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.words import number_of
 
 
 @dataclass(frozen=True)
@@ -121,13 +122,14 @@ def _update_once(
     # Gram rows after this snapshot of them, and this job's commit is a conflict.
     grams = warehouse.grams.snapshot()
     logs = warehouse.logs.snapshot()
-    if logs.version is None and grams.rows:
-        raise StorageError(
-            f"{warehouse.logs.folder}: the logs that {grams.rows:,} Gram rows were computed from "
-            "are gone. Nothing is changed: restore the folder from a backup."
-        )
     identity = features().identity(feature_set)
     backlog = find_backlog(logs, grams, identity)
+    if logs.version is None and backlog.stale:
+        raise StorageError(
+            f"{warehouse.logs.folder}: the logs that Gram rows were computed from are gone, of "
+            f"{number_of(len(backlog.stale), 'file')}. Nothing is changed: restore the folder from "
+            "a backup."
+        )
     if among is not None:
         chosen = tuple(file for file in backlog.missing if file.path in among)
         backlog = Backlog(chosen, backlog.stale)

@@ -18,8 +18,8 @@ first 8 bytes of the SHA-256 of the canonical JSON of name, scale and range of e
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 from fleet_slip.canonical import canonical_json, sha256_of
 from fleet_slip.catalogue.signals import catalogue
@@ -37,8 +37,7 @@ MOST_ROWS = 2**31 - 1
 """Rows of a drive: 248 days. No sum of so many products of int16 counts reaches 2^61."""
 
 
-@dataclass(frozen=True)
-class Message:
+class Message(NamedTuple):
     """A message whose checksum is right.
 
     Attributes:
@@ -64,6 +63,7 @@ class Message:
     content: bytes
 
 
+@cache
 def message_size(signals: int) -> int:
     """Return the bytes of a message of so many signals."""
     return HEADER.size + 8 * (signals + packed_size(signals)) + CHECKSUM.size

@@ -21,6 +21,7 @@ from fleet_slip.delta import Change, retry_conflicts, rows_in
 from fleet_slip.errors import FleetSlipError, QuestionError
 from fleet_slip.grams.job import reconcile
 from fleet_slip.maintenance.find_drives import Located, drives_by_file, locate
+from fleet_slip.maintenance.forget_received import forget_received
 from fleet_slip.maintenance.marks import newest_versions
 from fleet_slip.maintenance.old_files import (
     quarantined_of,
@@ -97,6 +98,7 @@ def forget(
     rows, rewritten, removed = _rewrite_logs(warehouse, subject, located, progress)
     if drives or state:
         warehouse.grams.fence()
+    rows += forget_received(warehouse, subject)
     uncommitted = remove_uncommitted_files(warehouse, subject)
     reconcile(warehouse)
     old = (remove_old_files if now else remove_uncommitted_files)(warehouse, subject)

@@ -8,6 +8,7 @@ documents with their checksums; model versions with the tables that they were ma
 from collections.abc import Mapping
 from concurrent.futures import Executor
 
+from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.delta import Snapshot, Table
 from fleet_slip.delta.checkpoints import FOLDER as CHECKSUMS
 from fleet_slip.delta.checkpoints import checkpoint_faults, unsealed_checkpoints
@@ -15,6 +16,7 @@ from fleet_slip.delta.commit_check import find_commit_faults
 from fleet_slip.errors import FleetSlipError, StorageError
 from fleet_slip.files.documents import DocumentFolder
 from fleet_slip.files.folder import StoredFile
+from fleet_slip.grams.backlog import named_files
 from fleet_slip.maintenance.vacuum import find_replaced, find_temporary_files, find_unreferenced
 from fleet_slip.maintenance.verification import Damage, Verification
 from fleet_slip.maintenance.verify_documents import verify_documents, verify_models
@@ -100,8 +102,8 @@ def _any_table(snapshots: Mapping[str, Snapshot]) -> bool:
 def _report_missing_logs(snapshots: Mapping[str, Snapshot], report: Verification) -> None:
     """Report a table of logs that is gone, as a folder that was not mounted is."""
     logs, grams = snapshots.get("logs"), snapshots.get("grams")
-    if logs and grams and logs.version is None and grams.rows:
-        problem = f"the table is gone that {number_of(grams.rows, 'Gram row')} were computed from"
+    if logs and grams and logs.version is None and (gone := named_files(grams, PLAIN)[1]):
+        problem = f"the table is gone that the Gram rows of {number_of(len(gone), 'file')} are of"
         report.findings.append(Damage("log", "logs", problem))
 
 

@@ -167,16 +167,26 @@ class TrainedOn(Config):
 
     `vehicles` and `drives_sha256`, which names the file of exactly these drives
     (`fleet_slip.models.trained_drives`), are None in versions from before they were kept.
+    `drives_without_log` are those whose cars sent Gram rows, None for none.
     """
 
     cohort: str
     feature_set: str = "signals"
     drives: Count
     vehicles: Count | None = None
+    drives_without_log: Count | None = None
     rows: Count
     logs_version: Count
     grams_version: Count
     drives_sha256: Sha256 | None = None
+
+    @model_serializer(mode="wrap")
+    def _without_nothing(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out what there is none of, so that a manifest is what it was before."""
+        content: dict[str, Any] = handler(self)
+        if self.drives_without_log is None:
+            del content["drives_without_log"]
+        return content
 
 
 class SelectedBy(Config):

@@ -73,6 +73,7 @@ def manifest_of(selection: RequestedSelection, name: str) -> Manifest:
             feature_set=features().identity(selection.cohort.feature_set),
             drives=winner.drives,
             vehicles=selection.cohort.members.count_vehicles_with(wanted),
+            drives_without_log=selection.cohort.members.count_received_with(wanted) or None,
             rows=winner.pooled.rows,
             logs_version=selection.cohort.logs_version,
             grams_version=selection.cohort.grams_version,

@@ -1,0 +1,242 @@
+"""`receive`: Gram rows of cars that send no log live beside those of logs."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fleet_slip
+from fleet_slip.cli.main import app
+from fleet_slip.errors import InputError, QuestionError
+from fleet_slip.grams.messages import Message, read_messages
+from fleet_slip.maintenance.forget import forget
+from fleet_slip.regression.gram import Gram
+from fleet_slip.warehouse.audit import Forgettable
+from tests.support.messages import START_S, gram_of, message_of
+
+
+@pytest.fixture
+def fleet(tmp_path: Path) -> fleet_slip.Fleet:
+    return fleet_slip.open(tmp_path / "data")
+
+
+def write(path: Path, *messages: bytes) -> Path:
+    path.write_bytes(b"".join(messages))
+    return path
+
+
+def drives(count: int, cars: int = 3) -> list[bytes]:
+    return [
+        message_of(gram_of(i), f"VIN{i % cars}", START_S + 86_400 * (i // cars))
+        for i in range(count)
+    ]
+
+
+def stored(fleet: fleet_slip.Fleet) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = (
+        fleet.sql("FROM grams ORDER BY drive_id, signals").to_arrow_table().to_pylist()
+    )
+    return rows
+
+
+def reasons(fleet: fleet_slip.Fleet) -> list[tuple[Any, ...]]:
+    return fleet.sql(
+        'SELECT "row", drive_id, vehicle_id, reason FROM quarantine ORDER BY ALL'
+    ).fetchall()
+
+
+def test_a_message_becomes_a_gram_row_and_a_drive(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
+    gram = gram_of(1)
+    (report,) = fleet.receive(write(tmp_path / "m", message_of(gram)))
+    assert (report.messages, report.received, report.rows) == (1, 1, 500)
+    (row,) = stored(fleet)
+    assert (row["drive_id"], row["vehicle_id"]) == ("VIN1-20240501T100000Z", "VIN1")
+    assert (row["source"], str(row["day"]), row["part"]) == ("received", "2024-05-01", None)
+    found = Gram(
+        tuple(row["signals"].split(",")), row["n"], tuple(row["sums"]), tuple(row["products"])
+    )
+    assert found == gram
+    drive = fleet.sql("SELECT drive_id, vehicle_id, day, rows FROM drives").fetchall()
+    assert drive == [("VIN1-20240501T100000Z", "VIN1", row["day"], 500)]
+
+
+def test_models_are_those_of_all_rows(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
+    fleet.receive(write(tmp_path / "m", *drives(12)))
+    selection = fleet.cohort().select()
+    publication = fleet.publish("cars", selection, force=True)
+    trained = publication.version.manifest.trained_on
+    assert (trained.drives, trained.drives_without_log, trained.vehicles) == (12, 12, 3)
+    assert trained.rows == 12 * 500
+
+
+def test_a_file_and_a_message_land_once(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
+    messages = drives(4)
+    file = write(tmp_path / "m", *messages[:3], messages[0])
+    (report,) = fleet.receive(file)
+    assert (report.received, report.duplicates) == (3, 1)
+    (again,) = fleet.receive(file)
+    assert (again.new, again.received) == (False, 0)
+    (other,) = fleet.receive(write(tmp_path / "n", *messages))
+    assert (other.received, other.duplicates) == (1, 3)
+    assert len(stored(fleet)) == 4
+    assert reasons(fleet) == []
+
+
+def test_another_message_of_a_drive_is_refused(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
+    fleet.receive(write(tmp_path / "m", message_of(gram_of(1))))
+    fleet.receive(write(tmp_path / "n", message_of(gram_of(2)), message_of(gram_of(3), "VIN2")))
+    assert [row["vehicle_id"] for row in stored(fleet)] == ["VIN1", "VIN2"]
+    assert reasons(fleet) == [
+        (1, "VIN1-20240501T100000Z", "VIN1", "the message contradicts another message of its drive")
+    ]
+
+
+def broken(gram: Gram, **fields: Any) -> Gram:
+    return Gram(
+        gram.signals, **{"n": gram.n, "sums": gram.sums, "products": gram.products, **fields}
+    )
+
+
+GRAM = gram_of(5)
+FIRST, SECOND, *REST = GRAM.products
+SUM = message_of(broken(GRAM, sums=(10**9, *GRAM.sums[1:])))
+ODD = message_of(broken(GRAM, products=(FIRST + 1, SECOND, *REST)))
+INDEFINITE = message_of(broken(GRAM, products=(FIRST, FIRST * 5, *REST)))
+
+
+@pytest.mark.parametrize(
+    ("message", "reason"),
+    [
+        (message_of(GRAM)[:-1], "is cut off"),
+        (message_of(GRAM)[:40], "is cut off"),
+        (message_of(GRAM)[:-1] + b"\x00", "has a wrong checksum"),
+        (b"nonsense", "does not begin as a message does"),
+        (message_of(GRAM, layout=2), "has another layout"),
+        (message_of(GRAM, size=60), "has a length that does not fit its signals"),
+        (message_of(GRAM, size=3), "has a length that does not fit its signals"),
+        (message_of(GRAM, mask=2**11 - 2), "has a length that does not fit its signals"),
+        (message_of(GRAM, mask=2**12 - 2), "is of signals or parts that there are not"),
+        (message_of(GRAM, place=1), "is of signals or parts that there are not"),
+        (message_of(GRAM, definition=1), "is of signals that mean something else here"),
+        (message_of(GRAM, ""), "has no name of a car"),
+        (message_of(GRAM, "a\nb"), "has no name of a car"),
+        (message_of(GRAM, "a\0b"), "has no name of a car"),
+        (message_of(GRAM, start_s=0), "begins at no time between 2000 and 2100"),
+        (message_of(GRAM, start_s=2**64 - 1), "begins at no time between 2000 and 2100"),
+        (message_of(GRAM, lost=1), "lacks rows of its drive"),
+        (message_of(GRAM, rows=0), "has no rows, or more than a drive can have"),
+        (SUM, "has sums outside the ranges of its signals"),
+        (ODD, "has products that no integer counts can have"),
+        (INDEFINITE, "has a matrix that is not positive semidefinite"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_goes_to_the_quarantine(
+    fleet: fleet_slip.Fleet, tmp_path: Path, message: bytes, reason: str
+) -> None:
+    good = message_of(gram_of(9), "GOOD")
+    (report,) = fleet.receive(write(tmp_path / "m", good, message))
+    assert report.refused == {reason: 1}
+    assert [(row[0], row[3]) for row in reasons(fleet)] == [(2, f"the message {reason}")]
+    assert [row["vehicle_id"] for row in stored(fleet)] == ["GOOD"]
+
+
+def test_after_damage_reading_goes_on_at_the_next_message() -> None:
+    content = b"".join(drives(4))
+    size = len(content) // 4
+    for at in (*range(0, size, 7), size - 1):
+        damaged = bytearray(content)
+        damaged[size + at] ^= 0x10
+        found = [m for _, m in read_messages(bytes(damaged)) if isinstance(m, Message)]
+        assert (
+            b"".join(m.content for m in found)
+            in (
+                content[:size] + content[2 * size :],  # the damaged one is not read
+                content[:size] + content[3 * size :],
+            )
+        )
+        assert len(found) == 3
+
+
+def test_no_bytes_end_in_an_error(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
+    random = np.random.default_rng(3)
+    content = b"".join(drives(3))
+    for case in range(40):
+        damaged = bytearray(content[: int(random.integers(1, len(content)))])
+        for at in random.integers(0, len(damaged), 5):
+            damaged[at] = int(random.integers(256))
+        for _, found in read_messages(bytes(damaged)):
+            assert isinstance(found, Message | str), case
+
+
+def test_a_car_is_forgotten_and_does_not_come_back(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
+    messages = drives(6)
+    fleet.receive(write(tmp_path / "m", *messages))
+    report = fleet.forget(vehicle="VIN1", now=True)
+    assert (report.drives, report.rows) == (2, 1000)
+    assert {row["vehicle_id"] for row in stored(fleet)} == {"VIN0", "VIN2"}
+    (again,) = fleet.receive(write(tmp_path / "n", *messages, b"x"))
+    assert (again.received, again.duplicates, again.forgotten) == (0, 4, 2)
+    for file in (tmp_path / "data" / "grams").rglob("*.parquet"):
+        assert b"VIN1" not in file.read_bytes()
+
+
+def test_old_drives_are_forgotten(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
+    fleet.receive(write(tmp_path / "m", *drives(6)))
+    forget(fleet.warehouse, Forgettable("before", "2024-05-02"))
+    assert {str(row["day"]) for row in stored(fleet)} == {"2024-05-02"}
+
+
+def test_the_other_jobs_know_them(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
+    messages = [message_of(gram_of(i, 6000), f"VIN{i}") for i in range(6)]
+    fleet.receive(write(tmp_path / "m", *messages))
+    assert not fleet.gram().changed
+    assert fleet.verify(full=True).findings == []
+    assert fleet.quality().drives == 6
+    fleet.compact()
+    assert fleet.status().tables["grams"].rows == 6
+    with pytest.raises(QuestionError):
+        fleet.forget(vehicle="VIN7")
+    assert len(stored(fleet)) == 6
+
+
+def test_rows_live_beside_those_of_logs(
+    smoke_root: Path, fleet: fleet_slip.Fleet, tmp_path: Path
+) -> None:
+    shutil.copytree(smoke_root, tmp_path / "data")
+    before, rows = stored(fleet), fleet.score("smoke").rows
+    (report,) = fleet.receive(write(tmp_path / "m", *drives(2)))
+    assert report.received == 2
+    assert fleet.score("smoke").rows == rows
+    assert len(stored(fleet)) == len(before) + 2
+    assert not fleet.gram().changed
+    assert fleet.verify().findings == []
+
+
+def test_what_cannot_be_read_is_said(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
+    (tmp_path / "empty").write_bytes(b"")
+    (tmp_path / "folder").mkdir()
+    for path, said in (("absent", "no file"), ("empty", "is empty"), ("folder", "no folder")):
+        with pytest.raises(InputError, match=said):
+            fleet.receive(tmp_path / path)
+
+
+def test_the_command_says_what_became_of_a_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "messages" / "day"
+    folder.mkdir(parents=True)
+    write(folder / "1", *drives(3))
+    write(folder / "2", *drives(2), b"x")
+    words = ["--root", str(tmp_path / "data"), "receive", str(tmp_path / "messages")]
+    for more in ([], ["--json"]):
+        with pytest.raises(SystemExit) as ended:
+            app([*words, *more])
+        assert ended.value.code == 0
+        if not more:
+            said = capsys.readouterr().err
+            assert "3 messages, 3 new Gram rows of 1,500 rows" in said
+            assert "2 duplicates; in quarantine: 1 does not begin as a message does" in said
+    assert [one["new"] for one in json.loads(capsys.readouterr().out)] == [False, False]

@@ -1,0 +1,49 @@
+"""Messages of cars, packed by what docs/edge.md says of their layout."""
+
+import struct
+import zlib
+from typing import Any
+
+import numpy as np
+
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.grams.messages import signals_definition
+from fleet_slip.regression.gram import Gram
+
+START_S = 1_714_557_600
+"""2024-05-01, 10:00 in UTC."""
+
+
+def message_of(gram: Gram, vehicle: str = "VIN1", start_s: int = START_S, **other: int) -> bytes:
+    """The message of a Gram row; `other` fields are as they should not be."""
+    names = catalogue().gram_signals
+    mask = sum(1 << names.index(name) for name in gram.signals)
+    numbers = np.array([*gram.sums, *gram.products], "<i8").tobytes()
+    known = {"layout": 1, "size": 60 + len(numbers), "definition": signals_definition()}
+    known |= {"place": 0, "parts": 1, "mask": mask, "rows": gram.n, "lost": 0} | other
+    head = struct.pack(
+        "<4sHHQ16s",
+        b"FSGR",
+        *(known[k] for k in ("layout", "size", "definition")),
+        vehicle.encode(),
+    )
+    head += struct.pack("<HHQ", known["place"], known["parts"], start_s)
+    head += struct.pack("<III", known["mask"], known["rows"], known["lost"])
+    body = head + numbers
+    return body + zlib.crc32(body).to_bytes(4, "little")
+
+
+def drive_counts(seed: int, rows: int = 500) -> Any:
+    """Counts of all signals of a drive, shape (rows, signals), related as those of a car are."""
+    random = np.random.default_rng(seed)
+    k = len(catalogue().gram_signals)
+    hidden = random.normal(0, 900, (rows, 4))
+    counts = hidden @ random.normal(0, 1, (4, k)) + random.normal(0, 30, (rows, k))
+    signals = [catalogue()[name] for name in catalogue().gram_signals]
+    low, high = ([s.min_count for s in signals], [s.max_count for s in signals])
+    return np.clip(np.rint(counts), low, high).astype(np.int16)
+
+
+def gram_of(seed: int, rows: int = 500) -> Gram:
+    """The Gram of a drive of all signals."""
+    return Gram.from_counts(catalogue().gram_signals, drive_counts(seed, rows).astype(np.int64))
