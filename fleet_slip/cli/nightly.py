@@ -9,6 +9,7 @@ import typer
 from fleet_slip.api.calls import open_workers
 from fleet_slip.api.fleet import RUN_MODELS, Fleet
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
+from fleet_slip.cli.completing import complete_config, complete_model
 from fleet_slip.cli.options import Worth
 from fleet_slip.cli.output import Json, print_json, print_text, say
 from fleet_slip.cli.progress import progress_of_steps
@@ -27,14 +28,22 @@ def nightly(
         Path, typer.Option(help="The folder where logs land; what is new in it is taken.")
     ],
     mapping: Annotated[
-        str, typer.Option(help="A mapping of configs/mappings, or the path of a TOML file.")
+        str,
+        typer.Option(
+            help="A mapping of configs/mappings, or the path of a TOML file.",
+            autocompletion=complete_config("mappings"),
+        ),
     ],
-    model: Annotated[str, typer.Option(help="Name of the model.")],
+    model: Annotated[str, typer.Option(help="Name of the model.", autocompletion=complete_model)],
     cohort: Annotated[
         str, typer.Option(help="SQL condition on the view drives: which drives train it.")
     ] = TRAINING_DRIVES,
     models: Annotated[
-        str, typer.Option(help="A model list of configs/models, or a TOML file.")
+        str,
+        typer.Option(
+            help="A model list of configs/models, or a TOML file.",
+            autocompletion=complete_config("models"),
+        ),
     ] = RUN_MODELS,
     worth: Worth = WORTH,
     candidate: Annotated[

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from fleet_slip.cli.completing import complete_config, complete_model
 from fleet_slip.cli.output import say
 from fleet_slip.cli.run import DEFAULT_CAMPAIGN
 from fleet_slip.cli.workers import Threads
@@ -17,11 +18,16 @@ def watch(
         typer.Argument(
             help="A scenario of configs/scenarios, the path of one, or a drive of the logs.",
             metavar="SCENARIO|DRIVE",
+            autocompletion=complete_config("scenarios"),
             show_default=False,
         ),
     ],
     model: Annotated[
-        str, typer.Option(help="NAME, NAME@VERSION or NAME@ALIAS of the model that estimates.")
+        str,
+        typer.Option(
+            help="NAME, NAME@VERSION or NAME@ALIAS of the model that estimates.",
+            autocompletion=complete_model,
+        ),
     ] = DEFAULT_CAMPAIGN,
     output: Annotated[
         Path, typer.Option(help="File: .html plays in a browser, .mp4 and .gif are films.")
