@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from datetime import date
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
-from fleet_slip.errors import AlarmError, FleetSlipError
+from fleet_slip.errors import AlarmError, FleetSlipError, printable
 from fleet_slip.runs.nights import Beginning, PastNight, hash_drive
 from fleet_slip.words import number_of
 
@@ -131,7 +131,7 @@ class NightReport:
                 for one in self.new_faults
             ),
         ]
-        return "\n".join(line.rstrip() for line in lines)
+        return "\n".join(printable(line).rstrip() for line in lines)
 
     @property
     def _moved(self) -> bool:

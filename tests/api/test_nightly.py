@@ -4,6 +4,7 @@ import json
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import date, timedelta
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from fleet_slip.api.nightly import Night
 from fleet_slip.errors import UsageError
 from fleet_slip.models.gate import floor
 from fleet_slip.monitoring.night_report import NightReport
+from fleet_slip.report.night_page import render_night
 from tests.support.commands import Finished, run_on, start_on
 from tests.support.landing import Landing
 from tests.support.once import made_once
@@ -209,6 +211,10 @@ def test_a_broken_sensor_is_told_once_and_trains_no_model(place: Path, landing: 
     second = give(place, 3)
     assert second.exit_code == 0
     assert (len(second.faults), second.new_faults) == (2, ())
+    hostile = replace(first.faults[0], drive_id="\x1b[2J<b>")
+    shown = replace(first, faults=(hostile,))
+    assert "\x1b" not in shown.as_text()
+    assert "<b>" not in render_night(shown)
     record = "".join(file.read_text() for file in (place / "data/nights").iterdir())
     assert first.new_faults[0].drive_id not in record
 
