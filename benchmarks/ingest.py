@@ -103,7 +103,7 @@ def _rows(start: int, end: int) -> pl.DataFrame:
     tick = np.arange(start, end)
     rng = np.random.default_rng(start)
     columns = {
-        name: np.round(np.sin(tick / 100 * (1 + i / 7)) + rng.normal(0, 0.05, tick.size), 3)
+        name: np.round(0.5 * np.sin(tick / 100 * (1 + i / 7)) + rng.normal(0, 0.05, tick.size), 3)
         for i, name in enumerate(SIGNALS)
     }
     return pl.DataFrame({"t": np.round(tick / 100 + tick // DRIVE * 10, 2), **columns})

@@ -148,7 +148,7 @@ class Filling(Rooted):
                     told(1, len(paths))
             finally:
                 if known is not None:
-                    known.save()
+                    known.save(warehouse)
         return [reports[str(path)] for path in wanted]
 
     def preview(

@@ -1,5 +1,6 @@
 """A Delta table of a data root, and one version of it: reading, writing files, committing."""
 
+import hashlib
 import math
 import uuid
 from collections.abc import Iterable, Sequence
@@ -260,6 +261,19 @@ class Snapshot:
             return None
         with storage_errors(self.table.folder):
             return self.delta.transaction_version(unit_name)
+
+    def moment(self, version: int) -> str | None:
+        """Return the digest of the commit that made a version of this table's past, or present.
+
+        Where it is what it was, so is all that had landed until then. None if there is none such.
+        """
+        if self.version is None or version > self.version:
+            return None
+        try:
+            content = (self.table.folder / "_delta_log").read(f"{version:020}.json")
+        except StorageError:
+            return None
+        return hashlib.sha256(content).hexdigest()
 
     def commit_or_discard(self, change: Change) -> None:
         """Apply a change like `commit`; after a conflict delete the files that it was to add.

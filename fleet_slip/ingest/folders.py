@@ -62,24 +62,34 @@ class KnownFiles:
 
     Attributes:
         digests: size, time of change and digest by absolute path.
+        landed: digests that are in the logs as they were at a moment: a version of the table, and
+            the digest of its commit. While that commit is the table's, they need not be asked for.
     """
 
     cache: Path
     digests: dict[str, tuple[int, int, str]] = field(default_factory=dict)
+    landed: set[str] = field(default_factory=set)
+    moment: tuple[int, str] | None = None
 
     @classmethod
     def of(cls, warehouse: Warehouse, mapping: Mapping) -> "KnownFiles":
         """Return what is remembered for a data root and a mapping."""
         about = sha256(f"{warehouse.root.uri}\n{mapping.canonical_json()}".encode()).hexdigest()
         cache = _cache_folder() / f"{about[:32]}.json"
-        with suppress(OSError, ValueError, TypeError):
+        with suppress(OSError, ValueError, TypeError, KeyError, AttributeError):
             kept: dict[str, Any] = json.loads(cache.read_bytes())
-            return cls(cache, {path: (int(s), int(t), str(d)) for path, (s, t, d) in kept.items()})
+            if "files" not in kept:  # of an earlier version, which remembered no moment
+                kept = {"files": kept, "landed": [], "moment": (0, "")}
+            files = {path: (int(s), int(t), str(d)) for path, (s, t, d) in kept["files"].items()}
+            version, commit = kept["moment"]
+            return cls(cache, files, set(kept["landed"]), (int(version), str(commit)))
         return cls(cache)
 
     def without_landed(self, files: Iterable[Path], warehouse: Warehouse) -> list[Path]:
         """Return the files that are not in the logs, as far as size and time of change tell."""
         snapshot = warehouse.logs.snapshot()
+        if self.moment is None or snapshot.moment(self.moment[0]) != self.moment[1]:
+            self.landed.clear()  # another table, or one that was restored
         return [file for file in files if not self._has_landed(file, snapshot)]
 
     def _has_landed(self, file: Path, snapshot: Snapshot) -> bool:
@@ -91,7 +101,7 @@ class KnownFiles:
         except OSError:
             return False
         unchanged = (found.st_size, found.st_mtime_ns) == known[:2]
-        return unchanged and snapshot.landed(unit_of(known[2]).name) is not None
+        return unchanged and (known[2] in self.landed or _is_in(snapshot, known[2]))
 
     def digest_of(self, file: Path) -> str | None:
         """Return the digest of what a path had when it landed, None if it never did."""
@@ -105,13 +115,26 @@ class KnownFiles:
             path = os.path.abspath(file)  # noqa: PTH100
             self.digests[path] = (found.st_size, found.st_mtime_ns, digest)
 
-    def save(self) -> None:
+    def save(self, warehouse: Warehouse) -> None:
         """Write the cache; what cannot be written is not kept."""
+        snapshot = warehouse.logs.snapshot()
+        asked = {digest for _, _, digest in self.digests.values()}
+        self.landed = {d for d in asked if d in self.landed or _is_in(snapshot, d)}
+        version = snapshot.version or 0
+        kept = {
+            "files": self.digests,
+            "landed": sorted(self.landed),
+            "moment": [version, snapshot.moment(version)],
+        }
         with suppress(OSError):
             self.cache.parent.mkdir(parents=True, exist_ok=True)
             draft = self.cache.with_suffix(f".{os.getpid()}")
-            draft.write_text(json.dumps(self.digests))
+            draft.write_text(json.dumps(kept))
             draft.replace(self.cache)
+
+
+def _is_in(snapshot: Snapshot, digest: str) -> bool:
+    return snapshot.landed(unit_of(digest).name) is not None
 
 
 def _cache_folder() -> Path:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -105,6 +106,47 @@ def test_a_cache_of_what_is_not_in_the_warehouse_is_not_believed(folder: Path) -
     ingest(folder)
     (folder.parent / "root").rename(folder.parent / "elsewhere")
     assert [report["new"] for report in ingest(folder)] == [True] * 5
+
+
+def test_what_has_landed_is_not_asked_for_again(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ingest(folder)
+
+    def landed(*_: Any) -> None:
+        raise AssertionError("asked")
+
+    monkeypatch.setattr(Snapshot, "landed", landed)
+    assert ingest(folder) == []
+
+
+def test_a_root_that_was_restored_from_a_backup_is_asked_for_all(folder: Path) -> None:
+    new = folder / "day 2" / "new.csv"
+    ingest(folder)
+    root, backup = folder.parent / "root", folder.parent / "backup"
+    shutil.copytree(root, backup)
+    write_log(new, rows=40)
+    assert len(ingest(folder)) == 1
+    shutil.rmtree(root)
+    shutil.copytree(backup, root)
+    write_log(folder.parent / "other.csv", rows=50)
+    ingest(folder, folder.parent / "other.csv")  # as many commits as before, and others
+    assert [report["file"] for report in ingest(folder) if report["new"]] == [str(new)]
+
+
+@pytest.mark.parametrize("content", ["{}", "[]", '{"files": {}}', '{"files": 1, "landed": 2}', "x"])
+def test_a_cache_that_is_none_costs_time_and_no_more(folder: Path, content: str) -> None:
+    ingest(folder)
+    (cache,) = (folder.parent / "cache").rglob("*.json")
+    cache.write_text(content)
+    assert not any(report["new"] for report in ingest(folder))
+
+
+def test_the_cache_of_an_earlier_version_is_read(folder: Path) -> None:
+    ingest(folder)
+    (cache,) = (folder.parent / "cache").rglob("*.json")
+    cache.write_text(json.dumps(json.loads(cache.read_text())["files"]))
+    assert ingest(folder) == []
 
 
 def test_a_file_of_another_time_and_the_same_content_is_not_new(folder: Path) -> None:
