@@ -313,6 +313,19 @@ class Serving(Rooted):
             folder.put(name, content)
         return [output / name for name in files]
 
+    def log_to_mlflow(self, model: str | ModelVersion, uri: str) -> str:
+        """Log a version to an MLflow server and register it; return the number that it has there.
+
+        It is a pyfunc model with signature, input example, metrics and tags. One that is registered
+        already is not registered again.
+
+        Raises `ConfigError` without the library, `UsageError` for a URI with a password in it,
+        `StorageError` if the server does not take it, and what `export` and `model` raise.
+        """
+        from fleet_slip.export.files import log_version
+
+        return log_version(self.resolve(model), self.warehouse, uri)
+
     def registry(self, sign_key: Path | None = None) -> Registry:
         """Return the registry of models; it signs new versions with a private key, if given one."""
         return Registry(self.root / "models", sign_key)

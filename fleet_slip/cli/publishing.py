@@ -35,6 +35,10 @@ def publish(
         ),
     ] = False,
     sign_key: SignKey = None,
+    mlflow: Annotated[
+        str | None,
+        typer.Option(help="Also register the version in the MLflow server of this URI."),
+    ] = None,
     json: Json = False,
 ) -> None:
     """Select on a cohort and make the winner the next version of a model, and its champion.
@@ -49,11 +53,14 @@ def publish(
     publication = context.obj.publish(
         name, selection, force=force, candidate=candidate, sign_key=signing_key(sign_key)
     )
+    number = context.obj.log_to_mlflow(publication.version, mlflow) if mlflow else None
     if json:
         print_json(publication)
     else:
         print_selection(selection)
         print_publication(publication)
+        if number:
+            say(f"in MLflow: {publication.version.manifest.name}, version {number}")
 
 
 def print_publication(publication: Publication) -> None:

@@ -57,17 +57,36 @@ def export_files(
         raise UsageError(f"{to!r}: export to one of {', '.join(get_args(Target))}.")
     if with_gram and to != "c":
         raise UsageError("only an export to c can have Gram rows: --to c --with-gram.")
+    contents = _WRITERS[to](_subject(version, warehouse, with_gram=with_gram))
+    return {
+        name: content.encode("utf-8") if isinstance(content, str) else content
+        for name, content in contents.items()
+    }
+
+
+def _subject(
+    version: ModelVersion, warehouse: Warehouse | None, *, with_gram: bool = False
+) -> Subject:
     program = compile_program(version.manifest)
     checks = make_checks(version.manifest, program, warehouse)
     drives = None
     if warehouse is not None:
         folder = Registry(warehouse.root / "models").folder_of(version.manifest.name)
         drives = read_drives_file(folder, version.manifest)
-    contents = _WRITERS[to](Subject(version, program, checks, drives, with_gram))
-    return {
-        name: content.encode("utf-8") if isinstance(content, str) else content
-        for name, content in contents.items()
-    }
+    return Subject(version, program, checks, drives, with_gram)
+
+
+def log_version(version: ModelVersion, warehouse: Warehouse, uri: str) -> str:
+    """Log a version to an MLflow server and register it; return the number that it has there.
+
+    Raises `ConfigError` without the library, `UsageError` for a URI with a password, `StorageError`
+    if the server does not take it, and what `export_files` raises.
+    """
+    from fleet_slip.export.mlflow_log import log_to_mlflow  # noqa: PLC0415 - it renders documents
+
+    subject = _subject(version, warehouse)
+    content = document_of(version, subject.program, subject.checks, subject.drives)
+    return log_to_mlflow(uri, version, subject.program, subject.checks, content)
 
 
 def _json(subject: Subject) -> dict[str, str]:

@@ -14,7 +14,12 @@ from tests.support.commands import run
 REPOSITORY = Path(__file__).parents[2]
 PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
 EXTRAS = PROJECT["optional-dependencies"]
-MODULES = {"scikit-learn": "sklearn", "python-can": "can", "highway-env": "highway_env"}
+MODULES = {
+    "highway-env": "highway_env",
+    "mlflow-skinny": "mlflow",
+    "python-can": "can",
+    "scikit-learn": "sklearn",
+}
 BROUGHT = {"gymnasium", "pandas", "pygame"}
 """What the packages of the extras bring, and nothing else does."""
 

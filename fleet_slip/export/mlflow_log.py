@@ -1,0 +1,167 @@
+"""Logs a version to an MLflow server and registers it, as a pyfunc model that computes `predict`.
+
+MLflow and pandas are the extra `fleet-slip[mlflow]`; they are imported when they are used.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from importlib.metadata import version as package_version
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+from urllib.parse import urlsplit
+
+from fleet_slip.errors import ConfigError, StorageError, UsageError
+from fleet_slip.export.checks import Check
+from fleet_slip.export.files import render
+from fleet_slip.export.program import Program, Window
+from fleet_slip.models.model_version import ModelVersion
+
+LOADER = "fleet_slip.export.mlflow_model"
+DOCUMENT = "estimator.json"
+EXAMPLE_ROWS = 50
+SHA256_TAG = "fleet_slip.sha256"
+
+_TEXTS = ("vehicle_id", "vehicle_model", "campaign", "track", "source")
+
+
+def log_to_mlflow(
+    uri: str,
+    version: ModelVersion,
+    program: Program,
+    checks: Sequence[Check],
+    document: dict[str, Any],
+) -> str:
+    """Register a version under its model's name; return the number that MLflow gave it.
+
+    One that is registered already, by its checksum, is not registered again. Raises `UsageError`
+    for a URI with a password, and `StorageError` if the server does not take it.
+    """
+    if urlsplit(uri).username is not None or urlsplit(uri).password is not None:
+        raise UsageError(
+            "the URI of MLflow has a name or password in it, which logs would keep. Set "
+            "MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD instead."
+        )
+    mlflow = _library()
+    try:
+        with _tracking(mlflow, uri), TemporaryDirectory() as folder:
+            found = _registered(mlflow, version)
+            return found or _log(mlflow, version, program, checks, document, Path(folder))
+    except mlflow.exceptions.MlflowException as error:
+        raise StorageError(
+            f"{version.reference} is published here, but MLflow did not take it: "
+            f"{str(error)[:300]} Publish it again when the server answers."
+        ) from None
+
+
+def _library() -> Any:
+    """Return MLflow. Raises `ConfigError` without it."""
+    try:
+        import mlflow  # noqa: PLC0415 - the library is optional
+        import pandas as pd  # noqa: F401, PLC0415
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"MLflow needs the package {error.name}. Run: pip install 'fleet-slip[mlflow]'"
+        ) from None
+    return mlflow
+
+
+@contextmanager
+def _tracking(mlflow: Any, uri: str) -> Iterator[None]:
+    before = mlflow.get_tracking_uri(), mlflow.get_registry_uri()
+    mlflow.set_tracking_uri(uri)
+    mlflow.set_registry_uri(uri)
+    try:
+        yield
+    finally:
+        mlflow.set_tracking_uri(before[0])
+        mlflow.set_registry_uri(before[1])
+
+
+def _registered(mlflow: Any, version: ModelVersion) -> str | None:
+    """Return the number of a version that is registered already."""
+    client = mlflow.MlflowClient()
+    name = version.manifest.name
+    for one in client.search_model_versions(f"name = '{name}'"):
+        if one.tags.get(SHA256_TAG) == version.sha256:
+            return str(one.version)
+    return None
+
+
+def _log(
+    mlflow: Any,
+    version: ModelVersion,
+    program: Program,
+    checks: Sequence[Check],
+    document: dict[str, Any],
+    folder: Path,
+) -> str:
+    manifest = version.manifest
+    (folder / DOCUMENT).write_text(render(document), "utf-8")
+    tags = _tags(version)
+    with mlflow.start_run(run_name=version.reference, tags=tags):
+        mlflow.log_metrics(_metrics(version))
+        logged = mlflow.pyfunc.log_model(
+            name=manifest.name,
+            loader_module=LOADER,
+            data_path=str(folder / DOCUMENT),
+            signature=_signature(mlflow, program),
+            input_example=_example(program, checks[0]),
+            registered_model_name=manifest.name,
+            pip_requirements=[f"fleet-slip=={package_version('fleet-slip')}"],
+            metadata=tags,
+        )
+    client = mlflow.MlflowClient()
+    number = str(logged.registered_model_version)
+    for key, value in tags.items():
+        client.set_model_version_tag(manifest.name, number, key, value)
+    return number
+
+
+def _tags(version: ModelVersion) -> dict[str, str]:
+    trained = version.manifest.trained_on
+    return {
+        "fleet_slip.reference": version.reference,
+        SHA256_TAG: version.sha256,
+        "fleet_slip.drives_sha256": trained.drives_sha256 or "",
+        "fleet_slip.drives": str(trained.drives),
+        "fleet_slip.feature_set": trained.feature_set,
+        "fleet_slip.model": version.manifest.selected_by.model,
+    }
+
+
+def _metrics(version: ModelVersion) -> dict[str, float]:
+    content = version.manifest.cross_validation.model_dump(mode="json")
+    return {k: float(v) for k, v in content.items() if isinstance(v, int | float)}
+
+
+def _columns(program: Program) -> dict[str, str]:
+    """Return what a row must have, and of which type."""
+    facts = {one.name: "string" if one.name in _TEXTS else "double" for one in program.facts}
+    numbers = {one.name: "double" for one in program.numbers}
+    return {one.column: "double" for one in program.signals} | facts | numbers
+
+
+def _signature(mlflow: Any, program: Program) -> Any:
+    types = mlflow.types
+    given = [types.ColSpec(kind, name) for name, kind in _columns(program).items()]
+    if any(isinstance(one, Window) and one.over for one in program.columns):
+        given += [
+            types.ColSpec("string", "drive_id", required=False),
+            types.ColSpec("long", "tick", required=False),
+        ]
+    angle = types.Schema([types.ColSpec("double", program.angle.column)])
+    return mlflow.models.ModelSignature(inputs=types.Schema(given), outputs=angle)
+
+
+def _example(program: Program, check: Check) -> Any:
+    """Return the first ticks of a check in SI units, as a frame; nothing is known of the car."""
+    import pandas as pd  # noqa: PLC0415 - the library is optional
+
+    samples = check.samples[:EXAMPLE_ROWS]
+    columns: dict[str, Any] = {}
+    for one, counts in zip(program.signals, zip(*samples, strict=True), strict=True):
+        columns[one.column] = [None if n is None else n * float(one.scale) for n in counts]
+    kinds = _columns(program)
+    frame = pd.DataFrame({name: columns.get(name, [None] * len(samples)) for name in kinds})
+    return frame.astype({n: "float64" for n, kind in kinds.items() if kind == "double"})

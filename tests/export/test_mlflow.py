@@ -1,0 +1,148 @@
+"""A version in a real MLflow server, on SQLite: registered, loaded back, and compared."""
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import fleet_slip
+from fleet_slip.errors import ConfigError
+
+START_S = 120
+
+
+def folder_of_mlflow() -> Path:
+    """The folder of programs of MLflow's own environment, which has fleet-slip too."""
+    found = shutil.which("mlflow")
+    assert found
+    return Path(found).resolve().parent
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    folder = tmp_path_factory.mktemp("mlflow")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    store = ["--backend-store-uri", f"sqlite:///{folder / 'mlflow.db'}"]
+    where = ["--artifacts-destination", str(folder / "artifacts"), "--workers", "1"]
+    words = [str(folder_of_mlflow() / "mlflow"), "server", *store, *where, "--port", str(port)]
+    with (folder / "log").open("wb") as log:
+        process = subprocess.Popen(
+            words, cwd=folder, stdout=log, stderr=log, start_new_session=True
+        )
+    uri = f"http://127.0.0.1:{port}"
+    try:
+        wait_for(uri, process)
+        yield uri
+    finally:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait(30)
+
+
+def wait_for(uri: str, process: "subprocess.Popen[bytes]") -> None:
+    until = time.monotonic() + START_S
+    while time.monotonic() < until and process.poll() is None:
+        try:
+            with urllib.request.urlopen(f"{uri}/health", timeout=5):  # noqa: S310 - our own
+                return
+        except (urllib.error.URLError, OSError):
+            time.sleep(0.5)
+    pytest.fail("the server of MLflow does not answer")
+
+
+LOAD = """
+import json, sys
+import mlflow, numpy as np, fleet_slip
+uri, root, drive = sys.argv[1:]
+mlflow.set_tracking_uri(uri)
+fleet = fleet_slip.open(root)
+version = fleet.model("logged")
+chosen = f"drive_id = '{drive}' AND tick < 3000"
+frame = fleet.sql(f"SELECT * FROM log WHERE {chosen} ORDER BY tick").df()
+model = mlflow.pyfunc.load_model("models:/logged/1")
+names = [one.name for one in model.metadata.get_input_schema().inputs]
+told = [name for name in names if name in frame]
+doubles = [name for name in told if name not in ("drive_id", "tick")]
+found = model.predict(frame[told].astype(dict.fromkeys(doubles, "float64")))
+client = mlflow.MlflowClient()
+registered = client.search_model_versions("name = 'logged'")
+run = client.get_run(registered[0].run_id)
+print(json.dumps({
+    "equal": bool(np.array_equal(found["sideslip_rad"], version.predict(frame))),
+    "rows": len(found), "versions": len(registered), "tags": registered[0].tags,
+    "metrics": run.data.metrics, "inputs": names,
+    "example": model.metadata.saved_input_example_info is not None,
+}))
+"""
+
+
+@pytest.mark.tools("mlflow")
+def test_a_version_is_registered_once_and_loads_back(
+    smoke_root: Path, server: str, tmp_path: Path
+) -> None:
+    root = tmp_path / "data"
+    shutil.copytree(smoke_root, root)
+    programs = folder_of_mlflow()
+    publish = [programs / "fleet-slip", "--root", root, "publish", "logged", "--mlflow", server]
+    for _ in range(2):
+        done = run(*publish)
+        assert "in MLflow: logged, version 1" in done.stderr
+    drive = "smoke-2024-05-01-0003"
+    done = run(programs / "python", "-c", LOAD, server, root, drive)
+    told: dict[str, Any] = json.loads(done.stdout)
+    version = fleet_slip.open(root).model("logged")
+    assert (told["equal"], told["rows"], told["versions"], told["example"]) == (True, 3000, 1, True)
+    assert told["tags"]["fleet_slip.sha256"] == version.sha256
+    assert told["tags"]["fleet_slip.reference"] == "logged@1"
+    figures = version.manifest.cross_validation
+    assert told["metrics"]["correlation"] == pytest.approx(figures.correlation, rel=1e-12)
+    assert set(version.manifest.columns) <= set(told["inputs"])
+
+
+@pytest.mark.tools("mlflow")
+def test_a_server_that_does_not_answer_is_said(smoke_root: Path, tmp_path: Path) -> None:
+    root = tmp_path / "data"
+    shutil.copytree(smoke_root, root)
+    publish = [folder_of_mlflow() / "fleet-slip", "--root", root, "publish", "logged", "--mlflow"]
+    environment = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "0"}
+    done = run(*publish, "http://127.0.0.1:9", code=6, more=environment)
+    assert "logged@1 is published here, but MLflow did not take it" in done.stderr
+    done = run(*publish, "http://me:secret@127.0.0.1:9", code=2)
+    assert "has a name or password in it" in done.stderr
+
+
+def run(
+    *words: Any, code: int = 0, more: dict[str, str] | None = None
+) -> "subprocess.CompletedProcess[str]":
+
+    done = subprocess.run(
+        list(map(str, words)),
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+        env={**os.environ, "FLEET_SLIP_LOG": "text", **(more or {})},
+    )
+    assert done.returncode == code, done.stderr[-3000:]
+    return done
+
+
+def test_without_the_library_the_extra_is_named(
+    smoke_root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "mlflow", None)
+    fleet = fleet_slip.open(smoke_root)
+    with pytest.raises(ConfigError, match=r"mlflow. Run: pip install 'fleet-slip\[mlflow\]'"):
+        fleet.log_to_mlflow("smoke", "http://127.0.0.1:9")
