@@ -56,7 +56,7 @@ def export_files(
     if to not in _WRITERS:
         raise UsageError(f"{to!r}: export to one of {', '.join(get_args(Target))}.")
     if with_gram and to != "c":
-        raise UsageError("only an export to c has Gram rows. Run: fleet-slip export NAME --to c --with-gram")
+        raise UsageError("only C has Gram rows. Run: fleet-slip export NAME --to c --with-gram")
     contents = _WRITERS[to](_subject(version, warehouse, with_gram=with_gram))
     return {
         name: content.encode("utf-8") if isinstance(content, str) else content
