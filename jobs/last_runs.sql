@@ -8,7 +8,8 @@ WITH judged AS (
         ) AS is_mistake
     FROM runs
 )
-SELECT run_id, command, started_at, ended_at, outcome, exit_code, error, seconds, rows, size_bytes, host, process
+SELECT
+    run_id, command, started_at, ended_at, outcome, exit_code, error, seconds, rows, size_bytes, host, process, process_began
 FROM judged
 WHERE NOT is_mistake
 QUALIFY row_number() OVER (PARTITION BY command ORDER BY started_at DESC, run_id DESC) = 1

@@ -15,6 +15,7 @@ SELECT
     any_value(steps) AS steps,
     any_value(host) AS host,
     any_value(process) AS process,
+    any_value(process_began) AS process_began,
     any_value(package_version) AS package_version
 FROM {stored_runs}
 WHERE run_id IS NOT NULL

@@ -24,10 +24,12 @@ import duckdb
 from fleet_slip.files.folder import Folder, StoredFile
 from fleet_slip.resources import read_sql
 from fleet_slip.runs.log import current_run_id
+from fleet_slip.runs.processes import process_began
 from fleet_slip.runs.records import FOLDER, RECORD_COLUMNS, is_intact, require_unchanged
 
 REMOVALS_AT_ONCE = 16
 RUNNING = "running"
+KILLED = "killed"
 
 
 def lend_runs(root: Folder, database: duckdb.DuckDBPyConnection, since: str = "") -> list[str]:
@@ -66,7 +68,8 @@ def runs_under_way(root: Folder) -> list[str]:
 def state_of(run: Mapping[str, Any]) -> str:
     """Return done, failed, interrupted, running, or killed: no outcome, and its process is gone.
 
-    Of another machine's process nothing is known: it is said to be running.
+    Of another machine's process nothing is known: it is said to be running. The number of a process
+    that is gone may be another's by now, whose beginning differs.
     """
     if run["outcome"] is not None:
         return str(run["outcome"])
@@ -75,10 +78,12 @@ def state_of(run: Mapping[str, Any]) -> str:
     try:
         os.kill(run["process"], 0)
     except ProcessLookupError:
-        return "killed"
+        return KILLED
     except (PermissionError, TypeError):
-        return RUNNING
-    return RUNNING
+        pass  # another user's, or a record without a number
+    began = run.get("process_began")
+    now = process_began(run["process"]) if began is not None else None
+    return RUNNING if now is None or now == began else KILLED
 
 
 def gather_runs(root: Folder) -> int:

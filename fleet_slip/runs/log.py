@@ -26,6 +26,7 @@ from typing import Any
 from fleet_slip.errors import StorageError
 from fleet_slip.files.folder import Folder
 from fleet_slip.runs.anchors import newest_documents
+from fleet_slip.runs.processes import process_began
 from fleet_slip.runs.records import ANCHORS, FOLDER, write_line
 
 LOGGER = logging.getLogger("fleet_slip")
@@ -94,6 +95,7 @@ class Run:
             "started_at": _timestamp(self.started_at),
             "host": socket.gethostname(),
             "process": os.getpid(),
+            "process_began": process_began(os.getpid()),
             "package_version": version("fleet-slip"),
         }
 

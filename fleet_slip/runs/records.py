@@ -33,6 +33,7 @@ RECORD_COLUMNS = {
     "steps": "STRUCT(name VARCHAR, seconds DOUBLE, rows BIGINT, size_bytes BIGINT)[]",
     "host": "VARCHAR",
     "process": "INTEGER",
+    "process_began": "VARCHAR",
     "package_version": "VARCHAR",
 }
 """What a line of the history may say, with DuckDB's types."""
