@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import resource
 import sys
 import time
@@ -18,6 +19,8 @@ from fleet_slip.limits import OPEN_FILES, memory_bytes
 MEMORY_BYTES = 2**30
 """The largest command that was measured, `verify` of files of a million rows, takes 828 MiB."""
 FILES_WISHED = 1024
+NAME = re.compile(r"[\w.-]+")
+"""Of a package, with which a requirement begins."""
 DISK_BYTES = 10**9
 CLOCK_S = 60.0
 """A clock that is so far from the store's makes files younger or older than they are."""
@@ -155,19 +158,13 @@ def _extras() -> Iterator[Examined]:
     about = metadata("fleet-slip")
     for extra in about.get_all("Provides-Extra") or ():
         packages = [
-            line.partition(";")[0].strip()
+            NAME.match(line)[0]  # type: ignore[index]
             for line in about.get_all("Requires-Dist") or ()
             if f"extra == '{extra}'" in line
         ]
-        names = [_name(package) for package in packages]
-        absent = [name for name in names if not _is_installed(name)]
+        absent = [name for name in packages if not _is_installed(name)]
         found = "installed" if not absent else f"not installed: {', '.join(absent)}"
         yield Examined(f"extra {extra}", found)
-
-
-def _name(requirement: str) -> str:
-    end = next((i for i, c in enumerate(requirement) if not (c.isalnum() or c in "-_.")), None)
-    return requirement[:end]
 
 
 def _is_installed(package: str) -> bool:
