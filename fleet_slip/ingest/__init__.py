@@ -2,7 +2,7 @@
 
 from fleet_slip.ingest.mapping import Mapping, load_mapping
 from fleet_slip.ingest.measured import MeasuredLog, read_measured
-from fleet_slip.ingest.stream import IngestCounts
+from fleet_slip.ingest.totals import IngestCounts
 
 __all__ = [
     "IngestCounts",

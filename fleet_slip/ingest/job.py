@@ -13,7 +13,7 @@ from fleet_slip.ingest.folders import KnownFiles
 from fleet_slip.ingest.landing import AskedFile, FileOutcome, Landing, unit_of, write_batch
 from fleet_slip.ingest.look_alikes import find_vehicles_like
 from fleet_slip.ingest.mapping import Mapping
-from fleet_slip.ingest.stream import IngestCounts
+from fleet_slip.ingest.totals import IngestCounts
 from fleet_slip.warehouse.tables import Warehouse
 from fleet_slip.words import number_of
 

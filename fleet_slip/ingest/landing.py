@@ -13,7 +13,8 @@ from fleet_slip.delta import Change, Snapshot, Table, Unit, retry_conflicts
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import shown
 from fleet_slip.ingest.mapping import Mapping
-from fleet_slip.ingest.stream import IngestCounts, MeasuredStream, open_measured
+from fleet_slip.ingest.stream import MeasuredStream, open_measured
+from fleet_slip.ingest.totals import IngestCounts
 from fleet_slip.ingest.writing import FILE_ROWS, DataFiles, FileWriter, TableName, WrittenFile
 from fleet_slip.warehouse.audit import Audit
 from fleet_slip.warehouse.tables import Warehouse

@@ -7,7 +7,8 @@ import pyarrow as pa
 
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.measured_drives import log_table
-from fleet_slip.ingest.stream import IngestCounts, open_measured
+from fleet_slip.ingest.stream import open_measured
+from fleet_slip.ingest.totals import IngestCounts
 
 
 @dataclass(frozen=True)

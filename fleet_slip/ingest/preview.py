@@ -12,8 +12,9 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.measured_drives import MeasuredDrive
-from fleet_slip.ingest.stream import IngestCounts, open_measured
+from fleet_slip.ingest.stream import open_measured
 from fleet_slip.ingest.suspicion import Suspicion, find_suspicions
+from fleet_slip.ingest.totals import IngestCounts
 
 MOST_TICKS = 200_000
 """Ticks of the longest drive that are looked at: half an hour."""

@@ -4,7 +4,7 @@ import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -30,6 +30,7 @@ from fleet_slip.ingest.quarantine import describe_refused, no_rows
 from fleet_slip.ingest.read_ahead import read_ahead
 from fleet_slip.ingest.reading import file_digest, require_unchanged_file
 from fleet_slip.ingest.resampling import STEP_S, TIME_EPSILON_S
+from fleet_slip.ingest.totals import IngestCounts, Totals
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA
 from fleet_slip.words import number_of
 
@@ -45,25 +46,6 @@ MOST_TICKS_A_ROW = 1000
 
 
 @dataclass(frozen=True)
-class IngestCounts:
-    """What became of a file's rows.
-
-    `rows_read == rows_left_out + rows_kept + sum(quarantined.values())`.
-    """
-
-    rows_read: int
-    rows_left_out: int
-    """Rows that do not meet the mapping's conditions."""
-    rows_kept: int
-    quarantined: dict[str, int]
-    """Rejected rows by reason."""
-    drives: int
-    drives_resampled: int
-    ticks: int
-    """Rows of the result; equal to `rows_kept` where nothing was resampled."""
-
-
-@dataclass(frozen=True)
 class Piece:
     """Drives of a file that have ended, and rows that were refused meanwhile.
 
@@ -74,30 +56,6 @@ class Piece:
 
     drives: list[MeasuredDrive]
     refused: pl.DataFrame
-
-
-@dataclass
-class Totals:
-    """What became of a file's rows so far."""
-
-    rows_kept: int = 0
-    quarantined: Counter[str] = field(default_factory=Counter)
-    drives: int = 0
-    drives_resampled: int = 0
-    ticks: int = 0
-    samples: Counter[str] = field(default_factory=Counter)
-    """Values of each signal in the file's rows; `values` are those on ticks."""
-    values: Counter[str] = field(default_factory=Counter)
-
-    def add(self, rows: pl.DataFrame, drive: MeasuredDrive) -> None:
-        """Count a drive that was made of rows."""
-        self.rows_kept += rows.height
-        self.drives += 1
-        self.drives_resampled += drive.method != "snap"
-        self.ticks += drive.ticks.size
-        for name, counts in drive.counts.items():
-            self.samples[name] += rows.height - rows[name].null_count()
-            self.values[name] += len(counts) - counts.null_count
 
 
 class MeasuredStream:
