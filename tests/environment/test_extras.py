@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import sys
 import tomllib
 from pathlib import Path
@@ -60,11 +61,10 @@ def given(absent: list[str], *commands: list[str]) -> tuple[list[int], str]:
     return json.loads(codes), "\n".join(said)
 
 
-@pytest.fixture(scope="module")
-def root(smoke_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    copy = tmp_path_factory.mktemp("core") / "data"
-    run(["cp", "-r", str(smoke_root), str(copy)])
-    return copy
+@pytest.fixture
+def root(smoke_root: Path, tmp_path: Path) -> Path:
+    """A data root of each test's own, because `status` tells of the commands that failed in it."""
+    return Path(shutil.copytree(smoke_root, tmp_path / "data"))
 
 
 def test_querying_and_selecting_need_the_core_alone(root: Path) -> None:
