@@ -63,8 +63,9 @@ def given(absent: list[str], *commands: list[str]) -> tuple[list[int], str]:
 
 @pytest.fixture
 def root(smoke_root: Path, tmp_path: Path) -> Path:
-    """A data root of each test's own, because `status` tells of the commands that failed in it."""
-    return Path(shutil.copytree(smoke_root, tmp_path / "data"))
+    """A data root of each test's own, without the failures of other tests, which `status` tells."""
+    without = shutil.ignore_patterns("runs")
+    return Path(shutil.copytree(smoke_root, tmp_path / "data", ignore=without))
 
 
 def test_querying_and_selecting_need_the_core_alone(root: Path) -> None:
