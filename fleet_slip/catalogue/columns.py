@@ -78,7 +78,7 @@ def _integer_arithmetic(sql: str) -> str:
         inputs = parse(sql).inputs
     except QuestionError as error:
         raise ValueError(str(error)) from None
-    if unknown := set(inputs) - set(catalogue().inputs):
+    if unknown := set(inputs) - set(catalogue().feature_inputs):
         raise ValueError(f"{', '.join(sorted(unknown))}: not an input signal")
     return sql
 
@@ -227,7 +227,7 @@ class Definition(Config):
 
     @model_validator(mode="after")
     def _of_is_known(self) -> "Definition":
-        if not self.sql and self.of not in catalogue().inputs:
+        if not self.sql and self.of not in catalogue().feature_inputs:
             raise ValueError(f"{self.of} is not an input signal")
         if self.sql and self.of in {*catalogue().signals, *catalogue().drive, "tick", "day"}:
             raise ValueError(f"{self.of} is the name of a column of the logs")

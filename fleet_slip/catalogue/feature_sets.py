@@ -63,7 +63,7 @@ class FeatureSet(Config):
 
     @model_validator(mode="after")
     def _consistent(self) -> "FeatureSet":
-        unknown = [name for name in self.signals if name not in catalogue().inputs]
+        unknown = [name for name in self.signals if name not in catalogue().feature_inputs]
         if unknown:
             raise ValueError(f"not input signals: {', '.join(unknown)}")
         if len(set(self.columns)) < len(self.columns):

@@ -43,7 +43,7 @@ def integer_sql(text: str) -> str:
 
     Raises `ValueError` for anything but integer arithmetic on input signals.
     """
-    inputs = catalogue().inputs
+    inputs = catalogue().feature_inputs
     _require(text, _DECLARED, inputs)
     return _WORD.sub(lambda m: f"{m[0]}::BIGINT" if m[0] in inputs else m[0], text)
 

@@ -60,7 +60,7 @@ class FeatureCatalogue(Config):
         if PLAIN in self.sets:
             raise ValueError(f"{PLAIN!r} is the set of the catalogue's own signals")
         for name, regime in self.regimes.items():
-            if regime.of not in {*self.features, *signals.inputs}:
+            if regime.of not in {*self.features, *signals.feature_inputs}:
                 raise ValueError(f"regimes.{name}: {regime.of} is no input signal or feature")
         for name, one in self.sets.items():
             unknown = [f for f in one.features if f not in self.features]
@@ -128,7 +128,7 @@ class FeatureCatalogue(Config):
         if name in self.features:
             one = self.features[name]
             return Definition(of=name, sql=one.sql, of_bits=one.bits), one.exact_scale
-        if name in catalogue().inputs:
+        if name in catalogue().feature_inputs:
             return Definition(of=name), catalogue()[name].exact_scale
         raise ValueError(f"{where}: {name} is no input signal or feature")
 
@@ -182,6 +182,8 @@ class FeatureCatalogue(Config):
             "row_folds": one.row_folds,
             "lagged": one.lagged,
         }
+        if extras := self._extras(one):
+            content["extras"] = {name: str(catalogue()[name].scale) for name in extras}
         if one.block_ticks:
             content["block_ticks"] = one.block_ticks
         if one.windows:
@@ -191,6 +193,16 @@ class FeatureCatalogue(Config):
             }
         digest = sha256_of(canonical_json(content))
         return f"{name}-{digest[:12]}"
+
+    def _extras(self, one: FeatureSet) -> tuple[str, ...]:
+        """Return the signals that a set is made of and that not every set knows."""
+        divided_by = [self.regimes[regime].of for regime in one.regimes]
+        used = {*one.signals, *divided_by}
+        for name in (*one.features, *divided_by):
+            used |= set(self.features[name].inputs) if name in self.features else set()
+        for name in one.windows:
+            used |= set(self.time_columns[name].definition.signals)
+        return tuple(name for name in catalogue().extras if name in used)
 
     def name_of(self, identity: str) -> str:
         """Return the name of the set that Gram rows are of, if it is still defined like that.
@@ -219,7 +231,7 @@ class FeatureCatalogue(Config):
     @property
     def inputs(self) -> tuple[str, ...]:
         """Everything that a model may use."""
-        return (*catalogue().inputs, *self.features, *self.time_columns)
+        return (*catalogue().feature_inputs, *self.features, *self.time_columns)
 
 
 def _named(where: str, make: Callable[..., T], *parts: object) -> T:
@@ -288,7 +300,8 @@ def column_query(known: FeatureCatalogue, name: str) -> str:
 def input_scales() -> Mapping[str, Fraction]:
     """Return the physical value of one count of every input signal, feature and the label."""
     signals = catalogue()
-    scales = {name: signals[name].exact_scale for name in signals.gram_signals}
+    usable = (*signals.feature_inputs, signals.label)
+    scales = {name: signals[name].exact_scale for name in usable}
     known = features()
     columns: dict[str, Feature | TimeColumn] = {**known.features, **known.time_columns}
     return scales | {name: one.exact_scale for name, one in columns.items()}

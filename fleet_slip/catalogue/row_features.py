@@ -55,7 +55,7 @@ class Feature(Config):
     def inputs(self) -> tuple[str, ...]:
         """The signals that it is computed from, in catalogue order."""
         used = names_in(self.counts) | names_in(self.divided_by or "")
-        return tuple(name for name in catalogue().inputs if name in used)
+        return tuple(name for name in catalogue().feature_inputs if name in used)
 
     @property
     def exact_scale(self) -> Fraction:

@@ -32,9 +32,9 @@ Identifier = Annotated[str, StringConstraints(pattern=IDENTIFIER_PATTERN)]
 
 _SYMBOL = r"(?:m|s|kg|rad|N|Pa|W|K|A|V)(?:\^[2-9])?"
 
-SIUnit = Annotated[str, StringConstraints(pattern=rf"^{_SYMBOL}(?:[*/]{_SYMBOL})*$")]
-"""A product or quotient of coherent SI units without prefixes, such as m/s^2. A pattern, because a
-units library takes half a second to start and every command needs the catalogue."""
+SIUnit = Annotated[str, StringConstraints(pattern=rf"^(?:1|{_SYMBOL}(?:[*/]{_SYMBOL})*)$")]
+"""A product or quotient of coherent SI units without prefixes, such as m/s^2; 1 for a number. A
+pattern, because a units library takes half a second to start and every command needs it."""
 
 
 class Signal(Config):
@@ -45,7 +45,9 @@ class Signal(Config):
     scale: Decimal = Field(gt=0)
     min: Decimal
     max: Decimal
-    role: Literal["input", "label", "truth"]
+    role: Literal["input", "extra", "label", "truth"]
+    stepwise: bool = False
+    """Whether it changes in steps, such as a gear: between two samples the first one holds."""
     description: str = Field(min_length=1)
 
     @model_validator(mode="after")
@@ -120,6 +122,19 @@ class SignalCatalogue(Config):
     def inputs(self) -> tuple[str, ...]:
         """Names of the signals that a model may use, in catalogue order."""
         return tuple(name for name, signal in self.signals.items() if signal.role == "input")
+
+    @cached_property
+    def extras(self) -> tuple[str, ...]:
+        """Names of the signals that some cars log besides, in catalogue order.
+
+        A file of the logs has their columns only where a drive in it has them.
+        """
+        return tuple(name for name, signal in self.signals.items() if signal.role == "extra")
+
+    @cached_property
+    def feature_inputs(self) -> tuple[str, ...]:
+        """Names of the signals that a feature may be computed from, in catalogue order."""
+        return tuple(name for name in self.signals if name in {*self.inputs, *self.extras})
 
     @cached_property
     def gram_signals(self) -> tuple[str, ...]:

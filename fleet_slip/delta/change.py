@@ -57,6 +57,11 @@ def rows_in(action: AddAction) -> int:
     return int(json.loads(action.stats)["numRecords"])
 
 
+def columns_in(action: AddAction) -> frozenset[str]:
+    """Return the columns of a file that an action adds."""
+    return frozenset(json.loads(action.stats)["nullCount"])
+
+
 def addition(path: str, encoded: Encoded, day: date | None) -> AddAction:
     """Return the action that adds a file to a table."""
     return AddAction(

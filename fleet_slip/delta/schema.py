@@ -6,7 +6,7 @@ the files (`fleet_slip.maintenance.migration`), and Delta refuses writers who be
 commit.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from decimal import Decimal
 
@@ -90,16 +90,21 @@ def require_readable(folder: Folder, schema: pa.Schema, delta: DeltaTable) -> No
         )
 
 
-def require_writable(folder: Folder, schema: pa.Schema, delta: DeltaTable) -> None:
-    """Raise `RefusedError` if a table lacks columns of the catalogue or is being migrated."""
+def require_writable(
+    folder: Folder, schema: pa.Schema, delta: DeltaTable, unneeded: Collection[str] = ()
+) -> None:
+    """Raise `RefusedError` if a table lacks columns of the catalogue or is being migrated.
+
+    It may lack `unneeded` ones, which what is to be written has not.
+    """
     found = compare_schemas(schema, delta)
     if found.migrating:
         raise RefusedError(
             f"{folder}: a migration to other scales is under way, or was interrupted. Wait for it, "
             "or run it again: fleet-slip migrate"
         )
-    if found.added:
+    if needed := [name for name in found.added if name not in unneeded]:
         raise RefusedError(
             f"{folder}: the signal catalogue has columns that the table has not: "
-            f"{', '.join(found.added)}. Add them with: fleet-slip migrate"
+            f"{', '.join(needed)}. Add them with: fleet-slip migrate"
         )

@@ -14,7 +14,7 @@ from deltalake import CommitProperties, DeltaTable, Transaction
 from deltalake.exceptions import CommitFailedError, TableNotFoundError
 from deltalake.transaction import AddAction
 
-from fleet_slip.delta.change import Change, addition
+from fleet_slip.delta.change import Change, addition, columns_in
 from fleet_slip.delta.checkpoints import seal_new_checkpoint
 from fleet_slip.delta.conflicts import is_conflict, retry_conflicts
 from fleet_slip.delta.encoding import Encoded, Encoding
@@ -30,6 +30,9 @@ from fleet_slip.files.storage_errors import first_line, storage_errors
 FENCE = "fleet_slip.fence"
 """Property of a table that is changed so that commits under way are in conflict."""
 
+ALL_STATISTICS = {"delta.dataSkippingNumIndexedCols": "-1"}
+"""Property of a table of which all columns have statistics: as a rule Delta reads those of 32."""
+
 
 @dataclass(frozen=True)
 class Table:
@@ -40,6 +43,8 @@ class Table:
     encoding: Encoding
     partition_by: tuple[str, ...] = ()
     description: str = ""
+    optional: tuple[str, ...] = ()
+    """Columns that a file has only where it has values of them."""
 
     def snapshot(self, version: int | None = None) -> "Snapshot":
         """Return the table as it is now; a table that nobody has written yet is empty.
@@ -134,6 +139,17 @@ class Table:
         """Return the content of a file with these rows."""
         return self.encoding.encode(rows, omitted=self.partition_by)
 
+    def require_writable(self, columns: Iterable[str]) -> None:
+        """Raise `RefusedError` if rows with some of the optional columns cannot be committed."""
+        delta = self.open_delta()
+        if delta is not None:
+            without = frozenset(self.optional).difference(columns)
+            require_writable(self.folder, self.schema, delta, without)
+
+    def unneeded(self, added: Iterable[AddAction]) -> frozenset[str]:
+        """Return the optional columns that none of some new files has."""
+        return frozenset(self.optional).difference(*map(columns_in, added))
+
     def fence(self) -> None:
         """Make a conflict of every commit that began before now and has not landed.
 
@@ -179,6 +195,7 @@ class Table:
             partition_by=list(self.partition_by),
             name=self.folder.name,
             description=self.description,
+            configuration=ALL_STATISTICS,
             storage_options=self.folder.delta_options,
             commit_properties=CommitProperties(custom_metadata={NOTE: seal_note({}, [], {})}),
         )
@@ -297,7 +314,7 @@ class Snapshot:
         with storage_errors(table.folder):
             try:
                 delta = self.delta or table.create()
-                require_writable(table.folder, table.schema, delta)
+                require_writable(table.folder, table.schema, delta, table.unneeded(change.add))
                 delta.create_write_transaction(
                     actions,
                     mode="append",

@@ -38,6 +38,15 @@ def require_columns(file: Path, names: Sequence[str], wanted: Iterable[str]) -> 
     return positions
 
 
+def describe_unknown(signal: str, known: Iterable[str]) -> str:
+    """Return what to say of a signal that the catalogue does not have."""
+    names = list(known)
+    near = difflib.get_close_matches(signal, names, n=2, cutoff=0.7)
+    near += [name for name in names if signal in name.split("_") and name not in near]
+    hint = f" Do you mean {' or '.join(near[:3])}?" if near else ""
+    return f"unknown signal {signal!r}.{hint} Known signals: {', '.join(names)}"
+
+
 def describe_missing(column: str, names: Sequence[str]) -> str:
     """Return what to say of a column that is not among a file's."""
     folded = {name.casefold(): name for name in names}

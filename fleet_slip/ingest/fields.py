@@ -17,6 +17,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.csv_batches import EXTRA_FIELDS
 from fleet_slip.ingest.mapping import FromColumn, Mapping, is_number
+from fleet_slip.ingest.signal_column import SignalColumn
 from fleet_slip.ingest.time_bases import DISORDER, HELD
 from fleet_slip.ingest.units import conversion_factor
 
@@ -89,9 +90,14 @@ def meets_conditions(mapping: Mapping, schema: pl.Schema) -> pl.Expr:
     """Return whether a row meets all of the mapping's conditions. Raises `InputError`."""
     met = pl.lit(value=True)
     for condition in mapping.where:
-        name = held(condition.column, schema)
+        of = condition.signal
+        source = None if of is None else mapping.signals[of]
+        name = held(str(source.column if source else condition.column), schema)
         column = pl.col(RAW + name)
-        if condition.one_of:
+        if of is not None and source is not None:
+            number = _number(name, schema, mapping)[1]
+            met &= condition.is_met(_si_value(of, source, number), column)
+        elif condition.one_of:
             met &= condition.is_met(column, _as_text(name, schema, mapping))
         else:
             met &= condition.is_met(_number(name, schema, mapping)[1], column)
@@ -133,7 +139,6 @@ def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> Field:
     source = mapping.signals[name]
     raw, number, present = _number(source.column, schema, mapping)
     signal, value = catalogue()[name], pl.col(name)
-    gain, bias = source.linear(signal.unit)
     count = value / float(signal.scale)
     outside = (count <= signal.min_count - 0.5) | (count >= signal.max_count + 0.5)
     problem = find_problems(
@@ -142,9 +147,6 @@ def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> Field:
         (~value.is_finite(), "not_finite"),
         (outside, "out_of_range"),
     )
-    si_value = source.looked_up(number)
-    if (gain, bias) != (1.0, 0.0):  # which would change nothing but the sign of zero
-        si_value = si_value * gain + bias
 
     def is_sound(rows: pl.DataFrame) -> bool:
         found = rows[name]
@@ -152,7 +154,14 @@ def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> Field:
             return False
         return _lies_within(found, signal.min_count - 0.5, signal.max_count + 0.5, signal.scale)
 
-    return Field(name, "signal", raw, si_value, problem, is_sound)
+    return Field(name, "signal", raw, _si_value(name, source, number), problem, is_sound)
+
+
+def _si_value(name: str, source: SignalColumn, number: pl.Expr) -> pl.Expr:
+    gain, bias = source.linear(catalogue()[name].unit)
+    value = source.looked_up(number)
+    # Otherwise it would change nothing but the sign of zero.
+    return value if (gain, bias) == (1.0, 0.0) else value * gain + bias
 
 
 def _lies_within(values: pl.Series, low: float, high: float, scale: Decimal) -> bool:

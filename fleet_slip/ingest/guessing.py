@@ -25,8 +25,23 @@ NAMES: dict[str, tuple[str, ...]] = {
     "sideslip": ("side slip", "sideslip", "slip angle", "beta", "schwimm", "correvit ang"),
     "vx": ("vx", "v x", "vel x", "speed x", "long vel", "vel long"),
     "vy": ("vy", "v y", "vel y", "speed y", "lat vel", "vel lat"),
+    "steer": ("road wheel ang", "front wheel ang", "wheel steer ang", "steer front", "delta f"),
+    "vehicle_speed": ("vehicle speed", "veh speed", "veh spd", "speed", "fahrzeug geschw"),
+    "roll_rate": ("roll rate", "rollrate", "gyro x", "omega x", "wank"),
+    "brake_pressure": ("brake press", "brk press", "brake pres", "master cylinder", "brems druck"),
+    "throttle": ("throttle", "accel pedal", "gas pedal", "fahrpedal", "drosselklappe"),
+    "gear": ("gear", "gang"),
 }  # fmt: skip
 """Words by which a signal is called, each at the beginning of a part of the name."""
+_NOT_NAMES = {
+    "vehicle_speed": (
+        "wheel", "whl", "engine", "motor", "wind", "fan", "turbo", "rad", "x", "y", "z", "east",
+        "north", "up", "down", "lateral", "vertical", "limit",
+    ),
+    "gear": ("ratio", "box", "torque", "temp"),
+    "steer": ("rear", "rate", "vel", "speed"),
+}  # fmt: skip
+"""Words that say that something else is called so."""
 _CORNERS = {
     "fl": ("fl", "vl", "lf", "front left"),
     "fr": ("fr", "vr", "rf", "front right"),
@@ -57,6 +72,7 @@ _UNITS = {
     "rad/s": "rad/s", "radps": "rad/s", "°": "deg", "deg": "deg", "degree": "deg",
     "degrees": "deg", "rad": "rad", "km/h": "km/h", "kmh": "km/h", "kph": "km/h",
     "m/s": "m/s", "mps": "m/s", "mph": "mph", "rpm": "rpm", "1/min": "rpm", "u/min": "rpm",
+    "bar": "bar", "kpa": "kPa", "mpa": "MPa", "pa": "Pa", "psi": "psi", "%": "%", "1": "1",
 }  # fmt: skip
 _SUFFIXES = (
     (r"m_?p?s_?\^?2", "m/s^2"), (r"deg_?p?_?s", "deg/s"), (r"dps", "deg/s"),
@@ -140,7 +156,8 @@ def _pairs(profiles: tuple[Profile, ...]) -> Iterator[tuple[str, str, Profile]]:
         if profile.is_number and profile.channel.name.isprintable():
             for signal, called in NAMES.items():
                 best = max(called, key=lambda words: _score(words, profile.channel.name))
-                yield signal, best, profile
+                if not set(_NOT_NAMES.get(signal, ())) & set(parts_of(profile.channel.name)):
+                    yield signal, best, profile
 
 
 def _score(words: str, name: str) -> int:
@@ -179,11 +196,15 @@ def _unit_of_values(si_unit: str, signal: str, largest: float) -> tuple[str, flo
     """Return the unit that values of a car on a road are likely to have."""
     if signal.startswith("wheel_"):
         return ("rad/s", None) if largest > 110 else ("km/h", RADIUS_M)
+    if signal == "gear":
+        return "1", None
     likely = {
         "m/s^2": (1.3, "g", "m/s^2"),
         "rad/s": (2.5, "rad/s", "deg/s"),
         "rad": (0.9 if signal != "steering_wheel" else 14.0, "rad", "deg"),
         "m/s": (70.0, "m/s", "km/h"),
+        "Pa": (400.0, "bar", "kPa"),
+        "1": (1.2, "1", "%"),
     }
     limit, small, large = likely[si_unit]
     return (small if largest < limit else large), None

@@ -79,6 +79,7 @@ def ingest_files(
     of it. Raises `ClusterError` at the end for files that workers died of.
     """
     write = partial(write_batch, warehouse, mapping)
+    warehouse.logs.require_writable(mapping.signals)
     failures: list[InputError] = []
     asked = (AskedFile(file, known.digest_of(file) if known else None) for file in files)
     for batch, written in run_tasks(executor, write, _batches(asked), lambda b: str(b[0].file)):

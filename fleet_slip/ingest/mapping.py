@@ -2,16 +2,18 @@
 
 from datetime import UTC, date, datetime
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import polars as pl
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from fleet_slip.canonical import canonical_ascii
 from fleet_slip.catalogue.signals import Identifier, catalogue
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import ConfigError
 from fleet_slip.ingest.can_bus import CanBus, read_can_database
+from fleet_slip.ingest.columns import describe_unknown
+from fleet_slip.ingest.condition_text import text_conditions
 from fleet_slip.ingest.csv_batches import PlainNumbers
 from fleet_slip.ingest.csv_format import CsvFormat
 from fleet_slip.ingest.duckdb_table import DuckdbRows
@@ -116,16 +118,33 @@ class Mapping(Config):
     drive: DriveMetadata
     signals: dict[str, SignalColumn] = Field(min_length=1)
     where: tuple[RowCondition, ...] = Field(default=(), exclude_if=_is_empty)
-    """Conditions that a row meets, all of them, or is left out and only counted."""
+    """Conditions that a row meets, all of them, or is left out and only counted; also as text."""
     vehicles: tuple[VehicleFacts, ...] | Name = Field(default=(), exclude_if=_is_empty)
     """What is known of each car; a text is the path of a CSV file, seen from the mapping's own."""
+
+    @field_validator("where", mode="before")
+    @classmethod
+    def _texts_are_read(cls, where: Any, info: ValidationInfo) -> Any:
+        texts = [where] if isinstance(where, str) else where
+        if not isinstance(texts, list | tuple):
+            return where
+        signals = info.data.get("signals", {})
+        read = [text_conditions(t, signals) if isinstance(t, str) else [t] for t in texts]
+        return [condition for conditions in read for condition in conditions]
+
+    @model_validator(mode="after")
+    def _conditions_name_signals(self) -> "Mapping":
+        for condition in self.where:
+            if condition.signal is not None and condition.signal not in self.signals:
+                raise ValueError(f"where: {condition.signal!r} is no signal of this mapping")
+        return self
 
     @model_validator(mode="after")
     def _signals_fit_catalogue(self) -> "Mapping":
         known = catalogue().signals
         for name, column in self.signals.items():
             if name not in known:
-                raise ValueError(f"unknown signal {name!r}. Known signals: {', '.join(known)}")
+                raise ValueError(describe_unknown(name, known))
             try:
                 column.require_unit_of(name, known[name].unit)
             except ValueError as error:
@@ -153,7 +172,9 @@ class Mapping(Config):
 
     def time_bases(self) -> dict[str | None, list[str]]:
         """Return the columns that the mapping uses, each once, by the column of their times."""
-        bases = {self.time.column: [self.time.column, *self.common_columns()]}
+        own = {s.column for s in self.signals.values() if s.time not in {None, self.time.column}}
+        common = [name for name in self.common_columns() if name not in own]
+        bases = {self.time.column: [self.time.column, *common]}
         for signal in self.signals.values():
             time = self.time.column if signal.time is None else signal.time
             bases.setdefault(time, [time]).append(signal.column)
@@ -167,7 +188,9 @@ class Mapping(Config):
         metadata = (getattr(self.drive, name) for name in DriveMetadata.model_fields)
         names = [self.drive.column]
         names += [source.column for source in metadata if isinstance(source, FromColumn)]
-        names += [condition.column for condition in self.where]
+        for condition in self.where:
+            of = condition.signal
+            names.append(condition.column if of is None else self.signals[of].column)
         return list(dict.fromkeys(name for name in names if name is not None))
 
     @property

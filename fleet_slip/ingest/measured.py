@@ -16,7 +16,10 @@ class MeasuredLog:
     """A measured file, ready for the warehouse."""
 
     drives: pa.Table
-    """The catalogue's `log_schema` with strings dictionary-encoded, by drive_id, then tick."""
+    """The catalogue's `log_schema`, of extras those that are mapped, by drive_id, then tick.
+
+    Strings are dictionary-encoded.
+    """
     quarantine: pa.Table
     """`QUARANTINE_SCHEMA`, in the file's order."""
     counts: IngestCounts

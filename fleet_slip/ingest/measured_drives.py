@@ -77,7 +77,8 @@ def to_ticks(
             own = _on_own_times(samples, start_s, resampler, intervals_s)
         values = samples[signal].to_numpy()
         longest = source.longest_gap_s or mapping.time.longest_gap_s
-        bring = partial(own.resample, longest_gap_s=longest) if source.interpolate else own.place
+        between = own.hold if catalogue()[signal].stepwise else own.resample
+        bring = partial(between, longest_gap_s=longest) if source.interpolate else own.place
         resample = partial(bring, delay_s=source.delay_s)
         between_samples = (method != "snap" or source.delay_s) and source.interpolate
         angle = between_samples and signal == catalogue().label
@@ -128,6 +129,8 @@ def log_table(drives: Sequence[MeasuredDrive], mapping: Mapping) -> pa.Table:
             columns[field.name] = pa.chunked_array([drive.ticks for drive in drives], field.type)
         elif field.name in mapping.signals:
             columns[field.name] = pa.chunked_array([drive.counts[field.name] for drive in drives])
+        elif field.name in catalogue().extras:
+            continue
         elif field.name in catalogue().signals:
             columns[field.name] = pa.nulls(sum(sizes), field.type)
         else:

@@ -62,6 +62,20 @@ class Resampler:
         resample = average if self.method == "average" else interpolate
         return resample(self.time_s - delay_s, values, self.at_s, longest_gap_s)
 
+    def hold(
+        self, values: FloatArray, delay_s: float = 0.0, longest_gap_s: float = 0.1
+    ) -> FloatArray:
+        """Return a signal that changes in steps: at each tick the last sample, unless too old."""
+        if self.method == "snap" and not delay_s:
+            return values
+        time_s, values = _present(self.time_s - delay_s, values)
+        last = np.searchsorted(time_s, self.at_s + TIME_EPSILON_S, side="right") - 1
+        held = np.full(self.at_s.size, np.nan)
+        known = last >= 0
+        known[known] = (self.at_s[known] - time_s[last[known]]) <= longest_gap_s + TIME_EPSILON_S
+        held[known] = values[last[known]]
+        return held
+
     def place(self, values: FloatArray, delay_s: float = 0.0) -> FloatArray:
         """Return a signal with each sample at the tick nearest to it, NaN at the other ticks.
 

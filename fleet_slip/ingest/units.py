@@ -16,7 +16,10 @@ _NEEDS = {
     "m/s": "a velocity, such as 'km/h'",
     "m/s^2": "an acceleration, such as 'g' or 'm/s^2'",
     "s": "a time, such as 'ms'",
+    "Pa": "a pressure, such as 'bar'",
+    "1": "a number: '1', or '%'",
 }
+_NUMBERS = {"1": 1.0, "%": 0.01, "percent": 0.01}
 
 
 def require_unit(unit: str, si_unit: str, quantity: str = "it") -> None:
@@ -34,6 +37,8 @@ def conversion_factor(unit: str, si_unit: str, quantity: str = "it") -> float:
     Raises `ValueError`, with a message that ends in what is needed instead.
     """
     needs = f"{quantity} needs {_NEEDS.get(si_unit, f'a unit like {si_unit!r}')}"
+    if si_unit == "1" and unit in _NUMBERS:
+        return _NUMBERS[unit]
     # The pattern keeps pint from evaluating arithmetic: '9^9^9^9' would never end.
     if len(unit) > _LONGEST_UNIT or not _UNIT.fullmatch(unit):
         raise ValueError(f"is in {unit[:_LONGEST_UNIT]!r}, which is not a unit; {needs}")

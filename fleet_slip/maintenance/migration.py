@@ -34,6 +34,7 @@ from fleet_slip.catalogue.signals import COUNT_MAX
 from fleet_slip.delta import Snapshot, Table, TableFile
 from fleet_slip.delta.schema import SCALE, TARGET, Evolution, compare_schemas, scales_of
 from fleet_slip.delta.sealing import NOTE, seal_note
+from fleet_slip.delta.table import ALL_STATISTICS
 from fleet_slip.errors import ConflictError, RefusedError, StorageError
 from fleet_slip.files.storage_errors import storage_errors
 from fleet_slip.grams.ahead import land_ahead
@@ -105,6 +106,7 @@ def _add_columns(table: Table, delta: DeltaTable, found: Evolution) -> None:
     scales = scales_of(table.schema)
     with storage_errors(table.folder), _conflicts(table):
         if found.added:
+            delta.alter.set_table_properties(ALL_STATISTICS)
             delta.alter.add_columns([_with_scale(fields[n], scales) for n in found.added])
         for name in found.unrecorded:
             delta.alter.set_column_metadata(name, {SCALE: str(scales[name])})

@@ -91,7 +91,10 @@ def _read(table: Table, file: TableFile, without: Collection[str]) -> pa.Table:
     for field in table.schema:
         if field.name in table.partition_by:
             continue
-        if field.name not in stored.schema.names:
+        there = field.name in stored.schema.names
+        if not there and field.name in table.optional:
+            continue
+        if not there:
             column = pa.chunked_array([pa.nulls(stored.num_rows, field.type)])
         else:
             column = stored[field.name]

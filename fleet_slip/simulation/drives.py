@@ -71,7 +71,8 @@ def lane_drive(spec: DriveSpec) -> LaneDrive:
 def simulate_batch(batch: Batch) -> pa.Table:
     """Simulate and measure the drives of a batch.
 
-    Returns a table in the order of `SignalCatalogue.log_schema`, with strings as dictionaries,
+    Returns a table in the order of `SignalCatalogue.log_schema`, without the signals that no
+    simulated car logs, with strings as dictionaries,
     sorted by drive, then tick. It depends on the batch alone: any number of threads may simulate
     any batches in any order.
     """
@@ -111,8 +112,10 @@ def tabulate(batch: Batch, logs: Sequence[DriveLog]) -> pa.Table:
     ticks = pa.array(np.arange(max(rows), dtype=np.int32))
     columns["tick"] = pa.chunked_array([ticks[:n] for n in rows])
     for name in catalogue().signals:
-        columns[name] = pa.chunked_array([_counts(log, name) for log in logs])
-    return pa.table({name: columns[name] for name in catalogue().log_schema.names})
+        if name not in catalogue().extras or any(name in log.measurement.counts for log in logs):
+            columns[name] = pa.chunked_array([_counts(log, name) for log in logs])
+    names = [name for name in catalogue().log_schema.names if name in columns]
+    return pa.table({name: columns[name] for name in names})
 
 
 def _counts(log: DriveLog, name: str) -> pa.Array:

@@ -67,7 +67,12 @@ def test_canonical_json_does_not_depend_on_the_layout(tmp_path: Path) -> None:
     [
         ('"deg"', '"km/h"', "steer_fl_deg is in 'km/h', steer_fl needs an angle"),
         ('"deg"', '"smoot"', "'smoot', which is not a known unit; steer_fl needs an angle"),
-        ("steer_fl =", "steer =", "unknown signal 'steer'. Known signals: ax, ay"),
+        ("steer_fl =", "steer_f =", "unknown signal 'steer_f'. Do you mean steer"),
+        (
+            "steer_fl =",
+            "speed =",
+            "unknown signal 'speed'. Do you mean vehicle_speed? Known signals: ax, ay",
+        ),
         ("negate", "negat", "signals.ax.negat: unknown key"),
         ('unit = "s"', 'unit = "m"', "t is in 'm', it needs a time"),
         ('unit = "s"', "rate_hz = 100", "either 'column' or 'rate_hz'"),

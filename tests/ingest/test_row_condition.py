@@ -1,5 +1,6 @@
 """Rows that a mapping leaves out are counted, and not quarantined one by one."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,58 @@ def test_rows_that_do_not_meet_the_conditions_are_counted(
     assert (log.counts.rows_read, log.counts.rows_left_out) == (20, 20 - len(kept))
     assert log.counts.rows_kept == len(kept)
     assert log.counts.quarantined == {}
+
+
+@pytest.mark.parametrize(
+    ("where", "kept"),
+    [
+        ("speed >= 5", [1, 2, *range(5, 20)]),
+        ("speed > 5", [2, *range(5, 20)]),
+        ("speed = 20", list(range(5, 20))),
+        ("speed != 20", [0, 1, 2]),
+        ("speed < 6 and speed >= 5", [1, 2]),
+        ("fix = 'RTK'", list(range(18))),
+        ("fix in ('RTK', 'float') and speed > 5.5", list(range(5, 18))),
+        (["speed > 5", {"column": "fix", "one_of": ["RTK"]}], [2, *range(5, 18)]),
+        ('"speed" <= 5e0', [0, 1]),
+        ("vehicle_speed > 5.1 m/s", [2, *range(5, 20)]),
+        ("vehicle_speed > 17 km/h and vehicle_speed < 25 km/h", [1, 2, 3]),
+    ],
+)
+def test_conditions_can_be_written_as_text(tmp_path: Path, where: Any, kept: list[int]) -> None:
+    rows = columns()
+    rows["v"] = [18 if v is None else "" if v == "n/a" else 3.6 * v for v in rows["speed"]]
+    signals = {
+        "ax": {"column": "ax", "unit": "m/s^2"},
+        "vehicle_speed": {"column": "v", "unit": "km/h"},
+    }
+    log = read_columns(tmp_path, rows, a_mapping(where=where, signals=signals))
+    first = kept[0]
+    assert ticks(log) == [tick - first for tick in kept]
+    assert log.counts.rows_left_out == 20 - len(kept)
+
+
+@pytest.mark.parametrize(
+    ("where", "message"),
+    [
+        ("", "is no condition. Write NAME"),
+        ("speed", "is no condition"),
+        ("speed > 5 or speed < 2", "is no condition"),
+        ("speed > 5 m/s", "'speed' is no signal of this mapping but a column"),
+        ("ax > 5", "of which unit? Say it: m/s"),
+        ("ax > 5 km/h", "ax needs an acceleration"),
+        ("ax = 'much'", "compared with a number"),
+        ("fix > 'RTK'", "a text can only be ="),
+        ("speed > 5; DROP TABLE x", "is no condition"),
+        ("speed > " + "9" * 3000, "is longer than 2,000 characters"),
+        ([{"signal": "ay", "above": 1}], "'ay' is no signal of this mapping"),
+        ([{"signal": "ax", "one_of": ["1"]}], "'one_of' is for a column"),
+        ([{"at_least": 1}], "needs either 'column' or 'signal'"),
+    ],
+)
+def test_what_a_text_cannot_say(where: Any, message: str) -> None:
+    with pytest.raises(ValidationError, match=re.escape(message)):
+        a_mapping(where=where)
 
 
 def test_a_number_in_parquet_can_be_one_of_several(tmp_path: Path) -> None:

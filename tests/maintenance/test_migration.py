@@ -29,14 +29,14 @@ from tests.support.logs import land, log_rows, path_of, random_counts
 SHIPPED = (folder("configs") / "signals.toml").read_text()
 
 PRESSURE = """
-[signals.brake_pressure]
+[signals.tyre_pressure]
 unit = "Pa"
-column = "brake_pressure_pa"
+column = "tyre_pressure_pa"
 scale = 1000
 min = 0
 max = 20000000
 role = "input"
-description = "Pressure in the brake circuit"
+description = "Pressure in a tyre"
 
 [drive.drive_id]"""
 
@@ -81,19 +81,19 @@ def test_a_new_signal_is_null_in_old_files(warehouse: Warehouse, use: Use) -> No
     before = fetch(warehouse, "SELECT sums, products FROM grams")
     use(NEW_SIGNAL)
     now = Warehouse(warehouse.root)
-    assert fetch(now, "SELECT count(*), count(brake_pressure_pa) FROM log") == [(40, 0)]
-    with pytest.raises(RefusedError, match=r"has not: brake_pressure.*fleet-slip migrate"):
+    assert fetch(now, "SELECT count(*), count(tyre_pressure_pa) FROM log") == [(40, 0)]
+    with pytest.raises(RefusedError, match=r"has not: tyre_pressure.*fleet-slip migrate"):
         land(now, "new", log_rows("new", small_counts(2)))
     report = migrate(now)
-    assert (report.added, report.files_rewritten) == (("brake_pressure",), 0)
+    assert (report.added, report.files_rewritten) == (("tyre_pressure",), 0)
     assert not migrate(now).changed
     land(now, "new", log_rows("new", small_counts(2)))
     assert update_grams(now).files_read == 1
     signals = dict(fetch(now, "SELECT drive_id, signals FROM grams"))
-    assert "brake_pressure" in str(signals["new"])
-    assert "brake_pressure" not in str(signals["old"])
+    assert "tyre_pressure" in str(signals["new"])
+    assert "tyre_pressure" not in str(signals["old"])
     assert fetch(now, "SELECT sums, products FROM grams WHERE drive_id = 'old'") == before
-    assert fetch(now, "SELECT count(*), count(brake_pressure) FROM log_counts") == [(80, 40)]
+    assert fetch(now, "SELECT count(*), count(tyre_pressure) FROM log_counts") == [(80, 40)]
     check_grams(now, 10)
 
 
@@ -108,7 +108,7 @@ def test_grams_of_old_files_alone_are_the_same_with_a_new_signal(
     (signals, first), *_ = fetch(
         now, "SELECT signals, sums[1] FROM grams WHERE feature_set = 'signals'"
     )
-    assert "brake_pressure" not in str(signals)
+    assert "tyre_pressure" not in str(signals)
     catalogue.cache_clear()
     assert first == small_counts(1)["ax"].sum()
     check_grams(now, 1)
@@ -234,7 +234,7 @@ def test_the_nightly_job_goes_on_after_a_signal_was_added(
     run_command("run", "--campaign", "smoke", "--days", "1")
     use(NEW_SIGNAL)
     assert run_command("simulate", "smoke").exit_code == 7
-    assert "added: brake_pressure" in run_command("migrate").stderr
+    assert "added: tyre_pressure" in run_command("migrate").stderr
     assert run_command("run", "--campaign", "smoke").exit_code == 0
     assert "nothing to do" in run_command("migrate").stderr
 

@@ -30,6 +30,12 @@ def random_counts(rng: np.random.Generator, rows: int) -> dict[str, Any]:
     return counts
 
 
+def schema_without_extras() -> pa.Schema:
+    """The schema of a file of the logs whose drives have no signal that only some cars log."""
+    schema = catalogue().log_schema
+    return pa.schema([field for field in schema if field.name not in catalogue().extras])
+
+
 def log_rows(drive_id: str, counts: dict[str, Any], day: date = DAY, **metadata: Any) -> pa.Table:
     """Rows of the logs for one drive; a signal that is not given is absent."""
     signals = catalogue()

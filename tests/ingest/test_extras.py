@@ -1,0 +1,202 @@
+"""Signals that some cars log besides: stored where they are, and known to features alone."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fleet_slip.catalogue.features import features
+from fleet_slip.catalogue.signals import CATALOGUE_VARIABLE, catalogue
+from fleet_slip.errors import RefusedError
+from fleet_slip.grams.aggregation import by_sql
+from fleet_slip.grams.job import update_grams
+from fleet_slip.ingest.job import ingest_file
+from fleet_slip.maintenance.compaction import compact
+from fleet_slip.maintenance.migration import migrate
+from fleet_slip.maintenance.verify import verify
+from fleet_slip.resources import CONFIG_VARIABLE, folder
+from fleet_slip.views import connect
+from fleet_slip.warehouse.tables import Warehouse
+from tests.support.measured import a_mapping, csv_text, physical, read_columns, ticks
+
+ROWS = 300
+PLAIN = {"ax": {"column": "ax", "unit": "m/s^2"}, "sideslip": {"column": "beta", "unit": "deg"}}
+EXTRA = {
+    "steer": {"column": "delta", "unit": "deg"},
+    "brake_pressure": {"column": "p", "unit": "bar"},
+    "throttle": {"column": "pedal", "unit": "%"},
+    "gear": {"column": "gear", "unit": "1"},
+    "vehicle_speed": {"column": "v", "unit": "km/h"},
+    "roll_rate": {"column": "roll", "unit": "deg/s"},
+}
+OWN_FEATURES = """
+[features.steer_doubled]
+counts = "2 * steer"
+scale = 0.00005
+unit = "rad"
+column = "steer_doubled_rad"
+description = "Twice the road wheels' angle"
+
+[windows.steer_late]
+of = "steer"
+over = "lag"
+ticks = [1]
+scale = 0.00005
+unit = "rad"
+column = "steer_late_{ticks}_rad"
+description = "Angle of the road wheels so many ticks ago"
+
+[sets.one_angle]
+description = "One angle for both road wheels"
+signals = ["ax", "steer"]
+features = ["steer_doubled"]
+
+[sets.looks_back]
+description = "The angle of the tick before"
+signals = ["ax"]
+windows = ["steer_late"]
+"""
+
+
+def columns_of(rows: int = ROWS) -> dict[str, Any]:
+    tick = range(rows)
+    return {
+        "t": [f"{i / 100:.2f}" for i in tick],
+        "ax": [i % 5 * 0.1 for i in tick],
+        "beta": [i % 7 * 0.1 for i in tick],
+        "delta": [i % 11 * 0.2 for i in tick],
+        "p": [i % 60 for i in tick],
+        "pedal": [i % 101 for i in tick],
+        "gear": [i % 7 - 1 for i in tick],
+        "v": [90] * rows,
+        "roll": [1.5] * rows,
+    }
+
+
+def write(file: Path, seed: int = 0) -> Path:
+    file.write_text(csv_text(columns_of(ROWS + seed)), encoding="utf-8")
+    return file
+
+
+@pytest.fixture
+def clear_caches() -> Iterator[None]:
+    yield
+    catalogue.cache_clear()
+    features.cache_clear()
+
+
+def ask(warehouse: Warehouse, query: str) -> list[tuple[Any, ...]]:
+    with connect(warehouse.root) as database:
+        return database.execute(query).fetchall()
+
+
+def test_extras_are_stored_in_their_units(tmp_path: Path) -> None:
+    log = read_columns(tmp_path, columns_of(), a_mapping(signals={**PLAIN, **EXTRA}))
+    assert physical(log, "brake_pressure", 1000)[:3] == pytest.approx([0, 1e5, 2e5])
+    assert physical(log, "throttle", 0.0001)[100] == pytest.approx(1)
+    assert physical(log, "gear", 1)[:3].tolist() == [-1, 0, 1]
+    assert physical(log, "vehicle_speed", 0.005)[0] == pytest.approx(25)
+    assert physical(log, "steer", 0.00005)[5] == pytest.approx(0.01745, abs=2.5e-5)
+
+
+def test_a_gear_is_never_between_two_gears(tmp_path: Path) -> None:
+    columns = {"t": [0, 0.05, 0.1, 0.15], "gear": [2, 3, 3, 5], "ax": [0, 1, 2, 3]}
+    log = read_columns(tmp_path, columns, a_mapping(signals={"ax": PLAIN["ax"], **only("gear")}))
+    assert ticks(log) == list(range(16))
+    assert physical(log, "gear", 1).tolist() == [2] * 5 + [3] * 10 + [5]
+    assert physical(log, "ax", 0.001)[1] == pytest.approx(0.2)
+
+
+def only(name: str) -> dict[str, Any]:
+    return {name: EXTRA[name]}
+
+
+def test_a_file_has_the_columns_of_extras_only_where_a_drive_has_them(
+    warehouse: Warehouse, tmp_path: Path
+) -> None:
+    ingest_file(warehouse, write(tmp_path / "a.csv"), a_mapping(signals=PLAIN))
+    (plain,) = warehouse.logs.snapshot().files
+    assert not set(catalogue().extras) & set(plain.null_counts)
+    assert ask(warehouse, "SELECT count(*), count(steer), count(gear) FROM log_counts") == [
+        (ROWS, 0, 0)
+    ]
+    ingest_file(
+        warehouse, write(tmp_path / "b.csv", 1), a_mapping(name="two", signals={**PLAIN, **EXTRA})
+    )
+    found = "SELECT count(*), count(steer_rad), max(gear_number), max(throttle_position) FROM log"
+    assert ask(warehouse, found) == [(2 * ROWS + 1, ROWS + 1, 5.0, 1.0)]
+    update_grams(warehouse)
+    assert set(ask(warehouse, "SELECT signals FROM grams")) == {("ax,sideslip",)}
+    compact(warehouse)
+    assert ask(warehouse, found) == [(2 * ROWS + 1, ROWS + 1, 5.0, 1.0)]
+    assert not list(verify(warehouse, full=True).damage)
+
+
+def test_features_may_use_extras(
+    warehouse: Warehouse, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, clear_caches: None
+) -> None:
+    known = {name: features().identity(name) for name in ("signals", *features().sets)}
+    own = tmp_path / "configs"
+    own.mkdir()
+    (own / "features.toml").write_text(OWN_FEATURES, encoding="utf-8")
+    monkeypatch.setenv(CONFIG_VARIABLE, str(own))
+    features.cache_clear()
+    assert {name: features().identity(name) for name in known} == known
+    ingest_file(warehouse, write(tmp_path / "a.csv"), a_mapping(signals=PLAIN))
+    ingest_file(
+        warehouse,
+        write(tmp_path / "b.csv", 1),
+        a_mapping(name="two", signals={**PLAIN, **only("steer")}),
+    )
+    update_grams(warehouse, feature_set="one_angle")
+    ((names, n, sums),) = ask(
+        warehouse,
+        "SELECT signals, n, sums FROM grams "
+        "WHERE starts_with(feature_set, 'one_angle') AND contains(signals, 'steer_doubled')",
+    )
+    assert (names, n) == ("ax,steer,steer_doubled,sideslip", ROWS + 1)
+    assert sums[2] == 2 * sums[1]
+    ((total,),) = ask(warehouse, "SELECT sum(steer) FROM log_counts")
+    assert sums[1] == total
+    late = by_sql(warehouse, warehouse.logs.snapshot().files, "looks_back").to_pylist()
+    assert {row["n"]: row["signals"] for row in late}[ROWS] == "ax,steer_late_1,sideslip"
+    ((plain, rows),) = ask(
+        warehouse,
+        "SELECT signals, n FROM grams WHERE starts_with(feature_set, 'one_angle') "
+        "AND NOT contains(signals, 'steer')",
+    )
+    assert (plain, rows) == ("ax,sideslip", ROWS)
+
+
+def test_a_data_root_of_before_takes_what_has_no_extras_and_asks_to_migrate_for_the_rest(
+    warehouse: Warehouse, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, clear_caches: None
+) -> None:
+    shipped = (folder("configs") / "signals.toml").read_text(encoding="utf-8")
+    before, _, rest = shipped.partition("[signals.steer]\n")
+    old = tmp_path / "signals.toml"
+    old.write_text(
+        before + rest[rest.index("# What is known of a whole drive") :], encoding="utf-8"
+    )
+    monkeypatch.setenv(CATALOGUE_VARIABLE, str(old))
+    catalogue.cache_clear()
+    ingest_file(warehouse, write(tmp_path / "a.csv"), a_mapping(signals=PLAIN))
+    update_grams(warehouse)
+    grams = ask(warehouse, "SELECT * FROM grams")
+    monkeypatch.delenv(CATALOGUE_VARIABLE)
+    catalogue.cache_clear()
+    now = Warehouse(warehouse.root)
+    assert ask(now, "SELECT * FROM grams") == grams
+    assert update_grams(now).files_read == 0
+    ingest_file(now, write(tmp_path / "b.csv", 1), a_mapping(signals=PLAIN))
+    extended = a_mapping(name="two", signals={**PLAIN, **only("steer")})
+    late = {**columns_of(), "ax": ["x", *columns_of()["ax"][1:]]}
+    (tmp_path / "c.csv").write_text(csv_text(late), encoding="utf-8")
+    with pytest.raises(RefusedError, match=r"has not: steer\. Add them with: fleet-slip migrate"):
+        ingest_file(now, tmp_path / "c.csv", extended)
+    assert ask(now, "SELECT count(*) FROM quarantine") == [(0,)]
+    migrate(now)
+    ingest_file(now, tmp_path / "c.csv", extended)
+    assert ask(now, "SELECT count(*), count(steer), count(gear) FROM log_counts") == [
+        (3 * ROWS, ROWS - 1, 0)
+    ]
