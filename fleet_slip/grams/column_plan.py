@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 from fleet_slip.catalogue.arithmetic import parse
 from fleet_slip.catalogue.columns import Definition, features_behind, limit_of
@@ -91,8 +91,20 @@ class ColumnPlan:
 
     @cached_property
     def program(self) -> Program:
-        """The program that computes the columns.
+        """The program that computes the columns; equal plans have the same.
 
         Raises `QuestionError` for a feature that divides by a number that is not positive.
         """
-        return compile_plan(self.names, self.rows, self.windows, self.also)
+        return _program(
+            self.names, tuple(self.rows.items()), tuple(self.windows.items()), self.also
+        )
+
+
+@lru_cache(maxsize=64)
+def _program(
+    names: tuple[str, ...],
+    rows: tuple[tuple[str, RowColumn], ...],
+    windows: tuple[tuple[str, Definition], ...],
+    also: tuple[str, ...],
+) -> Program:
+    return compile_plan(names, dict(rows), dict(windows), also)

@@ -46,9 +46,19 @@ class DriveCounts:
         """Whether no tick between the first and the last is missing."""
         return bool(int(self.ticks[-1]) - int(self.ticks[0]) + 1 == len(self.ticks))
 
+    def part(
+        self, rows: Any, facts: Mapping[str, Any], numbers: Mapping[str, int]
+    ) -> "DriveCounts":
+        """Return some of the rows, as those of a drive of which that is known."""
+        counts = {name: values[rows] for name, values in self.counts.items()}
+        present = {name: values[rows] for name, values in self.present.items()}
+        return DriveCounts(self.ticks[rows], counts, present, facts, numbers)
+
 
 class Workspace:
     """The memory that the columns of a plan are computed in, for one drive after the other.
+
+    Not for several threads at once.
 
     Attributes:
         rows: of the drive that was loaded last.

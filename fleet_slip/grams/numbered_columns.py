@@ -59,7 +59,13 @@ class NumberedColumns:
 
     def compute(self, drive: DriveCounts) -> FloatArray:
         """Return the columns, shape (columns, rows); missing is NaN. Raises `DataError`."""
-        found = dict(zip(self.plan.names, DriveColumns(self.plan, drive).compute(), strict=True))
+        return self.complete(DriveColumns(self.plan, drive).compute(), drive)
+
+    def complete(self, computed: FloatArray, drive: DriveCounts) -> FloatArray:
+        """Return the columns, given those of the plan on some rows of a drive, as it has them."""
+        if not self.factors:
+            return computed
+        found = dict(zip(self.plan.names, computed, strict=True))
         for name, number in self.factors.items():
             of = found[name + _OF]
             factor = self._factor(name, number, drive, found)

@@ -2,28 +2,29 @@
 
 The angle is `intercept + sum(coefficient * signal)`, added up from left to right as `score` does in
 SQL, so that both give the same bits. A feature is a function of counts: the signals that it is
-made of are rounded to counts as the sensors round them, and its SQL is run as it stands in the
-manifest. A model with columns over time looks back within a drive: by `drive_id` and `tick` or
+made of are rounded to counts as the sensors round them, and its arithmetic is that which stands in
+the manifest. A model with columns over time looks back within a drive: by `drive_id` and `tick` or
 `time_s` of the frame; a frame without them is one drive with a row for each tick.
 """
 
 from fractions import Fraction
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
 from fleet_slip.arrays import FloatArray, IntArray
+from fleet_slip.catalogue.arithmetic import parse
 from fleet_slip.catalogue.car_numbers import round_number
-from fleet_slip.catalogue.column_sql import with_features
 from fleet_slip.catalogue.counts import round_to_counts
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
+from fleet_slip.catalogue.feature_counts import feature_counts
+from fleet_slip.catalogue.signals import COUNT_MAX, SAMPLE_TIME_S, catalogue
 from fleet_slip.errors import DataError, InputError
 from fleet_slip.grams.drive_rows import counts_of
 from fleet_slip.models.frames import Frame, open_frame
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predictor import Predictor
-from fleet_slip.warehouse.database import database_errors, open_database
 
 
 def predict(manifest: Manifest, frame: Any) -> Any:
@@ -58,23 +59,29 @@ def _over_time(manifest: Manifest, frame: Frame, columns: dict[str, FloatArray])
     facts = {name: _column(frame, name) for name in predictor.plan.facts}
     numbers = _numbers(manifest, frame)
     ticks, drives = _ticks(frame, len(next(iter(counts.values())))), _drives(frame)
-    rows = pa.table({"tick": ticks, **counts, **facts})
-    if not len(rows):
+    if not len(ticks):
         return np.empty(0)
-    angle = np.full(len(rows), np.nan)
-    each = [np.arange(len(rows))] if drives is None else _rows_of_each(drives)
-    for at in each:
+    rows = counts_of(pa.table({"tick": ticks, **counts}), predictor.plan, {})
+    angle, workspace = np.empty(len(ticks)), predictor.workspace()
+    for at in [slice(0, len(ticks))] if drives is None else _rows_of_each(drives):
+        first = at.start if isinstance(at, slice) else at[0]
         own = {
-            name: round_number(Fraction(float(values[at[0]])), grain)
+            name: round_number(Fraction(float(values[first])), grain)
             for name, (values, grain) in numbers.items()
-            if not np.isnan(values[at[0]])
+            if not np.isnan(values[first])
         }
-        angle[at] = predictor(counts_of(rows.take(at), predictor.plan, None, own))
+        known = {name: values[first].as_py() for name, values in facts.items()}
+        angle[at] = predictor(rows.part(at, known, own), workspace)
     return angle
 
 
-def _rows_of_each(drives: IntArray) -> list[IntArray]:
-    return [np.flatnonzero(drives == drive) for drive in np.unique(drives)]
+def _rows_of_each(drives: IntArray) -> list[slice] | list[IntArray]:
+    """Return the rows of each drive: a slice of each, if the rows of every drive lie together."""
+    starts = np.flatnonzero(np.diff(drives, prepend=drives[0] - 1))
+    found = np.unique(drives[starts])
+    if len(found) < len(starts):
+        return [np.flatnonzero(drives == drive) for drive in found]
+    return [slice(*ends) for ends in pairwise([*starts.tolist(), len(drives)])]
 
 
 def _numbers(manifest: Manifest, frame: Frame) -> dict[str, tuple[FloatArray, Fraction]]:
@@ -124,19 +131,19 @@ def _drives(frame: Frame) -> IntArray | None:
 def _features(manifest: Manifest, columns: dict[str, FloatArray]) -> dict[str, FloatArray]:
     """Return the features in SI units by column, NaN where one has no value."""
     terms = [term for term in manifest.terms if term.sql]
-    if not terms:
-        return {}
-    signals = catalogue()
-    used = {name for term in terms for name in term.inputs}
-    if not used:
+    made = {term.column: parse(term.sql) for term in terms}
+    if not all(one.inputs for one in made.values()):
         raise DataError(f"the features of {manifest.name} are of no signal. Publish it again.")
-    counts = {name: round_to_counts(columns[signals[name].column], signals[name]) for name in used}
-    with open_database() as database, database_errors(f"the features of {manifest.name}"):
-        database.register("counts", pa.table(counts))
-        rows = with_features("counts", manifest.features)
-        names = ", ".join(manifest.features)
-        found = database.sql(f"SELECT {names} FROM {rows}").to_arrow_table()
-    return {
-        term.column: found[term.signal].cast(pa.float64()).to_numpy() * float(term.scale)
-        for term in terms
-    }
+    signals = catalogue()
+    counts, present = {}, {}
+    for name in {name for one in made.values() for name in one.inputs}:
+        rounded = round_to_counts(columns[signals[name].column], signals[name])
+        present[name] = rounded.is_valid().to_numpy(zero_copy_only=False)
+        counts[name] = rounded.fill_null(0).to_numpy().astype(np.int64)
+    found = {}
+    for term in terms:
+        arithmetic = made[term.column]
+        given = np.logical_and.reduce([present[name] for name in arithmetic.inputs])
+        values, there = feature_counts(arithmetic, COUNT_MAX, counts, given)
+        found[term.column] = np.where(there, values * float(term.scale), np.nan)
+    return found

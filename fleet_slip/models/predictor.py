@@ -1,15 +1,18 @@
 """Estimates of a published model, sample by sample in the order of time, from logged counts."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.arithmetic import parse
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.compiling import kernel
 from fleet_slip.grams.column_plan import ColumnPlan
-from fleet_slip.grams.columns import DriveCounts
+from fleet_slip.grams.columns import DriveCounts, Workspace
 from fleet_slip.grams.numbered_columns import NumberedColumns
+from fleet_slip.grams.operations import BLOCK_ROWS
 from fleet_slip.grams.row_code import RowColumn
 from fleet_slip.models.manifest import Manifest
 
@@ -52,14 +55,35 @@ class Predictor:
         """What the kernel computes of a drive."""
         return self.columns.plan
 
-    def __call__(self, drive: DriveCounts) -> FloatArray:
+    def workspace(self) -> Workspace:
+        """Return memory for one drive after the other."""
+        return Workspace(self.plan)
+
+    def __call__(self, drive: DriveCounts, workspace: Workspace | None = None) -> FloatArray:
         """Return the estimate at each row in rad, shape (rows,); NaN where a column is missing.
 
-        Added up from left to right, as `score --sql` does, to the same bits on every machine.
+        Added up from left to right, as `score --sql` does, to the same bits on every machine; block
+        by block, so that the columns of a block are still in the processor's cache.
         Raises `DataError` for a drive that cannot be looked back on.
         """
-        columns = self.columns.compute(drive)
-        estimate: FloatArray = np.full(columns.shape[1], self.intercept)
-        for column, coefficient, scale in zip(columns, self.coefficients, self.scales, strict=True):
-            estimate += coefficient * (column * scale)
+        workspace = workspace or self.workspace()
+        workspace.load(drive)
+        coefficients, scales = np.array(self.coefficients), np.array(self.scales)
+        estimate: FloatArray = np.full(len(drive.ticks), self.intercept)
+        for first in range(0, len(estimate), BLOCK_ROWS):
+            workspace.compute_block(first)
+            columns = self.columns.complete(workspace.block(first)[0], drive)
+            add_terms(columns, coefficients, scales, estimate[first : first + BLOCK_ROWS])
         return estimate
+
+
+@kernel
+def add_terms(columns: Any, coefficients: Any, scales: Any, estimate: Any) -> None:
+    """Add the terms of a dot product to the estimate of each row, from left to right.
+
+    Columns are counts, shape (columns, rows).
+    """
+    for number in range(len(columns)):
+        column, coefficient, scale = columns[number], coefficients[number], scales[number]
+        for row in range(len(estimate)):
+            estimate[row] += coefficient * (column[row] * scale)

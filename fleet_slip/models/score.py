@@ -137,6 +137,7 @@ def _score_over_time(
 ) -> Score | None:
     """Estimate the drives that have rows of the cohort, whole; score the rows of the cohort."""
     predictor = Predictor.of(manifest)
+    workspace = predictor.workspace()
     label = manifest.label.signal
     needed = [*predictor.plan.signals, label, *predictor.plan.facts, "vehicle_id"]
     cars = calibrated_cars(warehouse) if predictor.columns.numbers else {}
@@ -151,7 +152,7 @@ def _score_over_time(
         stream = database.sql(text).to_arrow_reader(BATCH_ROWS)
         for rows in drives_of_stream(stream):
             numbers = cars.get(rows["vehicle_id"][0].as_py())
-            estimate = predictor(counts_of(rows, predictor.plan, None, numbers))
+            estimate = predictor(counts_of(rows, predictor.plan, None, numbers), workspace)
             truth = rows[label].to_numpy(zero_copy_only=False).astype(np.float64) * unit
             chosen = rows["chosen"].to_numpy(zero_copy_only=False).astype(np.bool_)
             given = chosen & np.isfinite(estimate) & np.isfinite(truth)

@@ -1,0 +1,84 @@
+"""Estimates of models that look back: drives that lie together, that are mixed, and blocks."""
+
+from fractions import Fraction
+
+import numpy as np
+import polars as pl
+import pyarrow as pa
+
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.grams.columns import DriveCounts
+from fleet_slip.grams.operations import BLOCK_ROWS
+from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.models.predictor import Predictor
+from tests.export.models import MODELS, model_of
+
+MANIFEST = model_of(MODELS["every_kind"], Fraction(1, 7))
+NUMBERS = {"yaw_rate_offset": -30, "speed_ratio": 2003, "understeer": 55}
+
+
+def drive_of(rows: int, seed: int) -> DriveCounts:
+    """Counts of ordinary sizes, some of them missing, with holes between ticks."""
+    random = np.random.default_rng(seed)
+    signals = Predictor.of(MANIFEST).plan.signals
+    counts = {name: random.integers(900, 1800, rows).astype(np.int16) for name in signals}
+    present = {name: random.random(rows) < 0.999 for name in signals}
+    facts = {"mass_kg": 1320.5 + seed, "vehicle_model": "suv" if seed % 2 else "van"}
+    ticks = np.cumsum(random.random(rows) < 0.001) + np.arange(rows)
+    return DriveCounts(ticks, counts, present, facts, NUMBERS if seed % 2 else {})
+
+
+def test_blocks_of_rows_have_the_bits_of_the_whole_drive() -> None:
+    """One workspace for drives of several lengths, against a dot product over all columns."""
+    predictor = Predictor.of(MANIFEST)
+    workspace = predictor.workspace()
+    for rows, seed in ((3 * BLOCK_ROWS + 7, 1), (BLOCK_ROWS, 2), (1, 3), (BLOCK_ROWS + 1, 4)):
+        drive = drive_of(rows, seed)
+        expected = np.full(rows, predictor.intercept)
+        for column, coefficient, scale in zip(
+            predictor.columns.compute(drive), predictor.coefficients, predictor.scales, strict=True
+        ):
+            expected += coefficient * (column * scale)
+        found = predictor(drive, workspace)
+        assert np.array_equal(found, expected, equal_nan=True)
+        assert np.isfinite(found).any() or rows == 1
+
+
+def frame_of(drive: DriveCounts, name: str) -> pl.DataFrame:
+    """A drive in SI units."""
+    columns = {
+        catalogue()[one].column: pl.Series(
+            np.where(drive.present[one], counts * float(catalogue()[one].scale), np.nan)
+        )
+        for one, counts in drive.counts.items()
+    }
+    told = {name: drive.numbers.get(name) for name in NUMBERS}
+    grains = {"yaw_rate_offset": 0.00000625, "speed_ratio": 0.0005, "understeer": 0.00002}
+    numbers = {one: None if n is None else n * grains[one] for one, n in told.items()}
+    return pl.DataFrame({"drive_id": name, "tick": drive.ticks, **columns}).with_columns(
+        pl.lit(drive.facts["mass_kg"]).alias("mass_kg"),
+        pl.lit(drive.facts["vehicle_model"]).alias("vehicle_model"),
+        *(pl.lit(value, pl.Float64).alias(one) for one, value in numbers.items()),
+    )
+
+
+def test_drives_that_are_mixed_have_the_angles_of_each_alone() -> None:
+    version = ModelVersion(1, MANIFEST, "0" * 64)
+    drives = {f"drive {seed}": drive_of(rows, seed) for rows, seed in ((1300, 1), (40, 2), (9, 5))}
+    predictor = Predictor.of(MANIFEST)
+    expected = np.concatenate([predictor(one) for one in drives.values()])
+    together = pl.concat([frame_of(one, name) for name, one in drives.items()])
+    found = version.predict(together).to_numpy()
+    assert np.array_equal(found, expected, equal_nan=True)
+    assert np.isfinite(found).sum() > 1000
+    mixed = together.with_row_index("place").sort("tick", "drive_id")
+    angles = version.predict(mixed).to_numpy()[np.argsort(mixed["place"].to_numpy())]
+    assert np.array_equal(angles, expected, equal_nan=True)
+
+
+def test_a_frame_without_rows_has_no_angles() -> None:
+    version = ModelVersion(1, MANIFEST, "0" * 64)
+    empty = frame_of(drive_of(3, 1), "drive").head(0)
+    assert version.predict(empty).to_list() == []
+    assert version.predict(empty.to_arrow()).to_pylist() == []
+    assert isinstance(version.predict(empty.to_arrow()), pa.ChunkedArray)
