@@ -7,7 +7,7 @@ product is at most 2^30 and a sum of `MOST_ROWS` of them below 2^61: nothing ove
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.export.c_names import literal
 from fleet_slip.grams.messages import (
-    HEADER,
+    HEADER_BYTES,
     LAYOUT,
     LONGEST_VEHICLE,
     MAGIC,
@@ -205,7 +205,7 @@ uint32_t {prefix}_gram_message(const {prefix}_gram *gram, uint32_t part, const u
     at = put(message, at, start_s, 8U);
     at = put(message, at, from->mask, 4U);
     at = put(message, at, from->rows, 4U);
-    at = put(message, at, gram->lost, 4U); /* byte {HEADER.size} is next */
+    at = put(message, at, gram->lost, 4U); /* byte {HEADER_BYTES} is next */
     for (uint32_t i = 0U; i < SIGNALS; i++) {{
         if (((from->mask >> i) & 1U) != 0U) {{
             at = put(message, at, (uint64_t)from->sums[i], 8U);

@@ -1,6 +1,5 @@
 """Writes Gram rows to files: of one feature set each, neither too many nor too large."""
 
-import hashlib
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import accumulate
 
@@ -39,11 +38,13 @@ def write_rows(warehouse: Warehouse, parts: Iterable[pa.Table]) -> list[AddActio
 
 def _write_files(warehouse: Warehouse, rows: pa.Table) -> list[AddAction]:
     """Write one file for each feature set, so that reading one set reads no other."""
-    actions = []
-    for identity in sorted(rows["feature_set"].unique().to_pylist()):
-        part = rows.filter(pc.equal(rows["feature_set"], identity))
-        actions.append(warehouse.grams.write_file(f"{identity}-{_content_digest(part)}", part))
-    return actions
+    identities = sorted(rows["feature_set"].unique().to_pylist())
+    if len(identities) == 1:
+        return [warehouse.grams.write_file(identities[0], rows)]
+    return [
+        warehouse.grams.write_file(identity, rows.filter(pc.equal(rows["feature_set"], identity)))
+        for identity in identities
+    ]
 
 
 def files_to_rewrite(grams: Snapshot, stale: frozenset[str]) -> list[TableFile]:
@@ -86,11 +87,3 @@ def rows_to_keep(
         schema = grams.table.schema
         rows = grams.table.read(file.path).select(schema.names).cast(schema)
         yield rows.filter(pc.invert(pc.is_in(rows["file"], dropped)))
-
-
-def _content_digest(rows: pa.Table) -> str:
-    """Name a Gram file by its content, so that a repeated run writes the same file again."""
-    sink = pa.BufferOutputStream()
-    with pa.ipc.new_stream(sink, rows.schema) as writer:
-        writer.write_table(rows.combine_chunks())
-    return hashlib.sha256(sink.getvalue()).hexdigest()[:16]

@@ -1,4 +1,4 @@
-"""The message of a car that sends a Gram row instead of a log: its layout, and reading it.
+"""The message of a car that sends a Gram row instead of a log: its layout, and reading many.
 
 All numbers are little-endian. A message is
 
@@ -13,13 +13,17 @@ All numbers are little-endian. A message is
 
 A drive has a message for each set of signals that its rows have. What the signals mean are the
 first 8 bytes of the SHA-256 of the canonical JSON of name, scale and range of each.
+
+Messages of one length that stand one behind the other are read at once, as an array.
 """
 
-import struct
 import zlib
-from collections.abc import Iterator
+from dataclasses import dataclass, field
 from functools import cache
-from typing import NamedTuple
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from fleet_slip.canonical import canonical_json, sha256_of
 from fleet_slip.catalogue.signals import catalogue
@@ -27,8 +31,8 @@ from fleet_slip.regression.gram import packed_size
 
 MAGIC = b"FSGR"
 LAYOUT = 1
-HEADER = struct.Struct("<4sHHQ16sHHQIII")
-CHECKSUM = struct.Struct("<I")
+HEADER_BYTES = 56
+CHECKSUM_BYTES = 4
 LONGEST_VEHICLE = 16
 MOST_PARTS = 4
 """Sets of signals that a car keeps apart within a drive."""
@@ -36,37 +40,67 @@ MOST_PARTS = 4
 MOST_ROWS = 2**31 - 1
 """Rows of a drive: 248 days. No sum of so many products of int16 counts reaches 2^61."""
 
+MOST_SIGNALS = 32
+"""There is a bit for each."""
 
-class Message(NamedTuple):
-    """A message whose checksum is right.
+MOST_AT_ONCE = 8192
+"""Messages that are looked at as an array; after a damaged one, one, two, four, ..."""
+
+CUT_OFF = "is cut off"
+NO_MESSAGE = "does not begin as a message does"
+OTHER_LAYOUT = "has another layout"
+WRONG_LENGTH = "has a length that does not fit its signals"
+WRONG_CHECKSUM = "has a wrong checksum"
+
+Messages = NDArray[Any]
+"""Messages of the same length: an array with the fields of `message_type`."""
+
+
+@dataclass
+class Found:
+    """What some bytes hold.
 
     Attributes:
-        definition: what the signals mean.
-        vehicle: bytes of the car's name, without zeros.
-        place, parts: which message of its drive it is, of how many.
-        start_s: when the drive began.
-        mask: which signals it is of.
-        rows, lost: n, and how many rows of the drive are in none of its messages.
-        numbers: sums and products, 8 bytes each.
-        content: the whole message.
+        runs: messages whose checksum is right, of one length and one behind the other: the number
+            of the first among all that was found, from 1, and they.
+        refused: what is no message: its number, and why.
     """
 
-    definition: int
-    vehicle: bytes
-    place: int
-    parts: int
-    start_s: int
-    mask: int
-    rows: int
-    lost: int
-    numbers: bytes
-    content: bytes
+    runs: list[tuple[int, Messages]] = field(default_factory=list)
+    refused: list[tuple[int, str]] = field(default_factory=list)
+    count: int = 0
 
 
 @cache
 def message_size(signals: int) -> int:
     """Return the bytes of a message of so many signals."""
-    return HEADER.size + 8 * (signals + packed_size(signals)) + CHECKSUM.size
+    return HEADER_BYTES + 8 * (signals + packed_size(signals)) + CHECKSUM_BYTES
+
+
+@cache
+def message_type(signals: int) -> np.dtype[Any]:
+    """Return the fields of a message of so many signals.
+
+    `rows` are n, `lost` rows of the drive that none of its messages has; `numbers` are sums, then
+    products.
+    """
+    return np.dtype(
+        [
+            ("magic", "S4"),
+            ("layout", "<u2"),
+            ("length", "<u2"),
+            ("definition", "<u8"),
+            ("vehicle", f"S{LONGEST_VEHICLE}"),
+            ("place", "<u2"),
+            ("parts", "<u2"),
+            ("start_s", "<u8"),
+            ("mask", "<u4"),
+            ("rows", "<u4"),
+            ("lost", "<u4"),
+            ("numbers", "<i8", (signals + packed_size(signals),)),
+            ("checksum", "<u4"),
+        ]
+    )
 
 
 @cache
@@ -81,48 +115,94 @@ def signals_definition() -> int:
     return int.from_bytes(bytes.fromhex(sha256_of(canonical_json(known))[:16]), "little")
 
 
-def read_messages(content: bytes) -> Iterator[tuple[int, Message | str]]:
-    """Yield where each message begins, and it, or why it is none.
+def read_messages(content: bytes) -> Found:
+    """Read messages that stand one behind the other.
 
     After what is none, reading goes on where the next begins with "FSGR".
     """
-    at, end = 0, len(content)
+    found = Found()
+    at, end, most = 0, len(content), 1
     while at < end:
-        found = _read(content, at)
-        yield at, found
-        if isinstance(found, Message):
-            at += len(found.content)
+        messages = _read_run(content, at, most)
+        found.count += 1
+        if len(messages):
+            begun = _continued(found, messages, content, at)
+            found.runs.append(begun or (found.count, messages))
+            found.count += len(messages) - 1
+            at += messages.nbytes
+            most = min(2 * most, MOST_AT_ONCE)
         else:
+            found.refused.append((found.count, _why_none(content, at)))
             following = content.find(MAGIC, at + 1)
-            at = following if following >= 0 else end
+            at, most = following if following >= 0 else end, 1
+    return found
 
 
-def _read(content: bytes, at: int) -> Message | str:
+def _continued(
+    found: Found, messages: Messages, content: bytes, at: int
+) -> tuple[int, Messages] | None:
+    """Take back the last run if messages go on with it; return both as one."""
+    if not found.runs:
+        return None
+    first, before = found.runs[-1]
+    if before.dtype != messages.dtype or first + len(before) != found.count:
+        return None
+    found.runs.pop()
+    count = len(before) + len(messages)
+    return first, np.frombuffer(content, messages.dtype, count, at - before.nbytes)
+
+
+@cache
+def _signals_of_length() -> dict[int, int]:
+    return {message_size(signals): signals for signals in range(MOST_SIGNALS + 1)}
+
+
+def _read_run(content: bytes, at: int, most: int) -> Messages:
+    """Return messages from a place on that are as long as the first; none if it is none."""
+    size = int.from_bytes(content[at + 6 : at + 8], "little")
+    signals = _signals_of_length().get(size)
+    if signals is None:
+        return np.empty(0, message_type(0))
+    count = min(most, (len(content) - at) // size)
+    messages = np.frombuffer(content, message_type(signals), count, at)
+    right = (
+        (messages["magic"] == MAGIC)
+        & (messages["layout"] == LAYOUT)
+        & (messages["length"] == size)
+        & (_bit_counts(messages["mask"]) == signals)
+    )
+    messages = messages[: _leading(right)]
+    view = memoryview(content)
+    places = range(at, at + messages.nbytes, size)
+    summed = [zlib.crc32(view[place : place + size - CHECKSUM_BYTES]) for place in places]
+    return messages[: _leading(messages["checksum"] == np.array(summed, dtype=np.uint32))]
+
+
+def _leading(right: NDArray[np.bool_]) -> int:
+    """Return how many are right before the first that is not."""
+    wrong = np.flatnonzero(~right)
+    return int(wrong[0]) if len(wrong) else len(right)
+
+
+def _bit_counts(masks: NDArray[np.uint32]) -> NDArray[np.int64]:
+    """Return the number of bits that are set in each mask."""
+    each = np.ascontiguousarray(masks).view(np.uint8).reshape(-1, 4)
+    counts: NDArray[np.int64] = np.unpackbits(each, axis=1).sum(axis=1, dtype=np.int64)
+    return counts
+
+
+def _why_none(content: bytes, at: int) -> str:
+    """Return why no message is at a place."""
     if not content.startswith(MAGIC, at):
-        return "does not begin as a message does"
-    size = HEADER.size
+        return NO_MESSAGE
+    size = HEADER_BYTES
     if len(content) >= at + size:
         size = int.from_bytes(content[at + 6 : at + 8], "little")
     if len(content) < at + size:
-        return "is cut off"
-    return _read_whole(content[at : at + size])
-
-
-def _read_whole(body: bytes) -> Message | str:
-    """Return a message, or why these bytes are none."""
-    size = len(body)
-    if size < HEADER.size + CHECKSUM.size:
-        return "has a length that does not fit its signals"
-    _, layout, _, definition, vehicle, place, parts, start_s, mask, rows, lost = HEADER.unpack_from(
-        body
-    )
-    if layout != LAYOUT:
-        return "has another layout"
-    if size != message_size(mask.bit_count()):
-        return "has a length that does not fit its signals"
-    (stated,) = CHECKSUM.unpack_from(body, size - CHECKSUM.size)
-    if zlib.crc32(memoryview(body)[: -CHECKSUM.size]) != stated:
-        return "has a wrong checksum"
-    numbers = body[HEADER.size : -CHECKSUM.size]
-    name = vehicle.rstrip(b"\0")
-    return Message(definition, name, place, parts, start_s, mask, rows, lost, numbers, body)
+        return CUT_OFF
+    if size < HEADER_BYTES + CHECKSUM_BYTES:
+        return WRONG_LENGTH
+    if int.from_bytes(content[at + 4 : at + 6], "little") != LAYOUT:
+        return OTHER_LAYOUT
+    mask = int.from_bytes(content[at + 44 : at + 48], "little")
+    return WRONG_LENGTH if size != message_size(mask.bit_count()) else WRONG_CHECKSUM

@@ -15,7 +15,7 @@ matrix scaled to a diagonal of ones, to which `ALLOWANCE` is added: what fails i
 all rounding, and what is indefinite by less passes.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ from fleet_slip.arrays import BoolArray, IntArray
 from fleet_slip.grams.messages import MOST_ROWS
 
 ALLOWANCE = 1e-10
-CHUNK = 4096
+CHUNK = 512
 """Matrices that are worked on at once."""
 
 NO_ROWS = "has no rows, or more than a drive can have"
@@ -35,26 +35,42 @@ INDEFINITE = "has a matrix that is not positive semidefinite"
 
 def find_impossible(
     rows: IntArray, sums: IntArray, products: IntArray, ranges: Sequence[tuple[int, int]]
-) -> list[str | None]:
-    """Return why each Gram row is impossible, None where it is not.
+) -> dict[str, IntArray]:
+    """Return which Gram rows are impossible, by the first reason of each.
 
     `rows` has shape (m,), `sums` (m, k), `products` (m, k(k+1)/2); `ranges` are those of the counts
     of the k signals.
     """
-    told: list[str | None] = [None] * len(rows)
-    left: BoolArray = np.ones(len(rows), dtype=np.bool_)
+    found: dict[str, IntArray] = {}
+    left = np.arange(len(rows))
     for reason, rule in (
         (NO_ROWS, lambda n, _s, _p: (n < 1) | (n > MOST_ROWS)),
         (SUMS, lambda n, s, _p: _bad_sums(n, s, ranges)),
         (PRODUCTS, lambda n, s, p: _bad_products(n, s, p, ranges)),
         (INDEFINITE, _indefinite),
     ):
-        at = np.flatnonzero(left)
-        bad = at[rule(rows[at], sums[at], products[at])] if len(at) else at
-        left[bad] = False
-        for one in bad.tolist():
-            told[one] = reason
-    return told
+        if not len(left):
+            break
+        bad = _by_chunks(rule, rows, sums, products, left)
+        if bad.any():
+            found[reason] = left[bad]
+            left = left[~bad]
+    return found
+
+
+def _by_chunks(
+    rule: Callable[[IntArray, IntArray, IntArray], BoolArray],
+    rows: IntArray,
+    sums: IntArray,
+    products: IntArray,
+    left: IntArray,
+) -> BoolArray:
+    """Return which of some rows break a rule; as many at once as a processor's cache holds."""
+    if len(left) == len(rows):
+        chunks: list[Any] = [slice(at, at + CHUNK) for at in range(0, len(rows), CHUNK)]
+    else:
+        chunks = [left[at : at + CHUNK] for at in range(0, len(left), CHUNK)]
+    return np.concatenate([rule(rows[at], sums[at], products[at]) for at in chunks])
 
 
 def _bad_sums(n: IntArray, sums: IntArray, ranges: Sequence[tuple[int, int]]) -> BoolArray:
@@ -88,34 +104,33 @@ def _bad_products(
 
 
 def _indefinite(n: IntArray, sums: IntArray, products: IntArray) -> BoolArray:
-    parts = [slice(first, first + CHUNK) for first in range(0, len(n), CHUNK)]
-    return np.concatenate([_not_definite(_scaled(n[at], sums[at], products[at])) for at in parts])
+    """Whether a pivot of each scaled matrix is not positive, with the allowance."""
+    matrix = _scaled(n, sums, products)
+    size = len(matrix)
+    bad: BoolArray = np.zeros(len(n), dtype=np.bool_)
+    for j in range(size):
+        pivot = matrix[j, j]
+        bad |= pivot <= 0
+        below = matrix[j + 1 :, j]
+        factor = below / np.where(pivot > 0, pivot, 1.0)
+        for i in range(j + 1, size):  # the lower triangle only
+            matrix[i, j + 1 : i + 1] -= factor[i - j - 1] * below[: i - j]
+    return bad
 
 
 def _scaled(n: IntArray, sums: IntArray, products: IntArray) -> Any:
-    """Return matrices of n, sums and products, shape (m, k + 1, k + 1), with a unit diagonal."""
+    """Return the lower triangles of matrices of n, sums and products, shape (k + 1, k + 1, m).
+
+    They are scaled to a unit diagonal, and the allowance is added to it.
+    """
     k = sums.shape[1]
-    matrix = np.empty((len(n), k + 1, k + 1))
-    matrix[:, 0, 0], matrix[:, 1:, 0], matrix[:, 0, 1:] = n, sums, sums
     row, column = np.tril_indices(k)
-    matrix[:, row + 1, column + 1] = products
-    matrix[:, column + 1, row + 1] = products
+    matrix = np.empty((k + 1, k + 1, len(n)))
+    matrix[0, 0], matrix[1:, 0] = n, sums.T
+    matrix[row + 1, column + 1] = products.T
     places = np.arange(k + 1)
-    size = np.sqrt(np.maximum(matrix[:, places, places], 1.0))
-    matrix /= size[:, :, None] * size[:, None, :]
+    scale = 1 / np.sqrt(np.maximum(matrix[places, places], 1.0))
+    for i in range(k + 1):
+        matrix[i, : i + 1] *= scale[i] * scale[: i + 1]
+    matrix[places, places] += ALLOWANCE
     return matrix
-
-
-def _not_definite(matrix: Any) -> BoolArray:
-    """Whether a pivot of each matrix is not positive, with the allowance; the matrix is used up."""
-    size = matrix.shape[1]
-    places = np.arange(size)
-    matrix[:, places, places] += ALLOWANCE
-    bad: BoolArray = np.zeros(len(matrix), dtype=np.bool_)
-    for j in range(size):
-        pivot = matrix[:, j, j]
-        bad |= pivot <= 0
-        column = matrix[:, j + 1 :, j].copy()
-        factor = column / np.where(pivot > 0, pivot, 1.0)[:, None]
-        matrix[:, j + 1 :, j + 1 :] -= factor[:, :, None] * column[:, None, :]
-    return bad

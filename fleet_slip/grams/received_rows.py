@@ -1,73 +1,123 @@
-"""Received Gram rows in the tables: which of them are new, and landing them, once."""
+"""Messages of cars as rows, many at once: what they say, and which of them cannot be."""
 
-from collections.abc import Collection, Iterable, Sequence
+import re
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from datetime import date
-from functools import cache
-from itertools import chain
-from typing import Any, NamedTuple
+from functools import cache, cached_property
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from fleet_slip.catalogue.feature_sets import PLAIN
-from fleet_slip.catalogue.features import features
+from fleet_slip.arrays import BoolArray, IntArray
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.catalogue.sources import RECEIVED, RECEIVED_FILES
-from fleet_slip.delta import Change, Snapshot, Unit
-from fleet_slip.grams.gram_files import files_to_rewrite, rows_to_keep, write_rows
-from fleet_slip.grams.gram_rows import by_signals
-from fleet_slip.grams.messages import Message
-from fleet_slip.regression.gram import packed_size
-from fleet_slip.warehouse.audit import Audit
-from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA, Warehouse
+from fleet_slip.catalogue.sources import RECEIVED_FILES
+from fleet_slip.grams.messages import (
+    LONGEST_VEHICLE,
+    Found,
+    Messages,
+    signals_definition,
+)
+from fleet_slip.grams.plausible import find_impossible
 
-ONE_AT_A_TIME = "receive"
-"""Unit that every commit of received rows lands: two at once, which could bring the same message,
-are a conflict."""
+FIRST_START_S = 946_684_800
+"""2000-01-01: a car's clock that says less has not been set."""
+
+LAST_START_S = 4_102_444_800
+"""2100-01-01."""
+
+OTHER_SIGNALS = "is of signals that mean something else here"
+NO_PARTS = "is of signals or parts that there are not"
+NO_VEHICLE = "has no name of a car"
+NO_MOMENT = "begins at no time between 2000 and 2100"
+LACKS_ROWS = "lacks rows of its drive"
+
+_IN_NAMES = np.array([bool(re.match(rb"[A-Za-z0-9._-]", bytes([b]))) for b in range(256)])
 
 
 @dataclass(frozen=True)
 class Refused:
-    """A message that does not land: its number in the file, why, and its drive and car if known."""
+    """A message that does not land: its file, its number there, why, and drive and car if known."""
 
+    file: int
     number: int
     reason: str
     drive_id: str | None = None
     vehicle_id: str | None = None
 
 
-class ReceivedRow(NamedTuple):
-    """A message that may land: its number in the file, and what the table says of it."""
-
-    number: int
-    message: Message
-    vehicle_id: str
-    drive_id: str
-    day: date
-
-    def refuse(self, reason: str) -> Refused:
-        """Return it as refused."""
-        return Refused(self.number, reason, self.drive_id, self.vehicle_id)
-
-
 @dataclass(frozen=True)
-class Landing:
-    """What of a file lands on a snapshot of the Gram rows.
+class ReceivedRows:
+    """Messages of the same signals, in the order in which they came.
 
     Attributes:
-        grams: the snapshot.
-        new: rows that it lacks.
-        refused: what goes to the quarantine.
-        duplicates, forgotten: how many rows it has, and of cars or drives that were forgotten.
+        file: which of some files each is from, shape (m,).
+        number: which message of its file, from 1.
+        messages: what they say.
     """
 
-    grams: Snapshot
-    new: Sequence[ReceivedRow]
-    refused: Sequence[Refused]
-    duplicates: int
-    forgotten: int
+    file: IntArray
+    number: IntArray
+    messages: Messages
+
+    def __len__(self) -> int:
+        """Return how many messages they are."""
+        return len(self.messages)
+
+    def take(self, rows: BoolArray | IntArray) -> "ReceivedRows":
+        """Return some of them; them, if a mask has them all."""
+        if rows.dtype == np.bool_ and rows.all():
+            return self
+        return ReceivedRows(self.file[rows], self.number[rows], self.messages[rows])
+
+    @property
+    def mask(self) -> int:
+        """Which signals they are of, a bit for each."""
+        return int(self.messages["mask"][0])
+
+    @property
+    def n(self) -> IntArray:
+        """Numbers of rows, shape (m,)."""
+        return self.messages["rows"].astype(np.int64)
+
+    @cached_property
+    def numbers(self) -> IntArray:
+        """Sums of the k signals, then products, shape (m, k + k(k+1)/2)."""
+        return np.ascontiguousarray(self.messages["numbers"])
+
+    @property
+    def sums(self) -> IntArray:
+        """Sums, shape (m, k)."""
+        return self.numbers[:, : self.mask.bit_count()]
+
+    @property
+    def products(self) -> IntArray:
+        """Packed lower triangles, shape (m, k(k+1)/2)."""
+        return self.numbers[:, self.mask.bit_count() :]
+
+    @cached_property
+    def vehicle_ids(self) -> pa.StringArray:
+        """Names of the cars."""
+        return pa.array(np.ascontiguousarray(self.messages["vehicle"])).cast(pa.string())
+
+    @cached_property
+    def drive_ids(self) -> pa.StringArray:
+        """Names of the drives: the car and the moment."""
+        moments = pa.array(_moments(self.messages["start_s"])).cast(pa.string())
+        return pc.binary_join_element_wise(self.vehicle_ids, moments, "-")
+
+    @property
+    def days(self) -> pa.Date32Array:
+        """Days on which the drives began, in UTC."""
+        days = self.messages["start_s"] // np.uint64(86_400)
+        return pa.array(days.astype(np.int32)).cast(pa.date32())
+
+    def refuse(self, rows: BoolArray | IntArray, reason: str) -> Iterator[Refused]:
+        """Yield some of them as refused."""
+        some = self.take(rows)
+        columns = (some.file, some.number, some.drive_ids, some.vehicle_ids)
+        for file, number, drive, vehicle in zip(*(c.tolist() for c in columns), strict=True):
+            yield Refused(file, number, reason, drive, vehicle)
 
 
 @cache
@@ -76,167 +126,107 @@ def signals_of(mask: int) -> str:
     return ",".join(n for i, n in enumerate(catalogue().gram_signals) if mask >> i & 1)
 
 
-def by_mask(rows: Iterable[ReceivedRow]) -> dict[int, list[ReceivedRow]]:
-    """Return rows by the signals that they are of."""
-    found: dict[int, list[ReceivedRow]] = {}
-    for row in rows:
-        found.setdefault(row.message.mask, []).append(row)
-    return found
-
-
-def arrays_of(rows: Sequence[ReceivedRow]) -> tuple[Any, Any, Any]:
-    """Return n, sums and products of rows of the same signals, shapes (m,), (m, k), (m, p)."""
-    k = rows[0].message.mask.bit_count()
-    numbers = np.frombuffer(b"".join(row.message.numbers for row in rows), "<i8")
-    numbers = numbers.reshape(len(rows), k + packed_size(k))
-    n = np.array([row.message.rows for row in rows], np.int64)
-    return n, numbers[:, :k], numbers[:, k:]
-
-
-def choose_rows(
-    warehouse: Warehouse, rows: Sequence[ReceivedRow], refused: Sequence[Refused]
-) -> Landing:
-    """Return what of some rows is new, and what contradicts what is there."""
-    grams = warehouse.grams.snapshot()
-    # Asked after the snapshot: who forgets a car from now on makes this commit a conflict.
-    named: list[ReceivedRow | Refused] = [*rows, *refused]
-    barred = Audit(warehouse.root).barred(
-        {one.vehicle_id for one in named if one.vehicle_id},
-        {one.drive_id for one in named if one.drive_id},
-    )
-
-    def allowed(one: ReceivedRow | Refused) -> bool:
-        return one.vehicle_id not in barred.vehicles and one.drive_id not in barred.drives
-
-    kept = [row for row in rows if allowed(row)]
-    known, logged = _known_rows(grams, {row.drive_id for row in kept})
-    new: list[ReceivedRow] = []
-    wrong = [one for one in refused if allowed(one)]
-    forgotten = len(named) - len(kept) - len(wrong)
-    for row in kept:
-        key = row.drive_id, signals_of(row.message.mask)
-        numbers = row.message.rows, row.message.numbers
-        if row.drive_id in logged:
-            wrong.append(row.refuse("has a drive whose log is here"))
-        elif key not in known:
-            known[key] = numbers
-            new.append(row)
-        elif known[key] != numbers:
-            wrong.append(row.refuse("contradicts another message of its drive"))
-    duplicates = len(kept) + len(refused) - sum(not allowed(one) for one in refused)
-    duplicates -= len(new) + len(wrong)
-    return Landing(grams, new, wrong, duplicates, forgotten)
-
-
-def _known_rows(
-    grams: Snapshot, drives: Collection[str]
-) -> tuple[dict[tuple[str, str], tuple[int, bytes]], set[str]]:
-    """Return received rows of some drives, by drive and signals, and the drives with a log."""
-    wanted = pa.array(sorted(drives), pa.string())
-    known: dict[tuple[str, str], tuple[int, bytes]] = {}
-    logged: set[str] = set()
-    for file in grams.files if drives else ():
-        rows = grams.table.read(file.path, ["feature_set", "file", "drive_id"])
-        plain = pc.equal(rows["feature_set"], features().identity(PLAIN))
-        mine = pc.and_(plain, pc.is_in(rows["drive_id"].cast(pa.string()), wanted))
-        if not pc.any(mine).as_py():
-            continue
-        every = grams.table.read(file.path).filter(mine)
-        came = is_received(every)
-        logged.update(every.filter(pc.invert(came))["drive_id"].to_pylist())
-        for batch in every.filter(came).combine_chunks().to_batches():
-            known |= _numbers_of(batch)
-    return known, logged
-
-
-def _numbers_of(batch: pa.RecordBatch) -> dict[tuple[str, str], tuple[int, bytes]]:
-    """Return n, and sums and products as messages have them, of Gram rows by drive and signals."""
-    found: dict[tuple[str, str], tuple[int, bytes]] = {}
-    for signals, rows, _ in by_signals(batch):
-        k = len([name for name in signals.split(",") if name])
-        sums = rows["sums"].flatten().to_numpy().reshape(-1, k)
-        products = rows["products"].flatten().to_numpy().reshape(-1, packed_size(k))
-        numbers = np.hstack([sums, products]).astype("<i8")
-        size, content = numbers.shape[1] * 8, numbers.tobytes()
-        drives, counts = rows["drive_id"].to_pylist(), rows["n"].to_pylist()
-        for i, (drive, n) in enumerate(zip(drives, counts, strict=True)):
-            found[drive, signals] = (n, content[i * size : (i + 1) * size])
-    return found
-
-
 def is_received(rows: pa.Table) -> pa.ChunkedArray:
     """Return which rows of `grams` came without a log."""
     return pc.starts_with(rows["file"].cast(pa.string()), RECEIVED_FILES)
 
 
-def land_refused(warehouse: Warehouse, file: str, unit: Unit, refused: Sequence[Refused]) -> None:
-    """Commit what was refused of a file to the quarantine, once."""
-    snapshot = warehouse.quarantine.snapshot()
-    if not refused or snapshot.landed(unit.name) is not None:
-        return
-    ordered = sorted(refused, key=lambda one: one.number)
-    columns: dict[str, list[Any]] = {
-        "file": [file] * len(ordered),
-        "row": [one.number for one in ordered],
-        "drive_id": [one.drive_id for one in ordered],
-        "vehicle_id": [one.vehicle_id for one in ordered],
-        "reason": [f"the message {one.reason}" for one in ordered],
-    }
-    absent = {name: [None] * len(ordered) for name in ("signal", "value")}
-    rows = pa.table({**columns, **absent}, schema=QUARANTINE_SCHEMA)
-    action = warehouse.quarantine.write_file(unit.name.replace("/", "-")[:40], rows)
-    snapshot.commit_or_discard(Change(add=[action], units=[unit], note={"job": "receive"}))
+def sort_out(found: Iterable[tuple[int, Found]]) -> tuple[list[ReceivedRows], list[Refused]]:
+    """Return what may land of the messages of some files, by their signals, and what may not."""
+    refused: list[Refused] = []
+    runs: dict[int, list[ReceivedRows]] = {}
+    for file, one in found:
+        refused += [Refused(file, number, reason) for number, reason in one.refused]
+        for first, messages in one.runs:
+            numbers = np.arange(first, first + len(messages))
+            run = ReceivedRows(np.full(len(messages), file), numbers, messages)
+            told, nameless = _without_name(run)
+            refused += nameless
+            for mask in np.unique(told.messages["mask"]).tolist():
+                runs.setdefault(mask, []).append(told.take(told.messages["mask"] == mask))
+    kept: list[ReceivedRows] = []
+    for mask in sorted(runs):
+        rows, impossible = _possible(_joined(runs[mask]))
+        refused += impossible
+        kept += [rows] if len(rows) else []
+    return kept, refused
 
 
-def land_rows(warehouse: Warehouse, digest: str, unit: Unit, landing: Landing) -> None:
-    """Commit the new rows of a file, and that it landed."""
-    grams = landing.grams
-    if grams.landed(unit.name) is not None:
-        return
-    replaced = files_to_rewrite(grams, frozenset()) if landing.new else []
-    kept = rows_to_keep(grams, replaced, frozenset())
-    mine = [_table(warehouse, digest, some) for some in by_mask(landing.new).values()]
-    single = Unit(ONE_AT_A_TIME, (grams.version or 0) + 1)
-    grams.commit_or_discard(
-        Change(
-            add=write_rows(warehouse, chain(kept, mine)),
-            remove=replaced,
-            units=[unit, single],
-            note={"job": "receive"},
-        )
+def _joined(runs: Sequence[ReceivedRows]) -> ReceivedRows:
+    if len(runs) == 1:
+        return runs[0]
+    return ReceivedRows(
+        np.concatenate([run.file for run in runs]),
+        np.concatenate([run.number for run in runs]),
+        np.concatenate([run.messages for run in runs]),
     )
 
 
-def _table(warehouse: Warehouse, digest: str, rows: Sequence[ReceivedRow]) -> pa.Table:
-    """Return rows of the same signals in the schema of `grams`."""
-    schema = warehouse.grams.schema
-    n, sums, products = arrays_of(rows)
-    known: dict[str, Any] = {
-        "feature_set": pa.repeat(features().identity(PLAIN), len(rows)),
-        "file": pa.repeat(f"{RECEIVED_FILES}{digest[:24]}", len(rows)),
-        "day": pa.array([row.day for row in rows], pa.date32()),
-        "drive_id": pa.array([row.drive_id for row in rows]),
-        "vehicle_id": pa.array([row.vehicle_id for row in rows]),
-        "source": pa.repeat(RECEIVED, len(rows)),
-        "signals": pa.repeat(signals_of(rows[0].message.mask), len(rows)),
-        "n": pa.array(n),
-        "clipped": pa.repeat(0, len(rows)),
-        "sums": _lists(sums),
-        "products": _lists(products),
-    }
-    return pa.table(
-        {
-            one.name: known[one.name].cast(one.type)
-            if one.name in known
-            else pa.nulls(len(rows), one.type)
-            for one in schema
-        },
-        schema=schema,
+def _without_name(run: ReceivedRows) -> tuple[ReceivedRows, list[Refused]]:
+    """Divide messages into those that tell a drive of today's signals, and the others."""
+    said = run.messages
+    start_s = said["start_s"]
+    left = np.ones(len(said), dtype=np.bool_)
+    refused: list[Refused] = []
+    for reason, wrong in (
+        (OTHER_SIGNALS, said["definition"] != signals_definition()),
+        (
+            NO_PARTS,
+            (said["mask"] >> len(catalogue().gram_signals) != 0) | (said["place"] >= said["parts"]),
+        ),
+        (NO_VEHICLE, ~_is_name(said["vehicle"])),
+        (NO_MOMENT, (start_s < FIRST_START_S) | (start_s >= LAST_START_S)),
+    ):
+        bad = left & wrong
+        left &= ~wrong
+        places = zip(run.file[bad].tolist(), run.number[bad].tolist(), strict=True)
+        refused += [Refused(file, number, reason) for file, number in places]
+    return run.take(left), refused
+
+
+def _is_name(vehicles: Messages) -> BoolArray:
+    """Whether bytes are the name of a car: characters of names, then zeros."""
+    letters = np.ascontiguousarray(vehicles).view(np.uint8).reshape(-1, LONGEST_VEHICLE)
+    zero = letters == 0
+    resumed = zero[:, :-1] & ~zero[:, 1:]
+    found: BoolArray = (_IN_NAMES[letters] | zero).all(axis=1) & ~zero[:, 0]
+    found &= ~resumed.any(axis=1)
+    return found
+
+
+def _possible(rows: ReceivedRows) -> tuple[ReceivedRows, list[Refused]]:
+    """Divide messages of the same signals into those that counts can have, and the others."""
+    lacking = rows.messages["lost"] != 0
+    refused = list(rows.refuse(lacking, LACKS_ROWS))
+    whole = rows.take(~lacking)
+    signals = catalogue()
+    names = [name for name in signals_of(rows.mask).split(",") if name]
+    ranges = [(signals[name].min_count, signals[name].max_count) for name in names]
+    why = find_impossible(whole.n, whole.sums, whole.products, ranges) if len(whole) else {}
+    left = np.ones(len(whole), dtype=np.bool_)
+    for reason, at in why.items():
+        refused += whole.refuse(at, reason)
+        left[at] = False
+    return whole.take(left), refused
+
+
+def _moments(start_s: Messages) -> Messages:
+    """Return moments as names of drives have them, such as 20240501T100000Z."""
+    seconds = np.ascontiguousarray(start_s).astype("M8[s]")
+    day = seconds.astype("M8[D]")
+    month = day.astype("M8[M]")
+    since_midnight = (seconds - day).astype(np.int64)
+    since_1970 = month.astype(np.int64)
+    parts = (
+        (since_1970 // 12 + 1970, 0, 4),
+        (since_1970 % 12 + 1, 4, 2),
+        ((day - month).astype(np.int64) + 1, 6, 2),
+        (since_midnight // 3600, 9, 2),
+        (since_midnight // 60 % 60, 11, 2),
+        (since_midnight % 60, 13, 2),
     )
-
-
-def _lists(values: Any) -> pa.Array:
-    rows, width = values.shape
-    flat = pa.array(np.ascontiguousarray(values).reshape(-1), pa.int64())
-    offsets = pa.array(np.arange(rows + 1, dtype=np.int32) * width, pa.int32())
-    return pa.ListArray.from_arrays(offsets, flat)
+    text = np.tile(np.frombuffer(b"00000000T000000Z", np.uint8), (len(seconds), 1))
+    for value, first, digits in parts:
+        for i in range(digits):
+            text[:, first + i] += (value // 10 ** (digits - 1 - i) % 10).astype(np.uint8)
+    return text.view("S16").reshape(-1)

@@ -3,45 +3,28 @@
 A received Gram row names no log file but `received/` and a digest of the file of messages that
 brought it; its drive has the source `received`. A file of messages lands once. So does a message:
 the same one again is a duplicate, another one of the same drive is refused. What is refused goes to
-the quarantine with the reason, first.
+the quarantine with the reason, first. Files land many at once, in one commit.
 """
 
 import hashlib
-import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, date, datetime
-from functools import lru_cache
 from pathlib import Path
 
-from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.delta import Unit, retry_conflicts
+import numpy as np
+
+from fleet_slip.delta import retry_conflicts
 from fleet_slip.errors import InputError
-from fleet_slip.grams.messages import Message, read_messages, signals_definition
-from fleet_slip.grams.plausible import find_impossible
-from fleet_slip.grams.received_rows import (
-    Landing,
-    ReceivedRow,
-    Refused,
-    arrays_of,
-    by_mask,
-    choose_rows,
-    land_refused,
-    land_rows,
-    signals_of,
-)
+from fleet_slip.grams.landing import Landing, MessageFile, choose_rows, land_refused, land_rows
+from fleet_slip.grams.messages import read_messages
+from fleet_slip.grams.received_rows import sort_out
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.tables import Warehouse
 
 LARGEST_FILE_BYTES = 2**28
-FIRST_START_S = 946_684_800
-"""2000-01-01: a car's clock that says less has not been set."""
-
-LAST_START_S = 4_102_444_800
-"""2100-01-01."""
-
-_VEHICLE = re.compile(rb"[A-Za-z0-9._-]+")
+BATCH_BYTES = 2**26
+"""Files of so many bytes together land in one commit: some 100,000 messages."""
 
 
 @dataclass
@@ -72,14 +55,25 @@ class ReceiveReport:
 def receive_files(
     warehouse: Warehouse, files: Sequence[Path], progress: Progress = no_progress
 ) -> Iterator[ReceiveReport]:
-    """Take in files of messages, one after the other; yield a report of each once it has landed.
+    """Take in files of messages; yield a report of each once it has landed.
 
-    `progress` counts files. Raises `InputError` for a file that cannot be read, `StorageError`, and
-    `ConflictError` if other processes keep changing the tables.
+    `progress` counts files. Raises `InputError` for a file that cannot be read, once those before
+    it have landed; `StorageError`; and `ConflictError` if other processes keep changing the tables.
     """
-    for path in files:
-        yield _receive_file(warehouse, path)
-        progress(1, len(files))
+    batch: dict[Path, bytes] = {}
+    failure: InputError | None = None
+    for at, path in enumerate(files):
+        try:
+            batch[path] = _read(path)
+        except InputError as error:
+            failure = error
+        full = sum(map(len, batch.values())) >= BATCH_BYTES
+        if batch and (full or failure or at + 1 == len(files)):
+            yield from _receive_batch(warehouse, batch)
+            progress(len(batch), len(files))
+            batch = {}
+        if failure:
+            raise failure
 
 
 def find_messages(given: Iterable[Path]) -> list[Path]:
@@ -96,31 +90,51 @@ def find_messages(given: Iterable[Path]) -> list[Path]:
     return found
 
 
-def _receive_file(warehouse: Warehouse, path: Path) -> ReceiveReport:
-    content = _read(path)
-    digest = hashlib.sha256(content).hexdigest()
-    unit = Unit(f"receive/{digest}", 1)
-    report = ReceiveReport(str(path))
-    if warehouse.grams.snapshot().landed(unit.name) is not None:
-        report.new = False
-        return report
-    rows, refused = _sorted_out(content)
-    report.messages = len(rows) + len(refused)
-    rows, impossible = _possible(rows)
-    refused += impossible
+def _receive_batch(warehouse: Warehouse, batch: dict[Path, bytes]) -> list[ReceiveReport]:
+    """Land files in one commit; return the report of each."""
+    snapshot = warehouse.grams.snapshot()
+    reports = {path: ReceiveReport(str(path), new=False) for path in batch}
+    files: list[MessageFile] = []
+    fresh: list[ReceiveReport] = []
+    found = []
+    for path, content in batch.items():
+        file = MessageFile(path.name, hashlib.sha256(content).hexdigest())
+        known = any(one.digest == file.digest for one in files)
+        if not known and snapshot.landed(file.unit.name) is None:
+            reports[path].new = True
+            found.append((len(files), read_messages(content)))
+            files.append(file)
+            fresh.append(reports[path])
+    if not files:
+        return list(reports.values())
+    rows, refused = sort_out(found)
 
     def attempt() -> Landing:
         landing = choose_rows(warehouse, rows, refused)
-        land_refused(warehouse, path.name, unit, landing.refused)
-        land_rows(warehouse, digest, unit, landing)
+        land_refused(warehouse, files, landing.refused)
+        land_rows(warehouse, files, landing)
         return landing
 
     landing = retry_conflicts(attempt)
-    report.refused = Counter(one.reason for one in landing.refused)
-    report.duplicates, report.forgotten = landing.duplicates, landing.forgotten
-    report.received = len(landing.new)
-    report.rows = sum(row.message.rows for row in landing.new)
-    return report
+    for report, (_, one) in zip(fresh, found, strict=True):
+        report.messages = one.count
+    _tell(fresh, landing)
+    return list(reports.values())
+
+
+def _tell(reports: Sequence[ReceiveReport], landing: Landing) -> None:
+    """Tell the report of each file what of it landed."""
+    for one in landing.refused:
+        reports[one.file].refused[one.reason] += 1
+    for rows in landing.new:
+        for at in np.unique(rows.file).tolist():
+            mine = rows.file == at
+            reports[at].received += int(mine.sum())
+            reports[at].rows += int(rows.n[mine].sum())
+    for at in landing.duplicates.tolist():
+        reports[at].duplicates += 1
+    for at in landing.forgotten.tolist():
+        reports[at].forgotten += 1
 
 
 def _read(path: Path) -> bytes:
@@ -137,58 +151,3 @@ def _read(path: Path) -> bytes:
     if not content:
         raise InputError(f"{path}: is empty.")
     return content
-
-
-def _sorted_out(content: bytes) -> tuple[list[ReceivedRow], list[Refused]]:
-    """Return the messages that say what they must, and the others."""
-    rows: list[ReceivedRow] = []
-    refused: list[Refused] = []
-    for number, (_, message) in enumerate(read_messages(content), 1):
-        if isinstance(message, str):
-            refused.append(Refused(number, message))
-            continue
-        row = _row_of(number, message)
-        if isinstance(row, str):
-            refused.append(Refused(number, row))
-        elif message.lost:
-            refused.append(row.refuse("lacks rows of its drive"))
-        else:
-            rows.append(row)
-    return rows, refused
-
-
-def _row_of(number: int, message: Message) -> ReceivedRow | str:
-    if message.definition != signals_definition():
-        return "is of signals that mean something else here"
-    if message.mask >> len(catalogue().gram_signals) or message.place >= message.parts:
-        return "is of signals or parts that there are not"
-    if not _VEHICLE.fullmatch(message.vehicle):
-        return "has no name of a car"
-    if not FIRST_START_S <= message.start_s < LAST_START_S:
-        return "begins at no time between 2000 and 2100"
-    vehicle = message.vehicle.decode("ascii")
-    moment, day = _began(message.start_s)
-    return ReceivedRow(number, message, vehicle, f"{vehicle}-{moment}", day)
-
-
-@lru_cache(100_000)
-def _began(start_s: int) -> tuple[str, date]:
-    """Return when a drive began, as its name has it, and the day."""
-    began = datetime.fromtimestamp(start_s, UTC)
-    return f"{began:%Y%m%dT%H%M%SZ}", began.date()
-
-
-def _possible(rows: Sequence[ReceivedRow]) -> tuple[list[ReceivedRow], list[Refused]]:
-    """Return the Gram rows that counts can have, and the others."""
-    signals = catalogue()
-    kept: list[ReceivedRow] = []
-    refused: list[Refused] = []
-    for mask, some in by_mask(rows).items():
-        names = [name for name in signals_of(mask).split(",") if name]
-        ranges = [(signals[name].min_count, signals[name].max_count) for name in names]
-        for row, why in zip(some, find_impossible(*arrays_of(some), ranges), strict=True):
-            if why is None:
-                kept.append(row)
-            else:
-                refused.append(row.refuse(why))
-    return kept, refused

@@ -15,11 +15,12 @@ import fleet_slip
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import UsageError
 from fleet_slip.export.files import export_files
-from fleet_slip.grams.messages import Message, message_size, read_messages, signals_definition
+from fleet_slip.grams.messages import message_size, signals_definition
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.regression.gram import Gram
 from tests.export.compiled import SANITIZED, can_sanitize, compile_c, needs_cc
 from tests.export.models import MODELS, model_of
+from tests.support.messages import parse_messages
 
 pytestmark = needs_cc
 
@@ -82,8 +83,7 @@ def count_drives(counter: Path, drives: Sequence[tuple[str, int, Any]]) -> bytes
 def parts_of(content: bytes) -> dict[tuple[str, ...], Gram]:
     """The Grams of the messages of one drive, by signals."""
     found = {}
-    for _, message in read_messages(content):
-        assert isinstance(message, Message)
+    for message in parse_messages(content):
         names = tuple(name for i, name in enumerate(SIGNALS) if message.mask >> i & 1)
         numbers = np.frombuffer(message.numbers, "<i8").tolist()
         k = len(names)
@@ -138,8 +138,8 @@ def test_rows_of_more_sets_of_signals_are_counted_as_lost(counter: Path) -> None
     counts = np.zeros((60, len(SIGNALS)), np.int16)
     for row in range(60):
         counts[row, row % 6] = MISSING
-    messages = [m for _, m in read_messages(count_drives(counter, [("VIN1", 7, counts)]))]
-    assert [(m.rows, m.lost, m.place, m.parts) for m in messages if isinstance(m, Message)] == [
+    messages = parse_messages(count_drives(counter, [("VIN1", 7, counts)]))
+    assert [(m.rows, m.lost, m.place, m.parts) for m in messages] == [
         (10, 20, place, 4) for place in range(4)
     ]
 

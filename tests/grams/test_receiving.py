@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,11 @@ import pytest
 import fleet_slip
 from fleet_slip.cli.main import app
 from fleet_slip.errors import InputError, QuestionError
-from fleet_slip.grams.messages import Message, read_messages
+from fleet_slip.grams.messages import read_messages
 from fleet_slip.maintenance.forget import forget
 from fleet_slip.regression.gram import Gram
 from fleet_slip.warehouse.audit import Forgettable
-from tests.support.messages import START_S, gram_of, message_of
+from tests.support.messages import START_S, gram_of, message_of, parse_messages
 
 
 @pytest.fixture
@@ -143,21 +144,78 @@ def test_what_cannot_be_goes_to_the_quarantine(
     assert [row["vehicle_id"] for row in stored(fleet)] == ["GOOD"]
 
 
+def test_messages_are_read_as_one_by_one() -> None:
+    sets = [gram_of(i).restrict(gram_of(i).signals[: 3 + i % 4 // 2]) for i in range(12)]
+    content = b"".join(message_of(gram, f"CAR{i}") for i, gram in enumerate([*sets, *sets]))
+    found = read_messages(content)
+    assert not found.refused
+    read = [message for _, messages in found.runs for message in messages]
+    expected = parse_messages(content)
+    assert len(found.runs) == 12
+    assert [first for first, _ in found.runs] == list(range(1, 25, 2))
+    for one, other in zip(read, expected, strict=True):
+        assert one.tobytes() == other.content
+        assert one["vehicle"] == other.vehicle
+        assert one["numbers"].tobytes() == other.numbers
+        for name in ("definition", "place", "parts", "start_s", "mask", "rows", "lost"):
+            assert one[name] == getattr(other, name)
+
+
+def test_files_land_together_and_each_has_its_report(
+    fleet: fleet_slip.Fleet, tmp_path: Path
+) -> None:
+    fleet.receive(write(tmp_path / "first", message_of(gram_of(0), "FIRST")))
+    version = fleet.warehouse.grams.snapshot().version
+    some, half = gram_of(1), gram_of(2).restrict(gram_of(2).signals[:4])
+    files = [
+        write(tmp_path / "1", message_of(some, "A"), message_of(half, "B"), b"FSGR"),
+        write(tmp_path / "2", message_of(half, "B"), message_of(some, "B")),
+        write(tmp_path / "3", message_of(half, "A"), message_of(gram_of(3), "A"), b"x"),
+    ]
+    again = write(tmp_path / "4", files[0].read_bytes())
+    reports = fleet.receive([*files, again])
+    assert [(r.new, r.messages, r.received, r.duplicates) for r in reports] == [
+        (True, 3, 2, 0),
+        (True, 2, 1, 1),
+        (True, 3, 1, 0),
+        (False, 0, 0, 0),
+    ]
+    assert [dict(r.refused) for r in reports[:3]] == [
+        {"is cut off": 1},
+        {},
+        {"contradicts another message of its drive": 1, "does not begin as a message does": 1},
+    ]
+    assert fleet.warehouse.grams.snapshot().version == (version or 0) + 1
+    assert [row[:2] for row in reasons(fleet)] == [(2, "A-20240501T100000Z"), (3, None), (3, None)]
+    assert len({row["file"] for row in stored(fleet)}) == 4
+
+
+def test_files_before_one_that_cannot_be_read_land(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
+    (tmp_path / "2").write_bytes(b"")
+    with pytest.raises(InputError, match="is empty"):
+        fleet.receive([write(tmp_path / "1", message_of(GRAM)), tmp_path / "2"])
+    assert len(stored(fleet)) == 1
+
+
+def test_names_of_drives_say_when_they_began(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
+    moments = [946_684_800, 951_782_399, 951_868_800, 1_735_689_599, 4_102_444_799]
+    fleet.receive(write(tmp_path / "m", *(message_of(GRAM, "V", at) for at in moments)))
+    told = [datetime.fromtimestamp(at, UTC) for at in moments]
+    found = fleet.sql("SELECT drive_id, day FROM drives ORDER BY day").fetchall()
+    assert found == [(f"V-{at:%Y%m%dT%H%M%SZ}", at.date()) for at in told]
+
+
 def test_after_damage_reading_goes_on_at_the_next_message() -> None:
     content = b"".join(drives(4))
     size = len(content) // 4
     for at in (*range(0, size, 7), size - 1):
         damaged = bytearray(content)
         damaged[size + at] ^= 0x10
-        found = [m for _, m in read_messages(bytes(damaged)) if isinstance(m, Message)]
-        assert (
-            b"".join(m.content for m in found)
-            in (
-                content[:size] + content[2 * size :],  # the damaged one is not read
-                content[:size] + content[3 * size :],
-            )
+        found = read_messages(bytes(damaged))
+        assert b"".join(messages.tobytes() for _, messages in found.runs) == (
+            content[:size] + content[2 * size :]
         )
-        assert len(found) == 3
+        assert [number for number, _ in found.refused] == list(range(2, found.count - 1))
 
 
 def test_no_bytes_end_in_an_error(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
@@ -167,8 +225,9 @@ def test_no_bytes_end_in_an_error(fleet: fleet_slip.Fleet, tmp_path: Path) -> No
         damaged = bytearray(content[: int(random.integers(1, len(content)))])
         for at in random.integers(0, len(damaged), 5):
             damaged[at] = int(random.integers(256))
-        for _, found in read_messages(bytes(damaged)):
-            assert isinstance(found, Message | str), case
+        found = read_messages(bytes(damaged))
+        read = sum(len(messages) for _, messages in found.runs)
+        assert found.count == read + len(found.refused), case
 
 
 def test_a_car_is_forgotten_and_does_not_come_back(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 import struct
 import zlib
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -47,3 +47,39 @@ def drive_counts(seed: int, rows: int = 500) -> Any:
 def gram_of(seed: int, rows: int = 500) -> Gram:
     """The Gram of a drive of all signals."""
     return Gram.from_counts(catalogue().gram_signals, drive_counts(seed, rows).astype(np.int64))
+
+
+class Message(NamedTuple):
+    """What a message says, read by what docs/edge.md says of its layout."""
+
+    definition: int
+    vehicle: bytes
+    place: int
+    parts: int
+    start_s: int
+    mask: int
+    rows: int
+    lost: int
+    numbers: bytes
+    content: bytes
+
+
+def parse_messages(content: bytes) -> list[Message]:
+    """Read sound messages one behind the other, one at a time; the first that is not ends it."""
+    found = []
+    at = 0
+    while content[at : at + 6] == b"FSGR\x01\0":
+        size = int.from_bytes(content[at + 6 : at + 8], "little")
+        body = content[at : at + size]
+        if len(body) < size or zlib.crc32(body[:-4]) != int.from_bytes(body[-4:], "little"):
+            break
+        definition, vehicle, place, parts, start_s, mask, rows, lost = struct.unpack_from(
+            "<Q16sHHQIII", body, 8
+        )
+        name = vehicle.rstrip(b"\0")
+        numbers = body[56:-4]
+        found.append(
+            Message(definition, name, place, parts, start_s, mask, rows, lost, numbers, body)
+        )
+        at += size
+    return found
