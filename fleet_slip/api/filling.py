@@ -158,14 +158,15 @@ class Filling(Rooted):
 
         A preview tells rows, drives, what would be rejected, the range of each signal, and what
         looks wrong in the longest drive: a sign, a unit, swapped wheels, a delay of the label.
-        Raises like `ingest`.
+        Of a folder every log is read. Raises like `ingest`.
         """
+        from fleet_slip.ingest.folders import find_logs
         from fleet_slip.ingest.mapping import load_mapping
         from fleet_slip.ingest.preview import preview_file
 
         plan = load_mapping(mapping) if isinstance(mapping, str) else mapping
         paths = [files] if isinstance(files, Path | str) else files
-        return [preview_file(Path(file), plan) for file in paths]
+        return [preview_file(file, plan) for file in find_logs(map(Path, paths))]
 
     @record_call
     def gram(

@@ -172,6 +172,9 @@ class Night:
         alike = {name for one in reports for names in one.look_alikes for name in names}
         if alike:
             return "attention", f"{told} Names that look the same: {', '.join(sorted(alike))}."
+        if wrong := {str(found): one.file for one in reports for found in one.suspicions}:
+            found, file = next(iter(wrong.items()))
+            return "attention", f"{told} {file}: looks wrong: {found}"
         return "done", told
 
     def _gram(self) -> Told:

@@ -157,7 +157,7 @@ def ingest(
         show_previews(fleet.preview(files, mapping), plot, json)
         return
     folders = any(file.is_dir() for file in files)
-    each = _warn_of_look_alikes if json or folders else _say_ingested
+    each = Remarks(quiet=json or folders)
     with recording(fleet.root, "ingest", sys.argv[1:]), ExitStack() as shown:
         show = shown.enter_context(progress("ingest", "files")) if folders else None
         reports = fleet.ingest(files, mapping, workers=cluster, each=each, progress=show)
@@ -180,14 +180,24 @@ def _summed_up(reports: "list[IngestReport]") -> str:
     )
 
 
-def _say_ingested(report: "IngestReport") -> None:
-    say(_ingested(report.as_dict()))
-    _warn_of_look_alikes(report)
+class Remarks:
+    """Says what became of each file, and once what looks wrong in several."""
 
+    def __init__(self, *, quiet: bool) -> None:
+        """Say of what became of files nothing, if it is said elsewhere."""
+        self._quiet = quiet
+        self._told: set[tuple[str, tuple[str, ...]]] = set()
 
-def _warn_of_look_alikes(report: "IngestReport") -> None:
-    for names in report.look_alikes:
-        say(_look_alike(report.file, names), logging.WARNING)
+    def __call__(self, report: "IngestReport") -> None:
+        """Say what is to be said of a file."""
+        if not self._quiet:
+            say(_ingested(report.as_dict()))
+        for names in report.look_alikes:
+            say(_look_alike(report.file, names), logging.WARNING)
+        for one in report.suspicions:
+            if (one.kind, one.signals) not in self._told:
+                self._told.add((one.kind, one.signals))
+                say(f"{report.file}: looks wrong: {one}", logging.WARNING)
 
 
 def _look_alike(file: str, names: tuple[str, ...]) -> str:

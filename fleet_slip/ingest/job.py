@@ -13,6 +13,7 @@ from fleet_slip.ingest.folders import KnownFiles
 from fleet_slip.ingest.landing import AskedFile, FileOutcome, Landing, unit_of, write_batch
 from fleet_slip.ingest.look_alikes import find_vehicles_like
 from fleet_slip.ingest.mapping import Mapping
+from fleet_slip.ingest.suspicion import Suspicion
 from fleet_slip.ingest.totals import IngestCounts
 from fleet_slip.warehouse.tables import Warehouse
 from fleet_slip.words import number_of
@@ -34,6 +35,8 @@ class IngestReport:
     """Names that differ only in their Unicode form: in the file, or of cars in the logs."""
     drives_forgotten: int = 0
     """Drives that were left out: of cars that were forgotten, or forgotten themselves."""
+    suspicions: tuple[Suspicion, ...] = ()
+    """What looks wrong in its longest drive; of small files that land together, in one of all."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `ingest --json` prints."""
@@ -50,6 +53,7 @@ class IngestReport:
             "drives_resampled": self.counts.drives_resampled,
             "ticks": self.counts.ticks,
             "look_alikes": self.look_alikes,
+            "suspicions": [vars(one) for one in self.suspicions],
         }
 
 
@@ -120,7 +124,10 @@ def _report(warehouse: Warehouse, outcome: FileOutcome, new: frozenset[str]) -> 
     is_new = unit_of(outcome.digest).name in new
     vehicles = find_vehicles_like(warehouse, outcome.vehicles) if is_new else ()
     look_alikes = tuple(sorted({*outcome.look_alikes, *vehicles}))
-    return IngestReport(str(outcome.file), is_new, outcome.counts, look_alikes, outcome.left_out)
+    suspicions = outcome.suspicions if is_new else ()
+    return IngestReport(
+        str(outcome.file), is_new, outcome.counts, look_alikes, outcome.left_out, suspicions
+    )
 
 
 def _joined(failures: list[InputError]) -> InputError:

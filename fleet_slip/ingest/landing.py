@@ -13,7 +13,10 @@ from fleet_slip.delta import Change, Snapshot, Table, Unit, retry_conflicts
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import shown
 from fleet_slip.ingest.mapping import Mapping
+from fleet_slip.ingest.measured_drives import MeasuredDrive
+from fleet_slip.ingest.preview import signals_of
 from fleet_slip.ingest.stream import MeasuredStream, open_measured
+from fleet_slip.ingest.suspicion import Suspicion, find_suspicions
 from fleet_slip.ingest.totals import IngestCounts
 from fleet_slip.ingest.writing import FILE_ROWS, DataFiles, FileWriter, TableName, WrittenFile
 from fleet_slip.warehouse.audit import Audit
@@ -39,6 +42,7 @@ class FileOutcome:
     vehicles: frozenset[str] = frozenset()
     drives: frozenset[str] = frozenset()
     left_out: int = 0
+    suspicions: tuple[Suspicion, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -85,8 +89,10 @@ def write_batch(
     """Read files, and write their rows together: one data file a day. Nothing is committed.
 
     A file that cannot be used is a failure of its own, and nothing of it is written. What landed
-    before is not written again.
+    before is not written again. The longest drive of what is new is looked at: one of a batch, so
+    that a folder of small files is not held up.
     """
+    longest: tuple[int, MeasuredDrive] | None = None
     outcomes: list[FileOutcome] = []
     failures: list[InputError] = []
     snapshots: dict[TableName, Snapshot] = {
@@ -114,8 +120,15 @@ def write_batch(
                 failures.append(error)
                 continue
             outcomes.append(_outcome(asked.file, stream, written, new="logs" in missing))
+            drive = written.longest if missing else None
+            if drive and (longest is None or drive.ticks.size > longest[1].ticks.size):
+                longest = len(outcomes) - 1, drive
             for name in missing:
                 parts[name].add(stream.digest, written.rest.get(name), written.files[name])
+        if longest is not None:
+            number, drive = longest
+            found = tuple(find_suspicions(signals_of(drive)))
+            outcomes[number] = replace(outcomes[number], suspicions=found)
         done = {name: part.finish() for name, part in parts.items()}
     return WrittenBatch(tuple(outcomes), tuple(failures), done["quarantine"], done["logs"])
 

@@ -21,6 +21,7 @@ Signals: TypeAlias = Mapping[str, FloatArray]
 RADIUS_M, TRACK_M = 0.31, 1.55
 """Of a passenger car: what is looked for is a factor of 3.6, 9.8 or 57."""
 WHEELS = ("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")
+ROAD_WHEELS = ("steer_fl", "steer")
 FEWEST_TICKS = 200
 LEAST_CORRELATION = 0.6
 MOVING_MPS = 2.0
@@ -68,11 +69,11 @@ def find_suspicions(signals: Signals) -> list[Suspicion]:
 
 
 def speed_mps(signals: Signals) -> FloatArray | None:
-    """Return a rough speed: that of the wheels, else `vx`; None without either."""
+    """Return a rough speed: that of the wheels, else `vx` or the car's own; None without any."""
     wheels = [signals[name] for name in WHEELS if name in signals]
     if wheels:
         return np.asarray(np.median(wheels, axis=0) * RADIUS_M, dtype=np.float64)
-    return signals.get("vx")
+    return signals.get("vx", signals.get("vehicle_speed"))
 
 
 def _still(signals: Signals) -> Iterator[Suspicion]:
@@ -93,7 +94,7 @@ def _turning(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
     """
     known = {
         name: np.asarray(sum(k * signals[s] for s, k in parts.items()))
-        for name, parts in WITNESSES.items()
+        for name, parts in {**WITNESSES, "steer": {"steer": 1}}.items()
         if set(parts) <= set(signals)
     }
     known = {name: values for name, values in known.items() if np.nanstd(values) > 0}
@@ -111,7 +112,7 @@ def _turning(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
     for name, loading in zip(names, loadings, strict=True):
         if loading > -0.2:
             continue
-        concerned = tuple(WITNESSES[name])
+        concerned = tuple(WITNESSES.get(name, (name,)))
         others = np.where(loadings > 0, correlations[names.index(name)], 0.0)
         against = int(np.argmin(others))
         figure = f"its correlation with {names[against]} is {others[against]:+.2f}"
@@ -124,9 +125,9 @@ def _turning(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
 def _wheels_differ(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
     if speed is None:
         return
-    for name in (*WHEELS, "vx"):
+    for name in (*WHEELS, "vx", "vehicle_speed"):
         if name in signals:
-            own = signals[name] * (1.0 if name == "vx" else RADIUS_M)
+            own = signals[name] * (RADIUS_M if name in WHEELS else 1.0)
             yield from _of_scale(own, speed, (name,), "the speed of the wheels", (0.7, 1.4), speed)
 
 
@@ -141,9 +142,10 @@ def _rates_differ(signals: Signals, speed: FloatArray | None) -> Iterator[Suspic
     if "ay" in signals:
         both, of = ("ay", "yaw_rate"), "yaw rate times speed"
         yield from _of_scale(signals["ay"], yaw_rate * speed, both, of, wide, speed)
-    if {"steering_wheel", "steer_fl"} <= set(signals):
-        both, of = ("steering_wheel", "steer_fl"), "15 times the other"
-        wheel, road = signals["steering_wheel"], 15 * signals["steer_fl"]
+    angle = next((name for name in ROAD_WHEELS if name in signals), None)
+    if angle is not None and "steering_wheel" in signals:
+        both, of = ("steering_wheel", angle), "15 times the other"
+        wheel, road = signals["steering_wheel"], 15 * signals[angle]
         yield from _of_scale(wheel, road, both, of, wide, speed)
 
 
@@ -193,7 +195,7 @@ def _label(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
         return
     with np.errstate(divide="ignore", invalid="ignore"):
         inputs = [signals["ay"], signals["yaw_rate"] / speed, signals["yaw_rate"] * speed]
-    inputs += [signals[n] for n in ("steering_wheel", "steer_fl") if n in signals]
+    inputs += [signals[n] for n in ("steering_wheel", *ROAD_WHEELS) if n in signals]
     delay = _best_lag(angle, np.array([*inputs, speed]), rows)
     if delay is not None:
         lag, gain = delay

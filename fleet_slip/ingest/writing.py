@@ -98,6 +98,7 @@ class WrittenFile:
         rest: rows that wait for those of other files: those of a small file, or the last.
         vehicles, drives: whose rows they are.
         left_out: drives that were forgotten.
+        longest: the drive with the most ticks.
     """
 
     rest: dict[TableName, pa.Table] = field(default_factory=dict)
@@ -106,6 +107,7 @@ class WrittenFile:
     drives: set[str] = field(default_factory=set)
     left_out: int = 0
     ticks: int = 0
+    longest: MeasuredDrive | None = None
 
 
 class FileWriter:
@@ -146,6 +148,9 @@ class FileWriter:
             refused.add(piece.refused)
             for drive in piece.drives:
                 waiting.append(drive)
+                longest = self._result.longest
+                if longest is None or drive.ticks.size > longest.ticks.size:
+                    self._result.longest = drive
                 if sum(one.ticks.size for one in waiting) >= FILE_ROWS:
                     self._pass_on("logs", self._logs(waiting), last=False)
                     waiting = []

@@ -1,15 +1,18 @@
 """A car by the textbook is above suspicion; each way of logging it wrongly is not."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
+from typer.testing import CliRunner
 
 from fleet_slip.arrays import FloatArray
+from fleet_slip.cli.main import app
 from fleet_slip.errors import AlarmError, UsageError
-from fleet_slip.ingest.suspicion import WHEELS, find_suspicions
+from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS, find_suspicions
 from tests.support.reported import call
 from tests.support.textbook_car import Car, a_car
 
@@ -131,6 +134,49 @@ def test_a_dry_run_shows_and_stores_nothing(tmp_path: Path) -> None:
     assert not (tmp_path / "root").exists()
     with pytest.raises(UsageError, match="--plot draws one file"):
         call(tmp_path / "root", *command[:-1], "--plot", str(tmp_path / "car.png"))
+
+
+def test_one_angle_of_the_road_wheels_and_a_speed_of_the_bus_are_looked_at() -> None:
+    car = a_car()
+    speed = np.mean([car[name] for name in WHEELS], axis=0) * RADIUS_M
+    whole = {**car, "steer": car["steering_wheel"] / 15, "vehicle_speed": speed}
+    assert kinds(whole) == set()
+    assert kinds({**whole, "steer": -whole["steer"]}) == {("sign", ("steer",))}
+    assert ("unit", ("vehicle_speed",)) in kinds({**whole, "vehicle_speed": 3.6 * speed})
+    assert ("unit", ("steering_wheel", "steer")) in kinds({**whole, "steer": 57.3 * whole["steer"]})
+
+
+def test_ingest_says_what_looks_wrong_and_goes_on(tmp_path: Path) -> None:
+    car = a_car()
+    file, mapping = write_car(tmp_path, {**car, "ay": -car["ay"]})
+    words = ["--root", str(tmp_path / "root"), "ingest", file, "--mapping", mapping, "--json"]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0
+    (told,) = [line for line in done.stderr.splitlines() if "looks wrong: sign of ay?" in line]
+    assert told.startswith(file)
+    assert told.endswith("Write negate = true.")
+    (report,) = json.loads(done.stdout)
+    assert [(one["kind"], one["signals"]) for one in report["suspicions"]] == [("sign", ["ay"])]
+    assert report["new"]
+    again = json.loads(call(tmp_path / "root", "ingest", file, "--mapping", mapping, "--json"))
+    assert again[0]["suspicions"] == []
+
+
+def test_files_that_land_together_say_it_once(tmp_path: Path) -> None:
+    car = a_car()
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    _, mapping = write_car(logs, {**car, "ay": -car["ay"]})
+    write_car(logs, {name: v[:4000] for name, v in {**car, "ay": -car["ay"]}.items()})
+    (logs / "car.csv").rename(logs / "short.csv")
+    write_car(logs, {**car, "ay": -car["ay"]})
+    reports = json.loads(
+        call(tmp_path / "root", "ingest", str(logs), "--mapping", mapping, "--json")
+    )
+    found = {Path(one["file"]).name: len(one["suspicions"]) for one in reports}
+    assert found == {"car.csv": 1, "short.csv": 0}
+    with pytest.raises(AlarmError, match="2 things to look at"):
+        call(tmp_path / "root", "ingest", str(logs), "--mapping", mapping, "--dry-run")
 
 
 def test_a_dry_run_of_what_looks_wrong_calls_for_attention(tmp_path: Path) -> None:
