@@ -11,10 +11,10 @@ from fleet_slip.cli.output import Json, print_json, print_table, say
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.signing import signing_key
 from fleet_slip.errors import UsageError
+from fleet_slip.export.costs import costs_content, describe_costs
 from fleet_slip.models.aliases import CHAMPION
 from fleet_slip.models.manifest import ImportedFrom, ModelTerm
 from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.models.on_board import cost_on_board
 from fleet_slip.words import number_of
 
 Reference = Annotated[
@@ -121,8 +121,11 @@ def show(context: typer.Context, reference: Reference, json: Json = False) -> No
     version: ModelVersion = context.obj.model(reference)
     if json:
         content = version.manifest.model_dump(mode="json")
-        on_board = cost_on_board(version.manifest).as_dict()
-        facts = {"version": version.version, "sha256": version.sha256, "on_board": on_board}
+        facts = {
+            "version": version.version,
+            "sha256": version.sha256,
+            "on_board": costs_content(version.manifest),
+        }
         print_json({**facts, **content})
     else:
         _print_version(version)
@@ -202,7 +205,7 @@ def _print_version(version: ModelVersion) -> None:
             ["RMSE", f"{figures.rmse_deg:.4f} deg"],
             ["error std", f"{figures.error_std_deg:.4f} deg"],
             ["error mean", f"{figures.error_mean_deg:+.4f} deg"],
-            ["on board", str(cost_on_board(manifest))],
+            ["on board", describe_costs(manifest)],
             ["cross-validation", f"{number_of(figures.folds, 'fold')} by {figures.folds_by}"],
             [
                 "cohort",

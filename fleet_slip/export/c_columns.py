@@ -4,6 +4,7 @@ Every value is a word of 32 bits, `MISSING` where there is none; a column times 
 is one of 64. Whether a step needs 64 bits follows from the ranges of the signals.
 """
 
+from collections import Counter
 from collections.abc import Mapping
 
 from fleet_slip.catalogue.columns import WEIGHT
@@ -14,16 +15,17 @@ LARGEST_UNSIGNED = 2**32 - 1
 
 
 class ColumnWriter:
-    """Writes statements, and keeps in mind which helpers they call.
+    """Writes statements, and counts what they do.
 
     Attributes:
-        used: names of helpers.
+        done: how often each helper is called, and each operation of a feature is done; `//64` is a
+            division that needs 64 bits.
     """
 
     def __init__(self, program: Program) -> None:
         """Take a program."""
         self.program = program
-        self.used: set[str] = set()
+        self.done: Counter[str] = Counter()
         self._fields = field_names(program)
         self._sizes = {
             one.name: max(abs(one.min_count), abs(one.max_count)) for one in program.signals
@@ -40,7 +42,7 @@ class ColumnWriter:
 
     def signals(self) -> list[str]:
         """Return statements that take the signals of a sample; beyond their range they miss."""
-        self.used.add("within")
+        self.done["within"] += len(self.program.signals)
         return [
             f"const int32_t {one.name}_in = within(sample->{field}, {literal(one.min_count)}, "
             f"{literal(one.max_count)});"
@@ -94,8 +96,9 @@ class ColumnWriter:
                 bounds.append(sizes[0] * sizes[-1])
                 texts.append(literal(bounds[-1]))
             else:
-                self.used |= {"sign"} & {step.function}
                 value, bound = operation(step.function, operands, sizes)
+                wide = step.function == "//" and max(sizes) > LARGEST_32
+                self.done["//64" if wide else step.function] += 1
                 bounds.append(bound)
                 if step.function == "//" and not operands[1].isdigit():
                     lines.append(f"    if ({operands[1]} <= 0) {{ return MISSING; }}")
@@ -104,7 +107,7 @@ class ColumnWriter:
             if number == arithmetic.guard:
                 least = literal(arithmetic.at_least)
                 lines.append(f"    if ({texts[-1]} < {least}) {{ return MISSING; }}")
-        self.used.add("clip")
+        self.done["clip"] += 1
         return [*lines, f"    return clip({texts[-1]}, {one.limit});", "}", ""]
 
     def _window(self, place: int, one: Window) -> list[str]:
@@ -115,7 +118,7 @@ class ColumnWriter:
             lines.append(f"const int32_t past_{place} = {self.ago(one.source, one.ticks)};")
             now = f"past_{place}"
         elif one.over == "running_mean":
-            self.used.add("gather")
+            self.done["gather"] += 1
             lines.append(f"gather(&{sums}, &{counts}, {one.most_values}, {now});")
         total, count, largest = now, "1", one.source_limit
         if one.over in ("mean", "sum", "running_mean"):
@@ -139,12 +142,14 @@ class ColumnWriter:
         largest: int,
     ) -> str:
         """Return the call that rounds a quotient, in 32 bits where all of it fits."""
+        if numerator == denominator == 1 and count == "1" and largest <= limit:
+            return total
         size = 2 * largest * numerator + denominator * most
         if size <= LARGEST_UNSIGNED:
-            self.used.add("nearest_32")
+            self.done["nearest_32"] += 1
             times = f"{denominator}U" if count == "1" else f"{denominator}U * {count}"
             return f"nearest_32({total}, {numerator}U, {times}, {limit})"
-        self.used.add("nearest_64")
+        self.done["nearest_64"] += 1
         times = str(denominator) if count == "1" else f"(int64_t){denominator} * (int64_t){count}"
         return f"nearest_64({total}, {numerator}, {times}, {limit})"
 
@@ -152,14 +157,14 @@ class ColumnWriter:
         """Return the call that reads a source so many ticks ago."""
         one = self.program.sources[source]
         width = ring_width(one)
-        self.used.add(f"ago_{width}")
+        self.done[f"ago_{width}"] += 1
         return f"ago_{width}(state->ring_{source}, state->at_{source}, {one.ticks}U, {ticks}U)"
 
     def _factor(self, place: int, one: Factor) -> str:
         fact = f"state->{self._fields['facts'][one.fact]}"
         of = f"column_{one.of}"
         total = f"(int64_t){of} * {_less(fact, one.less)}"
-        self.used.add("nearest_64")
+        self.done.update(["*", "-", "nearest_64"])
         call = f"nearest_64({total}, {one.numerator}, {one.denominator}, {one.limit})"
         missing = f"(({of} == MISSING) || ({fact} == MISSING))"
         return f"const int32_t column_{place} = {missing} ? MISSING : {call};"
@@ -168,7 +173,7 @@ class ColumnWriter:
         of, by = f"column_{one.of}", f"column_{one.by}"
         high = "MISSING" if one.high is None else literal(one.high)
         weight = f"weight({by}, {literal(one.low)}, {literal(one.peak)}, {high})"
-        self.used |= {"weight", "nearest_32"}
+        self.done.update(["weight", "nearest_32"])
         call = f"nearest_32({of} * {weight}, 1U, {WEIGHT}U, {one.largest})"
         return (
             f"const int32_t column_{place} = (({of} == MISSING) || ({by} == MISSING)) "
@@ -180,6 +185,7 @@ class ColumnWriter:
         stand_in = "0" if one.running is None else f"column_{one.running}"
         factor = f"(({number} == MISSING) ? {stand_in} : {_less(number, one.less)})"
         of = f"column_{one.of}"
+        self.done.update(["-"] if one.alone else ["*", "-"])
         missing = f"({of} == {missing_of(self.program, one.of)})"
         if one.running is not None:
             missing = f"({missing} || (({number} == MISSING) && ({stand_in} == MISSING)))"

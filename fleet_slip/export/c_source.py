@@ -7,6 +7,7 @@ from fleet_slip.catalogue.signals import COUNT_MAX
 from fleet_slip.export.c_columns import ColumnWriter, missing_of, ring_width, sum_type, summed
 from fleet_slip.export.c_helpers import HELPERS
 from fleet_slip.export.c_names import field_names, literal, plain_text
+from fleet_slip.export.c_state import state_fields
 from fleet_slip.export.program import Numbered, Program
 from fleet_slip.models.model_version import ModelVersion
 
@@ -94,7 +95,7 @@ def c_source(version: ModelVersion, program: Program) -> str:
     prefix, writer = c_prefix(version), ColumnWriter(program)
     features = writer.sources()
     start, step = _start(prefix, program, writer), _step(prefix, program, writer)
-    helpers = [text.strip("\n") + "\n" for name, text in HELPERS.items() if name in writer.used]
+    helpers = [text.strip("\n") + "\n" for name, text in HELPERS.items() if writer.done[name]]
     wide = any(isinstance(one, Numbered) for one in program.columns)
     missing = "#define MISSING INT32_MIN\n" + (
         f"#define MISSING_64 {literal(-(2**62))}\n" if wide else ""
@@ -133,19 +134,7 @@ def _struct(comment: str, members: Sequence[str], prefix: str, name: str) -> str
 
 
 def _state(program: Program) -> list[str]:
-    fields = field_names(program)
-    members = []
-    for place, one in enumerate(program.sources):
-        if one.ticks:
-            kind = f"int{ring_width(one)}_t"
-            members += [
-                f"{kind} ring_{place}[{one.ticks}]; /* {one.name} */",
-                f"uint32_t at_{place};",
-            ]
-    for key, (_, window) in summed(program).items():
-        members += [f"{sum_type(window)} sum_{key};", f"uint32_t values_{key};"]
-    members += [f"int32_t {field};" for field in (*fields["facts"], *fields["numbers"])]
-    return members or ["uint8_t nothing; /* this model looks back on nothing */"]
+    return [one.declared for one in state_fields(program)]
 
 
 def _start(prefix: str, program: Program, writer: ColumnWriter) -> str:
@@ -164,7 +153,7 @@ def _start(prefix: str, program: Program, writer: ColumnWriter) -> str:
     ranges = [(-LARGEST_FACT, LARGEST_FACT) if f.equals is None else (0, 1) for f in program.facts]
     ranges += [(-COUNT_MAX, COUNT_MAX)] * len(program.numbers)
     for field, (least, most) in zip((*fields["facts"], *fields["numbers"]), ranges, strict=True):
-        writer.used.add("within")
+        writer.done["within"] += 1
         lines.append(f"state->{field} = within(car->{field}, {literal(least)}, {most});")
     body = "\n".join(INDENT + line for line in lines or ["state->nothing = 0U;"])
     return f"{_start_line(prefix, program)}\n{{\n{body}\n}}\n"
@@ -189,13 +178,17 @@ def _tables(program: Program) -> list[str]:
 
 
 def _step(prefix: str, program: Program, writer: ColumnWriter) -> str:
-    lines = [*_tables(program), *writer.signals(), *writer.values()]
-    lines += [*_slides(program, writer), *writer.columns()]
+    body = "\n".join(INDENT + line for line in [*_tables(program), *step_lines(program, writer)])
+    return f"{_step_line(prefix)}\n{{\n{body}\n}}\n"
+
+
+def step_lines(program: Program, writer: ColumnWriter) -> list[str]:
+    """Return the statements of a tick; the writer counts what they do."""
+    lines = [*writer.signals(), *writer.values(), *_slides(program, writer), *writer.columns()]
     lines += [*_keeps(program, writer), *_dot(program, writer)]
     if not any("state->" in line for line in lines):
         lines.insert(-1, "(void)state;")
-    body = "\n".join(INDENT + line for line in lines)
-    return f"{_step_line(prefix)}\n{{\n{body}\n}}\n"
+    return lines
 
 
 def _slides(program: Program, writer: ColumnWriter) -> list[str]:
@@ -205,7 +198,7 @@ def _slides(program: Program, writer: ColumnWriter) -> list[str]:
         if one.over == "running_mean":
             continue
         width = "32" if sum_type(one) == "int32_t" else "64"
-        writer.used.add(f"slide_{width}")
+        writer.done[f"slide_{width}"] += 1
         oldest = writer.ago(one.source, one.ticks)
         sums = f"&state->sum_{key}, &state->values_{key}"
         found.append(f"slide_{width}({sums}, {oldest}, source_{one.source});")
@@ -218,7 +211,7 @@ def _keeps(program: Program, writer: ColumnWriter) -> list[str]:
     for place, one in enumerate(program.sources):
         if one.ticks:
             width = ring_width(one)
-            writer.used.add(f"keep_{width}")
+            writer.done[f"keep_{width}"] += 1
             ring = f"state->ring_{place}, &state->at_{place}"
             found.append(f"keep_{width}({ring}, {one.ticks}U, source_{place});")
     return found
@@ -237,7 +230,7 @@ def _dot(program: Program, writer: ColumnWriter) -> list[str]:
     ]
     (high, low), *_ = angle.parts
     shift = angle.bits - angle.low_bits
-    writer.used |= {"floor_shift", "clip"}
+    writer.done.update({"floor_shift": 2, "clip": 1, "term": len(terms)})
     return [
         f"const {kind} term[{len(terms)}] = {{",
         *(f"{INDENT}{term}," for term in terms[:-1]),

@@ -25,7 +25,6 @@ from fleet_slip.export.program import (
 )
 from fleet_slip.models.counts_model import counts_model
 from fleet_slip.models.manifest import Manifest, ModelTerm
-from fleet_slip.models.predictor import Predictor
 
 Key = TypeVar("Key", bound=Hashable)
 
@@ -33,11 +32,21 @@ Key = TypeVar("Key", bound=Hashable)
 def compile_program(manifest: Manifest) -> Program:
     """Return what a published version computes.
 
-    Raises `RefusedError` if counts mean something else now, or no bound of the error can be stated;
-    `QuestionError` or `DataError` for definitions that contradict each other; and `DataError` for a
-    feature of no signal.
+    Raises what `write_program` raises, and `QuestionError` or `DataError` for definitions that
+    contradict each other.
     """
+    from fleet_slip.models.predictor import Predictor  # noqa: PLC0415 - numba, not for show
+
     Predictor.of(manifest)  # raises for definitions that it could not compute
+    return write_program(manifest)
+
+
+def write_program(manifest: Manifest) -> Program:
+    """Return the program of definitions that are known to agree.
+
+    Raises `RefusedError` if counts mean something else now, or no bound of the error can be stated,
+    and `DataError` for a feature of no signal.
+    """
     builder = _Builder()
     places = [builder.term(term) for term in manifest.terms]
     columns, sources = tuple(builder.columns), builder.sources_with_ticks()

@@ -4,6 +4,7 @@ Whole numbers that may need more than 53 bits are texts.
 """
 
 import base64
+import hashlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,6 +13,7 @@ from fleet_slip.catalogue.arithmetic import Step
 from fleet_slip.catalogue.columns import LARGEST_FACT, WEIGHT
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 from fleet_slip.export.checks import Check
+from fleet_slip.export.costs import count_costs
 from fleet_slip.export.program import (
     Angle,
     CarFact,
@@ -49,6 +51,7 @@ def document_of(
             "manifest": version.manifest.model_dump(mode="json"),
         },
         "program": program_content(program),
+        "costs": count_costs(program).as_dict(),
         "checks": [_check(one) for one in checks],
     }
     return {**content, "sha256": sha256_of(canonical_json(content))}
@@ -144,6 +147,28 @@ def _angle(angle: Angle) -> dict[str, Any]:
         "error": f"{angle.error.numerator}/{angle.error.denominator}",
         "largest": angle.largest,
         "limit": angle.limit,
+    }
+
+
+def manifest_of(
+    version: ModelVersion, program: Program, to: str, files: Mapping[str, bytes]
+) -> dict[str, Any]:
+    """Return what is said of the files of an export: of which version, the error and the costs."""
+    angle = program.angle
+    return {
+        "format": "fleet-slip export",
+        "to": to,
+        "model": version.reference,
+        "sha256": version.sha256,
+        "drives_sha256": version.manifest.trained_on.drives_sha256,
+        "angle": {
+            "column": angle.column,
+            "unit": angle.unit,
+            "scale": f"{angle.scale:f}",
+            "error": f"{angle.error.numerator}/{angle.error.denominator}",
+        },
+        "costs": count_costs(program).as_dict(),
+        "files": {name: hashlib.sha256(content).hexdigest() for name, content in files.items()},
     }
 
 

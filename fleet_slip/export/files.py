@@ -13,7 +13,7 @@ from fleet_slip.export.checks import Check, make_checks
 from fleet_slip.export.checks_table import checks_csv
 from fleet_slip.export.compile import compile_program
 from fleet_slip.export.dbc import dbc_text
-from fleet_slip.export.document import document_of
+from fleet_slip.export.document import document_of, manifest_of
 from fleet_slip.export.fmu import fmu
 from fleet_slip.export.program import Program
 from fleet_slip.export.sql_source import sql_macro, sql_statement
@@ -57,11 +57,15 @@ def export_files(
         raise UsageError(f"{to!r}: export to one of {', '.join(get_args(Target))}.")
     if with_gram and to != "c":
         raise UsageError("only C has Gram rows. Run: fleet-slip export NAME --to c --with-gram")
-    contents = _WRITERS[to](_subject(version, warehouse, with_gram=with_gram))
-    return {
+    subject = _subject(version, warehouse, with_gram=with_gram)
+    files = {
         name: content.encode("utf-8") if isinstance(content, str) else content
-        for name, content in contents.items()
+        for name, content in _WRITERS[to](subject).items()
     }
+    if to != "json":  # that says all of it itself
+        manifest = manifest_of(version, subject.program, to, files)
+        files[f"{c_prefix(version)}_manifest.json"] = render(manifest).encode("utf-8")
+    return files
 
 
 def _subject(

@@ -58,7 +58,9 @@ class Frame:
             column = self.column(name)
             if not _is_number(column.type):
                 raise InputError(f"the column {name} is of {column.type}, not of numbers.")
-            values = column.cast(pa.float64()).to_numpy(zero_copy_only=False)
+            if column.type != pa.float64():
+                column = column.cast(pa.float64())
+            values = column.to_numpy(zero_copy_only=False)
         except (pa.ArrowException, TypeError, ValueError, OverflowError) as error:
             raise InputError(f"the column {name} is no column of numbers: {error}") from None
         if infinite := int(np.isinf(values).sum()):

@@ -169,4 +169,4 @@ def test_gram_rows_go_with_c_alone() -> None:
     with pytest.raises(UsageError, match="--to c --with-gram"):
         export_files(version, None, "json", with_gram=True)
     names = [*export_files(version, None, "c", with_gram=True)]
-    assert names[-2:] == ["sideslip_any_gram.h", "sideslip_any_gram.c"]
+    assert {"sideslip_any_gram.h", "sideslip_any_gram.c"} <= {*names}

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.cortex_m import measure_cortex_m, run_self_test
+from fleet_slip.export.costs import cost_on_board
 from fleet_slip.export.files import export_files
 from fleet_slip.models.model_version import ModelVersion
 from tests.export.compiled import STRICT
@@ -61,6 +62,17 @@ def test_the_self_test_passes_on_a_cortex_m(tmp_path: Path) -> None:
     assert found["with_divisions_of_64_bits_bytes"] < 4096
     assert found["state_bytes"] + found["largest_frame_bytes"] < 2048
     assert 100 < found["most_instructions"] < 3000
+
+
+@pytest.mark.tools("arm-none-eabi-gcc", "qemu-system-arm")
+@pytest.mark.parametrize("name", MODELS)
+def test_estimates_for_a_cortex_m_are_above_what_is_measured(tmp_path: Path, name: str) -> None:
+    version = ModelVersion(1, model_of(MODELS[name], Fraction(-1, 700), name), "0" * 64)
+    estimated = cost_on_board(version.manifest)
+    found = measure_cortex_m(tmp_path, f"sideslip_{name}", export_texts(version, None, "c"))
+    assert found["state_bytes"] == estimated.memory_bytes
+    assert 0.5 < found["most_instructions"] / estimated.estimated_instructions <= 1
+    assert 0.5 < found["with_divisions_of_64_bits_bytes"] / estimated.estimated_code_bytes <= 1
 
 
 @pytest.mark.tools("arm-none-eabi-gcc", "qemu-system-arm")

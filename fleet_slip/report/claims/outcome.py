@@ -1,6 +1,6 @@
 """Claims of the comparison with the Kalman filter, and of the conclusions."""
 
-from fleet_slip.models.on_board import cost_on_board
+from fleet_slip.export.costs import describe_costs
 from fleet_slip.report.blocks import BLOCK_S, difference
 from fleet_slip.report.claims.claim import (
     NotEvaluatedError,
@@ -90,7 +90,7 @@ def easily_implemented(data: ReportData) -> Verdict:
         len(signals) <= LITTLE,
         f"an intercept and {len(signals)} coefficients",
         "It has no state, no matrix and no iteration. The published model, "
-        f"{data.version.reference}, on board: {cost_on_board(data.version.manifest)}.",
+        f"{data.version.reference}, on board: {describe_costs(data.version.manifest)}.",
     )
 
 

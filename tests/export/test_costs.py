@@ -1,0 +1,94 @@
+"""What a model costs in a car, against what is counted by hand, and against a compiler."""
+
+import json
+from fractions import Fraction
+from pathlib import Path
+
+import pytest
+
+import fleet_slip
+from fleet_slip.export.c_source import c_header, c_prefix
+from fleet_slip.export.compile import compile_program
+from fleet_slip.export.costs import cost_on_board, costs_content, count_costs, describe_costs
+from fleet_slip.export.files import export_files
+from fleet_slip.models.model_version import ModelVersion
+from tests.export.compiled import compile_c, needs_cc
+from tests.export.models import DEFINITIONS, MODELS, model_of
+
+ONE = Fraction(1, 1000)
+
+
+def test_a_signal_costs_one_term() -> None:
+    """Two words of a coefficient: two products and two sums, and two shifts that round."""
+    found = cost_on_board(model_of({"ay": ONE}))
+    assert (found.columns, found.coefficient_bytes, found.memory_bytes) == (1, 8, 1)
+    assert (found.multiplications, found.additions, found.divisions) == (2, 2 + 2, 0)
+
+
+def test_windows_of_one_source_share_its_ring_buffer() -> None:
+    """ay over 3 and 5 ticks: 5 words of 2 bytes, its place, two sums and two counters of 4."""
+    one = cost_on_board(model_of({"mean_5": ONE}))
+    two = cost_on_board(model_of({"mean_5": ONE, "mean_3": ONE}))
+    assert one.memory_bytes == 5 * 2 + 2 + 4 + 8  # the place of a word of 4 bytes is one of its own
+    assert two.memory_bytes == one.memory_bytes + 8
+    # Of a window more: the oldest is found and leaves, the newest comes, a quotient, a term.
+    assert two.additions - one.additions == 2 + 4 + 1 + 2
+    assert two.multiplications - one.multiplications == 2 + 2
+    assert (one.divisions, two.divisions, two.divisions_64) == (1, 2, 0)
+
+
+def test_a_feature_is_computed_once() -> None:
+    """Two looks at `change`: its arithmetic counts once, and needs a division of 64 bits."""
+    alone = cost_on_board(model_of({"course": ONE}))
+    both = cost_on_board(model_of({"course": ONE, "heavy_above": ONE}))
+    heavy = cost_on_board(model_of({"heavy": ONE}))
+    gate = (1, 3, 1)  # product, differences and quotient of a weight
+    rounded = (2, 1, 1)
+    assert both.multiplications == alone.multiplications + heavy.multiplications + 1 + 2
+    assert both.divisions == alone.divisions + heavy.divisions + gate[2] + rounded[2]
+    assert (alone.divisions_64, both.divisions_64) == (1, 2)
+
+
+@needs_cc
+@pytest.mark.parametrize("name", MODELS)
+def test_the_memory_is_what_a_compiler_says(tmp_path: Path, name: str) -> None:
+    version = ModelVersion(1, model_of(MODELS[name], name=name), "0" * 64)
+    program, prefix = compile_program(version.manifest), c_prefix(version)
+    (tmp_path / f"{prefix}.h").write_text(c_header(version, program))
+    size = count_costs(program).memory_bytes
+    (tmp_path / "size.c").write_text(
+        f'#include "{prefix}.h"\n'
+        f"extern char as_counted[(sizeof({prefix}_state) == {size}U) ? 1 : -1];\n"
+        "int main(void) { return 0; }\n"
+    )
+    compile_c(tmp_path, ["size.c"])
+
+
+def test_the_manifest_of_an_export_and_show_say_the_same(smoke_root: Path) -> None:
+    version = fleet_slip.open(smoke_root).model("smoke")
+    counted = costs_content(version.manifest)
+    assert counted["columns"] == len(version.manifest.terms)
+    assert counted["memory_bytes"] > 1000 < counted["estimated_instructions"]
+    files = export_files(version, None, "c")
+    manifest = json.loads(files["sideslip_smoke_manifest.json"])
+    assert manifest["costs"] == counted
+    assert (manifest["model"], manifest["sha256"]) == ("smoke@1", version.sha256)
+    assert [*manifest["files"]] == [name for name in files if "manifest" not in name]
+    document = json.loads(export_files(version, None, "json")["smoke-1.json"])
+    assert document["costs"] == counted
+    assert str(cost_on_board(version.manifest)) == describe_costs(version.manifest)
+
+
+def test_each_kind_of_column_adds_to_the_costs() -> None:
+    least = cost_on_board(model_of({"ay": ONE}))
+    for name in DEFINITIONS:
+        found = cost_on_board(model_of({"ay": ONE, name: ONE}))
+        assert found.operations > least.operations, name
+        assert found.estimated_instructions > least.estimated_instructions, name
+        assert found.estimated_code_bytes > least.estimated_code_bytes, name
+
+
+def test_what_cannot_be_exported_is_said() -> None:
+    wild = model_of({"ay": Fraction(10**40)})
+    assert describe_costs(wild).startswith("cannot be exported: the coefficients are so large")
+    assert "no bound" in costs_content(wild)["error"]
