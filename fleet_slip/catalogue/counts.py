@@ -1,9 +1,13 @@
 """From physical values to counts, as the cars' sensors and measured logs make them."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
-from fleet_slip.arrays import FloatArray
+from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.signals import Signal
 
 BLOCK = 2**14
@@ -15,17 +19,36 @@ def round_to_counts(values: FloatArray, signal: Signal) -> pa.Array:
 
     Halves round to even. A value beyond the signal's valid range takes the range's end.
     """
-    counts = np.empty(values.size, dtype=np.int16)
-    scaled = np.empty(min(values.size, BLOCK))
-    mask = None
-    for start in range(0, values.size, BLOCK):
-        here = slice(start, start + BLOCK)
-        block = np.divide(values[here], float(signal.scale), out=scaled[: counts[here].size])
-        np.rint(block, out=block).clip(signal.min_count, signal.max_count, out=block)
-        absent = np.isnan(block)
-        if absent.any():
-            mask = np.zeros(values.size, dtype=np.bool_) if mask is None else mask
-            mask[here] = absent
-            block[absent] = 0
-        counts[here] = block
-    return pa.array(counts, mask=mask)
+    return round_chunks([values], signal)
+
+
+def round_chunks(chunks: Sequence[FloatArray], signal: Signal) -> pa.Array:
+    """Return the counts of values that stand in several arrays, one after the other."""
+    counts = np.empty(sum(chunk.size for chunk in chunks), dtype=np.int16)
+    scaled, scale = np.empty(min(counts.size, BLOCK)), float(signal.scale)
+    low, high = float(signal.min_count), float(signal.max_count)
+    mask, end = None, 0
+    for chunk in chunks:
+        for start in range(0, chunk.size, BLOCK):
+            values = chunk[start : start + BLOCK]
+            here = slice(end, end := end + values.size)
+            block = np.divide(values, scale, out=scaled[: values.size])
+            np.clip(np.rint(block, out=block), low, high, out=block)
+            if np.isnan(block.sum()):  # the counts are finite, and a NaN stays one
+                mask = np.zeros(counts.size, dtype=np.bool_) if mask is None else mask
+                mask[here] = np.isnan(block)
+                block[mask[here]] = 0
+            counts[here] = block
+    return as_arrow(counts, mask)
+
+
+def as_arrow(numbers: NDArray[Any], absent: BoolArray | None = None) -> pa.Array:
+    """Return numbers as an Arrow array that shares their memory, null where they are absent.
+
+    Not `pa.array`: it copies, and imports pandas if that is installed.
+    """
+    valid = None
+    if absent is not None:
+        valid = pa.py_buffer(np.packbits(~absent, bitorder="little"))
+    kind = pa.from_numpy_dtype(numbers.dtype)
+    return pa.Array.from_buffers(kind, numbers.size, [valid, pa.py_buffer(numbers)])

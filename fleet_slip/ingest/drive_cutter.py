@@ -1,5 +1,8 @@
 """Checks the order of time and cuts rows, block by block, into drives: uninterrupted stretches."""
 
+import itertools
+from typing import NamedTuple
+
 import numpy as np
 import polars as pl
 
@@ -10,6 +13,17 @@ from fleet_slip.ingest.resampling import STEP_S, TIME_EPSILON_S
 
 LONGEST_DRIVE_S = 2**19 * STEP_S
 """A stretch that lasts longer, some 87 minutes, is cut, so that a drive fits into memory."""
+
+
+MOST_STRETCHES = 16
+"""Irregular steps in a block at which it is taken apart; with more it is cut as a whole."""
+
+
+class _Stretch(NamedTuple):
+    """Rows, and whether they are of one group at times that ascend without a gap."""
+
+    rows: pl.DataFrame
+    is_steady: bool
 
 
 class DriveCutter:
@@ -41,15 +55,43 @@ class DriveCutter:
         """Parts that the last block ended, in an order that does not depend on blocks."""
 
     def cut(self, rows: pl.DataFrame, *, last: bool) -> tuple[pl.DataFrame, pl.DataFrame]:
-        """Return the rows of a block, sorted by group, with a column `part`; and the bad ones.
+        """Return the rows of a block, those of a part together, with a column `part`; and the bad.
 
         Rows of several time bases are of a file's only block, in which they are sorted by time;
         their order was looked at base by base.
         """
+        self.ended = []
+        stretches = _stretches(rows, self._gap_s)
+        found = [
+            self._go_on(stretch, last=last and i + 1 == len(stretches))
+            for i, stretch in enumerate(stretches)
+        ]
+        if len(found) == 1:
+            return found[0]
+        good, bad = zip(*found, strict=True)
+        return pl.concat(good), pl.concat(bad)
+
+    def _go_on(self, stretch: "_Stretch", *, last: bool) -> tuple[pl.DataFrame, pl.DataFrame]:
+        """Cut a stretch; at once if nothing happens in it but that an open part goes on."""
+        rows = stretch.rows
+        if not stretch.is_steady or self._waiting is not None:
+            return self._cut(rows, last=last)
+        group, time = int(rows["group"][0]), rows["time"].to_numpy()
+        if group >= self._last.size or self._part[group] < 0:
+            return self._cut(rows, last=last)
+        near = all(abs(time[0] - at[group]) <= self._gap_s for at in (self._last, self._kept))
+        piece = (time[-1] - self._start[group]) // self._longest_s
+        if not near or time[0] <= self._latest[group] or piece != self._piece[group]:
+            return self._cut(rows, last=last)
+        self._last[group] = self._kept[group] = self._latest[group] = time[-1]
+        part = pl.lit(int(self._part[group]), pl.Int64)
+        return rows.with_columns(part.alias("part")), no_rows()
+
+    def _cut(self, rows: pl.DataFrame, *, last: bool) -> tuple[pl.DataFrame, pl.DataFrame]:
+        """Cut rows of any kind."""
         several = "base" in rows.columns
         if self._waiting is not None:
             rows = pl.concat([self._waiting, rows])
-        self.ended = []
         if rows.is_empty():
             return rows.with_columns(pl.lit(0, pl.Int64).alias("part")), no_rows()
         if several:
@@ -149,7 +191,7 @@ class DriveCutter:
         before_head[is_first] = self._part[group[heads[is_first]]]
         over = fresh & (before_head >= 0)
         order = np.lexsort((group[heads[over]], known_at[heads[over]]))
-        self.ended = before_head[over][order].tolist()
+        self.ended += before_head[over][order].tolist()
         parts = np.repeat(part_of, np.diff(np.append(heads, time.size)))
         self._kept[group[end]], self._latest[group[end]] = time[end], latest[end]
         self._start[group[end]], self._part[group[end]] = start[end], parts[end]
@@ -175,6 +217,26 @@ def sample_intervals_s(rows: pl.DataFrame) -> dict[int, float]:
         return {0: sample_interval_s(rows) or STEP_S}
     bases = rows.partition_by("base", as_dict=True)
     return {number: sample_interval_s(base) or STEP_S for (number,), base in bases.items()}
+
+
+def _stretches(rows: pl.DataFrame, gap_s: float) -> list[_Stretch]:
+    """Take a block apart so that few rows are beside an irregular step, and most are steady.
+
+    Two rows stand alone at each such step: the one that is far from the last, and the one that
+    tells what it is.
+    """
+    if "base" in rows.columns or rows.height < 2:
+        return [_Stretch(rows, is_steady=False)]
+    step = np.diff(rows["time"].to_numpy())
+    irregular = ~((step > 0) & (step <= gap_s)) | (np.diff(rows["group"].to_numpy()) != 0)
+    heads = np.flatnonzero(irregular) + 1
+    if heads.size > MOST_STRETCHES:
+        return [_Stretch(rows, is_steady=False)]
+    ends = np.unique(np.clip([0, *heads, *(heads + 2), rows.height], 0, rows.height)).tolist()
+    return [
+        _Stretch(rows.slice(start, end - start), is_steady=start not in heads)
+        for start, end in itertools.pairwise(ends)
+    ]
 
 
 def _ends(group: IntArray) -> tuple[IntArray, IntArray]:

@@ -12,10 +12,11 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.counts import round_to_counts
+from fleet_slip.catalogue.counts import as_arrow, round_chunks
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.mapping import FromColumn, Mapping
+from fleet_slip.ingest.open_drives import DriveRows
 from fleet_slip.ingest.resampling import (
     SNAP_TOLERANCE_S,
     STEP_S,
@@ -54,7 +55,7 @@ def drive_id(prefix: str, group: int, stretch: int = 1) -> str:
 
 
 def to_ticks(
-    rows: pl.DataFrame,
+    rows: DriveRows,
     mapping: Mapping,
     intervals_s: dict[int, float],
     name: str,
@@ -66,31 +67,41 @@ def to_ticks(
     the samples of each time base; `known` is what the drive's rows say of it. Raises `InputError`
     for what nobody says.
     """
-    start_s = float(rows["time"][0])
-    resampler = _build_resampler(rows["time"].to_numpy() - start_s, intervals_s)
-    method, ticks = resampler.method, resampler.ticks
+    start_s = float(rows.time_s[0])
+    resampler = _build_resampler(rows.time_s - start_s, intervals_s)
+    method, ticks = resampler.method, resampler.ticks.astype(np.int32)
     counts, somewhere = {}, np.zeros(ticks.size, dtype=np.bool_)
+    whole = rows.frame() if len(intervals_s) > 1 else None
     for signal, source in mapping.signals.items():
-        samples, own = rows, resampler
-        if len(intervals_s) > 1:
-            samples = rows.filter(pl.col(signal).is_not_null())
+        if method == "snap" and source.interpolate and not source.delay_s:
+            values = rows.chunks(signal)
+        elif whole is None:
+            values = [_resample(rows.column(signal), resampler, signal, mapping)]
+        else:
+            samples = whole.filter(pl.col(signal).is_not_null())
             own = _on_own_times(samples, start_s, resampler, intervals_s)
-        values = samples[signal].to_numpy()
-        longest = source.longest_gap_s or mapping.time.longest_gap_s
-        between = own.hold if catalogue()[signal].stepwise else own.resample
-        bring = partial(between, longest_gap_s=longest) if source.interpolate else own.place
-        resample = partial(bring, delay_s=source.delay_s)
-        between_samples = (method != "snap" or source.delay_s) and source.interpolate
-        angle = between_samples and signal == catalogue().label
-        values = _on_the_circle(resample, values) if angle else resample(values)
-        if not somewhere.all():
-            somewhere |= ~np.isnan(values)
+            values = [_resample(samples[signal].to_numpy(), own, signal, mapping)]
         # Rounding clips a resampled value's last bit, no more: the rest is in quarantine.
-        counts[signal] = round_to_counts(values, catalogue()[signal])
+        counts[signal] = round_chunks(values, catalogue()[signal])
+        if not somewhere.all():
+            somewhere |= counts[signal].is_valid().to_numpy(zero_copy_only=False)
     if not somewhere.all():
         counts = {key: array.filter(pa.array(somewhere)) for key, array in counts.items()}
-    kept = ticks[somewhere].astype(np.int32)
-    return MeasuredDrive(name, _metadata(name, known, start_s, mapping), method, kept, counts)
+        ticks = ticks[somewhere]
+    return MeasuredDrive(name, _metadata(name, known, start_s, mapping), method, ticks, counts)
+
+
+def _resample(
+    values: FloatArray, resampler: Resampler, signal: str, mapping: Mapping
+) -> FloatArray:
+    """Return a signal on the ticks of its drive."""
+    source = mapping.signals[signal]
+    if not source.interpolate:
+        return resampler.place(values, source.delay_s)
+    longest_gap_s = source.longest_gap_s or mapping.time.longest_gap_s
+    between = resampler.hold if catalogue()[signal].stepwise else resampler.resample
+    resample = partial(between, delay_s=source.delay_s, longest_gap_s=longest_gap_s)
+    return _on_the_circle(resample, values) if signal == catalogue().label else resample(values)
 
 
 def _build_resampler(time_s: FloatArray, intervals_s: dict[int, float]) -> Resampler:
@@ -126,7 +137,9 @@ def log_table(drives: Sequence[MeasuredDrive], mapping: Mapping) -> pa.Table:
     columns = {}
     for field in catalogue().log_schema:
         if field.name == "tick":
-            columns[field.name] = pa.chunked_array([drive.ticks for drive in drives], field.type)
+            columns[field.name] = pa.chunked_array(
+                [as_arrow(drive.ticks) for drive in drives], field.type
+            )
         elif field.name in mapping.signals:
             columns[field.name] = pa.chunked_array([drive.counts[field.name] for drive in drives])
         elif field.name in catalogue().extras:
@@ -149,7 +162,12 @@ def _repeat(values: pa.Array, times: Sequence[int]) -> pa.Array:
         return pa.nulls(sum(times), values.type)
     if values.null_count:
         return values.take(pa.array(np.repeat(np.arange(len(values)), times)))
-    return pa.array(np.repeat(values.to_numpy(zero_copy_only=False), times), values.type)
+    plain = values.view(pa.int32()) if pa.types.is_date(values.type) else values
+    repeated = np.empty(sum(times), dtype=plain.to_numpy().dtype)
+    ends = np.cumsum(times)
+    for value, end, number in zip(plain.to_numpy(), ends, times, strict=True):
+        repeated[end - number : end] = value
+    return as_arrow(repeated).view(values.type)
 
 
 def _metadata(name: str, told: dict[str, Any], start_s: float, mapping: Mapping) -> dict[str, Any]:

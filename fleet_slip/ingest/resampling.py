@@ -6,6 +6,7 @@ as well off as one with a file of its own. Nothing is extrapolated.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -31,10 +32,11 @@ def choose_method(time_s: FloatArray, interval_s: float) -> Method:
     if interval_s < STEP_S - SNAP_TOLERANCE_S:
         return "average"
     if interval_s <= STEP_S + SNAP_TOLERANCE_S:
-        ticks = snap(time_s)
-        offset = time_s - time_s[0] - ticks * STEP_S
-        distinct = bool(np.all(np.diff(ticks) > 0))
-        if distinct and np.abs(offset).max() <= SNAP_TOLERANCE_S + TIME_EPSILON_S:
+        since = time_s - time_s[0]
+        ticks = np.rint(since / STEP_S)
+        offset = np.abs(since - ticks * STEP_S).max()
+        distinct = bool(np.all(ticks[1:] > ticks[:-1]))
+        if distinct and offset <= SNAP_TOLERANCE_S + TIME_EPSILON_S:
             return "snap"
     return "interpolate"
 
@@ -45,13 +47,18 @@ class Resampler:
 
     Attributes:
         ticks: the drive's ticks, shape (n_ticks,).
-        at_s: their times.
+        start_s: time of tick 0.
     """
 
     time_s: FloatArray
     method: Method
     ticks: IntArray
-    at_s: FloatArray
+    start_s: float
+
+    @cached_property
+    def at_s(self) -> FloatArray:
+        """Times of the ticks."""
+        return np.asarray(self.start_s + self.ticks * STEP_S, dtype=np.float64)
 
     def resample(
         self, values: FloatArray, delay_s: float = 0.0, longest_gap_s: float = 0.1
@@ -93,10 +100,9 @@ class Resampler:
 def build_resampler(time_s: FloatArray, method: Method) -> Resampler:
     """Return what brings signals at these times onto the ticks of their drive."""
     if method == "snap":
-        ticks = snap(time_s)
-        return Resampler(time_s, method, ticks, time_s[0] + ticks * STEP_S)
-    at_s = tick_times(time_s, method)
-    return Resampler(time_s, method, np.arange(at_s.size), at_s)
+        return Resampler(time_s, method, snap(time_s), time_s[0])
+    start_s, number = tick_range(time_s, method)
+    return Resampler(time_s, method, np.arange(number), start_s)
 
 
 def snap(time_s: FloatArray) -> IntArray:
@@ -105,15 +111,14 @@ def snap(time_s: FloatArray) -> IntArray:
     return ticks
 
 
-def tick_times(time_s: FloatArray, method: Method) -> FloatArray:
-    """Return the times of all ticks in a drive that is not snapped, shape (n_ticks,).
+def tick_range(time_s: FloatArray, method: Method) -> tuple[float, int]:
+    """Return the time of tick 0, and how many ticks there are, in a drive that is not snapped.
 
     Averages need half a sample time on either side of a tick, so tick 0 is that much later.
     """
     margin = STEP_S / 2 if method == "average" else 0.0
     span = time_s[-1] - time_s[0] - 2 * margin
-    last = int(np.floor((span + TIME_EPSILON_S) / STEP_S))
-    return np.asarray(time_s[0] + margin + np.arange(last + 1) * STEP_S, dtype=np.float64)
+    return float(time_s[0] + margin), int(np.floor((span + TIME_EPSILON_S) / STEP_S)) + 1
 
 
 def interpolate(

@@ -24,7 +24,7 @@ from fleet_slip.ingest.drive_cutter import (
 from fleet_slip.ingest.look_alikes import find_look_alikes
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.measured_drives import MeasuredDrive, drive_id, to_ticks
-from fleet_slip.ingest.open_drives import MAX_OPEN_ROWS, OpenDrives
+from fleet_slip.ingest.open_drives import MAX_OPEN_ROWS, DriveRows, OpenDrives
 from fleet_slip.ingest.parquet_batches import partition_keys
 from fleet_slip.ingest.quarantine import describe_refused, no_rows
 from fleet_slip.ingest.read_ahead import read_ahead
@@ -119,8 +119,8 @@ class MeasuredStream:
         self._open.add(rows)
         drives = []
         for ended in self._open.take([*cutter.ended, *(cutter.open_parts() if last else ())]):
-            if ended["time"][-1] - ended["time"][0] < STEP_S - TIME_EPSILON_S:
-                refused.append(describe_refused(ended, None, "too_short"))
+            if ended.time_s[-1] - ended.time_s[0] < STEP_S - TIME_EPSILON_S:
+                refused.append(describe_refused(ended.frame(), None, "too_short"))
             else:
                 drives.append(self._drive(ended, intervals_s))
         if self._open.number_of_rows > MAX_OPEN_ROWS:
@@ -132,8 +132,8 @@ class MeasuredStream:
         self._note_refused(bad)
         return Piece(drives, bad)
 
-    def _drive(self, rows: pl.DataFrame, intervals_s: dict[int, float]) -> MeasuredDrive:
-        group = rows["group"][0]
+    def _drive(self, rows: DriveRows, intervals_s: dict[int, float]) -> MeasuredDrive:
+        group = rows.group
         self._stretches[group] += 1
         name = drive_id(self.prefix, group, self._stretches[group])
         try:

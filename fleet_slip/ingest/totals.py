@@ -3,9 +3,8 @@
 from collections import Counter
 from dataclasses import dataclass, field
 
-import polars as pl
-
 from fleet_slip.ingest.measured_drives import MeasuredDrive
+from fleet_slip.ingest.open_drives import DriveRows
 
 
 @dataclass(frozen=True)
@@ -40,12 +39,12 @@ class Totals:
     """Values of each signal in the file's rows; `values` are those on ticks."""
     values: Counter[str] = field(default_factory=Counter)
 
-    def add(self, rows: pl.DataFrame, drive: MeasuredDrive) -> None:
+    def add(self, rows: DriveRows, drive: MeasuredDrive) -> None:
         """Count a drive that was made of rows."""
         self.rows_kept += rows.height
         self.drives += 1
         self.drives_resampled += drive.method != "snap"
         self.ticks += drive.ticks.size
         for name, counts in drive.counts.items():
-            self.samples[name] += rows.height - rows[name].null_count()
+            self.samples[name] += rows.height - rows.nulls(name)
             self.values[name] += len(counts) - counts.null_count

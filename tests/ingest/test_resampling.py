@@ -7,10 +7,10 @@ from numpy.testing import assert_allclose
 from fleet_slip.arrays import FloatArray
 from fleet_slip.ingest.resampling import (
     average,
+    build_resampler,
     choose_method,
     interpolate,
     snap,
-    tick_times,
 )
 
 steps = st.lists(st.floats(0.0005, 0.09), min_size=3, max_size=60)
@@ -26,7 +26,7 @@ def test_a_linear_signal_is_interpolated_exactly(
     step_s: list[float], line: tuple[float, float]
 ) -> None:
     t = times(step_s)
-    at = tick_times(t, "interpolate")
+    at = build_resampler(t, "interpolate").at_s
     offset, slope = line
     got = interpolate(t, offset + slope * t, at, longest_gap_s=0.1)
     assert_allclose(got, offset + slope * at, rtol=0, atol=1e-9)
@@ -39,7 +39,7 @@ def test_a_linear_signal_is_averaged_exactly(
     step_s: list[float], line: tuple[float, float]
 ) -> None:
     t = times(step_s)
-    at = tick_times(t, "average")
+    at = build_resampler(t, "average").at_s
     offset, slope = line
     got = average(t, offset + slope * t, at, longest_gap_s=0.1)
     assert_allclose(got, offset + slope * at, rtol=0, atol=1e-8)
@@ -48,7 +48,7 @@ def test_a_linear_signal_is_averaged_exactly(
 @pytest.mark.parametrize("frequency_hz", [5.0, 30.0, 50.0, 90.0, 100.0, 210.0, 400.0])
 def test_averaging_has_the_frequency_response_of_a_moving_average(frequency_hz: float) -> None:
     t = np.arange(20_001) / 10_000
-    at = tick_times(t, "average")
+    at = build_resampler(t, "average").at_s
     phase = 0.4
     got = average(t, np.cos(2 * np.pi * frequency_hz * t + phase), at, longest_gap_s=0.1)
     gain = np.sinc(frequency_hz / 100)
@@ -60,32 +60,32 @@ def test_a_tone_that_would_alias_to_a_constant_vanishes() -> None:
     t = np.arange(1001) / 1000
     tone = np.sin(2 * np.pi * 100 * t + 1)
     assert np.ptp(tone[::10]) < 1e-9 < abs(tone[0])  # taking every tenth sample: a false constant
-    assert_allclose(average(t, tone, tick_times(t, "average"), 0.1), 0, atol=1e-12)
+    assert_allclose(average(t, tone, build_resampler(t, "average").at_s, 0.1), 0, atol=1e-12)
 
 
 def test_nothing_is_interpolated_across_a_long_gap() -> None:
     t = np.array([0.0, 0.02, 0.04, 0.30, 0.32])
-    got = interpolate(t, np.ones(5), tick_times(t, "interpolate"), longest_gap_s=0.1)
+    got = interpolate(t, np.ones(5), build_resampler(t, "interpolate").at_s, longest_gap_s=0.1)
     assert np.flatnonzero(~np.isnan(got)).tolist() == [0, 1, 2, 3, 4, 30, 31, 32]
 
 
 def test_nothing_is_averaged_across_a_long_gap() -> None:
     t = np.concatenate([np.arange(0, 51), np.arange(300, 351)]) / 1000
-    got = average(t, np.ones(t.size), tick_times(t, "average"), longest_gap_s=0.1)
+    got = average(t, np.ones(t.size), build_resampler(t, "average").at_s, longest_gap_s=0.1)
     assert np.flatnonzero(~np.isnan(got)).tolist() == [0, 1, 2, 3, 4, 30, 31, 32, 33, 34]
 
 
 def test_nothing_is_extrapolated() -> None:
     t = np.arange(11) / 50
     values = np.where((t > 0.05) & (t < 0.15), 1.0, np.nan)
-    got = interpolate(t, values, tick_times(t, "interpolate"), longest_gap_s=0.1)
+    got = interpolate(t, values, build_resampler(t, "interpolate").at_s, longest_gap_s=0.1)
     assert np.flatnonzero(~np.isnan(got)).tolist() == list(range(6, 15))
 
 
 def test_a_slow_sensor_is_resampled_from_its_own_samples() -> None:
     t = np.arange(51) / 50
     slow = np.where(np.arange(51) % 5 == 0, 3 * t, np.nan)  # 10 Hz
-    at = tick_times(t, "interpolate")
+    at = build_resampler(t, "interpolate").at_s
     assert_allclose(interpolate(t, slow, at, longest_gap_s=0.1), 3 * at, atol=1e-12)
     sparse = interpolate(t, slow, at, longest_gap_s=0.05)
     assert np.flatnonzero(~np.isnan(sparse)).tolist() == list(range(0, 101, 10))
