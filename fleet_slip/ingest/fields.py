@@ -169,9 +169,9 @@ def _lies_within(values: pl.Series, low: float, high: float, scale: Decimal) -> 
     present = values.drop_nulls().to_numpy()
     if not present.size:
         return True
-    # Dividing keeps the order of what it rounds.
+    # Dividing keeps the order of what it rounds; a NaN is the least and the most, and in no range.
     least, most = float(present.min()) / float(scale), float(present.max()) / float(scale)
-    return is_finite(present) and low < least and most < high
+    return low < least and most < high
 
 
 def _positive(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Field:

@@ -18,7 +18,14 @@ from fleet_slip.ingest.preview import signals_of
 from fleet_slip.ingest.stream import MeasuredStream, open_measured
 from fleet_slip.ingest.suspicion import Suspicion, find_suspicions
 from fleet_slip.ingest.totals import IngestCounts
-from fleet_slip.ingest.writing import FILE_ROWS, DataFiles, FileWriter, TableName, WrittenFile
+from fleet_slip.ingest.writing import (
+    FILE_ROWS,
+    WRITERS,
+    DataFiles,
+    FileWriter,
+    TableName,
+    WrittenFile,
+)
 from fleet_slip.warehouse.audit import Audit
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -99,10 +106,10 @@ def write_batch(
         "quarantine": warehouse.quarantine.snapshot(),
         "logs": warehouse.logs.snapshot(),
     }
-    with ThreadPoolExecutor(1) as thread:
+    with ThreadPoolExecutor(WRITERS) as threads:
         parts: dict[TableName, _PartInTheMaking] = {
-            "quarantine": _PartInTheMaking(DataFiles(warehouse.quarantine, thread, by_day=False)),
-            "logs": _PartInTheMaking(DataFiles(warehouse.logs, thread, by_day=True)),
+            "quarantine": _PartInTheMaking(DataFiles(warehouse.quarantine, threads, by_day=False)),
+            "logs": _PartInTheMaking(DataFiles(warehouse.logs, threads, by_day=True)),
         }
         for asked in files:
             try:
@@ -115,7 +122,7 @@ def write_batch(
                         and not _landed(snapshots[name], stream.digest)
                     ]
                     missing = missing if "logs" in missing else []
-                    written = FileWriter(warehouse, stream, missing, thread).write()
+                    written = FileWriter(warehouse, stream, missing, threads).write()
             except InputError as error:
                 failures.append(error)
                 continue

@@ -1,5 +1,6 @@
 """Keeps the rows of drives that have not ended yet."""
 
+import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -72,7 +73,7 @@ class OpenDrives:
         if len(heads) > MOST_RUNS + 1:
             runs = rows.partition_by("part", maintain_order=True)
         else:
-            runs = [_run(rows, *ends) for ends in zip(heads, heads[1:], strict=False)]
+            runs = [_run(rows, *ends) for ends in itertools.pairwise(heads)]
         for run in runs:
             self._rows.setdefault(int(run["part"][0]), []).append(run)
 

@@ -24,22 +24,25 @@ from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA, Warehouse
 FILE_ROWS = 2**18
 """A data file is written as soon as it has so many rows; its last drive may make it larger."""
 
+WRITERS = 2
+"""Data files that are written at once: encoding them is the longest part of an ingest."""
+
 TableName: TypeAlias = Literal["quarantine", "logs"]
 
 
 class DataFiles:
-    """Rows of one table on their way to data files, one file a day, written by a thread."""
+    """Rows of one table on their way to data files, one file a day, written by threads."""
 
-    def __init__(self, table: Table, thread: ThreadPoolExecutor, *, by_day: bool) -> None:
-        """Take the table and the only thread that writes."""
-        self._table, self._thread, self._by_day = table, thread, by_day
+    def __init__(self, table: Table, threads: ThreadPoolExecutor, *, by_day: bool) -> None:
+        """Take the table and the threads that write."""
+        self._table, self._threads, self._by_day = table, threads, by_day
         self._written: list[Future[list[AddAction]]] = []
 
     def write(self, name: str, rows: pa.Table) -> None:
-        """Write rows, while the caller goes on; the rows before are written then."""
-        if self._written:
-            self._written[-1].result()
-        self._written.append(self._thread.submit(self._write, name, rows))
+        """Write rows, while the caller goes on; at most `WRITERS` of a table are on their way."""
+        if len(self._written) >= WRITERS:
+            self._written[-WRITERS].result()
+        self._written.append(self._threads.submit(self._write, name, rows))
 
     def files(self) -> tuple[AddAction, ...]:
         """Return the files, all written."""
@@ -118,14 +121,14 @@ class FileWriter:
         warehouse: Warehouse,
         stream: MeasuredStream,
         missing: Collection[TableName],
-        thread: ThreadPoolExecutor,
+        threads: ThreadPoolExecutor,
     ) -> None:
-        """Take an open file, the tables that miss it, and the only thread that writes."""
+        """Take an open file, the tables that miss it, and the threads that write."""
         self._stream, self._missing = stream, missing
         self._audit = Audit(warehouse.root)
         self._large: dict[TableName, DataFiles] = {
-            "quarantine": DataFiles(warehouse.quarantine, thread, by_day=False),
-            "logs": DataFiles(warehouse.logs, thread, by_day=True),
+            "quarantine": DataFiles(warehouse.quarantine, threads, by_day=False),
+            "logs": DataFiles(warehouse.logs, threads, by_day=True),
         }
         self._names = count(1)
         self._result = WrittenFile()
