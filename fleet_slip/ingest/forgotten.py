@@ -1,54 +1,57 @@
 """Leaves out of a measured log what was forgotten: cars and drives that may not come back."""
 
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.delta import only_used_values
+from fleet_slip.ingest.measured_drives import MeasuredDrive
 from fleet_slip.warehouse.audit import Audit
 
 
 @dataclass(frozen=True)
-class KeptRows:
-    """What of a measured log may land.
+class KeptDrives:
+    """Drives that may land.
 
     Attributes:
-        logs, quarantine: its rows.
-        vehicles, drives: whose rows these are.
-        left_out: drives that may not land.
+        vehicles: whose drives they are.
+        left_out: how many may not land.
     """
 
-    logs: pa.Table
-    quarantine: pa.Table
+    drives: tuple[MeasuredDrive, ...]
     vehicles: frozenset[str]
-    drives: frozenset[str]
     left_out: int
 
 
-def without_forgotten(
-    logs: pa.Table, quarantine: pa.Table, audit: Audit, others: frozenset[str] = frozenset()
-) -> KeptRows:
-    """Return what of the rows of a measured log may land; it has also drives that are not there.
+def keep_drives(drives: Sequence[MeasuredDrive], audit: Audit) -> KeptDrives:
+    """Return the drives that were not forgotten, nor their cars."""
+    vehicles = {str(drive.metadata["vehicle_id"]) for drive in drives}
+    barred = audit.barred(vehicles, {drive.drive_id for drive in drives})
+    kept = tuple(
+        drive
+        for drive in drives
+        if drive.drive_id not in barred.drives
+        and str(drive.metadata["vehicle_id"]) not in barred.vehicles
+    )
+    there = frozenset(str(drive.metadata["vehicle_id"]) for drive in kept)
+    return KeptDrives(kept, there, len(drives) - len(kept))
+
+
+def keep_refused(
+    refused: pa.Table, audit: Audit, drives: Collection[str] = ()
+) -> tuple[pa.Table, frozenset[str]]:
+    """Return the refused rows that may land, and whose they are; their file has these drives.
 
     A refused row goes with its car, or with the drive that it would have been of: the name of a
     drive that was cut at gaps in time begins with it.
     """
-    there = _names(logs, "drive_id")
-    vehicles = _names(logs, "vehicle_id") | _names(quarantine, "vehicle_id")
-    drives = there | _names(quarantine, "drive_id")
-    barred = audit.barred(vehicles, drives | others)
-    whole = {name for name in drives if any(d.startswith(f"{name}-") for d in barred.drives)}
-    logs = _without(_without(logs, "vehicle_id", barred.vehicles), "drive_id", barred.drives)
-    refused = _without(quarantine, "vehicle_id", barred.vehicles)
-    refused = _without(refused, "drive_id", barred.drives | whole)
-    return KeptRows(
-        logs,
-        refused,
-        vehicles - barred.vehicles,
-        drives - barred.drives - whole,
-        len(there - _names(logs, "drive_id")) if barred else 0,
-    )
+    vehicles, named = _names(refused, "vehicle_id"), _names(refused, "drive_id")
+    barred = audit.barred(vehicles, named | set(drives))
+    whole = {name for name in named if any(d.startswith(f"{name}-") for d in barred.drives)}
+    kept = _without(refused, "vehicle_id", barred.vehicles)
+    return _without(kept, "drive_id", barred.drives | whole), vehicles - barred.vehicles
 
 
 def _names(rows: pa.Table, column: str) -> frozenset[str]:

@@ -171,7 +171,7 @@ class _PartInTheMaking:
         """Write the rows of files in the order of their digests: so drives are in that of names."""
         digests = sorted(self._rows)
         whole = pa.concat_tables(self._rows[digest] for digest in digests).unify_dictionaries()
-        self._together.write(f"measured-{_digest(digests)[:24]}", whole)
+        self._together.write(f"measured-{_digest(digests)[:24]}", lambda: whole)
         self._rows = {}
 
 

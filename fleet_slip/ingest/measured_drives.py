@@ -30,6 +30,13 @@ SOURCE = "measured"
 _SECONDS_PER_DAY = 86_400
 _EARLIEST_S = 10**8
 """Times before 1973 are counted from the start of a recording, not from 1970."""
+_POLARS_TYPES: dict[pa.DataType, type[pl.DataType]] = {
+    pa.string(): pl.String,
+    pa.float64(): pl.Float64,
+    pa.int64(): pl.Int64,
+    pa.int32(): pl.Int32,
+    pa.date32(): pl.Date,
+}
 _FROM_MAPPING = ("vehicle_id", "vehicle_model", "track", "mass_kg", "adhesion", "day")
 
 
@@ -83,7 +90,9 @@ def to_ticks(
             values = [_resample(samples[signal].to_numpy(), own, signal, mapping)]
         # Rounding clips a resampled value's last bit, no more: the rest is in quarantine.
         counts[signal] = round_chunks(values, catalogue()[signal])
-        if not somewhere.all():
+        if not counts[signal].null_count:
+            somewhere[:] = True
+        elif not somewhere.all():
             somewhere |= counts[signal].is_valid().to_numpy(zero_copy_only=False)
     if not somewhere.all():
         counts = {key: array.filter(pa.array(somewhere)) for key, array in counts.items()}
@@ -147,27 +156,25 @@ def log_table(drives: Sequence[MeasuredDrive], mapping: Mapping) -> pa.Table:
         elif field.name in catalogue().signals:
             columns[field.name] = pa.nulls(sum(sizes), field.type)
         else:
-            values = pa.array([drive.metadata.get(field.name) for drive in drives], field.type)
-            columns[field.name] = _repeat(values, sizes)
+            values = [drive.metadata.get(field.name) for drive in drives]
+            columns[field.name] = _repeat(values, field.type, sizes)
     return pa.table(columns)
 
 
-def _repeat(values: pa.Array, times: Sequence[int]) -> pa.Array:
+def _repeat(values: Sequence[Any], kind: pa.DataType, times: Sequence[int]) -> pa.Array:
     """Return each value as often as it is told; texts as codes of a dictionary."""
-    if pa.types.is_string(values.type):
-        encoded = values.dictionary_encode()
-        codes = _repeat(encoded.indices, times)
-        return pa.DictionaryArray.from_arrays(codes, encoded.dictionary)
-    if values.null_count == len(values):
-        return pa.nulls(sum(times), values.type)
-    if values.null_count:
-        return values.take(pa.array(np.repeat(np.arange(len(values)), times)))
-    plain = values.view(pa.int32()) if pa.types.is_date(values.type) else values
-    repeated = np.empty(sum(times), dtype=plain.to_numpy().dtype)
-    ends = np.cumsum(times)
-    for value, end, number in zip(plain.to_numpy(), ends, times, strict=True):
-        repeated[end - number : end] = value
-    return as_arrow(repeated).view(values.type)
+    if pa.types.is_string(kind):
+        texts = list(dict.fromkeys(text for text in values if text is not None))
+        codes = {text: i for i, text in enumerate(texts)}
+        repeated = _repeat([codes.get(text) for text in values], pa.int32(), times)
+        return pa.DictionaryArray.from_arrays(repeated, _as_arrow(texts, kind), safe=False)
+    scalars = zip(_as_arrow(values, kind), times, strict=True)
+    return pa.concat_arrays([pa.repeat(value, number) for value, number in scalars])
+
+
+def _as_arrow(values: Sequence[Any], kind: pa.DataType) -> pa.Array:
+    """Return values as Arrow has them; not by `pa.array`, which imports pandas if it is there."""
+    return pl.Series(values, dtype=_POLARS_TYPES[kind]).to_arrow().cast(kind)
 
 
 def _metadata(name: str, told: dict[str, Any], start_s: float, mapping: Mapping) -> dict[str, Any]:

@@ -1,9 +1,10 @@
 """Writes what a measured file becomes to data files of bounded size. Nothing is committed."""
 
 import os
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import count
 from tempfile import TemporaryFile
 from typing import IO, Any, Literal, TypeAlias
@@ -13,9 +14,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from deltalake.transaction import AddAction
 
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.delta import Table
-from fleet_slip.ingest.forgotten import without_forgotten
+from fleet_slip.ingest.forgotten import keep_drives, keep_refused
 from fleet_slip.ingest.measured_drives import MeasuredDrive, log_table
 from fleet_slip.ingest.stream import MeasuredStream
 from fleet_slip.warehouse.audit import Audit
@@ -38,8 +38,11 @@ class DataFiles:
         self._table, self._threads, self._by_day = table, threads, by_day
         self._written: list[Future[list[AddAction]]] = []
 
-    def write(self, name: str, rows: pa.Table) -> None:
-        """Write rows, while the caller goes on; at most `WRITERS` of a table are on their way."""
+    def write(self, name: str, rows: Callable[[], pa.Table]) -> None:
+        """Write rows, made when it is their turn, while the caller goes on.
+
+        At most `WRITERS` files of a table are on their way.
+        """
         if len(self._written) >= WRITERS:
             self._written[-WRITERS].result()
         self._written.append(self._threads.submit(self._write, name, rows))
@@ -53,7 +56,8 @@ class DataFiles:
         written = [future for future in self._written if future.exception() is None]
         self._table.discard(file for future in written for file in future.result())
 
-    def _write(self, name: str, rows: pa.Table) -> list[AddAction]:
+    def _write(self, name: str, make: Callable[[], pa.Table]) -> list[AddAction]:
+        rows = make()
         parts = _by_day(rows) if self._by_day else {None: rows}
         return [self._table.write_file(name, part, day) for day, part in parts.items()]
 
@@ -155,35 +159,36 @@ class FileWriter:
                 if longest is None or drive.ticks.size > longest.ticks.size:
                     self._result.longest = drive
                 if sum(one.ticks.size for one in waiting) >= FILE_ROWS:
-                    self._pass_on("logs", self._logs(waiting), last=False)
+                    self._pass_on_drives(waiting, last=False)
                     waiting = []
-        if waiting:
-            self._pass_on("logs", self._logs(waiting), last=True)
-        nothing = catalogue().log_schema.empty_table()
+        self._pass_on_drives(waiting, last=True)
         tables = refused.tables()
         table = next(tables, None)
         while table is not None:
-            kept = without_forgotten(nothing, table, self._audit, frozenset(self._result.drives))
-            self._result.vehicles |= kept.vehicles
+            kept, vehicles = keep_refused(table, self._audit, self._result.drives)
+            self._result.vehicles |= vehicles
             table = next(tables, None)
-            self._pass_on("quarantine", kept.quarantine, last=table is None)
+            if kept.num_rows:
+                self._pass_on("quarantine", partial(pa.Table.slice, kept), last=table is None)
 
-    def _logs(self, drives: list[MeasuredDrive]) -> pa.Table:
-        """Return rows of drives that may land."""
-        drives = sorted(drives, key=lambda drive: drive.drive_id)
-        table = log_table(drives, self._stream.mapping)
-        kept = without_forgotten(table, QUARANTINE_SCHEMA.empty_table(), self._audit)
+    def _pass_on_drives(self, drives: list[MeasuredDrive], *, last: bool) -> None:
+        """Pass on the rows of drives that may land."""
+        if not drives:
+            return
+        kept = keep_drives(sorted(drives, key=lambda drive: drive.drive_id), self._audit)
         self._result.vehicles |= kept.vehicles
-        self._result.drives |= kept.drives
+        self._result.drives |= {drive.drive_id for drive in kept.drives}
         self._result.left_out += kept.left_out
-        self._result.ticks += kept.logs.num_rows
-        return kept.logs
+        self._result.ticks += sum(drive.ticks.size for drive in kept.drives)
+        if kept.drives:
+            rows = partial(log_table, kept.drives, self._stream.mapping)
+            self._pass_on("logs", rows, last=last)
 
-    def _pass_on(self, name: TableName, rows: pa.Table, *, last: bool) -> None:
-        if not rows.num_rows or name not in self._missing:
+    def _pass_on(self, name: TableName, rows: Callable[[], pa.Table], *, last: bool) -> None:
+        if name not in self._missing:
             return
         if last:
-            self._result.rest[name] = rows
+            self._result.rest[name] = rows()
         else:
             self._large[name].write(
                 f"measured-{self._stream.digest[:24]}-{next(self._names)}", rows

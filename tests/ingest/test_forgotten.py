@@ -7,19 +7,26 @@ import pyarrow as pa
 import pytest
 
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.ingest import MeasuredLog
-from fleet_slip.ingest.forgotten import without_forgotten
+from fleet_slip.ingest.forgotten import keep_drives, keep_refused
+from fleet_slip.ingest.measured_drives import MeasuredDrive
+from fleet_slip.ingest.stream import open_measured
 from fleet_slip.warehouse.audit import Audit, Forgettable
-from tests.support.measured import a_mapping, good_columns, read_columns
+from tests.support.measured import a_mapping, csv_text, good_columns
 
 
-def two_cars(folder: Path) -> MeasuredLog:
-    """A log of the cars a and b, a drive each, the last row of each refused."""
+def two_cars(folder: Path) -> tuple[list[MeasuredDrive], pa.Table]:
+    """The drives of a log of the cars a and b, one each, and its refused rows: the last of each."""
     columns = {name: values * 2 for name, values in good_columns(20).items()}
     columns["car"] = ["a"] * 20 + ["b"] * 20
     columns["ax"] = list(columns["ax"])
     columns["ax"][19] = columns["ax"][39] = "broken"
-    return read_columns(folder, columns, a_mapping(drive={"vehicle_id": {"column": "car"}}))
+    mapping = a_mapping(drive={"vehicle_id": {"column": "car"}})
+    file = folder / "log.csv"
+    file.write_text(csv_text(columns))
+    with open_measured(file, mapping) as stream:
+        pieces = list(stream.pieces())
+    drives = [drive for piece in pieces for drive in piece.drives]
+    return drives, stream.quarantine_table([piece.refused for piece in pieces])
 
 
 def cars(rows: pa.Table) -> set[str]:
@@ -27,26 +34,31 @@ def cars(rows: pa.Table) -> set[str]:
 
 
 def test_without_a_record_all_rows_are_kept(tmp_path: Path) -> None:
-    log = two_cars(tmp_path)
-    kept = without_forgotten(log.drives, log.quarantine, Audit(LocalFolder(tmp_path / "data")))
-    assert (kept.logs.num_rows, kept.quarantine.num_rows) == (
-        log.drives.num_rows,
-        log.quarantine.num_rows,
-    )
-    assert (set(kept.vehicles), kept.left_out) == ({"a", "b"}, 0)
+    drives, refused = two_cars(tmp_path)
+    audit = Audit(LocalFolder(tmp_path / "data"))
+    kept = keep_drives(drives, audit)
+    assert (list(kept.drives), kept.vehicles, kept.left_out) == (drives, {"a", "b"}, 0)
+    assert keep_refused(refused, audit) == (refused, {"a", "b"})
 
 
 @pytest.mark.parametrize("kind", ["vehicle", "drive"])
 def test_the_rows_of_what_was_forgotten_are_left_out(
     kind: Literal["vehicle", "drive"], tmp_path: Path
 ) -> None:
-    log = two_cars(tmp_path)
-    of_a = [one for one in log.drives.to_pylist() if one["vehicle_id"] == "a"]
-    value = "a" if kind == "vehicle" else of_a[0]["drive_id"]
+    drives, refused = two_cars(tmp_path)
+    of_a, of_b = drives
     audit = Audit(LocalFolder(tmp_path / "data"))
-    audit.begin(Forgettable(kind, value), 1, [], {})
-    kept = without_forgotten(log.drives, log.quarantine, audit)
-    assert cars(log.drives) == cars(log.quarantine) == {"a", "b"}
-    assert cars(kept.logs) == cars(kept.quarantine) == {"b"}
-    assert kept.logs.num_rows == log.drives.num_rows - len(of_a)
-    assert kept.left_out == 1
+    audit.begin(Forgettable(kind, "a" if kind == "vehicle" else of_a.drive_id), 1, [], {})
+    kept = keep_drives(drives, audit)
+    assert (kept.drives, kept.vehicles, kept.left_out) == ((of_b,), {"b"}, 1)
+    assert cars(refused) == {"a", "b"}
+    assert cars(keep_refused(refused, audit)[0]) == {"b"}
+
+
+def test_the_refused_rows_of_a_drive_go_with_any_stretch_of_it(tmp_path: Path) -> None:
+    _, refused = two_cars(tmp_path)
+    stretch = f"{refused['drive_id'][0]}-2"
+    audit = Audit(LocalFolder(tmp_path / "data"))
+    audit.begin(Forgettable("drive", stretch), 1, [], {})
+    assert cars(keep_refused(refused, audit, {stretch})[0]) == {"b"}
+    assert cars(keep_refused(refused, audit)[0]) == {"a", "b"}
