@@ -46,6 +46,10 @@ class CanSource:
             for signal in message.signals
         ]
 
+    def number_of_bases(self, columns: Sequence[str]) -> int:
+        """Return how many messages have one of the columns."""
+        return len({column.partition(".")[0] for column in columns})
+
     def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
         """Yield one batch for each message that has one of the columns."""
         wanted: dict[str, dict[str, Any]] = defaultdict(dict)

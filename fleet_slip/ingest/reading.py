@@ -7,7 +7,7 @@ written.
 """
 
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Protocol, TypeVar
@@ -17,7 +17,7 @@ import pyarrow as pa
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.can_bus import CanBus
-from fleet_slip.ingest.can_trace import open_can_trace
+from fleet_slip.ingest.can_trace import CanSource, open_can_trace
 from fleet_slip.ingest.columns import shown
 from fleet_slip.ingest.csv_batches import PlainNumbers, open_csv
 from fleet_slip.ingest.csv_format import CsvFormat
@@ -27,7 +27,7 @@ from fleet_slip.ingest.duckdb_table import DuckdbRows, open_duckdb
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.matlab import HDF5_AT, HDF5_MAGIC, MAT5_MAGIC, open_mat, open_mat73
 from fleet_slip.ingest.mdf import MAGICS as MDF_MAGICS
-from fleet_slip.ingest.mdf import open_mdf
+from fleet_slip.ingest.mdf import MdfSource, open_mdf
 from fleet_slip.ingest.parquet_batches import BATCH_ROWS, PARQUET_MAGIC, open_parquet
 from fleet_slip.ingest.source import BASE, Source
 from fleet_slip.ingest.time_bases import merge_bases
@@ -113,9 +113,10 @@ def _one_table(source: Source, file: Path, mapping: Mapping) -> Iterator[pl.Data
             f"{shown(file)}: {_CLOCK if source.has_clock else _NO_CLOCK}, in the mapping "
             f"{mapping.name!r}."
         )
-    if time is None or (len(bases) == 1 and not source.has_clock):
-        (columns,) = bases.values()
-        yield from source.batches(columns)
+    columns = next(iter(bases.values()))
+    if time is None or (len(bases) == 1 and _has_one_base(source, columns)):
+        for table in source.batches(columns):
+            yield from table.drop(BASE, strict=False).iter_slices(BATCH_ROWS)
         return
     tables = (
         table if source.has_clock else _with_times(table, own, time)
@@ -127,6 +128,11 @@ def _one_table(source: Source, file: Path, mapping: Mapping) -> Iterator[pl.Data
     except InputError as error:
         raise InputError(f"{shown(file)}: {error}") from None
     yield from merged.iter_slices(BATCH_ROWS)
+
+
+def _has_one_base(source: Source, columns: Sequence[str]) -> bool:
+    """Whether the rows of all these columns share their times, and so need not be merged."""
+    return not isinstance(source, MdfSource | CanSource) or source.number_of_bases(columns) == 1
 
 
 def _with_times(table: pl.DataFrame, own: str | None, time: str) -> pl.DataFrame:

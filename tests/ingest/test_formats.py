@@ -15,7 +15,7 @@ import scipy.io
 from asammdf import MDF, Signal
 
 from fleet_slip.errors import ExtraError, InputError
-from fleet_slip.ingest import Mapping, MeasuredLog, read_measured
+from fleet_slip.ingest import Mapping, MeasuredLog, mdf, read_measured
 from fleet_slip.ingest.source import reading_with
 from tests.support.measured import a_mapping, ticks
 
@@ -116,6 +116,22 @@ def test_what_mdf_marks_as_invalid_is_null(tmp_path: Path) -> None:
     assert log.drives["ax"].to_pylist() == AX_COUNTS
     expected = [None if bad else b for b, bad in zip(BETA_COUNTS, invalid, strict=True)]
     assert log.drives["sideslip"].to_pylist() == expected
+
+
+@pytest.mark.parametrize("version", ["3.30", "4.10", "4.20"])
+def test_a_group_of_an_mdf_file_is_read_window_by_window(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: str
+) -> None:
+    flags = {} if version == "3.30" else {"invalidation_bits": np.arange(100) % 7 == 0}
+    file = write_mdf(tmp_path, [a_x(), beta(**flags)], version=version)
+    whole = read_measured(file, mdf_mapping())
+    monkeypatch.setattr(mdf, "WINDOW_RECORDS", 33)
+    with mdf.open_mdf(file) as source:
+        batches = list(source.batches(["a_x", "beta"]))
+    assert [batch.height for batch in batches] == [33, 33, 33, 1]
+    log = read_measured(file, mdf_mapping())
+    assert log.drives.equals(whole.drives)
+    assert log.drives["sideslip"].null_count == (15 if flags else 0)
 
 
 def test_an_unfinalised_mdf_file_is_read(tmp_path: Path) -> None:
