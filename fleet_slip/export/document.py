@@ -9,27 +9,16 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fleet_slip.canonical import canonical_json, sha256_of
-from fleet_slip.catalogue.arithmetic import Step
-from fleet_slip.catalogue.columns import LARGEST_FACT, WEIGHT
+from fleet_slip.catalogue.columns import LARGEST_FACT
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 from fleet_slip.export.checks import Check
 from fleet_slip.export.costs import count_costs
-from fleet_slip.export.program import (
-    Angle,
-    CarFact,
-    Column,
-    Factor,
-    Gated,
-    Input,
-    Numbered,
-    Program,
-    Source,
-    Window,
-)
+from fleet_slip.export.program import Angle, CarFact, Input, Program
+from fleet_slip.export.steps import steps_of
 from fleet_slip.models.model_version import ModelVersion
 
 FORMAT = "fleet-slip estimator"
-SCHEMA = 1
+SCHEMA = 2
 """Number of the schema: it changes if an implementation of before would compute something else."""
 
 
@@ -59,6 +48,7 @@ def document_of(
 
 def program_content(program: Program) -> dict[str, Any]:
     """Return the program alone."""
+    steps, terms = steps_of(program)
     return {
         "tick_s": str(float(SAMPLE_TIME_S)),
         "signals": [_signal(one) for one in program.signals],
@@ -67,9 +57,8 @@ def program_content(program: Program) -> dict[str, Any]:
             {"name": one.name, "unit": one.unit, "grain": f"{one.grain:f}"}
             for one in program.numbers
         ],
-        "sources": [_source(one) for one in program.sources],
-        "columns": [_column(one) for one in program.columns],
-        "angle": _angle(program.angle),
+        "steps": [list(step) for step in steps],
+        "angle": _angle(program.angle, terms),
     }
 
 
@@ -90,50 +79,7 @@ def _fact(one: CarFact) -> dict[str, Any]:
     return {"name": one.name, "largest": LARGEST_FACT}
 
 
-def _source(one: Source) -> dict[str, Any]:
-    content: dict[str, Any] = {"name": one.name, "limit": one.limit, "ticks": one.ticks}
-    if one.arithmetic is None:
-        return {**content, "steps": [["signal", one.name]]}
-    content["steps"] = [_step(step) for step in one.arithmetic.steps]
-    if one.arithmetic.guard is not None:
-        content["guard"] = {"step": one.arithmetic.guard, "at_least": one.arithmetic.at_least}
-    return content
-
-
-def _step(step: Step) -> list[Any]:
-    if step.name:
-        return ["signal", step.name]
-    return [step.function, *step.operands] if step.function else ["constant", step.value]
-
-
-def _column(column: Column) -> dict[str, Any]:
-    match column:
-        case Window():
-            content: dict[str, Any] = {
-                "kind": column.over or "value",
-                "source": column.source,
-                "numerator": column.numerator,
-                "denominator": column.denominator,
-                "limit": column.limit,
-            }
-            if column.ticks:
-                content["ticks"] = column.ticks
-            if column.over == "running_mean":
-                content["most_values"] = column.most_values
-            return content
-        case Factor():
-            return {"kind": "factor", **vars(column)}
-        case Gated():
-            return {"kind": "gate", "weight": WEIGHT, **_without(vars(column), "largest")}
-        case Numbered():
-            return {"kind": "number", **_without(vars(column), "largest")}
-
-
-def _without(content: Mapping[str, Any], name: str) -> dict[str, Any]:
-    return {key: value for key, value in content.items() if key != name}
-
-
-def _angle(angle: Angle) -> dict[str, Any]:
+def _angle(angle: Angle, steps: Sequence[int]) -> dict[str, Any]:
     return {
         "name": angle.name,
         "column": angle.column,
@@ -142,7 +88,8 @@ def _angle(angle: Angle) -> dict[str, Any]:
         "bits": angle.bits,
         "intercept": str(angle.intercept),
         "terms": [
-            {"column": place, "coefficient": str(coefficient)} for place, coefficient in angle.terms
+            {"step": step, "coefficient": str(coefficient)}
+            for step, (_, coefficient) in zip(steps, angle.terms, strict=True)
         ],
         "error": f"{angle.error.numerator}/{angle.error.denominator}",
         "largest": angle.largest,

@@ -1,111 +1,54 @@
 """An estimator from the JSON document alone, by docs/export.md; it knows nothing of the package."""
 
+from operator import add, mul, neg, sub
 from typing import Any
 
 
-def nearest(value: int, divisor: int) -> int:
-    size = (2 * abs(value) + divisor) // (2 * divisor)
-    return -size if value < 0 else size
+def divide(a: int, b: int) -> int | None:
+    return None if b <= 0 else a // b if a >= 0 else -(-a // b)
 
 
-def clip(value: int, limit: int) -> int:
-    return max(-limit, min(limit, value))
-
-
-def divide(a: int, b: int) -> int:
-    return abs(a) // b if a >= 0 else -(abs(a) // b)
+def nearest(a: int, b: int) -> int | None:
+    return divide(2 * a + (b if a >= 0 else -b), 2 * b)
 
 
 DO: dict[str, Any] = {
-    "+": int.__add__, "-": int.__sub__, "*": int.__mul__, "//": divide, "abs": int.__abs__,
-    "negative": int.__neg__, "sign": lambda a: (a > 0) - (a < 0),
+    "+": add, "-": sub, "*": mul, "//": divide, "nearest": nearest, "min": min, "max": max,
+    "negative": neg, "abs": abs, "sign": lambda a: (a > 0) - (a < 0),
+    "clip": lambda a, b: max(-b, min(a, b)), "where": lambda a, _: a,
+    "at_least": lambda a, b: a if a >= b else None,
 }  # fmt: skip
 
 
-def source(one: Any, counts: dict[str, int | None]) -> int | None:
-    found: list[Any] = []
-    for word, *rest in one["steps"]:
-        known = [found[i] for i in rest] if word in DO else rest
-        if (word == "signal" and counts[rest[0]] is None) or (word == "//" and known[1] <= 0):
-            return None
-        found.append(
-            DO[word](*known) if word in DO else counts[rest[0]] if word == "signal" else rest[0]
-        )
-    if "guard" in one and found[one["guard"]["step"]] < one["guard"]["at_least"]:
-        return None
-    return clip(found[-1], one["limit"])
-
-
-def window(one: Any, values: list[Any], sums: list[int], counts: list[int]) -> int | None:
-    kind, back = one["kind"], one.get("ticks") or len(values)
-    first = max(len(values) - back, 0)
-    now = values[-1]
-    total, count = sums[-1] - sums[first], counts[-1] - counts[first]
-    if kind == "lag":
-        now = values[-1 - back] if len(values) > back else None
-    if now is None:
-        return None
-    if kind in ("value", "lag", "sum"):
-        total, count = total if kind == "sum" else now, 1
-    quotient = nearest(total * one["numerator"], one["denominator"] * count)
-    return clip(quotient, one["limit"])
-
-
-def factor(one: Any, of: int, fact: int) -> int:
-    return clip(
-        nearest(of * (fact - one["less"]) * one["numerator"], one["denominator"]), one["limit"]
-    )
-
-
-def gate(one: Any, of: int, at: int) -> int:
-    low, peak, high, full = one["low"], one["peak"], one["high"], one["weight"]
-    rising = 0 if at <= low else (at - low) * full // (peak - low)
-    falling = (
-        full if high is None else full - (at - peak) * full // (high - peak) if at < high else 0
-    )
-    return nearest(of * (rising if at < peak else falling), full)
-
-
-def angles(
-    program: Any, facts: list[Any], numbers: list[Any], samples: list[Any]
-) -> list[int | None]:
-    angle = program["angle"]
-    out: list[int | None] = []
-    past: list[Any] = [([], [0], [0]) for _ in program["sources"]]
+def angles(program: Any, facts: Any, numbers: Any, samples: Any) -> list[int | None]:
+    angle, past, out = program["angle"], list[Any](), list[int | None]()
+    sums: Any = [[0, 0] for _ in program["steps"]]
     for sample in samples:
-        valid = {s["name"]: c if c is not None and s["min"] <= c <= s["max"] else None
-                 for s, c in zip(program["signals"], sample, strict=True)}  # fmt: skip
-        for one, (values, sums, counts) in zip(program["sources"], past, strict=True):
-            values.append(source(one, valid))
-            sums.append(sums[-1] + (values[-1] or 0))
-            counts.append(counts[-1] + (values[-1] is not None))
-        found: list[Any] = []
-        for one in program["columns"]:
-            kind, of = one["kind"], found[one["of"]] if "of" in one else None
-            if kind == "number":
-                known, running = numbers[one["number"]], one["running"]
-                by = (
-                    known - one["less"]
-                    if known is not None
-                    else 0
-                    if running is None
-                    else found[running]
-                )
-                found.append(None if of is None or by is None else by if one["alone"] else of * by)
-            elif kind in ("factor", "gate"):
-                by = facts[one["fact"]] if kind == "factor" else found[one["by"]]
-                found.append(
-                    None
-                    if of is None or by is None
-                    else (factor if kind == "factor" else gate)(one, of, by)
-                )
+        signals = [n if n is not None and s["min"] <= n <= s["max"] else None
+                   for n, s in zip(sample, program["signals"], strict=True)]  # fmt: skip
+        given = {"signal": signals, "fact": facts, "number": numbers}
+        now: list[Any] = []
+        past.append(now)
+        for (do, *of), total in zip(program["steps"], sums, strict=True):
+            if do in DO:
+                values = [now[i] for i in of]
+                now.append(None if None in values else DO[do](*values))
+            elif do in ("constant", *given):
+                now.append(of[0] if do == "constant" else given[do][of[0]])
+            elif do == "else":
+                now.append(now[of[0]] if now[of[0]] is not None else now[of[1]])
             else:
-                found.append(window(one, *past[one["source"]]))
-        terms = [(found[t["column"]], int(t["coefficient"])) for t in angle["terms"]]
+                new, old = now[of[0]], past[-1 - of[1]][of[0]] if len(past) > of[1] else None
+                if old is not None and of[1]:
+                    total[:] = total[0] - old, total[1] - 1
+                if new is not None and do != "ago" and total[1] < of[2]:
+                    total[:] = total[0] + new, total[1] + 1
+                now.append(old if do == "ago" else total[do == "values"])
+        terms = [(now[t["step"]], int(t["coefficient"])) for t in angle["terms"]]
         if any(n is None for n, _ in terms):
             out.append(None)
-        else:
-            total = int(angle["intercept"]) + sum(n * c for n, c in terms)
-            nearest_up = (2 * total + 2 ** angle["bits"]) >> (angle["bits"] + 1)
-            out.append(clip(nearest_up, angle["limit"]))
+            continue
+        total = int(angle["intercept"]) + sum(n * c for n, c in terms)
+        rounded = (2 * total + 2 ** angle["bits"]) >> (angle["bits"] + 1)
+        out.append(DO["clip"](rounded, angle["limit"]))
     return out

@@ -96,8 +96,12 @@ def with_another_name(document: Document) -> Document:
     return sealed(document)
 
 
+def of_yesterday(document: Document) -> Document:
+    return sealed({**document, "schema": 1})
+
+
 def of_tomorrow(document: Document) -> Document:
-    return sealed({**document, "schema": 2})
+    return sealed({**document, "schema": 3})
 
 
 def flipped(document: Document) -> Document:
@@ -111,7 +115,8 @@ def flipped(document: Document) -> Document:
         (without_drives, "lacks the hashes"),
         (with_another_coefficient, "is not that of"),
         (with_another_name, "is not that of"),
-        (of_tomorrow, "schema 2"),
+        (of_yesterday, "schema 1. Export it again"),
+        (of_tomorrow, "schema 3"),
         (flipped, "changed or damaged"),
         (lambda document: document["program"], "no exported version"),
         (lambda document: [document], "no exported version"),
