@@ -17,13 +17,16 @@ def field_names(program: Program) -> dict[str, tuple[str, ...]]:
     }
 
 
-def different(names: Sequence[str]) -> tuple[str, ...]:
-    """Return names of which none stands twice."""
-    seen: dict[str, int] = {}
-    found = []
+def different(names: Sequence[str], longest: int | None = None) -> tuple[str, ...]:
+    """Return names of which none stands twice; none is longer than that, if it is given."""
+    found: list[str] = []
     for name in names:
-        seen[name] = seen.get(name, 0) + 1
-        found.append(name if seen[name] == 1 else f"{name}_{seen[name]}")
+        number, one = 1, name[:longest]
+        while one in found:
+            number += 1
+            end = f"_{number}"
+            one = name[: longest - len(end)] + end if longest else name + end
+        found.append(one)
     return tuple(found)
 
 

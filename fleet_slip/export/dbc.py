@@ -24,7 +24,7 @@ def dbc_text(version: ModelVersion, program: Program) -> str:
     Raw values of signals are counts. In the angle's message are its count, whether there is one,
     and the first 24 bits of the version's SHA-256.
     """
-    names = different([one.name[:LONGEST_NAME] for one in program.signals])
+    names = different([one.name for one in program.signals], LONGEST_NAME)
     signals = iter(zip(names, program.signals, strict=True))
     parts, comments = [_HEAD], [f'CM_ "{_about(version, program)}";']
     number = 0

@@ -12,18 +12,18 @@ A ring has the oldest value first. A missing value of a ring, an unknown fact or
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any, Literal
 
 import numpy as np
 import onnx
-from onnx import TensorProto, helper, numpy_helper
+from onnx import TensorProto, helper
 
 from fleet_slip.catalogue.arithmetic import Arithmetic
 from fleet_slip.catalogue.columns import LARGEST_FACT, WEIGHT
 from fleet_slip.catalogue.signals import COUNT_MAX, catalogue
 from fleet_slip.export.c_columns import sum_key, summed
+from fleet_slip.export.onnx_nodes import Nodes, Value
 from fleet_slip.export.program import Factor, Gated, Numbered, Program, Source, Window
 from fleet_slip.models.counts_model import counts_model
 from fleet_slip.models.model_version import ModelVersion
@@ -34,14 +34,6 @@ UNKNOWN = -(2**31)
 FloatName = Literal["float32", "float64"]
 FLOAT_BITS = {"float32": 24, "float64": 53}
 _KINDS = {"float32": TensorProto.FLOAT, "float64": TensorProto.DOUBLE}
-
-
-@dataclass(frozen=True)
-class Value:
-    """Names of two tensors (cars, 1): an integer, which is 0 where missing, and if it is there."""
-
-    value: str
-    there: str
 
 
 def onnx_model(version: ModelVersion, program: Program, kind: FloatName) -> bytes:
@@ -99,18 +91,14 @@ def _properties(version: ModelVersion, program: Program, kind: FloatName) -> dic
     }
 
 
-class _Writer:
-    """Writes the nodes of a graph."""
+class _Writer(Nodes):
+    """Writes the nodes of a program."""
 
     def __init__(self, program: Program, kind: FloatName) -> None:
         """Begin with no node."""
+        super().__init__()
         self.program, self.kind = program, _KINDS[kind]
         self.dtype: Any = np.dtype(kind)
-        self.nodes: list[Any] = []
-        self.inputs: list[Any] = []
-        self.outputs: list[Any] = []
-        self.constants: list[Any] = []
-        self._known: dict[tuple[str, bytes], str] = {}
 
     def write(self, exact: Sequence[Fraction]) -> None:
         """Write all; `exact` is the intercept and the coefficients in the unit of the angle."""
@@ -140,70 +128,11 @@ class _Writer:
                     )
         self._angle([columns[place] for place, _ in program.angle.terms], exact)
 
-    def do(self, operation: str, *inputs: str | int, out: str = "", **attributes: Any) -> str:
-        """Add a node; whole numbers are constants. Return the name of what it computes."""
-        names = [one if isinstance(one, str) else self.constant(one) for one in inputs]
-        name = out or f"{operation.lower()}_{len(self.nodes)}"
-        self.nodes.append(helper.make_node(operation, names, [name], **attributes))
-        return name
-
-    def constant(self, value: Any, dtype: Any = np.int64) -> str:
-        """Return the name of a constant, which is written once."""
-        array = np.asarray(value, dtype)
-        key = (f"{array.dtype}{array.shape}", array.tobytes())
-        if key not in self._known:
-            self._known[key] = f"constant_{len(self._known)}"
-            self.constants.append(numpy_helper.from_array(array, self._known[key]))
-        return self._known[key]
-
-    def all_there(self, values: Sequence[Value]) -> str:
-        """Return whether all of these are there."""
-        there, *rest = dict.fromkeys(one.there for one in values)
-        for one in rest:
-            there = self.do("And", there, one)
-        return there
-
-    def where(self, there: str, value: str | int) -> Value:
-        """Return a value that is 0 where it is missing."""
-        return Value(self.do("Where", there, value, 0), there)
-
-    def clip(self, value: str, limit: int) -> str:
-        """Return a value within a limit."""
-        return self.do("Max", self.do("Min", value, limit), -limit)
-
-    def nearest(self, value: str, numerator: int, divisor: str | int) -> str:
-        """Return value * numerator / divisor to the nearest, halves away from zero."""
-        twice = self.do("Mul", self.do("Abs", value), 2 * numerator)
-        size = self.do("Div", self.do("Add", twice, divisor), self.do("Mul", divisor, 2))
-        return self.signed(value, size)
-
-    def signed(self, value: str, size: str | int) -> str:
-        """Return a size with the sign of a value.
-
-        Not by `Sign`: of vectors of int64, onnxruntime 1.31 takes it from the lower 32 bits.
-        """
-        negative = self.do("Less", value, 0)
-        return self.do("Where", negative, self.do("Neg", size), size)
-
-    def _declare(self, name: str, width: int, kind: int = TensorProto.INT64) -> str:
-        self.inputs.append(helper.make_tensor_value_info(name, kind, ["cars", width]))
-        return name
-
-    def _next(self, name: str, width: int) -> str:
-        declared = helper.make_tensor_value_info(f"{name}_next", TensorProto.INT64, ["cars", width])
-        self.outputs.append(declared)
-        return f"{name}_next"
-
-    def _part(self, name: str, first: int, last: int) -> str:
-        return self.do(
-            "Slice", name, *(self.constant([one]) for one in (first, last)), self.constant([1])
-        )
-
     def _signals(self) -> dict[str, Value]:
         found = {}
-        given = self._declare("signals", len(self.program.signals), self.kind)
+        given = self.declare("signals", len(self.program.signals), self.kind)
         for place, one in enumerate(self.program.signals):
-            physical = self._part(given, place, place + 1)
+            physical = self.part(given, place, place + 1)
             scale = self.constant(float(one.scale), self.dtype)
             count = self.do("Round", self.do("Div", physical, scale))
             least, most = (self.constant(n, self.dtype) for n in (one.min_count, one.max_count))
@@ -218,10 +147,10 @@ class _Writer:
         """Return what a car is told, unknown beyond the largest."""
         if not largest:
             return []
-        given = self._declare(name, len(largest))
+        given = self.declare(name, len(largest))
         found = []
         for place, most in enumerate(largest):
-            value = self._part(given, place, place + 1)
+            value = self.part(given, place, place + 1)
             known = self.do("LessOrEqual", self.do("Abs", value), most)
             found.append(self.where(known, value))
         return found
@@ -263,26 +192,32 @@ class _Writer:
         ticks = self.program.sources[place].ticks
         if not ticks:
             return ""
-        ring = self._declare(f"ring_{place}", ticks)
+        ring = self.declare(f"ring_{place}", ticks)
         kept = self.do("Where", now.there, now.value, UNKNOWN)
         longer = self.do("Concat", ring, kept, axis=1)
         last = [self.constant([one]) for one in (1, ticks + 1)]
-        self.do("Slice", longer, *last, self.constant([1]), out=self._next(f"ring_{place}", ticks))
+        self.do(
+            "Slice",
+            longer,
+            *last,
+            self.constant([1]),
+            out=self.declare_next(f"ring_{place}", ticks),
+        )
         return longer
 
     def _sum(self, key: str, one: Window, ring: str, now: Value) -> tuple[str, str]:
         """Return the sum and the number of the values of a window."""
         if one.over == "running_mean":
-            total, count = self._declare(f"sum_{key}", 1), self._declare(f"values_{key}", 1)
+            total, count = self.declare(f"sum_{key}", 1), self.declare(f"values_{key}", 1)
             takes = self.do("And", now.there, self.do("Less", count, one.most_values))
             more = self.do("Where", takes, now.value, 0)
             one_more = self.do("Cast", takes, to=TensorProto.INT64)
             return (
-                self.do("Add", total, more, out=self._next(total, 1)),
-                self.do("Add", count, one_more, out=self._next(count, 1)),
+                self.do("Add", total, more, out=self.declare_next(total, 1)),
+                self.do("Add", count, one_more, out=self.declare_next(count, 1)),
             )
         length = self.program.sources[one.source].ticks + 1
-        values = self._part(ring, length - one.ticks, length)
+        values = self.part(ring, length - one.ticks, length)
         there = self.do("Not", self.do("Equal", values, UNKNOWN))
         axis = self.constant([1])
         total = self.do("ReduceSum", self.do("Where", there, values, 0), axis, keepdims=1)
@@ -301,7 +236,7 @@ class _Writer:
         total, divisor = now.value, self.constant(one.denominator)
         if one.over == "lag":
             at = self.program.sources[one.source].ticks - one.ticks
-            past = self._part(rings[one.source], at, at + 1)
+            past = self.part(rings[one.source], at, at + 1)
             now = self.where(self.do("Not", self.do("Equal", past, UNKNOWN)), past)
             total = now.value
         elif one.over is not None:

@@ -1,23 +1,37 @@
 """A version that is exported and imported elsewhere is the same estimator, and says its origin."""
 
 import json
+import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from fractions import Fraction
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import fleet_slip
 from fleet_slip.canonical import canonical_json, sha256_of
 from fleet_slip.cli.main import app
 from fleet_slip.errors import DataError, InputError, RefusedError, UsageError
+from fleet_slip.export.files import export_files
+from fleet_slip.files.documents import checksum
 from fleet_slip.maintenance.verification import Verification
 from fleet_slip.maintenance.verify_documents import verify_models
+from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.models.signing import VERIFY_VARIABLE, make_keys
 from fleet_slip.models.trained_drives import read_trained_drives
 from fleet_slip.models.up_to_date import is_up_to_date
 from fleet_slip.monitoring.monitor import monitor
+from tests.export.models import model_of
 
 Document = dict[str, Any]
+
+needs_signing = pytest.mark.skipif(
+    find_spec("cryptography") is None, reason="signatures need the extra 'signing'"
+)
 
 
 @pytest.fixture(scope="module")
@@ -132,6 +146,103 @@ def test_what_is_no_sound_export_is_refused_and_nothing_is_written(
     with pytest.raises(InputError, match=said):
         away.import_model(file)
     assert away.registry().names() == []
+
+
+def small_export(folder: Path, coefficient: Fraction, name: str = "small") -> Path:
+    """A document of a model of one signal."""
+    folder.mkdir(exist_ok=True)
+    manifest = model_of({"ay": coefficient}, name=name)
+    ((stem, content),) = export_files(
+        ModelVersion(1, manifest, checksum(manifest.model_dump(mode="json"))), None, "json"
+    ).items()
+    (folder / stem).write_bytes(content)
+    return folder / stem
+
+
+def test_a_flipped_bit_is_refused_wherever_it_is(tmp_path: Path) -> None:
+    """But in white space, where the document stays what it was."""
+    file = small_export(tmp_path, Fraction(1, 3))
+    whole, random = file.read_bytes(), np.random.default_rng(1)
+    before = json.loads(whole)
+    away = fleet_slip.open(tmp_path / "away")
+    for place in random.integers(0, len(whole), 150).tolist():
+        damaged = bytearray(whole)
+        damaged[place] ^= 1 << int(random.integers(8))
+        file.write_bytes(damaged)
+        try:
+            same = json.loads(damaged.decode()) == before
+        except ValueError:
+            same = False
+        if not same:
+            with pytest.raises((InputError, RefusedError)):
+                away.import_model(file)
+    assert away.registry().names() == []
+
+
+def test_a_name_that_exists_gets_another_version(tmp_path: Path) -> None:
+    one, other = (small_export(tmp_path / str(n), Fraction(1, n)) for n in (3, 7))
+    away = fleet_slip.open(tmp_path / "away")
+    assert away.import_model(one).reference == "small@1"
+    away.promote("small@1")
+    assert away.import_model(other).reference == "small@2"
+    assert away.import_model(other).reference == "small@2"
+    champion = away.registry().champion("small")
+    assert champion is not None
+    assert champion.version == 1
+    assert away.import_model(one).manifest.terms[0].coefficient_exact == Fraction(1, 3)
+    assert len(away.registry().versions("small")) == 3  # it is not the newest any more
+
+
+def test_imports_at_once_are_versions_of_their_own(tmp_path: Path) -> None:
+    """Eight at once, of four estimators: the same one twice is one version, or its repetition."""
+    files = [small_export(tmp_path / str(n), Fraction(1, n)) for n in (3, 5, 7, 9)] * 2
+    away = tmp_path / "away"
+    start = threading.Barrier(len(files))
+
+    def bring(file: Path) -> ModelVersion:
+        start.wait(60)
+        return fleet_slip.open(away).import_model(file)
+
+    with ThreadPoolExecutor(len(files)) as pool:
+        brought = [*pool.map(bring, files)]
+    fleet = fleet_slip.open(away)
+    numbers = fleet.registry().versions("small")
+    assert numbers == [*range(1, len(numbers) + 1)]
+    assert 4 <= len(numbers) <= 8
+    for file, version in zip(files, brought, strict=True):
+        there = fleet.model(version.reference)
+        stated = json.loads(file.read_text())["model"]["sha256"]
+        assert there.manifest.imported_from is not None
+        assert there.manifest.imported_from.sha256 == stated
+    report = Verification()
+    verify_models(fleet.warehouse, {}, report)
+    assert report.findings == []
+
+
+@needs_signing
+def test_where_versions_must_be_signed_an_import_is_signed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, public = small_export(tmp_path, Fraction(1, 3)), make_keys(tmp_path / "key")
+    monkeypatch.setenv(VERIFY_VARIABLE, str(public))
+    away = fleet_slip.open(tmp_path / "away")
+    brought = away.import_model(file, sign_key=tmp_path / "key")
+    assert away.model("small@1").sha256 == brought.sha256
+
+
+@needs_signing
+def test_an_import_that_is_not_signed_is_not_used_until_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, public = small_export(tmp_path, Fraction(1, 3)), make_keys(tmp_path / "key")
+    away = fleet_slip.open(tmp_path / "away")
+    monkeypatch.setenv(VERIFY_VARIABLE, str(public))
+    away.import_model(file)
+    for use in (away.model, away.promote):
+        with pytest.raises(RefusedError, match=r"small@1 is not signed.* fleet-slip sign small@1"):
+            use("small@1")
+    away.sign("small@1", tmp_path / "key")
+    assert away.model("small@1").manifest.name == "small"
 
 
 def test_a_file_that_is_not_there_or_not_json_is_said(tmp_path: Path) -> None:

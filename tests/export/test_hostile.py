@@ -1,0 +1,153 @@
+"""Exports of models with names at the ends of what names may be, and of drives without rows."""
+
+import json
+import subprocess
+import zipfile
+from collections.abc import Mapping
+from fractions import Fraction
+from io import BytesIO
+from pathlib import Path
+from xml.etree import ElementTree
+
+import cantools
+import duckdb
+import numpy as np
+import onnxruntime
+import pandas as pd
+import polars as pl
+import pytest
+from cantools.database.can.database import Database
+
+from fleet_slip.catalogue.columns import Definition, Fact
+from fleet_slip.errors import InputError
+from fleet_slip.export import fmu
+from fleet_slip.export.c_names import different
+from fleet_slip.export.files import export_files
+from fleet_slip.export.mlflow_model import LoggedVersion
+from fleet_slip.models.model_version import ModelVersion
+from tests.export import plain
+from tests.export.compiled import compile_c, needs_cc
+from tests.export.models import MODELS, model_of
+from tests.export.test_sql import by_duckdb, by_sqlite
+
+LONGEST = "n" + "_" * 39 + "1"
+TEXTS = ("a-b", "a.b", "a_b_2", "A_B", "-" * 60, "." * 60)
+"""Facts whose names are the same, once they are names of C."""
+
+EMPTY = model_of(MODELS["every_kind"], name="empty")
+
+
+def hostile_version() -> ModelVersion:
+    plain_model = model_of({"ay": Fraction(1, 3), "of_suv": Fraction(1, 700)}, name=LONGEST)
+    signal, suv = plain_model.terms
+    facts = [Definition(of="ax", fact=Fact(name="vehicle_model", equals=text)) for text in TEXTS]
+    terms = [
+        suv.model_copy(update={"signal": f"f{i}", "column": f"f{i}", "definition": one})
+        for i, one in enumerate(facts)
+    ]
+    manifest = plain_model.model_copy(update={"terms": (signal, *terms)})
+    return ModelVersion(1, manifest, "0123" * 16)
+
+
+VERSION = hostile_version()
+
+
+def exported(to: str) -> dict[str, bytes]:
+    return export_files(VERSION, None, to)
+
+
+def test_names_are_different_however_they_are_made() -> None:
+    assert different(["a", "a", "a_2", "a"]) == ("a", "a_2", "a_2_2", "a_3")
+    long = different(["x" * 40, "x" * 40, "x" * 32, "x" * 30 + "_2"], 32)
+    assert len({*long}) == 4
+    assert {len(one) for one in long} == {32}
+
+
+@needs_cc
+def test_c_with_the_longest_names_passes_its_self_test(tmp_path: Path) -> None:
+    for name, content in exported("c").items():
+        (tmp_path / name).write_bytes(content)
+    stem = f"sideslip_{LONGEST}"
+    program = compile_c(tmp_path, [f"{stem}.c", f"{stem}_test.c"])
+    done = subprocess.run([program], capture_output=True, text=True, check=False, timeout=60)
+    assert (done.returncode, done.stdout) == (0, f"{LONGEST}@1: 0 of 600 angles are wrong\n")
+
+
+def test_fmus_have_a_parameter_for_each_fact(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the binary: what is compiled is that of other models, in test_fmu."""
+    monkeypatch.setattr(fmu, "_compile", lambda sources: repr([*sources]).encode())
+    for content in exported("fmu").values():
+        if not content.startswith(b"PK"):
+            continue
+        with zipfile.ZipFile(BytesIO(content)) as archive:
+            root = ElementTree.fromstring(archive.read("modelDescription.xml"))  # noqa: S314 - our own
+        named = [one.attrib for one in root.iter() if {"name", "valueReference"} <= {*one.attrib}]
+        assert len({one["name"] for one in named}) == len(named)
+        assert len({one["valueReference"] for one in named}) == len(named)
+        parameters = [one for one in named if one.get("causality") == "parameter"]
+        assert len(parameters) == len(TEXTS)
+
+
+def test_a_dbc_file_is_read_and_names_no_signal_twice() -> None:
+    text = exported("dbc")[f"sideslip_{LONGEST}.dbc"].decode()
+    bus = cantools.database.load_string(text, "dbc", strict=True)
+    assert isinstance(bus, Database)
+    names = [signal.name for message in bus.messages for signal in message.signals]
+    assert len({*names}) == len(names)
+    assert all(len(name) <= 32 for name in names)
+
+
+def test_the_json_document_gives_the_angles_of_its_checks() -> None:
+    document = json.loads(exported("json")[f"{LONGEST}-1.json"])
+    assert [one["equals"] for one in document["program"]["facts"]] == [*TEXTS]
+    for check in document["checks"]:
+        given = (check["facts"], check["numbers"], check["samples"])
+        assert plain.angles(document["program"], *given) == check["angles"]
+    assert len({angle for check in document["checks"] for angle in check["angles"]}) > 50
+
+
+def test_sql_gives_the_angles_of_its_checks(tmp_path: Path) -> None:
+    files = exported("sql")
+    (tmp_path / "checks.csv").write_bytes(files[f"sideslip_{LONGEST}_checks.csv"])
+    with duckdb.connect() as database:
+        database.execute(f"CREATE TABLE checks AS FROM read_csv('{tmp_path / 'checks.csv'}')")
+        database.execute(files[f"sideslip_{LONGEST}_macro.sql"].decode())
+        right = database.sql(
+            "SELECT count(*) FILTER (angle IS NOT DISTINCT FROM expected_angle) "
+            f"FROM checks JOIN sideslip_{LONGEST}('checks') USING (drive_id, tick)"
+        ).fetchall()
+    assert right == [(600,)]
+
+
+def test_onnx_takes_no_car_at_all() -> None:
+    model = exported("onnx")[f"sideslip_{LONGEST}_float32.onnx"]
+    session = onnxruntime.InferenceSession(model)
+    width = {one.name: one.shape[1] for one in session.get_inputs()}
+    kinds = {"signals": np.float32}
+    given = {one: np.empty((0, n), kinds.get(one, np.int64)) for one, n in width.items()}
+    assert session.run(["angle"], given)[0].shape == (0, 1)
+
+
+def empty_log() -> pl.DataFrame:
+    columns: Mapping[str, type[pl.DataType]] = dict.fromkeys(EMPTY.columns, pl.Float64)
+    facts = {"mass_kg": pl.Float64, "vehicle_model": pl.String}
+    numbers = dict.fromkeys(("yaw_rate_offset", "speed_ratio", "understeer"), pl.Float64)
+    return pl.DataFrame(
+        schema={"drive_id": pl.String, "tick": pl.Int64, **columns, **facts, **numbers}
+    )
+
+
+def test_sql_of_a_log_without_rows_has_none() -> None:
+    statement = export_files(ModelVersion(1, EMPTY, "0" * 64), None, "sql")["sideslip_empty.sql"]
+    assert by_duckdb(statement.decode(), empty_log()) == {}
+    assert by_sqlite(statement.decode(), empty_log()) == {}
+
+
+def test_what_mlflow_loads_takes_no_row_and_names_what_a_frame_lacks() -> None:
+    loaded = LoggedVersion(EMPTY)
+    frame: pd.DataFrame = empty_log().to_pandas()
+    assert loaded.predict(frame).shape == (0, 1)
+    with pytest.raises(InputError, match="the frame lacks ay_mps2"):
+        loaded.predict(frame.drop(columns="ay_mps2"))
+    with pytest.raises(InputError, match="needs what the car knows: mass_kg"):
+        loaded.predict(frame.drop(columns="mass_kg"))
