@@ -88,6 +88,11 @@ def _say_gram(report: "GramReport") -> None:
             f"read, {number_of(report.files_dropped, 'file')} dropped; "
             f"{number_of(report.gram_rows, 'Gram row')} in all"
         )
+        if report.received_dropped:
+            say(
+                f"{number_of(report.received_dropped, 'Gram row')} that cars had sent dropped: the "
+                "logs of the same drives are here now"
+            )
     else:
         say(
             f"gram {report.feature_set}: nothing to do, {number_of(report.gram_rows, 'Gram row')} "

@@ -76,6 +76,13 @@ def print_selection(selection: Selection[Any]) -> None:
         ],
         left=1 + listed,
     )
+    if without_log := selection.cohort.members.count_received:
+        say(f"{number_of(without_log, 'drive')} of these without a log: their cars sent Gram rows.")
+    if left_out := selection.cohort.left_out:
+        say(
+            f"{number_of(left_out, 'drive')} without a log left out: cars send Gram rows of the "
+            f"logged signals, not of the feature set {selection.cohort.feature_set}."
+        )
     if selection.folds.by in (PARTS, BANDS):
         _print_folds(selection.winner.model)
     if selection.folds.by == ROW_FOLDS:

@@ -33,6 +33,7 @@ from fleet_slip.regression.folds import CohortFolds, FoldAssignment, by_band, by
 from fleet_slip.regression.gram_table import GramTable
 from fleet_slip.warehouse.condition import Condition, asking, parse_condition
 from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.words import number_of
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,7 @@ class Cohort:
         drives: metadata of each Gram row, in the order of the tables.
         logs_version, grams_version: versions of the Delta tables that were read.
         feature_set: which Gram rows these are.
+        left_out: drives of the condition that have no such Gram rows: their cars sent no log.
     """
 
     condition: Condition
@@ -69,6 +71,7 @@ class Cohort:
     logs_version: int
     grams_version: int
     feature_set: str = PLAIN
+    left_out: int = 0
 
     @property
     def rows(self) -> int:
@@ -150,6 +153,7 @@ class Cohort:
             self.logs_version,
             self.grams_version,
             self.feature_set,
+            self.left_out,
         )
 
     def gram_condition(self, inputs: Sequence[str]) -> str:
@@ -237,8 +241,9 @@ def load_cohort(
         statement = opened.statement("cohort.sql", condition)
         with asking(opened.database, condition):
             rows = opened.database.sql(statement).to_arrow_table()
+        left_out = opened.count_left_out(condition)
         if not rows.num_rows:
-            raise empty_cohort_error(opened.database, condition)
+            raise empty_cohort_error(opened.database, condition, left_out)
     require_training(rows["source"].unique().to_pylist(), condition)
     parts = list(expansion.tables(rows))
     # Rows whose calibrated columns are not the same are apart now: their metadata follows them.
@@ -250,6 +255,7 @@ def load_cohort(
         logs_version=opened.logs_version,
         grams_version=opened.grams_version,
         feature_set=feature_set,
+        left_out=left_out,
     )
 
 
@@ -262,8 +268,15 @@ def require_training(sources: Iterable[str], condition: Condition) -> None:
         )
 
 
-def empty_cohort_error(database: duckdb.DuckDBPyConnection, condition: Condition) -> DataError:
-    """Return the error that no drive satisfies a condition."""
+def empty_cohort_error(
+    database: duckdb.DuckDBPyConnection, condition: Condition, left_out: int = 0
+) -> DataError:
+    """Return the error that no drive satisfies a condition, or none that has a log."""
+    if left_out:
+        return DataError(
+            f"all {number_of(left_out, 'drive')} of the cohort {condition.text!r} are of cars that "
+            "sent Gram rows of the logged signals and no log. Select with features = signals."
+        )
     examples = database.execute(
         "SELECT string_agg(DISTINCT source, ', '), string_agg(DISTINCT campaign, ', ') FROM grams"
     ).fetchone()

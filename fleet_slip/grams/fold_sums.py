@@ -55,6 +55,7 @@ class SummedCohort:
         members: which drives and cars the Gram rows are of.
         source: where they were read, and can be read again over other folds.
         feature_set: which Gram rows were read.
+        left_out: drives of the condition that have no such Gram rows: their cars sent no log.
     """
 
     condition: Condition
@@ -67,6 +68,7 @@ class SummedCohort:
     members: Members
     source: Warehouse | GramReader
     feature_set: str = PLAIN
+    left_out: int = 0
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -110,8 +112,9 @@ def sum_cohort(
         for batch in opened.batches(condition):
             require_training(batch["source"].unique().to_pylist(), condition)
             sums.add(batch)
+        left_out = opened.count_left_out(condition)
         if not sums.tables:
-            raise empty_cohort_error(opened.database, condition)
+            raise empty_cohort_error(opened.database, condition, left_out)
     return SummedCohort(
         condition=condition,
         folding=folding,
@@ -123,6 +126,7 @@ def sum_cohort(
         members=sums.members,
         source=warehouse,
         feature_set=feature_set,
+        left_out=left_out,
     )
 
 
@@ -142,7 +146,7 @@ def _folding(
         return names, lambda _, drives: (drives % few).astype(np.int64)
     values = found[key].combine_chunks()
     if not len(values):
-        raise empty_cohort_error(opened.database, condition)
+        raise empty_cohort_error(opened.database, condition, opened.count_left_out(condition))
     assignment = assign_folds(values.to_pylist(), folding.by, folding.count)
 
     def fold_of(batch: pa.RecordBatch, _: NDArray[np.uint64]) -> IntArray:

@@ -7,6 +7,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from deltalake.transaction import AddAction
 
+from fleet_slip.catalogue.sources import RECEIVED_FILES
 from fleet_slip.delta import Snapshot, TableFile
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -16,6 +17,9 @@ of a few files, however many Gram rows there are."""
 
 FILE_BYTES = 2**28
 """Most bytes of the Gram rows of a file; a row of 200 columns has 160,000."""
+
+RECEIVED_NAME = "received-"
+"""Before the name of a file of rows that cars sent."""
 
 SMALL_FILES_MAX = 32
 """So many small Gram files may stand side by side before a commit merges some."""
@@ -37,14 +41,28 @@ def write_rows(warehouse: Warehouse, parts: Iterable[pa.Table]) -> list[AddActio
 
 
 def _write_files(warehouse: Warehouse, rows: pa.Table) -> list[AddAction]:
-    """Write one file for each feature set, so that reading one set reads no other."""
-    identities = sorted(rows["feature_set"].unique().to_pylist())
-    if len(identities) == 1:
-        return [warehouse.grams.write_file(identities[0], rows)]
-    return [
-        warehouse.grams.write_file(identity, rows.filter(pc.equal(rows["feature_set"], identity)))
-        for identity in identities
-    ]
+    """Write one file for each feature set, so that reading one set reads no other.
+
+    Rows that cars sent have files of their own: these cannot be computed again.
+    """
+    came = pc.starts_with(rows["file"].cast(pa.string()), RECEIVED_FILES)
+    actions = []
+    for prefix, some in ((RECEIVED_NAME, came), ("", pc.invert(came))):
+        mine = _only(rows, some)
+        for identity in sorted(mine["feature_set"].unique().to_pylist()):
+            part = _only(mine, pc.equal(mine["feature_set"], identity))
+            actions.append(warehouse.grams.write_file(f"{prefix}{identity}", part))
+    return actions
+
+
+def _only(rows: pa.Table, some: pa.ChunkedArray) -> pa.Table:
+    """Return some rows; not copied if that is all."""
+    return rows if pc.all(some).as_py() else rows.filter(some)
+
+
+def is_of_received(file: TableFile) -> bool:
+    """Whether a Gram file is of rows that cars sent."""
+    return file.path.startswith(RECEIVED_NAME)
 
 
 def files_to_rewrite(grams: Snapshot, stale: frozenset[str]) -> list[TableFile]:

@@ -5,11 +5,11 @@ whose file is no longer active are dropped; both in one commit. That one rule co
 interrupted runs, repeated runs, deletions and compaction.
 """
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
 from concurrent.futures import Executor
-from dataclasses import dataclass
-from itertools import chain
+from dataclasses import dataclass, field
 
+import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.catalogue.feature_sets import PLAIN
@@ -19,6 +19,7 @@ from fleet_slip.errors import ConflictError, StorageError
 from fleet_slip.grams.aggregation import compute_grams
 from fleet_slip.grams.backlog import Backlog, find_backlog
 from fleet_slip.grams.gram_files import files_to_rewrite, rows_to_keep, write_rows
+from fleet_slip.grams.same_drives import LoggedDrives, has_received
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.tables import Warehouse
 from fleet_slip.words import number_of
@@ -35,6 +36,8 @@ class GramReport:
     gram_rows: int
     logs_version: int | None
     grams_version: int | None
+    received_dropped: int = 0
+    """Gram rows that cars had sent, of drives whose logs have come since."""
 
     @property
     def changed(self) -> bool:
@@ -135,14 +138,14 @@ def _update_once(
         backlog = Backlog(chosen, backlog.stale)
     version, gram_rows = grams.version, grams.rows
     logs_version = logs.version
+    dropped = 0
     if backlog.missing or backlog.stale:
         new_rows = compute_grams(warehouse, backlog.missing, progress, None, feature_set, executor)
-        replaced = files_to_rewrite(grams, backlog.stale)
-        kept = rows_to_keep(grams, replaced, backlog.stale)
+        merged = _Merged(grams, backlog.stale, LoggedDrives())
         grams.commit_or_discard(
             Change(
-                add=write_rows(warehouse, chain(kept, new_rows)),
-                remove=replaced,
+                add=write_rows(warehouse, merged.parts(new_rows)),
+                remove=merged.replaced,
                 units=[Unit(unit_name(identity), logs_version or 0)],
                 note={
                     "job": "gram",
@@ -154,6 +157,7 @@ def _update_once(
         _require_active(logs, backlog.missing)
         after = warehouse.grams.snapshot()
         version, gram_rows = after.version, after.rows
+        dropped = merged.logged.found
     return GramReport(
         feature_set=identity,
         files_read=len(backlog.missing),
@@ -162,7 +166,38 @@ def _update_once(
         gram_rows=gram_rows,
         logs_version=logs_version,
         grams_version=version,
+        received_dropped=dropped,
     )
+
+
+@dataclass
+class _Merged:
+    """New Gram rows, and those of the files that are written again with them.
+
+    Attributes:
+        grams, stale: what there is, and the log files that are gone.
+        logged: the drives of the new rows: what cars sent of them goes.
+        replaced: the files that are written again, once all parts were taken.
+    """
+
+    grams: Snapshot
+    stale: frozenset[str]
+    logged: LoggedDrives
+    replaced: list[TableFile] = field(default_factory=list)
+
+    def parts(self, new_rows: Iterable[pa.Table]) -> Iterator[pa.Table]:
+        """Yield the new rows, then those that stay of the files that are written again."""
+        looked_for = has_received(self.grams)
+        for rows in new_rows:
+            if looked_for:
+                self.logged.add(rows)
+            yield rows
+        paths = {file.path for file in files_to_rewrite(self.grams, self.stale)}
+        if looked_for:
+            paths.update(file.path for file in self.logged.files_with_received(self.grams))
+        self.replaced += [file for file in self.grams.files if file.path in paths]
+        for rows in rows_to_keep(self.grams, self.replaced, self.stale):
+            yield self.logged.without_received(rows) if looked_for else rows
 
 
 def _require_active(logs: Snapshot, files: Iterable[TableFile]) -> None:

@@ -12,13 +12,15 @@ import pyarrow.compute as pc
 from fleet_slip.arrays import BoolArray, IntArray
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import RECEIVED, RECEIVED_FILES
-from fleet_slip.delta import Change, Snapshot, Unit
-from fleet_slip.grams.gram_files import files_to_rewrite, rows_to_keep, write_rows
+from fleet_slip.delta import Change, Snapshot, TableFile, Unit
+from fleet_slip.grams.gram_files import files_to_rewrite, is_of_received, rows_to_keep, write_rows
 from fleet_slip.grams.gram_rows import by_signals, gram_table
 from fleet_slip.grams.received_rows import ReceivedRows, Refused, is_received, signals_of
+from fleet_slip.grams.same_drives import content_keys
 from fleet_slip.warehouse.audit import Audit, Barred
-from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA, Warehouse
+from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA, Warehouse, gram_schema
 
 ONE_AT_A_TIME = "receive"
 """Unit that every commit of received rows lands: two at once, which could bring the same message,
@@ -76,6 +78,7 @@ def choose_rows(
         kept.append(some.take(~out))
     drives = [_Drives.of(some) for some in kept if len(some)]
     _look_up(grams, drives)
+    _mark_logged(grams, drives)
     duplicates: list[IntArray] = []
     new: list[ReceivedRows] = []
     for one in drives:
@@ -181,7 +184,7 @@ def _look_up(grams: Snapshot, drives: Sequence[_Drives]) -> None:
         return
     by_name = {signals_of(one.rows.mask): one for one in drives}
     wanted = pa.concat_arrays([one.ids for one in drives]).unique()
-    for rows in _rows_of_drives(grams, wanted):
+    for rows in _rows_with(grams, "drive_id", wanted, grams.files):
         came = is_received(rows)
         logged = rows.filter(pc.invert(came))["drive_id"].cast(pa.string()).unique()
         for one in drives:
@@ -190,6 +193,21 @@ def _look_up(grams: Snapshot, drives: Sequence[_Drives]) -> None:
             for signals, some, _ in by_signals(batch):
                 if mine := by_name.get(signals):
                     mine.known += _known(mine, signals, some)
+
+
+def _mark_logged(grams: Snapshot, drives: Sequence[_Drives]) -> None:
+    """Tell messages whose car has a log of the same day with the very same Gram row."""
+    if not drives:
+        return
+    cars = pa.concat_arrays([one.rows.vehicle_ids for one in drives]).unique()
+    contents: set[bytes] = set()
+    of_logs = [file for file in grams.files if not is_of_received(file)]
+    for rows in _rows_with(grams, "vehicle_id", cars, of_logs):
+        contents.update(content_keys(rows.filter(pc.invert(is_received(rows)))))
+    for one in drives if contents else ():
+        keys = list(content_keys(row_table(one.rows, gram_schema(catalogue()))))
+        same = [key in contents for key in keys]
+        one.logged[one.drive[np.array(same, dtype=np.bool_)]] = True
 
 
 def _known(
@@ -209,13 +227,15 @@ def _known(
     yield at, mine["n"].to_numpy(), numbers
 
 
-def _rows_of_drives(grams: Snapshot, drives: pa.StringArray) -> Iterator[pa.Table]:
-    """Yield the Gram rows of the logged signals, of some drives."""
+def _rows_with(
+    grams: Snapshot, column: str, names: pa.StringArray, files: Sequence[TableFile]
+) -> Iterator[pa.Table]:
+    """Yield the Gram rows of the logged signals that some files have of some drives or cars."""
     identity = features().identity(PLAIN)
-    for file in grams.files:
-        rows = grams.table.read(file.path, ["feature_set", "drive_id"])
+    for file in files:
+        rows = grams.table.read(file.path, ["feature_set", column])
         plain = pc.equal(rows["feature_set"], identity)
-        mine = pc.and_(plain, pc.is_in(rows["drive_id"].cast(pa.string()), drives))
+        mine = pc.and_(plain, pc.is_in(rows[column].cast(pa.string()), names))
         if pc.any(mine).as_py():
             yield grams.table.read(file.path).filter(mine)
 
@@ -252,7 +272,10 @@ def land_rows(warehouse: Warehouse, files: Sequence[MessageFile], landing: Landi
     grams = landing.grams
     replaced = files_to_rewrite(grams, frozenset()) if landing.new else []
     kept = rows_to_keep(grams, replaced, frozenset())
-    mine = [_table(warehouse, files, rows) for rows in landing.new]
+    mine = [
+        row_table(rows, warehouse.grams.schema, [file.digest for file in files])
+        for rows in landing.new
+    ]
     single = Unit(ONE_AT_A_TIME, (grams.version or 0) + 1)
     grams.commit_or_discard(
         Change(
@@ -264,13 +287,13 @@ def land_rows(warehouse: Warehouse, files: Sequence[MessageFile], landing: Landi
     )
 
 
-def _table(warehouse: Warehouse, files: Sequence[MessageFile], rows: ReceivedRows) -> pa.Table:
-    """Return rows of the same signals in the schema of `grams`."""
-    schema, many = warehouse.grams.schema, len(rows)
-    names = pa.array([f"{RECEIVED_FILES}{file.digest[:24]}" for file in files])
+def row_table(rows: ReceivedRows, schema: pa.Schema, digests: Sequence[str] = ()) -> pa.Table:
+    """Return rows of the same signals in the schema of `grams`, from files of these digests."""
+    many = len(rows)
+    names = pa.array([f"{RECEIVED_FILES}{digest[:24]}" for digest in digests], pa.string())
     known: dict[str, Any] = {
         "feature_set": pa.repeat(features().identity(PLAIN), many),
-        "file": names.take(pa.array(rows.file)),
+        "file": names.take(pa.array(rows.file)) if digests else pa.repeat(RECEIVED_FILES, many),
         "day": rows.days,
         "drive_id": rows.drive_ids,
         "vehicle_id": rows.vehicle_ids,

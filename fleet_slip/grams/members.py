@@ -38,6 +38,11 @@ class Members:
         """Return the number of drives without a log that have all of some signals."""
         return len(_with(self.received, signals))
 
+    @property
+    def count_received(self) -> int:
+        """Number of drives without a log."""
+        return self.count_received_with(())
+
     def count_vehicles_with(self, signals: Collection[str]) -> int:
         """Return the number of cars that have all of some signals."""
         return len(_with(self.vehicles, signals))

@@ -48,6 +48,14 @@ class OpenedGrams:
         with asking(self.database, condition):
             yield from self.database.sql(statement).to_arrow_reader(self._batch_rows)
 
+    def count_left_out(self, condition: Condition) -> int:
+        """Return how many drives of a cohort have no Gram rows, since their cars sent no log."""
+        if self.identity == features().identity(PLAIN):
+            return 0
+        statement = self.statement("count_without_log.sql", condition)
+        with asking(self.database, condition):
+            return int(self.database.execute(statement).fetchall()[0][0])
+
     def files(self, condition: Condition) -> set[str]:
         """Return the log files that have a drive of a cohort."""
         statement = self.statement("cohort_files.sql", condition)

@@ -21,6 +21,7 @@ from fleet_slip.delta.checkpoints import (
 )
 from fleet_slip.errors import FleetSlipError, StorageError
 from fleet_slip.files.storage_errors import storage_errors
+from fleet_slip.grams.gram_files import is_of_received
 from fleet_slip.grams.job import reconcile
 from fleet_slip.maintenance.verification import Verification
 from fleet_slip.maintenance.verify_files import problem_of
@@ -149,7 +150,7 @@ def _aggregate_again(
 ) -> list[str]:
     """Drop the Gram files that are damaged or have wrong rows, and compute what is missing.
 
-    That of `lost` log files cannot be.
+    That of `lost` log files cannot be, nor what cars sent: its files stay.
     """
     removed: list[str] = []
 
@@ -160,7 +161,7 @@ def _aggregate_again(
         bad = [
             file
             for file in snapshot.files
-            if f"grams/{file.path}" in damaged
+            if (f"grams/{file.path}" in damaged and not is_of_received(file))
             or (file.path in readable and _names_any(readable[file.path], wrong))
         ]
         if bad:

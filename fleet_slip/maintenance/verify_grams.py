@@ -14,6 +14,7 @@ from fleet_slip.grams.check import (
     read_counts,
     stored_grams,
 )
+from fleet_slip.grams.received_check import find_unsound
 from fleet_slip.maintenance.verification import Damage, Verification
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.database import database_errors, open_database
@@ -61,6 +62,7 @@ def verify_grams(
     Gram rows of `SAMPLE` log files are computed again; with `full`, those of all.
     """
     _verify_unique(warehouse, sound.grams, report)
+    _verify_received(warehouse, sound.grams, report)
     stored = stored_grams(warehouse, sound.grams)
     covered = [file for file in sound.logs if file.path in stored]
     step = 1 if full else max(1, len(covered) // SAMPLE)
@@ -89,6 +91,16 @@ def _verify_unique(warehouse: Warehouse, grams: Sequence[TableFile], report: Ver
     for identity, file, drive, n in twice:
         problem = f"the Gram row {identity} of drive {drive} stands {n} times"
         report.findings.append(Damage("gram", f"logs/{file}", problem))
+
+
+def _verify_received(
+    warehouse: Warehouse, grams: Sequence[TableFile], report: Verification
+) -> None:
+    """Look for received Gram rows that no counts can have, or that their drive cannot have."""
+    for file in grams:
+        for drive, problem in find_unsound(warehouse.grams.read(file.path)):
+            told = f"the Gram row that a car sent of drive {drive} {problem}"
+            report.findings.append(Damage("gram", f"grams/{file.path}", told))
 
 
 def _compute_grams(warehouse: Warehouse, file: TableFile) -> DriveGrams:

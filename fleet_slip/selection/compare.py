@@ -66,6 +66,8 @@ class Selection(Generic[AnyCohort]):
             "feature_set": features().identity(self.cohort.feature_set),
             "drives": self.cohort.drive_count,
             "rows": self.cohort.rows,
+            "drives_without_log": self.cohort.members.count_received,
+            "drives_left_out": self.cohort.left_out,
             "intercept": self.intercept,
             "folds": {
                 "by": self.folds.by,
