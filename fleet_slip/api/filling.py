@@ -104,6 +104,7 @@ class Filling(Rooted):
         files: Iterable[Path | str] | Path | str,
         mapping: "str | Mapping",
         *,
+        as_one: bool = False,
         workers: Workers = None,
         each: "Callable[[IngestReport], None] | None" = None,
         progress: ShowProgress | None = None,
@@ -112,7 +113,8 @@ class Filling(Rooted):
 
         `mapping` is the name of one that ships, the path of a TOML file, or a `Mapping`. Rows that
         cannot be used go to the view `quarantine` with a reason. Of a folder all logs are taken, at
-        any depth, but for those that have landed before and have not changed. Returns a report of
+        any depth, but for those that have landed before and have not changed; with `as_one` they
+        are parts of one log, whose drives go on from file to file. Returns a report of
         each file that was read, in their order; `each` is called with it once the file is
         committed. Progress is in files. Without a cluster they are read one after the other.
 
@@ -120,14 +122,16 @@ class Filling(Rooted):
         for files that cannot be used, of which nothing is written; `StorageError` and
         `ClusterError`.
         """
-        from fleet_slip.ingest.folders import KnownFiles, find_logs
+        from fleet_slip.ingest.folders import KnownFiles
         from fleet_slip.ingest.job import ingest_files
+        from fleet_slip.ingest.log_files import find_logs
         from fleet_slip.ingest.mapping import load_mapping
 
         plan = load_mapping(mapping) if isinstance(mapping, str) else mapping
         given = [Path(files)] if isinstance(files, Path | str) else [Path(file) for file in files]
-        paths = find_logs(given)
-        known = KnownFiles.of(self.warehouse, plan) if paths != given else None
+        paths = given if as_one else find_logs(given)
+        folders = any(path.is_dir() for path in given)
+        known = KnownFiles.of(self.warehouse, plan) if folders else None
         told = count_from_start(progress)
         reports = {}
         with open_workers(self.root, workers) as executor, step("ingest") as figures:
@@ -136,7 +140,9 @@ class Filling(Rooted):
                 paths = [path.absolute() for path in paths]
             figures.rows = 0
             warehouse = within_reach(self.warehouse, executor)
-            wanted = paths if known is None else known.without_landed(paths, warehouse)
+            wanted = paths
+            if known is not None and not as_one:  # what is in a folder its own size does not tell
+                wanted = known.without_landed(paths, warehouse)
             if landed := len(paths) - len(wanted):
                 told(landed, len(paths))
             try:
@@ -152,21 +158,26 @@ class Filling(Rooted):
         return [reports[str(path)] for path in wanted]
 
     def preview(
-        self, files: Iterable[Path | str] | Path | str, mapping: "str | Mapping"
+        self,
+        files: Iterable[Path | str] | Path | str,
+        mapping: "str | Mapping",
+        *,
+        as_one: bool = False,
     ) -> "list[Preview]":
         """Read measured files as `ingest` does, and store nothing.
 
         A preview tells rows, drives, what would be rejected, the range of each signal, and what
         looks wrong in the longest drive: a sign, a unit, swapped wheels, a delay of the label.
-        Of a folder every log is read. Raises like `ingest`.
+        Of a folder every log is read, or with `as_one` all as one. Raises like `ingest`.
         """
-        from fleet_slip.ingest.folders import find_logs
+        from fleet_slip.ingest.log_files import find_logs
         from fleet_slip.ingest.mapping import load_mapping
         from fleet_slip.ingest.preview import preview_file
 
         plan = load_mapping(mapping) if isinstance(mapping, str) else mapping
         paths = [files] if isinstance(files, Path | str) else files
-        return [preview_file(file, plan) for file in find_logs(map(Path, paths))]
+        given = [Path(file) for file in paths]
+        return [preview_file(file, plan) for file in (given if as_one else find_logs(given))]
 
     @record_call
     def gram(

@@ -13,7 +13,7 @@ from fleet_slip.api.calls import ShowProgress, Workers
 from fleet_slip.api.retraining import Training
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.errors import DataError, FleetSlipError, InputError
-from fleet_slip.ingest.folders import find_logs
+from fleet_slip.ingest.log_files import find_logs
 from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.models.aliases import CANDIDATE
 from fleet_slip.models.model_version import ModelVersion

@@ -139,6 +139,10 @@ def ingest(
         Path | None,
         typer.Option(help="With --dry-run and one file, draw its longest drive: .png, .svg, .pdf."),
     ] = None,
+    as_one: Annotated[
+        bool,
+        typer.Option("--as-one", help="The files of each folder are parts of one log."),
+    ] = False,
     cluster: Cluster = None,
     json: Json = False,
 ) -> None:
@@ -154,13 +158,17 @@ def ingest(
     if dry_run:
         from fleet_slip.cli.previews import show_previews  # noqa: PLC0415 - draws, takes a while
 
-        show_previews(fleet.preview(files, mapping), plot, json)
+        show_previews(fleet.preview(files, mapping, as_one=as_one), plot, json)
         return
-    folders = any(file.is_dir() for file in files)
+    if as_one and not all(file.is_dir() for file in files):
+        raise UsageError("--as-one takes folders, whose files are parts of one log.")
+    folders = any(file.is_dir() for file in files) and not as_one
     each = Remarks(quiet=json or folders)
     with recording(fleet.root, "ingest", sys.argv[1:]), ExitStack() as shown:
         show = shown.enter_context(progress("ingest", "files")) if folders else None
-        reports = fleet.ingest(files, mapping, workers=cluster, each=each, progress=show)
+        reports = fleet.ingest(
+            files, mapping, as_one=as_one, workers=cluster, each=each, progress=show
+        )
     if json:
         print_json(reports)
     elif folders:

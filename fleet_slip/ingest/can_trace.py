@@ -155,6 +155,10 @@ def _key(message: Any) -> _Key:
 @contextmanager
 def open_can_trace(file: Path, bus: CanBus) -> Iterator[CanSource]:
     """Open a CAN trace. Raises `InputError`, for a database that cannot be parsed too."""
+    yield CanSource(file, bus, parse_database(bus))
+
+
+def parse_database(bus: CanBus) -> Any:
+    """Return the messages that a database describes. Raises `InputError`."""
     with reading_with(Path(bus.database), "cantools") as cantools:
-        database = cantools.database.load_string(bus.text, bus.format, strict=False)
-    yield CanSource(file, bus, database)
+        return cantools.database.load_string(bus.text, bus.format, strict=False)

@@ -1,4 +1,4 @@
-"""Finds measured logs in folders, and remembers which files of this machine have landed.
+"""Remembers which measured files of this machine have landed.
 
 What is remembered is a cache, of this machine and beside no data: a file's path, size and time of
 change tell its digest, so that thousands of files need not be read to find nothing new. Whether
@@ -8,7 +8,7 @@ notice that a file has changed since it landed, so that its drives would count t
 
 import json
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from hashlib import sha256
@@ -16,44 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from fleet_slip.delta import Snapshot
-from fleet_slip.errors import InputError
-from fleet_slip.ingest.columns import shown
 from fleet_slip.ingest.landing import unit_of
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.warehouse.tables import Warehouse
-
-SUFFIXES = (
-    ".csv", ".csv.gz", ".csv.zst", ".parquet", ".pq", ".mf4", ".mdf", ".mat", ".h5", ".hdf5",
-    ".blf", ".asc", ".log", ".trc", ".duckdb", ".ddb",
-)  # fmt: skip
-
-
-def find_logs(paths: Iterable[Path]) -> list[Path]:
-    """Return files as they are given, and those in folders that have the suffix of a log, sorted.
-
-    Hidden files and folders are passed over. Raises `InputError` for a folder without any.
-    """
-    found: list[Path] = []
-    for path in paths:
-        if not path.is_dir():
-            found.append(path)
-            continue
-        inside = sorted(_logs_below(path))
-        if not inside:
-            raise InputError(
-                f"{shown(path)}: no file in this folder has the suffix of a log: "
-                f"{', '.join(SUFFIXES)}."
-            )
-        found += inside
-    return found
-
-
-def _logs_below(folder: Path) -> Iterator[Path]:
-    for parent, folders, names in os.walk(folder):
-        folders[:] = [name for name in folders if not name.startswith(".")]
-        for name in names:
-            if name.lower().endswith(SUFFIXES) and not name.startswith("."):
-                yield Path(parent, name)
 
 
 @dataclass

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import describe_missing, shown
 from fleet_slip.ingest.source import BASE, OWN_TIME, Channel, as_column, reading_with
@@ -62,20 +63,36 @@ class MdfSource:
 
     def _read(self, number: int, indices: dict[str, int]) -> Iterator[pl.DataFrame]:
         """Read channels of a group, some records at a time."""
-        name = next(iter(indices))
-        self._require_times(number, name)
-        group = self._mdf.groups[number]
-        for index in (self._mdf.masters_db[number], *indices.values()):
-            self._require_inside(number, index)
-        self._require_data(number, name)
-        records = group.channel_group.cycles_nr
+        self._require_sound(number, indices)
+        records = self._mdf.groups[number].channel_group.cycles_nr
         for start in range(0, max(records, 1), WINDOW_RECORDS):
             yield self._window(number, indices, start, min(WINDOW_RECORDS, records - start))
 
-    def _window(
-        self, number: int, indices: dict[str, int], start: int, records: int
-    ) -> pl.DataFrame:
-        """Read some records of a group; what the file marks as invalid is null."""
+    def _require_sound(self, number: int, indices: dict[str, int]) -> None:
+        """Raise `InputError` for a group that asammdf would read beyond, or without times."""
+        name = next(iter(indices))
+        self._require_times(number, name)
+        for index in (self._mdf.masters_db[number], *indices.values()):
+            self._require_inside(number, index)
+        self._require_data(number, name)
+
+    def select(self, number: int, indices: dict[str, int]) -> list[Any]:
+        """Return channels of a group as asammdf's signals, whole. Raises `InputError`."""
+        self._require_sound(number, indices)
+        return self._signals(number, indices, 0, self._mdf.groups[number].channel_group.cycles_nr)
+
+    def times_s(self, signal: Any) -> FloatArray:
+        """Return when a signal's samples were taken, since 1970 if the file knows the date."""
+        return np.asarray(self._start_s + signal.timestamps.astype(np.float64))
+
+    def groups_with(self, name: str) -> Iterator[tuple[int, dict[str, int]]]:
+        """Yield the groups that have a channel of a name, and where each of their channels is."""
+        for number, _ in self._mdf.channels_db.get(name, ()):
+            group = self._mdf.groups[number]
+            if group.channel_group.cycles_nr:
+                yield number, {c.name: i for i, c in enumerate(group.channels)}
+
+    def _signals(self, number: int, indices: dict[str, int], start: int, records: int) -> list[Any]:
         with reading_with(self._file, "asammdf"):
             signals = self._mdf.select(
                 [(None, number, index) for index in indices.values()],
@@ -87,8 +104,14 @@ class MdfSource:
                 f"{shown(self._file)}: group {number} has {start + len(signals[0]):,} samples and "
                 "not as many as it says: it is truncated. Copy it again."
             )
-        times = signals[0].timestamps[:records].astype(np.float64)
-        frame = {OWN_TIME: pl.Series(self._start_s + times)}
+        return list(signals)
+
+    def _window(
+        self, number: int, indices: dict[str, int], start: int, records: int
+    ) -> pl.DataFrame:
+        """Read some records of a group; what the file marks as invalid is null."""
+        signals = self._signals(number, indices, start, records)
+        frame = {OWN_TIME: pl.Series(self.times_s(signals[0])[:records])}
         for name, signal in zip(indices, signals, strict=True):
             values = as_column(self._file, name, signal.samples[:records])
             invalid = signal.invalidation_bits

@@ -7,8 +7,8 @@ written.
 """
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from typing import Protocol, TypeVar
 
@@ -24,10 +24,12 @@ from fleet_slip.ingest.csv_format import CsvFormat
 from fleet_slip.ingest.duckdb_table import MAGIC as DUCKDB_MAGIC
 from fleet_slip.ingest.duckdb_table import MAGIC_AT as DUCKDB_AT
 from fleet_slip.ingest.duckdb_table import DuckdbRows, open_duckdb
+from fleet_slip.ingest.log_files import parts_of
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.matlab import HDF5_AT, HDF5_MAGIC, MAT5_MAGIC, open_mat, open_mat73
 from fleet_slip.ingest.mdf import MAGICS as MDF_MAGICS
 from fleet_slip.ingest.mdf import MdfSource, open_mdf
+from fleet_slip.ingest.mdf_bus import open_mdf_bus
 from fleet_slip.ingest.parquet_batches import BATCH_ROWS, PARQUET_MAGIC, open_parquet
 from fleet_slip.ingest.source import BASE, Source
 from fleet_slip.ingest.time_bases import merge_bases
@@ -76,6 +78,20 @@ class Formats(Protocol):
 
 
 @contextmanager
+def require_unchanged_log(log: Path) -> Iterator[None]:
+    """Raise `InputError` if a part of a log is written to, or comes, while it is read."""
+    parts = parts_of(log)
+    with ExitStack() as unchanged:
+        for part in parts:
+            unchanged.enter_context(require_unchanged_file(part))
+        yield
+    if parts_of(log) != parts:
+        raise InputError(
+            f"{shown(log)}: files came or went while it was read. Wait until it is complete."
+        )
+
+
+@contextmanager
 def require_unchanged_file(file: Path) -> Iterator[None]:
     """Raise `InputError` if this is no regular file, or if it is written to while it is read."""
     if not file.is_file():
@@ -90,49 +106,102 @@ def require_unchanged_file(file: Path) -> Iterator[None]:
         raise InputError(f"{shown(file)}: it changed while it was read. Wait until it is complete.")
 
 
-def file_digest(file: Path) -> "hashlib._Hash":
-    """Return the SHA-256 of a file's bytes, open for more. Raises `InputError`."""
-    with file_errors(file), file.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256")
+def log_digest(log: Path) -> "hashlib._Hash":
+    """Return the SHA-256 of a file's bytes, or of those of a log's parts. Raises `InputError`."""
+    digests = []
+    for part in parts_of(log):
+        with file_errors(part), part.open("rb") as stream:
+            digests.append(hashlib.file_digest(stream, "sha256"))
+    if not log.is_dir():
+        return digests[0]
+    return hashlib.sha256(b"".join(digest.digest() for digest in digests))
 
 
-def read_batches(file: Path, mapping: Mapping) -> Iterator[pl.DataFrame]:
-    """Yield the columns of a file that a mapping uses, in the file's order, in bounded batches.
+def read_batches(log: Path, mapping: Mapping) -> Iterator[pl.DataFrame]:
+    """Yield the columns of a log that a mapping uses, in its order, in bounded batches.
 
-    Raises `InputError` if the file cannot be read, or a column is missing or ambiguous.
+    Raises `InputError` if a file cannot be read, or a column is missing or ambiguous.
     """
-    with file_errors(file), open_source(file, mapping) as source:
-        yield from _one_table(source, file, mapping)
-
-
-def _one_table(source: Source, file: Path, mapping: Mapping) -> Iterator[pl.DataFrame]:
-    """Yield the rows of all time bases as those of one table."""
-    time, bases = mapping.time.key, mapping.time_bases()
-    if source.has_clock != mapping.time.own_clock:
-        raise InputError(
-            f"{shown(file)}: {_CLOCK if source.has_clock else _NO_CLOCK}, in the mapping "
-            f"{mapping.name!r}."
-        )
-    columns = next(iter(bases.values()))
-    if time is None or (len(bases) == 1 and _has_one_base(source, columns)):
-        for table in source.batches(columns):
-            yield from table.drop(BASE, strict=False).iter_slices(BATCH_ROWS)
+    bases = mapping.time_bases()
+    parts, columns = parts_of(log), next(iter(bases.values()))
+    if mapping.time.key is None or (len(bases) == 1 and not mapping.time.own_clock):
+        for part in parts:
+            with _open_part(part, mapping) as source:
+                yield from source.batches(columns)
         return
-    tables = (
-        table if source.has_clock else _with_times(table, own, time)
-        for own, columns in bases.items()
-        for table in source.batches(columns)
-    )
+    if len(parts) > 1:
+        yield from _merged(tables_of_parts(log, mapping), log, mapping)
+        return
+    with _open_part(parts[0], mapping) as source:
+        if len(bases) == 1 and _has_one_base(source, columns):
+            for table in source.batches(columns):
+                yield from table.drop(BASE).iter_slices(BATCH_ROWS)
+        else:
+            yield from _merged(_tables(source, mapping), log, mapping)
+
+
+def _merged(tables: Iterable[pl.DataFrame], log: Path, mapping: Mapping) -> Iterator[pl.DataFrame]:
+    """Yield the rows of all time bases as those of one table."""
+    time, held = str(mapping.time.key), mapping.common_columns()
     try:
-        merged = merge_bases(tables, time, mapping.common_columns(), mapping.time.split_gap_s)
+        merged = merge_bases(tables, time, held, mapping.time.split_gap_s)
     except InputError as error:
-        raise InputError(f"{shown(file)}: {error}") from None
+        raise InputError(f"{shown(log)}: {error}") from None
     yield from merged.iter_slices(BATCH_ROWS)
 
 
 def _has_one_base(source: Source, columns: Sequence[str]) -> bool:
     """Whether the rows of all these columns share their times, and so need not be merged."""
-    return not isinstance(source, MdfSource | CanSource) or source.number_of_bases(columns) == 1
+    return isinstance(source, MdfSource | CanSource) and source.number_of_bases(columns) == 1
+
+
+@contextmanager
+def _open_part(part: Path, mapping: Mapping) -> Iterator[Source]:
+    """Open a file that says times as the mapping does. Raises `InputError`."""
+    with file_errors(part), open_source(part, mapping) as source:
+        if source.has_clock != mapping.time.own_clock:
+            raise InputError(
+                f"{shown(part)}: {_CLOCK if source.has_clock else _NO_CLOCK}, in the mapping "
+                f"{mapping.name!r}."
+            )
+        yield source
+
+
+def _tables(source: Source, mapping: Mapping) -> Iterator[pl.DataFrame]:
+    """Yield the tables of a file's time bases."""
+    for own, columns in mapping.time_bases().items():
+        for table in source.batches(columns):
+            yield table if source.has_clock else _with_times(table, own, str(mapping.time.key))
+
+
+def tables_of_parts(log: Path, mapping: Mapping) -> list[pl.DataFrame]:
+    """Return the tables of all parts of a log, in the order of time.
+
+    A part may lack columns that another has. Tables of the same columns are one time base, which
+    goes on from part to part. Raises `InputError` for a column that no part has.
+    """
+    time, found = str(mapping.time.key), []
+    missing = {name for names in mapping.time_bases().values() for name in names}
+    for part in parts_of(log):
+        with _open_part(part, mapping) as source:
+            names = {channel.name for channel in source.channels()}
+            there = names | {name for name in missing if name.rpartition("@")[0] in names}
+            for own, columns in mapping.time_bases().items():
+                wanted = [name for name in columns if name in there]
+                if wanted and (own is None or own in there):
+                    for table in source.batches(wanted):
+                        named = table if source.has_clock else _with_times(table, own, time)
+                        base = " ".join(sorted(set(named.columns) - {BASE}))
+                        found.append(named.with_columns(pl.lit(base).alias(BASE)))
+                    missing -= set(wanted)
+    if missing:
+        raise InputError(f"{shown(log)}: no file in it has the column {min(missing)!r}.")
+    return sorted(found, key=lambda table: _first_time(table[time]))
+
+
+def _first_time(times: pl.Series) -> float:
+    first = times.min()
+    return first if isinstance(first, float) else 0.0
 
 
 def _with_times(table: pl.DataFrame, own: str | None, time: str) -> pl.DataFrame:
@@ -158,6 +227,8 @@ def open_source(file: Path, formats: Formats) -> Iterator[Source]:
 
 
 def _opened(file: Path, start: bytes, formats: Formats) -> AbstractContextManager[Source]:
+    if start.startswith(MDF_MAGICS) and formats.can is not None:
+        return open_mdf_bus(file, formats.can)
     for is_it, open_it in _FORMATS:
         if is_it(start):
             return open_it(file)

@@ -21,6 +21,7 @@ from fleet_slip.ingest.drive_cutter import (
     DriveCutter,
     sample_intervals_s,
 )
+from fleet_slip.ingest.log_files import parts_of
 from fleet_slip.ingest.look_alikes import find_look_alikes
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.measured_drives import MeasuredDrive, drive_id, to_ticks
@@ -28,7 +29,7 @@ from fleet_slip.ingest.open_drives import MAX_OPEN_ROWS, DriveRows, OpenDrives
 from fleet_slip.ingest.parquet_batches import partition_keys
 from fleet_slip.ingest.quarantine import describe_refused, no_rows
 from fleet_slip.ingest.read_ahead import read_ahead
-from fleet_slip.ingest.reading import file_digest, require_unchanged_file
+from fleet_slip.ingest.reading import log_digest, require_unchanged_log
 from fleet_slip.ingest.resampling import STEP_S, TIME_EPSILON_S
 from fleet_slip.ingest.totals import IngestCounts, Totals
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA
@@ -240,15 +241,16 @@ class MeasuredStream:
 @contextmanager
 def open_measured(file: Path, mapping: Mapping) -> Iterator[MeasuredStream]:
     """Open a measured file. Raises `InputError`, if it changes until the end too."""
-    with require_unchanged_file(file):
+    with require_unchanged_log(file):
         yield MeasuredStream(file, mapping, _identity(file, mapping))
 
 
 def _identity(file: Path, mapping: Mapping) -> str:
-    digest = file_digest(file)
+    digest = log_digest(file)
     used = {name for names in mapping.time_bases().values() for name in names}
-    if keys := {key: text for key, text in partition_keys(file).items() if key in used}:
-        digest.update(canonical_ascii(keys).encode())
+    for part in parts_of(file):
+        if keys := {key: text for key, text in partition_keys(part).items() if key in used}:
+            digest.update(canonical_ascii(keys).encode())
     digest.update(mapping.canonical_json().encode())
     return digest.hexdigest()
 

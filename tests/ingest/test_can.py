@@ -1,13 +1,16 @@
 """CAN traces: written by python-can, with databases and payloads by cantools."""
 
+import re
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import can
+import canmatrix.formats
 import cantools
 import numpy as np
 import pytest
+from asammdf import MDF, Signal
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -233,3 +236,60 @@ def test_signals_are_decoded_as_cantools_does(
     assert raw.tolist() == expected
     scaled = [database.decode_message(1, data)["s"] for data in payloads]
     np.testing.assert_allclose(physical(signal, raw), scaled, rtol=1e-15)
+
+
+@pytest.mark.parametrize("compression", [0, 1])
+def test_bus_logging_in_mdf(tmp_path: Path, compression: int) -> None:
+    frames = [motion(i) for i in range(50)]
+    frames += [mux(i, i % 2, i / 100) for i in range(50)]
+    frames.sort(key=lambda frame: frame.timestamp)
+    with can.MF4Writer(tmp_path / "log.mf4", compression_level=compression) as trace:
+        for frame in frames:
+            trace.on_message_received(frame)
+    mux_signals = 'yaw_rate = { column = "Mux.yaw", unit = "deg/s" }\n'
+    log = read(tmp_path / "log.mf4", MAPPING + mux_signals)
+    assert ticks(log) == list(range(50))
+    assert log.drives["ax"].to_pylist() == AX_COUNTS
+    assert log.drives["sideslip"].to_pylist() == BETA_COUNTS
+    assert str(log.drives["day"][0]) == "2024-05-31"
+    assert log.drives["yaw_rate"].drop_null().to_pylist()[:3] == [0, 2, 3]
+
+
+def test_bus_logging_says_what_is_not_in_it(tmp_path: Path) -> None:
+    with MDF(version="4.10") as mdf:
+        mdf.append([Signal(AX, TIME_S, name="ax")])
+        file = Path(mdf.save(tmp_path / "log.mf4"))
+    with pytest.raises(
+        InputError, match=r"log\.mf4: there is no CAN frame in it .* without \[can\]"
+    ):
+        read(file)
+    with can.MF4Writer(tmp_path / "bus.mf4") as trace:
+        trace.on_message_received(mux(0, 0, 1.0))
+    assert "the message Motion (0x100) is not in it" in failure(tmp_path / "bus.mf4")
+
+
+def arxml(folder: Path) -> str:
+    """Messages as canmatrix writes them, with the encodings that cantools asks for.
+
+    It writes factors as 0, so that the counts are what they are.
+    """
+    counts = DBC.partition("BO_ 2566844672")[0].replace("(0.001,0)", "(1,0)")
+    counts = counts.replace("(0.01,0)", "(1,0)").replace("BU_: ECU", "BU_: A ECU")
+    (folder / "plain.dbc").write_text(counts.replace("Motion: 8 ECU", "Motion: 8 A"))
+    matrix = canmatrix.formats.loadp_flat(str(folder / "plain.dbc"))
+    canmatrix.formats.dumpp({"": matrix}, str(folder / "plain.arxml"))
+    text = (folder / "plain.arxml").read_text()
+    for kind, encoding in (("sint", "2C"), ("uint", "NONE")):
+        size = rf"(<SHORT-NAME>{kind}\d+<.*?)(</SW-BASE-TYPE>)"
+        coded = rf"\1<BASE-TYPE-ENCODING>{encoding}</BASE-TYPE-ENCODING>\2"
+        text = re.sub(size, coded, text, flags=re.DOTALL)
+    return text
+
+
+def test_an_arxml_database_says_the_same(tmp_path: Path) -> None:
+    file = write_trace(tmp_path, [motion(i) for i in range(50)])
+    text = MAPPING.replace("car.dbc", "car.arxml").replace("Motion.", "FRAME_Motion.")
+    text = text.replace('"m/s^2"', '"mm/s^2"').replace('"deg"', '"deg", gain = 0.01')
+    log = read(file, text, arxml(tmp_path), "car.arxml")
+    assert log.drives["ax"].to_pylist() == AX_COUNTS
+    assert log.drives["sideslip"].to_pylist() == BETA_COUNTS

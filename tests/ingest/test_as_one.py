@@ -1,0 +1,126 @@
+"""A folder as one log: drives go on from file to file."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.dataset as ds
+import pytest
+from asammdf import MDF, Signal
+
+from fleet_slip.errors import InputError, UsageError
+from fleet_slip.ingest import read_measured, stream
+from fleet_slip.ingest.preview import preview_file
+from fleet_slip.ingest.reading import log_digest
+from tests.ingest.test_formats import AX, BETA_DEG, START, TIME_S, mdf_mapping, require_the_drive
+from tests.support.measured import a_mapping, csv_text, good_columns, read_columns, ticks
+from tests.support.reported import call
+
+MAPPING = """name = "test"
+time = { column = "t", unit = "s" }
+drive = { day = 2024-05-31, vehicle_id = "car", vehicle_model = "sedan" }
+signals.ax = { column = "ax", unit = "m/s^2" }
+signals.sideslip = { column = "beta", unit = "deg" }
+"""
+
+
+def write_parts(folder: Path, *slices: slice, rows: int = 30) -> Path:
+    columns = good_columns(rows)
+    folder.mkdir(exist_ok=True)
+    for number, part in enumerate(slices):
+        text = csv_text({name: values[part] for name, values in columns.items()})
+        (folder / f"part-{number}.csv").write_text(text, encoding="utf-8")
+    return folder
+
+
+def write_mdf(file: Path, start: float, *signals: Signal) -> None:
+    with MDF(version="4.10") as mdf:
+        mdf.start_time = START
+        for one in signals:
+            one.timestamps = one.timestamps + start
+            mdf.append([one])
+        mdf.save(file)
+
+
+def signal(name: str, values: object, part: slice) -> Signal:
+    return Signal(np.asarray(values)[part], TIME_S[part], name=name)
+
+
+def test_a_drive_goes_on_from_file_to_file(tmp_path: Path) -> None:
+    parts = write_parts(tmp_path / "drive", slice(0, 10), slice(10, 11), slice(11, 30))
+    log = read_measured(parts, a_mapping())
+    whole = read_columns(tmp_path, good_columns(30))
+    assert log.drives.drop_columns("drive_id") == whole.drives.drop_columns("drive_id")
+    assert log.counts == whole.counts
+    assert log.digest != whole.digest
+
+
+def test_files_of_one_recording_that_follow_one_another(tmp_path: Path) -> None:
+    logs = tmp_path / "drive"
+    logs.mkdir()
+    first, second = slice(0, 40), slice(40, 100)
+    write_mdf(logs / "a.mf4", 0, signal("a_x", AX, second), signal("beta", BETA_DEG, second))
+    write_mdf(logs / "b.mf4", 0, signal("a_x", AX, first), signal("beta", BETA_DEG, first))
+    require_the_drive(read_measured(logs, mdf_mapping()))
+
+
+def test_files_of_one_recording_with_other_channels(tmp_path: Path) -> None:
+    logs = tmp_path / "drive"
+    logs.mkdir()
+    whole = slice(0, 100)
+    write_mdf(logs / "imu.mf4", 0, signal("a_x", AX, whole))
+    write_mdf(logs / "optic.mf4", 0, signal("beta", BETA_DEG, whole))
+    require_the_drive(read_measured(logs, mdf_mapping()))
+    with pytest.raises(InputError, match=r"drive: no file in it has the column 'gamma'"):
+        extra = {"column": "gamma", "unit": "deg/s"}
+        read_measured(logs, mdf_mapping(signals={"yaw_rate": extra}))
+
+
+def test_a_hive_dataset_is_one_log(tmp_path: Path) -> None:
+    table = pa.table({"t": TIME_S, "ax": AX, "beta": BETA_DEG, "car": ["A7"] * 50 + ["B2"] * 50})
+    hive = ds.partitioning(pa.schema([("car", pa.string())]), flavor="hive")
+    ds.write_dataset(table, tmp_path / "set", format="parquet", partitioning=hive)
+    mapping = a_mapping(drive={"vehicle_id": {"column": "car"}})
+    drives = read_measured(tmp_path / "set", mapping).drives.to_pylist()
+    assert [d["vehicle_id"] for d in drives] == ["A7"] * 50 + ["B2"] * 50
+
+
+def test_a_part_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    parts = write_parts(tmp_path / "drive", slice(0, 10), slice(10, 30))
+    (parts / "part-1.csv").write_bytes(b"t,ax\n0.1,2\n")
+    with pytest.raises(InputError, match=r"part-1\.csv: no column 'beta'"):
+        read_measured(parts, a_mapping())
+
+
+def test_a_folder_that_grows_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    parts = write_parts(tmp_path / "drive", slice(0, 10), slice(10, 20))
+
+    def grow(log: Path) -> Any:
+        (log / "part-2.csv").write_text("t,ax,beta\n9.0,1,2\n", encoding="utf-8")
+        return log_digest(log)
+
+    monkeypatch.setattr(stream, "log_digest", grow)
+    with pytest.raises(InputError, match="drive: files came or went while it was read"):
+        preview_file(parts, a_mapping())
+
+
+def test_a_folder_lands_once_and_not_again_when_it_has_grown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    parts = write_parts(tmp_path / "drive", slice(0, 10), slice(10, 20))
+    (tmp_path / "m.toml").write_text(MAPPING, encoding="utf-8")
+    command = ("ingest", str(parts), "--mapping", str(tmp_path / "m.toml"), "--as-one")
+    root = tmp_path / "root"
+    for new in (True, False):
+        (report,) = json.loads(call(root, *command, "--json"))
+        assert (report["new"], report["drives"], report["ticks"]) == (new, 1, 20)
+    write_parts(parts, slice(0, 10), slice(10, 20), slice(20, 30))
+    with pytest.raises(InputError, match=r"drive: it has changed since it was ingested"):
+        call(root, *command)
+    assert "1 drive of 30 ticks" in call(root, *command, "--dry-run")
+    with pytest.raises(UsageError, match="--as-one takes folders"):
+        call(root, "ingest", str(parts / "part-0.csv"), *command[2:])
+    assert ticks(read_measured(parts, a_mapping())) == list(range(30))
