@@ -121,8 +121,8 @@ def ingest(
     files: Annotated[
         list[Path],
         typer.Argument(
-            help="Measured logs (CSV, Parquet, MDF, MATLAB, CAN traces, DuckDB), or folders of "
-            "them, of which what is new is taken.",
+            help="Measured logs (CSV, Parquet, MDF, MATLAB, CAN traces, MCAP, DuckDB), or folders "
+            "of them, of which what is new is taken.",
             show_default=False,
         ),
     ],

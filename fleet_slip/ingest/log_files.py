@@ -9,7 +9,7 @@ from fleet_slip.ingest.columns import shown
 
 SUFFIXES = (
     ".csv", ".csv.gz", ".csv.zst", ".parquet", ".pq", ".mf4", ".mdf", ".mat", ".h5", ".hdf5",
-    ".blf", ".asc", ".log", ".trc", ".duckdb", ".ddb",
+    ".blf", ".asc", ".log", ".trc", ".duckdb", ".ddb", ".mcap",
 )  # fmt: skip
 
 

@@ -1,10 +1,10 @@
 """Reads ASAM MDF, versions 2 to 4, through asammdf: each channel group is a time base."""
 
-import logging
 import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -201,17 +201,18 @@ class MdfSource:
 @contextmanager
 def open_mdf(file: Path) -> Iterator[MdfSource]:
     """Open an MDF file. Raises `InputError`."""
-    logging.getLogger("asammdf").setLevel(logging.CRITICAL)
-    with reading_with(file, "asammdf") as asammdf:
+    # It leaves copies of unfinalised files behind, and more where it fails.
+    with TemporaryDirectory(prefix="fleet-slip-", ignore_cleanup_errors=True) as folder:
+        with reading_with(file, "asammdf") as asammdf:
+            try:
+                mdf = asammdf.MDF(file, temporary_folder=folder)
+            except Exception as error:
+                _close_half_made(error)
+                raise
         try:
-            mdf = asammdf.MDF(file)
-        except Exception as error:
-            _close_half_made(error)
-            raise
-    try:
-        yield MdfSource(file, mdf)
-    finally:
-        mdf.close()
+            yield MdfSource(file, mdf)
+        finally:
+            mdf.close()
 
 
 def _close_half_made(error: Exception) -> None:
@@ -220,3 +221,5 @@ def _close_half_made(error: Exception) -> None:
         half_made: Any = frame.f_locals.get("self")
         if hasattr(half_made, "_closed"):
             half_made._closed = True
+            if hasattr(half_made, "_tempfile"):
+                half_made._tempfile.close()  # while its folder is there

@@ -27,6 +27,8 @@ from fleet_slip.ingest.duckdb_table import DuckdbRows, open_duckdb
 from fleet_slip.ingest.log_files import parts_of
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.matlab import HDF5_AT, HDF5_MAGIC, MAT5_MAGIC, open_mat, open_mat73
+from fleet_slip.ingest.mcap_log import MAGIC as MCAP_MAGIC
+from fleet_slip.ingest.mcap_log import open_mcap
 from fleet_slip.ingest.mdf import MAGICS as MDF_MAGICS
 from fleet_slip.ingest.mdf import MdfSource, open_mdf
 from fleet_slip.ingest.mdf_bus import open_mdf_bus
@@ -41,6 +43,7 @@ _BINARY = {
     (".mf4", ".mdf"): "an MDF file",
     (".mat", ".h5", ".hdf5"): "a MATLAB file of version 5 or 7.3",
     (".duckdb", ".ddb"): "a DuckDB file",
+    (".mcap",): "an MCAP file",
 }
 _CLOCK = "this format says when each sample was taken: write own_clock = true under [time]"
 _NO_CLOCK = "this format has no clock of its own: write column or rate_hz under [time]"
@@ -263,6 +266,7 @@ _FORMATS: tuple[
 ] = (
     (lambda start: start.startswith(PARQUET_MAGIC), open_parquet),
     (lambda start: start.startswith(MDF_MAGICS), open_mdf),
+    (lambda start: start.startswith(MCAP_MAGIC), open_mcap),
     (lambda start: start.startswith(MAT5_MAGIC), open_mat),
     (lambda start: HDF5_MAGIC in (start[: len(HDF5_MAGIC)], start[HDF5_AT:]), open_mat73),
 )

@@ -5,6 +5,7 @@ times stand in the column `OWN_TIME`, in s, since 1970 where the file tells the 
 time is a column like any other.
 """
 
+import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -67,6 +68,7 @@ def reading_with(file: Path, package: str) -> Iterator[Any]:
     """
     with needed("logs", f"{shown(file)}: its format"):
         module = import_module(package)
+    logging.getLogger(package.partition(".")[0]).setLevel(logging.CRITICAL)
     try:
         yield module
     except (FleetSlipError, MemoryError):

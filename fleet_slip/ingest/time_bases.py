@@ -31,15 +31,23 @@ def merge_bases(
     Raises `InputError` for a time that is no number.
     """
     parts: dict[str, list[pl.DataFrame]] = defaultdict(list)
+    columns: dict[str, pl.DataType] = {}
     for table in tables:
         if not table[time].dtype.is_numeric():
             raise InputError(
                 f"the time {time!r} is not of numbers; signals with times of their own need them."
             )
         parts[table[BASE][0] if len(table) else ""].append(table)
+        columns |= dict(table.drop(BASE).schema)
     bases = [pl.concat(of_base).drop(BASE) for name, of_base in parts.items() if name]
+    if not bases:
+        return pl.DataFrame()
+    # Of a base without rows there is nothing but its columns.
+    there = {name for base in bases for name in base.columns}
+    empty = [pl.lit(None, kind).alias(name) for name, kind in columns.items() if name not in there]
+    bases[0] = bases[0].with_columns(empty)
     if len(bases) < 2:
-        return bases[0] if bases else pl.DataFrame()
+        return bases[0]
     ordered = [
         base.with_columns(_disorder(base[time].to_numpy(), split_gap_s), pl.lit(i).alias(BASE))
         for i, base in zip(count(), bases)

@@ -17,6 +17,7 @@ PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
 EXTRAS = PROJECT["optional-dependencies"]
 MODULES = {
     "highway-env": "highway_env",
+    "mcap-ros2-support": "mcap_ros2",
     "mlflow-skinny": "mlflow",
     "python-can": "can",
     "scikit-learn": "sklearn",

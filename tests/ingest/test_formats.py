@@ -1,5 +1,7 @@
 """The same drive in every format, written by other programs, comes out as the same counts."""
 
+import gc
+import tempfile
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,6 +18,7 @@ from asammdf import MDF, Signal
 
 from fleet_slip.errors import ExtraError, InputError
 from fleet_slip.ingest import Mapping, MeasuredLog, mdf, read_measured
+from fleet_slip.ingest.preview import preview_file
 from fleet_slip.ingest.source import reading_with
 from tests.support.measured import a_mapping, ticks
 
@@ -134,13 +137,23 @@ def test_a_group_of_an_mdf_file_is_read_window_by_window(
     assert log.drives["sideslip"].null_count == (15 if flags else 0)
 
 
-def test_an_unfinalised_mdf_file_is_read(tmp_path: Path) -> None:
+def test_an_unfinalised_mdf_file_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
     file = write_mdf(tmp_path, [a_x(), beta()])
     data = bytearray(file.read_bytes())
     data[:8] = b"UnFinMF "
     data[60] = 1  # the cycle counters are not up to date
     file.write_bytes(data)
+    here = tmp_path / "temporary"
+    here.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(here))
     require_the_drive(read_measured(file, mdf_mapping()))
+    file.write_bytes(data[: len(data) // 3])
+    failure(file, mdf_mapping())
+    gc.collect()
+    assert list(here.iterdir()) == []  # no copy of the recording stays behind
+    assert capfd.readouterr().err == ""
 
 
 def test_a_condition_of_one_group_holds_for_the_others(tmp_path: Path) -> None:
@@ -346,3 +359,21 @@ def test_a_lack_of_memory_is_not_blamed_on_the_file(tmp_path: Path) -> None:
         raise MemoryError
     with pytest.raises(InputError, match="json cannot read it"), reading_with(tmp_path, "json"):
         raise IndexError
+
+
+def test_a_group_without_samples_is_a_signal_without_values(tmp_path: Path) -> None:
+    nothing = beta(samples=np.zeros(0), timestamps=np.zeros(0))
+    file = write_mdf(tmp_path, [a_x()], [nothing])
+    condition = a_x(samples=np.ones(100, "i2"), name="fix", conversion=None)
+    log = read_measured(file, mdf_mapping())
+    assert log.drives["ax"].to_pylist() == AX_COUNTS
+    assert log.drives["sideslip"].null_count == 100
+    (suspicion,) = preview_file(file, mdf_mapping()).suspicions
+    assert (suspicion.kind, suspicion.signals) == ("absent", ("sideslip",))
+    file = write_mdf(tmp_path, [a_x()], [beta()], [nothing_but(condition)])
+    where = mdf_mapping(where=[{"column": "fix", "at_least": 1}])
+    assert "none of its 200 rows meets the condition" in failure(file, where)
+
+
+def nothing_but(signal: Signal) -> Signal:
+    return Signal(signal.samples[:0], signal.timestamps[:0], name=signal.name)

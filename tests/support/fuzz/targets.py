@@ -48,6 +48,7 @@ from fleet_slip.views import connect
 from fleet_slip.warehouse.read_only_sql import one_query
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.fuzz.files import MAPPINGS, csv_file, parquet_file
+from tests.support.fuzz.logs import damaged_file
 from tests.support.fuzz.mutate import WORDS, mutate_bytes, mutate_tree, to_json, to_toml
 
 Target = Callable[[random.Random, Path], None]
@@ -75,13 +76,22 @@ def parquet(rng: random.Random, place: Path) -> None:
     _ingest(rng, place, parquet_file(rng), rng.choice([".parquet", ".pq", ".csv", ""]))
 
 
-def _ingest(rng: random.Random, place: Path, data: bytes, suffix: str) -> None:
+def logs(rng: random.Random, place: Path) -> None:
+    """Ingest a file of a format of test departments: MDF, CAN traces, MATLAB, DuckDB ..."""
+    data, written = damaged_file(rng)
+    _ingest(rng, place, data, written.suffix, written.mapping)
+
+
+def _ingest(
+    rng: random.Random, place: Path, data: bytes, suffix: str, mapping: Mapping | None = None
+) -> None:
     """Ingest a file. It lands as its report says, or leaves the warehouse as it was."""
     file = place / f"measured{suffix}"
     file.write_bytes(data)
     warehouse = Warehouse(LocalFolder(place / "data"))
+    chosen = mapping or rng.choice([*MAPPINGS, *MAPPINGS[:1] * 4])
     try:
-        report = ingest_file(warehouse, file, rng.choice([*MAPPINGS, *MAPPINGS[:1] * 4]))
+        report = ingest_file(warehouse, file, chosen)
     except FleetSlipError:
         assert warehouse.logs.snapshot().rows == 0
         assert not list((place / "data").rglob("*.parquet"))
@@ -420,8 +430,9 @@ def _sizes(root: Path) -> dict[str, tuple[int, int]]:
 
 
 TARGETS: dict[str, tuple[Target, int]] = {
-    "csv": (csv, 25),
-    "parquet": (parquet, 25),
+    "csv": (csv, 20),
+    "parquet": (parquet, 20),
+    "logs": (logs, 10),
     "config": (config, 20),
     "sql": (sql, 12),
     "manifest": (manifest, 10),

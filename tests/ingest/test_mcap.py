@@ -1,0 +1,170 @@
+"""MCAP files of ROS 2, written by the packages of its makers."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.writer import CompressionType
+from mcap.writer import Writer as PlainWriter
+from mcap_ros2.writer import Writer
+
+from fleet_slip.errors import InputError
+from fleet_slip.ingest import Mapping, read_measured
+from tests.ingest.test_formats import AX, AX_COUNTS, BETA_DEG, START, TIME_S, require_the_drive
+from tests.support.measured import a_mapping
+from tests.support.reported import call
+
+HEADER = """std_msgs/Header header
+{}
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+VECTOR = """================================================================================
+MSG: geometry_msgs/Vector3
+float64 x
+float64 y
+float64 z
+"""
+IMU = HEADER.format(
+    "geometry_msgs/Vector3 angular_velocity\ngeometry_msgs/Vector3 linear_acceleration"
+)
+JOINTS = HEADER.format("string[] name\nfloat64[] velocity")
+START_NS = round(START.timestamp() * 1e9)
+LATE_NS = 30_000_000
+"""Messages are written so much later than what they say was measured."""
+
+
+def header(time_s: float) -> dict[str, Any]:
+    stamp = START_NS + round(time_s * 1e9)
+    return {"stamp": {"sec": stamp // 10**9, "nanosec": stamp % 10**9}, "frame_id": "base_link"}
+
+
+def imu(i: int) -> dict[str, Any]:
+    zero = {"x": 0.0, "y": 0.0, "z": 0.0}
+    acceleration = {**zero, "x": float(AX[i])}
+    return {
+        "header": header(TIME_S[i]),
+        "angular_velocity": zero,
+        "linear_acceleration": acceleration,
+    }
+
+
+def joints(i: int) -> dict[str, Any]:
+    velocity = [0.0, float(BETA_DEG[i])]
+    return {"header": header(TIME_S[i]), "name": ["fl", "fr"], "velocity": velocity}
+
+
+def write(file: Path, compression: CompressionType = CompressionType.LZ4) -> Path:
+    with file.open("wb") as stream:
+        writer = Writer(stream, chunk_size=2000, compression=compression)
+        of_imu = writer.register_msgdef("sensor_msgs/Imu", IMU + VECTOR)
+        of_joints = writer.register_msgdef("sensor_msgs/JointState", JOINTS)
+        for i, time_s in enumerate(TIME_S):
+            written = START_NS + round(time_s * 1e9) + LATE_NS
+            writer.write_message(
+                "/imu/data", of_imu, imu(i), log_time=written, publish_time=written
+            )
+            writer.write_message("/joints", of_joints, joints(i), written, written)
+        writer.finish()  # type: ignore[no-untyped-call]
+    return file
+
+
+def mapping(**signals: Any) -> Mapping:
+    told = {
+        "ax": {"column": "/imu/data.linear_acceleration.x", "unit": "m/s^2"},
+        "sideslip": {"column": "/joints.velocity[1]", "unit": "deg"},
+        **signals,
+    }
+    clock = {"column": None, "unit": None, "own_clock": True}
+    return a_mapping(time=clock, drive={"day": None}, signals=told)
+
+
+def failure(file: Path, of: Mapping | None = None) -> str:
+    with pytest.raises(InputError) as caught:
+        read_measured(file, of or mapping())
+    assert str(caught.value).startswith(str(file))
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_messages_of_ros_2(tmp_path: Path, compression: CompressionType) -> None:
+    require_the_drive(read_measured(write(tmp_path / "log.mcap", compression), mapping()))
+
+
+def test_json_has_the_times_at_which_it_was_published(tmp_path: Path) -> None:
+    with (tmp_path / "log.mcap").open("wb") as stream:
+        writer = PlainWriter(stream)
+        writer.start()
+        schema = writer.register_schema("imu", "jsonschema", b"{}")
+        channel = writer.register_channel("imu", "json", schema)
+        for ax, time_s in zip(AX, TIME_S, strict=True):
+            now = START_NS + round(time_s * 1e9)
+            writer.add_message(channel, now, json.dumps({"a": {"x": ax}}).encode(), now)
+        writer.finish()  # type: ignore[no-untyped-call]
+    only = {"ax": {"column": "imu.a.x", "unit": "m/s^2"}}
+    clock = {"column": None, "unit": None, "own_clock": True}
+    plain = a_mapping(time=clock, drive={"day": None}, signals=only)
+    assert read_measured(tmp_path / "log.mcap", plain).drives["ax"].to_pylist() == AX_COUNTS
+
+
+def test_what_is_in_it_is_listed(tmp_path: Path) -> None:
+    file = write(tmp_path / "log.mcap")
+    shown = json.loads(call(tmp_path, "mapping", "suggest", str(file), "--json"))
+    found = {one["channel"]: (one["rate_hz"], one["signal"]) for one in shown["channels"]}
+    assert found["/joints.velocity[1]"][0] == pytest.approx(100)
+    assert "/imu/data.header.frame_id" in found
+
+
+def test_what_is_not_in_it_is_named(tmp_path: Path) -> None:
+    file = write(tmp_path / "log.mcap")
+    absent = mapping(ax={"column": "/imu/data.linear_acceleration.w", "unit": "m/s^2"})
+    assert "Did the mapping mean '/imu/data.linear_acceleration.z'" in failure(file, absent)
+    absent = mapping(ax={"column": "/imu.x", "unit": "m/s^2"})
+    assert "no column '/imu.x'" in failure(file, absent)
+    text = mapping(ax={"column": "/joints.name[0]", "unit": "m/s^2"})
+    assert "100 not_a_number; first: ax = 'fl'" in failure(file, text)
+
+
+@pytest.mark.parametrize("share", [0.01, 0.3, 0.7, 0.99])
+def test_a_truncated_file_is_refused(tmp_path: Path, share: float) -> None:
+    file = write(tmp_path / "log.mcap")
+    content = file.read_bytes()
+    file.write_bytes(content[: int(share * len(content))])
+    assert "Is it complete? Copy it again" in failure(file)
+
+
+def test_a_chunk_that_lies_about_its_size_is_refused(tmp_path: Path) -> None:
+    file = write(tmp_path / "log.mcap")
+    data = bytearray(file.read_bytes())
+    at = data.index(b"lz4") - 16  # before it stand its length, a checksum, and the size
+    data[at : at + 8] = (2**40).to_bytes(8, "little")
+    file.write_bytes(data)
+    assert "says that it unfolds to 1,099,511,627,776: the file is damaged" in failure(file)
+
+
+def test_a_chunk_with_a_flipped_bit_is_refused(tmp_path: Path) -> None:
+    file = write(tmp_path / "log.mcap", CompressionType.NONE)
+    data = bytearray(file.read_bytes())
+    at = data.index(np.float64(AX[50]).tobytes())
+    data[at] ^= 1
+    file.write_bytes(data)
+    assert "crc validation failed" in failure(file)
+
+
+def test_messages_in_another_encoding_are_named(tmp_path: Path) -> None:
+    with (tmp_path / "log.mcap").open("wb") as stream:
+        writer = PlainWriter(stream)
+        writer.start()
+        channel = writer.register_channel("imu", "protobuf", 0)
+        writer.add_message(channel, START_NS, b"\x08\x01", START_NS)
+        writer.finish()  # type: ignore[no-untyped-call]
+    assert "no message in it can be decoded (protobuf)" in failure(tmp_path / "log.mcap")
