@@ -83,6 +83,8 @@ def print_selection(selection: Selection[Any]) -> None:
             f"{number_of(left_out, 'drive')} without a log left out: cars send Gram rows of the "
             f"logged signals, not of the feature set {selection.cohort.feature_set}."
         )
+    for car, drives in selection.cohort.revoked.items():
+        say(f"{number_of(drives, 'drive')} of {car} left out: a key of it was revoked.")
     if selection.folds.by in (PARTS, BANDS):
         _print_folds(selection.winner.model)
     if selection.folds.by == ROW_FOLDS:

@@ -1,7 +1,7 @@
 """Cohorts: the Gram rows of the drives that satisfy an SQL condition."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -63,6 +63,7 @@ class Cohort:
         logs_version, grams_version: versions of the Delta tables that were read.
         feature_set: which Gram rows these are.
         left_out: drives of the condition that have no such Gram rows: their cars sent no log.
+        revoked: how many drives of a car are left out, since a revoked key signed them.
     """
 
     condition: Condition
@@ -72,6 +73,7 @@ class Cohort:
     grams_version: int
     feature_set: str = PLAIN
     left_out: int = 0
+    revoked: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def rows(self) -> int:
@@ -154,6 +156,7 @@ class Cohort:
             self.grams_version,
             self.feature_set,
             self.left_out,
+            self.revoked,
         )
 
     def gram_condition(self, inputs: Sequence[str]) -> str:
@@ -241,7 +244,7 @@ def load_cohort(
         statement = opened.statement("cohort.sql", condition)
         with asking(opened.database, condition):
             rows = opened.database.sql(statement).to_arrow_table()
-        left_out = opened.count_left_out(condition)
+        left_out, revoked = opened.count_left_out(condition), opened.revoked(condition)
         if not rows.num_rows:
             raise empty_cohort_error(opened.database, condition, left_out)
     require_training(rows["source"].unique().to_pylist(), condition)
@@ -256,6 +259,7 @@ def load_cohort(
         grams_version=opened.grams_version,
         feature_set=feature_set,
         left_out=left_out,
+        revoked=revoked,
     )
 
 

@@ -4,7 +4,7 @@ Comparing given models needs no single drive, only the Gram of each fold. So any
 rows is added up in the memory of one batch.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -56,6 +56,7 @@ class SummedCohort:
         source: where they were read, and can be read again over other folds.
         feature_set: which Gram rows were read.
         left_out: drives of the condition that have no such Gram rows: their cars sent no log.
+        revoked: how many drives of a car are left out, since a revoked key signed them.
     """
 
     condition: Condition
@@ -69,6 +70,7 @@ class SummedCohort:
     source: Warehouse | GramReader
     feature_set: str = PLAIN
     left_out: int = 0
+    revoked: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -112,7 +114,7 @@ def sum_cohort(
         for batch in opened.batches(condition):
             require_training(batch["source"].unique().to_pylist(), condition)
             sums.add(batch)
-        left_out = opened.count_left_out(condition)
+        left_out, revoked = opened.count_left_out(condition), opened.revoked(condition)
         if not sums.tables:
             raise empty_cohort_error(opened.database, condition, left_out)
     return SummedCohort(
@@ -127,6 +129,7 @@ def sum_cohort(
         source=warehouse,
         feature_set=feature_set,
         left_out=left_out,
+        revoked=revoked,
     )
 
 

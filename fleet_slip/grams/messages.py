@@ -3,7 +3,7 @@
 All numbers are little-endian. A message is
 
     0   4   "FSGR"                          36  8  when the drive began, s since 1970 in UTC
-    4   2   layout, 1                       44  4  which signals it is of, a bit for each
+    4   2   layout, 1; signed: 2            44  4  which signals it is of, a bit for each
     6   2   length with the checksum        48  4  n, rows
     8   8   what the signals mean, below    56  .. sums, 8 bytes each, of these signals
     16  16  the car, ASCII, zeros behind    ..  .. products, 8 bytes each, packed lower triangle
@@ -14,6 +14,7 @@ All numbers are little-endian. A message is
 A drive has a message for each set of signals that its rows have. What the signals mean are the
 first 8 bytes of the SHA-256 of the canonical JSON of name, scale and range of each.
 
+A signed message has its signature, 64 bytes, before the checksum (`fleet_slip.grams.signatures`).
 Messages of one length that stand one behind the other are read at once, as an array.
 """
 
@@ -31,6 +32,8 @@ from fleet_slip.regression.gram import packed_size
 
 MAGIC = b"FSGR"
 LAYOUT = 1
+SIGNED_LAYOUT = 2
+SIGNATURE_BYTES = 64
 HEADER_BYTES = 56
 CHECKSUM_BYTES = 4
 LONGEST_VEHICLE = 16
@@ -78,7 +81,7 @@ def message_size(signals: int) -> int:
 
 
 @cache
-def message_type(signals: int) -> np.dtype[Any]:
+def message_type(signals: int, *, signed: bool = False) -> np.dtype[Any]:
     """Return the fields of a message of so many signals.
 
     `rows` are n, `lost` rows of the drive that none of its messages has; `numbers` are sums, then
@@ -98,6 +101,7 @@ def message_type(signals: int) -> np.dtype[Any]:
             ("rows", "<u4"),
             ("lost", "<u4"),
             ("numbers", "<i8", (signals + packed_size(signals),)),
+            *([("signature", "V64")] if signed else []),
             ("checksum", "<u4"),
         ]
     )
@@ -153,21 +157,27 @@ def _continued(
 
 
 @cache
-def _signals_of_length() -> dict[int, int]:
-    return {message_size(signals): signals for signals in range(MOST_SIGNALS + 1)}
+def _types() -> dict[tuple[int, int], tuple[int, np.dtype[Any]]]:
+    """Return the number of signals and the fields of a message, by its layout and its length."""
+    return {
+        (layout, kind.itemsize): (signals, kind)
+        for layout in (LAYOUT, SIGNED_LAYOUT)
+        for signals in range(MOST_SIGNALS + 1)
+        for kind in [message_type(signals, signed=layout == SIGNED_LAYOUT)]
+    }
 
 
 def _read_run(content: bytes, at: int, most: int) -> Messages:
     """Return messages from a place on that are as long as the first; none if it is none."""
-    size = int.from_bytes(content[at + 6 : at + 8], "little")
-    signals = _signals_of_length().get(size)
-    if signals is None:
+    layout, size = (int.from_bytes(content[at + i : at + i + 2], "little") for i in (4, 6))
+    if (layout, size) not in _types():
         return np.empty(0, message_type(0))
+    signals, kind = _types()[layout, size]
     count = min(most, (len(content) - at) // size)
-    messages = np.frombuffer(content, message_type(signals), count, at)
+    messages = np.frombuffer(content, kind, count, at)
     right = (
         (messages["magic"] == MAGIC)
-        & (messages["layout"] == LAYOUT)
+        & (messages["layout"] == layout)
         & (messages["length"] == size)
         & (_bit_counts(messages["mask"]) == signals)
     )
@@ -202,7 +212,21 @@ def _why_none(content: bytes, at: int) -> str:
         return CUT_OFF
     if size < HEADER_BYTES + CHECKSUM_BYTES:
         return WRONG_LENGTH
-    if int.from_bytes(content[at + 4 : at + 6], "little") != LAYOUT:
+    layout = int.from_bytes(content[at + 4 : at + 6], "little")
+    if layout not in (LAYOUT, SIGNED_LAYOUT):
         return OTHER_LAYOUT
     mask = int.from_bytes(content[at + 44 : at + 48], "little")
-    return WRONG_LENGTH if size != message_size(mask.bit_count()) else WRONG_CHECKSUM
+    fitting = message_type(mask.bit_count(), signed=layout == SIGNED_LAYOUT).itemsize
+    return WRONG_LENGTH if size != fitting else WRONG_CHECKSUM
+
+
+def without_signatures(messages: Messages) -> Messages:
+    """Return messages as they were before they were signed, but for their checksums."""
+    names = messages.dtype.names or ()
+    if "signature" not in names:
+        return messages
+    kept = [name for name in names if name != "signature"]
+    plain = np.empty(len(messages), [(name, messages.dtype[name]) for name in kept])
+    for name in kept:
+        plain[name] = messages[name]
+    return plain

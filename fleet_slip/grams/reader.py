@@ -16,6 +16,7 @@ from fleet_slip.catalogue.sources import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.delta.table import Snapshot
 from fleet_slip.errors import DataError
 from fleet_slip.grams.backlog import find_backlog
+from fleet_slip.grams.car_keys import load_car_keys
 from fleet_slip.regression.gram import packed_size
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.condition import Condition, asking
@@ -39,8 +40,22 @@ class OpenedGrams:
     grams_version: int
 
     def statement(self, name: str, condition: Condition) -> str:
-        """Return a statement of `jobs/` for a condition."""
-        return read_sql("jobs", name).format(condition=condition.sql, feature_set=self.identity)
+        """Return a statement of `jobs/` for a condition, but for what revoked keys signed."""
+        keys = load_car_keys()
+        revoked = [key.condition for key in keys.revoked()] if keys else []
+        sql = f"{condition.sql} AND NOT ({' OR '.join(revoked)})" if revoked else condition.sql
+        return read_sql("jobs", name).format(condition=sql, feature_set=self.identity)
+
+    def revoked(self, condition: Condition) -> dict[str, int]:
+        """Return how many drives of each car a cohort lacks, since a key of it was revoked."""
+        keys = load_car_keys()
+        some = [key.condition for key in keys.revoked()] if keys else []
+        if not some:
+            return {}
+        sql = f"{condition.sql} AND ({' OR '.join(some)})"
+        statement = read_sql("jobs", "count_revoked.sql").format(condition=sql)
+        with asking(self.database, condition):
+            return dict(self.database.execute(statement).fetchall())
 
     def batches(self, condition: Condition) -> Iterator[pa.RecordBatch]:
         """Yield the Gram rows of a cohort in any order, with what their fold is told from."""

@@ -1,7 +1,7 @@
 """Messages of cars as rows, many at once: what they say, and which of them cannot be."""
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 
@@ -17,6 +17,7 @@ from fleet_slip.grams.messages import (
     Found,
     Messages,
     signals_definition,
+    without_signatures,
 )
 from fleet_slip.grams.plausible import find_impossible
 
@@ -131,7 +132,13 @@ def is_received(rows: pa.Table) -> pa.ChunkedArray:
     return pc.starts_with(rows["file"].cast(pa.string()), RECEIVED_FILES)
 
 
-def sort_out(found: Iterable[tuple[int, Found]]) -> tuple[list[ReceivedRows], list[Refused]]:
+Judge = Callable[["ReceivedRows"], Iterable[str | None]]
+"""Tells why each of some messages is not to be believed, None where it is."""
+
+
+def sort_out(
+    found: Iterable[tuple[int, Found]], judge: Judge | None = None
+) -> tuple[list[ReceivedRows], list[Refused]]:
     """Return what may land of the messages of some files, by their signals, and what may not."""
     refused: list[Refused] = []
     runs: dict[int, list[ReceivedRows]] = {}
@@ -142,6 +149,10 @@ def sort_out(found: Iterable[tuple[int, Found]]) -> tuple[list[ReceivedRows], li
             run = ReceivedRows(np.full(len(messages), file), numbers, messages)
             told, nameless = _without_name(run)
             refused += nameless
+            if judge is not None and len(told):
+                told, forged = _believed(told, judge(told))
+                refused += forged
+            told = ReceivedRows(told.file, told.number, without_signatures(told.messages))
             for mask in np.unique(told.messages["mask"]).tolist():
                 runs.setdefault(mask, []).append(told.take(told.messages["mask"] == mask))
     kept: list[ReceivedRows] = []
@@ -182,6 +193,15 @@ def _without_name(run: ReceivedRows) -> tuple[ReceivedRows, list[Refused]]:
         places = zip(run.file[bad].tolist(), run.number[bad].tolist(), strict=True)
         refused += [Refused(file, number, reason) for file, number in places]
     return run.take(left), refused
+
+
+def _believed(rows: ReceivedRows, why: Iterable[str | None]) -> tuple[ReceivedRows, list[Refused]]:
+    """Divide messages by whether there is a reason against each."""
+    reasons = np.array(list(why), dtype=object)
+    refused: list[Refused] = []
+    for reason in sorted({reason for reason in reasons if reason}):
+        refused += rows.refuse(reasons == reason, reason)
+    return rows.take(reasons == None), refused  # noqa: E711 - element by element
 
 
 def _is_name(vehicles: Messages) -> BoolArray:

@@ -10,15 +10,18 @@ import hashlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from fleet_slip.delta import retry_conflicts
 from fleet_slip.errors import InputError
+from fleet_slip.grams.car_keys import load_car_keys
 from fleet_slip.grams.landing import Landing, MessageFile, choose_rows, land_refused, land_rows
 from fleet_slip.grams.messages import read_messages
 from fleet_slip.grams.received_rows import sort_out
+from fleet_slip.grams.signatures import judge_signatures
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -107,7 +110,8 @@ def _receive_batch(warehouse: Warehouse, batch: dict[Path, bytes]) -> list[Recei
             fresh.append(reports[path])
     if not files:
         return list(reports.values())
-    rows, refused = sort_out(found)
+    keys = load_car_keys()
+    rows, refused = sort_out(found, None if keys is None else partial(judge_signatures, keys=keys))
 
     def attempt() -> Landing:
         landing = choose_rows(warehouse, rows, refused)

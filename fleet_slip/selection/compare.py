@@ -68,6 +68,7 @@ class Selection(Generic[AnyCohort]):
             "rows": self.cohort.rows,
             "drives_without_log": self.cohort.members.count_received,
             "drives_left_out": self.cohort.left_out,
+            "drives_revoked": dict(self.cohort.revoked),
             "intercept": self.intercept,
             "folds": {
                 "by": self.folds.by,

@@ -1,0 +1,175 @@
+"""Messages signed by the keys of cars: who may send, and what a revoked key leaves out."""
+
+import base64
+import contextlib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import fleet_slip
+from fleet_slip.cli.main import app
+from fleet_slip.errors import ConfigError, InputError
+from fleet_slip.grams.car_keys import KEYS_VARIABLE
+from fleet_slip.grams.signatures import sign_messages
+from fleet_slip.models.ed25519 import generate
+from tests.support.messages import START_S, gram_of, message_of
+
+HEADER = "vehicle_id,public_key,valid_from,valid_until,revoked_since"
+DAY_S = 86_400
+
+
+@pytest.fixture(scope="module")
+def keys() -> dict[str, tuple[bytes, str]]:
+    """Of some names, a private key, and the public one as lists have it."""
+    made = {name: generate() for name in ("VIN0", "VIN1", "VIN2", "thief")}
+    return {name: (own, known.decode().split("\n")[1]) for name, (own, known) in made.items()}
+
+
+@pytest.fixture
+def fleet(tmp_path: Path) -> fleet_slip.Fleet:
+    return fleet_slip.open(tmp_path / "data")
+
+
+def list_keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *lines: str) -> None:
+    path = tmp_path / f"keys{len(list(tmp_path.iterdir()))}.csv"
+    path.write_text("\n".join([HEADER, *lines]) + "\n")
+    monkeypatch.setenv(KEYS_VARIABLE, str(path))
+
+
+def receive(fleet: fleet_slip.Fleet, tmp_path: Path, content: bytes) -> Any:
+    path = tmp_path / f"m{len(list(tmp_path.iterdir()))}"
+    path.write_bytes(content)
+    (report,) = fleet.receive(path)
+    return report
+
+
+def message(car: int, day: int = 0) -> bytes:
+    return message_of(gram_of(10 * car + day), f"VIN{car}", START_S + DAY_S * day)
+
+
+def test_the_signature_is_over_what_the_page_says(keys: dict[str, tuple[bytes, str]]) -> None:
+    from cryptography.hazmat.primitives.serialization import load_der_public_key  # noqa: PLC0415
+
+    private, public = keys["VIN1"]
+    signed = sign_messages(message(1), private)
+    assert len(signed) == 740
+    assert signed[4:8] == b"\x02\x00" + (740).to_bytes(2, "little")
+    assert signed[8:-68] == message(1)[8:-4]
+    key: Any = load_der_public_key(base64.b64decode(public))
+    key.verify(signed[-68:-4], b"fleet-slip gram message\n" + signed[:-68])
+
+
+def test_messages_of_the_key_of_the_car_land_and_no_others(
+    fleet: fleet_slip.Fleet,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    keys: dict[str, tuple[bytes, str]],
+) -> None:
+    known = [f"{name},{keys[name][1]},2024-05-01,2024-05-03," for name in ("VIN0", "VIN1")]
+    list_keys(tmp_path, monkeypatch, *known, f"VIN2,{keys['VIN2'][1]},,,2024-05-02")
+    changed = bytearray(sign_messages(message(1, 1), keys["VIN1"][0]))
+    good = sign_messages(message(1), keys["VIN1"][0])
+    wrong = [
+        message(0),
+        sign_messages(message(0), keys["thief"][0]),
+        sign_messages(message(0), keys["VIN1"][0]),
+        sign_messages(message(0, 3), keys["VIN0"][0]),
+        sign_messages(message(2), keys["VIN2"][0]),
+        sign_messages(message(3), keys["thief"][0]),
+    ]
+    report = receive(fleet, tmp_path, good + b"".join(wrong) + bytes(changed[:-1]) + b"?")
+    assert report.received == 1
+    assert dict(report.refused) == {
+        "is not signed": 1,
+        "is not signed by the key of its car": 2,
+        "is of a car that had no key on that day": 2,
+        "is signed by a key that was revoked": 1,
+        "has a wrong checksum": 1,
+    }
+    assert fleet.sql("SELECT vehicle_id FROM drives").fetchall() == [("VIN1",)]
+
+
+def test_a_signed_message_is_the_unsigned_one_again(
+    fleet: fleet_slip.Fleet, tmp_path: Path, keys: dict[str, tuple[bytes, str]]
+) -> None:
+    assert receive(fleet, tmp_path, message(1) + message(2)).received == 2
+    report = receive(fleet, tmp_path, sign_messages(message(1) + message(2), keys["VIN1"][0]))
+    assert (report.received, report.duplicates) == (0, 2)
+
+
+def test_what_a_revoked_key_signed_since_a_day_is_left_out_and_named(
+    fleet: fleet_slip.Fleet,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    keys: dict[str, tuple[bytes, str]],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    lines = [f"{name},{keys[name][1]},,," for name in ("VIN0", "VIN1", "VIN2")]
+    list_keys(tmp_path, monkeypatch, *lines)
+    signed = [
+        sign_messages(message(car, day), keys[f"VIN{car}"][0])
+        for car in range(3)
+        for day in range(4)
+    ]
+    assert receive(fleet, tmp_path, b"".join(signed)).received == 12
+    assert fleet.cohort().select(model="ax,ay").as_dict()["drives_revoked"] == {}
+    list_keys(tmp_path, monkeypatch, *lines[:2], f"{lines[2][:-1]},2024-05-02")
+    selection = fleet.cohort().select(model="ax,ay")
+    told = selection.as_dict()
+    assert (told["drives"], told["drives_revoked"]) == (9, {"VIN2": 3})
+    trained = fleet.publish("cars", selection, force=True).version.manifest.trained_on
+    assert (trained.drives, trained.drives_without_log) == (9, 9)
+    loaded = fleet.cohort().select(nested="ax,ay,yaw_rate", rank="backward")
+    assert (loaded.cohort.drive_count, dict(loaded.cohort.revoked)) == (9, {"VIN2": 3})
+    with contextlib.suppress(SystemExit):
+        app(["--root", str(tmp_path / "data"), "select", "--model", "ax,ay"])
+    said_by_cli = " ".join(capsys.readouterr().err.split())
+    assert "3 drives of VIN2 left out: a key of it was revoked" in said_by_cli
+
+
+@pytest.mark.parametrize(
+    ("line", "problem"),
+    [
+        (
+            "VIN1,{key},2024-05-01,2024-05-09,\nVIN1,{key},2024-05-09,,",
+            "has two keys on 2024-05-09",
+        ),
+        ("VIN1,c29tZQ==,,,", "is not an Ed25519 public key"),
+        ("V'1,{key},,,", "vehicle_id"),
+        ("VIN1,{key},yesterday,,", "must be a date"),
+        ("VIN1,{key},,,,more", "unknown key"),
+        ("VIN1", "public_key: is missing"),
+    ],
+)
+def test_a_wrong_list_of_keys_is_refused(
+    fleet: fleet_slip.Fleet,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    keys: dict[str, tuple[bytes, str]],
+    line: str,
+    problem: str,
+) -> None:
+    list_keys(tmp_path, monkeypatch, line.format(key=keys["VIN1"][1]))
+    with pytest.raises(ConfigError, match=problem):
+        receive(fleet, tmp_path, message(1))
+
+
+@pytest.mark.parametrize("value", ["", " ", "no/such/file"])
+def test_a_list_that_cannot_be_read_does_not_switch_signatures_off(
+    fleet: fleet_slip.Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, value: str
+) -> None:
+    monkeypatch.setenv(KEYS_VARIABLE, value)
+    with pytest.raises(ConfigError, match=r"set and empty|cannot be read"):
+        receive(fleet, tmp_path, message(1))
+
+
+def test_what_cannot_be_signed_is_refused(keys: dict[str, tuple[bytes, str]]) -> None:
+    private = keys["VIN1"][0]
+    for content, key, problem in (
+        (message(1)[:-1], private, "message 1 is cut off"),
+        (sign_messages(message(1), private), private, "is signed already"),
+        (message(1), b"no key", "not an unencrypted Ed25519"),
+    ):
+        with pytest.raises(InputError, match=problem):
+            sign_messages(content, key)
