@@ -16,6 +16,7 @@ from fleet_slip.arrays import is_finite
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import require_columns, shown
 from fleet_slip.ingest.csv_format import CsvFormat
+from fleet_slip.ingest.read_ahead import map_ahead
 from fleet_slip.ingest.source import Channel
 
 BLOCK_BYTES = 2**22
@@ -77,20 +78,23 @@ class CsvSource:
             plain = _decompressed(stream)
             names = _csv_header(plain, self.file, self.csv_format)
             positions = require_columns(self.file, names, columns)
-            numbers, unfolded = self.numbers.columns & set(columns), 0
-            for block in _whole_lines(plain, self.file):
-                unfolded += len(block)
-                if plain is not stream:
-                    _require_no_bomb(self.file, unfolded)
+            numbers = set(self.numbers.columns & set(columns))
+
+            def parse(block: bytes) -> pl.DataFrame:
                 # Reading on over bad numbers is reading on over bad quotes.
-                fit = frozenset() if b'"' in block else numbers
+                fit = frozenset() if b'"' in block else frozenset(numbers)
                 parsed = self._parse(block, len(names), positions, fit)
                 texts = {name for name in fit if not self.numbers.are_in(parsed[name])}
                 if texts:
-                    numbers -= texts
+                    numbers.difference_update(texts)  # so that others need not be parsed twice
                     again = self._parse(block, len(names), {n: positions[n] for n in texts}, set())
                     parsed = parsed.with_columns(again.select(sorted(texts)))
-                yield parsed
+                return parsed
+
+            blocks = _whole_lines(plain, self.file)
+            if plain is not stream:
+                blocks = _without_bomb(blocks, self.file)
+            yield from map_ahead(parse, blocks)
 
     def _parse(
         self, block: bytes, width: int, positions: dict[str, int], numbers: Set[str]
@@ -135,12 +139,17 @@ def _decompressed(stream: BinaryIO) -> BinaryIO:
     return stream
 
 
-def _require_no_bomb(file: Path, unfolded: int) -> None:
-    if unfolded > MOST_BYTES and unfolded > MOST_UNFOLDED * file.stat().st_size:
-        raise InputError(
-            f"{shown(file)}: it unfolds to more than {MOST_UNFOLDED} times its size, which no log "
-            "does. Unpack it and look at what is in it."
-        )
+def _without_bomb(blocks: Iterator[bytes], file: Path) -> Iterator[bytes]:
+    """Yield the blocks of a compressed file, as long as they are not absurdly many."""
+    unfolded = 0
+    for block in blocks:
+        unfolded += len(block)
+        if unfolded > MOST_BYTES and unfolded > MOST_UNFOLDED * file.stat().st_size:
+            raise InputError(
+                f"{shown(file)}: it unfolds to more than {MOST_UNFOLDED} times its size, which no "
+                "log does. Unpack it and look at what is in it."
+            )
+        yield block
 
 
 def _csv_header(stream: BinaryIO, file: Path, csv_format: CsvFormat) -> list[str]:
