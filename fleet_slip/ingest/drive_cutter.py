@@ -8,7 +8,7 @@ import polars as pl
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.ingest.mapping import TimeBase
-from fleet_slip.ingest.quarantine import describe_refused, no_rows
+from fleet_slip.ingest.quarantine import describe_refused, join_refused, no_rows
 from fleet_slip.ingest.resampling import STEP_S, TIME_EPSILON_S
 
 LONGEST_DRIVE_S = 2**19 * STEP_S
@@ -69,7 +69,7 @@ class DriveCutter:
         if len(found) == 1:
             return found[0]
         good, bad = zip(*found, strict=True)
-        return pl.concat(good), pl.concat(bad)
+        return pl.concat(good), join_refused(bad)
 
     def _go_on(self, stretch: "_Stretch", *, last: bool) -> tuple[pl.DataFrame, pl.DataFrame]:
         """Cut a stretch; at once if nothing happens in it but that an open part goes on."""

@@ -1,5 +1,6 @@
 """Splits rows into good ones, with values in SI units, and bad ones, each with its reason."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import polars as pl
@@ -85,6 +86,12 @@ def describe_refused(rows: pl.DataFrame, which: BoolArray | None, reason: str) -
         pl.lit("time").alias("signal"),
         pl.col("time").cast(pl.String).alias("value"),
     )
+
+
+def join_refused(frames: Sequence[pl.DataFrame]) -> pl.DataFrame:
+    """Return the bad rows of all frames; most have none, and joining takes a while."""
+    some = [frame for frame in frames if frame.height]
+    return pl.concat(some) if len(some) > 1 else next(iter(some), frames[0])
 
 
 def no_rows() -> pl.DataFrame:

@@ -18,11 +18,22 @@ WORKERS = 2
 def read_ahead(items: Iterator[Item], ahead: int = AHEAD) -> Generator[Item, None, None]:
     """Yield items, in their order, while a thread takes the next; errors come in their place.
 
-    No two are taken at once. Who closes it waits for the item that is being taken.
+    No two are taken at once. Who closes it waits for the item that is being taken. A single item,
+    as most small files have, needs no thread.
     """
+    first = _take(items)
+    try:
+        second = _take(items) if first else ()
+    except Exception:
+        yield from first
+        raise
+    if not second:
+        yield from first
+        return
     with ThreadPoolExecutor(1, thread_name_prefix="read-ahead") as thread:
         taken = deque(thread.submit(_take, items) for _ in range(ahead))
         try:
+            yield from (*first, *second)
             while item := taken.popleft().result():
                 taken.append(thread.submit(_take, items))
                 yield from item
@@ -38,19 +49,21 @@ def map_ahead(
 
     Errors, of the function and of the items, come in their place.
     """
+    held = _take(items)
+    failure: Exception | None = None
     with ThreadPoolExecutor(WORKERS, thread_name_prefix="map-ahead") as threads:
         under_way: deque[Future[Result]] = deque()
-        failure: Exception | None = None
         try:
-            while True:
+            while held:
                 try:
-                    item = next(items)
-                except StopIteration:
-                    break
+                    following = _take(items)
                 except Exception as error:
-                    failure = error
+                    following, failure = (), error
+                if not following and not under_way:
+                    yield function(*held)  # a single item, as most small files have
                     break
-                under_way.append(threads.submit(function, item))
+                under_way.append(threads.submit(function, *held))
+                held = following
                 if len(under_way) > WORKERS:
                     yield under_way.popleft().result()
             while under_way:
@@ -58,8 +71,8 @@ def map_ahead(
         finally:
             for future in under_way:
                 future.cancel()
-        if failure is not None:
-            raise failure
+    if failure is not None:
+        raise failure
 
 
 def _take(items: Iterator[Item]) -> tuple[Item, ...]:

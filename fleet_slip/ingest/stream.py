@@ -27,7 +27,7 @@ from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.measured_drives import MeasuredDrive, drive_id, to_ticks
 from fleet_slip.ingest.open_drives import MAX_OPEN_ROWS, DriveRows, OpenDrives
 from fleet_slip.ingest.parquet_batches import partition_keys
-from fleet_slip.ingest.quarantine import describe_refused, no_rows
+from fleet_slip.ingest.quarantine import describe_refused, join_refused, no_rows
 from fleet_slip.ingest.read_ahead import read_ahead
 from fleet_slip.ingest.reading import log_digest, require_unchanged_log
 from fleet_slip.ingest.resampling import STEP_S, TIME_EPSILON_S
@@ -129,7 +129,7 @@ class MeasuredStream:
                 f"{shown(self.file)}: more than {MAX_OPEN_ROWS:,} rows of drives that alternate, "
                 "and none of them ends. Sort the file by drive and time."
             )
-        bad = pl.concat(refused)
+        bad = join_refused(refused)
         self._note_refused(bad)
         return Piece(drives, bad)
 
@@ -147,8 +147,8 @@ class MeasuredStream:
         return drive
 
     def _note_refused(self, refused: pl.DataFrame) -> None:
-        self.totals.quarantined.update(refused["reason"])
         if refused.height:
+            self.totals.quarantined.update(refused["reason"])
             first = refused.row(refused["row"].arg_min() or 0, named=True)
             self._first_refused = min(self._first_refused or first, first, key=lambda r: r["row"])
 
@@ -196,7 +196,7 @@ class MeasuredStream:
 
     def quarantine_table(self, refused: Sequence[pl.DataFrame]) -> pa.Table:
         """Return refused rows as those of the table `quarantine`, in the file's order."""
-        bad = pl.concat(refused).sort("row", maintain_order=True)
+        bad = join_refused(refused).sort("row", maintain_order=True)
         name = os.fsencode(self.file.name).decode("utf-8", "replace")
         groups = bad["group"].unique().drop_nulls()
         ids = {group: drive_id(self.prefix, group) for group in groups}
@@ -257,7 +257,7 @@ def _identity(file: Path, mapping: Mapping) -> str:
 
 def _trial(mapping: Mapping, blocks: list[Block], until: int) -> pl.DataFrame:
     """Return the rows of the first blocks up to a number, cut into parts."""
-    rows = pl.concat([block.rows for block in blocks])
+    rows = blocks[0].rows if len(blocks) == 1 else pl.concat([block.rows for block in blocks])
     if until < blocks[-1].read:
         rows = rows.filter(pl.col("row") <= until)
     return DriveCutter(mapping.time).cut(rows, last="base" in rows.columns)[0]

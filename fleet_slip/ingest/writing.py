@@ -77,6 +77,8 @@ class RefusedRows:
 
     def add(self, rows: pl.DataFrame) -> None:
         """Keep rows."""
+        if not rows.height:
+            return
         self._rows.append(rows)
         self._number += rows.height
         if self._number >= FILE_ROWS:
