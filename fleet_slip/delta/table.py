@@ -3,7 +3,7 @@
 import hashlib
 import math
 import uuid
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import date
 from functools import cached_property
@@ -22,6 +22,7 @@ from fleet_slip.delta.files import TableFile, active_files, have_same_columns, r
 from fleet_slip.delta.log_check import require_sound_log
 from fleet_slip.delta.schema import require_readable, require_writable
 from fleet_slip.delta.sealing import NOTE, seal_note
+from fleet_slip.delta.units import read_landed_units
 from fleet_slip.errors import ConflictError, StorageError
 from fleet_slip.files.checksums import checksum_in
 from fleet_slip.files.folder import Folder
@@ -32,6 +33,9 @@ FENCE = "fleet_slip.fence"
 
 ALL_STATISTICS = {"delta.dataSkippingNumIndexedCols": "-1"}
 """Property of a table of which all columns have statistics: as a rule Delta reads those of 32."""
+
+MANY_UNITS = 8
+"""So many units of work are not asked for one by one."""
 
 
 @dataclass(frozen=True)
@@ -278,6 +282,20 @@ class Snapshot:
             return None
         with storage_errors(self.table.folder):
             return self.delta.transaction_version(unit_name)
+
+    def landed_among(self, number: int) -> Callable[[str], bool]:
+        """Return what tells of a unit whether it has landed, for so many questions.
+
+        Many are answered by reading the log once.
+        """
+        if self.version is None or number < MANY_UNITS:
+            return lambda name: self.landed(name) is not None
+        return self._units.__contains__
+
+    @cached_property
+    def _units(self) -> frozenset[str]:
+        with storage_errors(self.table.folder):
+            return read_landed_units(self.table.folder, self.version or 0)
 
     def moment(self, version: int) -> str | None:
         """Return the digest of the commit that made a version of this table's past, or present.

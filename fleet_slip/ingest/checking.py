@@ -1,6 +1,7 @@
 """Reads a file block by block, and checks each row by itself."""
 
 from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -41,7 +42,6 @@ class RowChecker:
         self._file, self._mapping = file, mapping
         self.rows = self.left_out = 0
         self.keys = DriveKeys()
-        self._understood: dict[object, tuple[list[Field], pl.Expr | None]] = {}
 
     def blocks(self) -> Iterator[Block]:
         """Yield the rows of each batch. Raises `InputError`."""
@@ -78,12 +78,17 @@ class RowChecker:
 
     def _understand(self, schema: pl.Schema) -> tuple[list[Field], pl.Expr | None]:
         """Return the fields of batches with a schema, and the condition on their rows."""
-        known = tuple(schema.items())
-        if known not in self._understood:
-            try:
-                fields = fields_of(self._mapping, schema)
-                meeting = meets_conditions(self._mapping, schema) if self._mapping.where else None
-            except InputError as error:
-                raise InputError(f"{shown(self._file)}: {error}") from None
-            self._understood[known] = fields, meeting
-        return self._understood[known]
+        try:
+            return _understand(self._mapping, tuple(schema.items()))
+        except InputError as error:
+            raise InputError(f"{shown(self._file)}: {error}") from None
+
+
+@lru_cache(maxsize=64)
+def _understand(
+    mapping: Mapping, columns: tuple[tuple[str, pl.DataType], ...]
+) -> tuple[list[Field], pl.Expr | None]:
+    """Return the fields of batches with these columns: the same for all files of a folder."""
+    schema = pl.Schema(columns)
+    fields = fields_of(mapping, schema)
+    return fields, meets_conditions(mapping, schema) if mapping.where else None

@@ -8,14 +8,13 @@ notice that a file has changed since it landed, so that its drives would count t
 
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from fleet_slip.delta import Snapshot
 from fleet_slip.ingest.landing import unit_of
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.warehouse.tables import Warehouse
@@ -55,9 +54,10 @@ class KnownFiles:
         snapshot = warehouse.logs.snapshot()
         if self.moment is None or snapshot.moment(self.moment[0]) != self.moment[1]:
             self.landed.clear()  # another table, or one that was restored
-        return [file for file in files if not self._has_landed(file, snapshot)]
+        landed = snapshot.landed_among(len(self.digests))
+        return [file for file in files if not self._has_landed(file, landed)]
 
-    def _has_landed(self, file: Path, snapshot: Snapshot) -> bool:
+    def _has_landed(self, file: Path, landed: Callable[[str], bool]) -> bool:
         known = self.digests.get(os.path.abspath(file))  # noqa: PTH100 - much the faster
         if known is None:
             return False
@@ -66,7 +66,7 @@ class KnownFiles:
         except OSError:
             return False
         unchanged = (found.st_size, found.st_mtime_ns) == known[:2]
-        return unchanged and (known[2] in self.landed or _is_in(snapshot, known[2]))
+        return unchanged and (known[2] in self.landed or landed(unit_of(known[2]).name))
 
     def digest_of(self, file: Path) -> str | None:
         """Return the digest of what a path had when it landed, None if it never did."""
@@ -84,7 +84,8 @@ class KnownFiles:
         """Write the cache; what cannot be written is not kept."""
         snapshot = warehouse.logs.snapshot()
         asked = {digest for _, _, digest in self.digests.values()}
-        self.landed = {d for d in asked if d in self.landed or _is_in(snapshot, d)}
+        has_landed = snapshot.landed_among(len(asked))
+        self.landed = {d for d in asked if d in self.landed or has_landed(unit_of(d).name)}
         version = snapshot.version or 0
         kept = {
             "files": self.digests,
@@ -96,10 +97,6 @@ class KnownFiles:
             draft = self.cache.with_suffix(f".{os.getpid()}")
             draft.write_text(json.dumps(kept))
             draft.replace(self.cache)
-
-
-def _is_in(snapshot: Snapshot, digest: str) -> bool:
-    return snapshot.landed(unit_of(digest).name) is not None
 
 
 def _cache_folder() -> Path:

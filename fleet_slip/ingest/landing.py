@@ -102,9 +102,9 @@ def write_batch(
     longest: tuple[int, MeasuredDrive] | None = None
     outcomes: list[FileOutcome] = []
     failures: list[InputError] = []
-    snapshots: dict[TableName, Snapshot] = {
-        "quarantine": warehouse.quarantine.snapshot(),
-        "logs": warehouse.logs.snapshot(),
+    landed: dict[TableName, Callable[[str], bool]] = {
+        "quarantine": warehouse.quarantine.snapshot().landed_among(len(files)),
+        "logs": warehouse.logs.snapshot().landed_among(len(files)),
     }
     with ThreadPoolExecutor(WRITERS) as threads:
         parts: dict[TableName, _PartInTheMaking] = {
@@ -114,12 +114,12 @@ def write_batch(
         for asked in files:
             try:
                 with open_measured(asked.file, mapping) as stream:
-                    _require_not_grown(asked, stream.digest, snapshots["logs"], mapping)
+                    _require_not_grown(asked, stream.digest, landed["logs"], mapping)
                     missing = [
                         name
                         for name, part in parts.items()
                         if not part.has(stream.digest)
-                        and not _landed(snapshots[name], stream.digest)
+                        and not landed[name](unit_of(stream.digest).name)
                     ]
                     missing = missing if "logs" in missing else []
                     written = FileWriter(warehouse, stream, missing, threads).write()
@@ -175,10 +175,12 @@ class _PartInTheMaking:
         self._rows = {}
 
 
-def _require_not_grown(asked: AskedFile, digest: str, logs: Snapshot, mapping: Mapping) -> None:
+def _require_not_grown(
+    asked: AskedFile, digest: str, landed: Callable[[str], bool], mapping: Mapping
+) -> None:
     """Raise `InputError` for a file whose earlier content is in the logs: it would count twice."""
     earlier = asked.earlier
-    if earlier is None or earlier == digest or not _landed(logs, earlier):
+    if earlier is None or earlier == digest or not landed(unit_of(earlier).name):
         return
     raise InputError(
         f"{shown(asked.file)}: it has changed since it was ingested, and its drives would count "
@@ -199,10 +201,6 @@ def _outcome(file: Path, stream: MeasuredStream, written: WrittenFile, *, new: b
         left_out=written.left_out,
         counts=replace(counts, drives=counts.drives - written.left_out, ticks=written.ticks),
     )
-
-
-def _landed(snapshot: Snapshot, digest: str) -> bool:
-    return snapshot.landed(unit_of(digest).name) is not None
 
 
 def _digest(digests: list[str]) -> str:
@@ -232,8 +230,8 @@ class Landing:
         snapshot = table.snapshot()
         # Asked after the snapshot: who forgets a car from now on makes this commit a conflict.
         audit = Audit(self._warehouse.root)
-        while audit.barred(self.written.vehicles, self.written.drives) or any(
-            snapshot.landed(unit.name) is not None for unit in self._part(name).units
+        while audit.barred(self.written.vehicles, self.written.drives) or self._has_landed(
+            snapshot, name
         ):
             self._warehouse.quarantine.discard(self.written.quarantine.files)
             self._warehouse.logs.discard(self.written.logs.files)
@@ -244,6 +242,11 @@ class Landing:
             return frozenset()
         snapshot.commit(Change(add=part.files, units=part.units, note=self._note))
         return frozenset(unit.name for unit in part.units)
+
+    def _has_landed(self, snapshot: Snapshot, name: TableName) -> bool:
+        units = self._part(name).units
+        landed = snapshot.landed_among(len(units))
+        return any(landed(unit.name) for unit in units)
 
     def _table(self, name: TableName) -> Table:
         return self._warehouse.logs if name == "logs" else self._warehouse.quarantine

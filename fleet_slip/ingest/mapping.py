@@ -170,6 +170,10 @@ class Mapping(Config):
                 raise ValueError(f"signals.{name}: 'time' needs [time] with 'column' and 'unit'")
         return self
 
+    def __hash__(self) -> int:
+        """Return the hash of what identifies it."""
+        return hash(self.canonical_json())
+
     def time_bases(self) -> dict[str | None, list[str]]:
         """Return the columns that the mapping uses, each once, by the column of their times."""
         own = {s.column for s in self.signals.values() if s.time not in {None, self.time.column}}

@@ -1,6 +1,7 @@
 """Factors from the units that people log in to the catalogue's SI units."""
 
 import re
+from functools import cache
 
 import pint
 
@@ -27,6 +28,7 @@ def require_unit(unit: str, si_unit: str, quantity: str = "it") -> None:
     conversion_factor(unit, si_unit, quantity)
 
 
+@cache
 def conversion_factor(unit: str, si_unit: str, quantity: str = "it") -> float:
     """Return f in `value in si_unit = f * value in unit`; `quantity` is what messages call it.
 

@@ -116,6 +116,24 @@ def test_different_units_land_side_by_side(warehouse: Warehouse) -> None:
     assert warehouse.logs.snapshot().rows == 40
 
 
+def test_of_many_units_the_log_says_at_once_what_it_says_of_each(warehouse: Warehouse) -> None:
+    for number in range(4):
+        action = warehouse.logs.write_file(f"f{number}", rows(f"d{number}", 10), DAY)
+        units = [Unit(f"unit-{number}-{i}", 1) for i in range(3)]
+        warehouse.logs.snapshot().commit(Change(add=[action], units=units))
+        if number == 1:
+            DeltaTable(str(path_of(warehouse.logs.folder))).create_checkpoint()
+    names = [f"unit-{number}-{i}" for number in range(5) for i in range(4)]
+    commits = sorted((path_of(warehouse.root) / "logs/_delta_log").glob("*.json"))
+    commits[1].unlink()  # what the checkpoint sums up, Delta removes in time
+    earlier, now = warehouse.logs.snapshot(3), warehouse.logs.snapshot()
+    for snapshot, number in ((earlier, 9), (now, 12)):
+        landed = snapshot.landed_among(len(names))
+        assert [landed(n) for n in names] == [snapshot.landed(n) is not None for n in names]
+        assert sum(map(landed, names)) == number
+    assert not any(map(warehouse.quarantine.snapshot().landed_among(99), names))
+
+
 def test_a_snapshot_does_not_see_later_commits(warehouse: Warehouse) -> None:
     first = warehouse.logs.write_file("one", rows("a"), DAY)
     warehouse.logs.snapshot().commit(Change(add=[first], units=[Unit("1", 1)]))

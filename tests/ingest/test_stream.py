@@ -1,6 +1,7 @@
 """The same rows and drives, in whatever blocks a file is read; plain numbers as by way of text."""
 
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from fleet_slip.ingest.csv_batches import PlainNumbers, open_csv
 from fleet_slip.ingest.csv_format import CsvFormat
 from fleet_slip.ingest.drive_cutter import DriveCutter
 from fleet_slip.ingest.job import ingest_file
-from fleet_slip.ingest.read_ahead import AHEAD, read_ahead
+from fleet_slip.ingest.read_ahead import AHEAD, map_ahead, read_ahead
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.measured import a_mapping, csv_text, good_columns, read_columns, ticks
 
@@ -206,6 +207,39 @@ def test_items_are_read_ahead_in_order_and_errors_come_in_their_place() -> None:
             seen.append(item)
     assert seen == [0, 1, 2, 3]
     assert not [t for t in threading.enumerate() if t.name.startswith("read-ahead")]
+
+
+def test_results_come_in_the_order_of_their_items_whoever_is_faster() -> None:
+    second_is_done = threading.Event()
+
+    def work(item: int) -> int:
+        if item == 0:
+            assert second_is_done.wait(10)  # so the first is done last
+        if item == 1:
+            second_is_done.set()
+        if item == 5:
+            raise ValueError("five")
+        return 10 * item
+
+    def items(number: int) -> Iterator[int]:
+        yield from range(number)
+        raise ValueError("end")
+
+    def results(items: Iterator[int]) -> tuple[list[int], str]:
+        seen: list[int] = []
+        try:
+            for result in map_ahead(work, items):
+                seen.append(result)
+        except ValueError as error:
+            return seen, str(error)
+        return seen, ""
+
+    assert results(items(4)) == ([0, 10, 20, 30], "end")
+    assert results(items(8)) == ([0, 10, 20, 30, 40], "five")
+    assert results(iter(range(4))) == ([0, 10, 20, 30], "")
+    assert results(items(1)) == ([0], "end")
+    assert results(iter([])) == ([], "")
+    assert not [t for t in threading.enumerate() if t.name.startswith("map-ahead")]
 
 
 def test_the_longest_drive_is_said_in_the_docs() -> None:
