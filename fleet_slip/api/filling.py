@@ -113,10 +113,11 @@ class Filling(Rooted):
 
         `mapping` is the name of one that ships, the path of a TOML file, or a `Mapping`. Rows that
         cannot be used go to the view `quarantine` with a reason. Of a folder all logs are taken, at
-        any depth, but for those that have landed before and have not changed; with `as_one` they
-        are parts of one log, whose drives go on from file to file. Returns a report of
-        each file that was read, in their order; `each` is called with it once the file is
-        committed. Progress is in files. Without a cluster they are read one after the other.
+        any depth, and of a pattern what matches, but for those that have landed before and have
+        not changed; with `as_one` they are parts of one log, whose drives go on from file to file.
+        Returns a report of each file that was read, in their order; `each` is called with it once
+        the file is committed. Progress is in files. Without a cluster they are read one after the
+        other.
 
         Raises `ConfigError` for a mapping that is not valid; `InputError`, when all others are in,
         for files that cannot be used, of which nothing is written; `StorageError` and
@@ -124,13 +125,13 @@ class Filling(Rooted):
         """
         from fleet_slip.ingest.folders import KnownFiles
         from fleet_slip.ingest.job import ingest_files
-        from fleet_slip.ingest.log_files import find_logs
+        from fleet_slip.ingest.log_files import find_logs, is_pattern
         from fleet_slip.ingest.mapping import load_mapping
 
         plan = load_mapping(mapping) if isinstance(mapping, str) else mapping
         given = [Path(files)] if isinstance(files, Path | str) else [Path(file) for file in files]
         paths = given if as_one else find_logs(given)
-        folders = any(path.is_dir() for path in given)
+        folders = any(path.is_dir() or is_pattern(path) for path in given)
         known = KnownFiles.of(self.warehouse, plan) if folders else None
         told = count_from_start(progress)
         reports = {}

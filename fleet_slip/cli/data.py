@@ -152,6 +152,8 @@ def ingest(
 
     Example: **fleet-slip ingest drive.csv --mapping logger.toml --dry-run**
     """
+    from fleet_slip.ingest.log_files import is_pattern  # noqa: PLC0415 - takes a while
+
     fleet: Fleet = context.obj
     if plot is not None and not (dry_run and len(files) == 1):
         raise UsageError("--plot draws one file, with --dry-run.")
@@ -162,7 +164,7 @@ def ingest(
         return
     if as_one and not all(file.is_dir() for file in files):
         raise UsageError("--as-one takes folders, whose files are parts of one log.")
-    folders = any(file.is_dir() for file in files) and not as_one
+    folders = any(file.is_dir() or is_pattern(file) for file in files) and not as_one
     each = Remarks(quiet=json or folders)
     with recording(fleet.root, "ingest", sys.argv[1:]), ExitStack() as shown:
         show = shown.enter_context(progress("ingest", "files")) if folders else None

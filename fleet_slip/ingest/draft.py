@@ -24,7 +24,7 @@ from fleet_slip.ingest.guessing import (
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.preview import preview_file
 from fleet_slip.ingest.profile import FileProfile, Profile, sample_rate_hz
-from fleet_slip.ingest.suspicion import WHEELS, Suspicion, find_suspicions
+from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS, Suspicion, find_suspicions, speed_ratio
 
 _TIME_NAMES = ("time", "timestamp", "zeit", "t", "sec", "seconds")
 _TIME_UNITS = {"s": "s", "sec": "s", "ms": "ms", "us": "us", "µs": "us", "ns": "ns"}
@@ -82,6 +82,7 @@ def draft_mapping(file: Path, profile: FileProfile) -> Draft:
     try:
         if unnamed and set(WHEELS) <= set(guesses):
             guesses |= _place_wheels(guesses, _drive(file, profile, time, guesses))
+        guesses |= _other_wheels(guesses, _drive(file, profile, time, guesses))
         suspicions = find_suspicions(_drive(file, profile, time, guesses))
         for name in _doubtful_units(guesses, suspicions):
             other = _with_other_unit(guesses, name, suspicions)
@@ -169,6 +170,25 @@ def _doubtful_units(guesses: dict[str, Guess], suspicions: list[Suspicion]) -> l
     doubtful = [name for one in suspicions if one.kind == "unit" for name in one.signals]
     able = (n for n in dict.fromkeys(doubtful) if n in guesses and guesses[n].is_without_unit)
     return [name for name in able if guesses[name].unit in OTHER_UNITS]
+
+
+def _other_wheels(guesses: dict[str, Guess], drive: dict[str, FloatArray]) -> dict[str, Guess]:
+    """Return wheel speeds without a unit as rad/s instead of km/h, or the other way round.
+
+    They differ by an eighth, as tyres do: what is nearer to the lateral acceleration is taken.
+    """
+    wheels = [name for name in WHEELS if name in guesses and guesses[name].is_without_unit]
+    ratio = speed_ratio(drive)
+    if not wheels or ratio is None:
+        return {}
+    in_kmh = guesses[wheels[0]].radius_m is not None
+    kmh_in_rad_s = 1 / (3.6 * RADIUS_M)
+    if_other = ratio * (kmh_in_rad_s if in_kmh else 1 / kmh_in_rad_s)
+    if abs(np.log(if_other)) >= abs(np.log(ratio)):
+        return {}
+    unit, radius_m = ("rad/s", None) if in_kmh else ("km/h", RADIUS_M)
+    reason = f"ay is {ratio:.2f} times yaw rate times speed, with {unit} {if_other:.2f} times"
+    return {n: guesses[n].because(reason, unit=unit, radius_m=radius_m) for n in wheels}
 
 
 def _with_other_unit(

@@ -17,7 +17,7 @@ from fleet_slip.ingest.units import conversion_factor
 NAMES: dict[str, tuple[str, ...]] = {
     "ax": ("ax", "a x", "acc x", "accel x", "long acc", "long accel", "laengs beschl"),
     "ay": ("ay", "a y", "acc y", "accel y", "lat acc", "lat accel", "quer beschl"),
-    "yaw_rate": ("yaw rate", "yawrate", "yaw vel", "gyro z", "omega z", "gier"),
+    "yaw_rate": ("yaw rate", "yawrate", "yaw vel", "gyro z", "omega z", "angular vel z", "gier"),
     "steering_wheel": (
         "steering wheel", "steer wheel", "sw pos", "sw ang", "swa", "lenkrad", "lwi",
         "steering ang", "steer ang", "hand wheel",
@@ -27,13 +27,15 @@ NAMES: dict[str, tuple[str, ...]] = {
     "vy": ("vy", "v y", "vel y", "speed y", "lat vel", "vel lat"),
     "steer": ("road wheel ang", "front wheel ang", "wheel steer ang", "steer front", "delta f"),
     "vehicle_speed": ("vehicle speed", "veh speed", "veh spd", "speed", "fahrzeug geschw"),
-    "roll_rate": ("roll rate", "rollrate", "gyro x", "omega x", "wank"),
+    "roll_rate": ("roll rate", "rollrate", "gyro x", "omega x", "angular vel x", "wank"),
     "brake_pressure": ("brake press", "brk press", "brake pres", "master cylinder", "brems druck"),
     "throttle": ("throttle", "accel pedal", "gas pedal", "fahrpedal", "drosselklappe"),
     "gear": ("gear", "gang"),
 }  # fmt: skip
 """Words by which a signal is called, each at the beginning of a part of the name."""
 _NOT_NAMES = {
+    "vx": ("angular",),
+    "vy": ("angular",),
     "vehicle_speed": (
         "wheel", "whl", "engine", "motor", "wind", "fan", "turbo", "rad", "x", "y", "z", "east",
         "north", "up", "down", "lateral", "vertical", "limit",
@@ -62,6 +64,8 @@ OTHER_UNITS = {
     "rad": "deg",
     "deg/s": "rad/s",
     "rad/s": "deg/s",
+    "m/s": "km/h",
+    "km/h": "m/s",
 }
 """What else values without a unit may be in."""
 

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterable, Iterator
+from glob import glob
 from pathlib import Path
 
 from fleet_slip.errors import InputError
@@ -16,10 +17,14 @@ SUFFIXES = (
 def find_logs(paths: Iterable[Path]) -> list[Path]:
     """Return files as they are given, and those in folders that have the suffix of a log, sorted.
 
-    Hidden files and folders are passed over. Raises `InputError` for a folder without any.
+    A path that is none may be a pattern, `2024-*/*.mf4`, for who gives it in quotes. Hidden files
+    and folders are passed over. Raises `InputError` for a folder or a pattern without any.
     """
     found: list[Path] = []
     for path in paths:
+        if is_pattern(path):
+            found += _matching(path)
+            continue
         if not path.is_dir():
             found.append(path)
             continue
@@ -31,6 +36,19 @@ def find_logs(paths: Iterable[Path]) -> list[Path]:
             )
         found += inside
     return found
+
+
+def is_pattern(path: Path) -> bool:
+    """Whether a path stands for those that match it."""
+    return any(c in str(path) for c in "*?[") and not path.exists()
+
+
+def _matching(pattern: Path) -> list[Path]:
+    names = sorted(glob(str(pattern), recursive=True))  # noqa: PTH207 - takes absolute ones
+    files = [path for path in map(Path, names) if path.is_file()]
+    if not files:
+        raise InputError(f"{shown(pattern)}: no file matches this pattern. Look at its folder.")
+    return files
 
 
 def parts_of(log: Path) -> list[Path]:

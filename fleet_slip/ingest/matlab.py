@@ -14,6 +14,7 @@ import polars as pl
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import describe_missing, shown
+from fleet_slip.ingest.matlab_check import require_sound_tags
 from fleet_slip.ingest.source import Channel, as_column, reading_with
 
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
@@ -92,6 +93,7 @@ def _rows_columns(shape: Sequence[int]) -> tuple[int, int]:
 @contextmanager
 def open_mat(file: Path) -> Iterator[MatSource]:
     """Open a MATLAB file of version 4 to 7. Raises `InputError`."""
+    require_sound_tags(file)
     with reading_with(file, "scipy.io") as scipy_io:
         content = scipy_io.loadmat(file, simplify_cells=True)
     vectors: dict[str, Array] = {}

@@ -14,6 +14,7 @@ import numpy as np
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.catalogue.turning import WITNESSES
+from fleet_slip.ingest.relations import FEWEST_TICKS, fit, moving, slope_of
 
 Signals: TypeAlias = Mapping[str, FloatArray]
 """Values in SI units on consecutive ticks, NaN where there is none; all of one shape (n_ticks,)."""
@@ -22,9 +23,7 @@ RADIUS_M, TRACK_M = 0.31, 1.55
 """Of a passenger car: what is looked for is a factor of 3.6, 9.8 or 57."""
 WHEELS = ("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")
 ROAD_WHEELS = ("steer_fl", "steer")
-FEWEST_TICKS = 200
-LEAST_CORRELATION = 0.6
-MOVING_MPS = 2.0
+LEAST_CORRELATION, SURE_CORRELATION = 0.6, 0.9
 LEAST_GAIN = 0.3
 """A delay explains away this part of a label's variance: a car's own lag of 0.1 s does 0.23."""
 
@@ -78,6 +77,18 @@ def speed_mps(signals: Signals) -> FloatArray | None:
     return signals.get("vx", signals.get("vehicle_speed"))
 
 
+def speed_ratio(signals: Signals) -> float | None:
+    """Return the lateral acceleration over yaw rate times speed, None if they do not go together.
+
+    It is 1 in steady driving; where the wheels' radius or unit is another, that factor.
+    """
+    speed = speed_mps(signals)
+    if speed is None or not {"ay", "yaw_rate"} <= set(signals):
+        return None
+    slope, correlation = slope_of(signals["ay"], signals["yaw_rate"] * speed, moving(speed))
+    return abs(slope) if abs(correlation) > SURE_CORRELATION and slope else None
+
+
 def _still(signals: Signals) -> Iterator[Suspicion]:
     for name, values in signals.items():
         present = values[np.isfinite(values)]
@@ -103,7 +114,7 @@ def _turning(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
     if len(known) < 2:
         return
     names, values = list(known), np.array(list(known.values()))
-    rows = _moving(speed) & np.isfinite(values).all(axis=0)
+    rows = moving(speed) & np.isfinite(values).all(axis=0)
     if rows.sum() < FEWEST_TICKS:
         return
     correlations = np.nan_to_num(np.corrcoef(values[:, rows]))
@@ -159,7 +170,7 @@ def _accelerates(signals: Signals, speed: FloatArray | None) -> Iterator[Suspici
     change = np.full(speed.size, np.nan)
     change[second // 2 : -second // 2] = speed[second:] - speed[:-second]
     smooth = np.convolve(np.nan_to_num(signals["ax"]), np.ones(second) / second, "same")
-    slope, correlation = _slope(smooth, change, _moving(speed))
+    slope, correlation = slope_of(smooth, change, moving(speed))
     if correlation < -LEAST_CORRELATION:
         figure = f"its correlation with the change of speed is {correlation:+.2f}"
         yield Suspicion("sign", ("ax",), figure, "Write negate = true.")
@@ -174,10 +185,10 @@ def _axles_swapped(signals: Signals, speed: FloatArray | None) -> Iterator[Suspi
     front, rear = (signals[f"wheel_{a}l"] + signals[f"wheel_{a}r"] for a in "fr")
     with np.errstate(divide="ignore", invalid="ignore"):
         tightness, longer = (signals["yaw_rate"] / speed) ** 2, front / rear - 1
-    rows = _moving(speed) & (speed < 12)
+    rows = moving(speed) & (speed < 12)
     if np.nanmax(tightness, initial=0, where=rows & np.isfinite(tightness)) < 0.05**2:
         return
-    slope, correlation = _slope(longer, tightness, rows)
+    slope, correlation = slope_of(longer, tightness, rows)
     if correlation < -LEAST_CORRELATION and slope < -1:
         figure = f"in tight bends the front wheels are slower (correlation {correlation:+.2f})"
         yield Suspicion("swapped", WHEELS, figure, "Swap the front columns with the rear ones.")
@@ -188,7 +199,7 @@ def _label(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
     label = catalogue().label
     if label not in signals or speed is None or not {"yaw_rate", "ay"} <= set(signals):
         return
-    rows = _moving(speed)
+    rows = moving(speed)
     angle = signals[label]
     large = np.abs(angle[rows & (speed > 8) & np.isfinite(angle)])
     if large.size >= FEWEST_TICKS and np.median(large) > 0.5:
@@ -207,7 +218,7 @@ def _label(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
         )
         figure += f", with {gain:.0%} less of its variance left"
         yield Suspicion("delay", (label,), figure, f"Try delay_s = {seconds:.2f}.", seconds)
-    fitted, explained = _fit(angle, np.array(inputs[:2]), rows & (speed < 20))
+    fitted, explained = fit(angle, np.array(inputs[:2]), rows & (speed < 20))
     if explained > LEAST_CORRELATION and fitted[1] < -0.3:
         figure = (
             f"turning slowly it goes against the yaw rate ({fitted[1]:+.1f} m, should be +1 to +2)"
@@ -223,7 +234,7 @@ def _best_lag(label: FloatArray, inputs: FloatArray, rows: BoolArray) -> tuple[i
     within = slice(m, n - m)
     left = {}
     for lag in range(-m, m + 1):
-        _, explained = _fit(label[m + lag : n - m + lag], inputs[:, within], rows[within])
+        _, explained = fit(label[m + lag : n - m + lag], inputs[:, within], rows[within])
         left[lag] = 1 - explained
     best = min(left, key=lambda lag: left[lag])
     gain = 1 - left[best] / left[0] if left[0] > 0 else 0.0
@@ -241,7 +252,7 @@ def _of_scale(
     sound: tuple[float, float],
     speed: FloatArray,
 ) -> Iterator[Suspicion]:
-    slope, correlation = _slope(values, expected, _moving(speed))
+    slope, correlation = slope_of(values, expected, moving(speed))
     if abs(correlation) > LEAST_CORRELATION:
         yield from _wrong_scale(abs(slope), concerned, of, sound)
 
@@ -255,37 +266,3 @@ def _wrong_scale(
     factor = min(_FACTORS, key=lambda f: abs(np.log(f / large)))
     near = f" ({factor:g} is between {_FACTORS[factor]})" if 0.6 < factor / large < 1.7 else ""
     yield Suspicion("unit", concerned, f"it is {slope:.3g} times {of}{near}", "Check the units.")
-
-
-def _moving(speed: FloatArray | None) -> BoolArray:
-    if speed is None:
-        return np.ones(1, dtype=np.bool_)
-    return np.asarray(np.nan_to_num(speed) > MOVING_MPS)
-
-
-def _slope(values: FloatArray, expected: FloatArray, rows: BoolArray) -> tuple[float, float]:
-    """Return values over expected, by least squares about their means, and their correlation."""
-    rows = rows & np.isfinite(values) & np.isfinite(expected)
-    if rows.sum() < FEWEST_TICKS:
-        return 1.0, 0.0
-    y, x = values[rows] - values[rows].mean(), expected[rows] - expected[rows].mean()
-    xx, yy, xy = x @ x, y @ y, x @ y
-    if not xx > 0 or not yy > 0:
-        return 1.0, 0.0
-    return float(xy / xx), float(xy / np.sqrt(xx * yy))
-
-
-def _fit(y: FloatArray, inputs: FloatArray, rows: BoolArray) -> tuple[FloatArray, float]:
-    """Return the coefficients of inputs, and the part of the variance of `y` they explain."""
-    rows = rows & np.isfinite(y) & np.isfinite(inputs).all(axis=0)
-    nothing = np.zeros(len(inputs)), 0.0
-    if rows.sum() < FEWEST_TICKS:
-        return nothing
-    x = inputs[:, rows] - inputs[:, rows].mean(axis=1, keepdims=True)
-    centred = y[rows] - y[rows].mean()
-    total = float(centred @ centred)
-    if not total > 0:
-        return nothing
-    coefficients = np.linalg.lstsq(x @ x.T, x @ centred, rcond=1e-12)[0]
-    left = centred - coefficients @ x
-    return coefficients, 1 - float(left @ left) / total

@@ -15,6 +15,8 @@ from fleet_slip.ingest import load_mapping, read_measured
 from fleet_slip.ingest.guessing import parts_of
 from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS
 from tests.support.reported import call
+from tests.support.suggested import LOGS, wrong_guesses
+from tests.support.suggested import suggest as suggest_of
 from tests.support.textbook_car import Car, a_car
 
 
@@ -127,6 +129,37 @@ def test_units_and_rates_of_an_mdf_file(tmp_path: Path) -> None:
     shown = json.loads(call(tmp_path, "mapping", "suggest", str(file), "--json"))
     rates = {one["channel"]: round(one["rate_hz"]) for one in shown["channels"]}
     assert (rates["a_x"], rates["beta"]) == (100, 10)
+
+
+@pytest.mark.parametrize("name", LOGS)
+def test_files_of_every_format_are_guessed_right(tmp_path: Path, name: str) -> None:
+    assert wrong_guesses(LOGS[name], suggest_of(LOGS[name], tmp_path)) == []
+
+
+def test_a_wrong_guess_counts_as_wrong(tmp_path: Path) -> None:
+    one = LOGS["CSV, names of a race team, km/h and degrees"]
+    draft = suggest_of(one, tmp_path)
+    del draft.guesses["ax"]
+    draft.guesses["ay"] = draft.guesses["ay"].because("", negate=True)
+    draft.guesses["yaw_rate"] = draft.guesses["yaw_rate"].because("", unit="rad/s")
+    swapped = draft.guesses["wheel_rl"], draft.guesses["wheel_rr"]
+    draft.guesses["wheel_rr"], draft.guesses["wheel_rl"] = swapped
+    assert wrong_guesses(one, draft) == ["ax", "ay", "yaw_rate", "wheel_rl", "wheel_rr"]
+
+
+def test_the_unit_of_a_speed_is_told_by_the_wheels(tmp_path: Path) -> None:
+    car = a_car()
+    rows = as_logged(car, NAMES[0], {**IN_DEGREES, **IN_KMH})
+    speed = np.mean([car[name] for name in WHEELS], axis=0) * RADIUS_M
+    rows = rows.with_columns(pl.Series("speedo", 3.75 * speed), pl.Series("gear", [3] * 6000))
+    rows = rows.with_columns(pl.Series("brake_pressure", np.abs(car["ax"]) * 9))
+    rows.insert_column(0, pl.Series("t", np.arange(rows.height) / 100))
+    rows.write_csv(tmp_path / "log.csv")
+    signals = suggest(tmp_path, tmp_path / "log.csv")["signals"]
+    assert signals["vehicle_speed"] == {"column": "speedo", "unit": "km/h"}
+    assert signals["brake_pressure"] == {"column": "brake_pressure", "unit": "bar"}
+    assert signals["gear"] == {"column": "gear", "unit": "1"}
+    assert {name: signals[name]["unit"] for name in WHEELS} == dict.fromkeys(WHEELS, "km/h")
 
 
 def test_names_from_strangers_stay_names(tmp_path: Path) -> None:

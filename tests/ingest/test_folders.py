@@ -8,12 +8,13 @@ from typing import Any
 
 import pytest
 
+import fleet_slip
 from fleet_slip.delta import Snapshot
 from fleet_slip.errors import InputError
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.ingest import job
 from fleet_slip.warehouse.tables import Warehouse
-from tests.support.measured import csv_text, good_columns
+from tests.support.measured import a_mapping, csv_text, good_columns
 from tests.support.reported import call
 
 MAPPING = """name = "car"
@@ -225,3 +226,20 @@ def test_quarantine_rows_of_a_batch_are_those_of_its_files(folder: Path) -> None
     (file,) = warehouse.quarantine.snapshot().files
     found = warehouse.quarantine.read(file.path)
     assert sorted(found["file"].to_pylist()) == ["0.csv", "3.csv"]
+
+
+def test_a_pattern_stands_for_what_matches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    for name in ("a/1.csv", "a/2.csv", "b/3.csv", "[odd].csv"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        columns = good_columns(20 + len(name) + int(name[2]) if name[2].isdigit() else 20)
+        (tmp_path / name).write_text(csv_text(columns), encoding="utf-8")
+    fleet = fleet_slip.open(tmp_path / "data")
+    mapping = a_mapping()
+    names = [Path(r.file).name for r in fleet.ingest(str(tmp_path / "*/[12].csv"), mapping)]
+    assert names == ["1.csv", "2.csv"]
+    names = [Path(r.file).name for r in fleet.ingest(tmp_path / "**/*.csv", mapping)]
+    assert names == ["[odd].csv", "3.csv"]
+    assert not fleet.ingest(tmp_path / "[odd].csv", mapping)[0].new
+    with pytest.raises(InputError, match=r"\*\.mf4: no file matches this pattern"):
+        fleet.ingest(tmp_path / "*.mf4", mapping)

@@ -14,6 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import scipy.io
+import scipy.sparse
 from asammdf import MDF, Signal
 
 from fleet_slip.errors import ExtraError, InputError
@@ -377,3 +378,37 @@ def test_a_group_without_samples_is_a_signal_without_values(tmp_path: Path) -> N
 
 def nothing_but(signal: Signal) -> Signal:
     return Signal(signal.samples[:0], signal.timestamps[:0], name=signal.name)
+
+
+@pytest.mark.parametrize(
+    ("offset", "value", "message"),
+    [
+        (176, 0, "an element of the type 0"),
+        (176, 15, "an element of the type 15"),
+        (180, 2**31, "an element of 2,147,483,648 bytes, and"),
+        (128, 99, "an element of the type 99"),
+    ],
+)
+def test_a_damaged_matlab_file_does_not_bring_its_reader_down(
+    tmp_path: Path, offset: int, value: int, message: str
+) -> None:
+    file = tmp_path / "log.mat"
+    scipy.io.savemat(file, {"t": TIME_S, "Data": {"beta": BETA_DEG}})
+    data = bytearray(file.read_bytes())
+    data[offset : offset + 4] = value.to_bytes(4, "little")
+    file.write_bytes(data)
+    assert message in failure(file, mat_mapping())
+
+
+def test_matlab_files_of_all_kinds_are_sound(tmp_path: Path) -> None:
+    kinds = {
+        "text": "words", "cell": np.array([1, "a", [2, 3]], dtype=object), "flag": np.array([True]),
+        "number": 1 + 2j, "nested": {"a": {"b": [1.0, 2.0], "none": np.zeros((0, 0))}},
+        "wide": np.zeros((3, 200), dtype="f4"), "sparse": scipy.sparse.eye(4).tocsc(),
+    }  # fmt: skip
+    for compressed in (False, True):
+        file = tmp_path / f"{compressed}.mat"
+        scipy.io.savemat(file, {**kinds, "t": TIME_S, "ax": AX}, do_compression=compressed)
+        only = {"ax": {"column": "ax", "unit": "m/s^2"}}
+        log = read_measured(file, a_mapping(signals=only))
+        assert log.drives["ax"].to_pylist() == AX_COUNTS
