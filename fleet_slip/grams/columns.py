@@ -62,6 +62,7 @@ class Workspace:
 
     Attributes:
         rows: of the drive that was loaded last.
+        rows_at_most: of the drives for which memory was taken so far.
     """
 
     def __init__(self, plan: ColumnPlan) -> None:
@@ -69,15 +70,15 @@ class Workspace:
         self.plan, self._program = plan, plan.program
         size = padded(len(plan.names))
         self._products = np.zeros((size + 1, size))
-        self._room = -1
+        self.rows_at_most = -1
         self.rows = 0
 
     def load(self, drive: DriveCounts) -> None:
         """Take a drive. Raises `DataError` for one that cannot be looked back on."""
         _require_exact(self.plan, drive)
         program, self.rows = self._program, len(drive.ticks)
-        if self.rows > self._room:
-            self._room = self.rows
+        if self.rows > self.rows_at_most:
+            self.rows_at_most = self.rows
             self._steps, self._regions = program.steps(self.rows), program.regions(self.rows)
             self._memory = np.zeros(self._regions[-1, 0])
         for number, name in enumerate(program.signals):

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol, overload
 
 from fleet_slip.models.manifest import Manifest
@@ -10,6 +11,8 @@ if TYPE_CHECKING:
     import polars as pl
     from numpy import float64
     from numpy.typing import ArrayLike, NDArray
+
+    from fleet_slip.models.predictor import Predictor
 
 
 class ArrowStream(Protocol):
@@ -80,4 +83,10 @@ class ModelVersion:
         """
         from fleet_slip.models.predict import predict  # noqa: PLC0415 - DuckDB, not for show
 
-        return predict(self.manifest, frame)
+        return predict(self.manifest, frame, self._predictor if self.manifest.definitions else None)
+
+    @cached_property
+    def _predictor(self) -> "Predictor":
+        from fleet_slip.models.predictor import Predictor  # noqa: PLC0415 - numba, not for show
+
+        return Predictor.of(self.manifest)

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.catalogue.arithmetic import parse
@@ -27,12 +28,15 @@ from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predictor import Predictor
 
 
-def predict(manifest: Manifest, frame: Any) -> Any:
-    """Return the angle in rad for each row of a frame; see `ModelVersion.predict`."""
+def predict(manifest: Manifest, frame: Any, predictor: Predictor | None = None) -> Any:
+    """Return the angle in rad for each row of a frame; see `ModelVersion.predict`.
+
+    `predictor` is that of the manifest, if it has been made before.
+    """
     opened = open_frame(frame)
     columns = opened.numbers(manifest.columns, f"the model {manifest.name}")
     if manifest.definitions:
-        angle = _over_time(manifest, opened, columns)
+        angle = _over_time(manifest, opened, columns, predictor or Predictor.of(manifest))
         return opened.wrap(pa.array(angle, from_pandas=True), manifest.label.column)
     physical = columns | _features(manifest, columns)
     angle = np.asarray(manifest.intercept)
@@ -42,13 +46,14 @@ def predict(manifest: Manifest, frame: Any) -> Any:
     return opened.wrap(pa.array(angle, from_pandas=True), manifest.label.column)
 
 
-def _over_time(manifest: Manifest, frame: Frame, columns: dict[str, FloatArray]) -> FloatArray:
+def _over_time(
+    manifest: Manifest, frame: Frame, columns: dict[str, FloatArray], predictor: Predictor
+) -> FloatArray:
     """Return the angles of a model that looks back: of each drive by itself, in the order of time.
 
     Raises `DataError` if time does not rise within a drive, and `InputError` for a fact that the
     frame lacks.
     """
-    predictor = Predictor.of(manifest)
     signals = catalogue()
     counts = {
         name: round_to_counts(columns[signals[name].column], signals[name])
@@ -58,30 +63,36 @@ def _over_time(manifest: Manifest, frame: Frame, columns: dict[str, FloatArray])
         raise InputError(f"{manifest.name} needs what the car knows: {', '.join(missing)}.")
     facts = {name: _column(frame, name) for name in predictor.plan.facts}
     numbers = _numbers(manifest, frame)
-    ticks, drives = _ticks(frame, len(next(iter(counts.values())))), _drives(frame)
+    ticks = _ticks(frame, len(next(iter(counts.values()))))
     if not len(ticks):
         return np.empty(0)
     rows = counts_of(pa.table({"tick": ticks, **counts}), predictor.plan, {})
-    angle, workspace = np.empty(len(ticks)), predictor.workspace()
-    for at in [slice(0, len(ticks))] if drives is None else _rows_of_each(drives):
-        first = at.start if isinstance(at, slice) else at[0]
-        own = {
-            name: round_number(Fraction(float(values[first])), grain)
-            for name, (values, grain) in numbers.items()
-            if not np.isnan(values[first])
-        }
-        known = {name: values[first].as_py() for name, values in facts.items()}
-        angle[at] = predictor(rows.part(at, known, own), workspace)
+    angle = np.empty(len(ticks))
+    with predictor.lend_workspace() as workspace:
+        for at in _rows_of_each_drive(frame, len(ticks)):
+            first = at.start if isinstance(at, slice) else at[0]
+            own = {
+                name: round_number(Fraction(float(values[first])), grain)
+                for name, (values, grain) in numbers.items()
+                if not np.isnan(values[first])
+            }
+            known = {name: values[first].as_py() for name, values in facts.items()}
+            angle[at] = predictor(rows.part(at, known, own), workspace)
     return angle
 
 
-def _rows_of_each(drives: IntArray) -> list[slice] | list[IntArray]:
+def _rows_of_each_drive(frame: Frame, rows: int) -> list[slice] | list[IntArray]:
     """Return the rows of each drive: a slice of each, if the rows of every drive lie together."""
-    starts = np.flatnonzero(np.diff(drives, prepend=drives[0] - 1))
-    found = np.unique(drives[starts])
-    if len(found) < len(starts):
-        return [np.flatnonzero(drives == drive) for drive in found]
-    return [slice(*ends) for ends in pairwise([*starts.tolist(), len(drives)])]
+    if "drive_id" not in frame.names:
+        return [slice(0, rows)]
+    runs = pc.run_end_encode(_column(frame, "drive_id").cast(pa.large_string()))
+    ends = [0, *runs.run_ends.to_pylist()]
+    drives = runs.values.dictionary_encode().indices.fill_null(-1).to_numpy(zero_copy_only=False)
+    found = np.unique(drives)
+    if len(found) == len(drives):
+        return [slice(*one) for one in pairwise(ends)]
+    of_row = np.repeat(drives, np.diff(ends))
+    return [np.flatnonzero(of_row == drive) for drive in found]
 
 
 def _numbers(manifest: Manifest, frame: Frame) -> dict[str, tuple[FloatArray, Fraction]]:
@@ -115,17 +126,6 @@ def _ticks(frame: Frame, rows: int) -> IntArray:
                 raise InputError(f"the column {name} has missing values.")
             return np.rint(values * per_tick).astype(np.int64)
     return np.arange(rows)
-
-
-def _drives(frame: Frame) -> IntArray | None:
-    """Return a number for each row's drive; None if the frame is of one."""
-    if "drive_id" not in frame.names:
-        return None
-    ids = _column(frame, "drive_id")
-    if not pa.types.is_dictionary(ids.type):
-        ids = ids.dictionary_encode()
-    numbers: IntArray = ids.indices.fill_null(-1).to_numpy(zero_copy_only=False)
-    return numbers
 
 
 def _features(manifest: Manifest, columns: dict[str, FloatArray]) -> dict[str, FloatArray]:

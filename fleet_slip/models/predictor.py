@@ -1,6 +1,8 @@
 """Estimates of a published model, sample by sample in the order of time, from logged counts."""
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,9 @@ from fleet_slip.grams.numbered_columns import NumberedColumns
 from fleet_slip.grams.operations import BLOCK_ROWS
 from fleet_slip.grams.row_code import RowColumn
 from fleet_slip.models.manifest import Manifest
+
+KEPT_ROWS = 2**16
+"""Of longer drives no memory is kept: it is some 400 bytes a row."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +37,7 @@ class Predictor:
     intercept: float
     coefficients: tuple[float, ...]
     scales: tuple[float, ...]
+    _idle: list[Workspace] = field(default_factory=list, repr=False, compare=False)
 
     @classmethod
     def of(cls, manifest: Manifest) -> "Predictor":
@@ -55,9 +61,18 @@ class Predictor:
         """What the kernel computes of a drive."""
         return self.columns.plan
 
-    def workspace(self) -> Workspace:
-        """Return memory for one drive after the other."""
-        return Workspace(self.plan)
+    @contextmanager
+    def lend_workspace(self) -> Iterator[Workspace]:
+        """Lend memory for one drive after the other; one that is not large is kept for the next."""
+        try:
+            workspace = self._idle.pop()  # no other thread has it then
+        except IndexError:
+            workspace = Workspace(self.plan)
+        try:
+            yield workspace
+        finally:
+            if workspace.rows_at_most <= KEPT_ROWS:
+                self._idle.append(workspace)
 
     def __call__(self, drive: DriveCounts, workspace: Workspace | None = None) -> FloatArray:
         """Return the estimate at each row in rad, shape (rows,); NaN where a column is missing.
@@ -66,7 +81,7 @@ class Predictor:
         by block, so that the columns of a block are still in the processor's cache.
         Raises `DataError` for a drive that cannot be looked back on.
         """
-        workspace = workspace or self.workspace()
+        workspace = workspace or Workspace(self.plan)
         workspace.load(drive)
         coefficients, scales = np.array(self.coefficients), np.array(self.scales)
         estimate: FloatArray = np.full(len(drive.ticks), self.intercept)

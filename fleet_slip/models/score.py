@@ -137,7 +137,6 @@ def _score_over_time(
 ) -> Score | None:
     """Estimate the drives that have rows of the cohort, whole; score the rows of the cohort."""
     predictor = Predictor.of(manifest)
-    workspace = predictor.workspace()
     label = manifest.label.signal
     needed = [*predictor.plan.signals, label, *predictor.plan.facts, "vehicle_id"]
     cars = calibrated_cars(warehouse) if predictor.columns.numbers else {}
@@ -148,7 +147,11 @@ def _score_over_time(
     estimates: list[FloatArray] = []
     truths: list[FloatArray] = []
     unit = float(input_scales()[label])
-    with connect_tables(warehouse, text) as database, asking(database, condition):
+    with (
+        connect_tables(warehouse, text) as database,
+        asking(database, condition),
+        predictor.lend_workspace() as workspace,
+    ):
         stream = database.sql(text).to_arrow_reader(BATCH_ROWS)
         for rows in drives_of_stream(stream):
             numbers = cars.get(rows["vehicle_id"][0].as_py())

@@ -1,5 +1,6 @@
 """Estimates of models that look back: drives that lie together, that are mixed, and blocks."""
 
+from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 
 import numpy as np
@@ -7,7 +8,7 @@ import polars as pl
 import pyarrow as pa
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.columns import DriveCounts
+from fleet_slip.grams.columns import DriveCounts, Workspace
 from fleet_slip.grams.operations import BLOCK_ROWS
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.predictor import Predictor
@@ -31,7 +32,7 @@ def drive_of(rows: int, seed: int) -> DriveCounts:
 def test_blocks_of_rows_have_the_bits_of_the_whole_drive() -> None:
     """One workspace for drives of several lengths, against a dot product over all columns."""
     predictor = Predictor.of(MANIFEST)
-    workspace = predictor.workspace()
+    workspace = Workspace(predictor.plan)
     for rows, seed in ((3 * BLOCK_ROWS + 7, 1), (BLOCK_ROWS, 2), (1, 3), (BLOCK_ROWS + 1, 4)):
         drive = drive_of(rows, seed)
         expected = np.full(rows, predictor.intercept)
@@ -74,6 +75,15 @@ def test_drives_that_are_mixed_have_the_angles_of_each_alone() -> None:
     mixed = together.with_row_index("place").sort("tick", "drive_id")
     angles = version.predict(mixed).to_numpy()[np.argsort(mixed["place"].to_numpy())]
     assert np.array_equal(angles, expected, equal_nan=True)
+
+
+def test_threads_that_share_a_version_do_not_share_memory() -> None:
+    version = ModelVersion(1, MANIFEST, "0" * 64)
+    frames = [frame_of(drive_of(2000, seed), "drive") for seed in range(4)]
+    expected = [ModelVersion(1, MANIFEST, "0" * 64).predict(one).to_list() for one in frames]
+    with ThreadPoolExecutor(4) as pool:
+        found = [*pool.map(lambda one: version.predict(one).to_list(), frames * 8)]
+    assert found == expected * 8
 
 
 def test_a_frame_without_rows_has_no_angles() -> None:
