@@ -114,7 +114,11 @@ def _exit_code_of_app() -> int:
         say(f"error: out of memory: {error}. Ask for less at once, or give it more.", logging.ERROR)
         return StorageError.exit_code
     except KeyboardInterrupt:
-        say("interrupted; run the same command again to go on.", logging.WARNING)
+        say(
+            "interrupted: what was committed is kept, and nothing is half written. Give the same "
+            "command again to go on.",
+            logging.WARNING,
+        )
         return INTERRUPTED
     except SystemExit as ended:
         return ended.code if isinstance(ended.code, int) else 0

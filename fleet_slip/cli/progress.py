@@ -1,5 +1,6 @@
 """How commands show the progress of long work: bars for people, events for machines."""
 
+import logging
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -20,6 +21,7 @@ from rich.progress import (
 from rich.text import Text
 
 from fleet_slip.cli.logs import for_people, stderr
+from fleet_slip.cli.output import say
 from fleet_slip.runs.log import log_event
 from fleet_slip.words import number_of
 
@@ -68,7 +70,8 @@ def progress_of_steps(
 
     And the number of workers, if the executor is of a cluster. Machines are told by an event now
     and then. Yields the callback: what is being done, how much is done, and how much there is. The
-    bar of the first step is there before it is called.
+    bar of the first step is there before it is called. At Ctrl-C a line says how much of each step
+    was done.
     """
     console = stderr()
     bar = Progress(
@@ -84,6 +87,7 @@ def progress_of_steps(
         disable=not (console.is_terminal and for_people()) or bool(os.environ.get("CI")),
     )
     begun: dict[str, tuple[TaskID, float]] = {}
+    reached: dict[str, tuple[int, int]] = {}
     told = time.monotonic()
 
     def begin(doing: str) -> tuple[TaskID, float]:
@@ -95,6 +99,7 @@ def progress_of_steps(
         if doing not in begun:
             begun[doing] = begin(doing)
         task, since = begun[doing]
+        reached[doing] = done, total
         bar.update(task, completed=done, total=total)
         if (now := time.monotonic()) - told > TOLD_EVERY_S:
             told = now
@@ -102,7 +107,18 @@ def progress_of_steps(
             workers = getattr(executor, "workers", None)
             log_event("progress", doing=doing, done=done, total=total, workers=workers, **rate)
 
-    with bar:
-        if first is not None:
-            begun[first] = begin(first)
-        yield show
+    try:
+        with bar:
+            if first is not None:
+                begun[first] = begin(first)
+            yield show
+    except KeyboardInterrupt:
+        for doing, (done, total) in reached.items():
+            say(f"{doing}: {_how_far(done, total, unit)}.", logging.WARNING)
+        raise
+
+
+def _how_far(done: int, total: int, unit: str) -> str:
+    if done >= total:
+        return f"all {total:,} {unit} were done"
+    return f"{done:,} of {total:,} {unit} were done, {total - done:,} were not"

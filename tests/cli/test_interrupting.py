@@ -1,0 +1,72 @@
+"""Ctrl-C in long work: what is said, and that the same command does the rest."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+import fleet_slip
+from fleet_slip.cli import main
+from fleet_slip.cli.progress import progress, progress_of_steps
+from fleet_slip.runs.log import LOGGER
+
+
+@pytest.fixture
+def said(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Remarks, as they come."""
+    remarks: list[str] = []
+    monkeypatch.setattr(LOGGER, "log", lambda _level, text, **_: remarks.append(text))
+    return remarks
+
+
+def test_what_is_done_and_what_is_not_is_said(said: list[str]) -> None:
+    with pytest.raises(KeyboardInterrupt), progress("ingest", "files") as show:
+        show(37, 1200)
+        raise KeyboardInterrupt
+    assert said == ["ingest: 37 of 1,200 files were done, 1,163 were not."]
+
+
+def test_each_step_is_told(said: list[str]) -> None:
+    with pytest.raises(KeyboardInterrupt), progress_of_steps("rows") as show:
+        show("simulate", 500, 500)
+        show("gram", 0, 500)
+        raise KeyboardInterrupt
+    assert said == [
+        "simulate: all 500 rows were done.",
+        "gram: 0 of 500 rows were done, 500 were not.",
+    ]
+
+
+def test_nothing_is_said_of_work_that_ends(said: list[str]) -> None:
+    with progress("gram", "rows") as show:
+        show(500, 500)
+    assert said == []
+
+
+def test_the_command_ends_with_130_and_may_be_given_again(
+    monkeypatch: pytest.MonkeyPatch, said: list[str]
+) -> None:
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(main, "app", interrupted)
+    assert main._exit_code_of_app() == main.INTERRUPTED == 130
+    (remark,) = said
+    assert remark.endswith("Give the same command again to go on.")
+
+
+def test_a_gram_job_that_was_interrupted_goes_on(smoke_root: Path, tmp_path: Path) -> None:
+    shutil.copytree(smoke_root, tmp_path / "data")
+    fleet = fleet_slip.open(tmp_path / "data")
+    seen: list[tuple[int, int]] = []
+
+    def interrupt(done: int, total: int) -> None:
+        seen.append((done, total))
+        if done:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fleet.gram("motion", workers=1, progress=interrupt)
+    done, total = seen[-1]
+    assert 0 < done <= total
+    assert 0 < fleet.gram("motion", workers=1).rows_read <= total
