@@ -94,6 +94,12 @@ class ClusterError(FleetSlipError):
     exit_code = 11
 
 
+class CohortError(FleetSlipError):
+    """The answer would be of fewer cars than the rule of a minimum cohort allows."""
+
+    exit_code = 14
+
+
 class ExtraError(FleetSlipError):
     """A package that only some commands need is not installed."""
 

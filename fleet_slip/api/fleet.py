@@ -57,9 +57,12 @@ class Fleet(Filling, Tending):
         With a `query`, only the views that it names are opened, which is faster. Raises
         `StorageError` without a data root.
         """
-        from fleet_slip.api.session import Session
+        from fleet_slip.api.session import Session, query_of_many
         from fleet_slip.views import connect
+        from fleet_slip.warehouse.minimum_cohort import VIEWS_WITHOUT_CARS, minimum_vehicles
 
+        if minimum_vehicles():
+            return Session(connect(self.root, query=" ".join(VIEWS_WITHOUT_CARS)), query_of_many)
         return Session(connect(self.root, threads=threads, query=query))
 
     def unlocked_session(self, query: str | None = None) -> "Session":
@@ -67,9 +70,12 @@ class Fleet(Filling, Tending):
 
         Only for SQL that you trust: it can overwrite the warehouse. Else like `session`.
         """
-        from fleet_slip.api.session import Session, any_statement
+        from fleet_slip.api.session import Session, any_statement, cohort_error
         from fleet_slip.views import connect_unlocked
+        from fleet_slip.warehouse.minimum_cohort import minimum_vehicles
 
+        if minimum_vehicles():
+            raise cohort_error()
         return Session(connect_unlocked(self.root, query), any_statement)
 
     def cohort(self, condition: str = TRAINING_DRIVES) -> FleetCohort:

@@ -8,10 +8,12 @@ from typing import Self, TypeVar
 import duckdb
 import pyarrow as pa
 
-from fleet_slip.errors import QuestionError
-from fleet_slip.views import add_calibration
+from fleet_slip.errors import CohortError, QuestionError
+from fleet_slip.views import VIEWS, add_calibration
 from fleet_slip.warehouse.database import database_errors, interruptible, reading_files
+from fleet_slip.warehouse.minimum_cohort import MINIMUM_VARIABLE, VIEWS_WITHOUT_CARS
 from fleet_slip.warehouse.read_only_sql import one_query
+from fleet_slip.warehouse.table_views import views_in
 
 Result = TypeVar("Result")
 
@@ -36,8 +38,8 @@ class Session:
 
         It and all that is made of it keep the connection open.
         """
-        add_calibration(self.database, query)
         text = self.allow(self.database, query)
+        add_calibration(self.database, query)
         with database_errors("the query"):
             relation: duckdb.DuckDBPyRelation | None = self.database.sql(text)
         if relation is None:
@@ -82,3 +84,18 @@ class Session:
 def any_statement(_database: duckdb.DuckDBPyConnection, text: str) -> str:
     """Return a text as it is: what an unlocked session may be asked."""
     return text
+
+
+def query_of_many(database: duckdb.DuckDBPyConnection, text: str) -> str:
+    """Return a query that names no view of single cars. Raises `CohortError`."""
+    if views_in(text, VIEWS - set(VIEWS_WITHOUT_CARS) - {"dictionary"}):
+        raise cohort_error()
+    return one_query(database, text)
+
+
+def cohort_error() -> CohortError:
+    """Return the error that a query could tell of single cars."""
+    return CohortError(
+        f"SQL can tell of single cars, and ${MINIMUM_VARIABLE} is set: only the views "
+        f"{' and '.join(VIEWS_WITHOUT_CARS)} are there. Ask select, which counts the cars."
+    )

@@ -32,6 +32,7 @@ from fleet_slip.regression.drive_moments import serving_drives
 from fleet_slip.regression.folds import CohortFolds, FoldAssignment, by_band, by_hash, by_value
 from fleet_slip.regression.gram_table import GramTable
 from fleet_slip.warehouse.condition import Condition, asking, parse_condition
+from fleet_slip.warehouse.minimum_cohort import minimum_vehicles, require_vehicles
 from fleet_slip.warehouse.tables import Warehouse
 from fleet_slip.words import number_of
 
@@ -251,6 +252,10 @@ def load_cohort(
     parts = list(expansion.tables(rows))
     # Rows whose calibrated columns are not the same are apart now: their metadata follows them.
     order = np.concatenate([np.flatnonzero(here) for _, _, here in parts])
+    if minimum_vehicles():
+        for names, _, here in parts:
+            cars = rows["vehicle_id"].filter(pa.array(here)).unique()
+            require_vehicles(len(cars), f"the cohort {condition.text!r} with the signals {names}")
     return Cohort(
         condition=condition,
         tables=tuple(table for _, table, _ in parts),

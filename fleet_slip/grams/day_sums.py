@@ -18,6 +18,7 @@ from fleet_slip.grams.reader import GramReader, open_grams
 from fleet_slip.regression.drive_moments import missing_signals_error
 from fleet_slip.regression.gram import Gram
 from fleet_slip.warehouse.condition import Condition, parse_condition
+from fleet_slip.warehouse.minimum_cohort import require_vehicles
 from fleet_slip.warehouse.tables import Warehouse
 
 
@@ -44,6 +45,7 @@ def sum_days(
     signals = (*inputs, catalogue().label)
     grams: dict[date, Gram] = {}
     drives: dict[date, list[NDArray[np.uint64]]] = {}
+    cars: dict[date, set[str]] = {}
     found = False
     condition = parse_condition(condition)
     with open_grams(source, feature_set, condition) as opened:
@@ -63,11 +65,15 @@ def sum_days(
                 for i, (day, total) in enumerate(zip(days, totals, strict=True)):
                     grams[day] = grams[day] + total if day in grams else total
                     drives.setdefault(day, []).append(ids[number == i])
+                    mine = rows["vehicle_id"].filter(pa.array(number == i)).unique()
+                    cars.setdefault(day, set()).update(mine.to_pylist())
         if not found:
             raise empty_cohort_error(opened.database, condition)
     if not grams:
         raise missing_signals_error(signals)
     days = sorted(grams)
+    for day in days:
+        require_vehicles(len(cars[day]), f"the cohort {condition.text!r} on {day}")
     return DailySums(
         tuple(days),
         tuple(grams[day] for day in days),

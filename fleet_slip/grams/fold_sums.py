@@ -36,6 +36,7 @@ from fleet_slip.grams.reader import GramReader, OpenedGrams, open_grams
 from fleet_slip.regression.folds import CohortFolds
 from fleet_slip.regression.gram import Gram
 from fleet_slip.warehouse.condition import Condition, asking, parse_condition
+from fleet_slip.warehouse.minimum_cohort import require_vehicles
 from fleet_slip.warehouse.tables import Warehouse
 
 FoldOf = Callable[[pa.RecordBatch, NDArray[np.uint64]], IntArray]
@@ -117,6 +118,9 @@ def sum_cohort(
         left_out, revoked = opened.count_left_out(condition), opened.revoked(condition)
         if not sums.tables:
             raise empty_cohort_error(opened.database, condition, left_out)
+    for signals, hashes in sums.members.vehicles.items():
+        of = f"the cohort {condition.text!r} with the signals {signals}"
+        require_vehicles(len(np.unique(hashes)), of)
     return SummedCohort(
         condition=condition,
         folding=folding,

@@ -1,0 +1,129 @@
+"""The rule of a minimum cohort: no answer of fewer cars; and masks that cancel in exact sums."""
+
+import shutil
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fleet_slip
+from fleet_slip.errors import CohortError, ConfigError, QuestionError
+from fleet_slip.regression.gram import Gram
+from fleet_slip.warehouse.minimum_cohort import MINIMUM_VARIABLE
+from tests.support.messages import START_S, gram_of, message_of
+
+
+@pytest.fixture
+def fleet(tmp_path: Path) -> fleet_slip.Fleet:
+    """Five cars of all signals and two of few, on two days each."""
+    fleet = fleet_slip.open(tmp_path / "data")
+    grams = [
+        gram_of(i) if i < 5 else gram_of(i).restrict(gram_of(i).signals[-5:]) for i in range(7)
+    ]
+    messages = [
+        message_of(gram, f"VIN{i}", START_S + 86_400 * day)
+        for i, gram in enumerate(grams)
+        for day in range(2)
+    ]
+    (tmp_path / "m").write_bytes(b"".join(messages))
+    fleet.receive(tmp_path / "m")
+    return fleet
+
+
+FULL = "vehicle_id < 'VIN5'"
+
+
+def test_an_answer_of_fewer_cars_is_refused(
+    fleet: fleet_slip.Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    few = fleet.cohort("vehicle_id < 'VIN2'")
+    assert few.select(model="ax,ay").cohort.drive_count == 4
+    monkeypatch.setenv(MINIMUM_VARIABLE, "5")
+    for ask in (
+        lambda: few.select(model="ax,ay"),
+        lambda: few.select(nested="ax,ay", rank="backward"),
+        lambda: few.diagnose(signals="ax,ay"),
+        lambda: fleet.cohort().select(model="ax,ay"),  # two cars have other signals
+    ):
+        with pytest.raises(CohortError, match="fewer than 5 cars"):
+            ask()
+    assert fleet.cohort(FULL).select(model="ax,ay").cohort.drive_count == 10
+    monkeypatch.setenv(MINIMUM_VARIABLE, "6")
+    with pytest.raises(CohortError, match="fewer than 6 cars"):
+        fleet.cohort(FULL).select(model="ax,ay")
+    assert CohortError.exit_code == 14
+
+
+def test_a_day_of_fewer_cars_is_not_monitored(
+    fleet: fleet_slip.Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fleet.publish("cars", fleet.cohort(FULL).select(model="ax,ay"), force=True)
+    monkeypatch.setenv(MINIMUM_VARIABLE, "6")
+    with pytest.raises(CohortError, match="on 2024-05-01"):
+        fleet.monitor("cars")
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        "FROM drives",
+        "SELECT count(*) FROM grams",
+        'SELECT 1 FROM "log"',
+        "FROM (SELECT * FROM LOG_COUNTS)",
+        "FROM quarantine",
+        "FROM calibration",
+    ],
+)
+def test_sql_tells_of_no_single_car(
+    fleet: fleet_slip.Fleet, monkeypatch: pytest.MonkeyPatch, query: str
+) -> None:
+    monkeypatch.setenv(MINIMUM_VARIABLE, "2")
+    with pytest.raises(CohortError, match="single cars"):
+        fleet.sql(query)
+    with pytest.raises(CohortError, match="single cars"):
+        fleet.unlocked_session(query)
+    assert fleet.sql("SELECT count(*) FROM models").fetchall() == [(0,)]
+
+
+def test_no_file_of_the_warehouse_is_open_to_sql(
+    fleet: fleet_slip.Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (stored,) = (tmp_path / "data" / "grams").glob("*.parquet")
+    file = shutil.copy(stored, tmp_path / "copy.parquet")
+    monkeypatch.setenv(MINIMUM_VARIABLE, "2")
+    for query in (f"FROM '{file}'", f"FROM read_parquet('{file}')", f"FROM '{stored}'"):
+        with pytest.raises((CohortError, QuestionError)):
+            fleet.sql(query).fetchall()
+
+
+@pytest.mark.parametrize("value", ["", "1", "0", "-3", "five", "²", "2.5"])
+def test_a_wrong_number_does_not_switch_the_rule_off(
+    fleet: fleet_slip.Fleet, monkeypatch: pytest.MonkeyPatch, value: str
+) -> None:
+    monkeypatch.setenv(MINIMUM_VARIABLE, value)
+    with pytest.raises(ConfigError, match="at least 2"):
+        fleet.cohort().select(model="ax,ay")
+
+
+def test_masks_of_pairs_of_cars_cancel_exactly_in_sums_of_gram_rows() -> None:
+    """Bonawitz et al. (2017), without their treatment of cars that drop out."""
+    grams = [gram_of(seed) for seed in range(6)]
+    rows = [np.array([g.n, *g.sums, *g.products], np.int64).view(np.uint64) for g in grams]
+    masked = [row.copy() for row in rows]
+    for one, other in combinations(range(len(rows)), 2):
+        mask = np.random.default_rng([one, other]).integers(
+            0, 2**64, len(rows[0]), dtype=np.uint64, endpoint=False
+        )
+        masked[one] += mask  # modulo 2^64
+        masked[other] -= mask
+    total: list[int] = sum(masked[1:], masked[0]).view(np.int64).tolist()
+    k = len(grams[0].signals)
+    expected = sum(grams[1:], grams[0])
+    assert (
+        Gram(grams[0].signals, total[0], tuple(total[1 : k + 1]), tuple(total[k + 1 :])) == expected
+    )
+    for row, hidden in zip(rows, masked, strict=True):
+        assert not (row == hidden).any()
+    five = np.sum(masked[1:], axis=0, dtype=np.uint64)
+    assert (five != np.sum(rows[1:], axis=0, dtype=np.uint64)).all()
