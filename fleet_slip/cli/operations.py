@@ -39,14 +39,20 @@ def quality(
         _print_quality(found)
     if found.findings:
         raise AlarmError(
-            f"the sensors of {len(found.findings)} of {found.drives} drives are not in order"
+            f"{len(found.findings)} of {number_of(found.drives, 'drive')} are not in order"
         )
 
 
 def _print_quality(found: QualityReport) -> None:
-    print_table(
+    examined = (
         f"{number_of(found.drives, 'drive')} examined, {found.compared:,} of them beside their "
-        "peers",
+        "peers"
+    )
+    if not found.findings:
+        typer.echo(f"{examined}: all are in order")
+        return
+    print_table(
+        examined,
         ["drive", "car", "fault", "signals", "what shows it"],
         [
             [

@@ -1,13 +1,16 @@
 """The command that asks the warehouse a query: sql."""
 
 import contextlib
+import io
 import logging
+import re
 import shutil
 import sys
 from collections.abc import Iterator
 from enum import StrEnum
 from typing import Annotated
 
+import duckdb
 import pyarrow as pa
 import pyarrow.compute as pc
 import typer
@@ -94,8 +97,39 @@ def _read_stdin() -> str:
 
 
 def _show(session: Session, text: str) -> None:
+    """Print what fits of an answer, and say what is left out and how to see it."""
     width = shutil.get_terminal_size((160, 40)).columns
-    session.compute(text, lambda answer: answer.show(max_rows=ROWS_SHOWN, max_width=width))
+    shown, empty = session.compute(text, lambda answer: _fitting(answer, width))
+    typer.echo(shown)
+    if found := _CUT.search(shown):
+        left_out = [f"{int(found[1]) - int(found[2])} of {found[1]} columns do not fit"]
+        left_out += [f"without a value: {', '.join(empty)}"] if empty else []
+        say(f"{'; '.join(left_out)}. Name those to see: SELECT …; all: --csv or --json")
+    elif empty:
+        say(f"columns without a value in these rows are left out: {', '.join(empty)}")
+
+
+_CUT = re.compile(r"(\d+) columns \((\d+) shown\)")
+
+
+def _fitting(answer: duckdb.DuckDBPyRelation, width: int) -> tuple[str, list[str]]:
+    """Return a table, and the columns that it is without: what has no value gives way to others."""
+    shown = _drawn(answer, width)
+    if not _CUT.search(shown):
+        return shown, []
+    sample = answer.limit(ROWS_SHOWN).to_arrow_table()
+    empty = [name for name in sample.column_names if sample[name].null_count == len(sample)]
+    kept = [name for name in sample.column_names if name not in empty]
+    if not empty or not kept or len(set(sample.column_names)) < len(sample.column_names):
+        return shown, []
+    names = ", ".join('"' + name.replace('"', '""') + '"' for name in kept)
+    return _drawn(answer.project(names), width), empty
+
+
+def _drawn(answer: duckdb.DuckDBPyRelation, width: int) -> str:
+    with contextlib.redirect_stdout(io.StringIO()) as drawn:
+        answer.show(max_rows=ROWS_SHOWN, max_width=width)
+    return drawn.getvalue().rstrip("\n")
 
 
 def _mark_formulas(answer: pa.Table) -> pa.Table:
