@@ -183,24 +183,39 @@ class Tending(Serving):
         *,
         vehicle: str | None = None,
         drive: str | None = None,
+        drive_name: str | None = None,
+        source_file: str | None = None,
         now: bool = False,
         progress: ShowProgress | None = None,
     ) -> "ForgetReport":
-        """Forget a vehicle or a drive in logs, Gram rows and quarantine; mark its models.
+        """Forget a vehicle, a drive, or drives of a name or file; mark their models.
 
-        No job brings it back, nor one that is under way: its rows are left out, until `allow`.
-        With `now` the old files are deleted at once, not when vacuum is due; while anything
-        is `pending` in the report, repeat it. Progress is in files.
+        They go in logs, Gram rows and quarantine. No job brings them back, nor one that is under
+        way: their rows are left out, until `allow`. Others that come under the same name or file
+        land. With `now` the old files are deleted at once, not when vacuum is due; while anything
+        is `pending` in the report, repeat it. Progress is in files, or in drives.
 
-        Raises `UsageError` unless one of `vehicle` and `drive` is given, `QuestionError` if there
-        never was such a drive, `StorageError` and `ConflictError`.
+        Raises `UsageError` unless one subject is given, `QuestionError` if there never was such a
+        drive, `StorageError` and `ConflictError`.
         """
         from fleet_slip.maintenance.forget import forget
+        from fleet_slip.maintenance.forget_called import forget_called
 
-        subject = _forgettable(vehicle, drive)
+        if sum(one is not None for one in (vehicle, drive, drive_name, source_file)) != 1:
+            raise UsageError("give one of vehicle, drive, drive_name and source_file.")
         told = count_from_start(progress)
         with step("forget") as figures:
-            report = forget(self.warehouse, subject, now=now, progress=told)
+            if drive_name is not None:
+                report = forget_called(
+                    self.warehouse, "drive_name", drive_name, now=now, progress=told
+                )
+            elif source_file is not None:
+                report = forget_called(
+                    self.warehouse, "source_file", source_file, now=now, progress=told
+                )
+            else:
+                subject = _forgettable(vehicle, drive)
+                report = forget(self.warehouse, subject, now=now, progress=told)
             figures.rows = report.rows
         return report
 

@@ -174,6 +174,12 @@ def forget(
     context: typer.Context,
     vehicle: Annotated[str | None, typer.Option(help="The vehicle_id to forget.")] = None,
     drive: Annotated[str | None, typer.Option(help="The drive_id to forget.")] = None,
+    drive_name: Annotated[
+        str | None, typer.Option(help="The drive_name whose drives are to be forgotten.")
+    ] = None,
+    source_file: Annotated[
+        str | None, typer.Option(help="The source_file whose drives are to be forgotten.")
+    ] = None,
     now: Annotated[
         bool,
         typer.Option("--now", help="Delete the old files at once, not when vacuum is due."),
@@ -184,15 +190,24 @@ def forget(
     ] = False,
     json: Json = False,
 ) -> None:
-    """Forget a vehicle or a drive: in logs, Gram rows and quarantine; mark the models it trained.
+    """Forget a vehicle or drives: in logs, Gram rows and quarantine; mark the models they trained.
 
     No job brings it back, nor one that is under way: its rows are left out, until --allow.
     `fleet-slip run` retrains. With --now it exits with 12 while anything may be left: repeat it.
 
     Example: **fleet-slip forget --vehicle car-7 --now**
     """
-    if (vehicle is None) == (drive is None):
-        raise typer.BadParameter("give one of --vehicle and --drive.")
+    subjects = {
+        "vehicle": vehicle,
+        "drive": drive,
+        "drive_name": drive_name,
+        "source_file": source_file,
+    }
+    given = {name: value for name, value in subjects.items() if value is not None}
+    if len(given) != 1:
+        raise typer.BadParameter("give one of --vehicle, --drive, --drive-name and --source-file.")
+    if allow and not given.keys() & {"vehicle", "drive"}:
+        raise typer.BadParameter("give --allow with --vehicle or --drive.")
     if allow and now:
         raise typer.BadParameter("give one of --allow and --now.")
     fleet: Fleet = context.obj
@@ -204,7 +219,7 @@ def forget(
             say("its new rows are landed again from now on; what was forgotten stays forgotten")
         return
     with progress("forget", "files") as show:
-        report = fleet.forget(vehicle=vehicle, drive=drive, now=now, progress=show)
+        report = fleet.forget(**given, now=now, progress=show)
     if json:
         print_json(report)
     else:

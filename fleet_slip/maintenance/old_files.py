@@ -104,10 +104,10 @@ class OldFile:
         return not self.replaced and self.file.age_hours < BEING_WRITTEN_HOURS
 
 
-def _readable(snapshot: Snapshot) -> Iterator[OldFile]:
+def read_old_files(snapshot: Snapshot) -> Iterator[OldFile]:
     """Yield replaced files and leftovers, with what tells the drives."""
     known = find_replaced(snapshot)
-    wanted = {"drive_id", "vehicle_id", "day"}
+    wanted = {"drive_id", "drive_name", "source_file", "vehicle_id", "day"}
     for file in find_unreferenced(snapshot.table):
         try:
             names = snapshot.table.read_metadata(file.path).schema.to_arrow_schema().names
@@ -126,7 +126,7 @@ def _with_day(file: StoredFile, rows: pa.Table) -> pa.Table:
 
 
 def _with_subject(snapshot: Snapshot, subject: Forgettable) -> Iterator[OldFile]:
-    for one in _readable(snapshot):
+    for one in read_old_files(snapshot):
         names = one.rows.filter(rows_of(one.rows, subject))["drive_id"].unique().to_pylist()
         if names:
             yield replace(one, drives=frozenset(names))
@@ -135,7 +135,7 @@ def _with_subject(snapshot: Snapshot, subject: Forgettable) -> Iterator[OldFile]
 def _of_quarantine(
     snapshot: Snapshot, subject: Forgettable, drives: Collection[str]
 ) -> Iterator[OldFile]:
-    for one in _readable(snapshot):
+    for one in read_old_files(snapshot):
         if pc.any(quarantined_of(one.rows, subject, drives)).as_py():
             yield one
 

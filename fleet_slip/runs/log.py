@@ -36,9 +36,13 @@ ARGUMENTS_MAX = 50
 ERROR_MAX = 2000
 """So many characters of a message are kept."""
 
-_PRIVATE_OPTION = re.compile(r"(?i)--?(?:[\w-]*(?:key|token|secret|passw)[\w-]*|vehicle|drive)")
-_NAMES = re.compile(r"(?i)\b(?:vehicle_id|drive_id)\b")
-_DATA_FILE = re.compile(r"(?is).*(\.(?:csv|parquet|mf4)(?:\.\w+)?)")
+_PRIVATE_OPTION = re.compile(
+    r"(?i)--?(?:[\w-]*(?:key|token|secret|passw)[\w-]*|vehicle|drive(?:-name)?|source-file)"
+)
+_NAMES = re.compile(r"(?i)\b(?:vehicle_id|drive_id|drive_name|source_file|trip_id)\b")
+_DATA_FILE = re.compile(
+    r"(?is).*(\.(?:csv|parquet|mf4|mdf|dat|mat|blf|asc|log|trc|mcap|duckdb|ddb)(?:\.\w+)?)"
+)
 _URL_CREDENTIALS = re.compile(r"(?<=://)[^/@\s]+(?=@)")
 HIDDEN = "***"
 
@@ -174,8 +178,8 @@ def publishable(arguments: Sequence[str]) -> list[str]:
 
     That is the value of an option whose name speaks of a key, token, secret or password, the user
     part of a URL, and what may name a person's car, since the history outlives what is forgotten:
-    the values of --vehicle and --drive, conditions on vehicle_id or drive_id, and the names of data
-    files.
+    the values of --vehicle, --drive, --drive-name and --source-file, conditions on such columns,
+    and the names of data files.
     """
     kept: list[str] = []
     hide_next = False
