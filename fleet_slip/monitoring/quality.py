@@ -18,6 +18,7 @@ from fleet_slip.grams.reader import GramReader
 from fleet_slip.monitoring.moments import DriveBatches
 from fleet_slip.monitoring.peers import settle
 from fleet_slip.monitoring.plausibility import Fault, find_implausible
+from fleet_slip.monitoring.repeated import find_repeated
 from fleet_slip.monitoring.reversed_label import find_reversed_labels
 from fleet_slip.monitoring.thresholds import QualityThresholds, thresholds
 from fleet_slip.regression.gram_table import GramTable
@@ -118,6 +119,7 @@ def examine(cohort: Cohort, limits: QualityThresholds | None = None) -> QualityR
     """
     limits = limits or thresholds().quality
     drives = compared = 0
+    repeated = find_repeated(cohort.drives)
     findings = []
     for table, metadata in _groups(cohort, limits.min_rows):
         faults = find_implausible(table, limits.min_correlation)
@@ -133,6 +135,9 @@ def examine(cohort: Cohort, limits: QualityThresholds | None = None) -> QualityR
                 beside_peers[group] = True
                 found = _unlike_peers(table, group, in_order, limits)
                 faults |= {drive: fault for drive, fault in found.items() if drive not in faults}
+        for drive, name in enumerate(metadata["drive_id"].to_pylist()):
+            if name in repeated and drive not in faults:
+                faults[drive] = repeated[name]
         drives += len(table)
         compared += int(beside_peers.sum())
         findings += _findings(metadata, faults)

@@ -1,0 +1,76 @@
+"""Drives of one car that overlap in time are named: their rows count twice."""
+
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pyarrow as pa
+
+import fleet_slip
+from fleet_slip.ingest import Mapping
+from fleet_slip.monitoring.repeated import find_repeated
+from tests.support.commands import RunCommand
+from tests.support.measured import csv_text
+
+BEGAN = datetime(2024, 5, 31, 8, tzinfo=UTC)
+
+
+def drives(*told: tuple[str, str, float | None, float]) -> pa.Table:
+    """Drives by car, name, begin and duration in s."""
+    at = [None if start is None else BEGAN + timedelta(seconds=start) for _, _, start, _ in told]
+    return pa.table(
+        {
+            "vehicle_id": [car for car, *_ in told],
+            "drive_id": [name for _, name, *_ in told],
+            "started_at": pa.array(at, pa.timestamp("us", tz="UTC")),
+            "duration_s": [lasted for *_, lasted in told],
+        }
+    )
+
+
+def test_the_later_of_two_drives_at_once_is_named() -> None:
+    found = find_repeated(
+        drives(
+            ("car", "long", 0, 1000),
+            ("car", "within", 100, 50),
+            ("car", "beyond", 950, 100),
+            ("car", "after", 1049.5, 10),
+            ("other", "elsewhere", 0, 1000),
+            ("car", "undated", None, 1000),
+        )
+    )
+    assert {name: fault.figure for name, fault in found.items()} == {
+        "within": "50 s are in long",
+        "beyond": "50 s are in long",
+    }
+    assert {fault.kind for fault in found.values()} == {"repeated"}
+
+
+def test_a_log_through_a_corrected_mapping_counts_twice_and_quality_says_so(
+    tmp_path: Path, run_command: RunCommand
+) -> None:
+    rows = range(4000)
+    log = {
+        "t": [(BEGAN + timedelta(milliseconds=10 * i)).isoformat() for i in rows],
+        "ax": [f"{i % 7 / 10:.1f}" for i in rows],
+        "beta": [f"{i % 5 / 10:.1f}" for i in rows],
+    }
+    file = tmp_path / "log.csv"
+    file.write_text(csv_text(log))
+    fleet = fleet_slip.open(tmp_path / "data")
+    for unit in ("m/s^2", "g"):
+        plan = {
+            "name": "test",
+            "time": {"column": "t", "format": "%Y-%m-%dT%H:%M:%S%.f%:z"},
+            "drive": {"vehicle_id": "car", "vehicle_model": "sedan"},
+            "signals": {
+                "ax": {"column": "ax", "unit": unit},
+                "sideslip": {"column": "beta", "unit": "deg"},
+            },
+        }
+        fleet.ingest(file, Mapping.model_validate(plan))
+    fleet.gram()
+    told = run_command("quality", "--json")
+    assert told.exit_code == 10
+    (finding,) = told.json["findings"]
+    assert finding["kind"] == "repeated"
+    assert finding["figure"].startswith("40 s are in test-")
