@@ -178,9 +178,9 @@ def errors_of_learners(
     sets = {name: models()[name] for name in LEARNED}
     every = Inputs.of_catalogue(tuple(dict.fromkeys(name for one in sets.values() for name in one)))
     sample = draw_sample(warehouse, loaded, every, numbers=found.counts())
-    drives = loaded.drives.select(["drive_id", "vehicle_id"]).to_pylist()
-    car_of = {one["drive_id"]: one["vehicle_id"] for one in drives}
-    cars = [car_of[drive] for drive in sample.drive_id.tolist()]
+    drives = loaded.drives.select(["trip", "vehicle_id"]).to_pylist()
+    car_of = {one["trip"]: one["vehicle_id"] for one in drives}
+    cars = [car_of[drive] for drive in sample.trip.tolist()]
     folds = assign_folds(cars, "vehicle", FOLDS)
     for name, inputs in sets.items():
         for learner in (PERCEPTRON, TREES, ANFIS):

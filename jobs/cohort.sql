@@ -2,8 +2,12 @@
 -- Rows without any signal serve no model. Sorted, so that the same cohort reads the same everywhere.
 SELECT
     drive_id, vehicle_id, vehicle_model, source, campaign, track, mass_kg, adhesion, speed_factor, saturated, day,
-    part, signals, n, clipped, sums, products
+    started_at, duration_s,
+    part, signals, n, clipped, sums, products, coalesce(trip, drive_id) AS trip
 FROM grams
+LEFT JOIN (
+{trips}
+) AS trips USING (drive_id)
 WHERE feature_set = '{feature_set}' AND signals <> '' AND (
     {condition}
 )

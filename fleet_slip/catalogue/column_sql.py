@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from fractions import Fraction
 
 from fleet_slip.catalogue.columns import WEIGHT, Definition, Gate, features_behind, limit_of
-from fleet_slip.catalogue.signals import COUNT_MAX
+from fleet_slip.catalogue.signals import COUNT_MAX, catalogue
 
 _SEPARATOR = ",\n            "
 
@@ -32,10 +32,10 @@ def clipped_sql(name: str, limit: int = COUNT_MAX) -> str:
 
 
 def with_absent(rows: str, absent: Sequence[str]) -> str:
-    """Return a table expression with signals that none of its files has, as nulls."""
+    """Return a table expression with stored columns that none of its files has, as nulls."""
     if not absent:
         return rows
-    nulls = ", ".join(f"NULL::SMALLINT AS {name}" for name in absent)
+    nulls = ", ".join(map(catalogue().null_sql, absent))
     return f"(SELECT *, {nulls} FROM {rows})"
 
 

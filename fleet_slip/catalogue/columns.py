@@ -53,7 +53,10 @@ FactText = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_.-]{1,60}$")]
 NO_CAR_KNOWS = frozenset({"adhesion", "lost_control_s", "speed_factor", "saturated"})
 """Drive columns that are known to a simulation or afterwards, and to no car while it drives."""
 
-NOT_FACTS = NO_CAR_KNOWS | {"drive_id", "vehicle_id", "source", "campaign", "track"}
+NOT_FACTS = NO_CAR_KNOWS | {
+    *("drive_id", "drive_name", "source_file", "trip_id", "started_at", "duration_s", "rows"),
+    *("vehicle_id", "source", "campaign", "track"),
+}
 
 
 def limit_of(bits: int) -> int:

@@ -75,16 +75,44 @@ class Signal(Config):
         return int(self.max / self.scale)
 
 
+_ARROW_TYPES = {
+    "string": pa.string(),
+    "double": pa.float64(),
+    "integer": pa.int64(),
+    "timestamp": pa.timestamp("us", tz="UTC"),
+}
+_SQL_TYPES = {
+    "string": "VARCHAR",
+    "double": "DOUBLE",
+    "integer": "BIGINT",
+    "timestamp": "TIMESTAMPTZ",
+}
+
+
 class DriveColumn(Config):
     """One column of metadata, the same in every row of a drive."""
 
-    type: Literal["string", "double", "integer"]
+    type: Literal["string", "double", "integer", "timestamp"]
+    optional: bool = False
+    """Whether a file has the column only where a drive in it has a value."""
     description: str = Field(min_length=1)
 
     @property
     def arrow_type(self) -> pa.DataType:
         """Arrow type of the column."""
-        return {"string": pa.string(), "double": pa.float64(), "integer": pa.int64()}[self.type]
+        return _ARROW_TYPES[self.type]
+
+    @property
+    def sql_type(self) -> str:
+        """DuckDB's type of the column."""
+        return _SQL_TYPES[self.type]
+
+
+NEEDED_DRIVE_COLUMNS = (
+    *("drive_id", "trip_id", "vehicle_id", "vehicle_model", "source", "campaign", "track"),
+    *("mass_kg", "adhesion", "speed_factor", "started_at", "duration_s", "rows", "saturated"),
+)
+"""What the shipped SQL asks of drives."""
 
 
 class SignalCatalogue(Config):
@@ -98,6 +126,11 @@ class SignalCatalogue(Config):
         labels = [name for name, signal in self.signals.items() if signal.role == "label"]
         if len(labels) != 1:
             raise ValueError(f"exactly one signal must have the role 'label', not {labels}")
+        if missing := [name for name in NEEDED_DRIVE_COLUMNS if name not in self.drive]:
+            raise ValueError(
+                f"the drive columns {', '.join(missing)} are missing. Copy them from the shipped "
+                "catalogue, configs/signals.toml"
+            )
         names = [*self.signals, *(s.column for s in self.signals.values()), *self.drive]
         names += ["day", "tick", "time_s"]
         twice = sorted({name for name in names if names.count(name) > 1})
@@ -132,6 +165,11 @@ class SignalCatalogue(Config):
         return tuple(name for name, signal in self.signals.items() if signal.role == "extra")
 
     @cached_property
+    def optional(self) -> tuple[str, ...]:
+        """Names of the columns that a file of the logs has only where a drive has a value."""
+        return (*(name for name, one in self.drive.items() if one.optional), *self.extras)
+
+    @cached_property
     def feature_inputs(self) -> tuple[str, ...]:
         """Names of the signals that a feature may be computed from, in catalogue order."""
         return tuple(name for name in self.signals if name in {*self.inputs, *self.extras})
@@ -140,6 +178,16 @@ class SignalCatalogue(Config):
     def gram_signals(self) -> tuple[str, ...]:
         """Names of the signals of a Gram row: the inputs, then the label."""
         return (*self.inputs, self.label)
+
+    @property
+    def stored_columns(self) -> tuple[str, ...]:
+        """Names of the columns that may come to the table `logs` with a new catalogue."""
+        return (*self.drive, *self.signals)
+
+    def null_sql(self, name: str) -> str:
+        """Return SQL of a stored column that has no value."""
+        kind = "SMALLINT" if name in self.signals else self.drive[name].sql_type
+        return f"NULL::{kind} AS {name}"
 
     @cached_property
     def drive_schema(self) -> pa.Schema:

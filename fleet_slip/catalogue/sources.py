@@ -11,5 +11,8 @@ RECEIVED: Final = "received"
 RECEIVED_FILES: Final = "received/"
 """What stands before a digest in the column `file` of Gram rows without a log file."""
 
+LONGEST_PAUSE_S: Final = 600
+"""A pause that is longer begins another trip: road, load and warmth of the tyres may be others."""
+
 ALL_DRIVES: Final = "true"
 TRAINING_DRIVES: Final = f"source <> '{SCENARIO}'"

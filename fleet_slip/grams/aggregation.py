@@ -124,7 +124,7 @@ def _query(
 ) -> pa.Table:
     paths = {warehouse.logs.uri(file.path): file.path for file in files}
     whole = feature_set == PLAIN and _signals_are_whole(warehouse, files)
-    absent = absent_columns(files, warehouse.catalogue.signals)
+    absent = absent_columns(files, warehouse.catalogue.stored_columns)
     statement = gram_statement(warehouse.catalogue, feature_set, whole=whole, absent=absent)
     identity = features().identity(feature_set)
     doing = f"the Gram query over {number_of(len(files), 'log file')} in {warehouse.logs.folder}"

@@ -150,7 +150,7 @@ def _folding(
         found = opened.database.sql(query).to_arrow_table()
     if few and len(found) > few:
         names = [str(fold + 1) for fold in range(few)]
-        return names, lambda _, drives: (drives % few).astype(np.int64)
+        return names, lambda batch, drives: (_trips(batch, drives) % few).astype(np.int64)
     values = found[key].combine_chunks()
     if not len(values):
         raise empty_cohort_error(opened.database, condition, opened.count_left_out(condition))
@@ -161,6 +161,16 @@ def _folding(
         return assignment.fold[at]
 
     return list(assignment.names), fold_of
+
+
+def _trips(batch: pa.RecordBatch, drives: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Return the hash of each Gram row's trip, mostly that of its drive."""
+    alone = pc.equal(batch["trip"], batch["drive_id"]).to_numpy(zero_copy_only=False)
+    if alone.all():
+        return drives
+    trips = drives.copy()
+    trips[~alone] = hash_numbers(batch["trip"].filter(pa.array(~alone)))
+    return trips
 
 
 @dataclass

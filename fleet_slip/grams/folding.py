@@ -10,7 +10,7 @@ from fleet_slip.errors import UsageError
 FoldKey = Literal["drive", "vehicle", "track", "day", "mass", "adhesion", "speed", "part", "row"]
 
 FOLD_KEYS: dict[str, str] = {
-    "drive": "drive_id",
+    "drive": "trip",
     "vehicle": "vehicle_id",
     "track": "track",
     "day": "day",
@@ -20,7 +20,9 @@ FOLD_KEYS: dict[str, str] = {
     "part": "part",
     "row": "part",
 }
-"""What a fold may be made of, and the column that tells."""
+"""What a fold may be made of, and the column that tells.
+
+Drives of one trip share a fold: they are pieces of one drive, of the same road, load and tyres."""
 
 BANDS: FoldKey = "speed"
 """Whole bands of speed: neighbouring drives share a fold, so that no model sees their speed."""

@@ -12,7 +12,7 @@ import pyarrow as pa
 from fleet_slip.catalogue.car_numbers import CALIBRATION
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
-from fleet_slip.catalogue.sources import ALL_DRIVES, TRAINING_DRIVES
+from fleet_slip.catalogue.sources import ALL_DRIVES, LONGEST_PAUSE_S, TRAINING_DRIVES
 from fleet_slip.delta.table import Snapshot
 from fleet_slip.errors import DataError
 from fleet_slip.grams.backlog import find_backlog
@@ -44,7 +44,10 @@ class OpenedGrams:
         keys = load_car_keys()
         revoked = [key.condition for key in keys.revoked()] if keys else []
         sql = f"{condition.sql} AND NOT ({' OR '.join(revoked)})" if revoked else condition.sql
-        return read_sql("jobs", name).format(condition=sql, feature_set=self.identity)
+        trips = read_sql("jobs", "trips.sql").format(
+            feature_set=self.identity, longest_pause_s=LONGEST_PAUSE_S
+        )
+        return read_sql("jobs", name).format(condition=sql, feature_set=self.identity, trips=trips)
 
     def revoked(self, condition: Condition) -> dict[str, int]:
         """Return how many drives of each car a cohort lacks, since a key of it was revoked."""

@@ -27,7 +27,7 @@ def gram_statement(
     """Return the statement that computes the Gram rows of a feature set.
 
     `whole` states that no file has a column of the set in only some of its rows; `absent` are the
-    signals that no file has, since they came to the catalogue later. Raises
+    columns that no file has, since they came to the catalogue later. Raises
     `QuestionError` for an unknown set.
     """
     known = features()
@@ -53,7 +53,9 @@ def gram_statement(
     kind = "BIGINT" if wide else "INTEGER"
     parts = Parts.of_set(known, one)
     return read_sql("jobs", "gram.sql").format(
-        drive_columns=", ".join(signals.drive),
+        drive_columns=", ".join(
+            signals.null_sql(name) if name in absent else name for name in signals.drive
+        ),
         qualified_drive_columns=", ".join(f"drive.{name}" for name in signals.drive),
         absent="0" if whole else _absent(names),
         part=parts.number_sql if parts else "NULL",

@@ -55,7 +55,11 @@ def clustered_moments(
     owners = served.drives["vehicle_id"].to_pylist()
     cars = cars or owners
     if (cluster or ("vehicle" if len(set(cars)) > 1 else "drive")) == "drive":
-        return DriveMoments.of(table)
+        trips = served.drives["trip"].to_pylist()
+        if len(set(trips)) == len(trips):
+            return DriveMoments.of(table)
+        _, of_trip = np.unique(trips, return_inverse=True)
+        return DriveMoments.of(table, of_trip.astype(np.int64), "drive")
     number = {car: i for i, car in enumerate(sorted(set(cars)))}
     of_drive = np.array([number[car] for car in owners], dtype=np.int64)
     return DriveMoments.of(table, of_drive, "vehicle")

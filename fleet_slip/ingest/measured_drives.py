@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from datetime import date
+from datetime import UTC, date, datetime, timedelta
 from functools import partial
 from typing import Any
 
@@ -30,13 +30,15 @@ SOURCE = "measured"
 _SECONDS_PER_DAY = 86_400
 _EARLIEST_S = 10**8
 """Times before 1973 are counted from the start of a recording, not from 1970."""
-_POLARS_TYPES: dict[pa.DataType, type[pl.DataType]] = {
+_POLARS_TYPES: dict[pa.DataType, type[pl.DataType] | pl.DataType] = {
     pa.string(): pl.String,
     pa.float64(): pl.Float64,
     pa.int64(): pl.Int64,
     pa.int32(): pl.Int32,
     pa.date32(): pl.Date,
+    pa.timestamp("us", tz="UTC"): pl.Datetime("us", "UTC"),
 }
+_FROM_FILE = ("drive_name", "source_file", "trip_id")
 _FROM_MAPPING = ("vehicle_id", "vehicle_model", "track", "mass_kg", "adhesion", "day")
 
 
@@ -71,8 +73,8 @@ def to_ticks(
     """Bring one drive's signals, SI units at times in s, to counts at 100 Hz.
 
     Ticks at which no signal has a value are left out. `intervals_s` are the usual times between
-    the samples of each time base; `known` is what the drive's rows say of it. Raises `InputError`
-    for what nobody says.
+    the samples of each time base; `known` is what is known of the drive, by column of `logs`.
+    Raises `InputError` for what nobody says.
     """
     start_s = float(rows.time_s[0])
     resampler = _build_resampler(rows.time_s - start_s, intervals_s)
@@ -97,7 +99,10 @@ def to_ticks(
     if not somewhere.all():
         counts = {key: array.filter(pa.array(somewhere)) for key, array in counts.items()}
         ticks = ticks[somewhere]
-    return MeasuredDrive(name, _metadata(name, known, start_s, mapping), method, ticks, counts)
+    metadata = _metadata(name, known, start_s, mapping)
+    if len(ticks):
+        metadata |= {"rows": len(ticks), "duration_s": (int(ticks[-1]) - int(ticks[0])) * STEP_S}
+    return MeasuredDrive(name, metadata, method, ticks, counts)
 
 
 def _resample(
@@ -187,15 +192,22 @@ def _metadata(name: str, told: dict[str, Any], start_s: float, mapping: Mapping)
         known["day"] = date.fromordinal(
             date(1970, 1, 1).toordinal() + int(start_s // _SECONDS_PER_DAY)
         )
-    known |= {key: value for key, value in told.items() if key in given}
+    known |= {key: value for key, value in told.items() if key in given or key in _FROM_FILE}
+    dated = mapping.time.is_dated and start_s >= _EARLIEST_S
     return {
         **known,
+        "started_at": _moment(start_s) if dated else None,
         **_facts_of(mapping, known),
         "drive_id": name,
         "source": SOURCE,
         "campaign": mapping.name,
         "saturated": 0,  # what is outside its range is quarantined, not clipped
     }
+
+
+def _moment(time_s: float) -> datetime:
+    """Return a time in s since 1970 to the microsecond."""
+    return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=time_s)
 
 
 def _facts_of(mapping: Mapping, known: dict[str, Any]) -> dict[str, Any]:

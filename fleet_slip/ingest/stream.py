@@ -32,6 +32,7 @@ from fleet_slip.ingest.read_ahead import read_ahead
 from fleet_slip.ingest.reading import log_digest, require_unchanged_log
 from fleet_slip.ingest.resampling import STEP_S, TIME_EPSILON_S
 from fleet_slip.ingest.totals import IngestCounts, Totals
+from fleet_slip.ingest.trips import Trips
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA
 from fleet_slip.words import number_of
 
@@ -75,6 +76,9 @@ class MeasuredStream:
         self.totals = Totals()
         self._open = OpenDrives()
         self._stretches: Counter[int] = Counter()
+        self._trips = Trips()
+        self._name = os.fsencode(file.name).decode("utf-8", "replace")
+        self._stem = self._name.split(".", 1)[0] or self._name
         self._first_refused: dict[str, Any] | None = None
 
     def pieces(self) -> Iterator[Piece]:
@@ -137,9 +141,16 @@ class MeasuredStream:
         group = rows.group
         self._stretches[group] += 1
         name = drive_id(self.prefix, group, self._stretches[group])
+        start_s, end_s = float(rows.time_s[0]), float(rows.time_s[-1])
+        told = self.checker.keys.metadata[group]
+        known = {
+            **told,
+            "drive_name": told.get("drive", self._stem),
+            "source_file": self._name,
+            "trip_id": self._trips.name(name, group, start_s, end_s),
+        }
         try:
-            metadata = self.checker.keys.metadata[group]
-            drive = to_ticks(rows, self.mapping, intervals_s, name, metadata)
+            drive = to_ticks(rows, self.mapping, intervals_s, name, known)
         except InputError as error:
             raise InputError(f"{shown(self.file)}: {error}") from None
         self.totals.add(rows, drive)
@@ -197,7 +208,6 @@ class MeasuredStream:
     def quarantine_table(self, refused: Sequence[pl.DataFrame]) -> pa.Table:
         """Return refused rows as those of the table `quarantine`, in the file's order."""
         bad = join_refused(refused).sort("row", maintain_order=True)
-        name = os.fsencode(self.file.name).decode("utf-8", "replace")
         groups = bad["group"].unique().drop_nulls()
         ids = {group: drive_id(self.prefix, group) for group in groups}
         stated = self.mapping.drive.vehicle_id
@@ -205,7 +215,7 @@ class MeasuredStream:
         metadata = self.checker.keys.metadata
         vehicles = {str(group): metadata[group].get("vehicle_id", vehicle) for group in groups}
         frame = bad.select(
-            pl.lit(name).alias("file"),
+            pl.lit(self._name).alias("file"),
             "row",
             pl.col("group").replace_strict(ids, return_dtype=pl.String).alias("drive_id"),
             pl.col("group")

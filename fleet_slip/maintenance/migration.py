@@ -1,6 +1,6 @@
 """Brings the table `logs` to the signal catalogue: new columns, other scales.
 
-The quarantine, whose columns do not depend on the catalogue, gets those that came later.
+The quarantine and the Gram rows get the columns that came later.
 
 New columns need no file to be touched: where a file lacks a column, its values are null. Another
 scale needs every count of the signal rewritten, and no reader may ever mix the two:
@@ -68,7 +68,8 @@ def migrate(warehouse: Warehouse, progress: Progress = no_progress) -> Migration
     Raises `ConflictError` if another process changed the table at the same moment.
     """
     warehouse.require()
-    _add_columns_that_came_later(warehouse.quarantine)
+    for other in (warehouse.quarantine, warehouse.grams):
+        _add_columns_that_came_later(other)
     table = warehouse.logs
     delta = table.open_delta()
     if delta is None:

@@ -82,7 +82,14 @@ def read_kept_drives(
     order = _order(rows)
     if (np.diff(order) != 1).any():
         rows = rows.take(order)
+    empty = {name for name in table.optional if name in rows.column_names and _is_empty(rows[name])}
+    names = dict.fromkeys([*table.schema.names, *rows.column_names])
+    rows = rows.select([name for name in names if name in rows.column_names and name not in empty])
     return only_used_values(rows)
+
+
+def _is_empty(column: pa.ChunkedArray) -> bool:
+    return bool(column.null_count == len(column))
 
 
 def _read(table: Table, file: TableFile, without: Collection[str]) -> pa.Table:

@@ -128,7 +128,7 @@ def learn(
     return best
 
 
-def fit_anfis(inputs: FloatArray, label: FloatArray, drive_id: Names) -> Fitted:
+def fit_anfis(inputs: FloatArray, label: FloatArray, trip: Names) -> Fitted:
     """Fit rules to rows; centres and widths are those that estimate drives held back best."""
     scaling, of_label = Scaling.of(inputs), Scaling.of(label)
     scaled, wanted = scaling(inputs), of_label(label)
@@ -142,7 +142,7 @@ def fit_anfis(inputs: FloatArray, label: FloatArray, drive_id: Names) -> Fitted:
     def with_one(rows: FloatArray) -> FloatArray:
         return np.column_stack([rows, np.ones(len(rows))])
 
-    held = hold_back(drive_id)
+    held = hold_back(trip)
     thin = np.flatnonzero(~held)[:: max(1, int((~held).sum()) // LEARNING_ROWS)]
     parts = [
         (premises(scaled[part]), with_one(scaled[part] @ leading), wanted[part])

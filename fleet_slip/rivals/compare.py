@@ -113,7 +113,7 @@ def train(learner: Learner, sample: Sample, inputs: Inputs, suffix: str) -> Trai
     """Fit and cross-validate one learner, and measure it."""
     values = sample.of(inputs.names)
     started = time.perf_counter()
-    fitted = learner.fit(values, sample.sideslip_rad, sample.drive_id)
+    fitted = learner.fit(values, sample.sideslip_rad, sample.trip)
     training_s = time.perf_counter() - started
     one_us, each_us = time_estimates(fitted, values)
     return TrainedRival(
@@ -144,7 +144,7 @@ def cross_validate_learner(
     estimates = np.full(len(inputs), np.nan)
     for fold in range(len(folds.names)):
         test = folds.fold == fold
-        fitted = learner.fit(inputs[~test], sample.sideslip_rad[~test], sample.drive_id[~test])
+        fitted = learner.fit(inputs[~test], sample.sideslip_rad[~test], sample.trip[~test])
         estimates[test] = fitted.predict(inputs[test])
     return error_figures(estimates, sample.sideslip_rad, np.ones(len(inputs), dtype=np.bool_))
 

@@ -61,13 +61,13 @@ HELD_BACK = 8
 """Every so many drives one is held back, by which a learner sees when to stop."""
 
 
-def hold_back(drive_id: Names) -> BoolArray:
+def hold_back(trip: Names) -> BoolArray:
     """Return which rows to stop by: those of whole drives; with one drive its last tenth."""
-    drives = np.unique(drive_id)
+    drives = np.unique(trip)
     if len(drives) > 1:
         every = min(HELD_BACK, len(drives))
-        return np.isin(drive_id, drives[every // 2 :: every])
-    return np.arange(len(drive_id)) >= 0.9 * len(drive_id)
+        return np.isin(trip, drives[every // 2 :: every])
+    return np.arange(len(trip)) >= 0.9 * len(trip)
 
 
 @contextmanager

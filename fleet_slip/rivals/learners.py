@@ -24,7 +24,7 @@ def fit_regression(inputs: FloatArray, label: FloatArray, _: Names) -> Fitted:
 MOST_TREES = 500
 
 
-def fit_trees(inputs: FloatArray, label: FloatArray, drive_id: Names) -> Fitted:
+def fit_trees(inputs: FloatArray, label: FloatArray, trip: Names) -> Fitted:
     """Fit gradient-boosted trees with at most 31 leaves each.
 
     As many, up to 500, as estimate drives better which they are not fitted to.
@@ -33,7 +33,7 @@ def fit_trees(inputs: FloatArray, label: FloatArray, drive_id: Names) -> Fitted:
         learning_rate=0.1, max_iter=MOST_TREES, early_stopping=True, n_iter_no_change=20,
         tol=0.0, random_state=SEED,
     )  # fmt: skip
-    held = hold_back(drive_id)
+    held = hold_back(trip)
     trees.fit(inputs[~held], label[~held], X_val=inputs[held], y_val=label[held])
     # scikit-learn shows the nodes of these trees nowhere else.
     nodes = sum(tree.nodes.nbytes for stage in trees._predictors for tree in stage)

@@ -17,7 +17,7 @@ PASSES = 60
 """Passes over the sample, at most."""
 
 
-def fit_perceptron(inputs: FloatArray, label: FloatArray, drive_id: Names) -> Fitted:
+def fit_perceptron(inputs: FloatArray, label: FloatArray, trip: Names) -> Fitted:
     """Fit a network with two hidden layers of 64 neurons, on scaled inputs and label, by Adam.
 
     It keeps the weights that estimate drives best which it does not learn from.
@@ -28,7 +28,7 @@ def fit_perceptron(inputs: FloatArray, label: FloatArray, drive_id: Names) -> Fi
     )  # fmt: skip
     scaling, of_label = Scaling.of(inputs), Scaling.of(label)
     scaled, wanted = scaling(inputs).astype(np.float32), of_label(label).astype(np.float32)
-    held = hold_back(drive_id)
+    held = hold_back(trip)
     least, best, passes = np.inf, None, 0
     for rate in RATES:
         network.set_params(learning_rate_init=rate)
@@ -64,14 +64,14 @@ BANDWIDTHS = (0.1, 0.15, 0.2, 0.3, 0.45, 0.7, 1.0)
 """Widths of its kernel to choose from, in standard deviations of the inputs."""
 
 
-def fit_general_regression(inputs: FloatArray, label: FloatArray, drive_id: Names) -> Fitted:
+def fit_general_regression(inputs: FloatArray, label: FloatArray, trip: Names) -> Fitted:
     """Fit a general regression network (Specht 1991): a mean of remembered labels.
 
     Each remembered row counts with exp(−d²/2h²), d its distance in scaled inputs. The width h is
     the one that estimates drives best which are not remembered.
     """
     scaling = Scaling.of(inputs)
-    held = hold_back(drive_id)
+    held = hold_back(trip)
     order = np.random.default_rng(SEED).permutation(len(inputs))
     kept, others = order[~held[order]][:CENTRES], order[held[order]][:CENTRES]
     centres, labels = scaling(inputs[kept]), label[kept]

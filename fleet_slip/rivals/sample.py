@@ -28,13 +28,13 @@ class Sample:
         names: of the inputs.
         inputs: physical values, shape (rows, inputs).
         sideslip_rad: shape (rows,).
-        drive_id: the drive of each row.
+        trip: the trip of each row, called by its first drive.
     """
 
     names: tuple[str, ...]
     inputs: FloatArray
     sideslip_rad: FloatArray
-    drive_id: Names
+    trip: Names
 
     def of(self, names: tuple[str, ...]) -> FloatArray:
         """Return some of the inputs, shape (rows, inputs)."""
@@ -42,7 +42,7 @@ class Sample:
 
     def folds(self, count: int) -> FoldAssignment:
         """Divide the rows as the regression's cross-validation divides the drives."""
-        return assign_folds(self.drive_id.tolist(), "drive", count)
+        return assign_folds(self.trip.tolist(), "drive", count)
 
 
 def draw_sample(
@@ -59,14 +59,14 @@ def draw_sample(
     """
     with_label = inputs.beside(catalogue().label)
     plan = with_label.columns.plan
-    wanted = set(cohort.drives["drive_id"].to_pylist())
+    trips = dict(zip(*(cohort.drives[n].to_pylist() for n in ("drive_id", "trip")), strict=True))
     stride = max(1, cohort.rows // rows)
     parts: list[FloatArray] = []
     names: list[str] = []
     files = cohort_files(warehouse, cohort.condition)
     for file in (one for one in warehouse.logs.snapshot().files if one.path in files):
         for drive in read_drives(warehouse, file, plan):
-            if drive.drive_id not in wanted:
+            if drive.drive_id not in trips:
                 continue
             told = (numbers or {}).get(str(drive.metadata["vehicle_id"]), {})
             values = with_label.values(replace(drive.counts, numbers=told))
@@ -79,4 +79,5 @@ def draw_sample(
         )
     order = np.argsort(np.array(names), kind="stable")
     found = np.concatenate(parts)[order]
-    return Sample(inputs.names, found[:, :-1], found[:, -1], np.array(names)[order])
+    trip = np.array([trips[names[at]] for at in order])
+    return Sample(inputs.names, found[:, :-1], found[:, -1], trip)

@@ -47,6 +47,8 @@ class DriveLog:
             "mass_kg": spec.vehicle.body.sprung_mass_kg,
             "adhesion": spec.adhesion,
             "speed_factor": spec.speed_factor,
+            "duration_s": (self.rows - 1) / SAMPLE_RATE_HZ,
+            "rows": self.rows,
             "lost_control_s": self.lost_control_s,
             "saturated": self.measurement.saturated,
         }
@@ -107,8 +109,9 @@ def tabulate(batch: Batch, logs: Sequence[DriveLog]) -> pa.Table:
     rows = [log.rows for log in logs]
     columns = {"day": pa.repeat(pa.scalar(batch.day), sum(rows))}
     for field in catalogue().drive_schema:
-        values = pa.array([log.metadata[field.name] for log in logs], type=field.type)
-        columns[field.name] = _repeated(values, rows)
+        values = pa.array([log.metadata.get(field.name) for log in logs], type=field.type)
+        if field.name not in catalogue().optional or values.null_count < len(values):
+            columns[field.name] = _repeated(values, rows)
     ticks = pa.array(np.arange(max(rows), dtype=np.int32))
     columns["tick"] = pa.chunked_array([ticks[:n] for n in rows])
     for name in catalogue().signals:

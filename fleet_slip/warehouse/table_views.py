@@ -131,11 +131,11 @@ def _source(database: duckdb.DuckDBPyConnection, snapshot: Snapshot) -> str:
     database.execute(f"SET VARIABLE {variable} = $paths", {"paths": snapshot.paths})
     if snapshot.paths:
         rows = read_sql("warehouse", f"stored_{snapshot.table.folder.name}.sql").replace("{{", "{")
-        if snapshot.table.folder.name != "logs":
-            return rows
-        differ = not snapshot.has_same_columns
-        database.execute("SET VARIABLE log_columns_differ = $differ", {"differ": differ})
-        return with_absent(rows, absent_columns(snapshot.files, catalogue().signals))
+        if snapshot.table.folder.name == "logs":
+            differ = not snapshot.has_same_columns
+            database.execute("SET VARIABLE log_columns_differ = $differ", {"differ": differ})
+        known = [n for n in catalogue().stored_columns if n in snapshot.table.schema.names]
+        return with_absent(rows, absent_columns(snapshot.files, known))
     empty = f"empty_{snapshot.table.folder.name}"
     add_table(database, empty, snapshot.table.schema.empty_table())
     return empty
@@ -145,6 +145,7 @@ def _generated_columns(signals: SignalCatalogue) -> Mapping[str, Any]:
     separator = ",\n    "
     return {
         "drive_columns": separator.join(signals.drive),
+        "drive_columns_but_rows": separator.join(n for n in signals.drive if n != "rows"),
         "signals": separator.join(signals.signals),
         "si_columns": separator.join(
             f"{name} * {signal.scale}::DOUBLE AS {signal.column}"

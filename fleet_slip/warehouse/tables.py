@@ -56,7 +56,7 @@ class Warehouse:
             ),
             partition_by=("day",),
             description="Logs of drives at 100 Hz as integer counts: physical = scale * count",
-            optional=signals.extras,
+            optional=signals.optional,
         )
 
     @cached_property

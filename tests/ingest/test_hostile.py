@@ -11,9 +11,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.ingest import MeasuredLog, read_measured
-from tests.support.logs import schema_without_extras
+from tests.support.logs import schema_without
 from tests.support.measured import a_mapping, csv_text, good_columns
 
 CASES = settings(
@@ -46,7 +47,7 @@ def outcome(folder: Path, data: bytes) -> None:
 def check(log: MeasuredLog) -> None:
     log.drives.validate(full=True)
     log.quarantine.validate(full=True)
-    assert log.drives.cast(schema_without_extras()).num_rows == log.counts.ticks > 0
+    assert log.drives.cast(schema_without(catalogue().extras)).num_rows == log.counts.ticks > 0
     assert log.counts.rows_read == log.counts.rows_kept + log.quarantine.num_rows
 
 

@@ -11,10 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import InputError
 from fleet_slip.ingest import checking, load_mapping, read_measured, stream
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA
-from tests.support.logs import schema_without_extras
+from tests.support.logs import schema_without, without_names
 from tests.support.measured import (
     a_mapping,
     csv_text,
@@ -29,7 +30,7 @@ from tests.support.measured import (
 
 def test_the_table_has_the_schema_of_the_logs(tmp_path: Path) -> None:
     log = read_columns(tmp_path, good_columns())
-    table = log.drives.cast(schema_without_extras())
+    table = log.drives.cast(schema_without(catalogue().extras))
     first = table.slice(0, 1).to_pylist()[0]
     known = {
         "day": date(2024, 5, 31),
@@ -38,6 +39,11 @@ def test_the_table_has_the_schema_of_the_logs(tmp_path: Path) -> None:
         "vehicle_model": "sedan",
         "source": "measured",
         "campaign": "test",
+        "drive_name": "log",
+        "source_file": "log.csv",
+        "trip_id": f"test-{log.digest[:12]}-1",
+        "duration_s": pytest.approx(0.19),
+        "rows": 20,
         "saturated": 0,
         "tick": 0,
         "ax": -1000,
@@ -179,7 +185,7 @@ def test_drives_from_columns_may_alternate(tmp_path: Path) -> None:
     ]
     assert log.quarantine["drive_id"].null_count == 3
     drives = (
-        log.drives.cast(schema_without_extras())
+        log.drives.cast(schema_without(catalogue().extras))
         .group_by(["drive_id", "day", "vehicle_id", "mass_kg"])
         .aggregate([("tick", "count"), ("ax", "min")])
     )
@@ -323,7 +329,7 @@ def test_bad_rows_anywhere_leave_the_good_ones_as_they_are(
     for where, line in sorted(bad, reverse=True):
         lines.insert(where, line)
     log = read_text(folder, "\n".join([header, *lines]))
-    assert log.drives.drop_columns("drive_id").equals(clean.drives.drop_columns("drive_id"))
+    assert without_names(log.drives).equals(without_names(clean.drives))
     positions = [i + 1 for i, line in enumerate(lines) if line in {text for _, text in bad}]
     assert log.quarantine["row"].to_pylist() == positions
 

@@ -92,7 +92,7 @@ def test_a_general_regression_network_follows_a_curve() -> None:
 
 def test_a_perceptron_carries_the_parameters_of_its_layers() -> None:
     data = sample(400)
-    fitted = fit_perceptron(data.inputs, data.sideslip_rad, data.drive_id)
+    fitted = fit_perceptron(data.inputs, data.sideslip_rad, data.trip)
     first, second = LAYERS
     weights = (8 * first + first) + (first * second + second) + (second + 1)
     scaling = 2 * 8 + 2
@@ -102,10 +102,10 @@ def test_a_perceptron_carries_the_parameters_of_its_layers() -> None:
 def test_what_a_network_and_trees_stop_by_is_not_learned_from() -> None:
     """Labels of the drives held back are another law; who learned from them would follow it."""
     data = sample()
-    held = hold_back(data.drive_id)
+    held = hold_back(data.trip)
     label = np.where(held, 5.0, data.sideslip_rad)
     for fit in (fit_perceptron, fit_trees):
-        far = fit(data.inputs, label, data.drive_id).predict(data.inputs[held])
+        far = fit(data.inputs, label, data.trip).predict(data.inputs[held])
         assert np.abs(far).max() < 1.0
 
 
@@ -124,16 +124,16 @@ def test_every_learner_learns(learner: Learner) -> None:
 def test_no_fold_is_tested_on_drives_that_it_was_fitted_on() -> None:
     """A learner that remembers labels by drive must fail on drives that it has not seen."""
     data = sample()
-    number = np.array([int(name.removeprefix("drive-")) for name in data.drive_id])
+    number = np.array([int(name.removeprefix("drive-")) for name in data.trip])
     seen: list[set[int]] = []
 
-    def remember(inputs: FloatArray, label: FloatArray, drive_id: Names) -> Fitted:
-        assert {f"drive-{n:.0f}" for n in inputs[:, 0]} == set(drive_id)
+    def remember(inputs: FloatArray, label: FloatArray, trip: Names) -> Fitted:
+        assert {f"drive-{n:.0f}" for n in inputs[:, 0]} == set(trip)
         seen.append(set(inputs[:, 0].astype(int)))
-        return fit_regression(inputs, label, drive_id)
+        return fit_regression(inputs, label, trip)
 
     learner = Learner("memory", "", remember)
-    folds = by_hash(data.drive_id.tolist(), 5)
+    folds = by_hash(data.trip.tolist(), 5)
     cross_validate_learner(learner, number[:, None].astype(float), data, folds)
     assert len(seen) == len(folds.names)
     for fold, fitted_on in enumerate(seen):

@@ -36,8 +36,8 @@ def test_a_sample_has_what_sql_makes_of_the_columns(warehouse: Warehouse, smoke_
     sample = draw_sample(warehouse, cohort, inputs(), rows=1000)
     assert sample.names == (*SIGNALS, *WINDOWS)
     assert 700 < len(sample.inputs) < 2000
-    assert set(sample.drive_id) == set(cohort.drives["drive_id"].to_pylist())
-    drive_id = str(sample.drive_id[0])
+    assert set(sample.trip) == set(cohort.drives["drive_id"].to_pylist())
+    drive_id = str(sample.trip[0])
     stride = cohort.rows // 1000
     assert stride >= 15
     with connect(smoke_root) as database:
@@ -46,7 +46,7 @@ def test_a_sample_has_what_sql_makes_of_the_columns(warehouse: Warehouse, smoke_
             "ORDER BY time_s",
             params={"id": drive_id},
         ).fetchnumpy()
-    of_drive = sample.drive_id == drive_id
+    of_drive = sample.trip == drive_id
     np.testing.assert_allclose(sample.inputs[of_drive, 0], rows["ay_mps2"][::stride], rtol=1e-9)
     np.testing.assert_allclose(
         sample.sideslip_rad[of_drive], rows["sideslip_rad"][::stride], rtol=1e-9, atol=1e-12
@@ -65,7 +65,7 @@ def test_a_rival_sees_on_a_drive_what_it_was_trained_on(
     cohort = load_cohort(warehouse, "campaign = 'smoke'")
     sample = draw_sample(warehouse, cohort, inputs(), rows=1000)
     estimate = LearnedEstimate(inputs(), Fitted(lambda rows: rows[:, 3], 0))
-    drive_id = str(sample.drive_id[0])
+    drive_id = str(sample.trip[0])
     columns = [catalogue()[name].column for name in catalogue().inputs]
     with connect(smoke_root) as database:
         rows = database.sql(
@@ -75,7 +75,7 @@ def test_a_rival_sees_on_a_drive_what_it_was_trained_on(
     signals = {name: np.ma.filled(values.astype(float), np.nan) for name, values in rows.items()}
     stride = cohort.rows // 1000
     np.testing.assert_array_equal(
-        estimate(signals)[::stride], sample.inputs[sample.drive_id == drive_id, 3]
+        estimate(signals)[::stride], sample.inputs[sample.trip == drive_id, 3]
     )
 
 

@@ -49,9 +49,9 @@ SCENARIOS = {
 
 
 def checksum(rows: pa.Table) -> str:
-    """Return a checksum of the values of a table, whatever its chunks."""
+    """Return a checksum of the values of a table, whatever its chunks, but for what came later."""
     digest = sha256()
-    for name in rows.column_names:
+    for name in rows.drop_columns(["rows", "duration_s"]).column_names:
         digest.update(f"{name}{rows[name].to_pylist()}".encode())
     return digest.hexdigest()
 

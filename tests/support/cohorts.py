@@ -60,6 +60,7 @@ def cohort_of(
     days = [date(2024, 5, 1) + timedelta(days=i % 3) for i in range(len(drives))]
     columns = {
         "drive_id": [one.drive for one in drives],
+        "trip": [one.drive for one in drives],
         "vehicle_id": [f"car-{i % 4}" for i in range(len(drives))],
         "track": [f"track-{i % 2}" for i in range(len(drives))],
         "day": days,

@@ -105,6 +105,7 @@ def simulated_drive() -> LabelledDrive:
     columns = {
         signal.column: table[name].to_numpy().astype(float) * float(signal.scale)
         for name, signal in catalogue().signals.items()
+        if name in table.column_names
     }
     names = DriveSignals.__dataclass_fields__
     signals = DriveSignals(**{name: columns[name] for name in names})

@@ -1,5 +1,6 @@
 """Rows of logs made up in memory, and landed in a warehouse."""
 
+from collections.abc import Collection
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,11 @@ def path_of(folder: Folder) -> Path:
     return Path(str(folder))
 
 
+def without_names(drives: pa.Table) -> pa.Table:
+    """Return rows of the logs without what depends on their file: its digest and its name."""
+    return drives.drop_columns(["drive_id", "trip_id", "drive_name", "source_file"])
+
+
 def random_counts(rng: np.random.Generator, rows: int) -> dict[str, Any]:
     """Counts over the whole int16 range, the extremes among them."""
     counts: dict[str, Any] = {}
@@ -30,10 +36,9 @@ def random_counts(rng: np.random.Generator, rows: int) -> dict[str, Any]:
     return counts
 
 
-def schema_without_extras() -> pa.Schema:
-    """The schema of a file of the logs whose drives have no signal that only some cars log."""
-    schema = catalogue().log_schema
-    return pa.schema([field for field in schema if field.name not in catalogue().extras])
+def schema_without(optional: Collection[str]) -> pa.Schema:
+    """The schema of a file of the logs whose drives have nothing of some optional columns."""
+    return pa.schema([field for field in catalogue().log_schema if field.name not in optional])
 
 
 def log_rows(drive_id: str, counts: dict[str, Any], day: date = DAY, **metadata: Any) -> pa.Table:
@@ -50,12 +55,13 @@ def log_rows(drive_id: str, counts: dict[str, Any], day: date = DAY, **metadata:
         "mass_kg": 1320.0,
         "adhesion": 1.0,
         "speed_factor": 0.8,
-        "lost_control_s": None,
+        "duration_s": (rows - 1) / 100,
+        "rows": rows,
         "saturated": 0,
         **metadata,
     }
     columns: dict[str, Any] = {"day": [day] * rows}
-    columns |= {name: [known[name]] * rows for name in signals.drive}
+    columns |= {name: [known.get(name)] * rows for name in signals.drive}
     columns["tick"] = np.arange(rows, dtype=np.int32)
     columns |= {name: counts.get(name, [None] * rows) for name in signals.signals}
     return pa.table(columns, schema=signals.log_schema)

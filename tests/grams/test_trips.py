@@ -1,0 +1,201 @@
+"""Pieces of one drive share a fold, however its log was cut."""
+
+from collections.abc import Mapping as Told
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import fleet_slip
+from fleet_slip import Fleet
+from fleet_slip.catalogue.sources import LONGEST_PAUSE_S
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.fold_sums import sum_cohort
+from fleet_slip.grams.folding import EACH, Folding
+from fleet_slip.ingest import Mapping
+from fleet_slip.resources import read_sql
+from tests.support.measured import csv_text
+
+BEGAN = datetime(2024, 5, 31, 8, tzinfo=UTC)
+
+Drive = tuple[str, str, str | None, int | None, int]
+"""Name, car, trip within its file, when it began and how long it lasted, in s."""
+
+
+@st.composite
+def drives(draw: st.DrawFn) -> list[Drive]:
+    """Draw drives of two cars; some are dated, some pieces of one file."""
+    found: list[Drive] = []
+    for number in range(draw(st.integers(1, 9))):
+        car = draw(st.sampled_from("ab"))
+        dated = draw(st.booleans())
+        start_s = draw(st.integers(0, 6000)) if dated else None
+        earlier = [one for one in found if one[1] == car and (one[3] is not None) == dated]
+        named = [None if dated else f"d{number}", *(one[2] or one[0] for one in earlier)]
+        found.append((f"d{number}", car, draw(st.sampled_from(named)), start_s, 100))
+    return found
+
+
+def trips_of(found: list[Drive]) -> dict[str, str]:
+    """Return the trip of each drive, by SQL."""
+    at = [None if one[3] is None else BEGAN + timedelta(seconds=one[3]) for one in found]
+    grams = pa.table(
+        {
+            "feature_set": ["x"] * len(found),
+            "drive_id": [one[0] for one in found],
+            "vehicle_id": [one[1] for one in found],
+            "trip_id": pa.array([one[2] for one in found], pa.string()),
+            "started_at": pa.array(at, pa.timestamp("us", tz="UTC")),
+            "duration_s": [float(one[4]) for one in found],
+        }
+    )
+    statement = read_sql("jobs", "trips.sql").format(
+        feature_set="x", longest_pause_s=LONGEST_PAUSE_S
+    )
+    with duckdb.connect() as database:
+        database.register("grams", grams)
+        return dict(database.sql(statement).fetchall())
+
+
+def joined(found: list[Drive]) -> set[frozenset[str]]:
+    """Return the trips by joining any two drives that belong together, until none is left."""
+    groups = [{one[0]} for one in found]
+    for i, a in enumerate(found):
+        for b in found[:i]:
+            same_file = (a[2] or a[0]) == (b[2] or b[0])
+            near = None not in (a[3], b[3]) and abs(a[3] - b[3]) <= LONGEST_PAUSE_S + 100  # type: ignore[operator]
+            if a[1] == b[1] and (same_file or near):
+                one = next(group for group in groups if a[0] in group)
+                other = next(group for group in groups if b[0] in group)
+                if one is not other:
+                    one |= other
+                    groups.remove(other)
+    return {frozenset(group) for group in groups}
+
+
+@given(drives())
+def test_drives_that_follow_each_other_are_one_trip(found: list[Drive]) -> None:
+    trips = trips_of(found)
+    every = {one[0]: trips.get(one[0], one[0]) for one in found}
+    groups = {frozenset(d for d in every if every[d] == trip) for trip in every.values()}
+    assert groups == joined(found)
+
+
+def test_a_pause_of_ten_minutes_does_not_part_a_trip_and_a_longer_one_does() -> None:
+    first: Drive = ("a", "car", None, 0, 100)
+    assert set(trips_of([first, ("b", "car", None, 700, 100)]).values()) == {"a"}
+    assert set(trips_of([first, ("b", "car", None, 701, 100)]).values()) == {"a", "b"}
+    assert set(trips_of([first, ("b", "other", None, 100, 100)]).values()) == {"a", "b"}
+
+
+def mapping(day: str | None = None, **time: Any) -> Mapping:
+    known: Told[str, Any] = {
+        "name": "test",
+        "time": {"column": "t", **time},
+        "drive": {"vehicle_id": "car", "vehicle_model": "sedan", "day": day},
+        "signals": {
+            "ax": {"column": "ax", "unit": "m/s^2"},
+            "ay": {"column": "ay", "unit": "m/s^2"},
+            "sideslip": {"column": "beta", "unit": "deg"},
+        },
+    }
+    return Mapping.model_validate(known)
+
+
+def log_of(rng: np.random.Generator, start: datetime, rows: int = 400) -> dict[str, list[str]]:
+    """Signals that say something of the label, from a moment on."""
+    ax, ay = rng.normal(0, 2, (2, rows))
+    beta = 0.8 * ay - 0.3 * ax + rng.normal(0, 0.2, rows)
+    times = [start + timedelta(milliseconds=10 * i) for i in range(rows)]
+    return {
+        "t": [one.strftime("%Y-%m-%d %H:%M:%S.%f") for one in times],
+        "ax": [f"{x:.3f}" for x in ax],
+        "ay": [f"{x:.3f}" for x in ay],
+        "beta": [f"{x:.3f}" for x in beta],
+    }
+
+
+def write(folder: Path, name: str, log: dict[str, list[str]], rows: slice) -> Path:
+    file = folder / name
+    file.write_text(csv_text({key: values[rows] for key, values in log.items()}))
+    return file
+
+
+@pytest.fixture(scope="module")
+def roots(tmp_path_factory: pytest.TempPathFactory) -> tuple[Fleet, Fleet]:
+    """The same five drives of a car, as logs of their own and cut into pieces of a second."""
+    folder = tmp_path_factory.mktemp("trips")
+    rng = np.random.default_rng(3)
+    files: tuple[list[Path], list[Path]] = ([], [])
+    for drive in range(5):
+        log = log_of(rng, BEGAN + timedelta(hours=drive))
+        files[0].append(write(folder, f"whole-{drive}.csv", log, slice(None)))
+        for first in range(0, 400, 100):
+            rows = slice(first, first + 100)
+            files[1].append(write(folder, f"piece-{drive}-{first}.csv", log, rows))
+    fleets = []
+    for name, some in zip(("whole", "cut"), files, strict=True):
+        fleet = fleet_slip.open(folder / name)
+        fleet.ingest(some, mapping(format="%Y-%m-%d %H:%M:%S%.f"))
+        fleet.gram()
+        fleets.append(fleet)
+    return fleets[0], fleets[1]
+
+
+def test_a_log_that_was_cut_gives_the_folds_of_the_whole(roots: tuple[Fleet, Fleet]) -> None:
+    whole, cut = (load_cohort(fleet.warehouse) for fleet in roots)
+    assert (whole.drive_count, cut.drive_count) == (5, 20)
+    folds = [
+        cohort.folds("drive", EACH).serving(["ax", "ay"], "sideslip") for cohort in (whole, cut)
+    ]
+    assert len(folds[1].names) == 5
+    sums = [sorted((gram.n, gram.products) for gram in one.grams) for one in folds]
+    assert sums[0] == sums[1]
+
+
+@pytest.mark.parametrize("count", [2, 5, EACH])
+def test_both_ways_to_read_a_cohort_make_the_same_folds(
+    roots: tuple[Fleet, Fleet], count: Any
+) -> None:
+    warehouse = roots[1].warehouse
+    folding = Folding(by="drive", count=count)
+    summed = sum_cohort(warehouse, folding).sums
+    loaded = load_cohort(warehouse).folds("drive", count)
+    assert [g.n for t in summed.tables for g in t] == [g.n for t in loaded.tables for g in t]
+    assert summed.names == loaded.names
+
+
+def test_the_selection_is_that_of_the_whole(roots: tuple[Fleet, Fleet]) -> None:
+    whole, cut = (fleet.cohort().select(nested="ay,ax", folds=EACH).winner.model for fleet in roots)
+    assert whole.signals == cut.signals
+    assert whole.sums == cut.sums
+    assert whole.model == cut.model
+
+
+def test_pieces_of_one_undated_file_are_one_trip(tmp_path: Path) -> None:
+    """A gap of two seconds parts drives, and one of eleven minutes parts trips."""
+    time = [*np.arange(0, 1, 0.01), *np.arange(3, 4, 0.01), *np.arange(700, 701, 0.01)]
+    log = {"t": [f"{t:.2f}" for t in time], **{n: ["1"] * 300 for n in ("ax", "ay", "beta")}}
+    fleet = fleet_slip.open(tmp_path / "data")
+    file = write(tmp_path, "log.csv", log, slice(None))
+    fleet.ingest(file, mapping("2024-05-31", unit="s"))
+    rows = fleet.sql(
+        "SELECT drive_id, trip_id, drive_name, source_file, started_at, rows FROM drives "
+        "ORDER BY drive_id"
+    ).fetchall()
+    first, second, third = (row[0] for row in rows)
+    assert [row[1] for row in rows] == [first, first, third]
+    assert {row[2:] for row in rows} == {("log", "log.csv", None, 100)}
+    fleet.gram()
+    trips = load_cohort(fleet.warehouse).drives.select(["drive_id", "trip"]).to_pylist()
+    assert {one["drive_id"]: one["trip"] for one in trips} == {
+        first: first,
+        second: first,
+        third: third,
+    }
