@@ -128,8 +128,8 @@ class ColumnWriter:
         quotient = self.nearest(
             total, one.numerator, one.denominator, count, most, one.limit, largest
         )
-        guarded = f"({now} == MISSING) ? MISSING : {quotient}"
-        return [*lines, f"const int32_t column_{place} = {guarded};"]
+        value = now if quotient == now else f"({now} == MISSING) ? MISSING : {quotient}"
+        return [*lines, f"const int32_t column_{place} = {value};"]
 
     def nearest(
         self,
