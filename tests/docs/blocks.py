@@ -132,7 +132,7 @@ def printed_by(command: str) -> str:
     `fleet-slip` runs in this process: Python and its libraries are loaded once and not 60 times.
     """
     typed = shlex.split(command)
-    if typed[0] != "fleet-slip":
+    if typed[0] != "fleet-slip" or {">", "|"} & set(typed):
         return printed_by_bash(command)
     printed = StringIO()
     with redirect_stdout(printed), redirect_stderr(printed):
