@@ -135,6 +135,7 @@ def write_batch(
         if longest is not None:
             number, drive = longest
             found = tuple(find_suspicions(signals_of(drive)))
+            found = (*outcomes[number].suspicions, *found)
             outcomes[number] = replace(outcomes[number], suspicions=found)
         done = {name: part.finish() for name, part in parts.items()}
     return WrittenBatch(tuple(outcomes), tuple(failures), done["quarantine"], done["logs"])
@@ -199,6 +200,7 @@ def _outcome(file: Path, stream: MeasuredStream, written: WrittenFile, *, new: b
         vehicles=frozenset(written.vehicles),
         drives=frozenset(written.drives),
         left_out=written.left_out,
+        suspicions=stream.suspicions(),
         counts=replace(counts, drives=counts.drives - written.left_out, ticks=written.ticks),
     )
 

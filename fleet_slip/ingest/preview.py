@@ -66,7 +66,8 @@ def preview_file(file: Path, mapping: Mapping) -> Preview:
                     found[name].add(counts)
     signals = signals_of(longest) if longest is not None else {}
     ranges = tuple(_range(name, found[name]) for name in mapping.signals)
-    return Preview(str(file), stream.counts(), ranges, tuple(find_suspicions(signals)), signals)
+    suspicions = (*stream.suspicions(), *find_suspicions(signals))
+    return Preview(str(file), stream.counts(), ranges, suspicions, signals)
 
 
 def signals_of(drive: MeasuredDrive) -> dict[str, FloatArray]:

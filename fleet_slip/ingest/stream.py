@@ -31,6 +31,7 @@ from fleet_slip.ingest.quarantine import describe_refused, join_refused, no_rows
 from fleet_slip.ingest.read_ahead import read_ahead
 from fleet_slip.ingest.reading import log_digest, require_unchanged_log
 from fleet_slip.ingest.resampling import STEP_S, TIME_EPSILON_S
+from fleet_slip.ingest.suspicion import Suspicion, find_refusals
 from fleet_slip.ingest.totals import IngestCounts, Totals
 from fleet_slip.ingest.trips import Trips
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA
@@ -160,6 +161,8 @@ class MeasuredStream:
     def _note_refused(self, refused: pl.DataFrame) -> None:
         if refused.height:
             self.totals.quarantined.update(refused["reason"])
+            of_signals = refused.filter(pl.col("signal").is_in(list(self.mapping.signals)))
+            self.totals.refused.update(zip(of_signals["signal"], of_signals["reason"], strict=True))
             first = refused.row(refused["row"].arg_min() or 0, named=True)
             self._first_refused = min(self._first_refused or first, first, key=lambda r: r["row"])
 
@@ -241,6 +244,10 @@ class MeasuredStream:
             drives_resampled=totals.drives_resampled,
             ticks=totals.ticks,
         )
+
+    def suspicions(self) -> tuple[Suspicion, ...]:
+        """Return the signals of which many values were refused, once all pieces were taken."""
+        return tuple(find_refusals(self.totals.refused, self.checker.rows))
 
     def look_alikes(self) -> tuple[tuple[str, ...], ...]:
         """Return names of drives or cars in the file that differ only in their Unicode form."""

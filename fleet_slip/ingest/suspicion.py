@@ -24,6 +24,12 @@ RADIUS_M, TRACK_M = 0.31, 1.55
 WHEELS = ("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")
 ROAD_WHEELS = ("steer_fl", "steer")
 LEAST_CORRELATION, SURE_CORRELATION = 0.6, 0.9
+LARGEST_REFUSED, FEWEST_REFUSED = 0.1, 10
+_REFUSED = {
+    "out_of_range": ("unit", "Check its unit."),
+    "not_a_number": ("texts", "Name those that mean no value under missing."),
+    "not_finite": ("values", 'Write missing = ["nan"] if they mean no value.'),
+}
 LEAST_GAIN = 0.3
 """A delay explains away this part of a label's variance: a car's own lag of 0.1 s does 0.23."""
 
@@ -67,6 +73,15 @@ def find_suspicions(signals: Signals) -> list[Suspicion]:
     if not any({"ay", "yaw_rate"} & set(one.signals) for one in found):
         found += _label(usual, speed)  # which is judged by them
     return found
+
+
+def find_refusals(refused: Mapping[tuple[str, str], int], rows: int) -> Iterator[Suspicion]:
+    """Yield the signals of which more than a tenth of a file's rows were refused, by reason."""
+    for (name, reason), count in refused.items():
+        if count > max(rows * LARGEST_REFUSED, FEWEST_REFUSED):
+            kind, remedy = _REFUSED.get(reason, ("values", "Look at the column."))
+            figure = f"{count:,} of {rows:,} rows are refused for it, {reason}"
+            yield Suspicion(kind, (name,), figure, remedy)
 
 
 def speed_mps(signals: Signals) -> FloatArray | None:

@@ -32,6 +32,8 @@ class Totals:
 
     rows_kept: int = 0
     quarantined: Counter[str] = field(default_factory=Counter)
+    refused: Counter[tuple[str, str]] = field(default_factory=Counter)
+    """Rejected rows by what is wrong, where that is a signal, and by the reason."""
     drives: int = 0
     drives_resampled: int = 0
     ticks: int = 0

@@ -128,3 +128,20 @@ def test_a_condition_that_no_row_meets_is_an_error(tmp_path: Path) -> None:
 def test_what_a_condition_cannot_be(condition: dict[str, Any], message: str) -> None:
     with pytest.raises(ValidationError, match=message):
         a_mapping(where=[{"column": "speed", **condition}])
+
+
+def test_a_drive_ends_where_the_ignition_is_off(tmp_path: Path) -> None:
+    rows = good_columns(100)
+    rows["t"] = [f"{i / 10:.1f}" for i in range(100)]  # at 10 Hz
+    on = [0] * 5 + [1] * 40 + [0] * 15 + [1] * 40
+    rows["KL15"] = on
+    time = {"longest_gap_s": 0.2, "split_gap_s": 1}
+    log = read_columns(tmp_path, rows, a_mapping(where="KL15 = 1", time=time))
+    assert log.counts.rows_left_out == on.count(0)
+    first, second = sorted(set(log.drives["drive_id"].to_pylist()))
+    assert second == f"{first}-2"
+    assert log.counts.ticks == 2 * 391
+    assert log.counts.quarantined == {}
+    short = {"longest_gap_s": 0.2, "split_gap_s": 2}
+    whole = read_columns(tmp_path, rows, a_mapping(where="KL15 = 1", time=short))
+    assert whole.counts.drives == 1

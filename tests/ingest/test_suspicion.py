@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from fleet_slip.arrays import FloatArray
 from fleet_slip.cli.main import app
 from fleet_slip.errors import AlarmError, UsageError
-from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS, find_suspicions
+from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS, find_refusals, find_suspicions
 from tests.support.reported import call
 from tests.support.textbook_car import Car, a_car
 
@@ -160,6 +160,26 @@ def test_ingest_says_what_looks_wrong_and_goes_on(tmp_path: Path) -> None:
     assert report["new"]
     again = json.loads(call(tmp_path / "root", "ingest", file, "--mapping", mapping, "--json"))
     assert again[0]["suspicions"] == []
+
+
+def test_a_unit_that_lies_so_much_that_rows_are_refused_is_told(tmp_path: Path) -> None:
+    car = a_car()
+    file, mapping = write_car(tmp_path, {**car, "yaw_rate": 57.3 * car["yaw_rate"]})
+    command = ("ingest", file, "--mapping", mapping, "--json")
+    (report,) = json.loads(call(tmp_path / "root", *command))
+    (found,) = report["suspicions"]
+    assert (found["kind"], found["signals"]) == ("unit", ["yaw_rate"])
+    refused = report["quarantined"]["out_of_range"]
+    assert found["figure"] == f"{refused:,} of 6,000 rows are refused for it, out_of_range"
+    with pytest.raises(AlarmError, match="1 thing to look at"):
+        call(tmp_path / "other", *command, "--dry-run")
+
+
+def test_few_refused_rows_are_no_suspicion() -> None:
+    refused = {("ax", "out_of_range"): 100, ("ay", "not_a_number"): 101, ("vx", "new"): 500}
+    found = [(one.kind, one.signals) for one in find_refusals(refused, 1000)]
+    assert found == [("texts", ("ay",)), ("values", ("vx",))]
+    assert not list(find_refusals({("ax", "out_of_range"): 10}, 12))
 
 
 def test_files_that_land_together_say_it_once(tmp_path: Path) -> None:
