@@ -49,7 +49,8 @@ def _print_quality(found: QualityReport) -> None:
         "peers"
     )
     if not found.findings:
-        typer.echo(f"{examined}: all are in order")
+        order = "all are in order" if found.drives else "none is long enough"
+        typer.echo(f"{examined}: {order}")
         return
     print_table(
         examined,
