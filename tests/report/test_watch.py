@@ -4,6 +4,7 @@ import json
 import math
 import re
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,10 @@ import pytest
 from PIL import Image
 
 import fleet_slip
-from fleet_slip.errors import QuestionError, UsageError
-from fleet_slip.report.frames import Frames, drive_frames
+from fleet_slip.errors import ExtraError, QuestionError, UsageError
+from fleet_slip.report.frames import FRAMES_PER_S, Frames, drive_frames
 from fleet_slip.report.watch_page import render_watch
+from tests.support.commands import run
 
 DRIVE = "smoke-2024-05-01-0000"
 
@@ -98,6 +100,43 @@ def test_a_film_moves(smoke_root: Path, tmp_path: Path) -> None:
         last = np.asarray(image.convert("L"), dtype=int)
     assert shown == 4
     assert (abs(first - last) > 50).sum() > 100
+
+
+def test_an_mp4_needs_an_extra_that_is_named(
+    smoke_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    fleet = fleet_slip.open(smoke_root)
+    with pytest.raises(ExtraError, match=r"fleet-slip\[watch\]"):
+        fleet.watch(DRIVE, "smoke", tmp_path / "film.mp4", from_s=5.0, until_s=5.1)
+    assert list(tmp_path.iterdir()) == []
+
+
+READ_BACK = """
+import sys
+import fleet_slip
+from pathlib import Path
+from imageio_ffmpeg import read_frames
+root, drive, file = sys.argv[1:]
+film = fleet_slip.open(root).watch(drive, "smoke", Path(file), from_s=5.0, until_s=5.5)
+about, *pictures = read_frames(str(film))
+print(about["codec"], about["fps"], *about["size"], len(pictures), len({*pictures}))
+"""
+
+
+@pytest.mark.tools("marimo")
+def test_an_mp4_plays_as_long_as_the_drive(smoke_root: Path, tmp_path: Path) -> None:
+    """In the environment of the notebook, which has an encoder."""
+    root = shutil.copytree(smoke_root, tmp_path / "data")
+    program = shutil.which("marimo")
+    assert program
+    python = Path(program).resolve().parent / "python"
+    done = run([str(python), "-c", READ_BACK, str(root), DRIVE, str(tmp_path / "film.mp4")])
+    assert done.exit_code == 0, done.stderr
+    codec, rate, width, height, pictures, different = done.stdout.split()
+    assert (codec, float(rate)) == ("h264", FRAMES_PER_S)
+    assert (int(width), int(height)) == (800, 448)
+    assert int(pictures) == int(different) == round(0.5 * FRAMES_PER_S) + 1
 
 
 def test_what_cannot_be_shown_is_told(smoke_root: Path, tmp_path: Path) -> None:
