@@ -18,6 +18,7 @@ import polars as pl
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.can_bus import CanBus
 from fleet_slip.ingest.can_decoding import is_sent, needed_bytes, physical, raw_numbers
+from fleet_slip.ingest.can_frames import CanFrames
 from fleet_slip.ingest.columns import describe_missing, shown
 from fleet_slip.ingest.source import BASE, OWN_TIME, Channel, reading_with
 
@@ -36,6 +37,7 @@ class CanSource:
     def __init__(self, file: Path, bus: CanBus, database: Any) -> None:
         """Take the trace's path, what the mapping says of it, and the parsed database."""
         self._file, self._bus, self._database = file, bus, database
+        self._wanted: set[_Key] | None = None
 
     def channels(self) -> list[Channel]:
         """Return the signals of all messages of the trace that the database knows."""
@@ -61,6 +63,10 @@ class CanSource:
                 known = [f"{m}.{s.name}" for m, of in messages.items() for s in of.signals]
                 raise InputError(f"{shown(self._bus.database)}: {describe_missing(column, known)}")
             wanted[name][column] = found[signal]
+        asked = {_key(messages[name]) for name in wanted}
+        if self._wanted is not None and not asked <= self._wanted:
+            self.__dict__.pop("_frames", None)  # they were left empty
+        self._wanted = asked
         for name, signals in wanted.items():
             yield self._decode(messages[name], signals)
 
@@ -94,9 +100,9 @@ class CanSource:
                 f"in it. Of the {len(self._frames)} numbers in the trace {known} are in "
                 f"{self._bus.database}. Is it the database of this car and bus?"
             )
-        buses = sorted({bus for _, bus, _ in frames})
+        buses, chosen = frames.buses, np.ones(len(frames), dtype=np.bool_)
         if self._bus.channel is not None:
-            frames = [frame for frame in frames if frame[1] == self._bus.channel]
+            chosen = frames.are_on(self._bus.channel)
         elif len(buses) > 1:
             raise InputError(
                 f"{shown(self._file)}: the message {message.name} is on the buses "
@@ -104,39 +110,43 @@ class CanSource:
                 f'"{buses[0]}".'
             )
         needed = max(map(needed_bytes, signals.values()))
-        whole = [(time, data) for time, _, data in frames if len(data) >= needed]
-        if len(whole) < len(frames) or not frames:
-            longest = max((len(data) for _, _, data in frames), default=0)
+        sizes = np.asarray(frames.sizes)[chosen]
+        short = int((sizes < needed).sum())
+        if short or not sizes.size:
             raise InputError(
-                f"{shown(self._file)}: {len(frames) - len(whole):,} of {len(frames):,} frames of "
+                f"{shown(self._file)}: {short:,} of {sizes.size:,} frames of "
                 f"{message.name} ({message.frame_id:#x}) are too short: {next(iter(signals))} ends "
-                f"in byte {needed}, the longest has {longest}; buses: {', '.join(buses)}. Is "
-                f"{self._bus.database} the database of this car and bus?"
+                f"in byte {needed}, the longest has {sizes.max(initial=0)}; buses: "
+                f"{', '.join(buses)}. Is {self._bus.database} the database of this car and bus?"
             )
-        times = np.array([time for time, _ in whole])
-        joined = b"".join(data[:needed] for _, data in whole)
-        return times, np.frombuffer(joined, dtype=np.uint8).reshape(len(whole), needed)
+        return frames.take(chosen, needed)
 
     @cached_property
-    def _frames(self) -> dict[_Key, list[tuple[float, str, bytes]]]:
-        """Time, bus and payload of all frames, by message."""
-        frames = defaultdict(list)
+    def _frames(self) -> dict[_Key, CanFrames]:
+        """All frames, by message; those of messages that are not wanted are left empty."""
+        frames: dict[_Key, CanFrames] = defaultdict(CanFrames)
         count = 0
         with reading_with(self._file, "can") as can, can.LogReader(self._file) as trace:
             self._require_whole(trace)
             for frame in trace:
                 if frame.is_error_frame or frame.is_remote_frame:
                     continue
+                found = frames[frame.arbitration_id, frame.is_extended_id]
+                if not self._is_wanted(frame.arbitration_id, frame.is_extended_id):
+                    continue
                 count += 1
                 if count > MAX_FRAMES:
                     raise InputError(
                         f"{shown(self._file)}: more than {MAX_FRAMES:,} frames. Split the trace."
                     )
-                key = (frame.arbitration_id, frame.is_extended_id)
-                frames[key].append((frame.timestamp, str(frame.channel), bytes(frame.data)))
+                found.append(frame.timestamp, str(frame.channel), frame.data)
         if not frames:
             raise InputError(f"{shown(self._file)}: there is no CAN frame in it. Record it again.")
         return dict(frames)
+
+    def _is_wanted(self, number: int, is_extended: bool) -> bool:
+        """Whether a column is of this message; all are wanted of who lists what is there."""
+        return self._wanted is None or (number, is_extended) in self._wanted
 
     def _require_whole(self, trace: Any) -> None:
         # A BLF file says how long it is; python-can reads what is there of one that was cut.

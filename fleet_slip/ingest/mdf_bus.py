@@ -14,6 +14,7 @@ import numpy as np
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.can_bus import CanBus
+from fleet_slip.ingest.can_frames import CanFrames
 from fleet_slip.ingest.can_trace import CanSource, parse_database
 from fleet_slip.ingest.columns import shown
 from fleet_slip.ingest.mdf import MdfSource, open_mdf
@@ -33,11 +34,11 @@ class MdfBus(CanSource):
         self._mdf = mdf
 
     @cached_property
-    def _frames(self) -> dict[tuple[int, bool], list[tuple[float, str, bytes]]]:
-        frames = defaultdict(list)
+    def _frames(self) -> dict[tuple[int, bool], CanFrames]:
+        frames: dict[tuple[int, bool], CanFrames] = defaultdict(CanFrames)
         for number, places in self._mdf.groups_with(f"{_FRAME}ID"):
             for key, frame in self._group(number, places):
-                frames[key].append(frame)
+                frames[key].append(*frame)
         if not frames:
             raise InputError(
                 f"{shown(self._file)}: there is no CAN frame in it ({_FRAME}ID). Map its channels "

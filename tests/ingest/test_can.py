@@ -16,7 +16,10 @@ from hypothesis import strategies as st
 
 from fleet_slip.errors import ConfigError, InputError
 from fleet_slip.ingest import MeasuredLog, load_mapping, read_measured
+from fleet_slip.ingest.can_bus import CanBus, read_can_database
 from fleet_slip.ingest.can_decoding import physical, raw_numbers
+from fleet_slip.ingest.can_frames import CanFrames
+from fleet_slip.ingest.can_trace import open_can_trace
 from tests.support.logs import without_names
 from tests.support.measured import ticks
 
@@ -294,3 +297,33 @@ def test_an_arxml_database_says_the_same(tmp_path: Path) -> None:
     log = read(file, text, arxml(tmp_path), "car.arxml")
     assert log.drives["ax"].to_pylist() == AX_COUNTS
     assert log.drives["sideslip"].to_pylist() == BETA_COUNTS
+
+
+@given(
+    st.lists(
+        st.tuples(st.floats(0, 9), st.sampled_from("ab"), st.binary(min_size=2, max_size=9)),
+        max_size=20,
+    )
+)
+def test_frames_that_are_kept_are_those_that_came(came: list[tuple[float, str, bytes]]) -> None:
+    frames = CanFrames()
+    for frame in came:
+        frames.append(*frame)
+    assert len(frames) == len(came)
+    assert list(frames.sizes) == [len(data) for _, _, data in came]
+    assert frames.buses == sorted({bus for _, bus, _ in came})
+    for bus in "ab":
+        times, payloads = frames.take(frames.are_on(bus), 2)
+        expected = [(time, data[:2]) for time, on, data in came if on == bus]
+        assert list(zip(times, map(bytes, payloads), strict=True)) == expected
+
+
+def test_a_trace_is_asked_for_one_message_after_the_other(tmp_path: Path) -> None:
+    frames = [motion(i) for i in range(50)] + [mux(i, 0, 1.0) for i in range(50)]
+    (tmp_path / "car.dbc").write_text(DBC)
+    bus = read_can_database(CanBus(database="car.dbc"), tmp_path)
+    with open_can_trace(write_trace(tmp_path, frames), bus) as source:
+        for column in ("Motion.ax", "Mux.yaw", "Motion.beta"):
+            (table,) = source.batches([column])
+            assert (table.height, table[column].null_count()) == (50, 0)
+        assert {channel.base for channel in source.channels()} == {"Motion", "Mux"}
