@@ -14,7 +14,16 @@ from hypothesis import strategies as st
 
 from fleet_slip.errors import InputError
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.ingest import csv_batches, drive_cutter, open_drives, read_measured, stream, writing
+from fleet_slip.ingest import (
+    csv_batches,
+    drive_cutter,
+    landing,
+    open_drives,
+    read_measured,
+    stream,
+    writing,
+)
+from fleet_slip.ingest import read_ahead as read_ahead_module
 from fleet_slip.ingest.csv_batches import PlainNumbers, open_csv
 from fleet_slip.ingest.csv_format import CsvFormat
 from fleet_slip.ingest.drive_cutter import DriveCutter
@@ -127,6 +136,33 @@ def test_what_lands_does_not_depend_on_the_size_of_data_files(
     assert logs["ax"].to_pylist() == whole.drives["ax"].to_pylist()
     assert sorted(refused["row"].to_pylist()) == [4, 71]
     assert not ingest_file(warehouse, tmp_path / "log.csv", a_mapping()).new
+
+
+@pytest.mark.parametrize("threads", [1, 4])
+@pytest.mark.parametrize("block_bytes", [200, 2**22])
+def test_the_bits_that_land_depend_on_neither_threads_nor_blocks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: int, block_bytes: int
+) -> None:
+    columns = good_columns(120)
+    columns["t"] = [f"{i / 100 + 5 * (i // 30):.2f}" for i in range(120)]
+    columns["ax"][70] = "broken"
+    (tmp_path / "log.csv").write_text(csv_text(columns))
+    monkeypatch.setattr(writing, "FILE_ROWS", 50)
+    expected = _land_in(tmp_path / "as it is", tmp_path / "log.csv")
+    monkeypatch.setattr(read_ahead_module, "WORKERS", threads)
+    monkeypatch.setattr(writing, "WRITERS", threads)
+    monkeypatch.setattr(landing, "WRITERS", threads)
+    monkeypatch.setattr(csv_batches, "BLOCK_BYTES", block_bytes)
+    assert _land_in(tmp_path / "otherwise", tmp_path / "log.csv") == expected
+    assert len(expected) == 3  # 4 drives in two files, and the quarantine
+
+
+def _land_in(root: Path, file: Path) -> list[str]:
+    """Return the names of the data files, which have the checksums of what is in them."""
+    warehouse = Warehouse(LocalFolder(root))
+    ingest_file(warehouse, file, a_mapping())
+    tables = (warehouse.logs, warehouse.quarantine)
+    return sorted(one.path for table in tables for one in table.snapshot().files)
 
 
 def test_nothing_is_left_of_a_file_that_fails_at_its_end(
