@@ -18,7 +18,7 @@ from fleet_slip.ingest.source import BASE, OWN_TIME, Channel, as_column, reading
 MAGICS = (b"MDF     ", b"UnFinMF ")
 _LARGEST_BLOCK, _LARGEST_RATIO = 2**30, 20_000
 """Bytes of one block of data, and how many times its size one may become."""
-WINDOW_RECORDS = 2**18
+WINDOW_RECORDS = 2**17
 """Records that are read at once. asammdf takes four times as long for a whole group."""
 _TIME_SYNC = 1
 _EARLIEST_S = 10**8

@@ -16,7 +16,7 @@ from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import require_columns, shown
 from fleet_slip.ingest.source import Channel
 
-BATCH_ROWS = 2**16
+BATCH_ROWS = 2**15
 """Parquet is read in batches of this many rows."""
 
 MAX_FOOTER_BYTES = 2**24
@@ -78,7 +78,10 @@ def _parquet_batches(
 ) -> Iterator[pl.DataFrame]:
     schema = pq.ParquetFile(stream).schema_arrow
     texts = [name for name in columns if _is_text(schema.field(name).type)]
-    parquet = pq.ParquetFile(stream, read_dictionary=texts, page_checksum_verification=True)
+    # Buffered before, the bytes of the whole file would stay in memory until its end.
+    parquet = pq.ParquetFile(
+        stream, read_dictionary=texts, page_checksum_verification=True, pre_buffer=False
+    )
     for batch in parquet.iter_batches(BATCH_ROWS, columns=list(columns)):
         plain = {name: plain_column(batch.column(name), name, file) for name in columns}
         yield pl.DataFrame(pa.table(plain))

@@ -59,7 +59,9 @@ class DataFiles:
     def _write(self, name: str, make: Callable[[], pa.Table]) -> list[AddAction]:
         rows = make()
         parts = _by_day(rows) if self._by_day else {None: rows}
-        return [self._table.write_file(name, part, day) for day, part in parts.items()]
+        encoded = {day: self._table.encode(part) for day, part in parts.items()}
+        del rows, parts  # a disk may take its time
+        return [self._table.put(name, content, day) for day, content in encoded.items()]
 
 
 class RefusedRows:
