@@ -5,12 +5,8 @@
 The cars are those of the campaign `fleet`, six days of which are simulated into the data root first
 if it is not there (a temporary one by default). In each draw two thirds of the cars train model 4
 of Table I, and a share of these lies about the label: it has a gain, an offset, or the
-other sign. The error is that on the other third, which is honest. "Left out" are the cars whose
-influence no honest car has: the root mean square, over all training rows, of how much the
-estimate changes when the car is taken out of the sums, exactly. Its logarithm lies above the
-cars' median by more than so many of their standard deviations (1.4826 times the median absolute
-deviation) that one car in a thousand would, were it normal. The car of the largest influence goes,
-until there is none.
+other sign. The error is that on the other third, which is honest. "Left out" are the cars that
+`select --robust` leaves out.
 """
 
 import argparse
@@ -21,25 +17,28 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
-from statistics import NormalDist, median
+from statistics import median
 
 import numpy as np
 
 import fleet_slip
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.regression.drive_moments import DriveMoments
 from fleet_slip.regression.exact import LinearModel, fit
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.gram import Gram, packed_position
+from fleet_slip.regression.gram_table import GramTable
+from fleet_slip.regression.influential import find_influential
 
 INPUTS = (
     *("ax", "ay", "yaw_rate", "steering_wheel"),
     *("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr"),
 )
 LABEL = catalogue().label
+SIGNALS = (*INPUTS, LABEL)
 DAYS = 6
 TRAINING = 2 / 3
-FALSE_ALARMS = 0.001
 LIES: dict[str, tuple[int, float]] = {
     "none": (1, 0.0),
     "gain 2": (2, 0.0),
@@ -136,41 +135,15 @@ def error_deg(model: LinearModel, gram: Gram) -> float:
 
 def left_out(cars: Sequence[Gram]) -> set[int]:
     """Return the cars whose influence no honest car has."""
-    out: set[int] = set()
-    limit = NormalDist().inv_cdf(1 - FALSE_ALARMS)
-    while len(out) < len(cars) // 10:
-        rest = [i for i in range(len(cars)) if i not in out]
-        logs = np.log(influences([cars[i] for i in rest]))
-        spread = 1.4826 * np.median(np.abs(logs - np.median(logs)))
-        worst = int(np.argmax(logs))
-        if logs[worst] <= np.median(logs) + limit * spread:
-            break
-        out.add(rest[worst])
-    return out
-
-
-def influences(cars: Sequence[Gram]) -> np.ndarray:
-    """Return the influence of each car: by subtracting it from the sums, no row is read again."""
-    every = total(cars)
-    whole = fit(every, INPUTS, LABEL).model
-    part = every.restrict(INPUTS)
-    moments = np.array([[part.n, *part.sums], *map(list, zip(part.sums, *part.raw(), strict=True))])
-    moments = np.array(moments, dtype=np.float64) / part.n
-    found = []
-    for car in cars:
-        other = fit(every - car, INPUTS, LABEL).model
-        change = np.array(
-            [
-                float(a - b)
-                for a, b in zip(
-                    (whole.intercept, *whole.coefficients),
-                    (other.intercept, *other.coefficients),
-                    strict=True,
-                )
-            ]
-        )
-        found.append(math.sqrt(max(change @ moments @ change, 1e-300)))
-    return np.array(found)
+    grams = [car.restrict(SIGNALS) for car in cars]
+    table = GramTable(
+        SIGNALS,
+        np.array([gram.n for gram in grams]),
+        np.array([gram.sums for gram in grams]),
+        np.array([gram.products for gram in grams]),
+    )
+    found = find_influential(DriveMoments.of(table), np.arange(len(cars)))
+    return {one.car for one in found}
 
 
 if __name__ == "__main__":

@@ -51,6 +51,7 @@ class FleetCohort(Rooted):
         criterion: str | None = None,
         worth: str = "0.005deg",
         all_subsets: bool = False,
+        robust: bool = False,
         naive: bool = False,
         cluster: "ClusterUnit | None" = None,
         intercept: bool = True,
@@ -75,6 +76,8 @@ class FleetCohort(Rooted):
             criterion: what decides how many of the ranked inputs are kept: `cv`, `bic` ...
             worth: the smallest gain in RMSE that is worth a signal, such as `0.005deg` or `2%`.
             all_subsets: search all subsets of the inputs of `nested` instead of an order.
+            robust: leave out the cars whose influence on the model no honest car has; they are
+                `left_out` of the answer, and its cohort names them.
             naive: take rows for independent evidence, not drives or cars.
             cluster: what is independent evidence, `vehicle` or `drive`; by default cars where there
                 are several.
@@ -102,6 +105,7 @@ class FleetCohort(Rooted):
             criterion=criterion,
             worth=worth,
             all_subsets=all_subsets,
+            robust=robust,
             naive=naive,
             cluster=cluster,
             intercept=intercept,

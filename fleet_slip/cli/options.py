@@ -69,6 +69,10 @@ SELECTION: dict[str, Any] = {
     "all_subsets": typer.Option(
         "--all-subsets", help="Search all subsets of the inputs of --nested instead of an order."
     ),
+    "robust": typer.Option(
+        "--robust",
+        help="Leave out the cars whose influence on the model no honest car has, and say which.",
+    ),
     "naive": typer.Option(
         "--naive",
         help="Take rows for independent evidence, not drives or cars. At 100 Hz they are not: "

@@ -76,15 +76,7 @@ def print_selection(selection: Selection[Any]) -> None:
         ],
         left=1 + listed,
     )
-    if without_log := selection.cohort.members.count_received:
-        say(f"{number_of(without_log, 'drive')} of these without a log: their cars sent Gram rows.")
-    if left_out := selection.cohort.left_out:
-        say(
-            f"{number_of(left_out, 'drive')} without a log left out: cars send Gram rows of the "
-            f"logged signals, not of the feature set {selection.cohort.feature_set}."
-        )
-    for car, drives in selection.cohort.revoked.items():
-        say(f"{number_of(drives, 'drive')} of {car} left out: a key of it was revoked.")
+    _say_left_out(selection)
     if selection.folds.by in (PARTS, BANDS):
         _print_folds(selection.winner.model)
     if selection.folds.by == ROW_FOLDS:
@@ -103,6 +95,22 @@ def print_selection(selection: Selection[Any]) -> None:
         _print_honest(selection.choice.honest)
     if selection.uncertainty is not None:
         _print_uncertainty(selection.uncertainty)
+
+
+def _say_left_out(selection: Selection[Any]) -> None:
+    """Say which drives of the cohort the models were not made of, and which have no log."""
+    if without_log := selection.cohort.members.count_received:
+        say(f"{number_of(without_log, 'drive')} of these without a log: their cars sent Gram rows.")
+    if left_out := selection.cohort.left_out:
+        say(
+            f"{number_of(left_out, 'drive')} without a log left out: cars send Gram rows of the "
+            f"logged signals, not of the feature set {selection.cohort.feature_set}."
+        )
+    for car, drives in selection.cohort.revoked.items():
+        say(f"{number_of(drives, 'drive')} of {car} left out: a key of it was revoked.")
+    if isinstance(selection, RequestedSelection):
+        for car, times in selection.left_out.items():
+            say(f"{car} left out: its influence on the model is {times:.0f} times the median one.")
 
 
 def _print_folds(model: CrossValidation) -> None:

@@ -13,6 +13,7 @@ from fleet_slip.grams.folding import EACH, ROW_FOLDS, Folding, make_folding
 from fleet_slip.regression.nested_choice import Rule
 from fleet_slip.regression.stepwise import METHODS
 from fleet_slip.selection.compare import Selection, select
+from fleet_slip.selection.influential_cars import influential_cars, without_vehicles
 from fleet_slip.selection.inputs import WHOLE_SET, inputs_of, require_inputs
 from fleet_slip.selection.model_list import (
     CandidateModel,
@@ -44,6 +45,8 @@ def answer_request(warehouse: Warehouse, request: SelectionRequest) -> Requested
     model_list = _given(request) or (load_model_list(name) if name else None)
     folds = _folding(request, model_list)
     feature_set = _feature_set(request, model_list)
+    if request.robust:
+        return _answer_without(warehouse, request, model_list, feature_set)
     distances = bool(request.nested and not request.ordered and not _search_of(request, model_list))
     if not (request.ordered or request.resampled or distances):
         return _compare_listed(
@@ -73,6 +76,24 @@ def answer_request(warehouse: Warehouse, request: SelectionRequest) -> Requested
         intercept=request.intercept,
     )
     return replace(answer, uncertainty=figures)
+
+
+def _answer_without(
+    warehouse: Warehouse,
+    request: SelectionRequest,
+    model_list: ModelList | None,
+    feature_set: str,
+) -> RequestedSelection:
+    """Select without the cars of unusual influence on a model of all inputs that are compared."""
+    cohort = load_cohort(warehouse, request.cohort, feature_set)
+    inputs = inputs_of(cohort, request.nested or WHOLE_SET)
+    if model_list and model_list.model and not (request.nested or request.search):
+        listed = {name for one in model_list.model for name in one.signals}
+        inputs = tuple(name for name in cohort.inputs if name in listed)
+    left_out = influential_cars(cohort, inputs)
+    condition = without_vehicles(cohort.condition, left_out)
+    answer = answer_request(warehouse, replace(request, cohort=condition.text, robust=False))
+    return replace(answer, left_out=left_out)
 
 
 def _given(request: SelectionRequest) -> ModelList | None:

@@ -1,6 +1,7 @@
 """What to select, as it is asked for on the command line."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
@@ -27,6 +28,7 @@ class SelectionRequest:
         rank, criterion: rank the inputs of `nested` first; choose by a criterion.
         all_subsets: choose among the best subsets of `nested` instead of an order's.
         worth: gain in RMSE for which cross-validation keeps a signal, such as `0.005deg` or `2%`.
+        robust: leave out the cars whose influence on the model is unusual.
         naive: take rows for independent instead of drives or cars.
         cluster: what is independent; by default cars where there are several, else drives.
         intercept: whether models have one; without it they go through the origin.
@@ -45,6 +47,7 @@ class SelectionRequest:
     criterion: str | None = None
     worth: str = WORTH
     all_subsets: bool = False
+    robust: bool = False
     naive: bool = False
     cluster: ClusterUnit | None = None
     intercept: bool = True
@@ -101,10 +104,16 @@ class RequestedSelection(Selection[Any]):
     Attributes:
         model_list: what was compared, such as `table1`.
         config_sha256: checksum of all that says what to compare.
+        left_out: the cars that `robust` left out, and their influence as a multiple of the median.
     """
 
     model_list: str
     config_sha256: str
+    left_out: Mapping[str, float] = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `select --json` prints."""
+        return {**super().as_dict(), "vehicles_left_out": dict(self.left_out)}
 
     @classmethod
     def of(

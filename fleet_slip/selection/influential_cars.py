@@ -1,0 +1,32 @@
+"""Which cars of a cohort have an influence on a model that no honest car has."""
+
+from collections.abc import Collection, Sequence
+
+import numpy as np
+
+from fleet_slip.grams.cohort import Cohort
+from fleet_slip.grams.training import clustered_moments
+from fleet_slip.regression.influential import find_influential
+from fleet_slip.warehouse.condition import Condition, parse_condition
+
+
+def influential_cars(cohort: Cohort, inputs: Sequence[str]) -> dict[str, float]:
+    """Return the cars of unusual influence, and how many times the median influence theirs is.
+
+    Drives that name no car are never left out. Raises `DataError` if no drive has all inputs, and
+    for fewer cars than tell what is usual.
+    """
+    served = cohort.serving(inputs)
+    owners = np.array([name or "" for name in served.drives["vehicle_id"].to_pylist()])
+    names, cars = np.unique(owners, return_inverse=True)
+    found = find_influential(clustered_moments(served, "drive"), cars.astype(np.int64))
+    return {str(names[one.car]): one.times for one in found if names[one.car]}
+
+
+def without_vehicles(condition: Condition, vehicles: Collection[str]) -> Condition:
+    """Return a condition on drives that is not true of those of some cars."""
+    if not vehicles:
+        return condition
+    quoted = ", ".join("'" + name.replace("'", "''") + "'" for name in sorted(vehicles))
+    others = f"(vehicle_id IS NULL OR vehicle_id NOT IN ({quoted}))"
+    return parse_condition(f"{condition.sql} AND {others}")

@@ -1,0 +1,83 @@
+"""Cars of unusual influence: leave-one-out by subtraction is leave-one-out by rows."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fleet_slip.errors import DataError
+from fleet_slip.regression.drive_moments import DriveMoments
+from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.influential import LEAST_CARS, find_influential
+from tests.support.counts import table_of
+
+SIGNALS = ("a", "b", "y")
+
+
+def rows_of(seed: int, cars: int = 30, rows: int = 60) -> list[np.ndarray]:
+    """Counts of honest cars: y is a sum of a and b, with noise and a little of each car."""
+    random = np.random.default_rng(seed)
+    found = []
+    for _ in range(cars):
+        x = random.integers(-2000, 2000, (rows, 2))
+        y = x @ (0.5, -0.3) + random.normal(0, 30, rows) + random.normal(0, 5)
+        found.append(np.column_stack([x, np.rint(y)]).astype(np.int64))
+    return found
+
+
+def found_in(cars: list[np.ndarray]) -> dict[int, float]:
+    moments = DriveMoments.of(table_of([Gram.from_counts(SIGNALS, rows) for rows in cars]))
+    return {one.car: one.times for one in find_influential(moments, np.arange(len(cars)))}
+
+
+def influence_by_rows(cars: list[np.ndarray], left: int) -> float:
+    """Fit all rows, and all but those of a car, by numpy's least squares."""
+    every = np.concatenate(cars)
+    others = np.concatenate([rows for i, rows in enumerate(cars) if i != left])
+    fits = [
+        np.linalg.lstsq(np.column_stack([np.ones(len(r)), r[:, :2]]), r[:, 2], rcond=None)[0]
+        for r in (every, others)
+    ]
+    change = np.column_stack([np.ones(len(every)), every[:, :2]]) @ (fits[0] - fits[1])
+    return float(np.sqrt(np.mean(change**2)))
+
+
+@settings(max_examples=10)
+@given(st.integers(0, 100))
+def test_the_multiple_of_the_median_is_that_of_fits_to_rows(seed: int) -> None:
+    cars = rows_of(seed)
+    cars[4][:, 2] *= -1
+    found = found_in(cars)
+    assert 4 in found
+    by_rows = [influence_by_rows(cars, i) for i in range(len(cars))]
+    assert found[4] == pytest.approx(by_rows[4] / float(np.exp(np.median(np.log(by_rows)))))
+
+
+def test_an_input_that_repeats_another_changes_nothing() -> None:
+    cars = rows_of(3)
+    cars[7][:, 2] += 4000
+    doubled = [np.column_stack([rows[:, 0], rows]) for rows in cars]
+    table = table_of([Gram.from_counts(("c", *SIGNALS), rows) for rows in doubled])
+    found = find_influential(DriveMoments.of(table), np.arange(len(cars)))
+    assert {one.car: pytest.approx(one.times, rel=1e-6) for one in found} == found_in(cars)
+
+
+def test_several_drives_of_a_car_are_one_car() -> None:
+    cars = rows_of(5)
+    cars[2][:, 2] *= -1
+    halves = [half for rows in cars for half in np.array_split(rows, 2)]
+    moments = DriveMoments.of(table_of([Gram.from_counts(SIGNALS, rows) for rows in halves]))
+    found = find_influential(moments, np.repeat(np.arange(len(cars)), 2))
+    assert {one.car: pytest.approx(one.times) for one in found} == found_in(cars)
+
+
+def test_at_most_a_tenth_is_left_out() -> None:
+    cars = rows_of(1, cars=40)
+    for car in range(6):
+        cars[car][:, 2] *= -1 - car
+    assert len(found_in(cars)) <= 4
+
+
+def test_few_cars_do_not_tell_what_is_usual() -> None:
+    with pytest.raises(DataError, match=f"takes {LEAST_CARS} of them, and these drives are of 5"):
+        found_in(rows_of(1, cars=5))
