@@ -15,6 +15,7 @@ from fleet_slip.api.calls import (
     within_reach,
 )
 from fleet_slip.api.root import Rooted
+from fleet_slip.progress import Progress, no_progress
 from fleet_slip.runs.log import step
 
 if TYPE_CHECKING:
@@ -116,8 +117,8 @@ class Filling(Rooted):
         any depth, and of a pattern what matches, but for those that have landed before and have
         not changed; with `as_one` they are parts of one log, whose drives go on from file to file.
         Returns a report of each file that was read, in their order; `each` is called with it once
-        the file is committed. Progress is in files. Without a cluster they are read one after the
-        other.
+        the file is committed. Progress is in files for folders and patterns, else in rows, where a
+        format tells about how many there are. Without a cluster they are read one after the other.
 
         Raises `ConfigError` for a mapping that is not valid; `InputError`, when all others are in,
         for files that cannot be used, of which nothing is written; `StorageError` and
@@ -146,13 +147,16 @@ class Filling(Rooted):
                 wanted = known.without_landed(paths, warehouse)
             if landed := len(paths) - len(wanted):
                 told(landed, len(paths))
+            by_file = folders and not as_one
+            rows = no_progress if by_file or progress is None else _rows_of(wanted, told)
             try:
-                for report in ingest_files(warehouse, wanted, plan, elsewhere, known):
+                for report in ingest_files(warehouse, wanted, plan, elsewhere, known, rows):
                     reports[report.file] = report
                     figures.rows += report.counts.ticks if report.new else 0
                     if each is not None:
                         each(report)
-                    told(1, len(paths))
+                    if by_file:
+                        told(1, len(paths))
             finally:
                 if known is not None:
                     known.save(warehouse)
@@ -246,3 +250,19 @@ class Filling(Rooted):
             report = migrate(self.warehouse, count_from_start(progress))
             figures.rows = report.rows_rewritten
         return report
+
+
+def _rows_of(logs: Iterable[Path], told: Progress) -> Progress:
+    """Return what counts the rows read of each log among about so many that all have."""
+    from fleet_slip.ingest.expected_rows import expected_rows
+
+    total = sum(map(expected_rows, logs))
+    left = total
+
+    def count(more: int, _of_one: int) -> None:
+        nonlocal left
+        more = min(more, left)  # a guess may be too low, and a batch is written again at a conflict
+        left -= more
+        told(more, total)
+
+    return count

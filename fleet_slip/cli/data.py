@@ -2,7 +2,6 @@
 
 import logging
 import sys
-from contextlib import ExitStack
 from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -166,8 +165,10 @@ def ingest(
         raise UsageError("--as-one takes folders, whose files are parts of one log.")
     folders = any(file.is_dir() or is_pattern(file) for file in files) and not as_one
     each = Remarks(quiet=json or folders)
-    with recording(fleet.root, "ingest", sys.argv[1:]), ExitStack() as shown:
-        show = shown.enter_context(progress("ingest", "files")) if folders else None
+    with (
+        recording(fleet.root, "ingest", sys.argv[1:]),
+        progress(*(("ingest", "files") if folders else ("read", "rows"))) as show,
+    ):
         reports = fleet.ingest(
             files, mapping, as_one=as_one, workers=cluster, each=each, progress=show
         )

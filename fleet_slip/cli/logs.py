@@ -4,6 +4,8 @@ import json
 import logging
 import sys
 import textwrap
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from enum import StrEnum
 from typing import Any
@@ -24,9 +26,24 @@ class LogFormat(StrEnum):
     JSON = "json"
 
 
+_drawn_on: list[Console] = []
+
+
 def stderr() -> Console:
-    """Return a console for progress and remarks."""
+    """Return a console for progress and remarks: that on which a bar is drawn, if there is one."""
+    if _drawn_on:
+        return _drawn_on[-1]
     return Console(stderr=True, highlight=False, emoji=False, soft_wrap=True)
+
+
+@contextmanager
+def drawing_on(console: Console) -> Iterator[None]:
+    """Print remarks above what is drawn on a console, not into it."""
+    _drawn_on.append(console)
+    try:
+        yield
+    finally:
+        _drawn_on.remove(console)
 
 
 def wrapped(text: str, width: int) -> str:

@@ -20,7 +20,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from fleet_slip.cli.logs import for_people, stderr
+from fleet_slip.cli.logs import drawing_on, for_people, stderr
 from fleet_slip.cli.output import say
 from fleet_slip.runs.log import log_event
 from fleet_slip.words import number_of
@@ -108,7 +108,7 @@ def progress_of_steps(
             log_event("progress", doing=doing, done=done, total=total, workers=workers, **rate)
 
     try:
-        with bar:
+        with drawing_on(console), bar:
             if first is not None:
                 begun[first] = begin(first)
             yield show

@@ -15,6 +15,7 @@ from fleet_slip.ingest.look_alikes import find_vehicles_like
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.suspicion import Suspicion
 from fleet_slip.ingest.totals import IngestCounts
+from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.tables import Warehouse
 from fleet_slip.words import number_of
 
@@ -73,16 +74,20 @@ def ingest_files(
     mapping: Mapping,
     executor: Executor | None = None,
     known: KnownFiles | None = None,
+    progress: Progress = no_progress,
 ) -> Iterator[IngestReport]:
     """Ingest files, and yield a report of each as it is committed; small files land together.
 
     With an executor batches are read and written by its workers, in any order. `known` remembers
-    what landed, and refuses a file that has changed since.
+    what landed, and refuses a file that has changed since. `progress` counts rows of each file as
+    it is read, but for those that an executor's workers read.
 
     A file that is not usable does not hold up the others: when they are done `InputError` tells
     of it. Raises `ClusterError` at the end for files that workers died of.
     """
     write = partial(write_batch, warehouse, mapping)
+    if executor is None:
+        write = partial(write, progress=progress)
     warehouse.logs.require_writable(mapping.signals)
     failures: list[InputError] = []
     asked = (AskedFile(file, known.digest_of(file) if known else None) for file in files)

@@ -26,6 +26,7 @@ from fleet_slip.ingest.writing import (
     TableName,
     WrittenFile,
 )
+from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.audit import Audit
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -91,13 +92,16 @@ def unit_of(digest: str) -> Unit:
 
 
 def write_batch(
-    warehouse: Warehouse, mapping: Mapping, files: tuple[AskedFile, ...]
+    warehouse: Warehouse,
+    mapping: Mapping,
+    files: tuple[AskedFile, ...],
+    progress: Progress = no_progress,
 ) -> WrittenBatch:
     """Read files, and write their rows together: one data file a day. Nothing is committed.
 
     A file that cannot be used is a failure of its own, and nothing of it is written. What landed
     before is not written again. The longest drive of what is new is looked at: one of a batch, so
-    that a folder of small files is not held up.
+    that a folder of small files is not held up. `progress` counts rows of each file.
     """
     longest: tuple[int, MeasuredDrive] | None = None
     outcomes: list[FileOutcome] = []
@@ -122,7 +126,7 @@ def write_batch(
                         and not landed[name](unit_of(stream.digest).name)
                     ]
                     missing = missing if "logs" in missing else []
-                    written = FileWriter(warehouse, stream, missing, threads).write()
+                    written = FileWriter(warehouse, stream, missing, threads, progress).write()
             except InputError as error:
                 failures.append(error)
                 continue

@@ -15,9 +15,11 @@ import pyarrow.compute as pc
 from deltalake.transaction import AddAction
 
 from fleet_slip.delta import Table
+from fleet_slip.ingest.expected_rows import expected_rows
 from fleet_slip.ingest.forgotten import keep_drives, keep_refused
 from fleet_slip.ingest.measured_drives import MeasuredDrive, log_table
 from fleet_slip.ingest.stream import MeasuredStream
+from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.audit import Audit
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA, Warehouse
 
@@ -130,8 +132,13 @@ class FileWriter:
         stream: MeasuredStream,
         missing: Collection[TableName],
         threads: ThreadPoolExecutor,
+        progress: Progress = no_progress,
     ) -> None:
-        """Take an open file, the tables that miss it, and the threads that write."""
+        """Take an open file, the tables that miss it, and the threads that write.
+
+        `progress` counts rows of the file, if it is known about how many it has.
+        """
+        self._progress = progress
         self._stream, self._missing = stream, missing
         self._audit = Audit(warehouse.root)
         self._large: dict[TableName, DataFiles] = {
@@ -155,7 +162,12 @@ class FileWriter:
     def _read(self) -> None:
         refused = RefusedRows(self._stream)
         waiting: list[MeasuredDrive] = []
+        expected, read = expected_rows(self._stream.file), 0
         for piece in self._stream.pieces():
+            rows = self._stream.checker.rows
+            if expected:
+                self._progress(rows - read, max(expected, rows))
+            read = rows
             refused.add(piece.refused)
             for drive in piece.drives:
                 waiting.append(drive)

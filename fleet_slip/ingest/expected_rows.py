@@ -1,0 +1,35 @@
+"""How many rows a measured log may have, before it is read: for its progress."""
+
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from fleet_slip.errors import InputError
+from fleet_slip.ingest.log_files import parts_of
+from fleet_slip.ingest.parquet_batches import PARQUET_MAGIC
+
+_SAMPLE_BYTES = 2**18
+
+
+def expected_rows(log: Path) -> int:
+    """Return about how many rows a log has; 0 where that is not known before all is read.
+
+    A Parquet file says it, text has the lines of its begin throughout. Never raises for what is
+    wrong with the log: who reads it does.
+    """
+    try:
+        return sum(map(_expected, parts_of(log)))
+    except (InputError, OSError, pa.ArrowException):
+        return 0
+
+
+def _expected(file: Path) -> int:
+    with file.open("rb") as stream:
+        sample = stream.read(_SAMPLE_BYTES)
+    if sample.startswith(PARQUET_MAGIC):
+        return int(pq.read_metadata(file).num_rows)
+    lines = sample.count(b"\n")
+    if b"\0" in sample or not lines:
+        return 0
+    return round(file.stat().st_size * lines / len(sample))
