@@ -146,7 +146,8 @@ def test_drives_of_a_car_are_one_piece_of_evidence_unless_told_otherwise() -> No
         assert found.robust.degrees_of_freedom == len(set(groups)) - 1
         assert found.evidence.kind == f"{cluster}s"
     assert diagnose(cohort, INPUTS).cluster == "vehicle"
-    one_car = cohort.drives.set_column(2, "vehicle_id", pa.array(["a"] * len(drives)))
+    at = cohort.drives.schema.get_field_index("vehicle_id")
+    one_car = cohort.drives.set_column(at, "vehicle_id", pa.array(["a"] * len(drives)))
     assert diagnose(replace(cohort, drives=one_car), INPUTS).cluster == "drive"
 
 

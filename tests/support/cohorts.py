@@ -61,6 +61,7 @@ def cohort_of(
     columns = {
         "drive_id": [one.drive for one in drives],
         "trip": [one.drive for one in drives],
+        "source": ["simulated"] * len(drives),
         "vehicle_id": [f"car-{i % 4}" for i in range(len(drives))],
         "track": [f"track-{i % 2}" for i in range(len(drives))],
         "day": days,
