@@ -1,5 +1,6 @@
 """Forgets drives by what their owner calls them, or by the file that they came in."""
 
+from collections.abc import Iterator
 from typing import Literal, TypeAlias
 
 import pyarrow as pa
@@ -51,16 +52,21 @@ def _drives_called(
     with connect(warehouse.root, query="drives") as database:
         statement = f"SELECT DISTINCT drive_id FROM drives WHERE {calling} = $value"
         found = {name for (name,) in database.execute(statement, {"value": value}).fetchall()}
-    grams = warehouse.grams
-    tables = [grams.read(file.path) for file in grams.snapshot().files]
-    if old:
-        for table in (warehouse.logs, warehouse.grams):
-            tables += [one.rows for one in read_old_files(table.snapshot())]
-    for rows in tables:
+    for rows in _named_rows(warehouse, calling, old=old):
         if calling in rows.column_names:
             mine = pc.equal(rows[calling].cast(pa.string()), value)
             found.update(rows["drive_id"].filter(mine).cast(pa.string()).unique().to_pylist())
     return frozenset(found)
+
+
+def _named_rows(warehouse: Warehouse, calling: Calling, *, old: bool) -> Iterator[pa.Table]:
+    grams = warehouse.grams
+    for file in grams.snapshot().files:
+        if calling in grams.read_metadata(file.path).schema.to_arrow_schema().names:
+            yield grams.read(file.path, ["drive_id", calling])
+    if old:
+        for table in (warehouse.logs, warehouse.grams):
+            yield from (one.rows for one in read_old_files(table.snapshot()))
 
 
 def _together(reports: list[ForgetReport]) -> ForgetReport:
