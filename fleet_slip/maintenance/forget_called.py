@@ -70,6 +70,7 @@ def _named_rows(warehouse: Warehouse, calling: Calling, *, old: bool) -> Iterato
 
 
 def _together(reports: list[ForgetReport]) -> ForgetReport:
+    """Return one report of all; what may still have the rows of any of the drives is pending."""
     return ForgetReport(
         drives=sum(one.drives for one in reports),
         rows=sum(one.rows for one in reports),
@@ -77,6 +78,6 @@ def _together(reports: list[ForgetReport]) -> ForgetReport:
         files_removed=sum(one.files_removed for one in reports),
         models=tuple(sorted({name for one in reports for name in one.models})),
         old_files_deleted=sum(one.old_files_deleted for one in reports),
-        old_files_left=reports[-1].old_files_left,
-        pending=reports[-1].pending,
+        old_files_left=max(one.old_files_left for one in reports),
+        pending=tuple(dict.fromkeys(name for one in reports for name in one.pending)),
     )

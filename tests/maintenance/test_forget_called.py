@@ -1,7 +1,9 @@
 """Drives are forgotten by what their owner calls them, and by the file that they came in."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -9,6 +11,8 @@ import fleet_slip
 from fleet_slip import Fleet
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.ingest import Mapping
+from fleet_slip.maintenance import forget_called
+from fleet_slip.maintenance.forget import ForgetReport, forget
 from tests.support.commands import RunCommand
 from tests.support.measured import a_mapping, csv_text, good_columns
 
@@ -70,6 +74,22 @@ def test_every_drive_of_a_file_goes_and_does_not_come_back(
     # The old files still tell the name: --now finds them when the command is repeated.
     assert run_command("forget", "--source-file", "log-0.csv", "--now").exit_code == 0
     assert b"slalom" not in bytes_below(fleet)
+
+
+def test_what_may_have_the_rows_of_any_of_the_drives_is_pending(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first drive's files were forgotten about where the last drive had none: exit code 0."""
+    left = iter((2, 0))
+
+    def first_one_is_pending(*words: Any, **options: Any) -> ForgetReport:
+        number = next(left)
+        report = forget(*words, **options)
+        return replace(report, old_files_left=number, pending=("logs/x.parquet",) * (number > 0))
+
+    monkeypatch.setattr(forget_called, "forget", first_one_is_pending)
+    report = fleet.forget(drive_name="lap", now=True)
+    assert (report.drives, report.old_files_left, report.pending) == (2, 2, ("logs/x.parquet",))
 
 
 def test_a_name_that_no_drive_has_is_a_wrong_question(
