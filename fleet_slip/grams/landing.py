@@ -1,33 +1,22 @@
-"""Lands messages of cars in the table `grams`, once: which of them are new, and committing them."""
+"""Lands messages of cars in the table `grams`, once."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import chain
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
-from fleet_slip.arrays import BoolArray, IntArray
-from fleet_slip.catalogue.feature_sets import PLAIN
-from fleet_slip.catalogue.features import features
-from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.catalogue.sources import RECEIVED, RECEIVED_FILES
-from fleet_slip.delta import Change, Snapshot, TableFile, Unit
-from fleet_slip.grams.gram_files import files_to_rewrite, is_of_received, rows_to_keep, write_rows
-from fleet_slip.grams.gram_rows import by_signals, gram_table
-from fleet_slip.grams.received_rows import ReceivedRows, Refused, is_received, signals_of
-from fleet_slip.grams.same_drives import content_keys
-from fleet_slip.warehouse.audit import Audit, Barred
-from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA, Warehouse, gram_schema
+from fleet_slip.delta import Change, Unit
+from fleet_slip.grams.gram_files import files_to_rewrite, rows_to_keep, write_rows
+from fleet_slip.grams.new_messages import NewMessages
+from fleet_slip.grams.received_rows import Refused
+from fleet_slip.grams.received_table import received_table
+from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA, Warehouse
 
 ONE_AT_A_TIME = "receive"
 """Unit that every commit of received rows lands: two at once, which could bring the same message,
 are a conflict."""
-
-CONTRADICTS = "contradicts another message of its drive"
-HAS_LOG = "has a drive whose log is here"
 
 
 @dataclass(frozen=True)
@@ -41,203 +30,6 @@ class MessageFile:
     def unit(self) -> Unit:
         """The unit."""
         return Unit(f"receive/{self.digest}", 1)
-
-
-@dataclass(frozen=True)
-class Landing:
-    """What of some files lands on a snapshot of the Gram rows.
-
-    Attributes:
-        grams: the snapshot.
-        new: rows that it lacks, by their signals.
-        refused: what goes to the quarantine.
-        duplicates, forgotten: the file of each row that it has, and that is of a car or a drive
-            that was forgotten.
-    """
-
-    grams: Snapshot
-    new: Sequence[ReceivedRows]
-    refused: Sequence[Refused]
-    duplicates: IntArray
-    forgotten: IntArray
-
-
-def choose_rows(
-    warehouse: Warehouse, rows: Sequence[ReceivedRows], refused: Sequence[Refused]
-) -> Landing:
-    """Return what of some rows is new, and what contradicts what is there."""
-    grams = warehouse.grams.snapshot()
-    # Asked after the snapshot: who forgets a car from now on makes this commit a conflict.
-    barred = _barred(Audit(warehouse.root), rows, refused)
-    wrong = [one for one in refused if not _is_barred(one, barred)]
-    forgotten = [one.file for one in refused if _is_barred(one, barred)]
-    kept = []
-    for some in rows:
-        out = _are_barred(some, barred)
-        forgotten += some.file[out].tolist()
-        kept.append(some.take(~out))
-    drives = [_Drives.of(some) for some in kept if len(some)]
-    _look_up(grams, drives)
-    _mark_logged(grams, drives)
-    duplicates: list[IntArray] = []
-    new: list[ReceivedRows] = []
-    for one in drives:
-        fresh, same, logged = one.compare()
-        wrong += one.rows.refuse(logged, HAS_LOG)
-        wrong += one.rows.refuse(~(fresh | same | logged), CONTRADICTS)
-        duplicates.append(one.rows.file[same])
-        new += [one.rows.take(fresh)] if fresh.any() else []
-    return Landing(
-        grams,
-        new,
-        wrong,
-        np.concatenate([*duplicates, np.empty(0, np.int64)]),
-        np.array(forgotten, np.int64),
-    )
-
-
-def _barred(audit: Audit, rows: Sequence[ReceivedRows], refused: Sequence[Refused]) -> Barred:
-    if not audit.entries():
-        return Barred()
-    vehicles = {one.vehicle_id for one in refused if one.vehicle_id}
-    drives = {one.drive_id for one in refused if one.drive_id}
-    for some in rows:
-        vehicles.update(some.vehicle_ids.unique().to_pylist())
-        drives.update(some.drive_ids.unique().to_pylist())
-    return audit.barred(vehicles, drives)
-
-
-def _is_barred(one: Refused, barred: Barred) -> bool:
-    return one.vehicle_id in barred.vehicles or one.drive_id in barred.drives
-
-
-def _are_barred(rows: ReceivedRows, barred: Barred) -> BoolArray:
-    if not barred:
-        return np.zeros(len(rows), dtype=np.bool_)
-    vehicles, drives = (
-        pa.array(sorted(names), pa.string()) for names in (barred.vehicles, barred.drives)
-    )
-    found = pc.or_(pc.is_in(rows.vehicle_ids, vehicles), pc.is_in(rows.drive_ids, drives))
-    return np.asarray(found.to_numpy(zero_copy_only=False), dtype=np.bool_)
-
-
-@dataclass
-class _Drives:
-    """Messages of the same signals by their drives, and what the table has of these.
-
-    Attributes:
-        rows: the messages.
-        ids: the drives, each once.
-        drive: of each message, its place in `ids`.
-        first: of each drive, its first message.
-        logged: of each drive, whether its log is here.
-        known: of a drive, by its place, n, sums and products that the table has.
-    """
-
-    rows: ReceivedRows
-    ids: pa.StringArray
-    drive: IntArray
-    first: IntArray
-    logged: BoolArray
-    known: list[tuple[IntArray, IntArray, IntArray]] = field(default_factory=list)
-
-    @classmethod
-    def of(cls, rows: ReceivedRows) -> "_Drives":
-        coded = rows.drive_ids.dictionary_encode()
-        drive = coded.indices.to_numpy().astype(np.int64)
-        _, first = np.unique(drive, return_index=True)
-        return cls(rows, coded.dictionary, drive, first, np.zeros(len(first), dtype=np.bool_))
-
-    def compare(self) -> tuple[BoolArray, BoolArray, BoolArray]:
-        """Return which messages are new, which are here already, and which have a log here.
-
-        What is none of these contradicts what is here, or a message before it.
-        """
-        logged = self.logged[self.drive]
-        there = np.zeros(len(self.ids), dtype=np.bool_)
-        same = np.zeros(len(self.rows), dtype=np.bool_)
-        at = np.full(len(self.ids), -1, dtype=np.int64)
-        for drives, n, numbers in self.known:
-            there[drives] = True
-            at[drives] = np.arange(len(drives))
-            mine = np.flatnonzero(at[self.drive] >= 0)
-            its = at[self.drive[mine]]
-            same[mine] = self._equal(mine, n[its], numbers[its])
-            at[drives] = -1
-        fresh = np.zeros(len(self.rows), dtype=np.bool_)
-        fresh[self.first] = True
-        fresh &= ~there[self.drive] & ~logged
-        again = np.flatnonzero(~fresh & ~there[self.drive] & ~logged)
-        before = self.first[self.drive[again]]
-        same[again] = self._equal(again, self.rows.n[before], self.rows.numbers[before])
-        return fresh, same & ~logged, logged
-
-    def _equal(self, mine: IntArray, n: IntArray, numbers: IntArray) -> BoolArray:
-        equal = (self.rows.numbers[mine] == numbers).all(axis=1)
-        found: BoolArray = equal & (self.rows.n[mine] == n)
-        return found
-
-
-def _look_up(grams: Snapshot, drives: Sequence[_Drives]) -> None:
-    """Tell messages by their drives what a snapshot of the Gram rows has of these."""
-    if not drives:
-        return
-    by_name = {signals_of(one.rows.mask): one for one in drives}
-    wanted = pa.concat_arrays([one.ids for one in drives]).unique()
-    for rows in _rows_with(grams, "drive_id", wanted, grams.files):
-        came = is_received(rows)
-        logged = rows.filter(pc.invert(came))["drive_id"].cast(pa.string()).unique()
-        for one in drives:
-            one.logged |= pc.is_in(one.ids, logged).to_numpy(zero_copy_only=False)
-        for batch in rows.filter(came).combine_chunks().to_batches():
-            for signals, some, _ in by_signals(batch):
-                if mine := by_name.get(signals):
-                    mine.known += _known(mine, signals, some)
-
-
-def _mark_logged(grams: Snapshot, drives: Sequence[_Drives]) -> None:
-    """Tell messages whose car has a log of the same day with the very same Gram row."""
-    if not drives:
-        return
-    cars = pa.concat_arrays([one.rows.vehicle_ids for one in drives]).unique()
-    contents: set[bytes] = set()
-    of_logs = [file for file in grams.files if not is_of_received(file)]
-    for rows in _rows_with(grams, "vehicle_id", cars, of_logs):
-        contents.update(content_keys(rows.filter(pc.invert(is_received(rows)))))
-    for one in drives if contents else ():
-        keys = list(content_keys(row_table(one.rows, gram_schema(catalogue()))))
-        same = [key in contents for key in keys]
-        one.logged[one.drive[np.array(same, dtype=np.bool_)]] = True
-
-
-def _known(
-    one: _Drives, signals: str, rows: pa.RecordBatch
-) -> Iterator[tuple[IntArray, IntArray, IntArray]]:
-    """Yield the places of drives, and n and numbers that the table has of them."""
-    places = pc.index_in(rows["drive_id"].cast(pa.string()), one.ids)
-    if places.null_count == len(places):
-        return
-    mine = rows.filter(places.is_valid())
-    if not signals:
-        numbers = np.empty((len(mine), 0), np.int64)
-    else:
-        table = gram_table(signals, mine)
-        numbers = np.hstack([table.sums, table.products])
-    at = places.drop_null().to_numpy().astype(np.int64)
-    yield at, mine["n"].to_numpy(), numbers
-
-
-def _rows_with(
-    grams: Snapshot, column: str, names: pa.StringArray, files: Sequence[TableFile]
-) -> Iterator[pa.Table]:
-    """Yield the Gram rows of the logged signals that some files have of some drives or cars."""
-    identity = features().identity(PLAIN)
-    for file in files:
-        rows = grams.table.read(file.path, ["feature_set", column])
-        plain = pc.equal(rows["feature_set"], identity)
-        mine = pc.and_(plain, pc.is_in(rows[column].cast(pa.string()), names))
-        if pc.any(mine).as_py():
-            yield grams.table.read(file.path).filter(mine)
 
 
 def land_refused(
@@ -267,14 +59,14 @@ def land_refused(
     snapshot.commit_or_discard(Change(add=[action], units=units, note={"job": "receive"}))
 
 
-def land_rows(warehouse: Warehouse, files: Sequence[MessageFile], landing: Landing) -> None:
+def land_rows(warehouse: Warehouse, files: Sequence[MessageFile], new: NewMessages) -> None:
     """Commit the new rows of some files, and that these landed."""
-    grams = landing.grams
-    replaced = files_to_rewrite(grams, frozenset()) if landing.new else []
+    grams = new.grams
+    replaced = files_to_rewrite(grams, frozenset()) if new.new else []
     kept = rows_to_keep(grams, replaced, frozenset())
     mine = [
-        row_table(rows, warehouse.grams.schema, [file.digest for file in files])
-        for rows in landing.new
+        received_table(rows, warehouse.grams.schema, [file.digest for file in files])
+        for rows in new.new
     ]
     single = Unit(ONE_AT_A_TIME, (grams.version or 0) + 1)
     grams.commit_or_discard(
@@ -285,34 +77,3 @@ def land_rows(warehouse: Warehouse, files: Sequence[MessageFile], landing: Landi
             note={"job": "receive"},
         )
     )
-
-
-def row_table(rows: ReceivedRows, schema: pa.Schema, digests: Sequence[str] = ()) -> pa.Table:
-    """Return rows of the same signals in the schema of `grams`, from files of these digests."""
-    many = len(rows)
-    names = pa.array([f"{RECEIVED_FILES}{digest[:24]}" for digest in digests], pa.string())
-    known: dict[str, Any] = {
-        "feature_set": pa.repeat(features().identity(PLAIN), many),
-        "file": names.take(pa.array(rows.file)) if digests else pa.repeat(RECEIVED_FILES, many),
-        "day": rows.days,
-        "drive_id": rows.drive_ids,
-        "vehicle_id": rows.vehicle_ids,
-        "source": pa.repeat(RECEIVED, many),
-        "signals": pa.repeat(signals_of(rows.mask), many),
-        "n": pa.array(rows.n),
-        "clipped": pa.repeat(0, many),
-        "sums": _lists(rows.sums),
-        "products": _lists(rows.products),
-    }
-    columns = [
-        known[one.name].cast(one.type) if one.name in known else pa.nulls(many, one.type)
-        for one in schema
-    ]
-    return pa.table(columns, schema=schema)
-
-
-def _lists(values: IntArray) -> pa.Array:
-    rows, width = values.shape
-    flat = pa.array(np.ascontiguousarray(values).reshape(-1), pa.int64())
-    offsets = pa.array(np.arange(rows + 1, dtype=np.int32) * width, pa.int32())
-    return pa.ListArray.from_arrays(offsets, flat)

@@ -18,8 +18,9 @@ import numpy as np
 from fleet_slip.delta import retry_conflicts
 from fleet_slip.errors import InputError
 from fleet_slip.grams.car_keys import load_car_keys
-from fleet_slip.grams.landing import Landing, MessageFile, choose_rows, land_refused, land_rows
+from fleet_slip.grams.landing import MessageFile, land_refused, land_rows
 from fleet_slip.grams.messages import read_messages
+from fleet_slip.grams.new_messages import NewMessages, choose_new
 from fleet_slip.grams.received_rows import sort_out
 from fleet_slip.grams.signatures import judge_signatures
 from fleet_slip.progress import Progress, no_progress
@@ -113,31 +114,31 @@ def _receive_batch(warehouse: Warehouse, batch: dict[Path, bytes]) -> list[Recei
     keys = load_car_keys()
     rows, refused = sort_out(found, None if keys is None else partial(judge_signatures, keys=keys))
 
-    def attempt() -> Landing:
-        landing = choose_rows(warehouse, rows, refused)
-        land_refused(warehouse, files, landing.refused)
-        land_rows(warehouse, files, landing)
-        return landing
+    def attempt() -> NewMessages:
+        new = choose_new(warehouse, rows, refused)
+        land_refused(warehouse, files, new.refused)
+        land_rows(warehouse, files, new)
+        return new
 
-    landing = retry_conflicts(attempt)
+    new = retry_conflicts(attempt)
     for report, (_, one) in zip(fresh, found, strict=True):
         report.messages = one.count
-    _tell(fresh, landing)
+    _tell(fresh, new)
     return list(reports.values())
 
 
-def _tell(reports: Sequence[ReceiveReport], landing: Landing) -> None:
+def _tell(reports: Sequence[ReceiveReport], new: NewMessages) -> None:
     """Tell the report of each file what of it landed."""
-    for one in landing.refused:
+    for one in new.refused:
         reports[one.file].refused[one.reason] += 1
-    for rows in landing.new:
+    for rows in new.new:
         for at in np.unique(rows.file).tolist():
             mine = rows.file == at
             reports[at].received += int(mine.sum())
             reports[at].rows += int(rows.n[mine].sum())
-    for at in landing.duplicates.tolist():
+    for at in new.duplicates.tolist():
         reports[at].duplicates += 1
-    for at in landing.forgotten.tolist():
+    for at in new.forgotten.tolist():
         reports[at].forgotten += 1
 
 
