@@ -4,6 +4,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime, timedelta
 from functools import partial
+from itertools import groupby
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -27,6 +29,8 @@ from fleet_slip.ingest.resampling import (
 )
 
 SOURCE = "measured"
+SHARED_ROWS = 2**14
+"""Rows of a drive that share the memory of what is the same in all of them."""
 _SECONDS_PER_DAY = 86_400
 _EARLIEST_S = 10**8
 """Times before 1973 are counted from the start of a recording, not from 1970."""
@@ -159,22 +163,42 @@ def log_table(drives: Sequence[MeasuredDrive], mapping: Mapping) -> pa.Table:
         elif field.name in catalogue().extras:
             continue
         elif field.name in catalogue().signals:
-            columns[field.name] = pa.nulls(sum(sizes), field.type)
+            absent = _same(pa.scalar(None, field.type), sum(sizes))
+            columns[field.name] = pa.chunked_array(absent, field.type)
         else:
             values = [drive.metadata.get(field.name) for drive in drives]
             columns[field.name] = _repeat(values, field.type, sizes)
     return pa.table(columns)
 
 
-def _repeat(values: Sequence[Any], kind: pa.DataType, times: Sequence[int]) -> pa.Array:
+def _repeat(values: Sequence[Any], kind: pa.DataType, times: Sequence[int]) -> pa.ChunkedArray:
     """Return each value as often as it is told; texts as codes of a dictionary."""
     if pa.types.is_string(kind):
         texts = list(dict.fromkeys(text for text in values if text is not None))
         codes = {text: i for i, text in enumerate(texts)}
         repeated = _repeat([codes.get(text) for text in values], pa.int32(), times)
-        return pa.DictionaryArray.from_arrays(repeated, _as_arrow(texts, kind), safe=False)
-    scalars = zip(_as_arrow(values, kind), times, strict=True)
-    return pa.concat_arrays([pa.repeat(value, number) for value, number in scalars])
+        named = _as_arrow(texts, kind)
+        return pa.chunked_array(
+            [pa.DictionaryArray.from_arrays(chunk, named, safe=False) for chunk in repeated.chunks],
+            pa.dictionary(pa.int32(), kind),
+        )
+    runs = [
+        (value, sum(number for _, number in run))
+        for value, run in groupby(zip(values, times, strict=True), key=itemgetter(0))
+    ]
+    scalars = zip(_as_arrow([value for value, _ in runs], kind), runs, strict=True)
+    chunks = [chunk for scalar, (_, number) in scalars for chunk in _same(scalar, number)]
+    repeated = pa.chunked_array(chunks, kind)
+    many_short_runs = len(runs) * SHARED_ROWS > sum(times)
+    return pa.chunked_array([repeated.combine_chunks()]) if many_short_runs else repeated
+
+
+def _same(value: pa.Scalar, number: int) -> list[pa.Array]:
+    """Return a value so many times, in chunks that share their memory."""
+    shared = pa.repeat(value, min(number, SHARED_ROWS))
+    return [
+        shared.slice(0, min(SHARED_ROWS, number - start)) for start in range(0, number, SHARED_ROWS)
+    ]
 
 
 def _as_arrow(values: Sequence[Any], kind: pa.DataType) -> pa.Array:
