@@ -99,9 +99,10 @@ def to_ticks(
         if not counts[signal].null_count:
             somewhere[:] = True
         elif not somewhere.all():
-            somewhere |= counts[signal].is_valid().to_numpy(zero_copy_only=False)
+            somewhere |= pl.Series(counts[signal]).is_not_null().to_numpy()
     if not somewhere.all():
-        counts = {key: array.filter(pa.array(somewhere)) for key, array in counts.items()}
+        kept = pl.Series(somewhere).to_arrow()
+        counts = {key: array.filter(kept) for key, array in counts.items()}
         ticks = ticks[somewhere]
     metadata = _metadata(name, known, start_s, mapping)
     if len(ticks):
@@ -163,7 +164,7 @@ def log_table(drives: Sequence[MeasuredDrive], mapping: Mapping) -> pa.Table:
         elif field.name in catalogue().extras:
             continue
         elif field.name in catalogue().signals:
-            absent = _same(pa.scalar(None, field.type), sum(sizes))
+            absent = _shared(pa.nulls(SHARED_ROWS, field.type), sum(sizes))
             columns[field.name] = pa.chunked_array(absent, field.type)
         else:
             values = [drive.metadata.get(field.name) for drive in drives]
@@ -187,17 +188,20 @@ def _repeat(values: Sequence[Any], kind: pa.DataType, times: Sequence[int]) -> p
         for value, run in groupby(zip(values, times, strict=True), key=itemgetter(0))
     ]
     scalars = zip(_as_arrow([value for value, _ in runs], kind), runs, strict=True)
-    chunks = [chunk for scalar, (_, number) in scalars for chunk in _same(scalar, number)]
+    chunks = [
+        chunk
+        for scalar, (_, number) in scalars
+        for chunk in _shared(pa.repeat(scalar, min(number, SHARED_ROWS)), number)
+    ]
     repeated = pa.chunked_array(chunks, kind)
     many_short_runs = len(runs) * SHARED_ROWS > sum(times)
     return pa.chunked_array([repeated.combine_chunks()]) if many_short_runs else repeated
 
 
-def _same(value: pa.Scalar, number: int) -> list[pa.Array]:
-    """Return a value so many times, in chunks that share their memory."""
-    shared = pa.repeat(value, min(number, SHARED_ROWS))
+def _shared(rows: pa.Array, number: int) -> list[pa.Array]:
+    """Return so many rows that are all the same, in chunks of some that share their memory."""
     return [
-        shared.slice(0, min(SHARED_ROWS, number - start)) for start in range(0, number, SHARED_ROWS)
+        rows.slice(0, min(SHARED_ROWS, number - start)) for start in range(0, number, SHARED_ROWS)
     ]
 
 

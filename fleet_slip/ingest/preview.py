@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import polars as pl
 import pyarrow as pa
 import pyarrow.compute as pc
 
@@ -77,7 +78,7 @@ def signals_of(drive: MeasuredDrive) -> dict[str, FloatArray]:
     signals = {}
     for name, counts in drive.counts.items():
         values = np.full(int(ticks[kept][-1]) + 1, np.nan)
-        numbers = pc.cast(counts, pa.float64()).to_numpy(zero_copy_only=False)
+        numbers = pl.Series(counts).cast(pl.Float64).to_numpy()  # Arrow's own would load pandas
         values[ticks[kept]] = numbers[kept] * float(catalogue()[name].scale)
         signals[name] = values
     return signals

@@ -1,6 +1,8 @@
 """The Arrow table of measured drives: what it says, and what it takes of memory."""
 
+import sys
 from datetime import date
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -8,7 +10,22 @@ import pytest
 
 from fleet_slip.catalogue.counts import as_arrow
 from fleet_slip.ingest.measured_drives import SHARED_ROWS, MeasuredDrive, log_table
-from tests.support.measured import a_mapping
+from tests.support.commands import run
+from tests.support.measured import a_mapping, csv_text, good_columns
+
+INGEST = """
+import sys
+from pathlib import Path
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.ingest.job import ingest_file
+from fleet_slip.ingest.mapping import Mapping
+from fleet_slip.warehouse.tables import Warehouse
+root, log, mapping = sys.argv[1:]
+warehouse = Warehouse(LocalFolder(Path(root)))
+ingest_file(warehouse, Path(log), Mapping.model_validate_json(mapping))
+assert "polars" in sys.modules
+assert "pandas" not in sys.modules
+"""
 
 
 def drive(name: str, rows: int) -> MeasuredDrive:
@@ -39,3 +56,14 @@ def test_what_is_the_same_in_all_rows_of_a_drive_is_in_memory_once() -> None:
     assert own == rows * (4 + 2)
     assert table.get_total_buffer_size() - own < rows * 8
     assert pa.types.is_dictionary(table["drive_id"].type)
+
+
+def test_pandas_which_would_take_a_tenth_of_the_memory_is_not_loaded(tmp_path: Path) -> None:
+    columns = good_columns()
+    columns["t"][10:] = [f"{i / 100 + 0.305:.3f}" for i in range(10, 20)]  # ticks without a value
+    columns["ax"][0] = columns["beta"][1] = None
+    log = tmp_path / "log.csv"
+    log.write_text(csv_text(columns))
+    mapping = a_mapping().canonical_json()
+    done = run([sys.executable, "-c", INGEST, str(tmp_path / "data"), str(log), mapping])
+    assert not done.exit_code, done.stderr
