@@ -6,15 +6,12 @@ in place, so that several machines can write.
 """
 
 import contextlib
-import functools
-import os
 import tempfile
 import time
 import uuid
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -22,27 +19,15 @@ import duckdb
 import obstore
 import pyarrow as pa
 from obstore.exceptions import AlreadyExistsError
-from obstore.store import from_url
 
 from fleet_slip.errors import StorageError
 from fleet_slip.files.folder import Content, StoredFile
-from fleet_slip.files.object_credentials import AwsProfile, aws_profile
+from fleet_slip.files.object_client import client, delta_options
 from fleet_slip.files.object_errors import object_errors
 from fleet_slip.files.object_files import LentFile, ObjectFilesystem, open_object
 
 if TYPE_CHECKING:
     from obstore.store import ObjectStore
-
-HTTP_VARIABLE = "AWS_ALLOW_HTTP"
-"""Environment variable, which the Delta library reads too: true lets an endpoint be http."""
-
-TIMEOUT_S = 60
-"""Longest that one request may take: a log file has up to 40 MB."""
-
-CONNECT_TIMEOUT_S = 5
-RETRIES = 5
-RETRY_S = 60
-"""No attempt begins later than so long after the first."""
 
 READS_AT_ONCE = 32
 LISTINGS = 20
@@ -83,15 +68,7 @@ class ObjectFolder:
     @property
     def delta_options(self) -> dict[str, str] | None:
         """Options of the Delta library; credentials it finds where we do."""
-        profile = _profile(self.bucket)
-        return {
-            "timeout": f"{TIMEOUT_S}s",
-            "connect_timeout": f"{CONNECT_TIMEOUT_S}s",
-            "max_retries": f"{RETRIES}",
-            "retry_timeout": f"{RETRY_S}s",
-            "conditional_put": "etag",
-            **(profile.delta_options if profile else {}),
-        }
+        return delta_options(self.bucket)
 
     @property
     def spill(self) -> Path:
@@ -119,7 +96,7 @@ class ObjectFolder:
         """Return all files below, at any depth, sorted by path."""
         with object_errors(str(self)):
             pages = list(obstore.list(self._store, self.prefix or None))
-        found = [self._found(meta) for page in pages for meta in page]
+        found = [self.found(meta) for page in pages for meta in page]
         return sorted(found, key=lambda file: file.path)
 
     def read(self, path: str, longest: int | None = None) -> bytes:
@@ -178,7 +155,7 @@ class ObjectFolder:
                 meta = obstore.head(self._store, self._key(file.path))
             except FileNotFoundError:
                 return False
-            if self._found(meta) != file:
+            if self.found(meta) != file:
                 return False
             obstore.delete(self._store, self._key(file.path))
         return True
@@ -228,7 +205,7 @@ class ObjectFolder:
 
     @property
     def _store(self) -> "ObjectStore":
-        return _store(self.bucket)
+        return client(self.bucket)
 
     def _read_or_none(self, path: str) -> bytes | None:
         with object_errors(f"{self}/{path}"):
@@ -249,7 +226,8 @@ class ObjectFolder:
                 return False
         return True
 
-    def _found(self, meta: Any) -> StoredFile:
+    def found(self, meta: Any) -> StoredFile:
+        """Return an object as the library tells of it."""
         # Of one object some stores list milliseconds, or a tag without quotes, and tell seconds
         # and quotes when they are asked for it alone.
         return StoredFile(
@@ -258,26 +236,4 @@ class ObjectFolder:
             meta["size"],
             int(meta["last_modified"].timestamp()) * 10**9,
             (meta["e_tag"] or "").strip('"'),
-        )
-
-
-def _profile(bucket: str) -> AwsProfile | None:
-    """Return where credentials are, if it is a bucket of S3 and they are not in the environment."""
-    return aws_profile() if bucket.startswith("s3://") else None
-
-
-@functools.cache
-def _store(bucket: str) -> "ObjectStore":
-    """Return the client for a bucket, which a process makes when it first needs it."""
-    profile = _profile(bucket)
-    with object_errors(bucket):
-        return from_url(
-            bucket,
-            client_options={
-                "allow_http": os.environ.get(HTTP_VARIABLE, "").lower() in ("1", "true"),
-                "timeout": timedelta(seconds=TIMEOUT_S),
-                "connect_timeout": timedelta(seconds=CONNECT_TIMEOUT_S),
-            },
-            retry_config={"max_retries": RETRIES, "retry_timeout": timedelta(seconds=RETRY_S)},
-            **(profile.store_options if profile else {}),
         )

@@ -17,7 +17,7 @@ import pytest
 import fleet_slip
 from fleet_slip.delta import Change, Unit, retry_conflicts
 from fleet_slip.errors import StorageError
-from fleet_slip.files import object_folder
+from fleet_slip.files import object_client
 from fleet_slip.files.data_root import data_root
 from fleet_slip.files.documents import DocumentFolder
 from fleet_slip.files.folder import Folder
@@ -216,7 +216,7 @@ def close_the_port(_server: Server, patch: pytest.MonkeyPatch, silent: socket.so
 
 def never_answer(server: Server, patch: pytest.MonkeyPatch, silent: socket.socket) -> None:
     silent.listen()
-    patch.setattr(object_folder, "TIMEOUT_S", 1)
+    patch.setattr(object_client, "TIMEOUT_S", 1)
     close_the_port(server, patch, silent)
 
 
@@ -239,11 +239,11 @@ def test_a_fault_is_told_in_one_line_without_credentials(
     fault: Fault,
     told: str,
 ) -> None:
-    monkeypatch.setattr(object_folder, "RETRY_S", 2)
+    monkeypatch.setattr(object_client, "RETRY_S", 2)
     logs = Warehouse(root).logs
     action = logs.write_file("one", rows("a"), DAY)
     with server.misbehaving():
-        object_folder._store.cache_clear()
+        object_client.client.cache_clear()
         fault(server, monkeypatch, silent)
         attempts: tuple[Callable[[], None], ...] = (
             lambda: root.put("runs/1", b"x"),

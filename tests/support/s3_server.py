@@ -18,8 +18,8 @@ from typing import Any
 from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
 from werkzeug.serving import BaseWSGIServer, WSGIRequestHandler, make_server
 
+from fleet_slip.files.object_client import client
 from fleet_slip.files.object_credentials import aws_profile
-from fleet_slip.files.object_folder import _store
 from tests.support.commands import PATIENCE_S, Finished, run_on
 
 ACCESS_KEY = "AKIDFORTESTS"
@@ -150,7 +150,7 @@ def command_on(root: object, *arguments: str) -> Finished:
 def forget_clients() -> None:
     """Let this process look anew for credentials, as a new one would."""
     aws_profile.cache_clear()
-    _store.cache_clear()
+    client.cache_clear()
 
 
 def _answer(start: StartResponse, status: str, code: str) -> Iterable[bytes]:
