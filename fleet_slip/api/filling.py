@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from fleet_slip.grams.job import GramReport
     from fleet_slip.grams.receiving import ReceiveReport
     from fleet_slip.ingest.job import IngestReport
+    from fleet_slip.ingest.log_files import Log
     from fleet_slip.ingest.mapping import Mapping
     from fleet_slip.ingest.preview import Preview
     from fleet_slip.maintenance.migration import MigrationReport
@@ -116,6 +117,7 @@ class Filling(Rooted):
         cannot be used go to the view `quarantine` with a reason. Of a folder all logs are taken, at
         any depth, and of a pattern what matches, but for those that have landed before and have
         not changed; with `as_one` they are parts of one log, whose drives go on from file to file.
+        Files on an object store are given as URLs, and copied to the temporary folder to be read.
         Returns a report of each file that was read, in their order; `each` is called with it once
         the file is committed. Progress is in files for folders and patterns, else in rows, where a
         format tells about how many there are. Without a cluster they are read one after the other.
@@ -126,20 +128,20 @@ class Filling(Rooted):
         """
         from fleet_slip.ingest.folders import KnownFiles
         from fleet_slip.ingest.job import ingest_files
-        from fleet_slip.ingest.log_files import find_logs, is_pattern
+        from fleet_slip.ingest.log_files import find_logs, find_whole_logs, names_several
         from fleet_slip.ingest.mapping import load_mapping
 
         plan = load_mapping(mapping) if isinstance(mapping, str) else mapping
-        given = [Path(files)] if isinstance(files, Path | str) else [Path(file) for file in files]
-        paths = given if as_one else find_logs(given)
-        folders = any(path.is_dir() or is_pattern(path) for path in given)
+        given = [files] if isinstance(files, Path | str) else list(files)
+        paths = find_whole_logs(given) if as_one else find_logs(given)
+        folders = any(map(names_several, given))
         known = KnownFiles.of(self.warehouse, plan) if folders else None
         told = count_from_start(progress)
         reports = {}
         with open_workers(self.root, workers) as executor, step("ingest") as figures:
             elsewhere = unless_local(executor)
             if elsewhere:  # a worker has a working directory of its own
-                paths = [path.absolute() for path in paths]
+                paths = [one.absolute() if isinstance(one, Path) else one for one in paths]
             figures.rows = 0
             warehouse = within_reach(self.warehouse, executor)
             wanted = paths
@@ -175,14 +177,14 @@ class Filling(Rooted):
         looks wrong in the longest drive: a sign, a unit, swapped wheels, a delay of the label.
         Of a folder every log is read, or with `as_one` all as one. Raises like `ingest`.
         """
-        from fleet_slip.ingest.log_files import find_logs
+        from fleet_slip.ingest.log_files import find_logs, find_whole_logs
         from fleet_slip.ingest.mapping import load_mapping
-        from fleet_slip.ingest.preview import preview_file
+        from fleet_slip.ingest.preview import preview_log
 
         plan = load_mapping(mapping) if isinstance(mapping, str) else mapping
-        paths = [files] if isinstance(files, Path | str) else files
-        given = [Path(file) for file in paths]
-        return [preview_file(file, plan) for file in (given if as_one else find_logs(given))]
+        given = [files] if isinstance(files, Path | str) else list(files)
+        logs = find_whole_logs(given) if as_one else find_logs(given)
+        return [preview_log(log, plan) for log in logs]
 
     @record_call
     def gram(
@@ -252,7 +254,7 @@ class Filling(Rooted):
         return report
 
 
-def _rows_of(logs: Iterable[Path], told: Progress) -> Progress:
+def _rows_of(logs: "Iterable[Log]", told: Progress) -> Progress:
     """Return what counts the rows read of each log among about so many that all have."""
     from fleet_slip.ingest.expected_rows import expected_rows
 

@@ -183,13 +183,13 @@ class Fleet(Filling, Tending):
     ) -> "NightReport":
         """Do all that a night with real cars asks for, and tell how each step went.
 
-        Ingest what is new in the folder `landing` through a mapping, forget what is too old, update
-        Gram rows, examine sensors, chart the champion's error, train again without the faulty
-        drives, and verify some log files, the next ones on the next night. The winner becomes
-        champion of the model `name` if it is not worse, else, or if `candidate`, a candidate. A
-        night that was killed and is given again ends where it would have ended; `night` is its
-        date, today unless told otherwise. A second one of the model on this machine waits for the
-        first; `waiting` is called once before.
+        Ingest what is new in the folder `landing`, a path or a URL, through a mapping, forget what
+        is too old, update Gram rows, examine sensors, chart the champion's error, train again
+        without the faulty drives, and verify some log files, the next ones on the next night. The
+        winner becomes champion of the model `name` if it is not worse, else, or if `candidate`, a
+        candidate. A night that was killed and is given again ends where it would have ended;
+        `night` is its date, today unless told otherwise. A second one of the model on this machine
+        waits for the first; `waiting` is called once before.
 
         What goes wrong in a step is in the report, whose `problem` is what a command fails with;
         later steps go on where they can. Raises `UsageError` for a name that no model may have or a
@@ -204,7 +204,7 @@ class Fleet(Filling, Tending):
         with self.root.exclusive(f".nightly-{name}.lock", waiting):
             return Night(
                 fleet=self,
-                landing=Path(landing),
+                landing=landing,
                 mapping=mapping,
                 training=training,
                 night=night or date.today(),

@@ -13,7 +13,7 @@ from fleet_slip.api.calls import ShowProgress, Workers
 from fleet_slip.api.retraining import Training
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.errors import DataError, FleetSlipError, InputError
-from fleet_slip.ingest.log_files import find_logs
+from fleet_slip.ingest.log_files import Place, find_logs, is_url
 from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.models.aliases import CANDIDATE
 from fleet_slip.models.model_version import ModelVersion
@@ -55,7 +55,7 @@ class Night:
     """
 
     fleet: "Fleet"
-    landing: Path
+    landing: Place
     mapping: str
     training: Training
     night: date
@@ -155,7 +155,7 @@ class Night:
 
     def _ingest(self) -> Told:
         mapping = load_mapping(self.mapping)
-        if not self.landing.is_dir():
+        if not is_url(self.landing) and not Path(self.landing).is_dir():
             raise InputError(
                 f"{self.landing}: no such folder. Name the folder where logs land, or mount it."
             )

@@ -118,10 +118,10 @@ def _where_the_time_went(report: "SimulationReport") -> str:
 def ingest(
     context: typer.Context,
     files: Annotated[
-        list[Path],
+        list[str],
         typer.Argument(
             help="Measured logs (CSV, Parquet, MDF, MATLAB, CAN traces, MCAP, DuckDB), or folders "
-            "of them, of which what is new is taken.",
+            "of them, of which what is new is taken; also s3://, gs:// and az://.",
             show_default=False,
         ),
     ],
@@ -151,7 +151,7 @@ def ingest(
 
     Example: **fleet-slip ingest drive.csv --mapping logger.toml --dry-run**
     """
-    from fleet_slip.ingest.log_files import is_pattern  # noqa: PLC0415 - takes a while
+    from fleet_slip.ingest.log_files import names_several  # noqa: PLC0415 - takes a while
 
     fleet: Fleet = context.obj
     if plot is not None and not (dry_run and len(files) == 1):
@@ -161,9 +161,7 @@ def ingest(
 
         show_previews(fleet.preview(files, mapping, as_one=as_one), plot, json)
         return
-    if as_one and not all(file.is_dir() for file in files):
-        raise UsageError("--as-one takes folders, whose files are parts of one log.")
-    folders = any(file.is_dir() or is_pattern(file) for file in files) and not as_one
+    folders = any(map(names_several, files)) and not as_one
     each = Remarks(quiet=json or folders)
     with (
         recording(fleet.root, "ingest", sys.argv[1:]),

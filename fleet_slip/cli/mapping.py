@@ -22,7 +22,9 @@ class Action(StrEnum):
 
 def mapping(
     _action: Annotated[Action, typer.Argument(metavar="suggest", show_default=False)],
-    file: Annotated[Path, typer.Argument(help="A measured log.", show_default=False)],
+    file: Annotated[
+        str, typer.Argument(help="A measured log; also s3://, gs:// and az://.", show_default=False)
+    ],
     output: Annotated[
         Path | None, typer.Option(help="Write the draft to this file instead of printing it.")
     ] = None,
@@ -43,18 +45,24 @@ def mapping(
     from fleet_slip.ingest.draft import draft_mapping  # noqa: PLC0415
     from fleet_slip.ingest.draft_text import write_draft  # noqa: PLC0415
     from fleet_slip.ingest.duckdb_table import DuckdbRows  # noqa: PLC0415
+    from fleet_slip.ingest.local_copies import local_copy  # noqa: PLC0415
+    from fleet_slip.ingest.log_files import find_logs  # noqa: PLC0415
     from fleet_slip.ingest.profile import FileFormats, profile_file  # noqa: PLC0415
 
     if output is not None and output.exists():
         raise UsageError(f"{output}: it exists. Give another name, or remove it.")
     bus = read_can_database(CanBus(database=str(can.absolute())), can.parent) if can else None
     formats = FileFormats(can=bus, duckdb=DuckdbRows(table=table) if table else None)
-    draft = draft_mapping(file, profile_file(file, formats))
-    text = write_draft(draft, "".join(c if c.isalnum() else "_" for c in file.stem.lower()))
+    logs = find_logs([file])
+    if len(logs) > 1:
+        raise UsageError(f"{file}: {len(logs):,} logs. Give one of them.")
+    with local_copy(logs[0]) as copy:
+        draft = draft_mapping(copy, profile_file(copy, formats))
+        text = write_draft(draft, "".join(c if c.isalnum() else "_" for c in copy.stem.lower()))
     if json:
         print_json({"channels": _channels(draft), "mapping": text})
     else:
-        _show(draft)
+        _show(file, draft)
     if output is not None:
         with storage_errors(output):
             output.write_text(text, encoding="utf-8")
@@ -80,7 +88,7 @@ def _channels(draft: "Draft") -> list[dict[str, object]]:
     ]
 
 
-def _show(draft: "Draft") -> None:
+def _show(file: str, draft: "Draft") -> None:
     rows = []
     for one in draft.profile.profiles:
         signal = next((n for n, g in draft.guesses.items() if g.profile is one), "")
@@ -90,4 +98,4 @@ def _show(draft: "Draft") -> None:
         rate = "" if rate_hz is None else f"{rate_hz:.4g}"
         rows.append([one.channel.name, one.channel.unit, signal, rate, *cells, missing])
     header = ["channel", "unit", "guess", "Hz", "least", "most", "missing"]
-    print_table(f"{draft.file}: {len(rows)} channels", header, rows, left=3)
+    print_table(f"{file}: {len(rows)} channels", header, rows, left=3)

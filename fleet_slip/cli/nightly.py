@@ -25,7 +25,8 @@ from fleet_slip.selection.worth import WORTH
 def nightly(
     context: typer.Context,
     landing: Annotated[
-        Path, typer.Option(help="The folder where logs land; what is new in it is taken.")
+        str,
+        typer.Option(help="The folder where logs land, or s3://…; what is new in it is taken."),
     ],
     mapping: Annotated[
         str,

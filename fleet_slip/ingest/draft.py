@@ -22,7 +22,7 @@ from fleet_slip.ingest.guessing import (
     parts_of,
 )
 from fleet_slip.ingest.mapping import Mapping
-from fleet_slip.ingest.preview import preview_file
+from fleet_slip.ingest.preview import preview_log
 from fleet_slip.ingest.profile import FileProfile, Profile, sample_rate_hz
 from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS, Suspicion, find_suspicions, speed_ratio
 
@@ -125,7 +125,7 @@ def _drive(
     file: Path, profile: FileProfile, time: TimeGuess, guesses: dict[str, Guess]
 ) -> dict[str, FloatArray]:
     mapping = as_mapping(profile, time, guesses)
-    return preview_file(file, mapping).longest
+    return preview_log(file, mapping).longest
 
 
 def _guess_time(profile: FileProfile, guesses: dict[str, Guess]) -> TimeGuess:

@@ -6,18 +6,20 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.log_files import parts_of
+from fleet_slip.ingest.log_files import Log, parts_of
 from fleet_slip.ingest.parquet_batches import PARQUET_MAGIC
 
 _SAMPLE_BYTES = 2**18
 
 
-def expected_rows(log: Path) -> int:
+def expected_rows(log: Log) -> int:
     """Return about how many rows a log has; 0 where that is not known before all is read.
 
-    A Parquet file says it, text has the lines of its begin throughout. Never raises for what is
-    wrong with the log: who reads it does.
+    A Parquet file says it, text has the lines of its begin throughout; objects are not asked.
+    Never raises for what is wrong with the log: who reads it does.
     """
+    if not isinstance(log, Path):
+        return 0
     try:
         return sum(map(_expected, parts_of(log)))
     except (InputError, OSError, pa.ArrowException):

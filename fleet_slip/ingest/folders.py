@@ -15,7 +15,9 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+from fleet_slip.files.folder import StoredFile
 from fleet_slip.ingest.landing import unit_of
+from fleet_slip.ingest.log_files import Log, StoredParts
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -25,13 +27,14 @@ class KnownFiles:
     """Which content the files of this machine had when they landed through a mapping.
 
     Attributes:
-        digests: size, time of change and digest by absolute path.
+        digests: size, time of change (of an object, what the store calls its version) and
+            digest, by absolute path or URL.
         landed: digests that are in the logs as they were at a moment: a version of the table, and
             the digest of its commit. While that commit is the table's, they need not be asked for.
     """
 
     cache: Path
-    digests: dict[str, tuple[int, int, str]] = field(default_factory=dict)
+    digests: dict[str, tuple[int, int | str, str]] = field(default_factory=dict)
     landed: set[str] = field(default_factory=set)
     moment: tuple[int, str] | None = None
 
@@ -44,12 +47,12 @@ class KnownFiles:
             kept: dict[str, Any] = json.loads(cache.read_bytes())
             if "files" not in kept:  # of an earlier version, which remembered no moment
                 kept = {"files": kept, "landed": [], "moment": (0, "")}
-            files = {path: (int(s), int(t), str(d)) for path, (s, t, d) in kept["files"].items()}
+            files = {path: (int(s), t, str(d)) for path, (s, t, d) in kept["files"].items()}
             version, commit = kept["moment"]
             return cls(cache, files, set(kept["landed"]), (int(version), str(commit)))
         return cls(cache)
 
-    def without_landed(self, files: Iterable[Path], warehouse: Warehouse) -> list[Path]:
+    def without_landed(self, files: Iterable[Log], warehouse: Warehouse) -> list[Log]:
         """Return the files that are not in the logs, as far as size and time of change tell."""
         snapshot = warehouse.logs.snapshot()
         if self.moment is None or snapshot.moment(self.moment[0]) != self.moment[1]:
@@ -57,28 +60,21 @@ class KnownFiles:
         landed = snapshot.landed_among(len(self.digests))
         return [file for file in files if not self._has_landed(file, landed)]
 
-    def _has_landed(self, file: Path, landed: Callable[[str], bool]) -> bool:
-        known = self.digests.get(os.path.abspath(file))  # noqa: PTH100 - much the faster
-        if known is None:
+    def _has_landed(self, file: Log, landed: Callable[[str], bool]) -> bool:
+        known = self.digests.get(_name_of(file))
+        if known is None or _state_of(file) != known[:2]:
             return False
-        try:
-            found = file.stat()
-        except OSError:
-            return False
-        unchanged = (found.st_size, found.st_mtime_ns) == known[:2]
-        return unchanged and (known[2] in self.landed or landed(unit_of(known[2]).name))
+        return known[2] in self.landed or landed(unit_of(known[2]).name)
 
-    def digest_of(self, file: Path) -> str | None:
+    def digest_of(self, file: Log) -> str | None:
         """Return the digest of what a path had when it landed, None if it never did."""
-        known = self.digests.get(os.path.abspath(file))  # noqa: PTH100
+        known = self.digests.get(_name_of(file))
         return None if known is None else known[2]
 
-    def remember(self, file: Path, digest: str) -> None:
+    def remember(self, file: Log, digest: str) -> None:
         """Keep in mind that a file has landed."""
-        with suppress(OSError):
-            found = file.stat()
-            path = os.path.abspath(file)  # noqa: PTH100
-            self.digests[path] = (found.st_size, found.st_mtime_ns, digest)
+        if state := _state_of(file):
+            self.digests[_name_of(file)] = (*state, digest)
 
     def save(self, warehouse: Warehouse) -> None:
         """Write the cache; what cannot be written is not kept."""
@@ -97,6 +93,23 @@ class KnownFiles:
             draft = self.cache.with_suffix(f".{os.getpid()}")
             draft.write_text(json.dumps(kept))
             draft.replace(self.cache)
+
+
+def _name_of(log: Log) -> str:
+    return os.path.abspath(log) if isinstance(log, Path) else str(log)  # noqa: PTH100 - the faster
+
+
+def _state_of(log: Log) -> tuple[int, int | str] | None:
+    """Return what changes when the content does; None if that is not known."""
+    if isinstance(log, StoredFile):
+        return log.size_bytes, log.identity
+    if isinstance(log, StoredParts):
+        return None
+    try:
+        found = log.stat()
+    except OSError:
+        return None
+    return found.st_size, found.st_mtime_ns
 
 
 def _cache_folder() -> Path:

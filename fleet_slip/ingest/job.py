@@ -9,8 +9,10 @@ from typing import Any
 
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import InputError
+from fleet_slip.files.folder import StoredFile
 from fleet_slip.ingest.folders import KnownFiles
 from fleet_slip.ingest.landing import AskedFile, FileOutcome, Landing, unit_of, write_batch
+from fleet_slip.ingest.log_files import Log, StoredParts
 from fleet_slip.ingest.look_alikes import find_vehicles_like
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.suspicion import Suspicion
@@ -70,7 +72,7 @@ def ingest_file(warehouse: Warehouse, file: Path, mapping: Mapping) -> IngestRep
 
 def ingest_files(
     warehouse: Warehouse,
-    files: Iterable[Path],
+    files: Iterable[Log],
     mapping: Mapping,
     executor: Executor | None = None,
     known: KnownFiles | None = None,
@@ -112,10 +114,7 @@ def _batches(files: Iterable[AskedFile]) -> Iterator[tuple[AskedFile, ...]]:
     batch: list[AskedFile] = []
     size = 0
     for asked in files:
-        try:
-            more = asked.file.stat().st_size
-        except OSError:
-            more = 0  # whoever reads it says what is wrong
+        more = _size_of(asked.file)
         if batch and (size + more > BATCH_BYTES or len(batch) >= BATCH_FILES):
             yield tuple(batch)
             batch, size = [], 0
@@ -123,6 +122,17 @@ def _batches(files: Iterable[AskedFile]) -> Iterator[tuple[AskedFile, ...]]:
         size += more
     if batch:
         yield tuple(batch)
+
+
+def _size_of(log: Log) -> int:
+    if isinstance(log, StoredFile):
+        return log.size_bytes
+    if isinstance(log, StoredParts):
+        return BATCH_BYTES  # or more: it is a batch of its own
+    try:
+        return log.stat().st_size
+    except OSError:
+        return 0  # whoever reads it says what is wrong
 
 
 def _report(warehouse: Warehouse, outcome: FileOutcome, new: frozenset[str]) -> IngestReport:

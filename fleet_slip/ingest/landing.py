@@ -4,7 +4,6 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from hashlib import sha256
-from pathlib import Path
 
 import pyarrow as pa
 from deltalake.transaction import AddAction
@@ -12,6 +11,8 @@ from deltalake.transaction import AddAction
 from fleet_slip.delta import Change, Snapshot, Table, Unit, retry_conflicts
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import shown
+from fleet_slip.ingest.local_copies import LocalCopies
+from fleet_slip.ingest.log_files import Log
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.measured_drives import MeasuredDrive
 from fleet_slip.ingest.preview import signals_of
@@ -35,7 +36,7 @@ from fleet_slip.warehouse.tables import Warehouse
 class AskedFile:
     """A file to ingest, and the digest of what this very path had when it was ingested before."""
 
-    file: Path
+    file: Log
     earlier: str | None = None
 
 
@@ -43,7 +44,7 @@ class AskedFile:
 class FileOutcome:
     """What one file became: its drives, those left out as forgotten, and whether it had landed."""
 
-    file: Path
+    file: Log
     digest: str
     counts: IngestCounts
     look_alikes: tuple[tuple[str, ...], ...]
@@ -110,14 +111,15 @@ def write_batch(
         "quarantine": warehouse.quarantine.snapshot().landed_among(len(files)),
         "logs": warehouse.logs.snapshot().landed_among(len(files)),
     }
-    with ThreadPoolExecutor(WRITERS) as threads:
+    copies = LocalCopies(asked.file for asked in files)
+    with copies, ThreadPoolExecutor(WRITERS) as threads:
         parts: dict[TableName, _PartInTheMaking] = {
             "quarantine": _PartInTheMaking(DataFiles(warehouse.quarantine, threads, by_day=False)),
             "logs": _PartInTheMaking(DataFiles(warehouse.logs, threads, by_day=True)),
         }
         for asked in files:
             try:
-                with open_measured(asked.file, mapping) as stream:
+                with copies.of(asked.file) as file, open_measured(file, mapping) as stream:
                     _require_not_grown(asked, stream.digest, landed["logs"], mapping)
                     missing = [
                         name
@@ -194,7 +196,7 @@ def _require_not_grown(
     )
 
 
-def _outcome(file: Path, stream: MeasuredStream, written: WrittenFile, *, new: bool) -> FileOutcome:
+def _outcome(file: Log, stream: MeasuredStream, written: WrittenFile, *, new: bool) -> FileOutcome:
     counts = stream.counts()
     outcome = FileOutcome(file, stream.digest, counts, stream.look_alikes())
     if not new:

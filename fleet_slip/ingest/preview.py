@@ -1,7 +1,6 @@
 """What ingesting a file would do: nothing is stored."""
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,8 @@ import pyarrow.compute as pc
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.ingest.local_copies import local_copy
+from fleet_slip.ingest.log_files import Log
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.measured_drives import MeasuredDrive
 from fleet_slip.ingest.stream import open_measured
@@ -54,11 +55,11 @@ class Preview:
         }
 
 
-def preview_file(file: Path, mapping: Mapping) -> Preview:
-    """Read a file through a mapping, and look at what came out. Raises `InputError`."""
+def preview_log(log: Log, mapping: Mapping) -> Preview:
+    """Read a log through a mapping, and look at what came out. Raises `InputError`."""
     longest: MeasuredDrive | None = None
     found = {name: _Found() for name in mapping.signals}
-    with open_measured(file, mapping) as stream:
+    with local_copy(log) as file, open_measured(file, mapping) as stream:
         for piece in stream.pieces():
             for drive in piece.drives:
                 if longest is None or drive.ticks.size > longest.ticks.size:
@@ -68,7 +69,7 @@ def preview_file(file: Path, mapping: Mapping) -> Preview:
     signals = signals_of(longest) if longest is not None else {}
     ranges = tuple(_range(name, found[name]) for name in mapping.signals)
     suspicions = (*stream.suspicions(), *find_suspicions(signals))
-    return Preview(str(file), stream.counts(), ranges, suspicions, signals)
+    return Preview(str(log), stream.counts(), ranges, suspicions, signals)
 
 
 def signals_of(drive: MeasuredDrive) -> dict[str, FloatArray]:

@@ -12,7 +12,7 @@ from asammdf import MDF, Signal
 
 from fleet_slip.errors import InputError, UsageError
 from fleet_slip.ingest import read_measured, stream
-from fleet_slip.ingest.preview import preview_file
+from fleet_slip.ingest.preview import preview_log
 from fleet_slip.ingest.reading import log_digest
 from tests.ingest.test_formats import AX, BETA_DEG, START, TIME_S, mdf_mapping, require_the_drive
 from tests.support.measured import a_mapping, csv_text, good_columns, read_columns, ticks
@@ -104,7 +104,7 @@ def test_a_folder_that_grows_is_refused(tmp_path: Path, monkeypatch: pytest.Monk
 
     monkeypatch.setattr(stream, "log_digest", grow)
     with pytest.raises(InputError, match="drive: files came or went while it was read"):
-        preview_file(parts, a_mapping())
+        preview_log(parts, a_mapping())
 
 
 def test_a_folder_lands_once_and_not_again_when_it_has_grown(
@@ -122,6 +122,6 @@ def test_a_folder_lands_once_and_not_again_when_it_has_grown(
     with pytest.raises(InputError, match=r"drive: it has changed since it was ingested"):
         call(root, *command)
     assert "1 drive of 30 ticks" in call(root, *command, "--dry-run")
-    with pytest.raises(UsageError, match="--as-one takes folders"):
+    with pytest.raises(UsageError, match="only a folder has the files"):
         call(root, "ingest", str(parts / "part-0.csv"), *command[2:])
     assert ticks(read_measured(parts, a_mapping())) == list(range(30))

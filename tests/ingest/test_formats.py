@@ -19,7 +19,7 @@ from asammdf import MDF, Signal
 
 from fleet_slip.errors import ExtraError, InputError
 from fleet_slip.ingest import Mapping, MeasuredLog, mdf, read_measured
-from fleet_slip.ingest.preview import preview_file
+from fleet_slip.ingest.preview import preview_log
 from fleet_slip.ingest.source import reading_with
 from tests.support.measured import a_mapping, ticks
 
@@ -369,7 +369,7 @@ def test_a_group_without_samples_is_a_signal_without_values(tmp_path: Path) -> N
     log = read_measured(file, mdf_mapping())
     assert log.drives["ax"].to_pylist() == AX_COUNTS
     assert log.drives["sideslip"].null_count == 100
-    (suspicion,) = preview_file(file, mdf_mapping()).suspicions
+    (suspicion,) = preview_log(file, mdf_mapping()).suspicions
     assert (suspicion.kind, suspicion.signals) == ("absent", ("sideslip",))
     file = write_mdf(tmp_path, [a_x()], [beta()], [nothing_but(condition)])
     where = mdf_mapping(where=[{"column": "fix", "at_least": 1}])
