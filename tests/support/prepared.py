@@ -28,8 +28,9 @@ from typing import Any, Never
 
 import fleet_slip
 from fleet_slip.cli.main import main as fleet_slip_main
+from fleet_slip.ingest.units import require_unit
 
-READ_LATE = ("AWS_", "FLEET_SLIP_")
+READ_LATE = ("AWS_", "FLEET_SLIP_", "XDG_CACHE_HOME", "CACHE_DIRECTORY", "TMPDIR")
 """How variables begin that nothing reads while importing."""
 
 LATE = ("pandas", "matplotlib.figure")
@@ -106,6 +107,7 @@ def main(address: str) -> None:
     """Serve until stdin closes. What a forked process is to do is done at the end of the module."""
     for module in _modules():
         importlib.import_module(module)
+    require_unit("km/h", "m/s")  # pint reads its definitions at the first use
     gc.freeze()
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(address)
@@ -168,6 +170,7 @@ def _become(asked: dict[str, Any], streams: list[int]) -> None:
     os.chdir(asked["folder"])
     os.environ.clear()
     os.environ.update(asked["environment"])
+    tempfile.tempdir = None  # what TMPDIR said before
     sys.argv = asked["words"]
     sys.modules["__main__"].__package__ = None  # or messages would say `python -m`
     sys.path[0] = str(Path(sys.argv[0]).parent)
