@@ -290,6 +290,7 @@ _METADATA: dict[str, Callable[[str, str, pl.Schema, Mapping], Field]] = {
     "vehicle_model": _text,
     "track": _text,
     "mass_kg": _positive,
+    "tyres": _text,
     "adhesion": _positive,
     "day": _day,
 }

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import polars as pl
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
 from fleet_slip.canonical import canonical_ascii
 from fleet_slip.catalogue.signals import Identifier, catalogue
@@ -22,7 +22,7 @@ from fleet_slip.ingest.row_condition import RowCondition
 from fleet_slip.ingest.signal_column import SignalColumn
 from fleet_slip.ingest.source import OWN_TIME
 from fleet_slip.ingest.units import require_unit
-from fleet_slip.ingest.vehicle_facts import VehicleFacts, read_vehicle_facts
+from fleet_slip.ingest.vehicle_facts import VehicleFacts, read_vehicle_facts, require_tyres_column
 from fleet_slip.resources import find_config
 
 
@@ -87,6 +87,10 @@ class TimeBase(Config):
         return OWN_TIME if self.own_clock else self.column
 
 
+def _is_empty(value: object) -> bool:
+    return value in ((), None)
+
+
 class DriveMetadata(Config):
     """What is known of each drive, given here or taken from a column; absent stays null."""
 
@@ -98,11 +102,10 @@ class DriveMetadata(Config):
     vehicle_model: Name | FromColumn | None = None
     track: Name | FromColumn | None = None
     mass_kg: PositiveFloat | FromColumn | None = None
+    tyres: Annotated[Name | FromColumn, AfterValidator(require_tyres_column)] | None = Field(
+        default=None, exclude_if=_is_empty
+    )
     adhesion: PositiveFloat | FromColumn | None = None
-
-
-def _is_empty(value: object) -> bool:
-    return value in ((), None)
 
 
 class Mapping(Config):

@@ -43,7 +43,7 @@ _POLARS_TYPES: dict[pa.DataType, type[pl.DataType] | pl.DataType] = {
     pa.timestamp("us", tz="UTC"): pl.Datetime("us", "UTC"),
 }
 _FROM_FILE = ("drive_name", "source_file", "trip_id")
-_FROM_MAPPING = ("vehicle_id", "vehicle_model", "track", "mass_kg", "adhesion", "day")
+_FROM_MAPPING = ("vehicle_id", "vehicle_model", "track", "mass_kg", "tyres", "adhesion", "day")
 
 
 @dataclass(frozen=True)

@@ -2,12 +2,26 @@
 
 import csv
 from pathlib import Path
+from typing import Annotated, TypeVar
 
-from pydantic import Field, ValidationError
+from pydantic import AfterValidator, Field, ValidationError
 
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.config import LONGEST_FILE_BYTES, Config, faults_of
 from fleet_slip.errors import ConfigError
 from fleet_slip.ingest.names import Name, PositiveFloat
+
+Told = TypeVar("Told")
+
+
+def require_tyres_column(told: Told) -> Told:
+    """Return what is told of tyres. Raises `ValueError` if no column of the catalogue takes it."""
+    if "tyres" not in catalogue().drive:
+        raise ValueError(
+            "the catalogue has no such drive column. Copy it from the shipped one: "
+            "configs/signals.toml"
+        )
+    return told
 
 
 class VehicleFacts(Config):
@@ -15,7 +29,10 @@ class VehicleFacts(Config):
 
     vehicle_id: Name
     vehicle_model: Name | None = None
-    mass_kg: PositiveFloat | None = Field(default=None)
+    mass_kg: PositiveFloat | None = None
+    tyres: Annotated[Name, AfterValidator(require_tyres_column)] | None = Field(
+        default=None, exclude_if=lambda value: value is None
+    )
 
 
 def read_vehicle_facts(file: Path) -> tuple[VehicleFacts, ...]:

@@ -4,8 +4,10 @@ from pathlib import Path
 
 import pytest
 
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import ConfigError, InputError
 from fleet_slip.ingest import Mapping, load_mapping
+from fleet_slip.resources import config_file
 from tests.support.measured import read_columns
 
 MAPPING = """
@@ -15,7 +17,7 @@ time = { column = "t", unit = "s" }
 drive = { day = 2024-05-31, vehicle_id = { column = "car" } }
 signals.ax = { column = "ax", unit = "m/s^2" }
 """
-CARS = "vehicle_id,vehicle_model,mass_kg\nA7,suv,1900\nB2,sedan,\n"
+CARS = "vehicle_id,vehicle_model,mass_kg,tyres\nA7,suv,1900,winter 225/50\nB2,sedan,,\n"
 COLUMNS = {"t": [0, 0.01, 0, 0.01], "car": ["A7", "A7", "B2", "B2"], "ax": [1, 2, 3, 4]}
 
 
@@ -27,8 +29,8 @@ def load(folder: Path, cars: str = CARS, mapping: str = MAPPING) -> Mapping:
 
 def test_drives_get_what_is_known_of_their_car(tmp_path: Path) -> None:
     drives = read_columns(tmp_path, COLUMNS, load(tmp_path)).drives.to_pylist()
-    known = {(d["vehicle_id"], d["vehicle_model"], d["mass_kg"]) for d in drives}
-    assert known == {("A7", "suv", 1900.0), ("B2", "sedan", None)}
+    known = {(d["vehicle_id"], d["vehicle_model"], d["mass_kg"], d["tyres"]) for d in drives}
+    assert known == {("A7", "suv", 1900.0, "winter 225/50"), ("B2", "sedan", None, None)}
 
 
 def test_what_the_mapping_says_comes_before_the_table(tmp_path: Path) -> None:
@@ -84,3 +86,31 @@ def test_a_table_that_is_not_there_is_named(tmp_path: Path) -> None:
 def test_without_a_table_the_model_is_needed(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"drive\.vehicle_model is needed"):
         load(tmp_path, mapping=MAPPING.replace('vehicles = "cars.csv"', ""))
+
+
+def test_tyres_need_a_column_of_the_catalogue(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shipped = config_file("signals.toml").read_text(encoding="utf-8")
+    start = shipped.index("[drive.tyres]")
+    own = shipped[:start] + shipped[shipped.index("[drive.adhesion]") :]
+    (tmp_path / "signals.toml").write_text(own, encoding="utf-8")
+    monkeypatch.setenv("FLEET_SLIP_SIGNALS", str(tmp_path / "signals.toml"))
+    catalogue.cache_clear()
+    try:
+        with pytest.raises(ConfigError, match="line 2: tyres: the catalogue has no such drive"):
+            load(tmp_path)
+        said = MAPPING.replace('"car" } }', '"car" }, tyres = "winter" }')
+        with pytest.raises(ConfigError, match=r"drive\.tyres: the catalogue has no such drive"):
+            load(tmp_path, CARS.replace("winter 225/50", ""), said)
+        plain = load(tmp_path, "vehicle_id,vehicle_model\nA7,suv\nB2,sedan\n")
+        assert len(read_columns(tmp_path, COLUMNS, plain).drives)
+    finally:
+        catalogue.cache_clear()
+
+
+def test_tyres_of_a_column_are_known_of_each_drive(tmp_path: Path) -> None:
+    said = MAPPING.replace('"car" } }', '"car" }, tyres = { column = "shoes" } }')
+    columns = {**COLUMNS, "shoes": ["slick", "slick", "wet", "wet"]}
+    drives = read_columns(tmp_path, columns, load(tmp_path, mapping=said)).drives.to_pylist()
+    assert {(d["vehicle_id"], d["tyres"]) for d in drives} == {("A7", "slick"), ("B2", "wet")}
