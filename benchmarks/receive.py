@@ -1,10 +1,13 @@
 """How fast messages of cars are taken in.
 
-    python -m benchmarks.receive [--cars 20000] [--drives 5] [--folder FOLDER]
+    python -m benchmarks.receive [--cars 20000] [--drives 5] [--forgotten 1] [--folder FOLDER]
 
 Writes a file of messages for each day, one of each car, all different; receives them, and receives
 them again with a message more in each file, so that all others are duplicates. Sums and products
 are those that drives of 20 s to an hour have whose signals vary at random with each other.
+With `--forgotten`, the first day lands, then so many cars are forgotten, each in turn a car and a
+single drive of another one; what is measured are the other days, and then messages of a few cars
+that nobody knew.
 """
 
 import argparse
@@ -22,18 +25,22 @@ from fleet_slip.grams.messages import message_size, message_type, signals_defini
 from fleet_slip.regression.gram import Gram
 from tests.support.messages import START_S, gram_of, message_of
 
+UNKNOWN = 100
+"""Cars that come after others were forgotten."""
+
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--cars", type=int, default=20_000)
-    parser.add_argument("--drives", type=int, default=5)
+    for name, default in (("cars", 20_000), ("drives", 5), ("forgotten", 0)):
+        parser.add_argument(f"--{name}", type=int, default=default)
     parser.add_argument("--folder", type=Path)
     given = parser.parse_args()
     with tempfile.TemporaryDirectory(dir=given.folder) as folder:
-        print(json.dumps(measure(Path(folder), given.cars, given.drives), indent=2))
+        found = measure(Path(folder), given.cars, given.drives, given.forgotten)
+        print(json.dumps(found, indent=2))
 
 
-def measure(folder: Path, cars: int, drives: int) -> dict[str, float]:
+def measure(folder: Path, cars: int, drives: int, forgotten: int) -> dict[str, float]:
     """Return messages a second, of new ones and of duplicates, and bytes of a message and a row."""
     first = gram_of(0)
     fleet = fleet_slip.open(folder / "data")
@@ -41,8 +48,11 @@ def measure(folder: Path, cars: int, drives: int) -> dict[str, float]:
     for drive in range(drives):
         paths.append(folder / f"day-{drive}")
         paths[-1].write_bytes(messages_of(cars, START_S + 86_400 * drive, seed=drive))
-    size = sum(path.stat().st_size for path in paths)
+    size_bytes = paths[0].stat().st_size / cars
     fleet.receive(write_first(folder, first))  # and have everything imported
+    if forgotten:
+        fleet.receive(paths.pop(0))
+        forget_some(fleet, forgotten)
     began = time.perf_counter()
     received = sum(report.received for report in fleet.receive(paths))
     first_s = time.perf_counter() - began
@@ -51,15 +61,36 @@ def measure(folder: Path, cars: int, drives: int) -> dict[str, float]:
     began = time.perf_counter()
     duplicates = sum(report.duplicates for report in fleet.receive(paths))
     again_s = time.perf_counter() - began
-    stored = sum(file.size_bytes for file in fleet.warehouse.grams.snapshot().files)
+    unknown_s = receive_unknown(fleet, folder) if forgotten else 0.0
+    stored = fleet.warehouse.grams.snapshot().files
+    stored_bytes = sum(file.size_bytes for file in stored) / sum(file.rows for file in stored)
     return {
         "messages": received,
         "messages_per_s": round(received / first_s),
         "duplicates": duplicates,
         "duplicates_per_s": round(duplicates / again_s),
-        "message_bytes": size / received,
-        "stored_bytes_per_row": round(stored / (received + 1), 1),
+        "ms_for_a_car_that_nobody_knew": round(1e3 * unknown_s / UNKNOWN, 2),
+        "message_bytes": size_bytes,
+        "stored_bytes_per_row": round(stored_bytes, 1),
     }
+
+
+def forget_some(fleet: fleet_slip.Fleet, many: int) -> None:
+    """Forget some cars, and single drives of others."""
+    for car in range(many):
+        if car % 2 == 0:
+            fleet.forget(vehicle=f"CAR{car}", now=True)
+        else:
+            fleet.forget(drive=f"CAR{car}-20240501T100000Z", now=True)
+
+
+def receive_unknown(fleet: fleet_slip.Fleet, folder: Path) -> float:
+    """Return the seconds that messages of cars take of which no message ever came."""
+    messages = [message_of(gram_of(car), f"NEW{car}") for car in range(UNKNOWN)]
+    (folder / "unknown").write_bytes(b"".join(messages))
+    began = time.perf_counter()
+    fleet.receive(folder / "unknown")
+    return time.perf_counter() - began
 
 
 def messages_of(cars: int, start_s: int, seed: int) -> bytes:

@@ -17,7 +17,7 @@ from fleet_slip.grams.gram_rows import by_signals, gram_table
 from fleet_slip.grams.received_rows import ReceivedRows, Refused, is_received, signals_of
 from fleet_slip.grams.received_table import received_table
 from fleet_slip.grams.same_drives import content_keys
-from fleet_slip.warehouse.audit import Audit, Barred
+from fleet_slip.grams.screening import Screened, screen
 from fleet_slip.warehouse.tables import Warehouse, gram_schema
 
 CONTRADICTS = "contradicts another message of its drive"
@@ -34,6 +34,7 @@ class NewMessages:
         refused: what goes to the quarantine.
         duplicates, forgotten: the file of each row that it has, and that is of a car or a drive
             that was forgotten.
+        screened: what of all that was forgotten, and which cars were found to be none of it.
     """
 
     grams: Snapshot
@@ -41,6 +42,7 @@ class NewMessages:
     refused: Sequence[Refused]
     duplicates: IntArray
     forgotten: IntArray
+    screened: Screened
 
 
 def choose_new(
@@ -49,12 +51,12 @@ def choose_new(
     """Return what of some rows is new, and what contradicts what is there."""
     grams = warehouse.grams.snapshot()
     # Asked after the snapshot: who forgets a car from now on makes this commit a conflict.
-    barred = _barred(Audit(warehouse.root), rows, refused)
-    wrong = [one for one in refused if not _is_barred(one, barred)]
-    forgotten = [one.file for one in refused if _is_barred(one, barred)]
+    screened = screen(warehouse.root, rows, refused)
+    wrong = [one for one in refused if not screened.bars(one)]
+    forgotten = [one.file for one in refused if screened.bars(one)]
     kept = []
     for some in rows:
-        out = _are_barred(some, barred)
+        out = screened.bars_rows(some)
         forgotten += some.file[out].tolist()
         kept.append(some.take(~out))
     drives = [_Drives.of(some) for some in kept if len(some)]
@@ -74,32 +76,8 @@ def choose_new(
         wrong,
         np.concatenate([*duplicates, np.empty(0, np.int64)]),
         np.array(forgotten, np.int64),
+        screened,
     )
-
-
-def _barred(audit: Audit, rows: Sequence[ReceivedRows], refused: Sequence[Refused]) -> Barred:
-    if not audit.entries():
-        return Barred()
-    vehicles = {one.vehicle_id for one in refused if one.vehicle_id}
-    drives = {one.drive_id for one in refused if one.drive_id}
-    for some in rows:
-        vehicles.update(some.vehicle_ids.unique().to_pylist())
-        drives.update(some.drive_ids.unique().to_pylist())
-    return audit.barred(vehicles, drives)
-
-
-def _is_barred(one: Refused, barred: Barred) -> bool:
-    return one.vehicle_id in barred.vehicles or one.drive_id in barred.drives
-
-
-def _are_barred(rows: ReceivedRows, barred: Barred) -> BoolArray:
-    if not barred:
-        return np.zeros(len(rows), dtype=np.bool_)
-    vehicles, drives = (
-        pa.array(sorted(names), pa.string()) for names in (barred.vehicles, barred.drives)
-    )
-    found = pc.or_(pc.is_in(rows.vehicle_ids, vehicles), pc.is_in(rows.drive_ids, drives))
-    return np.asarray(found.to_numpy(zero_copy_only=False), dtype=np.bool_)
 
 
 @dataclass

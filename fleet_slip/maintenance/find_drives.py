@@ -12,6 +12,7 @@ from fleet_slip.maintenance.old_files import rows_of
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.audit import Forgettable
 from fleet_slip.warehouse.database import open_database, reading_files
+from fleet_slip.warehouse.tables import Warehouse
 
 FILES_PER_QUERY = 256
 """DuckDB keeps what it read of each file of a query: some 70 KB."""
@@ -47,6 +48,13 @@ def locate(grams: Snapshot, subject: Forgettable) -> Located:
         ):
             drives.setdefault(path, set()).add(drive)
     return Located(frozenset(known), {path: frozenset(names) for path, names in drives.items()})
+
+
+def cars_with_rows(warehouse: Warehouse) -> set[str]:
+    """Return the cars that have Gram rows."""
+    grams = warehouse.grams.snapshot()
+    each = (grams.table.read(file.path, ["vehicle_id"])["vehicle_id"] for file in grams.files)
+    return {name for cars in each for name in cars.unique().to_pylist() if name is not None}
 
 
 def drives_by_file(

@@ -13,6 +13,7 @@ a conflict. What such jobs have written is never committed, and deleted by them 
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -20,7 +21,7 @@ import pyarrow.compute as pc
 from fleet_slip.delta import Change, retry_conflicts, rows_in
 from fleet_slip.errors import FleetSlipError, QuestionError
 from fleet_slip.grams.job import reconcile
-from fleet_slip.maintenance.find_drives import Located, drives_by_file, locate
+from fleet_slip.maintenance.find_drives import Located, cars_with_rows, drives_by_file, locate
 from fleet_slip.maintenance.forget_received import forget_received
 from fleet_slip.maintenance.marks import newest_versions
 from fleet_slip.maintenance.old_files import (
@@ -36,6 +37,7 @@ from fleet_slip.progress import Progress, no_progress
 from fleet_slip.runs.history import runs_under_way
 from fleet_slip.views import connect
 from fleet_slip.warehouse.audit import ALLOWED, Audit, Forgettable
+from fleet_slip.warehouse.cleared_cars import ClearedCars
 from fleet_slip.warehouse.condition import asking, parse_condition
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -87,6 +89,8 @@ def forget(
     models = audit.models_of(subject)
     if state == ALLOWED or (drives and state != "begun"):
         models = _begin(warehouse, audit, subject, drives)
+    cleared, present = ClearedCars(warehouse.root), partial(cars_with_rows, warehouse)
+    cleared.forget(audit, subject, present)
     for table in (warehouse.quarantine, warehouse.logs):
         if drives or state:
             table.fence()
@@ -94,6 +98,7 @@ def forget(
     if not landed <= drives:  # they landed before the fence
         drives |= landed
         models = _begin(warehouse, audit, subject, drives)
+        cleared.forget(audit, subject, present)
     _forget_quarantined(warehouse, subject, drives)
     rows, rewritten, removed = _rewrite_logs(warehouse, subject, located, progress)
     if drives or state:
@@ -101,6 +106,7 @@ def forget(
     rows += forget_received(warehouse, subject)
     uncommitted = remove_uncommitted_files(warehouse, subject)
     reconcile(warehouse)
+    cleared.keep(present)
     old = (remove_old_files if now else remove_uncommitted_files)(warehouse, subject)
     if drives or state in ("begun", ALLOWED):
         audit.end(subject, warehouse.grams.snapshot().version)

@@ -6,6 +6,8 @@ forgotten?" can be answered by who knows the name, and by no other.
     forgotten/1.json, 2.json, ...   "begun" before anything is changed, "done" after all of it,
                                     "allowed" where a car or drive may come back
 
+"begun" of a drive has the hash of the only car that can send a message of it, too.
+
 Who lands rows asks `barred` between looking at the table and committing to it. Who forgets writes
 "begun" and then fences the table (`Table.fence`). So a commit either began after the fence, and its
 writer has read the entry; or it began before, and is a conflict; or it landed before the fence, and
@@ -19,9 +21,9 @@ from collections.abc import Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import partial
 from typing import Any, Literal, TypeAlias, cast
 
+from fleet_slip.catalogue.sources import sender_of
 from fleet_slip.files.documents import DocumentFolder
 from fleet_slip.files.folder import Folder
 
@@ -44,6 +46,11 @@ class Forgettable:
         return {"vehicle": "vehicle_id", "drive": "drive_id", "before": "day"}[self.kind]
 
     @property
+    def sender(self) -> str | None:
+        """The only car, if any, whose messages it can be of; None for a time."""
+        return {"vehicle": self.value, "drive": sender_of(self.value), "before": None}[self.kind]
+
+    @property
     def condition(self) -> str:
         """SQL condition with the parameter `$value`."""
         if self.kind == "before":
@@ -55,7 +62,7 @@ class Forgettable:
         return _digest(f"{self.kind}:{self.value}", salt)
 
 
-@functools.lru_cache(100_000)
+@functools.lru_cache(300_000)
 def _digest(text: str, salt: str) -> str:
     name = text.encode("utf-8", "surrogatepass")
     return hashlib.scrypt(name, salt=bytes.fromhex(salt), n=2**14, r=8, p=1, dklen=32).hex()
@@ -67,8 +74,11 @@ def _entry(folder: DocumentFolder, number: int) -> Mapping[str, Any]:
     return folder.read(number).content
 
 
-def _digest_of(salt: str, subject: Forgettable) -> str:
-    return subject.digest(salt)
+def _digests(kind: Kind, names: Collection[str], salt: str) -> dict[str, str]:
+    """Return the hash of each name, computed on all processors."""
+    with ThreadPoolExecutor() as threads:  # scrypt lets others run
+        found = threads.map(lambda name: Forgettable(kind, name).digest(salt), names)
+        return dict(zip(names, found, strict=True))
 
 
 @dataclass(frozen=True)
@@ -103,18 +113,46 @@ class Audit:
         Each name takes some 40 ms to look up, once in a process, where a car, or a drive, was ever
         forgotten; nothing where none was.
         """
-        last = {(e["kind"], e["salt"], e["subject"]): e["event"] for e in self.entries()}
-        named = {"vehicle": vehicles, "drive": drives}
+        last = self._last_events()
         found: dict[str, set[str]] = {"vehicle": set(), "drive": set()}
-        with ThreadPoolExecutor() as threads:  # scrypt lets others run
-            for kind, salt in sorted({key[:2] for key in last if key[0] in named}):
-                names = sorted(named[kind])
-                subjects = [Forgettable(cast(Kind, kind), name) for name in names]
-                digests = threads.map(partial(_digest_of, salt), subjects)
-                for name, digest in zip(names, digests, strict=True):
+        for kind, names in (("vehicle", vehicles), ("drive", drives)):
+            for salt in {key[1] for key in last if key[0] == kind}:
+                for name, digest in _digests(cast(Kind, kind), names, salt).items():
                     if last.get((kind, salt, digest), ALLOWED) != ALLOWED:
                         found[kind].add(name)
         return Barred(frozenset(found["vehicle"]), frozenset(found["drive"]))
+
+    def with_forgotten_drives(self, cars: Collection[str]) -> frozenset[str]:
+        """Return which of some cars can send a message of a drive that was forgotten.
+
+        All of them, where an earlier version forgot a drive, which did not keep whose it is. As
+        slow as `barred`.
+        """
+        last = self._last_events()
+        begun = [e for e in self.entries() if (e["kind"], e["event"]) == ("drive", "begun")]
+        left = [e for e in begun if last["drive", e["salt"], e["subject"]] != ALLOWED]
+        if any("sender" not in entry for entry in left):
+            return frozenset(cars)
+        senders = {(e["salt"], e["sender"]) for e in left if e["sender"] is not None}
+        found: set[str] = set()
+        for salt in {salt for salt, _ in senders}:
+            hashed = _digests("vehicle", cars, salt)
+            found.update(name for name, digest in hashed.items() if (salt, digest) in senders)
+        return frozenset(found)
+
+    def begun(self, subject: Forgettable | None = None) -> frozenset[int]:
+        """Return the numbers of the entries that bar a car or a drive, or only a subject."""
+        digests = {e["salt"]: subject.digest(e["salt"]) for e in self.entries()} if subject else {}
+        return frozenset(
+            number
+            for number, entry in enumerate(self.entries(), 1)
+            if entry["event"] == "begun" and entry["kind"] != "before"
+            if subject is None or entry["subject"] == digests[entry["salt"]]
+        )
+
+    def _last_events(self) -> dict[tuple[str, str, str], str]:
+        """Return the last event of each subject, by its kind, salt and hash."""
+        return {(e["kind"], e["salt"], e["subject"]): e["event"] for e in self.entries()}
 
     def state(self, subject: Forgettable) -> Literal["begun", "done", "allowed"] | None:
         """Return how far forgetting a subject got; None if it was never begun."""
@@ -157,6 +195,9 @@ class Audit:
     def _append(self, subject: Forgettable, content: Mapping[str, Any]) -> None:
         entries = self.entries()
         salt = entries[0]["salt"] if entries else secrets.token_hex(16)
+        if subject.kind == "drive" and content["event"] == "begun":
+            car = Forgettable("vehicle", subject.sender) if subject.sender else None
+            content = {**content, "sender": car.digest(salt) if car else None}
         at = datetime.now(UTC).isoformat(timespec="seconds")
         known = {"kind": subject.kind, "subject": subject.digest(salt), "salt": salt, "at": at}
         self._folder.append({**known, **content})
