@@ -120,7 +120,8 @@ class Filling(Rooted):
         Files on an object store are given as URLs, and copied to the temporary folder to be read.
         Returns a report of each file that was read, in their order; `each` is called with it once
         the file is committed. Progress is in files for folders and patterns, else in rows, where a
-        format tells about how many there are. Without a cluster they are read one after the other.
+        format tells about how many there are. Without a cluster, threads read the small files of
+        folders, and large ones come one after the other, each read by all cores.
 
         Raises `ConfigError` for a mapping that is not valid; `InputError`, when all others are in,
         for files that cannot be used, of which nothing is written; `StorageError` and
@@ -152,7 +153,8 @@ class Filling(Rooted):
             by_file = folders and not as_one
             rows = no_progress if by_file or progress is None else _rows_of(wanted, told)
             try:
-                for report in ingest_files(warehouse, wanted, plan, elsewhere, known, rows):
+                threads = executor if by_file else elsewhere
+                for report in ingest_files(warehouse, wanted, plan, threads, known, rows):
                     reports[report.file] = report
                     figures.rows += report.counts.ticks if report.new else 0
                     if each is not None:

@@ -166,7 +166,7 @@ def _si_value(name: str, source: SignalColumn, number: pl.Expr) -> pl.Expr:
 
 def _lies_within(values: pl.Series, low: float, high: float, scale: Decimal) -> bool:
     """Whether all values are finite, and their counts between two limits, which are outside."""
-    present = values.drop_nulls().to_numpy()
+    present = (values.drop_nulls() if values.null_count() else values).to_numpy()
     if not present.size:
         return True
     # Dividing keeps the order of what it rounds; a NaN is the least and the most, and in no range.

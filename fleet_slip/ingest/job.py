@@ -1,17 +1,24 @@
 """Brings measured logs into the warehouse; the same file through the same mapping lands once."""
 
-from collections.abc import Iterable, Iterator
-from concurrent.futures import Executor
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import InputError
 from fleet_slip.files.folder import StoredFile
 from fleet_slip.ingest.folders import KnownFiles
-from fleet_slip.ingest.landing import AskedFile, FileOutcome, Landing, unit_of, write_batch
+from fleet_slip.ingest.landing import (
+    AskedFile,
+    FileOutcome,
+    Landing,
+    WrittenBatch,
+    unit_of,
+    write_batch,
+)
 from fleet_slip.ingest.log_files import Log, StoredParts
 from fleet_slip.ingest.look_alikes import find_vehicles_like
 from fleet_slip.ingest.mapping import Mapping
@@ -25,6 +32,8 @@ BATCH_BYTES = 2**24
 """Files are read, written and committed together up to this size."""
 BATCH_FILES = 500
 FAILURES_SHOWN = 5
+
+Batch: TypeAlias = tuple[AskedFile, ...]
 
 
 @dataclass(frozen=True)
@@ -80,9 +89,11 @@ def ingest_files(
 ) -> Iterator[IngestReport]:
     """Ingest files, and yield a report of each as it is committed; small files land together.
 
-    With an executor batches are read and written by its workers, in any order. `known` remembers
-    what landed, and refuses a file that has changed since. `progress` counts rows of each file as
-    it is read, but for those that an executor's workers read.
+    With an executor batches are read and written by its workers, in any order; threads of this
+    process take those of small files only, since a large one keeps all cores and much of the
+    memory busy by itself. `known` remembers what landed, and refuses a file that has changed since.
+    `progress` counts rows of each file as it is read, but for those that an executor's workers
+    read.
 
     A file that is not usable does not hold up the others: when they are done `InputError` tells
     of it. Raises `ClusterError` at the end for files that workers died of.
@@ -93,7 +104,7 @@ def ingest_files(
     warehouse.logs.require_writable(mapping.signals)
     failures: list[InputError] = []
     asked = (AskedFile(file, known.digest_of(file) if known else None) for file in files)
-    for batch, written in run_tasks(executor, write, _batches(asked), lambda b: str(b[0].file)):
+    for batch, written in _written(executor, write, _batches(asked)):
         failures += written.failures
         # Not the file's name: it may name a car, and the Delta log outlives what is forgotten.
         note = {"job": "ingest", "mapping": mapping.name, "digest": written.digest}
@@ -109,7 +120,21 @@ def ingest_files(
         raise _joined(failures)
 
 
-def _batches(files: Iterable[AskedFile]) -> Iterator[tuple[AskedFile, ...]]:
+def _written(
+    executor: Executor | None, write: Callable[[Batch], WrittenBatch], batches: Iterable[Batch]
+) -> Iterator[tuple[Batch, WrittenBatch]]:
+    """Yield batches as they are written."""
+    alone: list[Batch] = []
+    if isinstance(executor, ThreadPoolExecutor):
+        together: list[Batch] = []
+        for batch in batches:
+            (alone if _size_of(batch[0].file) >= BATCH_BYTES else together).append(batch)
+        batches = together
+    yield from run_tasks(executor, write, batches, lambda batch: str(batch[0].file))
+    yield from run_tasks(None, write, alone, str)
+
+
+def _batches(files: Iterable[AskedFile]) -> Iterator[Batch]:
     """Group files, in their order, into batches of `BATCH_BYTES` and one file at least."""
     batch: list[AskedFile] = []
     size = 0

@@ -3,9 +3,10 @@
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from hashlib import sha256
+from typing import Any
 
-import pyarrow as pa
 from deltalake.transaction import AddAction
 
 from fleet_slip.delta import Change, Snapshot, Table, Unit, retry_conflicts
@@ -24,8 +25,10 @@ from fleet_slip.ingest.writing import (
     WRITERS,
     DataFiles,
     FileWriter,
+    Rows,
     TableName,
     WrittenFile,
+    as_table,
 )
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.audit import Audit
@@ -107,15 +110,16 @@ def write_batch(
     longest: tuple[int, MeasuredDrive] | None = None
     outcomes: list[FileOutcome] = []
     failures: list[InputError] = []
-    landed: dict[TableName, Callable[[str], bool]] = {
-        "quarantine": warehouse.quarantine.snapshot().landed_among(len(files)),
-        "logs": warehouse.logs.snapshot().landed_among(len(files)),
-    }
+    tables: tuple[tuple[TableName, Table, bool], ...] = (
+        ("quarantine", warehouse.quarantine, False),
+        ("logs", warehouse.logs, True),
+    )
+    landed = {name: table.snapshot().landed_among(len(files)) for name, table, _ in tables}
     copies = LocalCopies(asked.file for asked in files)
     with copies, ThreadPoolExecutor(WRITERS) as threads:
         parts: dict[TableName, _PartInTheMaking] = {
-            "quarantine": _PartInTheMaking(DataFiles(warehouse.quarantine, threads, by_day=False)),
-            "logs": _PartInTheMaking(DataFiles(warehouse.logs, threads, by_day=True)),
+            name: _PartInTheMaking(DataFiles(table, threads, by_day=by_day), mapping)
+            for name, table, by_day in tables
         }
         for asked in files:
             try:
@@ -137,7 +141,9 @@ def write_batch(
             if drive and (longest is None or drive.ticks.size > longest[1].ticks.size):
                 longest = len(outcomes) - 1, drive
             for name in missing:
-                parts[name].add(stream.digest, written.rest.get(name), written.files[name])
+                parts[name].add(stream.digest, written.rest.get(name, ()), written.files[name])
+        for part in parts.values():
+            part.write_rest()
         if longest is not None:
             number, drive = longest
             found = tuple(find_suspicions(signals_of(drive)))
@@ -150,36 +156,39 @@ def write_batch(
 class _PartInTheMaking:
     """The rows of small files, which are written together, and data files of large ones."""
 
-    def __init__(self, together: DataFiles) -> None:
-        self._together = together
-        self._rows: dict[str, pa.Table] = {}
+    def __init__(self, together: DataFiles, mapping: Mapping) -> None:
+        self._together, self._mapping = together, mapping
+        self._rest: dict[str, Rows] = {}
+        self._number_of_rows = 0
         self._digests: list[str] = []
         self._files: list[AddAction] = []
 
     def has(self, digest: str) -> bool:
         return digest in self._digests
 
-    def add(self, digest: str, rest: pa.Table | None, files: tuple[AddAction, ...]) -> None:
-        if rest is not None:
-            self._rows[digest] = rest
-        if rest is not None or files:
+    def add(self, digest: str, rest: Rows, files: tuple[AddAction, ...]) -> None:
+        if rest:
+            self._rest[digest] = rest
+            self._number_of_rows += sum(one.num_rows for one in rest)
+        if rest or files:
             self._digests.append(digest)
         self._files += files
-        if sum(rows.num_rows for rows in self._rows.values()) >= FILE_ROWS:
-            self._write()
+        if self._number_of_rows >= FILE_ROWS:
+            self.write_rest()
 
     def finish(self) -> Part:
-        if self._rows:
-            self._write()
         units = tuple(map(unit_of, sorted(self._digests)))
         return Part(units, (*self._files, *self._together.files()))
 
-    def _write(self) -> None:
+    def write_rest(self) -> None:
         """Write the rows of files in the order of their digests: so drives are in that of names."""
-        digests = sorted(self._rows)
-        whole = pa.concat_tables(self._rows[digest] for digest in digests).unify_dictionaries()
-        self._together.write(f"measured-{_digest(digests)[:24]}", lambda: whole)
-        self._rows = {}
+        if not self._rest:
+            return
+        digests = sorted(self._rest)
+        rows: Any = [one for digest in digests for one in self._rest[digest]]
+        name = f"measured-{_digest(digests)[:24]}"
+        self._together.write(name, partial(as_table, rows, self._mapping))
+        self._rest, self._number_of_rows = {}, 0
 
 
 def _require_not_grown(

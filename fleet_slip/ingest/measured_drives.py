@@ -61,6 +61,11 @@ class MeasuredDrive:
     ticks: NDArray[np.int32]
     counts: dict[str, pa.Array]
 
+    @property
+    def num_rows(self) -> int:
+        """Number of its rows, as a table has it."""
+        return self.ticks.size
+
 
 def drive_id(prefix: str, group: int, stretch: int = 1) -> str:
     """Return the name of the n-th stretch (from 1) of the drive with this number (from 0)."""

@@ -1,6 +1,7 @@
 """Splits rows into good ones, with values in SI units, and bad ones, each with its reason."""
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import polars as pl
@@ -94,6 +95,7 @@ def join_refused(frames: Sequence[pl.DataFrame]) -> pl.DataFrame:
     return pl.concat(some) if len(some) > 1 else next(iter(some), frames[0])
 
 
+@cache
 def no_rows() -> pl.DataFrame:
     """Return an empty frame of bad rows."""
     names = {"row": pl.Int64, "group": pl.Int32, "reason": pl.String}

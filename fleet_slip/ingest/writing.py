@@ -1,7 +1,7 @@
 """Writes what a measured file becomes to data files of bounded size. Nothing is committed."""
 
 import os
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
@@ -17,6 +17,7 @@ from deltalake.transaction import AddAction
 from fleet_slip.delta import Table
 from fleet_slip.ingest.expected_rows import expected_rows
 from fleet_slip.ingest.forgotten import keep_drives, keep_refused
+from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.measured_drives import MeasuredDrive, log_table
 from fleet_slip.ingest.stream import MeasuredStream
 from fleet_slip.progress import Progress, no_progress
@@ -30,6 +31,8 @@ WRITERS = 2
 """Data files that are written at once: encoding them is the longest part of an ingest."""
 
 TableName: TypeAlias = Literal["quarantine", "logs"]
+Rows: TypeAlias = Sequence[MeasuredDrive] | Sequence[pa.Table]
+"""Drives for the logs, or refused rows for the quarantine."""
 
 
 class DataFiles:
@@ -114,7 +117,7 @@ class WrittenFile:
         longest: the drive with the most ticks.
     """
 
-    rest: dict[TableName, pa.Table] = field(default_factory=dict)
+    rest: dict[TableName, Rows] = field(default_factory=dict)
     files: dict[TableName, tuple[AddAction, ...]] = field(default_factory=dict)
     vehicles: set[str] = field(default_factory=set)
     drives: set[str] = field(default_factory=set)
@@ -162,7 +165,8 @@ class FileWriter:
     def _read(self) -> None:
         refused = RefusedRows(self._stream)
         waiting: list[MeasuredDrive] = []
-        expected, read = expected_rows(self._stream.file), 0
+        told = self._progress is not no_progress
+        expected, read = expected_rows(self._stream.file) if told else 0, 0
         for piece in self._stream.pieces():
             rows = self._stream.checker.rows
             if expected:
@@ -185,7 +189,7 @@ class FileWriter:
             self._result.vehicles |= vehicles
             table = next(tables, None)
             if kept.num_rows:
-                self._pass_on("quarantine", partial(pa.Table.slice, kept), last=table is None)
+                self._pass_on("quarantine", [kept], last=table is None)
 
     def _pass_on_drives(self, drives: list[MeasuredDrive], *, last: bool) -> None:
         """Pass on the rows of drives that may land."""
@@ -197,18 +201,26 @@ class FileWriter:
         self._result.left_out += kept.left_out
         self._result.ticks += sum(drive.ticks.size for drive in kept.drives)
         if kept.drives:
-            rows = partial(log_table, kept.drives, self._stream.mapping)
-            self._pass_on("logs", rows, last=last)
+            self._pass_on("logs", kept.drives, last=last)
 
-    def _pass_on(self, name: TableName, rows: Callable[[], pa.Table], *, last: bool) -> None:
+    def _pass_on(self, name: TableName, rows: Rows, *, last: bool) -> None:
         if name not in self._missing:
             return
         if last:
-            self._result.rest[name] = rows()
+            self._result.rest[name] = rows
         else:
             self._large[name].write(
-                f"measured-{self._stream.digest[:24]}-{next(self._names)}", rows
+                f"measured-{self._stream.digest[:24]}-{next(self._names)}",
+                partial(as_table, rows, self._stream.mapping),
             )
+
+
+def as_table(rows: Rows, mapping: Mapping) -> pa.Table:
+    """Return rows in one table."""
+    tables = [one for one in rows if isinstance(one, pa.Table)]
+    if tables:
+        return pa.concat_tables(tables).unify_dictionaries()
+    return log_table([one for one in rows if isinstance(one, MeasuredDrive)], mapping)
 
 
 def _by_day(rows: pa.Table) -> dict[Any, pa.Table]:

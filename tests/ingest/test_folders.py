@@ -3,6 +3,8 @@
 import json
 import os
 import shutil
+import threading
+from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,8 @@ from fleet_slip.delta import Snapshot
 from fleet_slip.errors import InputError
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.ingest import job
+from fleet_slip.ingest.landing import write_batch
+from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.measured import a_mapping, csv_text, good_columns
 from tests.support.reported import call
@@ -243,3 +247,23 @@ def test_a_pattern_stands_for_what_matches(tmp_path: Path, monkeypatch: pytest.M
     assert not fleet.ingest(tmp_path / "[odd].csv", mapping)[0].new
     with pytest.raises(InputError, match=r"\*\.mf4: no file matches this pattern"):
         fleet.ingest(tmp_path / "*.mf4", mapping)
+
+
+def test_threads_read_small_files_and_large_ones_come_alone(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    large, read_by = folder / "large.csv", defaultdict[int, set[str]](set)
+    write_log(large, rows=200)
+
+    def write_and_note(warehouse: Warehouse, mapping: Mapping, files: Any, **more: Any) -> Any:
+        read_by[threading.get_ident()].update(Path(one.file).name for one in files)
+        return write_batch(warehouse, mapping, files, **more)
+
+    monkeypatch.setattr(job, "write_batch", write_and_note)
+    monkeypatch.setattr(job, "BATCH_FILES", 1)
+    monkeypatch.setattr(job, "BATCH_BYTES", large.stat().st_size)
+    reports = ingest(folder)
+    assert [report["new"] for report in reports] == [True] * 6
+    assert sorted(drives(folder).values()) == [20, 21, 22, 23, 24, 200]
+    assert read_by.pop(threading.get_ident()) == {"large.csv"}
+    assert set().union(*read_by.values()) == {f"{i}.csv" for i in range(5)}
