@@ -15,12 +15,14 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import partial
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.delta import Change, retry_conflicts, rows_in
 from fleet_slip.errors import FleetSlipError, QuestionError
 from fleet_slip.grams.job import reconcile
+from fleet_slip.grams.members import hash_numbers
 from fleet_slip.maintenance.find_drives import Located, cars_with_rows, drives_by_file, locate
 from fleet_slip.maintenance.forget_received import forget_received
 from fleet_slip.maintenance.marks import newest_versions
@@ -200,7 +202,7 @@ def models_trained_on(warehouse: Warehouse, drives: Collection[str]) -> list[str
     versions: dict[str, TrainedOn] = {}
     known: list[str] = []
     for name in registry.names():
-        hashed = hash_drives(name, drives)
+        hashed = hash_drives(name, hash_numbers(pa.array(sorted(drives), pa.string())))
         for number in registry.versions(name):
             reference = f"{name}@{number}"
             try:
@@ -211,7 +213,7 @@ def models_trained_on(warehouse: Warehouse, drives: Collection[str]) -> list[str
                 continue
             if kept is None:
                 versions[reference] = manifest.trained_on
-            elif not kept.isdisjoint(hashed):
+            elif np.isin(hashed, kept).any():
                 known.append(reference)
     return sorted([*known, *_asked_again(warehouse, versions, drives)])
 

@@ -6,11 +6,14 @@ until the erasure is done; then it does if one of its own drives (`models/traine
 Gram rows any more. A version from before those were kept counts as trained on them for ever.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
 
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.files.folder import Folder
+from fleet_slip.grams.members import Hashes, hash_numbers
 from fleet_slip.models.trained_drives import hash_drives, read_trained_drives
 from fleet_slip.models.versions import Registry
 from fleet_slip.warehouse.audit import Audit
@@ -53,18 +56,20 @@ class _PresentDrives:
     """The drives that have Gram rows, read when they are asked for."""
 
     warehouse: Warehouse
-    hashed: dict[str, frozenset[int]] = field(default_factory=dict)
+    hashed: dict[str, Hashes] = field(default_factory=dict)
 
-    def hashed_for(self, name: str) -> frozenset[int]:
+    def hashed_for(self, name: str) -> Hashes:
         """Return them as the versions of a model keep them."""
         if name not in self.hashed:
-            self.hashed[name] = hash_drives(name, frozenset(self._names()))
+            self.hashed[name] = hash_drives(name, self._hashes)
         return self.hashed[name]
 
-    def _names(self) -> Iterator[str]:
+    @cached_property
+    def _hashes(self) -> Hashes:
         grams = self.warehouse.grams.snapshot()
-        for file in grams.files:
-            yield from grams.table.read(file.path, ["drive_id"])["drive_id"].unique().to_pylist()
+        drives = (grams.table.read(file.path, ["drive_id"])["drive_id"] for file in grams.files)
+        found = [hash_numbers(some.unique()) for some in drives]
+        return np.unique(np.concatenate(found)) if found else np.array([], dtype=np.uint64)
 
 
 def _may_have_seen(
@@ -82,6 +87,6 @@ def _may_have_seen(
         if here and manifest.trained_on.grams_version >= without:
             return False
         kept = read_trained_drives(registry.folder_of(name), manifest)
-        return kept is None or not kept <= present.hashed_for(name)
+        return kept is None or not bool(np.isin(kept, present.hashed_for(name)).all())
     except FleetSlipError:
         return True

@@ -4,6 +4,8 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
+import numpy as np
+
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.trained_drives import read_trained_drives
@@ -72,7 +74,8 @@ def _drives(registry: Registry, one: ModelVersion, other: ModelVersion) -> Commo
     a, b = (read_trained_drives(folder, version.manifest) for version in (one, other))
     if a is None or b is None:
         return None
-    return CommonDrives(len(a - b), len(b - a), len(a & b))
+    both = len(np.intersect1d(a, b, assume_unique=True))
+    return CommonDrives(len(a) - both, len(b) - both, both)
 
 
 def _facts(one: ModelVersion, other: ModelVersion) -> dict[str, tuple[Any, Any]]:

@@ -8,8 +8,7 @@ the drive is forgotten, too. The hashes are salted with the model's name, so tha
 for versions of a model and differ between models. A manifest names the file by its SHA-256.
 """
 
-import hashlib
-from collections.abc import Collection
+from hashlib import sha256
 
 import numpy as np
 
@@ -17,19 +16,19 @@ from fleet_slip.errors import StorageError
 from fleet_slip.files.folder import Folder
 from fleet_slip.grams.members import Hashes
 from fleet_slip.models.manifest import Manifest
-from fleet_slip.regression.folds import hash_number
 
 _SALT = b"fleet-slip trained drives\n"
+_AT_ONCE = 2**20
 
 
 def pack_drives(name: str, drives: Hashes) -> bytes:
     """Return the content of the file about the drives that a model was trained on."""
-    return np.sort(_salted(name, drives)).astype(">u8").tobytes()
+    return hash_drives(name, drives).astype(">u8").tobytes()
 
 
 def checksum_of_drives(content: bytes) -> str:
     """Return the SHA-256 by which a manifest names the file of its drives."""
-    return hashlib.sha256(content).hexdigest()
+    return sha256(content).hexdigest()
 
 
 def keep_drives(versions: Folder, content: bytes) -> None:
@@ -37,15 +36,13 @@ def keep_drives(versions: Folder, content: bytes) -> None:
     versions.create(_file_name(checksum_of_drives(content)), content)
 
 
-def read_trained_drives(versions: Folder, manifest: Manifest) -> frozenset[int] | None:
-    """Return the salted hashes of a version's drives; None if it is from before they were kept.
+def read_trained_drives(versions: Folder, manifest: Manifest) -> Hashes | None:
+    """Return the salted hashes of a version's drives, sorted; None of one from before.
 
     Raises what `read_drives_file` raises.
     """
     content = read_drives_file(versions, manifest)
-    if content is None:
-        return None
-    return frozenset(np.frombuffer(content, dtype=">u8").tolist())
+    return None if content is None else np.frombuffer(content, dtype=">u8").astype(np.uint64)
 
 
 def read_drives_file(versions: Folder, manifest: Manifest) -> bytes | None:
@@ -65,19 +62,18 @@ def read_drives_file(versions: Folder, manifest: Manifest) -> bytes | None:
     return content
 
 
-def hash_drives(name: str, drives: Collection[str]) -> frozenset[int]:
-    """Return the salted hashes of drives that are known by their names."""
-    numbers = np.array([hash_number(drive) for drive in drives], dtype=np.uint64)
-    return frozenset(_salted(name, numbers).tolist())
+def hash_drives(name: str, drives: Hashes) -> Hashes:
+    """Return the salted hashes of drives, as the versions of a model keep them, sorted."""
+    return np.sort(_salted(name, drives))
 
 
 def _salted(name: str, drives: Hashes) -> Hashes:
-    salt = hashlib.sha256(_SALT + name.encode())
+    salt, numbers = _SALT + name.encode(), drives.astype("<u8")
     hashed = np.empty(len(drives), dtype=np.uint64)
-    for i, number in enumerate(drives.astype(">u8")):
-        one = salt.copy()
-        one.update(number.tobytes())
-        hashed[i] = int.from_bytes(one.digest()[:8], "big")
+    for first in range(0, len(drives), _AT_ONCE):
+        some = numbers[first : first + _AT_ONCE].tobytes()
+        digests = [sha256(salt + some[at : at + 8]).digest()[:8] for at in range(0, len(some), 8)]
+        hashed[first : first + _AT_ONCE] = np.frombuffer(b"".join(digests), dtype=">u8")
     return hashed
 
 
