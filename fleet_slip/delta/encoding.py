@@ -9,6 +9,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from fleet_slip.delta.preface import pack_preface
 from fleet_slip.files.checksums import checksum_of, fast_checksum_of
 
 ROW_GROUP_ROWS = 2**17
@@ -40,24 +41,30 @@ class Encoding:
     compression: str = "none"
 
     def options(self) -> dict[str, Any]:
-        """Return the arguments of `pyarrow.parquet.write_table`."""
+        """Return the arguments of `pyarrow.parquet.ParquetWriter`."""
         return {
             "use_dictionary": list(self.dictionary),
             "column_encoding": dict.fromkeys(self.delta_packed, "DELTA_BINARY_PACKED"),
             "compression": self.compression,
         }
 
-    def encode(self, rows: pa.Table, omitted: Sequence[str] = ()) -> Encoded:
-        """Return the content of a file with these rows, without some of their columns."""
-        stored = rows.drop_columns([name for name in omitted if name in rows.schema.names])
-        sink = pa.BufferOutputStream()
-        pq.write_table(
-            _required(stored),
-            sink,
-            row_group_size=ROW_GROUP_ROWS,
-            write_batch_size=WRITE_BATCH_ROWS,
-            **self.options(),
+    def encode(
+        self, rows: pa.Table, omitted: Sequence[str] = (), preface: Sequence[bytes] = ()
+    ) -> Encoded:
+        """Return the content of a file with these rows, without some of their columns.
+
+        The parts of a `preface` stand before them; see `fleet_slip.delta.preface`.
+        """
+        stored = _required(
+            rows.drop_columns([name for name in omitted if name in rows.schema.names])
         )
+        sink = pa.BufferOutputStream()
+        with pq.ParquetWriter(
+            sink, stored.schema, write_batch_size=WRITE_BATCH_ROWS, **self.options()
+        ) as writer:
+            if preface:
+                sink.write(pack_preface(preface))
+            writer.write_table(stored, row_group_size=ROW_GROUP_ROWS)
         content = sink.getvalue()
         statistics = json.dumps(_statistics(rows))
         return Encoded(content, checksum_of(content), fast_checksum_of(content), statistics)

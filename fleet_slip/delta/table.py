@@ -20,6 +20,7 @@ from fleet_slip.delta.conflicts import is_conflict, retry_conflicts
 from fleet_slip.delta.encoding import Encoded, Encoding
 from fleet_slip.delta.files import TableFile, active_files, have_same_columns, read_actions
 from fleet_slip.delta.log_check import require_sound_log
+from fleet_slip.delta.preface import read_preface
 from fleet_slip.delta.schema import require_readable, require_writable
 from fleet_slip.delta.sealing import NOTE, seal_note
 from fleet_slip.delta.units import read_landed_units
@@ -103,9 +104,15 @@ class Table:
         with storage_errors(f"{self.folder}/{path}"), self.folder.open(path) as file:
             return pq.read_metadata(file)
 
-    def write_file(self, name: str, rows: pa.Table, day: date | None = None) -> AddAction:
+    def read_preface(self, path: str, part: int) -> bytes | None:
+        """Return a part of what stands before a file's rows; see `fleet_slip.delta.preface`."""
+        return read_preface(self.folder, path, part)
+
+    def write_file(
+        self, name: str, rows: pa.Table, day: date | None = None, preface: Sequence[bytes] = ()
+    ) -> AddAction:
         """Write rows to the file NAME-CHECKSUMS.parquet, durably; see `put`."""
-        return self.put(name, self.encode(rows), day)
+        return self.put(name, self.encode(rows, preface), day)
 
     def put(self, name: str, encoded: Encoded, day: date | None = None) -> AddAction:
         """Write a file's content to the file NAME-CHECKSUMS.parquet, durably.
@@ -139,9 +146,9 @@ class Table:
         self.folder.put(file.path, encoded.content)
         return True
 
-    def encode(self, rows: pa.Table) -> Encoded:
+    def encode(self, rows: pa.Table, preface: Sequence[bytes] = ()) -> Encoded:
         """Return the content of a file with these rows."""
-        return self.encoding.encode(rows, omitted=self.partition_by)
+        return self.encoding.encode(rows, self.partition_by, preface)
 
     def require_writable(self, columns: Iterable[str]) -> None:
         """Raise `RefusedError` if rows with some of the optional columns cannot be committed."""
@@ -212,6 +219,8 @@ class Snapshot:
 
     table: Table
     delta: DeltaTable | None
+    without: frozenset[str] = frozenset()
+    """Paths of files that are left out."""
 
     @property
     def version(self) -> int | None:
@@ -224,7 +233,8 @@ class Snapshot:
         if self.delta is None:
             return ()
         with storage_errors(self.table.folder):
-            return active_files(self._actions, self.table.folder)
+            every = active_files(self._actions, self.table.folder)
+        return tuple(file for file in every if file.path not in self.without)
 
     @property
     def has_same_columns(self) -> bool:

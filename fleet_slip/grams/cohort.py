@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
-import duckdb
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -16,6 +15,7 @@ from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import SCENARIO, TRAINING_DRIVES
 from fleet_slip.errors import DataError, QuestionError, RefusedError
+from fleet_slip.grams.empty_cohort import empty_cohort_error
 from fleet_slip.grams.expansion import expansion_of
 from fleet_slip.grams.folding import (
     BANDS,
@@ -26,7 +26,7 @@ from fleet_slip.grams.folding import (
     FoldCount,
     FoldKey,
 )
-from fleet_slip.grams.members import Members, hash_numbers, received_among
+from fleet_slip.grams.members import Hashed, Members, hash_numbers, received_among
 from fleet_slip.grams.reader import GramReader, open_grams
 from fleet_slip.regression.drive_moments import serving_drives
 from fleet_slip.regression.folds import CohortFolds, FoldAssignment, by_band, by_hash, by_value
@@ -34,7 +34,6 @@ from fleet_slip.regression.gram_table import GramTable
 from fleet_slip.warehouse.condition import Condition, asking, parse_condition
 from fleet_slip.warehouse.minimum_cohort import minimum_vehicles, require_vehicles
 from fleet_slip.warehouse.tables import Warehouse
-from fleet_slip.words import number_of
 
 
 @dataclass(frozen=True)
@@ -98,10 +97,15 @@ class Cohort:
         hashes, cars = (hash_numbers(self.drives[name]) for name in ("drive_id", "vehicle_id"))
         stops = np.cumsum([len(table) for table in self.tables])[:-1]
         names = [",".join(table.signals) for table in self.tables]
-        drives = dict(zip(names, np.split(hashes, stops), strict=True))
+        drives, vehicles = np.split(hashes, stops), np.split(cars, stops)
         came = np.split(received_among(self.drives), stops)
-        received = {name: drives[name][mask] for name, mask in zip(names, came, strict=True)}
-        return Members(drives, dict(zip(names, np.split(cars, stops), strict=True)), received)
+        received = [some[mask] for some, mask in zip(drives, came, strict=True)]
+        return Members(
+            *(
+                {name: Hashed.of(some) for name, some in zip(names, parts, strict=True)}
+                for parts in (drives, vehicles, received)
+            )
+        )
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -275,23 +279,3 @@ def require_training(sources: Iterable[str], condition: Condition) -> None:
             f"the cohort {condition.text!r} has drives of evaluation scenarios, which no model "
             f"may be trained on. Add to the condition: AND {TRAINING_DRIVES}"
         )
-
-
-def empty_cohort_error(
-    database: duckdb.DuckDBPyConnection, condition: Condition, left_out: int = 0
-) -> DataError:
-    """Return the error that no drive satisfies a condition, or none that has a log."""
-    if left_out:
-        return DataError(
-            f"all {number_of(left_out, 'drive')} of the cohort {condition.text!r} are of cars that "
-            "sent Gram rows of the logged signals and no log. Select with features = signals."
-        )
-    examples = database.execute(
-        "SELECT string_agg(DISTINCT source, ', '), string_agg(DISTINCT campaign, ', ') FROM grams"
-    ).fetchone()
-    sources, campaigns = examples or ("", "")
-    return DataError(
-        f"no drive satisfies the cohort condition {condition.text!r}. The warehouse has sources "
-        f"{sources} and campaigns {campaigns}. See the columns with: "
-        'fleet-slip sql "DESCRIBE drives"'
-    )

@@ -1,24 +1,26 @@
-"""The sums of a cohort over each day, from Gram rows that are read batch by batch."""
+"""The sums of a cohort over each day, from rollups, and from Gram rows read batch by batch."""
 
+from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import date
 
-import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.grams.cohort import empty_cohort_error, require_training
+from fleet_slip.grams.cohort import require_training
+from fleet_slip.grams.empty_cohort import empty_cohort
 from fleet_slip.grams.expansion import expansion_of
-from fleet_slip.grams.members import hash_numbers
+from fleet_slip.grams.folding import EACH, Folding
+from fleet_slip.grams.gram_rows import gram_table
+from fleet_slip.grams.members import Hashed, Members, add_hashed, hash_numbers
 from fleet_slip.grams.reader import GramReader, open_grams
 from fleet_slip.regression.drive_moments import missing_signals_error
 from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.gram_table import GramTable
 from fleet_slip.warehouse.condition import Condition, parse_condition
-from fleet_slip.warehouse.minimum_cohort import require_vehicles
 from fleet_slip.warehouse.tables import Warehouse
 
 
@@ -43,39 +45,66 @@ def sum_days(
     if no drive has them all.
     """
     signals = (*inputs, catalogue().label)
-    grams: dict[date, Gram] = {}
-    drives: dict[date, list[NDArray[np.uint64]]] = {}
-    cars: dict[date, set[str]] = {}
+    days: dict[date, _Day] = defaultdict(lambda: _Day(Gram.zero(signals)))
     found = False
     condition = parse_condition(condition)
-    with open_grams(source, feature_set, condition) as opened:
+    with open_grams(source, feature_set, condition, Folding(by="day", count=EACH)) as opened:
         expansion = expansion_of(opened, feature_set)
+        if len(opened.cells.table):
+            found = True
+            require_training(opened.cells.table["source"].unique().to_pylist(), condition)
+        for (day, names), cells in opened.cells.by("day", "signals"):
+            if set(signals) <= set(names.split(",")):
+                days[day].add(
+                    names,
+                    gram_table(names, cells).restrict(signals).total(),
+                    opened.cells.drives(cells),
+                    opened.cells.vehicles(cells),
+                )
         for batch in opened.batches(condition):
             found = True
             require_training(batch["source"].unique().to_pylist(), condition)
             for names, table, chosen in expansion.tables(batch):
-                if not set(signals) <= set(names.split(",")):
-                    continue
-                rows = batch.filter(pa.array(chosen))
-                here = rows["day"].dictionary_encode()
-                number = here.indices.to_numpy()
-                days = here.dictionary.to_pylist()
-                totals = table.restrict(signals).totals(number, len(days))
-                ids = hash_numbers(rows["drive_id"])
-                for i, (day, total) in enumerate(zip(days, totals, strict=True)):
-                    grams[day] = grams[day] + total if day in grams else total
-                    drives.setdefault(day, []).append(ids[number == i])
-                    mine = rows["vehicle_id"].filter(pa.array(number == i)).unique()
-                    cars.setdefault(day, set()).update(mine.to_pylist())
+                if set(signals) <= set(names.split(",")):
+                    rows = batch.filter(pa.array(chosen))
+                    _add_rows(days, names, table.restrict(signals), rows)
         if not found:
-            raise empty_cohort_error(opened.database, condition)
-    if not grams:
+            raise empty_cohort(source, condition, feature_set)
+    if not days:
         raise missing_signals_error(signals)
-    days = sorted(grams)
-    for day in days:
-        require_vehicles(len(cars[day]), f"the cohort {condition.text!r} on {day}")
+    order = sorted(days)
+    members = [Members(days[day].drives, days[day].vehicles) for day in order]
+    for day, known in zip(order, members, strict=True):
+        known.require_vehicles(known.vehicles, f"the cohort {condition.text!r} on {day}")
     return DailySums(
-        tuple(days),
-        tuple(grams[day] for day in days),
-        tuple(len(np.unique(np.concatenate(drives[day]))) for day in days),
+        tuple(order),
+        tuple(days[day].gram for day in order),
+        tuple(known.count_drives(known.drives) for known in members),
     )
+
+
+@dataclass
+class _Day:
+    """What a day comes to: its Gram, and its drives and cars by their signals."""
+
+    gram: Gram
+    drives: dict[str, Hashed] = field(default_factory=dict)
+    vehicles: dict[str, Hashed] = field(default_factory=dict)
+
+    def add(self, names: str, gram: Gram, drives: Hashed, vehicles: Hashed) -> None:
+        """Add Gram rows of the same signals."""
+        self.gram += gram
+        add_hashed(self.drives, names, drives)
+        add_hashed(self.vehicles, names, vehicles)
+
+
+def _add_rows(days: dict[date, _Day], names: str, table: GramTable, rows: pa.RecordBatch) -> None:
+    """Add Gram rows of the same signals to their days."""
+    here = rows["day"].dictionary_encode()
+    number, values = here.indices.to_numpy(), here.dictionary.to_pylist()
+    ids = hash_numbers(rows["drive_id"])
+    once = bool(rows["part"].null_count == len(rows))
+    for i, total in enumerate(table.totals(number, len(values))):
+        mine = rows["vehicle_id"].filter(pa.array(number == i)).unique()
+        drives = Hashed.of(ids[number == i], once=once)
+        days[values[i]].add(names, total, drives, Hashed.of(hash_numbers(mine)))

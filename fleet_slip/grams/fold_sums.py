@@ -1,7 +1,7 @@
-"""The sums of a cohort over its folds, from Gram rows that are read batch by batch.
+"""The sums of a cohort over its folds, from rollups, and from Gram rows read batch by batch.
 
 Comparing given models needs no single drive, only the Gram of each fold. So any number of Gram
-rows is added up in the memory of one batch.
+rows is added up in the memory of one batch; and of a file whose rollup serves, no row is read.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -10,20 +10,20 @@ from dataclasses import dataclass, field
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from numpy.typing import NDArray
 
 from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.errors import DataError
+from fleet_slip.grams.cells import Cells, dealt_folds
 from fleet_slip.grams.cohort import (
     assign_folds,
-    empty_cohort_error,
     gram_condition,
     require_divided,
     require_training,
 )
+from fleet_slip.grams.empty_cohort import empty_cohort
 from fleet_slip.grams.expansion import Expansion, expansion_of
 from fleet_slip.grams.folding import (
     FOLD_KEYS,
@@ -31,16 +31,21 @@ from fleet_slip.grams.folding import (
     Folding,
     FoldKey,
 )
-from fleet_slip.grams.members import Members, hash_numbers, received_among
+from fleet_slip.grams.gram_rows import by_signals, gram_table
+from fleet_slip.grams.members import (
+    Hashed,
+    Hashes,
+    Members,
+    add_hashed,
+    hash_numbers,
+    received_among,
+)
 from fleet_slip.grams.reader import GramReader, OpenedGrams, open_grams
 from fleet_slip.regression.folds import CohortFolds
 from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.gram_table import GramTable
 from fleet_slip.warehouse.condition import Condition, asking, parse_condition
-from fleet_slip.warehouse.minimum_cohort import require_vehicles
 from fleet_slip.warehouse.tables import Warehouse
-
-FoldOf = Callable[[pa.RecordBatch, NDArray[np.uint64]], IntArray]
-"""Tells the fold of each Gram row, from its metadata and its drive's hash."""
 
 
 @dataclass(frozen=True)
@@ -109,27 +114,31 @@ def sum_cohort(
     """
     condition = parse_condition(condition)
     require_divided(feature_set, folding.by, folding.count)
-    with open_grams(warehouse, feature_set, condition) as opened:
-        names, fold_of = _folding(opened, folding, condition)
-        sums = _Sums(len(names), fold_of, expansion_of(opened, feature_set))
+    with open_grams(warehouse, feature_set, condition, folding) as opened:
+        folds = _find_folds(opened, folding, condition)
+        if folds is None:
+            raise empty_cohort(warehouse, condition, feature_set)
+        sums = _Sums(folds, expansion_of(opened, feature_set))
+        sums.add_cells(opened.cells, condition)
         for batch in opened.batches(condition):
             require_training(batch["source"].unique().to_pylist(), condition)
             sums.add(batch)
         left_out, revoked = opened.count_left_out(condition), opened.revoked(condition)
         if not sums.tables:
-            raise empty_cohort_error(opened.database, condition, left_out)
-    for signals, hashes in sums.members.vehicles.items():
+            raise empty_cohort(warehouse, condition, feature_set)
+    members = sums.members
+    for signals in members.vehicles:
         of = f"the cohort {condition.text!r} with the signals {signals}"
-        require_vehicles(len(np.unique(hashes)), of)
+        members.require_vehicles([signals], of)
     return SummedCohort(
         condition=condition,
         folding=folding,
-        sums=sums.folds(names),
+        sums=sums.of_folds(members),
         rows=sum(gram.n for grams in sums.tables.values() for gram in grams),
-        drive_count=sums.drive_count,
+        drive_count=members.count_drives(members.drives),
         logs_version=opened.logs_version,
         grams_version=opened.grams_version,
-        members=sums.members,
+        members=members,
         source=warehouse,
         feature_set=feature_set,
         left_out=left_out,
@@ -137,39 +146,62 @@ def sum_cohort(
     )
 
 
-def _folding(
-    opened: OpenedGrams, folding: Folding, condition: Condition
-) -> tuple[list[str], FoldOf]:
-    """Return the names of all folds that there may be, and what tells the fold of a Gram row."""
-    count = folding.count
-    few = count if folding.by == "drive" and isinstance(count, int) else None
-    key = FOLD_KEYS[folding.by]
-    text = opened.statement("cohort_sums.sql", condition)
-    query = f"SELECT DISTINCT {key} FROM ({text}){f' LIMIT {few + 1}' if few else ''}"
-    with asking(opened.database, condition):
-        found = opened.database.sql(query).to_arrow_table()
-    if few and len(found) > few:
-        names = [str(fold + 1) for fold in range(few)]
-        return names, lambda batch, drives: (_trips(batch, drives) % few).astype(np.int64)
-    values = found[key].combine_chunks()
-    if not len(values):
-        raise empty_cohort_error(opened.database, condition, opened.count_left_out(condition))
-    assignment = assign_folds(values.to_pylist(), folding.by, folding.count)
+@dataclass(frozen=True)
+class _Folds:
+    """The folds that there may be.
 
-    def fold_of(batch: pa.RecordBatch, _: NDArray[np.uint64]) -> IntArray:
-        at: IntArray = pc.index_in(batch[key], value_set=values).to_numpy()
+    Attributes:
+        names: what they are called.
+        of_rows: tells the fold of each Gram row, from its metadata and its drive's hash.
+        of_cells: tells the fold of each cell of rollups.
+        key: what was dealt into the buckets of the cells that folds are made of.
+    """
+
+    names: Sequence[str]
+    of_rows: Callable[[pa.RecordBatch, Hashes], IntArray]
+    of_cells: Callable[[pa.Table], IntArray]
+    key: str = "drive"
+
+
+def _find_folds(opened: OpenedGrams, folding: Folding, condition: Condition) -> _Folds | None:
+    """Return the folds of a cohort; None of an empty one. Raises like `sum_cohort`."""
+    cells, key, few = opened.cells.table, FOLD_KEYS[folding.by], dealt_folds(folding)
+    found = pa.array([], pa.null())
+    if not (few and len(cells)):  # else the cells alone tell that there are more than folds
+        text = opened.statement("cohort_sums.sql", condition)
+        query = f"SELECT DISTINCT {key} FROM ({text}){f' LIMIT {few + 1}' if few else ''}"
+        with asking(opened.database, condition):
+            found = opened.database.sql(query).to_arrow_table()[key].combine_chunks()
+    if few and (len(cells) or len(found) > few):
+        return _Folds(
+            [str(fold + 1) for fold in range(few)],
+            lambda rows, drives: (_dealt(rows, drives, key) % few).astype(np.int64),
+            lambda cells: cells["bucket"].to_numpy() % few,
+            folding.by,
+        )
+    if len(cells):
+        of_cells = cells[key].combine_chunks().unique().cast(found.type)
+        found = pa.concat_arrays([found, of_cells]).unique()
+    if not len(found):
+        return None
+    assignment = assign_folds(found.to_pylist(), folding.by, folding.count)
+
+    def fold_of(rows: pa.RecordBatch | pa.Table) -> IntArray:
+        at: IntArray = pc.index_in(rows[key].cast(found.type), value_set=found).to_numpy()
         return assignment.fold[at]
 
-    return list(assignment.names), fold_of
+    return _Folds(assignment.names, lambda rows, _: fold_of(rows), fold_of)
 
 
-def _trips(batch: pa.RecordBatch, drives: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Return the hash of each Gram row's trip, mostly that of its drive."""
-    alone = pc.equal(batch["trip"], batch["drive_id"]).to_numpy(zero_copy_only=False)
+def _dealt(rows: pa.RecordBatch, drives: Hashes, key: str) -> Hashes:
+    """Return the hash of each Gram row's car, or of its trip, mostly that of its drive."""
+    if key == "vehicle_id":
+        return hash_numbers(rows[key])
+    alone = pc.equal(rows["trip"], rows["drive_id"]).to_numpy(zero_copy_only=False)
     if alone.all():
         return drives
     trips = drives.copy()
-    trips[~alone] = hash_numbers(batch["trip"].filter(pa.array(~alone)))
+    trips[~alone] = hash_numbers(rows["trip"].filter(pa.array(~alone)))
     return trips
 
 
@@ -177,72 +209,67 @@ def _trips(batch: pa.RecordBatch, drives: NDArray[np.uint64]) -> NDArray[np.uint
 class _Sums:
     """Adds up Gram rows by set of signals and fold, and remembers which drives they are of."""
 
-    count: int
-    fold_of: FoldOf
+    known: _Folds
     expansion: Expansion
     tables: dict[str, list[Gram]] = field(default_factory=dict)
-    drives: dict[str, list[NDArray[np.uint64]]] = field(default_factory=dict)
-    vehicles: dict[str, list[NDArray[np.uint64]]] = field(default_factory=dict)
-    received: dict[str, list[NDArray[np.uint64]]] = field(default_factory=dict)
-    used: set[int] = field(default_factory=set)
-    divided: bool = False
-    """Whether a drive may have several Gram rows of the same signals."""
+    drives: dict[str, Hashed] = field(default_factory=dict)
+    vehicles: dict[str, Hashed] = field(default_factory=dict)
+    received: dict[str, Hashed] = field(default_factory=dict)
 
     def add(self, batch: pa.RecordBatch) -> None:
         """Add a batch of Gram rows."""
         drives = hash_numbers(batch["drive_id"])
-        folds, came = self.fold_of(batch, drives), received_among(batch)
-        self.used.update(np.unique(folds).tolist())
-        self.divided |= batch["part"].null_count < len(batch)
+        folds, came = self.known.of_rows(batch, drives), received_among(batch)
+        once = bool(batch["part"].null_count == len(batch))  # else a drive may have several
         for signals, table, here in self.expansion.tables(batch):
-            totals = table.totals(folds[here], self.count)
-            known = self.tables.get(signals)
-            self.tables[signals] = (
-                [a + b for a, b in zip(known, totals, strict=True)] if known else totals
-            )
-            self.drives.setdefault(signals, []).append(drives[here])
+            self._add(signals, table, folds[here])
             cars = hash_numbers(batch["vehicle_id"].filter(pa.array(here)).unique())
-            self.vehicles.setdefault(signals, []).append(cars)
-            self.received.setdefault(signals, []).append(drives[here & came])
+            add_hashed(self.drives, signals, Hashed.of(drives[here], once=once))
+            add_hashed(self.vehicles, signals, Hashed.of(cars))
+            add_hashed(self.received, signals, Hashed.of(drives[here & came], once=once))
 
-    @property
-    def _one_each(self) -> bool:
-        """Whether every Gram row is of a drive of its own: then nothing must be sorted to tell."""
-        return len(self.tables) == 1 and not self.divided
+    def add_cells(self, cells: Cells, condition: Condition) -> None:
+        """Add cells of rollups. Raises `RefusedError` for those of scenarios."""
+        if not len(cells.table):
+            return
+        require_training(cells.table["source"].unique().to_pylist(), condition)
+        dealt = cells.dealt(self.known.key).combine_chunks()
+        folds = self.known.of_cells(dealt)
+        [batch] = dealt.to_batches()
+        for signals, some, here in by_signals(batch):
+            self._add(signals, gram_table(signals, some), folds[here])
+        for (signals,), mine in cells.by("signals"):
+            add_hashed(self.drives, signals, cells.drives(mine))
+            add_hashed(self.vehicles, signals, cells.vehicles(mine))
+            add_hashed(self.received, signals, cells.received(mine))
+
+    def _add(self, signals: str, table: GramTable, folds: IntArray) -> None:
+        totals = table.totals(folds, len(self.known.names))
+        before = self.tables.get(signals)
+        self.tables[signals] = (
+            [a + b for a, b in zip(before, totals, strict=True)] if before else totals
+        )
 
     @property
     def members(self) -> Members:
         """Which drives and cars the Gram rows are of."""
-        drives = {signals: np.concatenate(parts) for signals, parts in self.drives.items()}
-        cars = {signals: np.concatenate(parts) for signals, parts in self.vehicles.items()}
-        came = {signals: np.concatenate(parts) for signals, parts in self.received.items()}
-        return Members(drives, cars, came)
+        return Members(self.drives, self.vehicles, self.received)
 
-    @property
-    def drive_count(self) -> int:
-        """Number of drives."""
-        every = [part for parts in self.drives.values() for part in parts]
-        return sum(map(len, every)) if self._one_each else len(np.unique(np.concatenate(every)))
-
-    def folds(self, names: Sequence[str]) -> CohortFolds:
+    def of_folds(self, members: Members) -> CohortFolds:
         """Return the folds that a drive fell into. Raises `DataError` if it is one only."""
-        used = sorted(self.used)
+        names, order = self.known.names, sorted(self.tables)
+        used = [
+            fold
+            for fold in range(len(names))
+            if any(self.tables[signals][fold].n for signals in order)
+        ]
         if len(used) < 2:
             raise DataError(
                 "cross-validation needs at least two folds, and the cohort has one: "
                 f"{names[used[0]]}. Widen the cohort, or fold by another key."
             )
-        order = sorted(self.tables)
         return CohortFolds(
             tuple(names[fold] for fold in used),
             tuple(tuple(self.tables[signals][fold] for fold in used) for signals in order),
-            self._numbers(order),
+            lambda tables: members.count_drives([order[i] for i in tables]),
         )
-
-    def _numbers(self, order: Sequence[str]) -> tuple[IntArray, ...]:
-        """Return the number of each Gram row's drive, table by table."""
-        if self._one_each:
-            return (np.arange(self.drive_count),)
-        each = [np.concatenate(self.drives[signals]) for signals in order]
-        _, numbers = np.unique(np.concatenate(each), return_inverse=True)
-        return tuple(np.split(numbers, np.cumsum([len(part) for part in each])[:-1]))

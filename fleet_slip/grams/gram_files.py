@@ -9,6 +9,7 @@ from deltalake.transaction import AddAction
 
 from fleet_slip.catalogue.sources import RECEIVED_FILES
 from fleet_slip.delta import Snapshot, TableFile
+from fleet_slip.grams.rollup import make_rollup
 from fleet_slip.warehouse.tables import Warehouse
 
 FILE_ROWS = 100_000
@@ -51,7 +52,8 @@ def _write_files(warehouse: Warehouse, rows: pa.Table) -> list[AddAction]:
         mine = _only(rows, some)
         for identity in sorted(mine["feature_set"].unique().to_pylist()):
             part = _only(mine, pc.equal(mine["feature_set"], identity))
-            actions.append(warehouse.grams.write_file(f"{prefix}{identity}", part))
+            name = f"{prefix}{identity}"
+            actions.append(warehouse.grams.write_file(name, part, preface=make_rollup(part)))
     return actions
 
 

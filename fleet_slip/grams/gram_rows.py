@@ -39,3 +39,11 @@ def _matrix(lists: pa.ChunkedArray | pa.ListArray, width: int) -> IntArray:
     parts = [chunk.flatten().to_numpy() for chunk in chunks]
     values: IntArray = parts[0] if len(parts) == 1 else np.concatenate(parts)
     return values.reshape(-1, width)
+
+
+def list_array(values: IntArray) -> pa.ListArray:
+    """Return a list for each row of a matrix."""
+    rows, width = values.shape
+    flat = pa.array(np.ascontiguousarray(values).reshape(-1), pa.int64())
+    offsets = pa.array(np.arange(rows + 1, dtype=np.int32) * width, pa.int32())
+    return pa.ListArray.from_arrays(offsets, flat)

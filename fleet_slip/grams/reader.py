@@ -2,8 +2,9 @@
 
 import contextlib
 import shlex
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Self
 
 import duckdb
@@ -17,6 +18,8 @@ from fleet_slip.delta.table import Snapshot
 from fleet_slip.errors import DataError
 from fleet_slip.grams.backlog import find_backlog
 from fleet_slip.grams.car_keys import load_car_keys
+from fleet_slip.grams.cells import NO_CELLS, Cells, RollupReader
+from fleet_slip.grams.folding import Folding
 from fleet_slip.regression.gram import packed_size
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.condition import Condition, asking
@@ -32,12 +35,16 @@ BATCH_NUMBERS = 2**20
 
 @dataclass(frozen=True)
 class OpenedGrams:
-    """A connection to the Gram rows of a feature set, and what stood in the warehouse then."""
+    """A connection to the Gram rows of a feature set, and what stood in the warehouse then.
+
+    Instead of the rows of some files it has their `cells`.
+    """
 
     database: duckdb.DuckDBPyConnection
     identity: str
     logs_version: int
     grams_version: int
+    cells: Cells = NO_CELLS
 
     def statement(self, name: str, condition: Condition) -> str:
         """Return a statement of `jobs/` for a condition, but for what revoked keys signed."""
@@ -99,7 +106,9 @@ class GramReader:
         self._warehouse = warehouse
         self._logs: Snapshot | None = None
         self._grams: Snapshot | None = None
+        self._without: frozenset[str] = frozenset()
         self._database: duckdb.DuckDBPyConnection | None = None
+        self._rollups = RollupReader()
 
     def __enter__(self) -> Self:
         """Return the reader."""
@@ -109,16 +118,18 @@ class GramReader:
         """Close the connection."""
         self._close()
 
-    def opened(self, feature_set: str, condition: Condition) -> OpenedGrams:
+    def opened(
+        self, feature_set: str, condition: Condition, folding: Folding | None = None
+    ) -> OpenedGrams:
         """Return the Gram rows of a feature set, until the next call.
 
+        For a cohort's sums over folds, cells stand in for the rows of files that have rollups.
         Raises `DataError` if there are no Gram rows, or if those of the feature set are not
         complete for a cohort.
         """
         grams, logs = gram_snapshots(self._warehouse, self._grams, self._logs)
         if grams is not self._grams or logs is not self._logs:
             self._close()
-        database = self._connected(grams, logs)
         self._logs, self._grams = logs, grams
         if not grams.rows:
             fill = "fleet-slip simulate CAMPAIGN (or fleet-slip ingest FILE --mapping M), then "
@@ -126,20 +137,33 @@ class GramReader:
                 f"{self._warehouse.root}: there are no Gram rows yet. "
                 f"Run: {'' if logs.rows else fill}fleet-slip gram."
             )
-        identity = features().identity(feature_set)
-        opened = OpenedGrams(database, identity, logs.version or 0, grams.version or 0)
-        if feature_set != PLAIN:
-            _require_complete(logs, grams, opened, feature_set, condition)
-        if features().feature_set(feature_set).calibrated:
-            calibration = replace(opened, identity=features().identity(CALIBRATION))
-            _require_complete(logs, grams, calibration, CALIBRATION, condition)
-        return opened
+        calibrated = bool(features().feature_set(feature_set).calibrated)
+        for name in (feature_set, *([CALIBRATION] if calibrated else [])):
+            if name != PLAIN:
+                rows = partial(self._opened, grams, logs, name)
+                _require_complete(logs, grams, rows, name, condition)
+        cells = NO_CELLS
+        if folding and not calibrated:
+            identity, revoked = features().identity(feature_set), _revoked_cars()
+            cells = self._rollups.cells(grams, logs, identity, condition, folding, revoked)
+        return self._opened(grams, logs, feature_set, cells)
 
-    def _connected(self, grams: Snapshot, logs: Snapshot) -> duckdb.DuckDBPyConnection:
-        if self._database is None:
-            self._database = open_tables(self._warehouse, {"grams"}, [grams, logs])
-            lock(self._database, grams.paths)
-        return self._database
+    def _opened(
+        self, grams: Snapshot, logs: Snapshot, feature_set: str, cells: Cells = NO_CELLS
+    ) -> OpenedGrams:
+        if self._database is None or cells.paths != self._without:
+            self._close()
+            read = replace(grams, without=cells.paths) if cells.paths else grams
+            self._database = open_tables(self._warehouse, {"grams"}, [read, logs])
+            self._without = cells.paths
+            lock(self._database, read.paths)
+        return OpenedGrams(
+            self._database,
+            features().identity(feature_set),
+            logs.version or 0,
+            grams.version or 0,
+            cells,
+        )
 
     def _close(self) -> None:
         if self._database is not None:
@@ -149,23 +173,35 @@ class GramReader:
 
 @contextlib.contextmanager
 def open_grams(
-    source: Warehouse | GramReader, feature_set: str, condition: Condition
+    source: Warehouse | GramReader,
+    feature_set: str,
+    condition: Condition,
+    folding: Folding | None = None,
 ) -> Iterator[OpenedGrams]:
-    """Open the Gram rows of a feature set, anew unless by a reader. Raises like `opened`."""
+    """Open the Gram rows of a feature set, anew unless by a reader; see `opened`."""
     if isinstance(source, GramReader):
-        yield source.opened(feature_set, condition)
+        yield source.opened(feature_set, condition, folding)
     else:
         with GramReader(source) as reader:
-            yield reader.opened(feature_set, condition)
+            yield reader.opened(feature_set, condition, folding)
+
+
+def _revoked_cars() -> frozenset[str]:
+    keys = load_car_keys()
+    return frozenset(key.vehicle_id for key in keys.revoked()) if keys else frozenset()
 
 
 def _require_complete(
-    logs: Snapshot, grams: Snapshot, opened: OpenedGrams, feature_set: str, condition: Condition
+    logs: Snapshot,
+    grams: Snapshot,
+    opened: Callable[[], OpenedGrams],
+    feature_set: str,
+    condition: Condition,
 ) -> None:
-    backlog = find_backlog(logs, grams, opened.identity)
+    backlog = find_backlog(logs, grams, features().identity(feature_set))
     if not backlog.missing and not backlog.stale:
         return
-    files = opened.files(condition)
+    files = opened().files(condition)
     missing = [file for file in backlog.missing if file.path in files]
     if missing or backlog.stale & files:
         everything = condition.text in {ALL_DRIVES, TRAINING_DRIVES}

@@ -3,13 +3,12 @@
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 
-from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import RECEIVED, RECEIVED_FILES
+from fleet_slip.grams.gram_rows import list_array
 from fleet_slip.grams.received_rows import ReceivedRows, signals_of
 
 
@@ -27,18 +26,11 @@ def received_table(rows: ReceivedRows, schema: pa.Schema, digests: Sequence[str]
         "signals": pa.repeat(signals_of(rows.mask), many),
         "n": pa.array(rows.n),
         "clipped": pa.repeat(0, many),
-        "sums": _lists(rows.sums),
-        "products": _lists(rows.products),
+        "sums": list_array(rows.sums),
+        "products": list_array(rows.products),
     }
     columns = [
         known[one.name].cast(one.type) if one.name in known else pa.nulls(many, one.type)
         for one in schema
     ]
     return pa.table(columns, schema=schema)
-
-
-def _lists(values: IntArray) -> pa.Array:
-    rows, width = values.shape
-    flat = pa.array(np.ascontiguousarray(values).reshape(-1), pa.int64())
-    offsets = pa.array(np.arange(rows + 1, dtype=np.int32) * width, pa.int32())
-    return pa.ListArray.from_arrays(offsets, flat)

@@ -15,6 +15,7 @@ from fleet_slip.grams.check import (
     stored_grams,
 )
 from fleet_slip.grams.received_check import find_unsound
+from fleet_slip.grams.rollup import is_rollup_of, read_rollup
 from fleet_slip.maintenance.verification import Damage, Verification
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.database import database_errors, open_database
@@ -62,7 +63,7 @@ def verify_grams(
     Gram rows of `SAMPLE` log files are computed again; with `full`, those of all.
     """
     _verify_unique(warehouse, sound.grams, report)
-    _verify_received(warehouse, sound.grams, report)
+    _verify_each(warehouse, sound.grams, report)
     stored = stored_grams(warehouse, sound.grams)
     covered = [file for file in sound.logs if file.path in stored]
     step = 1 if full else max(1, len(covered) // SAMPLE)
@@ -93,13 +94,16 @@ def _verify_unique(warehouse: Warehouse, grams: Sequence[TableFile], report: Ver
         report.findings.append(Damage("gram", f"logs/{file}", problem))
 
 
-def _verify_received(
-    warehouse: Warehouse, grams: Sequence[TableFile], report: Verification
-) -> None:
-    """Look for received Gram rows that no counts can have, or that their drive cannot have."""
+def _verify_each(warehouse: Warehouse, grams: Sequence[TableFile], report: Verification) -> None:
+    """Look for received Gram rows that no counts or drives can have, and for wrong rollups."""
     for file in grams:
-        for drive, problem in find_unsound(warehouse.grams.read(file.path)):
+        rows = warehouse.grams.read(file.path)
+        for drive, problem in find_unsound(rows):
             told = f"the Gram row that a car sent of drive {drive} {problem}"
+            report.findings.append(Damage("gram", f"grams/{file.path}", told))
+        rollup = read_rollup(warehouse.grams, file.path)
+        if rollup and not is_rollup_of(rollup, rows):
+            told = "its rollup is not that of its Gram rows"
             report.findings.append(Damage("gram", f"grams/{file.path}", told))
 
 

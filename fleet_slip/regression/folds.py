@@ -8,7 +8,7 @@ fewer than about five drives a fold, one may be empty, which is an error and not
 """
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -146,12 +146,12 @@ class CohortFolds:
     Attributes:
         names: what the folds are called.
         tables: for each signal set, one Gram a fold.
-        drives: for each signal set, the number of each Gram row's drive.
+        count_drives: tells how many drives have a Gram row in some of the tables, by their places.
     """
 
     names: tuple[str, ...]
     tables: tuple[tuple[Gram, ...], ...]
-    drives: tuple[IntArray, ...]
+    count_drives: Callable[[Sequence[int]], int]
 
     @classmethod
     def of(
@@ -174,7 +174,13 @@ class CohortFolds:
             tuple(table.totals(fold, len(assignment.names)))
             for table, fold in zip(tables, parts, strict=True)
         )
-        return cls(assignment.names, grams, tuple(np.split(numbers, stops)))
+        of_table = np.split(numbers, stops)
+
+        def count_drives(chosen: Sequence[int]) -> int:
+            rows_of_drive = np.bincount(np.concatenate([of_table[i] for i in chosen]))
+            return int(np.count_nonzero(rows_of_drive))
+
+        return cls(assignment.names, grams, count_drives)
 
     def serving(self, inputs: Sequence[str], label: str, *, sparse: bool = False) -> Folds:
         """Return the folds of the drives that have the label and all the inputs.
@@ -205,5 +211,4 @@ class CohortFolds:
                 f"fold {', '.join(empty)} has no rows with all of {', '.join(signals)}. Choose "
                 "fewer folds, another key to fold by, or fewer signals."
             )
-        rows_of_drive = np.bincount(np.concatenate([self.drives[i] for i in served]))
-        return Folds(folds, names, int(np.count_nonzero(rows_of_drive)))
+        return Folds(folds, names, self.count_drives(served))

@@ -20,7 +20,7 @@ import duckdb
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError, StorageError, printable
 from fleet_slip.warehouse.database import duckdb_message, reading_files
-from fleet_slip.warehouse.lasting_sql import Tree, problems
+from fleet_slip.warehouse.lasting_sql import Tree, columns_of, problems
 from fleet_slip.warehouse.read_only_sql import LONGEST_QUERY
 
 LONGEST_S = 3600.0
@@ -46,6 +46,11 @@ class Condition:
     def __str__(self) -> str:
         """Return it as it was written."""
         return self.text
+
+    @property
+    def columns(self) -> frozenset[str]:
+        """The columns that it asks for."""
+        return columns_of(_expression(self.sql, self.text))
 
     def __and__(self, other: "Condition") -> "Condition":
         """Return the condition that both are true."""

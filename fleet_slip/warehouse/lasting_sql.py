@@ -75,6 +75,16 @@ def problems(tree: Tree, columns: frozenset[str]) -> Iterator[str]:
             yield problem
 
 
+def columns_of(tree: Tree) -> frozenset[str]:
+    """Return the columns that an expression without problems asks for."""
+    return frozenset(
+        name.lower()
+        for node in _nodes(tree)
+        if node.get("class") == "COLUMN_REF"
+        for name in node["column_names"]
+    )
+
+
 def _nodes(value: Any) -> Iterator[Tree]:
     if isinstance(value, dict):
         yield value

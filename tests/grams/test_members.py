@@ -5,7 +5,7 @@ import pyarrow as pa
 
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.job import update_grams
-from fleet_slip.grams.members import Members, hash_numbers
+from fleet_slip.grams.members import Hashed, Members, hash_numbers
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import land, log_rows, random_counts
 
@@ -18,8 +18,10 @@ def hashes(names: list[str]) -> list[int]:
 
 
 def members() -> Members:
-    drives = {signals: hash_numbers(pa.array(names)) for signals, names in DRIVES.items()}
-    cars = {signals: hash_numbers(pa.array(["car-1"])) for signals in DRIVES}
+    drives = {
+        signals: Hashed.of(hash_numbers(pa.array(names))) for signals, names in DRIVES.items()
+    }
+    cars = {signals: Hashed.of(hash_numbers(pa.array(["car-1"]))) for signals in DRIVES}
     return Members(drives, cars)
 
 
