@@ -7,10 +7,14 @@ from datetime import date
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from fleet_slip.delta.preface import pack_preface
 from fleet_slip.files.checksums import checksum_of, fast_checksum_of
+
+DAY = "day"
+"""The one column of which the Delta log tells the least and the largest value."""
 
 ROW_GROUP_ROWS = 2**17
 WRITE_BATCH_ROWS = 2**14
@@ -66,7 +70,7 @@ class Encoding:
                 sink.write(pack_preface(preface))
             writer.write_table(stored, row_group_size=ROW_GROUP_ROWS)
         content = sink.getvalue()
-        statistics = json.dumps(_statistics(rows))
+        statistics = json.dumps(_statistics(rows, stored.column_names))
         return Encoded(content, checksum_of(content), fast_checksum_of(content), statistics)
 
 
@@ -87,9 +91,15 @@ def _required(rows: pa.Table) -> pa.Table:
     return pa.Table.from_arrays(rows.columns, schema=pa.schema(fields))
 
 
-def _statistics(rows: pa.Table) -> dict[str, Any]:
+def _statistics(rows: pa.Table, stored: Sequence[str]) -> dict[str, Any]:
     nulls = {name: rows[name].null_count for name in rows.schema.names}
-    return {"numRecords": rows.num_rows, "nullCount": nulls}
+    told: dict[str, Any] = {"numRecords": rows.num_rows, "nullCount": nulls}
+    if DAY in stored:
+        limits = pc.min_max(rows[DAY]).as_py()
+        if limits["min"] is not None:
+            told["minValues"] = {DAY: limits["min"].isoformat()}
+            told["maxValues"] = {DAY: limits["max"].isoformat()}
+    return told
 
 
 def _compact(column: pa.Array) -> pa.Array:

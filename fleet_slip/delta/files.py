@@ -19,13 +19,17 @@ _NULLS = "null_count."
 
 @dataclass(frozen=True)
 class TableFile:
-    """One active file of a table, as the Delta log has it."""
+    """One active file of a table, as the Delta log has it.
+
+    `days` are the first and the last day of its rows, where the log tells them.
+    """
 
     path: str
     rows: int
     size_bytes: int
     null_counts: Mapping[str, int]
     day: date | None = None
+    days: tuple[date, date] | None = None
 
 
 def absent_columns(files: Iterable[TableFile], names: Iterable[str]) -> tuple[str, ...]:
@@ -115,7 +119,8 @@ def _table_files(actions: pa.Table) -> Iterator[TableFile]:
     unknown = [None] * actions.num_rows
     columns = (
         actions[name].to_pylist() if name in actions.column_names else unknown
-        for name in ("path", "num_records", "size_bytes", "partition.day")
+        for name in ("path", "num_records", "size_bytes", "partition.day", "min.day", "max.day")
     )
-    for row, (path, rows, size_bytes, day) in enumerate(zip(*columns, strict=True)):
-        yield TableFile(path, rows, size_bytes, _NullCounts(nulls, row), day)
+    for row, (path, rows, size_bytes, day, first, last) in enumerate(zip(*columns, strict=True)):
+        days = (first, last) if first and last else None
+        yield TableFile(path, rows, size_bytes, _NullCounts(nulls, row), day, days)

@@ -143,7 +143,7 @@ def _look_up(grams: Snapshot, drives: Sequence[_Drives]) -> None:
         return
     by_name = {signals_of(one.rows.mask): one for one in drives}
     wanted = pa.concat_arrays([one.ids for one in drives]).unique()
-    for rows in _rows_with(grams, "drive_id", wanted, grams.files):
+    for rows in _rows_with(grams, "drive_id", wanted, _files_of_days(grams, drives)):
         came = is_received(rows)
         logged = rows.filter(pc.invert(came))["drive_id"].cast(pa.string()).unique()
         for one in drives:
@@ -152,6 +152,18 @@ def _look_up(grams: Snapshot, drives: Sequence[_Drives]) -> None:
             for signals, some, _ in by_signals(batch):
                 if mine := by_name.get(signals):
                     mine.known += _known(mine, signals, some)
+
+
+def _files_of_days(grams: Snapshot, drives: Sequence[_Drives]) -> list[TableFile]:
+    """Return the files that may have the drives: a received one is of the day in its name."""
+    days = [limit for one in drives for limit in pc.min_max(one.rows.days).as_py().values()]
+    first, last = min(days), max(days)
+    return [
+        file
+        for file in grams.files
+        if not (is_of_received(file) and file.days)
+        or (file.days[0] <= last and first <= file.days[1])
+    ]
 
 
 def _mark_logged(grams: Snapshot, drives: Sequence[_Drives]) -> None:
