@@ -5,11 +5,12 @@ log; drives with the rule that they are whole; Gram rows with the logs by a path
 documents with their checksums; model versions with the tables that they were made of.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
+from dataclasses import replace
 
 from fleet_slip.catalogue.feature_sets import PLAIN
-from fleet_slip.delta import Snapshot, Table
+from fleet_slip.delta import Snapshot, Table, TableFile
 from fleet_slip.delta.checkpoints import FOLDER as CHECKSUMS
 from fleet_slip.delta.checkpoints import checkpoint_faults, unsealed_checkpoints
 from fleet_slip.delta.commit_check import find_commit_faults
@@ -46,7 +47,7 @@ def verify(
     logs, grams = (good.get(table, []) for table in ("logs", "grams"))
     if logs:
         verify_drives(warehouse, logs, report)
-    _report_missing_logs(snapshots, report)
+    _report_missing_logs(snapshots, grams, report)
     if grams:
         active = {file.path for file in snapshots["logs"].files} if "logs" in snapshots else set()
         verify_grams(warehouse, SoundFiles(logs, grams, active), report, full, executor)
@@ -99,10 +100,15 @@ def _any_table(snapshots: Mapping[str, Snapshot]) -> bool:
     return any(snapshot.version is not None for snapshot in snapshots.values())
 
 
-def _report_missing_logs(snapshots: Mapping[str, Snapshot], report: Verification) -> None:
+def _report_missing_logs(
+    snapshots: Mapping[str, Snapshot], sound: Sequence[TableFile], report: Verification
+) -> None:
     """Report a table of logs that is gone, as a folder that was not mounted is."""
     logs, grams = snapshots.get("logs"), snapshots.get("grams")
-    if logs and grams and logs.version is None and (gone := named_files(grams, PLAIN)[1]):
+    if not logs or not grams or logs.version is not None:
+        return
+    damaged = frozenset(file.path for file in grams.files).difference(file.path for file in sound)
+    if gone := named_files(replace(grams, without=damaged), PLAIN)[1]:
         problem = f"the table is gone that the Gram rows of {number_of(len(gone), 'file')} are of"
         report.findings.append(Damage("log", "logs", problem))
 
