@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 import fleet_slip
+from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.grams.messages import message_size, message_type, signals_definition
 from fleet_slip.regression.gram import Gram
@@ -93,8 +94,13 @@ def receive_unknown(fleet: fleet_slip.Fleet, folder: Path) -> float:
     return time.perf_counter() - began
 
 
-def messages_of(cars: int, start_s: int, seed: int) -> bytes:
-    """Return a message of each of some cars, whose drives began at the same moment."""
+def messages_of(
+    cars: int, start_s: int | IntArray, seed: int, *, label_follows: bool = False
+) -> bytes:
+    """Return a message of each of some cars, whose drives began at one moment, or at one each.
+
+    If the label follows, it is a sum of the inputs, the same in all cars, and noise.
+    """
     signals = catalogue().gram_signals
     random = np.random.default_rng(seed)
     k = len(signals)
@@ -103,6 +109,10 @@ def messages_of(cars: int, start_s: int, seed: int) -> bytes:
     half = (high - low) / 2
     mean = (low + high) / 2 + random.uniform(-0.2, 0.2, (cars, k)) * half
     spread = random.normal(0, 0.1, (cars, 4, k)) * half
+    if label_follows:
+        weight = 0.5 / (k - 1) * half[-1] / half[:-1]
+        mean[:, -1] = (mean[:, :-1] - (low + high)[:-1] / 2) @ weight
+        spread[:, :, -1] = spread[:, :, :-1] @ weight
     square = np.einsum("mik,mil->mkl", spread, spread) + mean[:, :, None] * mean[:, None, :]
     square[:, range(k), range(k)] += (0.01 * half) ** 2
     row, column = np.tril_indices(k)
