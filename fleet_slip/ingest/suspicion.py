@@ -11,9 +11,10 @@ from typing import TypeAlias
 
 import numpy as np
 
-from fleet_slip.arrays import BoolArray, FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.catalogue.turning import WITNESSES
+from fleet_slip.ingest.label_delay import find_delay
 from fleet_slip.ingest.relations import FEWEST_TICKS, fit, moving, slope_of
 
 Signals: TypeAlias = Mapping[str, FloatArray]
@@ -30,13 +31,7 @@ _REFUSED = {
     "not_a_number": ("texts", "Name those that mean no value under missing."),
     "not_finite": ("values", 'Write missing = ["nan"] if they mean no value.'),
 }
-LEAST_GAIN = 0.3
-"""A delay explains away this part of a label's variance: a car's own lag of 0.1 s does 0.23."""
-
 _FACTORS = {57.3: "degrees and radians", 9.81: "g and m/s^2", 3.6: "km/h and m/s"}
-_LABEL_LAGS = 50
-"""A label is looked for this many ticks before and after its inputs."""
-_FIT_TICKS = 20_000
 
 
 @dataclass(frozen=True)
@@ -223,13 +218,12 @@ def _label(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
         return
     with np.errstate(divide="ignore", invalid="ignore"):
         inputs = [signals["ay"], signals["yaw_rate"] / speed, signals["yaw_rate"] * speed]
-    inputs += [signals[n] for n in ("steering_wheel", *ROAD_WHEELS) if n in signals]
-    delay = _best_lag(angle, np.array([*inputs, speed]), rows)
+    steering = [signals[n] for n in ("steering_wheel", *ROAD_WHEELS) if n in signals]
+    delay = find_delay(angle, signals["ay"], signals["yaw_rate"], speed, [*inputs, *steering])
     if delay is not None:
-        lag, gain = delay
-        seconds = lag * float(SAMPLE_TIME_S)
+        seconds, gain = delay
         figure = f"its inputs explain it best {abs(seconds):.2f} s " + (
-            "earlier" if lag > 0 else "later"
+            "earlier" if seconds > 0 else "later"
         )
         figure += f", with {gain:.0%} less of its variance left"
         yield Suspicion("delay", (label,), figure, f"Try delay_s = {seconds:.2f}.", seconds)
@@ -239,24 +233,6 @@ def _label(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
             f"turning slowly it goes against the yaw rate ({fitted[1]:+.1f} m, should be +1 to +2)"
         )
         yield Suspicion("sign", (label,), figure, "Write negate = true.")
-
-
-def _best_lag(label: FloatArray, inputs: FloatArray, rows: BoolArray) -> tuple[int, float] | None:
-    """Return the lag in ticks at which inputs explain a label clearly better than at none."""
-    if rows.sum() < 1000:
-        return None
-    n, m = min(label.size, _FIT_TICKS), _LABEL_LAGS
-    within = slice(m, n - m)
-    left = {}
-    for lag in range(-m, m + 1):
-        _, explained = fit(label[m + lag : n - m + lag], inputs[:, within], rows[within])
-        left[lag] = 1 - explained
-    best = min(left, key=lambda lag: left[lag])
-    gain = 1 - left[best] / left[0] if left[0] > 0 else 0.0
-    at_the_edge = abs(best) == m
-    if abs(best) < 3 or at_the_edge or gain < LEAST_GAIN or left[best] > 0.5:
-        return None
-    return best, gain
 
 
 def _of_scale(

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from fleet_slip.arrays import FloatArray
 from fleet_slip.cli.main import app
 from fleet_slip.errors import AlarmError, UsageError
+from fleet_slip.ingest import label_delay
 from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS, find_refusals, find_suspicions
 from tests.support.reported import call
 from tests.support.textbook_car import Car, a_car
@@ -85,6 +86,29 @@ def test_a_delay_of_the_label(delay: float) -> None:
     found = [one for one in find_suspicions(late) if one.kind == "delay"]
     assert [one.value for one in found] == [pytest.approx(delay, abs=0.011)]
     assert "delay_s" in found[0].remedy
+
+
+def test_a_car_that_lags_behind_its_inputs_is_not_taken_for_a_late_label(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    car = a_car(20.0)
+    ticks, speed = np.arange(car["ay"].size), car["wheel_rl"] * RADIUS_M
+    steer = 0.02 * np.sin(ticks / 40) + 0.02 * np.sin(ticks / 91)
+    angle = -0.8 * np.roll(steer, 25)
+    lazy = {
+        "yaw_rate": speed * steer / 3,
+        "ay": speed * (np.gradient(angle, 0.01) + speed * steer / 3),
+        "steering_wheel": 15 * steer,
+        "sideslip": angle,
+        **{name: car[name] for name in WHEELS},
+    }
+    assert "delay" not in {kind for kind, _ in kinds(lazy)}
+    late = {**lazy, "sideslip": np.roll(angle, 20)}
+    assert [s.value for s in find_suspicions(late) if s.kind == "delay"] == [
+        pytest.approx(0.2, abs=0.02)
+    ]
+    monkeypatch.setattr(label_delay, "LEAST_EXPLAINED", 1.0)  # without the witness
+    assert "delay" in {kind for kind, _ in kinds(lazy)}
 
 
 def test_a_signal_that_stands_still_or_is_absent() -> None:
