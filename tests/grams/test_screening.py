@@ -140,6 +140,22 @@ def test_erasures_at_the_same_moment_leave_a_list_that_is_cleared_of_all(
     assert cleared.read() == Cleared(record.begun(), frozenset({"VIN3"}))
 
 
+def test_a_car_is_not_cleared_while_it_is_being_forgotten(
+    fleet: fleet_slip.Fleet, send: Send, cleared: ClearedCars, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    send(0, "VIN0", "VIN1", "VIN2")
+    found = []
+
+    def look(*_: Any) -> None:
+        found.append((cleared.read(), send(1, "VIN1", "VIN2").forgotten))
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr("fleet_slip.maintenance.forget.forget_received", look)
+        forget(fleet.warehouse, Forgettable("vehicle", "VIN1"))
+    assert found == [(Cleared(frozenset({1}), frozenset({"VIN0", "VIN2"})), 1)]
+
+
 def test_a_job_that_saw_less_of_the_record_clears_nobody(cleared: ClearedCars) -> None:
     cleared.add(Cleared(frozenset({1, 3}), frozenset({"A"})))
     cleared.add(Cleared(frozenset({1}), frozenset({"A", "B", "C"})))
