@@ -1,17 +1,19 @@
 """How fast messages of cars are taken in.
 
-    python -m benchmarks.receive [--cars 20000] [--drives 5] [--forgotten 1] [--folder FOLDER]
+    python -m benchmarks.receive [--cars 20000] [--drives 5] [--forgotten 1] [--signed]
+        [--folder FOLDER]
 
 Writes a file of messages for each day, one of each car, all different; receives them, and receives
 them again with a message more in each file, so that all others are duplicates. Sums and products
 are those that drives of 20 s to an hour have whose signals vary at random with each other.
 With `--forgotten`, the first day lands, then so many cars are forgotten, each in turn a car and a
 single drive of another one; what is measured are the other days, and then messages of a few cars
-that nobody knew.
+that nobody knew. With `--signed`, each car signs by a key of its own.
 """
 
 import argparse
 import json
+import os
 import tempfile
 import time
 import zlib
@@ -22,7 +24,10 @@ import numpy as np
 import fleet_slip
 from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.grams.car_keys import KEYS_VARIABLE, load_car_keys
 from fleet_slip.grams.messages import message_size, message_type, signals_definition
+from fleet_slip.grams.signatures import sign_messages
+from fleet_slip.models.ed25519 import generate
 from fleet_slip.regression.gram import Gram
 from tests.support.messages import START_S, gram_of, message_of
 
@@ -34,23 +39,28 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     for name, default in (("cars", 20_000), ("drives", 5), ("forgotten", 0)):
         parser.add_argument(f"--{name}", type=int, default=default)
+    parser.add_argument("--signed", action="store_true")
     parser.add_argument("--folder", type=Path)
     given = parser.parse_args()
     with tempfile.TemporaryDirectory(dir=given.folder) as folder:
-        found = measure(Path(folder), given.cars, given.drives, given.forgotten)
+        keys = make_keys(Path(folder), given.cars) if given.signed else None
+        found = measure(Path(folder), given.cars, given.drives, given.forgotten, keys)
         print(json.dumps(found, indent=2))
 
 
-def measure(folder: Path, cars: int, drives: int, forgotten: int) -> dict[str, float]:
+def measure(
+    folder: Path, cars: int, drives: int, forgotten: int, keys: list[bytes] | None
+) -> dict[str, float]:
     """Return messages a second, of new ones and of duplicates, and bytes of a message and a row."""
     first = gram_of(0)
     fleet = fleet_slip.open(folder / "data")
     paths = []
     for drive in range(drives):
         paths.append(folder / f"day-{drive}")
-        paths[-1].write_bytes(messages_of(cars, START_S + 86_400 * drive, seed=drive))
+        content = messages_of(cars, START_S + 86_400 * drive, seed=drive)
+        paths[-1].write_bytes(content if keys is None else signed(content, keys))
     size_bytes = paths[0].stat().st_size / cars
-    fleet.receive(write_first(folder, first))  # and have everything imported
+    fleet.receive(write_first(folder, first, keys))  # and have everything imported
     if forgotten:
         fleet.receive(paths.pop(0))
         forget_some(fleet, forgotten)
@@ -58,7 +68,8 @@ def measure(folder: Path, cars: int, drives: int, forgotten: int) -> dict[str, f
     received = sum(report.received for report in fleet.receive(paths))
     first_s = time.perf_counter() - began
     for path in paths:
-        path.write_bytes(path.read_bytes() + message_of(first, "MORE"))
+        content = path.read_bytes()
+        path.write_bytes(content + content[-len(content) // cars :])
     began = time.perf_counter()
     duplicates = sum(report.duplicates for report in fleet.receive(paths))
     again_s = time.perf_counter() - began
@@ -74,6 +85,26 @@ def measure(folder: Path, cars: int, drives: int, forgotten: int) -> dict[str, f
         "message_bytes": size_bytes,
         "stored_bytes_per_row": round(stored_bytes, 1),
     }
+
+
+def make_keys(folder: Path, cars: int) -> list[bytes]:
+    """Return a private key of each car, the last of `FIRST`; name the list of public ones."""
+    private, public = zip(*(generate() for _ in range(cars + 1)), strict=True)
+    names = [*(f"CAR{car}" for car in range(cars)), "FIRST"]
+    lines = [f"{n},{key.decode().splitlines()[1]}" for n, key in zip(names, public, strict=True)]
+    (folder / "keys.csv").write_text("\n".join(["vehicle_id,public_key", *lines]))
+    os.environ[KEYS_VARIABLE] = str(folder / "keys.csv")
+    began = time.perf_counter()
+    load_car_keys()
+    print(f"the list of keys was read in {time.perf_counter() - began:.1f} s")
+    return list(private)
+
+
+def signed(content: bytes, keys: list[bytes]) -> bytes:
+    """Return the message of each car, signed by its key."""
+    size = message_size(len(catalogue().gram_signals))
+    each = (content[at : at + size] for at in range(0, len(content), size))
+    return b"".join(sign_messages(one, key) for one, key in zip(each, keys, strict=False))
 
 
 def forget_some(fleet: fleet_slip.Fleet, many: int) -> None:
@@ -130,8 +161,9 @@ def messages_of(
     return messages.tobytes()
 
 
-def write_first(folder: Path, gram: Gram) -> Path:
-    (folder / "first").write_bytes(message_of(gram, "FIRST"))
+def write_first(folder: Path, gram: Gram, keys: list[bytes] | None) -> Path:
+    message = message_of(gram, "FIRST")
+    (folder / "first").write_bytes(sign_messages(message, keys[-1]) if keys else message)
     return folder / "first"
 
 

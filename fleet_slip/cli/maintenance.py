@@ -100,9 +100,15 @@ def _print_verification(report: Verification, rebuilt: list[str]) -> None:
         f"{number_of(report.files, 'file')} with {report.size_bytes:,} bytes and "
         f"{number_of(report.documents, 'document')} "
         f"were read, the Gram rows of {number_of(report.log_files_recomputed, 'log file')} "
-        "computed again: "
+        f"computed again{_signatures(report)}: "
         + (f"{len(report.damage)} damaged" if report.damage else "all is as it must be")
     )
+
+
+def _signatures(report: Verification) -> str:
+    if not report.signatures_checked:
+        return ""
+    return f", {report.signatures_checked:,} of {number_of(report.signatures, 'signature')} checked"
 
 
 def _row(finding: Damage) -> list[str]:

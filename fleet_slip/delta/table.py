@@ -51,6 +51,11 @@ class Table:
     optional: tuple[str, ...] = ()
     """Columns that a file has only where it has values of them."""
 
+    @property
+    def usual_schema(self) -> pa.Schema:
+        """The schema without the optional columns."""
+        return pa.schema([field for field in self.schema if field.name not in self.optional])
+
     def snapshot(self, version: int | None = None) -> "Snapshot":
         """Return the table as it is now; a table that nobody has written yet is empty.
 

@@ -36,7 +36,7 @@ def aggregate(
     executor: Executor | None = None,
 ) -> pa.Table:
     """Return the Gram rows of log files, in the schema of `grams`, sorted by file and drive."""
-    empty = warehouse.grams.schema.empty_table()
+    empty = warehouse.grams.usual_schema.empty_table()
     return pa.concat_tables(
         [empty, *compute_grams(warehouse, files, progress, threads, feature_set, executor)]
     )
@@ -133,7 +133,7 @@ def _query(
         rows = database.sql(statement, params={"feature_set": identity}).to_arrow_table()
     relative = pa.array([paths[path] for path in rows["file"].to_pylist()], pa.string())
     return rows.set_column(rows.schema.get_field_index("file"), "file", relative).cast(
-        warehouse.grams.schema
+        warehouse.grams.usual_schema
     )
 
 

@@ -8,7 +8,7 @@ import pyarrow.compute as pc
 from deltalake.transaction import AddAction
 
 from fleet_slip.catalogue.sources import RECEIVED_FILES
-from fleet_slip.delta import Snapshot, TableFile
+from fleet_slip.delta import Snapshot, Table, TableFile
 from fleet_slip.grams.rollup import make_rollup
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -36,9 +36,13 @@ def write_rows(warehouse: Warehouse, parts: Iterable[pa.Table]) -> list[AddActio
             waiting.append(part.slice(first, step))
             rows = sum(some.num_rows for some in waiting)
             if rows >= FILE_ROWS or sum(some.nbytes for some in waiting) >= FILE_BYTES:
-                actions += _write_files(warehouse, pa.concat_tables(waiting))
+                actions += _write_files(warehouse, _together(waiting))
                 waiting.clear()
-    return actions + (_write_files(warehouse, pa.concat_tables(waiting)) if waiting else [])
+    return actions + (_write_files(warehouse, _together(waiting)) if waiting else [])
+
+
+def _together(parts: Sequence[pa.Table]) -> pa.Table:
+    return pa.concat_tables(parts, promote_options="default")  # some lack an optional column
 
 
 def _write_files(warehouse: Warehouse, rows: pa.Table) -> list[AddAction]:
@@ -52,9 +56,15 @@ def _write_files(warehouse: Warehouse, rows: pa.Table) -> list[AddAction]:
         mine = _only(rows, some)
         for identity in sorted(mine["feature_set"].unique().to_pylist()):
             part = _only(mine, pc.equal(mine["feature_set"], identity))
+            empty = [name for name in warehouse.grams.optional if _is_empty(part, name)]
+            part = part.drop_columns(empty)
             name = f"{prefix}{identity}"
             actions.append(warehouse.grams.write_file(name, part, preface=make_rollup(part)))
     return actions
+
+
+def _is_empty(rows: pa.Table, name: str) -> bool:
+    return name in rows.column_names and rows[name].null_count == len(rows)
 
 
 def _only(rows: pa.Table, some: pa.ChunkedArray) -> pa.Table:
@@ -104,6 +114,17 @@ def rows_to_keep(
     """Yield the Gram rows of files without those of stale log files."""
     dropped = pa.array(sorted(stale), pa.string())
     for file in files:
-        schema = grams.table.schema
-        rows = grams.table.read(file.path).select(schema.names).cast(schema)
+        rows = read_rows(grams.table, file)
         yield rows.filter(pc.invert(pc.is_in(rows["file"], dropped)))
+
+
+def read_rows(grams: Table, file: TableFile) -> pa.Table:
+    """Return the Gram rows of a file in the schema of the table; null in columns that it lacks."""
+    rows = grams.read(file.path)
+    columns = [
+        rows[field.name].cast(field.type)
+        if field.name in rows.column_names
+        else pa.nulls(len(rows), field.type)
+        for field in grams.schema
+    ]
+    return pa.table(columns, schema=grams.schema)

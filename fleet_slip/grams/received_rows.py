@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 
 import numpy as np
@@ -20,6 +20,7 @@ from fleet_slip.grams.messages import (
     without_signatures,
 )
 from fleet_slip.grams.plausible import find_impossible
+from fleet_slip.grams.signed_rows import keep_signatures
 
 FIRST_START_S = 946_684_800
 """2000-01-01: a car's clock that says less has not been set."""
@@ -54,12 +55,14 @@ class ReceivedRows:
     Attributes:
         file: which of some files each is from, shape (m,).
         number: which message of its file, from 1.
-        messages: what they say.
+        messages: what they say, without signatures.
+        kept: what is kept of their signatures.
     """
 
     file: IntArray
     number: IntArray
     messages: Messages
+    kept: Messages
 
     def __len__(self) -> int:
         """Return how many messages they are."""
@@ -69,7 +72,19 @@ class ReceivedRows:
         """Return some of them; them, if a mask has them all."""
         if rows.dtype == np.bool_ and rows.all():
             return self
-        return ReceivedRows(self.file[rows], self.number[rows], self.messages[rows])
+        return ReceivedRows(*(one[rows] for one in self._arrays))
+
+    @property
+    def _arrays(self) -> tuple[IntArray, IntArray, Messages, Messages]:
+        return self.file, self.number, self.messages, self.kept
+
+    @classmethod
+    def joined(cls, runs: Sequence["ReceivedRows"]) -> "ReceivedRows":
+        """Return messages of the same signals behind each other."""
+        if len(runs) == 1:
+            return runs[0]
+        each = zip(*(run._arrays for run in runs), strict=True)
+        return cls(*(np.concatenate(arrays) for arrays in each))
 
     @property
     def mask(self) -> int:
@@ -146,31 +161,22 @@ def sort_out(
         refused += [Refused(file, number, reason) for number, reason in one.refused]
         for first, messages in one.runs:
             numbers = np.arange(first, first + len(messages))
-            run = ReceivedRows(np.full(len(messages), file), numbers, messages)
+            kept_of = keep_signatures(messages)
+            run = ReceivedRows(np.full(len(messages), file), numbers, messages, kept_of)
             told, nameless = _without_name(run)
             refused += nameless
             if judge is not None and len(told):
                 told, forged = _believed(told, judge(told))
                 refused += forged
-            told = ReceivedRows(told.file, told.number, without_signatures(told.messages))
+            told = replace(told, messages=without_signatures(told.messages))
             for mask in np.unique(told.messages["mask"]).tolist():
                 runs.setdefault(mask, []).append(told.take(told.messages["mask"] == mask))
     kept: list[ReceivedRows] = []
     for mask in sorted(runs):
-        rows, impossible = _possible(_joined(runs[mask]))
+        rows, impossible = _possible(ReceivedRows.joined(runs[mask]))
         refused += impossible
         kept += [rows] if len(rows) else []
     return kept, refused
-
-
-def _joined(runs: Sequence[ReceivedRows]) -> ReceivedRows:
-    if len(runs) == 1:
-        return runs[0]
-    return ReceivedRows(
-        np.concatenate([run.file for run in runs]),
-        np.concatenate([run.number for run in runs]),
-        np.concatenate([run.messages for run in runs]),
-    )
 
 
 def _without_name(run: ReceivedRows) -> tuple[ReceivedRows, list[Refused]]:

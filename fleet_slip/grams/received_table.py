@@ -10,6 +10,8 @@ from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import RECEIVED, RECEIVED_FILES
 from fleet_slip.grams.gram_rows import list_array
 from fleet_slip.grams.received_rows import ReceivedRows, signals_of
+from fleet_slip.grams.signed_rows import signed_column
+from fleet_slip.warehouse.tables import SIGNED
 
 
 def received_table(rows: ReceivedRows, schema: pa.Schema, digests: Sequence[str] = ()) -> pa.Table:
@@ -28,6 +30,7 @@ def received_table(rows: ReceivedRows, schema: pa.Schema, digests: Sequence[str]
         "clipped": pa.repeat(0, many),
         "sums": list_array(rows.sums),
         "products": list_array(rows.products),
+        SIGNED: signed_column(rows.kept),
     }
     columns = [
         known[one.name].cast(one.type) if one.name in known else pa.nulls(many, one.type)

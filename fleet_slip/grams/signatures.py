@@ -4,9 +4,15 @@ A signed message has the layout 2: it is 64 bytes longer, which stand before its
 signature is over `DOMAIN` and all bytes before it.
 """
 
+import os
 import zlib
-from collections.abc import Iterator
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING
 
+import numpy as np
+
+from fleet_slip.arrays import BoolArray
 from fleet_slip.errors import InputError
 from fleet_slip.extras import needed
 from fleet_slip.grams.car_keys import CarKey, CarKeys
@@ -14,12 +20,19 @@ from fleet_slip.grams.messages import (
     CHECKSUM_BYTES,
     SIGNATURE_BYTES,
     SIGNED_LAYOUT,
+    Messages,
     read_messages,
 )
 from fleet_slip.grams.received_rows import ReceivedRows
 
+if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+
 DOMAIN = b"fleet-slip gram message\n"
 """Before what is signed: the same key signs nothing else that could be taken for a message."""
+
+AT_ONCE = 256
+"""Messages that a thread checks one after the other."""
 
 UNSIGNED = "is not signed"
 NO_KEY = "is of a car that had no key on that day"
@@ -60,28 +73,53 @@ def sign_messages(content: bytes, private_key: bytes) -> bytes:
     return b"".join(signed)
 
 
-def judge_signatures(rows: ReceivedRows, keys: CarKeys) -> Iterator[str | None]:
-    """Yield why each message is not to be believed; None where the key of its car signed it."""
-    with needed("signing", "a signature"):
-        from cryptography.exceptions import InvalidSignature  # noqa: PLC0415
-        from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey  # noqa: PLC0415
+def judge_signatures(rows: ReceivedRows, keys: CarKeys) -> list[str | None]:
+    """Return why each message is not to be believed; None where the key of its car signed it."""
     layout = int(rows.messages["layout"][0])
     cars, days = rows.vehicle_ids.to_pylist(), rows.days.to_pylist()
-    for message, car, day in zip(rows.messages, cars, days, strict=True):
-        key = keys.of(car, day)
-        if (told := _without_looking(layout, key)) or key is None:
-            yield told
-            continue
-        content = message.tobytes()
-        end = len(content) - CHECKSUM_BYTES - SIGNATURE_BYTES
-        try:
-            Ed25519PublicKey.from_public_bytes(key.bytes).verify(
-                content[end:-CHECKSUM_BYTES], DOMAIN + content[:end]
+    known = [keys.of(car, day) for car, day in zip(cars, days, strict=True)]
+    told = [_without_looking(layout, key) for key in known]
+    asked = [at for at, why in enumerate(told) if why is None]
+    public = [key.bytes for at in asked if (key := known[at])]
+    right = check_signatures(rows.messages[asked], public)
+    for at in np.array(asked, dtype=np.int64)[~right].tolist():
+        told[at] = FORGED
+    return told
+
+
+def check_signatures(messages: Messages, public_keys: Sequence[bytes]) -> BoolArray:
+    """Return which of some signed messages are signed by the key of each, on all processors."""
+    with needed("signing", "a signature"):
+        from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey  # noqa: PLC0415
+    size = messages.dtype.itemsize
+    content = messages.tobytes()
+    end = size - CHECKSUM_BYTES - SIGNATURE_BYTES
+
+    def check(numbers: range) -> list[bool]:
+        return [
+            _is_signed(
+                Ed25519PublicKey.from_public_bytes(public_keys[number]),
+                content[number * size + end : (number + 1) * size - CHECKSUM_BYTES],
+                DOMAIN + content[number * size : number * size + end],
             )
-        except InvalidSignature:
-            yield FORGED
-        else:
-            yield None
+            for number in numbers
+        ]
+
+    count = len(messages)
+    some = [range(first, min(first + AT_ONCE, count)) for first in range(0, count, AT_ONCE)]
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as threads:  # checking lets others run
+        found = [right for rights in threads.map(check, some) for right in rights]
+    return np.array(found, dtype=np.bool_)
+
+
+def _is_signed(key: "Ed25519PublicKey", signature: bytes, content: bytes) -> bool:
+    from cryptography.exceptions import InvalidSignature  # noqa: PLC0415
+
+    try:
+        key.verify(signature, content)
+    except InvalidSignature:
+        return False
+    return True
 
 
 def _without_looking(layout: int, key: CarKey | None) -> str | None:

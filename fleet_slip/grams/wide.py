@@ -39,7 +39,7 @@ def wide_grams(warehouse: Warehouse, files: Sequence[TableFile], feature_set: st
     workspace = Workspace(plan)
     parts = Parts.of_set(features(), features().feature_set(feature_set))
     identity = features().identity(feature_set)
-    columns: dict[str, list[Any]] = {name: [] for name in warehouse.grams.schema.names}
+    columns: dict[str, list[Any]] = {name: [] for name in warehouse.grams.usual_schema.names}
     # Files are shared out among threads; a BLAS with threads of its own would be in their way.
     with threadpool_limits(1, user_api="blas"):
         for file in sorted(files, key=lambda one: one.path):
@@ -51,7 +51,7 @@ def wide_grams(warehouse: Warehouse, files: Sequence[TableFile], feature_set: st
                     drive,
                     {"feature_set": identity, "file": file.path, "day": file.day},
                 )
-    return pa.table(columns, schema=warehouse.grams.schema)
+    return pa.table(columns, schema=warehouse.grams.usual_schema)
 
 
 def _append_rows(

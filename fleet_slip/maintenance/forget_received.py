@@ -4,7 +4,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.delta import Change, TableFile, retry_conflicts
-from fleet_slip.grams.gram_files import write_rows
+from fleet_slip.grams.gram_files import read_rows, write_rows
 from fleet_slip.grams.received_rows import is_received
 from fleet_slip.maintenance.old_files import rows_of
 from fleet_slip.warehouse.audit import Forgettable
@@ -24,11 +24,10 @@ def forget_received(warehouse: Warehouse, subject: Forgettable) -> int:
         concerned: list[TableFile] = []
         rows = 0
         for file in snapshot.files:
-            every = warehouse.grams.read(file.path)
+            every = read_rows(warehouse.grams, file)
             mine = pc.and_(rows_of(every, subject), is_received(every))
             if pc.any(mine).as_py():
-                schema = warehouse.grams.schema
-                left = every.select(schema.names).cast(schema).filter(pc.invert(mine))
+                left = every.filter(pc.invert(mine))
                 kept += [left] if left.num_rows else []
                 concerned.append(file)
                 rows += pc.sum(every.filter(mine)["n"]).as_py()

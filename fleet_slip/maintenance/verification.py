@@ -10,19 +10,29 @@ class Damage:
 
     Attributes:
         kind: where it is. "damage" of a `file`, a `drive`, a `gram` row, a `document`, a `model`,
-            or the `log` of a table; or only a remark: "unreferenced" or "backlog".
+            or the `log` of a table; or only a remark: "unreferenced", "backlog", or "unchecked".
         path: the file below the root, or the drive or model version.
         problem: what is wrong.
     """
 
-    kind: Literal["file", "drive", "gram", "document", "model", "log", "unreferenced", "backlog"]
+    kind: Literal[
+        "file",
+        "drive",
+        "gram",
+        "document",
+        "model",
+        "log",
+        "unreferenced",
+        "backlog",
+        "unchecked",
+    ]
     path: str
     problem: str
 
     @property
     def damage(self) -> bool:
         """Whether something is lost, or would be computed wrongly."""
-        return self.kind not in {"unreferenced", "backlog"}
+        return self.kind not in {"unreferenced", "backlog", "unchecked"}
 
 
 @dataclass
@@ -34,6 +44,9 @@ class Verification:
     rows: int = 0
     log_files_recomputed: int = 0
     documents: int = 0
+    signatures: int = 0
+    """Messages of cars whose signature was kept."""
+    signatures_checked: int = 0
     findings: list[Damage] = field(default_factory=list)
 
     @property

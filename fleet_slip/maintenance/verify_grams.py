@@ -7,6 +7,7 @@ from functools import partial
 
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.delta import TableFile
+from fleet_slip.grams.car_keys import load_car_keys
 from fleet_slip.grams.check import (
     DriveGrams,
     differing_drives,
@@ -14,8 +15,10 @@ from fleet_slip.grams.check import (
     read_counts,
     stored_grams,
 )
+from fleet_slip.grams.gram_files import is_of_received
 from fleet_slip.grams.received_check import find_unsound
 from fleet_slip.grams.rollup import is_rollup_of, read_rollup
+from fleet_slip.grams.signature_check import check_signed_rows
 from fleet_slip.maintenance.verification import Damage, Verification
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.database import database_errors, open_database
@@ -24,6 +27,9 @@ from fleet_slip.words import number_of
 
 SAMPLE = 4
 """Log files whose Gram rows are computed again, evenly chosen, unless all are asked for."""
+
+SIGNATURES = 1000
+"""Signatures that are checked of a Gram file, evenly chosen, unless all are asked for."""
 
 
 def verify_drives(warehouse: Warehouse, files: Sequence[TableFile], report: Verification) -> None:
@@ -64,6 +70,7 @@ def verify_grams(
     """
     _verify_unique(warehouse, sound.grams, report)
     _verify_each(warehouse, sound.grams, report)
+    _verify_signatures(warehouse, sound.grams, report, full)
     stored = stored_grams(warehouse, sound.grams)
     covered = [file for file in sound.logs if file.path in stored]
     step = 1 if full else max(1, len(covered) // SAMPLE)
@@ -105,6 +112,27 @@ def _verify_each(warehouse: Warehouse, grams: Sequence[TableFile], report: Verif
         if rollup and not is_rollup_of(rollup, rows):
             told = "its rollup is not that of its Gram rows"
             report.findings.append(Damage("gram", f"grams/{file.path}", told))
+
+
+def _verify_signatures(
+    warehouse: Warehouse, grams: Sequence[TableFile], report: Verification, full: bool
+) -> None:
+    """Look for received Gram rows that the key of their car did not sign; say what was not checked.
+
+    Those of a sample of each file are checked; with `full`, all.
+    """
+    files = list(filter(is_of_received, grams))
+    keys = load_car_keys() if files else None
+    for file in files:
+        rows = warehouse.grams.read(file.path)
+        found = check_signed_rows(rows, keys, None if full else SIGNATURES)
+        report.signatures += found.signed
+        report.signatures_checked += found.checked
+        for drive, problem in found.forged:
+            told = f"the Gram row that a car sent of drive {drive} {problem}"
+            report.findings.append(Damage("gram", f"grams/{file.path}", told))
+        for problem in found.unchecked:
+            report.findings.append(Damage("unchecked", f"grams/{file.path}", problem))
 
 
 def _compute_grams(warehouse: Warehouse, file: TableFile) -> DriveGrams:

@@ -26,6 +26,10 @@ QUARANTINE_SCHEMA = pa.schema(
 that it belongs to and `vehicle_id` its car, null if that is what is wrong; `signal` is the signal
 or metadata concerned, or `time`; `value` is what stood there, as text."""
 
+SIGNED = "signed"
+"""Column of `grams` with what is kept of the signature of a message that a car sent; no view has
+it (`fleet_slip/grams/signed_rows.py`)."""
+
 
 @dataclass(frozen=True)
 class Warehouse:
@@ -64,7 +68,7 @@ class Warehouse:
         """Gram rows of drives, by feature set: n, sums and sums of products of counts."""
         return Table(
             folder=self.root / "grams",
-            schema=gram_schema(self.catalogue),
+            schema=gram_schema(self.catalogue).append(pa.field(SIGNED, pa.binary())),
             encoding=Encoding(
                 dictionary=("feature_set", "file", "part", "signals", *self.catalogue.drive),
                 # A seventh smaller, and twice as fast to write and read, as zstd alone.
@@ -72,6 +76,7 @@ class Warehouse:
                 compression="zstd",
             ),
             description="Gram rows: exact sums and sums of products of counts, one a drive",
+            optional=(SIGNED,),
         )
 
     @cached_property

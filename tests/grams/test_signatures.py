@@ -2,18 +2,24 @@
 
 import base64
 import contextlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pyarrow as pa
 import pytest
 
 import fleet_slip
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.cli.main import app
+from fleet_slip.delta import Change
 from fleet_slip.errors import ConfigError, InputError
 from fleet_slip.grams.car_keys import KEYS_VARIABLE
 from fleet_slip.grams.signatures import sign_messages
 from fleet_slip.models.ed25519 import generate
-from tests.support.messages import START_S, gram_of, message_of
+from fleet_slip.regression.gram import Gram
+from tests.support.messages import START_S, drive_counts, gram_of, message_of
 
 HEADER = "vehicle_id,public_key,valid_from,valid_until,revoked_since"
 DAY_S = 86_400
@@ -126,6 +132,101 @@ def test_what_a_revoked_key_signed_since_a_day_is_left_out_and_named(
         app(["--root", str(tmp_path / "data"), "select", "--model", "ax,ay"])
     said_by_cli = " ".join(capsys.readouterr().err.split())
     assert "3 drives of VIN2 left out: a key of it was revoked" in said_by_cli
+
+
+@pytest.fixture
+def signed_fleet(
+    fleet: fleet_slip.Fleet,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    keys: dict[str, tuple[bytes, str]],
+) -> fleet_slip.Fleet:
+    """A root with two signed rows, one of all signals and one of three, and one unsigned row."""
+    receive(fleet, tmp_path, message(0))
+    list_keys(tmp_path, monkeypatch, *(f"{name},{keys[name][1]},,," for name in ("VIN1", "VIN2")))
+    few = Gram.from_counts(catalogue().gram_signals[:3], drive_counts(5)[:, :3].astype(np.int64))
+    content = sign_messages(message(1), keys["VIN1"][0])
+    content += sign_messages(message_of(few, "VIN2", place=1, parts=2), keys["VIN2"][0])
+    assert receive(fleet, tmp_path, content).received == 2
+    return fleet
+
+
+def remarks(fleet: fleet_slip.Fleet) -> list[str]:
+    return sorted(finding.problem for finding in fleet.verify(full=True).findings)
+
+
+def rewrite_rows(fleet: fleet_slip.Fleet, change: Callable[[dict[str, Any]], None]) -> None:
+    snapshot = fleet.warehouse.grams.snapshot()
+    rows = [row for file in snapshot.files for row in snapshot.table.read(file.path).to_pylist()]
+    for row in rows:
+        change(row)
+    add = [
+        snapshot.table.write_file("received-0", pa.Table.from_pylist(rows, snapshot.table.schema))
+    ]
+    snapshot.commit(Change(add=add, remove=list(snapshot.files), note={"job": "test"}))
+
+
+def test_signatures_are_kept_and_checked_again(
+    signed_fleet: fleet_slip.Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    unsigned = "1 message landed without a signature"
+    report = signed_fleet.verify()
+    assert (report.signatures, report.signatures_checked, report.damage) == (2, 2, [])
+    assert remarks(signed_fleet) == [unsigned]
+    signed_fleet.forget(vehicle="VIN0", now=True)  # which writes the file again
+    assert remarks(signed_fleet) == []
+    assert signed_fleet.verify().signatures_checked == 2
+    monkeypatch.delenv(KEYS_VARIABLE)
+    report = signed_fleet.verify(full=True)
+    assert (report.signatures, report.signatures_checked, report.damage) == (2, 0, [])
+    (told,) = remarks(signed_fleet)
+    assert told == f"2 signatures of messages not checked: ${KEYS_VARIABLE} names no list of keys"
+
+
+def test_a_row_that_was_changed_is_damage_though_it_is_plausible(
+    signed_fleet: fleet_slip.Fleet,
+) -> None:
+    def change(row: dict[str, Any]) -> None:
+        if row["vehicle_id"] == "VIN1":
+            row["sums"][0] += 2
+
+    rewrite_rows(signed_fleet, change)
+    (damage,) = signed_fleet.verify().damage
+    assert "VIN1-20240501T100000Z is not signed by the key of its car" in damage.problem
+
+
+def test_what_no_key_is_known_of_or_was_revoked_is_told_apart(
+    signed_fleet: fleet_slip.Fleet,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    keys: dict[str, tuple[bytes, str]],
+) -> None:
+    list_keys(tmp_path, monkeypatch, f"VIN1,{keys['VIN1'][1]},,,2024-01-01")
+    report = signed_fleet.verify(full=True)
+    assert (report.signatures_checked, report.damage) == (1, [])
+    keyless = "1 signature of messages not checked: the list of keys has no key"
+    assert sum(one.startswith(keyless) for one in remarks(signed_fleet)) == 1
+    list_keys(tmp_path, monkeypatch, f"VIN1,{keys['VIN2'][1]},,,")
+    assert len(signed_fleet.verify(full=True).damage) == 1
+
+
+@pytest.mark.parametrize("content", [b"", b"short", bytes(80)])
+def test_a_signature_of_another_row_is_damage(
+    signed_fleet: fleet_slip.Fleet, content: bytes
+) -> None:
+    def change(row: dict[str, Any]) -> None:
+        row["signed"] = content if row.get("signed") else None
+
+    rewrite_rows(signed_fleet, change)
+    assert len(signed_fleet.verify(full=True).damage) == 2
+
+
+def test_rows_without_a_signature_take_no_byte_more(
+    fleet: fleet_slip.Fleet, tmp_path: Path
+) -> None:
+    receive(fleet, tmp_path, message(1))
+    (file,) = fleet.warehouse.grams.snapshot().files
+    assert "signed" not in fleet.warehouse.grams.read(file.path).column_names
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,9 @@ import pytest
 
 import fleet_slip
 from fleet_slip import Fleet
+from fleet_slip.grams.signatures import sign_messages
+from fleet_slip.models.ed25519 import generate
+from tests.support.messages import gram_of, message_of
 
 ROOTS = sorted((Path(__file__).parents[1] / "evidence/roots").glob("*.tar.gz"))
 LARGEST_BYTES = 100_000
@@ -52,3 +55,14 @@ def test_its_model_estimates_and_is_trained_again_to_the_same(fleet: Fleet) -> N
         term.coefficient_exact for term in old.manifest.terms
     ]
     assert again.intercept == old.manifest.intercept
+
+
+def test_it_takes_signed_messages_once_it_is_migrated(fleet: Fleet, tmp_path: Path) -> None:
+    fleet.migrate()
+    fleet.gram()
+    private, _ = generate()
+    (tmp_path / "m").write_bytes(sign_messages(message_of(gram_of(1), "VIN1"), private))
+    (report,) = fleet.receive(tmp_path / "m")
+    assert report.received == 1
+    fleet.forget(vehicle="VIN1")
+    assert not fleet.verify(full=True).damage
