@@ -1,7 +1,7 @@
 """A night with real cars: what is new comes in, is examined, and trains the model again."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from datetime import date
@@ -196,7 +196,7 @@ class Night:
         new = len(set(hashes) - self.before.known)
         told = (
             f"{number_of(found.drives, 'drive')} examined: {new} newly not in order, "
-            f"{len(hashes)} in all, which train no model."
+            f"{len(hashes)} in all, which train no model.{_revoked(found.revoked)}"
         )
         return "attention" if new else "done", told
 
@@ -210,11 +210,14 @@ class Night:
         except DataError as error:
             return "left out", str(error)
         new = [day for day in self.chart.days if not day.training]
+        left_out = _revoked(self.chart.drives_revoked)
+        if drives := self.chart.drives_left_out:
+            left_out = f" {number_of(drives, 'drive')} without a log left out.{left_out}"
         told = f"{champion} on {number_of(len(new), 'new day')}: "
         if alarms := self.chart.alarms:
             days = ", ".join(f"{day.day} ({' and '.join(day.alarms)})" for day in alarms)
-            return "attention", f"{told}beyond its limits on {days}."
-        return "done", f"{told}within its limits."
+            return "attention", f"{told}beyond its limits on {days}.{left_out}"
+        return "done", f"{told}within its limits.{left_out}"
 
     def _publish(self) -> Told:
         if made := self.training.made_already(self.fleet):
@@ -249,3 +252,11 @@ class Night:
             f"{number_of(forgotten, 'drive')} before {report.before} forgotten, "
             f"{number_of(removed, 'old file')} removed."
         )
+
+
+def _revoked(drives: Mapping[str, int]) -> str:
+    """Return the sentence on drives that do not count, since a revoked key signed them."""
+    if not drives:
+        return ""
+    many, cars = number_of(sum(drives.values()), "drive"), number_of(len(drives), "car")
+    return f" {many} of {cars} left out: a key of theirs was revoked."

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
+from fleet_slip.cli.left_out import say_revoked, say_without_log
 from fleet_slip.cli.models import Reference
 from fleet_slip.cli.output import Json, print_json, print_table, say
 from fleet_slip.cli.progress import progress
@@ -37,6 +38,7 @@ def quality(
         print_json(found)
     else:
         _print_quality(found)
+        say_revoked(found.revoked)
     if found.findings:
         raise AlarmError(
             f"{len(found.findings)} of {number_of(found.drives, 'drive')} are not in order"
@@ -104,6 +106,8 @@ def monitor(
         print_json(chart)
     else:
         _print_chart(chart)
+        say_without_log(chart.drives_left_out, chart.feature_set)
+        say_revoked(chart.drives_revoked)
     if chart.alarms:
         days = ", ".join(f"{day.day} ({' and '.join(day.alarms)})" for day in chart.alarms)
         raise AlarmError(f"the error of {chart.model} is beyond its limits on {days}")

@@ -9,6 +9,7 @@ import typer
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
+from fleet_slip.cli.left_out import say_revoked, say_without_log
 from fleet_slip.cli.options import selection_options
 from fleet_slip.cli.output import Json, print_json, print_table, say, stdout
 from fleet_slip.grams.folding import BANDS, PARTS, ROW_FOLDS
@@ -101,13 +102,8 @@ def _say_left_out(selection: Selection[Any]) -> None:
     """Say which drives of the cohort the models were not made of, and which have no log."""
     if without_log := selection.cohort.members.count_received:
         say(f"{number_of(without_log, 'drive')} of these without a log: their cars sent Gram rows.")
-    if left_out := selection.cohort.left_out:
-        say(
-            f"{number_of(left_out, 'drive')} without a log left out: cars send Gram rows of the "
-            f"logged signals, not of the feature set {selection.cohort.feature_set}."
-        )
-    for car, drives in selection.cohort.revoked.items():
-        say(f"{number_of(drives, 'drive')} of {car} left out: a key of it was revoked.")
+    say_without_log(selection.cohort.left_out, selection.cohort.feature_set)
+    say_revoked(selection.cohort.revoked)
     if isinstance(selection, RequestedSelection):
         for car, times in selection.left_out.items():
             say(f"{car} left out: its influence on the model is {times:.0f} times the median one.")

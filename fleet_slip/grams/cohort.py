@@ -251,7 +251,7 @@ def load_cohort(
             rows = opened.database.sql(statement).to_arrow_table()
         left_out, revoked = opened.count_left_out(condition), opened.revoked(condition)
         if not rows.num_rows:
-            raise empty_cohort_error(opened.database, condition, left_out)
+            raise empty_cohort_error(opened, condition)
     require_training(rows["source"].unique().to_pylist(), condition)
     parts = list(expansion.tables(rows))
     # Rows whose calibrated columns are not the same are apart now: their metadata follows them.

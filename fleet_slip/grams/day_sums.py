@@ -1,7 +1,7 @@
 """The sums of a cohort over each day, from rollups, and from Gram rows read batch by batch."""
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import date
 
@@ -26,11 +26,18 @@ from fleet_slip.warehouse.tables import Warehouse
 
 @dataclass(frozen=True)
 class DailySums:
-    """The Gram of each day, and the number of drives in it."""
+    """The Gram of each day, and the number of drives in it.
+
+    Attributes:
+        left_out: drives of the condition that have no such Gram rows: their cars sent no log.
+        revoked: how many drives of a car are left out, since a revoked key signed them.
+    """
 
     days: tuple[date, ...]
     grams: tuple[Gram, ...]
     drives: tuple[int, ...]
+    left_out: int
+    revoked: Mapping[str, int]
 
 
 def sum_days(
@@ -68,6 +75,7 @@ def sum_days(
                 if set(signals) <= set(names.split(",")):
                     rows = batch.filter(pa.array(chosen))
                     _add_rows(days, names, table.restrict(signals), rows)
+        left_out, revoked = opened.count_left_out(condition), opened.revoked(condition)
         if not found:
             raise empty_cohort(source, condition, feature_set)
     if not days:
@@ -80,6 +88,8 @@ def sum_days(
         tuple(order),
         tuple(days[day].gram for day in order),
         tuple(known.count_drives(known.drives) for known in members),
+        left_out,
+        revoked,
     )
 
 

@@ -10,11 +10,12 @@ with Student's t for m - 1 degrees of freedom: with few days the limits are as w
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from datetime import date
 from statistics import fmean, stdev
 
+from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.errors import DataError, StorageError
 from fleet_slip.grams.day_sums import sum_days
@@ -83,13 +84,22 @@ class Day:
 
 @dataclass(frozen=True)
 class Chart:
-    """A control chart of a model version."""
+    """A control chart of a model version.
+
+    Attributes:
+        drives_left_out: drives of the cohort without Gram rows of the model's feature set, since
+            their cars sent no log.
+        drives_revoked: how many drives of a car are left out, since a revoked key signed them.
+    """
 
     model: str
     cohort: str
     days: tuple[Day, ...]
     mean_limits: Limits
     std_limits: Limits
+    feature_set: str = PLAIN
+    drives_left_out: int = 0
+    drives_revoked: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def alarms(self) -> tuple[Day, ...]:
@@ -135,7 +145,16 @@ def monitor(
     mean = Limits.of([day.error_mean_deg for day in usual], limits.false_alarms_per_day)
     std = Limits.above([day.error_std_deg for day in usual], limits.false_alarms_per_day)
     judged = tuple(day if day.training else _judged(day, mean, std) for day in found)
-    return Chart(version.reference, condition.text, judged, mean, std)
+    return Chart(
+        version.reference,
+        condition.text,
+        judged,
+        mean,
+        std,
+        feature_set,
+        sums.left_out,
+        sums.revoked,
+    )
 
 
 def _models(

@@ -1,7 +1,7 @@
 """Faulty sensors, drive by drive, from Gram rows alone."""
 
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field
 from datetime import date
 from math import ceil
 from typing import Any
@@ -50,17 +50,20 @@ class QualityReport:
         drives: Gram rows long enough to be examined.
         compared: those among them that had enough peers to be compared with.
         findings: one for each that is not in order, by day and drive.
+        revoked: how many drives of a car are left out, since a revoked key signed them.
     """
 
     drives: int
     compared: int
     findings: tuple[SensorFault, ...]
+    revoked: Mapping[str, int] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the report for a JSON document."""
         return {
             "drives": self.drives,
             "compared": self.compared,
+            "drives_revoked": dict(self.revoked),
             "findings": [finding.as_dict() for finding in self.findings],
         }
 
@@ -80,11 +83,13 @@ def examine_drives(
             examine(load_cohort(reader, drives & of_model), limits)
             for of_model in _vehicle_models(reader, drives)
         ]
+        revoked = reader.opened(PLAIN, drives).revoked(drives)
     findings = [finding for report in reports for finding in report.findings]
     return QualityReport(
         sum(report.drives for report in reports),
         sum(report.compared for report in reports),
         tuple(sorted(findings, key=_day_and_drive)),
+        revoked,
     )
 
 
@@ -96,7 +101,7 @@ def _vehicle_models(reader: GramReader, condition: Condition) -> list[Condition]
         statement = f"SELECT DISTINCT vehicle_model, source FROM ({cohort}\n)"
         found = opened.database.sql(statement).fetchall()
     if not found:
-        raise empty_cohort_error(opened.database, condition)
+        raise empty_cohort_error(opened, condition)
     require_training({source for _, source in found}, condition)
     models = sorted({model for model, _ in found}, key=str)
     return [

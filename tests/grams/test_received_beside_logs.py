@@ -161,6 +161,24 @@ def test_a_model_of_received_rows_is_monitored_on_received_rows(
     assert "2024-05-09" in said
 
 
+def test_monitor_says_what_a_feature_set_leaves_out(
+    fleet: fleet_slip.Fleet, tmp_path: Path, command: Command
+) -> None:
+    for day in (DAY + timedelta(days=days) for days in range(6)):
+        logs = [log_of(i, f"{day}-{i}", "A", day) for i in (1, 2)]
+        land(fleet.warehouse, str(day), *logs, day=day)
+    update_grams(fleet.warehouse, feature_set="motion")
+    fleet.gram()
+    selection = fleet.cohort().select(model="ax,ay,yaw_rate", features="motion")
+    fleet.publish("cars", selection, force=True)
+    receive(fleet, tmp_path, *(message_of(gram_of(i), f"VIN{i}") for i in range(10, 13)))
+    words = ("monitor", "cars", "--since", str(DAY + timedelta(days=5)))
+    said = " ".join(command(*words).split())
+    assert "3 drives without a log left out" in said
+    assert "not of the feature set motion" in said
+    assert json.loads(command(*words, "--json"))["drives_left_out"] == 3
+
+
 def test_retention_knows_the_days_of_received_rows(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
     fill_days(fleet, tmp_path, range(60, 62))
     fill_days(fleet, tmp_path, range(1))

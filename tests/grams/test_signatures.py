@@ -3,6 +3,7 @@
 import base64
 import contextlib
 from collections.abc import Callable
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import fleet_slip
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.cli.main import app
 from fleet_slip.delta import Change
-from fleet_slip.errors import ConfigError, InputError
+from fleet_slip.errors import AlarmError, ConfigError, DataError, InputError
 from fleet_slip.grams.car_keys import KEYS_VARIABLE
 from fleet_slip.grams.signatures import sign_messages
 from fleet_slip.models.ed25519 import generate
@@ -116,22 +117,32 @@ def test_what_a_revoked_key_signed_since_a_day_is_left_out_and_named(
     signed = [
         sign_messages(message(car, day), keys[f"VIN{car}"][0])
         for car in range(3)
-        for day in range(4)
+        for day in range(6)
     ]
-    assert receive(fleet, tmp_path, b"".join(signed)).received == 12
+    assert receive(fleet, tmp_path, b"".join(signed)).received == 18
     assert fleet.cohort().select(model="ax,ay").as_dict()["drives_revoked"] == {}
     list_keys(tmp_path, monkeypatch, *lines[:2], f"{lines[2][:-1]},2024-05-02")
     selection = fleet.cohort().select(model="ax,ay")
     told = selection.as_dict()
-    assert (told["drives"], told["drives_revoked"]) == (9, {"VIN2": 3})
+    assert (told["drives"], told["drives_revoked"]) == (13, {"VIN2": 5})
     trained = fleet.publish("cars", selection, force=True).version.manifest.trained_on
-    assert (trained.drives, trained.drives_without_log) == (9, 9)
+    assert (trained.drives, trained.drives_without_log) == (13, 13)
     loaded = fleet.cohort().select(nested="ax,ay,yaw_rate", rank="backward")
-    assert (loaded.cohort.drive_count, dict(loaded.cohort.revoked)) == (9, {"VIN2": 3})
+    assert (loaded.cohort.drive_count, dict(loaded.cohort.revoked)) == (13, {"VIN2": 5})
     with contextlib.suppress(SystemExit):
         app(["--root", str(tmp_path / "data"), "select", "--model", "ax,ay"])
     said_by_cli = " ".join(capsys.readouterr().err.split())
-    assert "3 drives of VIN2 left out: a key of it was revoked" in said_by_cli
+    assert "5 drives of VIN2 left out: a key of it was revoked" in said_by_cli
+    assert fleet.quality().revoked == {"VIN2": 5}
+    chart = fleet.monitor("cars", since=date(2024, 5, 5))
+    assert (sum(day.drives for day in chart.days), chart.drives_revoked) == (13, {"VIN2": 5})
+    for words in (["quality"], ["monitor", "cars", "--since", "2024-05-05"]):
+        with contextlib.suppress(SystemExit, AlarmError):
+            app(["--root", str(tmp_path / "data"), *words])
+        said_by_cli = " ".join(capsys.readouterr().err.split())
+        assert "5 drives of VIN2 left out: a key of it was revoked" in said_by_cli
+    with pytest.raises(DataError, match=r"all 5 drives of .* was revoked"):
+        fleet.quality("vehicle_id = 'VIN2' AND day > '2024-05-01'")
 
 
 @pytest.fixture
