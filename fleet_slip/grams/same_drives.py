@@ -7,10 +7,12 @@ n, sums and products: what a car counts is, bit for bit, what its log comes to.
 import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from datetime import date
 from itertools import pairwise
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from fleet_slip.arrays import BoolArray
 from fleet_slip.catalogue.feature_sets import PLAIN
@@ -26,6 +28,7 @@ class LoggedDrives:
 
     names: set[str] = field(default_factory=set)
     contents: set[bytes] = field(default_factory=set)
+    days: set[date] = field(default_factory=set)
     found: int = 0
     """Received Gram rows that were found to be of these drives."""
 
@@ -33,10 +36,27 @@ class LoggedDrives:
         """Add the drives of Gram rows."""
         self.names.update(rows["drive_id"].cast(pa.string()).to_pylist())
         self.contents.update(content_keys(rows))
+        self.days.update(rows["day"].unique().to_pylist())
 
     def files_with_received(self, grams: Snapshot) -> list[TableFile]:
         """Return the files that have received Gram rows of these drives."""
-        return [file for file, rows in received_by_file(grams) if self._mine(rows).any()]
+        names = pa.array(sorted(self.names), pa.string())
+        return [
+            file for file in grams.files if is_of_received(file) and self._in(file, names, grams)
+        ]
+
+    def _in(self, file: TableFile, names: pa.StringArray, grams: Snapshot) -> bool:
+        """Whether a file has received Gram rows of these drives.
+
+        The same content is of the same day: rows of other days are told by their names alone.
+        """
+        drives = grams.table.read(file.path, ["drive_id"])["drive_id"].cast(pa.string())
+        if pc.any(pc.is_in(drives, names)).as_py():
+            return True
+        first, last = file.days or (date.min, date.max)
+        if not any(first <= day <= last for day in self.days):
+            return False
+        return bool(self._mine(grams.table.read(file.path)).any())
 
     def without_received(self, rows: pa.Table) -> pa.Table:
         """Return rows of `grams` without the received ones of these drives; count those."""
@@ -56,13 +76,6 @@ class LoggedDrives:
 def has_received(grams: Snapshot) -> bool:
     """Whether any Gram row came without a log."""
     return any(is_of_received(file) for file in grams.files)
-
-
-def received_by_file(grams: Snapshot) -> Iterator[tuple[TableFile, pa.Table]]:
-    """Yield the files that have received Gram rows, and these."""
-    for file in grams.files:
-        if is_of_received(file):
-            yield file, grams.table.read(file.path)
 
 
 def content_keys(rows: pa.Table) -> Iterator[bytes]:

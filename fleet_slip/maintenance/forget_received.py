@@ -1,5 +1,7 @@
 """Takes drives out of the Gram rows that cars sent, which have no log to be written again."""
 
+from collections.abc import Iterator, Sequence
+
 import pyarrow as pa
 import pyarrow.compute as pc
 
@@ -20,20 +22,26 @@ def forget_received(warehouse: Warehouse, subject: Forgettable) -> int:
 
     def attempt() -> int:
         snapshot = warehouse.grams.snapshot()
-        kept: list[pa.Table] = []
         concerned: list[TableFile] = []
         rows = 0
         for file in snapshot.files:
-            every = read_rows(warehouse.grams, file)
-            mine = pc.and_(rows_of(every, subject), is_received(every))
+            told = warehouse.grams.read(file.path, ["file", "drive_id", "vehicle_id", "day", "n"])
+            mine = pc.and_(rows_of(told, subject), is_received(told))
             if pc.any(mine).as_py():
-                left = every.filter(pc.invert(mine))
-                kept += [left] if left.num_rows else []
                 concerned.append(file)
-                rows += pc.sum(every.filter(mine)["n"]).as_py()
+                rows += pc.sum(told.filter(mine)["n"]).as_py()
         if concerned:
-            add = write_rows(warehouse, kept)
+            add = write_rows(warehouse, _kept(warehouse, concerned, subject))
             snapshot.commit_or_discard(Change(add=add, remove=concerned, note={"job": "forget"}))
         return rows
 
     return retry_conflicts(attempt)
+
+
+def _kept(
+    warehouse: Warehouse, files: Sequence[TableFile], subject: Forgettable
+) -> Iterator[pa.Table]:
+    """Yield the Gram rows of files without those of a subject, file by file."""
+    for file in files:
+        rows = read_rows(warehouse.grams, file)
+        yield rows.filter(pc.invert(pc.and_(rows_of(rows, subject), is_received(rows))))

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import ConfigError, RefusedError
-from fleet_slip.grams.same_drives import received_by_file
+from fleet_slip.grams.gram_files import is_of_received
 from fleet_slip.maintenance.forget import ForgetReport, forget
 from fleet_slip.maintenance.vacuum import RETENTION_HOURS, VacuumReport, vacuum
 from fleet_slip.progress import Progress, no_progress
@@ -56,8 +56,8 @@ def retain(
     except OverflowError:
         raise ConfigError(f"drives_days = {retention.drives_days}: too long ago.") from None
     days = [file.day for file in warehouse.logs.snapshot().files if file.day is not None]
-    for _, rows in received_by_file(warehouse.grams.snapshot()):
-        days.append(pc.max(rows["day"]).as_py())
+    for file in filter(is_of_received, warehouse.grams.snapshot().files):
+        days.append(pc.max(warehouse.grams.read(file.path, ["day"])["day"]).as_py())
     if days and max(days) < before:
         raise RefusedError(
             f"{warehouse.root}: its latest drive is of {max(days)} and all before {before} would "
