@@ -5,6 +5,7 @@ sums are then those of the rows, to the bit. The rows of other files are read, b
 """
 
 from collections.abc import Callable, Collection, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -21,6 +22,8 @@ from fleet_slip.grams.rollup import BUCKET_KEYS, BUCKETS, Rollup, read_rollup
 from fleet_slip.warehouse.condition import Condition, asking
 from fleet_slip.warehouse.database import open_database
 from fleet_slip.warehouse.table_views import add_table
+
+READS_AT_ONCE = 16
 
 
 @dataclass(frozen=True)
@@ -140,11 +143,12 @@ class RollupReader:
         return cells
 
     def _rollups(self, grams: Snapshot) -> list[Rollup]:
-        known, table = self._known, grams.table
-        self._known = {
-            path: known[path] if path in known else read_rollup(table, path)
-            for path in (file.path for file in grams.files)
-        }
+        paths = [file.path for file in grams.files]
+        unread = [path for path in paths if path not in self._known]
+        with ThreadPoolExecutor(READS_AT_ONCE) as executor:  # a store answers many as fast as one
+            found = executor.map(partial(read_rollup, grams.table), unread)
+            known = self._known | dict(zip(unread, found, strict=True))
+        self._known = {path: known[path] for path in paths}
         return [one for one in self._known.values() if one]
 
 
