@@ -108,9 +108,8 @@ class Drives:
             "products": _lists(products),
         }
         schema = warehouse.grams.schema
-        return pa.table(
-            {name: columns[name].cast(schema.field(name).type) for name in schema.names}
-        )
+        names = [name for name in schema.names if name not in warehouse.grams.optional]
+        return pa.table({name: columns[name].cast(schema.field(name).type) for name in names})
 
     def log(self, warehouse: Warehouse) -> pa.Table:
         """Return the drives' rows as a log file has them; other signals are absent."""
