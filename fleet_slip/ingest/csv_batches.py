@@ -91,7 +91,10 @@ class CsvSource:
                     parsed = parsed.with_columns(again.select(sorted(texts)))
                 return parsed
 
-            blocks = _whole_lines(plain, self.file)
+            # A line of separators before each block fixes the number of fields and keeps a block
+            # from looking like a compressed file.
+            padding = self.csv_format.separator.encode() * len(names) + b"\n"
+            blocks = _whole_lines(plain, self.file, padding)
             if plain is not stream:
                 blocks = _without_bomb(blocks, self.file)
             yield from map_ahead(parse, blocks)
@@ -99,15 +102,12 @@ class CsvSource:
     def _parse(
         self, block: bytes, width: int, positions: dict[str, int], numbers: Set[str]
     ) -> pl.DataFrame:
-        """Parse whole lines. Columns are read by position: Polars renames duplicates."""
+        """Parse all lines but the first. Columns are read by position: Polars renames doubles."""
         fields = [f"column {i}" for i in range(width)] + [EXTRA_FIELDS]
         schema: dict[str, type[pl.DataType]] = dict.fromkeys(fields, pl.String)
         schema |= {fields[positions[name]]: pl.Float64 for name in numbers}
-        # The line of separators before each block fixes the number of fields and keeps a block
-        # from looking like a compressed file.
-        padding = self.csv_format.separator.encode() * width + b"\n"
         frame = pl.scan_csv(
-            BytesIO(padding + block),
+            BytesIO(block),
             has_header=False,
             separator=self.csv_format.separator,
             schema=schema,
@@ -170,22 +170,27 @@ def _csv_header(stream: BinaryIO, file: Path, csv_format: CsvFormat) -> list[str
     return [name.strip() for name in names]
 
 
-def _whole_lines(stream: BinaryIO, file: Path) -> Iterator[bytes]:
-    """Yield blocks of UTF-8 that end with a line; a line break in quotes does not end one."""
-    rest = b""
-    while block := stream.read(BLOCK_BYTES):
-        block = rest + block
+def _whole_lines(stream: BinaryIO, file: Path, padding: bytes) -> Iterator[bytes]:
+    """Yield blocks of UTF-8 that end with a line; a line break in quotes does not end one.
+
+    Each begins with the padding, a line of its own: put here, the block is not copied for it.
+    """
+    rest = padding
+    while more := stream.read(BLOCK_BYTES):
+        block = rest + more
         end = _end_of_lines(block)
-        if not end and len(block) > LINE_BLOCKS * BLOCK_BYTES:
+        if end > len(padding):
+            whole, rest = block[:end], padding + block[end:]
+            _require_text(whole, file)
+            yield whole
+            continue
+        if len(block) > LINE_BLOCKS * BLOCK_BYTES:
             raise InputError(
                 f"{shown(file)}: a line is longer than {LINE_BLOCKS * BLOCK_BYTES:,} bytes. "
                 "Is a quote not closed?"
             )
-        if end:
-            _require_text(block[:end], file)
-            yield block[:end]
-        rest = block[end:]
-    if rest:
+        rest = block
+    if len(rest) > len(padding):
         _require_text(rest, file)
         yield rest
 
