@@ -19,11 +19,11 @@ from fleet_slip.ingest.csv_format import CsvFormat
 from fleet_slip.ingest.read_ahead import map_ahead
 from fleet_slip.ingest.source import Channel
 
-BLOCK_BYTES = 2**21
+BLOCK_BYTES = 2**22
 """CSV is parsed in blocks of about this size."""
 
 MAX_LINE_BYTES = 2**20
-LINE_BLOCKS = 8
+LINE_BLOCKS = 4
 """Blocks that one line may fill: more often a quote is not closed."""
 MOST_UNFOLDED, MOST_BYTES = 200, 2**30
 """How many times its size a compressed file may become, beyond so many bytes: more is a bomb."""

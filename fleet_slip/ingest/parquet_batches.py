@@ -19,6 +19,8 @@ from fleet_slip.ingest.source import Channel
 BATCH_ROWS = 2**15
 """Parquet is read in batches of this many rows."""
 
+BUFFER_BYTES = 2**16
+"""Bytes of a column that are read at once."""
 MAX_FOOTER_BYTES = 2**24
 MAX_TEXT = 1_000
 """Characters of one text in Parquet: a dictionary can repeat a long one for the price of a bit."""
@@ -78,9 +80,14 @@ def _parquet_batches(
 ) -> Iterator[pl.DataFrame]:
     schema = pq.ParquetFile(stream).schema_arrow
     texts = [name for name in columns if _is_text(schema.field(name).type)]
-    # Buffered before, the bytes of the whole file would stay in memory until its end.
+    # Buffered before, the bytes of the whole file would stay in memory until its end; and without
+    # a buffer those of each column of a row group, of which a file may have a single one.
     parquet = pq.ParquetFile(
-        stream, read_dictionary=texts, page_checksum_verification=True, pre_buffer=False
+        stream,
+        read_dictionary=texts,
+        page_checksum_verification=True,
+        pre_buffer=False,
+        buffer_size=BUFFER_BYTES,
     )
     for batch in parquet.iter_batches(BATCH_ROWS, columns=list(columns)):
         plain = {name: plain_column(batch.column(name), name, file) for name in columns}

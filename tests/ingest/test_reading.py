@@ -8,6 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from fleet_slip.catalogue.counts import as_arrow
 from fleet_slip.errors import InputError
 from fleet_slip.ingest import checking, csv_batches, read_measured, reading
 from fleet_slip.ingest.parquet_batches import open_parquet
@@ -239,3 +240,15 @@ def test_a_time_beyond_the_calendar_is_no_time(
         (batch,) = source.batches(["time"])
     assert [value is None for value in batch["time"]] == [True, False]
     assert capfd.readouterr().err == ""
+
+
+def test_a_row_group_that_is_a_whole_file_is_not_in_memory_as_a_whole(tmp_path: Path) -> None:
+    rows = 2_000_000
+    values = np.random.default_rng(0).random(rows)
+    columns = pa.table({"ax": as_arrow(values)})
+    pq.write_table(columns, tmp_path / "log.parquet", row_group_size=rows, use_dictionary=False)
+    with open_parquet(tmp_path / "log.parquet") as source:
+        before = pa.total_allocated_bytes()
+        batches = source.batches(["ax"])
+        next(batches)
+        assert pa.total_allocated_bytes() - before < values.nbytes / 2
