@@ -7,24 +7,27 @@ a signal that has no other values the name itself.
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from functools import cached_property
+from contextlib import closing, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import polars as pl
+from numpy.typing import NDArray
 
+from fleet_slip.arrays import BoolArray
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.can_bus import CanBus
 from fleet_slip.ingest.can_decoding import is_sent, needed_bytes, physical, raw_numbers
 from fleet_slip.ingest.can_frames import CanFrames
 from fleet_slip.ingest.columns import describe_missing, shown
-from fleet_slip.ingest.source import BASE, OWN_TIME, Channel, reading_with
+from fleet_slip.ingest.source import OWN_TIME, Base, Channel, reading_with
+from fleet_slip.ingest.spool import Spool
 
-MAX_FRAMES = 20_000_000
 SUFFIXES = {".blf", ".asc", ".log", ".trc"}
 
+_MOST_NUMBERS = 100_000
 _Key = tuple[int, bool]
 """Number of a message, and whether it is of 29 bits."""
 
@@ -34,119 +37,139 @@ class CanSource:
 
     has_clock = True
 
-    def __init__(self, file: Path, bus: CanBus, database: Any) -> None:
-        """Take the trace's path, what the mapping says of it, and the parsed database."""
+    def __init__(self, file: Path, bus: CanBus, database: Any, spool: Spool) -> None:
+        """Take the trace's path, what the mapping says of it, the parsed database, and a spool."""
         self._file, self._bus, self._database = file, bus, database
-        self._wanted: set[_Key] | None = None
+        self._spool = spool
+        self._messages = {message.name: message for message in database.messages}
+        self._wanted: set[_Key] = set()
+        self._numbers: set[_Key] = set()
+        """Of the messages in the trace, once it was read."""
 
     def channels(self) -> list[Channel]:
         """Return the signals of all messages of the trace that the database knows."""
+        self._want({_key(message) for message in self._database.messages})
         return [
             Channel(f"{message.name}.{signal.name}", signal.unit or "", message.name)
             for message in self._database.messages
-            if _key(message) in self._frames
+            if _key(message) in self._numbers
             for signal in message.signals
         ]
 
-    def number_of_bases(self, columns: Sequence[str]) -> int:
-        """Return how many messages have one of the columns."""
-        return len({column.partition(".")[0] for column in columns})
-
-    def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
-        """Yield one batch for each message that has one of the columns."""
+    def bases(self, columns: Sequence[str]) -> list[Base]:
+        """Return the messages that have one of the columns. Raises `InputError`."""
         wanted: dict[str, dict[str, Any]] = defaultdict(dict)
-        messages = {message.name: message for message in self._database.messages}
         for column in columns:
             name, _, signal = column.partition(".")
-            found = {s.name: s for s in messages[name].signals} if name in messages else {}
+            of = self._messages[name].signals if name in self._messages else ()
+            found = {s.name: s for s in of}
             if signal not in found:
-                known = [f"{m}.{s.name}" for m, of in messages.items() for s in of.signals]
+                known = [f"{m}.{s.name}" for m, of in self._messages.items() for s in of.signals]
                 raise InputError(f"{shown(self._bus.database)}: {describe_missing(column, known)}")
             wanted[name][column] = found[signal]
-        asked = {_key(messages[name]) for name in wanted}
-        if self._wanted is not None and not asked <= self._wanted:
-            self.__dict__.pop("_frames", None)  # they were left empty
-        self._wanted = asked
-        for name, signals in wanted.items():
-            yield self._decode(messages[name], signals)
+        self._want({_key(self._messages[name]) for name in wanted})
+        return [
+            Base(name, partial(self._count, name, signals), partial(self._read, name, signals))
+            for name, signals in wanted.items()
+        ]
 
-    def _decode(self, message: Any, signals: dict[str, Any]) -> pl.DataFrame:
-        """Return the signals of one message; rows are frames that have one of them."""
-        times, payloads = self._payloads(message, signals)
-        frame = {OWN_TIME: times}
-        some = np.zeros(len(times), dtype=np.bool_)
-        for column, signal in signals.items():
+    def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
+        """Yield the rows of each message that has one of the columns, message by message."""
+        for base in self.bases(columns):
+            yield from base.read()
+
+    def _want(self, asked: set[_Key]) -> None:
+        """Read the trace, once more if it was read without these messages."""
+        if not self._numbers or not asked <= self._wanted:
+            self._wanted |= asked
+            self._spool.clear()
+            self._frames = {key: CanFrames(self._spool) for key in self._wanted}
+            self._numbers = set()
+            self._read_trace()
+            if not self._numbers:
+                raise InputError(
+                    f"{shown(self._file)}: there is no CAN frame in it. Record it again."
+                )
+
+    def _count(self, name: str, signals: dict[str, Any]) -> int:
+        """Return how many frames of a message have one of the signals."""
+        return sum(table.height for table in self._read(name, signals))
+
+    def _read(self, name: str, signals: dict[str, Any]) -> Iterator[pl.DataFrame]:
+        """Yield the signals of one message; rows are frames that have one of them."""
+        message, needed = self._messages[name], max(map(needed_bytes, signals.values()))
+        frames = self._require_usable(message, next(iter(signals)), needed)
+        named = {
+            column
+            for column, signal in signals.items()
+            if signal.choices and self._has_names_only(message, signal)
+        }
+        for times_s, payloads in frames.take(self._bus.channel, needed):
+            frame = {OWN_TIME: pl.Series(times_s)}
+            some = np.zeros(len(times_s), dtype=np.bool_)
+            for column, signal in signals.items():
+                sent = is_sent(message, signal, payloads)
+                some |= sent
+                raw = raw_numbers(signal, payloads)
+                frame[column] = _values(signal, raw, sent, as_names=column in named).alias(column)
+            yield pl.DataFrame(frame).filter(some)
+
+    def _has_names_only(self, message: Any, signal: Any) -> bool:
+        """Whether the database gives all values of a signal a name, and there is one."""
+        found = False
+        needed = needed_bytes(signal)
+        for _, payloads in self._frames[_key(message)].take(self._bus.channel, needed):
             sent = is_sent(message, signal, payloads)
-            some |= sent
-            raw = raw_numbers(signal, payloads)
-            values = pl.Series(column, physical(signal, raw)).set(pl.Series(~sent), None)
-            named = np.isin(raw, list(signal.choices)) if signal.choices else ~sent
-            if (named & sent).any():
-                texts = {value: str(text) for value, text in signal.choices.items()}
-                if (named | ~sent).all():
-                    names = [texts[v] if s else None for v, s in zip(raw, sent, strict=True)]
-                    values = pl.Series(column, names, pl.String)
-                else:
-                    values = values.set(pl.Series(named), None)
-            frame[column] = values
-        return pl.DataFrame(frame).filter(some).with_columns(pl.lit(message.name).alias(BASE))
+            named = np.isin(raw_numbers(signal, payloads), list(signal.choices))
+            if not (named | ~sent).all():
+                return False
+            found |= bool(sent.any())
+        return found
 
-    def _payloads(self, message: Any, signals: dict[str, Any]) -> tuple[Any, Any]:
-        frames = self._frames.get(_key(message))
-        if frames is None:
-            known = sum(_key(m) in self._frames for m in self._database.messages)
+    def _require_usable(self, message: Any, column: str, needed: int) -> CanFrames:
+        """Return the frames of a message. Raises `InputError` if they are not what it says."""
+        frames = self._frames[_key(message)]
+        if _key(message) not in self._numbers:
+            known = sum(_key(m) in self._numbers for m in self._database.messages)
             raise InputError(
                 f"{shown(self._file)}: the message {message.name} ({message.frame_id:#x}) is not "
-                f"in it. Of the {len(self._frames)} numbers in the trace {known} are in "
+                f"in it. Of the {len(self._numbers)} numbers in the trace {known} are in "
                 f"{self._bus.database}. Is it the database of this car and bus?"
             )
-        buses, chosen = frames.buses, np.ones(len(frames), dtype=np.bool_)
-        if self._bus.channel is not None:
-            chosen = frames.are_on(self._bus.channel)
-        elif len(buses) > 1:
+        buses = frames.buses
+        if self._bus.channel is None and len(buses) > 1:
             raise InputError(
                 f"{shown(self._file)}: the message {message.name} is on the buses "
                 f"{', '.join(buses)}. Say in the mapping which counts: [can] channel = "
                 f'"{buses[0]}".'
             )
-        needed = max(map(needed_bytes, signals.values()))
-        sizes = np.asarray(frames.sizes)[chosen]
-        short = int((sizes < needed).sum())
-        if short or not sizes.size:
+        sizes = frames.sizes_on(self._bus.channel)
+        short = sum(number for size, number in sizes.items() if size < needed)
+        if short or not sizes:
             raise InputError(
-                f"{shown(self._file)}: {short:,} of {sizes.size:,} frames of "
-                f"{message.name} ({message.frame_id:#x}) are too short: {next(iter(signals))} ends "
-                f"in byte {needed}, the longest has {sizes.max(initial=0)}; buses: "
+                f"{shown(self._file)}: {short:,} of {sizes.total():,} frames of "
+                f"{message.name} ({message.frame_id:#x}) are too short: {column} ends "
+                f"in byte {needed}, the longest has {max(sizes, default=0)}; buses: "
                 f"{', '.join(buses)}. Is {self._bus.database} the database of this car and bus?"
             )
-        return frames.take(chosen, needed)
+        return frames
 
-    @cached_property
-    def _frames(self) -> dict[_Key, CanFrames]:
-        """All frames, by message; those of messages that are not wanted are left empty."""
-        frames: dict[_Key, CanFrames] = defaultdict(CanFrames)
-        count = 0
+    def _note(self, key: _Key) -> None:
+        """Note that there is a message; of those that nobody wants not more than a car has."""
+        if key in self._frames or len(self._numbers) < _MOST_NUMBERS:
+            self._numbers.add(key)
+
+    def _read_trace(self) -> None:
+        """Keep the frames of the wanted messages, and note the numbers of all."""
         with reading_with(self._file, "can") as can, can.LogReader(self._file) as trace:
             self._require_whole(trace)
             for frame in trace:
                 if frame.is_error_frame or frame.is_remote_frame:
                     continue
-                found = frames[frame.arbitration_id, frame.is_extended_id]
-                if not self._is_wanted(frame.arbitration_id, frame.is_extended_id):
-                    continue
-                count += 1
-                if count > MAX_FRAMES:
-                    raise InputError(
-                        f"{shown(self._file)}: more than {MAX_FRAMES:,} frames. Split the trace."
-                    )
-                found.append(frame.timestamp, str(frame.channel), frame.data)
-        if not frames:
-            raise InputError(f"{shown(self._file)}: there is no CAN frame in it. Record it again.")
-        return dict(frames)
-
-    def _is_wanted(self, number: int, is_extended: bool) -> bool:
-        """Whether a column is of this message; all are wanted of who lists what is there."""
-        return self._wanted is None or (number, is_extended) in self._wanted
+                key = frame.arbitration_id, frame.is_extended_id
+                self._note(key)
+                if key in self._frames:
+                    self._frames[key].append(frame.timestamp, str(frame.channel), frame.data)
 
     def _require_whole(self, trace: Any) -> None:
         # A BLF file says how long it is; python-can reads what is there of one that was cut.
@@ -158,6 +181,16 @@ class CanSource:
             )
 
 
+def _values(signal: Any, raw: NDArray[Any], sent: BoolArray, *, as_names: bool) -> pl.Series:
+    """Return a signal, null where it was not sent; values that have a name are null, or all it."""
+    named = np.isin(raw, list(signal.choices)) if signal.choices else np.zeros_like(sent)
+    if as_names:
+        texts = {value: str(text) for value, text in signal.choices.items()}
+        names = [texts[v] if s else None for v, s in zip(raw, sent, strict=True)]
+        return pl.Series(names, dtype=pl.String)
+    return pl.Series(physical(signal, raw)).set(pl.Series(~sent | named), None)
+
+
 def _key(message: Any) -> _Key:
     return message.frame_id, message.is_extended_frame
 
@@ -165,7 +198,8 @@ def _key(message: Any) -> _Key:
 @contextmanager
 def open_can_trace(file: Path, bus: CanBus) -> Iterator[CanSource]:
     """Open a CAN trace. Raises `InputError`, for a database that cannot be parsed too."""
-    yield CanSource(file, bus, parse_database(bus))
+    with closing(Spool()) as spool:
+        yield CanSource(file, bus, parse_database(bus), spool)
 
 
 def parse_database(bus: CanBus) -> Any:

@@ -10,11 +10,12 @@ import polars as pl
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import shown
 from fleet_slip.ingest.fields import RAW, Field, fields_of, meets_conditions
+from fleet_slip.ingest.log_rows import read_batches
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.quarantine import DriveKeys, check_rows, with_values
-from fleet_slip.ingest.reading import read_batches
 from fleet_slip.ingest.row_condition import describe
 from fleet_slip.ingest.source import BASE
+from fleet_slip.ingest.time_bases import ROW
 
 MAX_KEYS = 100_000
 """Combinations of drive metadata in one file, of whatever rows."""
@@ -58,8 +59,11 @@ class RowChecker:
     def _check(self, batch: pl.DataFrame) -> Block:
         raw = batch.select(pl.all().name.prefix(RAW))
         fields, meeting = self._understand(raw.schema)
-        row = pl.int_range(self.rows + 1, self.rows + batch.height + 1, dtype=pl.Int64)
-        raw = raw.with_columns(row.alias("row"))
+        if RAW + ROW in raw.columns:
+            raw = raw.rename({RAW + ROW: "row"})
+        else:
+            row = pl.int_range(self.rows + 1, self.rows + batch.height + 1, dtype=pl.Int64)
+            raw = raw.with_columns(row.alias("row"))
         if meeting is not None:
             raw = raw.filter(meeting)
         raw = raw.rename({RAW + BASE: "base"}, strict=False)

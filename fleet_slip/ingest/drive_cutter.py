@@ -57,8 +57,8 @@ class DriveCutter:
     def cut(self, rows: pl.DataFrame, *, last: bool) -> tuple[pl.DataFrame, pl.DataFrame]:
         """Return the rows of a block, those of a part together, with a column `part`; and the bad.
 
-        Rows of several time bases are of a file's only block, in which they are sorted by time;
-        their order was looked at base by base.
+        Rows of several time bases are in the order of time, which was looked at base by base; those
+        of different bases may have the same.
         """
         self.ended = []
         stretches = _stretches(rows, self._gap_s)
@@ -152,7 +152,8 @@ class DriveCutter:
             waiting[end] = alone[end]
             alone[end] = False
         self._last[group[end]] = np.where(waiting[end], before[end], time[end])
-        number = rows["row"].to_numpy().astype(np.float64)
+        # Of several time bases only times tell what comes first.
+        number = time if "base" in rows.columns else rows["row"].to_numpy().astype(np.float64)
         known_at = np.concatenate([number[1:], [np.inf]])
         known_at[end] = np.inf
         return alone, waiting, np.where(far, known_at, number)

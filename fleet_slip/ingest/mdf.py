@@ -1,8 +1,10 @@
 """Reads ASAM MDF, versions 2 to 4, through asammdf: each channel group is a time base."""
 
+import mmap
 import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -13,7 +15,7 @@ import polars as pl
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import describe_missing, shown
-from fleet_slip.ingest.source import BASE, OWN_TIME, Channel, as_column, reading_with
+from fleet_slip.ingest.source import OWN_TIME, Base, Channel, as_column, reading_with
 
 MAGICS = (b"MDF     ", b"UnFinMF ")
 _LARGEST_BLOCK, _LARGEST_RATIO = 2**30, 20_000
@@ -45,26 +47,29 @@ class MdfSource:
             if index != self._mdf.masters_db.get(number)
         ]
 
-    def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
-        """Yield the rows of each channel group that has one of the columns, group by group."""
-        for number, indices in sorted(self._groups_of(columns).items()):
-            yield from self._read(number, indices)
-
-    def number_of_bases(self, columns: Sequence[str]) -> int:
-        """Return how many channel groups have one of the columns."""
-        return len(self._groups_of(columns))
-
-    def _groups_of(self, columns: Sequence[str]) -> dict[int, dict[str, int]]:
+    def bases(self, columns: Sequence[str]) -> list[Base]:
+        """Return the channel groups that have one of the columns. Raises `InputError`."""
         groups: dict[int, dict[str, int]] = {}
         for name in columns:
             number, index = self._find(name)
             groups.setdefault(number, {})[name] = index
-        return groups
+        return [
+            Base(f"group {number}", partial(self._records, number), partial(self._read, number, of))
+            for number, of in sorted(groups.items())
+        ]
+
+    def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
+        """Yield the rows of each channel group that has one of the columns, group by group."""
+        for base in self.bases(columns):
+            yield from base.read()
+
+    def _records(self, number: int) -> int:
+        return int(self._mdf.groups[number].channel_group.cycles_nr)
 
     def _read(self, number: int, indices: dict[str, int]) -> Iterator[pl.DataFrame]:
         """Read channels of a group, some records at a time."""
         self._require_sound(number, indices)
-        records = self._mdf.groups[number].channel_group.cycles_nr
+        records = self._records(number)
         for start in range(0, max(records, 1), WINDOW_RECORDS):
             yield self._window(number, indices, start, min(WINDOW_RECORDS, records - start))
 
@@ -76,10 +81,12 @@ class MdfSource:
             self._require_inside(number, index)
         self._require_data(number, name)
 
-    def select(self, number: int, indices: dict[str, int]) -> list[Any]:
-        """Return channels of a group as asammdf's signals, whole. Raises `InputError`."""
+    def windows(self, number: int, indices: dict[str, int]) -> Iterator[list[Any]]:
+        """Yield channels of a group as asammdf's signals, some records at a time."""
         self._require_sound(number, indices)
-        return self._signals(number, indices, 0, self._mdf.groups[number].channel_group.cycles_nr)
+        records = self._records(number)
+        for start in range(0, records, WINDOW_RECORDS):
+            yield self._signals(number, indices, start, min(WINDOW_RECORDS, records - start))
 
     def times_s(self, signal: Any) -> FloatArray:
         """Return when a signal's samples were taken, since 1970 if the file knows the date."""
@@ -99,12 +106,20 @@ class MdfSource:
                 record_offset=start,
                 record_count=records,
             )
+            self._release()
         if len(signals[0]) < records:
             raise InputError(
                 f"{shown(self._file)}: group {number} has {start + len(signals[0]):,} samples and "
                 "not as many as it says: it is truncated. Copy it again."
             )
         return list(signals)
+
+    def _release(self) -> None:
+        """Let the system have back the pages of the file, or all of it counts as our memory."""
+        mapped = self._mdf._mdf._file
+        # The copy of an unfinalised file has changes that are in memory only.
+        if isinstance(mapped, mmap.mmap) and memoryview(mapped).readonly:
+            mapped.madvise(mmap.MADV_DONTNEED)
 
     def _window(
         self, number: int, indices: dict[str, int], start: int, records: int
@@ -118,7 +133,7 @@ class MdfSource:
             if invalid is not None:
                 values = values.set(pl.Series(np.asarray(invalid[:records], dtype=np.bool_)), None)
             frame[name] = values
-        return pl.DataFrame(frame).with_columns(pl.lit(f"group {number}").alias(BASE))
+        return pl.DataFrame(frame)
 
     def _require_times(self, number: int, name: str) -> None:
         master = self._mdf.masters_db.get(number)
@@ -209,6 +224,8 @@ def open_mdf(file: Path) -> Iterator[MdfSource]:
             except Exception as error:
                 _close_half_made(error)
                 raise
+        if getattr(mdf._mdf, "_delete_on_close", False):
+            mdf._mdf.name.unlink()  # it stays open, and goes with the process however that ends
         try:
             yield MdfSource(file, mdf)
         finally:

@@ -85,18 +85,17 @@ def to_ticks(
     the samples of each time base; `known` is what is known of the drive, by column of `logs`.
     Raises `InputError` for what nobody says.
     """
-    start_s = float(rows.time_s[0])
-    resampler = _build_resampler(rows.time_s - start_s, intervals_s)
+    start_s = rows.start_s
+    resampler = _build_resampler(rows, intervals_s)
     method, ticks = resampler.method, resampler.ticks.astype(np.int32)
     counts, somewhere = {}, np.zeros(ticks.size, dtype=np.bool_)
-    whole = rows.frame() if len(intervals_s) > 1 else None
     for signal, source in mapping.signals.items():
         if method == "snap" and source.interpolate and not source.delay_s:
             values = rows.chunks(signal)
-        elif whole is None:
+        elif len(intervals_s) == 1:
             values = [_resample(rows.column(signal), resampler, signal, mapping)]
         else:
-            samples = whole.filter(pl.col(signal).is_not_null())
+            samples = rows.samples(signal)
             own = _on_own_times(samples, start_s, resampler, intervals_s)
             values = [_resample(samples[signal].to_numpy(), own, signal, mapping)]
         # Rounding clips a resampled value's last bit, no more: the rest is in quarantine.
@@ -128,12 +127,13 @@ def _resample(
     return _on_the_circle(resample, values) if signal == catalogue().label else resample(values)
 
 
-def _build_resampler(time_s: FloatArray, intervals_s: dict[int, float]) -> Resampler:
+def _build_resampler(rows: DriveRows, intervals_s: dict[int, float]) -> Resampler:
     """Return what says the ticks of a drive, and brings its signals there if they share times."""
     if len(intervals_s) == 1:
         (interval_s,) = intervals_s.values()
+        time_s = rows.time_s - rows.start_s
         return build_resampler(time_s, choose_method(time_s, interval_s))
-    return build_resampler(time_s, "interpolate")
+    return build_resampler(np.array([0.0, rows.end_s - rows.start_s]), "interpolate")
 
 
 def _on_own_times(

@@ -18,7 +18,10 @@ MOST_RUNS = 8
 
 @dataclass(frozen=True)
 class DriveRows:
-    """The rows of one drive, in the pieces that they came in: they are not joined without need."""
+    """The rows of one drive, in the pieces that they came in: they are not joined without need.
+
+    Of several time bases, each piece is of one, and has the signals of that base only.
+    """
 
     pieces: Sequence[pl.DataFrame]
 
@@ -33,26 +36,66 @@ class DriveRows:
         return int(self.pieces[0]["group"][0])
 
     @cached_property
+    def start_s(self) -> float:
+        """The first time."""
+        return min(float(piece["time"][0]) for piece in self.pieces)
+
+    @cached_property
+    def end_s(self) -> float:
+        """The last time."""
+        return max(float(piece["time"][-1]) for piece in self.pieces)
+
+    @cached_property
+    def bases(self) -> tuple[int, ...]:
+        """Numbers of the time bases; none if the file has but one."""
+        return tuple(sorted({_base(piece) for piece in self.pieces if "base" in piece.columns}))
+
+    @cached_property
     def time_s(self) -> FloatArray:
-        """Times of all rows."""
+        """Times of all rows, which are of one base."""
         return self.column("time")
+
+    def times_of(self, base: int) -> FloatArray:
+        """Return the times of one of several bases."""
+        return np.concatenate([p["time"].to_numpy() for p in self.pieces if _base(p) == base])
 
     def chunks(self, name: str) -> list[FloatArray]:
         """Return a column piece by piece, NaN where it has no value."""
-        return [chunk.to_numpy() for piece in self.pieces for chunk in piece[name].get_chunks()]
+        found: list[FloatArray] = []
+        for piece in self.pieces:
+            some = name in piece.columns
+            chunks = (
+                piece[name].get_chunks() if some else [pl.repeat(np.nan, piece.height, eager=True)]
+            )
+            found += [chunk.to_numpy() for chunk in chunks]
+        return found
 
     def column(self, name: str) -> FloatArray:
         """Return a column, NaN where it has no value."""
         chunks = self.chunks(name)
         return chunks[0] if len(chunks) == 1 else np.concatenate(chunks)
 
-    def nulls(self, name: str) -> int:
-        """Return how many rows have no value in a column."""
-        return sum(piece[name].null_count() for piece in self.pieces)
+    def samples(self, name: str) -> pl.DataFrame:
+        """Return `time`, `base` and a signal where it has a value, by time, of several bases."""
+        columns = ["time", "base", name]
+        some = [piece.select(columns) for piece in self.pieces if name in piece.columns]
+        if not some:
+            return pl.DataFrame(schema=dict.fromkeys(columns, pl.Float64))
+        found = pl.concat(some).filter(pl.col(name).is_not_null())
+        return found if found["time"].is_sorted() else found.sort("time", maintain_order=True)
+
+    def number_of(self, name: str) -> int:
+        """Return how many rows have a value in a column."""
+        columns = [piece[name] for piece in self.pieces if name in piece.columns]
+        return sum(len(column) - column.null_count() for column in columns)
 
     def frame(self) -> pl.DataFrame:
         """Return all rows in one frame."""
-        return pl.concat(self.pieces)
+        return pl.concat(self.pieces, how="diagonal")
+
+
+def _base(piece: pl.DataFrame) -> int:
+    return int(piece["base"][0])
 
 
 class OpenDrives:
@@ -75,7 +118,8 @@ class OpenDrives:
         else:
             runs = [_run(rows, *ends) for ends in itertools.pairwise(heads)]
         for run in runs:
-            self._rows.setdefault(int(run["part"][0]), []).append(run)
+            pieces = _by_base(run) if "base" in run.columns else [run]
+            self._rows.setdefault(int(run["part"][0]), []).extend(pieces)
 
     def take(self, parts: Iterable[int]) -> Iterator[DriveRows]:
         """Yield the rows of parts that have any, and let go of them."""
@@ -93,3 +137,12 @@ def _run(rows: pl.DataFrame, start: int, end: int) -> pl.DataFrame:
     if 2 * run.height >= rows.height:
         return run
     return run.select(pl.all().gather(pl.int_range(pl.len())))
+
+
+def _by_base(run: pl.DataFrame) -> list[pl.DataFrame]:
+    """Return the rows of each time base, with those columns that have a value there."""
+    bases = run.drop("part").partition_by("base", maintain_order=True)
+    return [
+        rows.select(column for column in rows if column.null_count() < rows.height)
+        for rows in bases
+    ]

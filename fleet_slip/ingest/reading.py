@@ -1,13 +1,10 @@
-"""Opens measured files of any format, and reads them in bounded batches.
+"""Opens measured files of any format.
 
-What a file is, its first bytes say; only what is text goes by the mapping and the name. A batch is
-a Polars frame with the columns that a mapping uses: text (CSV, text in Parquet), 64-bit floats,
-dates or timestamps. CSV fields stay text, so that what is not a number can be quarantined as it was
-written.
+What a file is, its first bytes say; only what is text goes by the mapping and the name.
 """
 
 import hashlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from typing import Protocol, TypeVar
@@ -17,7 +14,7 @@ import pyarrow as pa
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.can_bus import CanBus
-from fleet_slip.ingest.can_trace import CanSource, open_can_trace
+from fleet_slip.ingest.can_trace import open_can_trace
 from fleet_slip.ingest.columns import shown
 from fleet_slip.ingest.csv_batches import PlainNumbers, open_csv
 from fleet_slip.ingest.csv_format import CsvFormat
@@ -25,16 +22,14 @@ from fleet_slip.ingest.duckdb_table import MAGIC as DUCKDB_MAGIC
 from fleet_slip.ingest.duckdb_table import MAGIC_AT as DUCKDB_AT
 from fleet_slip.ingest.duckdb_table import DuckdbRows, open_duckdb
 from fleet_slip.ingest.log_files import parts_of
-from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.matlab import HDF5_AT, HDF5_MAGIC, MAT5_MAGIC, open_mat, open_mat73
 from fleet_slip.ingest.mcap_log import MAGIC as MCAP_MAGIC
 from fleet_slip.ingest.mcap_log import open_mcap
 from fleet_slip.ingest.mdf import MAGICS as MDF_MAGICS
-from fleet_slip.ingest.mdf import MdfSource, open_mdf
+from fleet_slip.ingest.mdf import open_mdf
 from fleet_slip.ingest.mdf_bus import open_mdf_bus
-from fleet_slip.ingest.parquet_batches import BATCH_ROWS, PARQUET_MAGIC, open_parquet
-from fleet_slip.ingest.source import BASE, Source
-from fleet_slip.ingest.time_bases import merge_bases
+from fleet_slip.ingest.parquet_batches import PARQUET_MAGIC, open_parquet
+from fleet_slip.ingest.source import Source
 
 BLF_MAGIC = b"LOGG"
 _ARCHIVES = {b"PK\x03\x04": "unzip", b"7z\xbc\xaf": "7z x", b"Rar!": "unrar x"}
@@ -45,8 +40,6 @@ _BINARY = {
     (".duckdb", ".ddb"): "a DuckDB file",
     (".mcap",): "an MCAP file",
 }
-_CLOCK = "this format says when each sample was taken: write own_clock = true under [time]"
-_NO_CLOCK = "this format has no clock of its own: write column or rate_hz under [time]"
 
 Told = TypeVar("Told")
 
@@ -118,101 +111,6 @@ def log_digest(log: Path) -> "hashlib._Hash":
     if not log.is_dir():
         return digests[0]
     return hashlib.sha256(b"".join(digest.digest() for digest in digests))
-
-
-def read_batches(log: Path, mapping: Mapping) -> Iterator[pl.DataFrame]:
-    """Yield the columns of a log that a mapping uses, in its order, in bounded batches.
-
-    Raises `InputError` if a file cannot be read, or a column is missing or ambiguous.
-    """
-    bases = mapping.time_bases()
-    parts, columns = parts_of(log), next(iter(bases.values()))
-    if mapping.time.key is None or (len(bases) == 1 and not mapping.time.own_clock):
-        for part in parts:
-            with _open_part(part, mapping) as source:
-                yield from source.batches(columns)
-        return
-    if len(parts) > 1:
-        yield from _merged(tables_of_parts(log, mapping), log, mapping)
-        return
-    with _open_part(parts[0], mapping) as source:
-        if len(bases) == 1 and _has_one_base(source, columns):
-            for table in source.batches(columns):
-                yield from table.drop(BASE).iter_slices(BATCH_ROWS)
-        else:
-            yield from _merged(_tables(source, mapping), log, mapping)
-
-
-def _merged(tables: Iterable[pl.DataFrame], log: Path, mapping: Mapping) -> Iterator[pl.DataFrame]:
-    """Yield the rows of all time bases as those of one table."""
-    time, held = str(mapping.time.key), mapping.common_columns()
-    try:
-        merged = merge_bases(tables, time, held, mapping.time.split_gap_s)
-    except InputError as error:
-        raise InputError(f"{shown(log)}: {error}") from None
-    yield from merged.iter_slices(BATCH_ROWS)
-
-
-def _has_one_base(source: Source, columns: Sequence[str]) -> bool:
-    """Whether the rows of all these columns share their times, and so need not be merged."""
-    return isinstance(source, MdfSource | CanSource) and source.number_of_bases(columns) == 1
-
-
-@contextmanager
-def _open_part(part: Path, mapping: Mapping) -> Iterator[Source]:
-    """Open a file that says times as the mapping does. Raises `InputError`."""
-    with file_errors(part), open_source(part, mapping) as source:
-        if source.has_clock != mapping.time.own_clock:
-            raise InputError(
-                f"{shown(part)}: {_CLOCK if source.has_clock else _NO_CLOCK}, in the mapping "
-                f"{mapping.name!r}."
-            )
-        yield source
-
-
-def _tables(source: Source, mapping: Mapping) -> Iterator[pl.DataFrame]:
-    """Yield the tables of a file's time bases."""
-    for own, columns in mapping.time_bases().items():
-        for table in source.batches(columns):
-            yield table if source.has_clock else _with_times(table, own, str(mapping.time.key))
-
-
-def tables_of_parts(log: Path, mapping: Mapping) -> list[pl.DataFrame]:
-    """Return the tables of all parts of a log, in the order of time.
-
-    A part may lack columns that another has. Tables of the same columns are one time base, which
-    goes on from part to part. Raises `InputError` for a column that no part has.
-    """
-    time, found = str(mapping.time.key), []
-    missing = {name for names in mapping.time_bases().values() for name in names}
-    for part in parts_of(log):
-        with _open_part(part, mapping) as source:
-            names = {channel.name for channel in source.channels()}
-            there = names | {name for name in missing if name.rpartition("@")[0] in names}
-            for own, columns in mapping.time_bases().items():
-                wanted = [name for name in columns if name in there]
-                if wanted and (own is None or own in there):
-                    for table in source.batches(wanted):
-                        named = table if source.has_clock else _with_times(table, own, time)
-                        base = " ".join(sorted(set(named.columns) - {BASE}))
-                        found.append(named.with_columns(pl.lit(base).alias(BASE)))
-                    missing -= set(wanted)
-    if missing:
-        raise InputError(f"{shown(log)}: no file in it has the column {min(missing)!r}.")
-    return sorted(found, key=lambda table: _first_time(table[time]))
-
-
-def _first_time(times: pl.Series) -> float:
-    first = times.min()
-    return first if isinstance(first, float) else 0.0
-
-
-def _with_times(table: pl.DataFrame, own: str | None, time: str) -> pl.DataFrame:
-    """Name a base by the column of its times, and call these as all times are called."""
-    base = str(own)
-    if own != time:
-        table = table.filter(pl.col(base).is_not_null()).rename({base: time})
-    return table.with_columns(pl.lit(base).alias(BASE))
 
 
 @contextmanager

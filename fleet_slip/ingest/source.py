@@ -6,12 +6,12 @@ time is a column like any other.
 """
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import polars as pl
@@ -23,7 +23,7 @@ from fleet_slip.ingest.columns import shown
 OWN_TIME = "\0time"
 """Column of times in s, where the file has clocks of its own."""
 BASE = "\0base"
-"""Column that says which of a file's time bases a row is of, where there are several."""
+"""Column with the number of the time base that a row is of, where there are several."""
 
 
 @dataclass(frozen=True)
@@ -41,11 +41,26 @@ class Channel:
     base: str = ""
 
 
+@dataclass(frozen=True)
+class Base:
+    """The rows of a log that share their times.
+
+    Attributes:
+        name: what goes on in another file of the log has the same.
+        count_rows: returns how many rows there are.
+        read: yields them in the file's order, in bounded batches of the same columns, at least one.
+    """
+
+    name: str
+    count_rows: Callable[[], int]
+    read: Callable[[], Iterator[pl.DataFrame]]
+
+
 class Source(Protocol):
     """A file that is open for reading."""
 
     has_clock: bool
-    """Whether its times are in `OWN_TIME`."""
+    """Whether its times are in `OWN_TIME`. Such a file is a `ClockSource`."""
 
     def channels(self) -> list[Channel]:
         """Return all that can be read, in the file's order."""
@@ -54,9 +69,19 @@ class Source(Protocol):
     def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
         """Yield rows that have the named columns: text, 64-bit floats, dates or timestamps.
 
-        With a clock, each batch has `OWN_TIME`, `BASE`, and those of the columns that are of its
-        time base. Raises `InputError`, for a column that is missing or ambiguous too.
+        With a clock, the rows of one time base come after those of another; each batch has
+        `OWN_TIME` and those of the columns that are of its base. Raises `InputError`, for a column
+        that is missing or ambiguous too.
         """
+        ...
+
+
+@runtime_checkable
+class ClockSource(Source, Protocol):
+    """A file that says when each sample was taken."""
+
+    def bases(self, columns: Sequence[str]) -> list[Base]:
+        """Return the time bases that have one of the columns. Raises `InputError`."""
         ...
 
 

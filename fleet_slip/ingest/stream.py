@@ -9,6 +9,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import polars as pl
 import pyarrow as pa
 
@@ -86,7 +87,7 @@ class MeasuredStream:
         """Yield what the file becomes, in order, once. Raises `InputError`, at its end too."""
         with closing(read_ahead(self.checker.blocks())) as blocks:
             early, intervals_s = self._usual_intervals(blocks)
-            longest_s = LONGEST_DRIVE_S * min(1.0, *(one / STEP_S for one in intervals_s.values()))
+            longest_s = LONGEST_DRIVE_S * min([1.0, *(s / STEP_S for s in intervals_s.values())])
             cutter = DriveCutter(self.mapping.time, longest_s)
             for block in chain(early, blocks):
                 yield self._piece(cutter, block, intervals_s)
@@ -97,20 +98,18 @@ class MeasuredStream:
         """Return the first blocks, and the usual time between samples of each time base in them.
 
         It is that of rows up to a number that is the same however a file is cut into blocks. Of a
-        file with several time bases all rows are one block.
+        time base that is not among them, its first drive tells it.
         """
         early: list[Block] = []
         enough = RATE_ROWS
         for block in blocks:
             early.append(block)
-            while block.read >= enough and "base" not in block.rows.columns:
+            while _reach(early) >= enough:
                 first = _trial(self.mapping, early, enough)
                 if first["part"].is_duplicated().sum() > FEWEST_STEPS:
                     return early, sample_intervals_s(first)
                 enough += RATE_ROWS
-        if "base" in early[0].rows.columns:
-            early = [_one_block(early)]
-        return early, sample_intervals_s(_trial(self.mapping, early, early[-1].read))
+        return early, sample_intervals_s(_trial(self.mapping, early, _reach(early)))
 
     def _piece(
         self,
@@ -125,7 +124,7 @@ class MeasuredStream:
         self._open.add(rows)
         drives = []
         for ended in self._open.take([*cutter.ended, *(cutter.open_parts() if last else ())]):
-            if ended.time_s[-1] - ended.time_s[0] < STEP_S - TIME_EPSILON_S:
+            if ended.end_s - ended.start_s < STEP_S - TIME_EPSILON_S:
                 refused.append(describe_refused(ended.frame(), None, "too_short"))
             else:
                 drives.append(self._drive(ended, intervals_s))
@@ -142,14 +141,16 @@ class MeasuredStream:
         group = rows.group
         self._stretches[group] += 1
         name = drive_id(self.prefix, group, self._stretches[group])
-        start_s, end_s = float(rows.time_s[0]), float(rows.time_s[-1])
         told = self.checker.keys.metadata[group]
         known = {
             **told,
             "drive_name": told.get("drive", self._stem),
             "source_file": self._name,
-            "trip_id": self._trips.name(name, group, start_s, end_s),
+            "trip_id": self._trips.name(name, group, rows.start_s, rows.end_s),
         }
+        for base in set(rows.bases) - intervals_s.keys():
+            steps_s = np.diff(rows.times_of(base)[:RATE_ROWS])
+            intervals_s[base] = float(np.median(steps_s)) if steps_s.size else STEP_S
         try:
             drive = to_ticks(rows, self.mapping, intervals_s, name, known)
         except InputError as error:
@@ -272,17 +273,25 @@ def _identity(file: Path, mapping: Mapping) -> str:
     return digest.hexdigest()
 
 
+def _reach(blocks: list[Block]) -> int:
+    """Return how many rows there are to tell the usual time between them.
+
+    Those of several time bases are numbered base by base, so that good ones are counted.
+    """
+    if "base" in blocks[-1].rows.columns:
+        return sum(block.rows.height for block in blocks)
+    return blocks[-1].read
+
+
 def _trial(mapping: Mapping, blocks: list[Block], until: int) -> pl.DataFrame:
     """Return the rows of the first blocks up to a number, cut into parts."""
     rows = blocks[0].rows if len(blocks) == 1 else pl.concat([block.rows for block in blocks])
-    if until < blocks[-1].read:
+    several = "base" in rows.columns
+    if several:
+        rows = rows.head(until)
+    elif until < blocks[-1].read:
         rows = rows.filter(pl.col("row") <= until)
-    return DriveCutter(mapping.time).cut(rows, last="base" in rows.columns)[0]
-
-
-def _one_block(blocks: list[Block]) -> Block:
-    rows, refused = (pl.concat(frames) for frames in zip(*(b[:2] for b in blocks), strict=True))
-    return Block(rows, refused, blocks[-1].read)
+    return DriveCutter(mapping.time).cut(rows, last=several)[0]
 
 
 def _no_more(block: Block) -> Block:

@@ -1,101 +1,187 @@
-"""Brings the tables of a file with several time bases into one, in which every signal keeps its own
-samples: a row is a sample time of one of them, and has no value of the others.
+"""Brings the time bases of a log into one table, in which every signal keeps its own samples.
+
+A row is a sample time of one of them, and has no value of the others. The table comes in windows of
+time, so that only some rows of each base are in memory.
 """
 
-from collections import defaultdict
-from collections.abc import Iterable, Sequence
-from itertools import count
+from collections.abc import Iterator, Sequence
+from itertools import chain
 
 import numpy as np
 import polars as pl
 
-from fleet_slip.arrays import FloatArray
-from fleet_slip.errors import InputError
-from fleet_slip.ingest.source import BASE
+from fleet_slip.ingest.source import BASE, Base
 
 DISORDER = "\0disorder"
 """Column that says what is wrong with a row's time among those of its base, null if nothing."""
 HELD = "\0held "
 """Before the name of a column: its last value at the time, whatever base the row is of."""
+ROW = "\0row"
+"""Column with the row's number, from 1: those of the first base come first, then the next."""
+_RIGHT = "\0right"
+"""Column with the last right time of the base up to each row, which has the row's place."""
+WINDOW_ROWS = 2**16
+"""About so many rows of all bases together are in a window."""
 
 
 def merge_bases(
-    tables: Iterable[pl.DataFrame], time: str, held: Sequence[str], split_gap_s: float
-) -> pl.DataFrame:
-    """Return one table of all rows, in the order of the tables, with `BASE` as a number.
+    bases: Sequence[Base], time: str, held: Sequence[str], split_gap_s: float
+) -> Iterator[pl.DataFrame]:
+    """Yield the rows of all bases, window by window in the order of time, with `BASE` as a number.
 
     Times are in s. Within a base they must increase: what does not has its reason in `DISORDER`,
-    because once bases are mixed it could not be told. The `held` columns say of every row what was
-    last known, for `split_gap_s` at most: conditions and names of drives hold for all signals.
-
-    Raises `InputError` for a time that is no number.
+    because once bases are mixed it could not be told, and its place is where the base's last right
+    time was. The `held` columns say of every row what was last known at its place, for
+    `split_gap_s` at most: conditions and names of drives hold for all signals. Rows of one time are
+    in one window. Where only one base has rows, they come as they are.
     """
-    parts: dict[str, list[pl.DataFrame]] = defaultdict(list)
-    columns: dict[str, pl.DataType] = {}
-    for table in tables:
-        if not table[time].dtype.is_numeric():
-            raise InputError(
-                f"the time {time!r} is not of numbers; signals with times of their own need them."
+    opened = [_Opened(base) for base in bases]
+    columns = {name: kind for one in opened for name, kind in one.columns.items()}
+    some = [one for one in opened if one.has_rows]
+    if len(some) == 1:
+        yield from (_completed(batch, columns) for batch in some[0].batches)
+        return
+    coming, offset = [], 0
+    for number, one in enumerate(some):
+        judged = _Clock(time, split_gap_s, offset).judge_all(one.batches)
+        coming.append(_Coming(number, judged, max(WINDOW_ROWS // len(some), 1)))
+        if number + 1 < len(some):
+            offset += one.base.count_rows()
+    columns |= {BASE: pl.Int32(), DISORDER: pl.String(), ROW: pl.Int64(), _RIGHT: pl.Float64()}
+    of = {name: number for number, one in reversed([*enumerate(some)]) for name in one.columns}
+    lasting = [_Lasting(name, of.get(name, -1), time, split_gap_s) for name in held]
+    while coming := [one for one in coming if one.fill()]:
+        until = min(one.reached for one in coming)
+        rows = pl.concat([_completed(one.take(until), columns) for one in coming])
+        rows = rows.sort(_RIGHT, maintain_order=True)
+        yield rows.with_columns(one.hold(rows) for one in lasting).drop(_RIGHT)
+
+
+class _Opened:
+    """A base of which the first rows were read, so that its columns are known."""
+
+    def __init__(self, base: Base) -> None:
+        self.base, batches = base, base.read()
+        first = next(batches)
+        while not first.height and (following := next(batches, None)) is not None:
+            first = following
+        self.columns, self.has_rows = dict(first.schema), first.height > 0
+        self.batches = chain([first], batches)
+
+
+def _completed(rows: pl.DataFrame, columns: dict[str, pl.DataType]) -> pl.DataFrame:
+    """Return rows with all columns, null where they have none."""
+    absent = [pl.lit(None, kind).alias(name) for name, kind in columns.items() if name not in rows]
+    return rows.with_columns(absent).select(*columns)
+
+
+class _Clock:
+    """Judges the times of one base, row by row: what is wrong with each."""
+
+    def __init__(self, time: str, split_gap_s: float, offset: int) -> None:
+        self._time, self._gap_s, self._rows = time, split_gap_s, offset
+        self._before_s, self._right_s = np.nan, -np.inf
+
+    def judge_all(self, batches: Iterator[pl.DataFrame]) -> Iterator[pl.DataFrame]:
+        """Yield the rows with `DISORDER`, `ROW` and `_RIGHT`; the last one waits for the next."""
+        waiting: pl.DataFrame | None = None
+        for batch in batches:
+            rows = batch if waiting is None else pl.concat([waiting, batch])
+            if rows.height > 1:
+                yield self._judge(rows.head(rows.height - 1), rows[self._time][-1])
+            waiting = rows.tail(1)
+        if waiting is not None and waiting.height:
+            yield self._judge(waiting, None)
+
+    def _judge(self, rows: pl.DataFrame, after_s: float | None) -> pl.DataFrame:
+        """Judge rows before a time.
+
+        One far ahead of those around it is `isolated`, or it would make all that follow backwards.
+        """
+        time_s = rows[self._time].to_numpy()
+        before_s = np.concatenate([[self._before_s], time_s[:-1]])
+        after_s = np.nan if after_s is None else after_s
+        next_s = np.concatenate([time_s[1:], [after_s]])
+        with np.errstate(invalid="ignore"):
+            ahead = (time_s - before_s > self._gap_s) & (next_s < time_s)
+        usable = np.where(ahead | ~np.isfinite(time_s), -np.inf, time_s)
+        right_s = np.maximum.accumulate(np.concatenate([[self._right_s], usable]))
+        late, twice = time_s < right_s[:-1], time_s == right_s[:-1]
+        reasons: pl.Series | pl.Expr = pl.lit(None, pl.String)
+        if (late | twice | ahead).any():
+            names = np.select(
+                [ahead, late, twice], ["isolated", "time_backwards", "time_duplicate"], ""
             )
-        parts[table[BASE][0] if len(table) else ""].append(table)
-        columns |= dict(table.drop(BASE).schema)
-    bases = [pl.concat(of_base).drop(BASE) for name, of_base in parts.items() if name]
-    if not bases:
-        return pl.DataFrame()
-    # Of a base without rows there is nothing but its columns.
-    there = {name for base in bases for name in base.columns}
-    empty = [pl.lit(None, kind).alias(name) for name, kind in columns.items() if name not in there]
-    bases[0] = bases[0].with_columns(empty)
-    if len(bases) < 2:
-        return bases[0]
-    ordered = [
-        base.with_columns(_disorder(base[time].to_numpy(), split_gap_s), pl.lit(i).alias(BASE))
-        for i, base in zip(count(), bases)
-    ]
-    last = {name: _samples(ordered, name, time) for name in held}
-    return pl.concat(
-        [
-            base.with_columns(
-                _hold(*last[name], base[time].to_numpy(), split_gap_s).alias(HELD + name)
-                for name in held
-            )
-            for base in ordered
-        ],
-        how="diagonal",
-    )
+            reasons = pl.Series(names.tolist()).replace("", None)
+        self._before_s, self._right_s = time_s[-1], right_s[-1]
+        self._rows += rows.height
+        return rows.with_columns(
+            reasons.alias(DISORDER),
+            pl.int_range(self._rows - rows.height + 1, self._rows + 1, dtype=pl.Int64).alias(ROW),
+            pl.Series(_RIGHT, right_s[1:]),
+        )
 
 
-def _disorder(time_s: FloatArray, split_gap_s: float) -> pl.Series:
-    """Name what is wrong with each time of one base.
-
-    A time far ahead of those around it is `isolated`, or it would make all that follow backwards.
-    """
-    ahead = np.zeros(time_s.size, dtype=np.bool_)
-    if time_s.size > 2:
-        step = np.diff(time_s)
-        ahead[1:-1] = (step[:-1] > split_gap_s) & (time_s[2:] < time_s[1:-1])
-    usable = np.where(ahead | ~np.isfinite(time_s), -np.inf, time_s)
-    before = np.concatenate([[-np.inf], np.maximum.accumulate(usable)[:-1]])
-    reason = np.full(time_s.size, None, dtype=object)
-    reason[time_s < before] = "time_backwards"
-    reason[time_s == before] = "time_duplicate"
-    reason[ahead] = "isolated"
-    return pl.Series(DISORDER, reason.tolist(), pl.String)
+def _resized(batches: Iterator[pl.DataFrame], most: int) -> Iterator[pl.DataFrame]:
+    """Yield the rows of batches with `most` at once: of large ones less, of small ones together."""
+    small: list[pl.DataFrame] = []
+    for batch in batches:
+        small.append(batch)
+        if sum(one.height for one in small) >= most:
+            yield from pl.concat(small).iter_slices(most)
+            small = []
+    if small:
+        yield from pl.concat(small).iter_slices(most)
 
 
-def _samples(bases: Sequence[pl.DataFrame], name: str, time: str) -> tuple[FloatArray, pl.Series]:
-    """Return times and values of the base that has a column, those in order and not null."""
-    base = next(base for base in bases if name in base.columns)
-    usable = base.filter(pl.col(name).is_not_null() & pl.col(DISORDER).is_null())
-    usable = usable.filter(pl.col(time).is_finite())
-    return usable[time].to_numpy(), usable[name]
+class _Coming:
+    """Rows of a base that were read and are in no window yet."""
+
+    def __init__(self, number: int, batches: Iterator[pl.DataFrame], most: int) -> None:
+        self._number = pl.lit(number, pl.Int32).alias(BASE)
+        self._slices = _resized(batches, most)
+        self._rows = pl.DataFrame()
+
+    def fill(self) -> bool:
+        """Read on if no rows wait; return whether some do now."""
+        if not self._rows.height:
+            self._rows = next(self._slices, self._rows)
+        return self._rows.height > 0
+
+    @property
+    def reached(self) -> float:
+        """Place of the last row."""
+        return float(self._rows[_RIGHT][-1])
+
+    def take(self, until: float) -> pl.DataFrame:
+        """Return what waits up to a time."""
+        number = int(self._rows[_RIGHT].search_sorted(until, side="right"))
+        taken, self._rows = self._rows.head(number), self._rows.slice(number)
+        return taken.with_columns(self._number)
 
 
-def _hold(time_s: FloatArray, values: pl.Series, at_s: FloatArray, longest_s: float) -> pl.Series:
-    """Return the last value at each time, null if it is older than `longest_s`."""
-    if not time_s.size:
-        return pl.Series([None] * at_s.size, dtype=values.dtype)
-    last = np.searchsorted(time_s, at_s, side="right") - 1
-    held = values.gather(np.maximum(last, 0))
-    known = (last >= 0) & (at_s - time_s[np.maximum(last, 0)] <= longest_s)
-    return held.set(pl.Series(~known), None)
+class _Lasting:
+    """A column of one base that says something of the rows of all."""
+
+    def __init__(self, name: str, base: int, time: str, longest_s: float) -> None:
+        self._name, self._longest_s = name, longest_s
+        self._says = (
+            pl.col(name).is_not_null()
+            & (pl.col(BASE) == base)
+            & pl.col(DISORDER).is_null()
+            & pl.col(time).is_finite()
+        )
+        self._last: list[pl.DataFrame] = []
+
+    def hold(self, rows: pl.DataFrame) -> pl.Series:
+        """Return the last value at the place of each row of a window, null if it is too old."""
+        said = rows.filter(self._says).select(_RIGHT, self._name)
+        known = pl.concat([*self._last, said])
+        self._last = [known.tail(1)]
+        if not known.height:
+            return pl.Series(HELD + self._name, [None] * rows.height, known[self._name].dtype)
+        time_s, at_s = known[_RIGHT].to_numpy(), rows[_RIGHT].to_numpy()
+        last = np.searchsorted(time_s, at_s, side="right") - 1
+        lasts = (last >= 0) & (at_s - time_s[np.maximum(last, 0)] <= self._longest_s)
+        held = known[self._name].gather(np.maximum(last, 0)).set(pl.Series(~lasts), None)
+        return held.alias(HELD + self._name)

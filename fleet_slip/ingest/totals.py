@@ -48,5 +48,5 @@ class Totals:
         self.drives_resampled += drive.method != "snap"
         self.ticks += drive.ticks.size
         for name, counts in drive.counts.items():
-            self.samples[name] += rows.height - rows.nulls(name)
+            self.samples[name] += rows.number_of(name)
             self.values[name] += len(counts) - counts.null_count

@@ -1,9 +1,12 @@
 """CAN traces: written by python-can, with databases and payloads by cantools."""
 
 import re
+from collections import Counter
+from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import can
 import canmatrix.formats
@@ -15,11 +18,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet_slip.errors import ConfigError, InputError
-from fleet_slip.ingest import MeasuredLog, load_mapping, read_measured
+from fleet_slip.ingest import MeasuredLog, can_frames, load_mapping, read_measured
 from fleet_slip.ingest.can_bus import CanBus, read_can_database
 from fleet_slip.ingest.can_decoding import physical, raw_numbers
 from fleet_slip.ingest.can_frames import CanFrames
 from fleet_slip.ingest.can_trace import open_can_trace
+from fleet_slip.ingest.spool import Spool
 from tests.support.logs import without_names
 from tests.support.measured import ticks
 
@@ -303,19 +307,35 @@ def test_an_arxml_database_says_the_same(tmp_path: Path) -> None:
     st.lists(
         st.tuples(st.floats(0, 9), st.sampled_from("ab"), st.binary(min_size=2, max_size=9)),
         max_size=20,
-    )
+    ),
+    st.integers(1, 30),
 )
-def test_frames_that_are_kept_are_those_that_came(came: list[tuple[float, str, bytes]]) -> None:
-    frames = CanFrames()
-    for frame in came:
-        frames.append(*frame)
-    assert len(frames) == len(came)
-    assert list(frames.sizes) == [len(data) for _, _, data in came]
+def test_frames_that_are_kept_are_those_that_came(
+    came: list[tuple[float, str, bytes]], piece: int
+) -> None:
+    with closing(Spool()) as spool, mock.patch.object(can_frames, "PIECE_FRAMES", piece):
+        one_by_one, together = CanFrames(spool), CanFrames(spool)
+        for frame in came:
+            one_by_one.append(*frame)
+        times, buses, payloads = zip(*came, strict=True) if came else ((), (), ())
+        filled = np.array([list(data.ljust(9, b"x")) for data in payloads], dtype=np.uint8)
+        sizes = np.array([len(data) for data in payloads], dtype=np.int64)
+        together.extend(np.array(times), np.array(buses), sizes, filled.reshape(-1, 9))
+        require_the_frames(one_by_one, came)
+        require_the_frames(together, came)
+
+
+def require_the_frames(frames: CanFrames, came: list[tuple[float, str, bytes]]) -> None:
     assert frames.buses == sorted({bus for _, bus, _ in came})
+    assert frames.sizes_on(None) == Counter(len(data) for _, _, data in came)
     for bus in "ab":
-        times, payloads = frames.take(frames.are_on(bus), 2)
-        expected = [(time, data[:2]) for time, on, data in came if on == bus]
-        assert list(zip(times, map(bytes, payloads), strict=True)) == expected
+        assert frames.sizes_on(bus) == Counter(len(data) for _, on, data in came if on == bus)
+        found = [
+            (time, payload.tobytes())
+            for times, payloads in frames.take(bus, 2)
+            for time, payload in zip(times, payloads, strict=True)
+        ]
+        assert found == [(time, data[:2]) for time, on, data in came if on == bus]
 
 
 def test_a_trace_is_asked_for_one_message_after_the_other(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from fleet_slip.catalogue.counts import as_arrow
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import checking, csv_batches, read_measured, reading
+from fleet_slip.ingest import checking, csv_batches, log_rows, read_measured
 from fleet_slip.ingest.parquet_batches import open_parquet
 from tests.support.logs import without_names
 from tests.support.measured import a_mapping, csv_text, good_columns, read_text, reasons, ticks
@@ -137,7 +137,7 @@ def test_a_file_that_grows_while_it_is_read_is_refused(
     file = write(tmp_path, GOOD.encode())
 
     def grow(*arguments: Any) -> Any:
-        yield from reading.read_batches(*arguments)
+        yield from log_rows.read_batches(*arguments)
         file.write_bytes(GOOD.encode() + b"0.20,1,1\n")
 
     monkeypatch.setattr(checking, "read_batches", grow)

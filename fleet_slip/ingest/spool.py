@@ -1,0 +1,55 @@
+"""Keeps aside what comes in one order and is read in another, in a temporary file if it is much.
+
+The file has no name: it is gone with the process, however that ends.
+"""
+
+import tempfile
+from collections import defaultdict
+from collections.abc import Hashable, Iterator
+
+from fleet_slip.errors import InputError
+
+IN_MEMORY_BYTES = 2**24
+"""As long as there is no more, there is no file."""
+
+
+class Spool:
+    """Pieces of bytes by key, those of a key in the order in which they came."""
+
+    def __init__(self) -> None:
+        """Begin without any."""
+        self._file = tempfile.SpooledTemporaryFile(IN_MEMORY_BYTES)  # noqa: SIM115 - see close
+        self._pieces: dict[Hashable, list[tuple[int, int]]] = defaultdict(list)
+        self._end = 0
+
+    def add(self, key: Hashable, piece: bytes) -> None:
+        """Keep a piece. Raises `InputError` if the disk is full."""
+        try:
+            self._file.seek(self._end)
+            self._file.write(piece)
+            self._file.flush()
+        except OSError as error:
+            raise InputError(
+                f"{tempfile.gettempdir()}: no room for a temporary copy of more than "
+                f"{self._end:,} bytes ({error.strerror}). Free some, or name another folder in the "
+                "environment variable TMPDIR."
+            ) from None
+        self._pieces[key].append((self._end, len(piece)))
+        self._end += len(piece)
+
+    def read(self, key: Hashable) -> Iterator[bytes]:
+        """Yield the pieces of a key."""
+        for start, size in self._pieces[key]:
+            self._file.seek(start)
+            yield self._file.read(size)
+
+    def clear(self) -> None:
+        """Forget all pieces."""
+        self._pieces.clear()
+        self._file.seek(0)
+        self._file.truncate()
+        self._end = 0
+
+    def close(self) -> None:
+        """Let go of all."""
+        self._file.close()

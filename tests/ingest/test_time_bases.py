@@ -1,0 +1,246 @@
+"""Several time bases come together window by window as they would all at once."""
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import polars as pl
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fleet_slip.arrays import FloatArray
+from fleet_slip.errors import InputError
+from fleet_slip.ingest import MeasuredLog, log_rows, read_measured, stream, time_bases
+from fleet_slip.ingest.source import OWN_TIME, Base, Channel
+from fleet_slip.ingest.time_bases import DISORDER, HELD, ROW, merge_bases
+from tests.support.measured import a_mapping
+
+GAP_S = 1.0
+
+
+class FakeSource:
+    """A file with clocks that is in memory, read in batches of some rows."""
+
+    has_clock = True
+
+    def __init__(self, frames: Sequence[pl.DataFrame], batch: int) -> None:
+        self._frames, self._batch = frames, batch
+
+    def channels(self) -> list[Channel]:
+        return [Channel(name) for frame in self._frames for name in frame.columns[1:]]
+
+    def bases(self, columns: Sequence[str]) -> list[Base]:
+        return [
+            Base(str(i), lambda f=frame: f.height, partial(self._read, frame, columns))  # type: ignore[misc]
+            for i, frame in enumerate(self._frames)
+            if {*columns} & {*frame.columns}
+        ]
+
+    def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
+        for base in self.bases(columns):
+            yield from base.read()
+
+    def _read(self, frame: pl.DataFrame, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
+        some = frame.select(OWN_TIME, *(name for name in columns if name in frame.columns))
+        if not some.height:
+            yield some
+        yield from some.iter_slices(self._batch)
+
+
+def reason_and_place(times: Sequence[float]) -> list[tuple[str | None, float]]:
+    """What is wrong with each time of a base, and the last right one, told one by one."""
+    found: list[tuple[str | None, float]] = []
+    right = -math.inf
+    for i, time in enumerate(times):
+        inside = 0 < i < len(times) - 1
+        reason = "time_duplicate" if time == right else "time_backwards" if time < right else None
+        if inside and time - times[i - 1] > GAP_S and times[i + 1] < time:
+            reason = "isolated"
+        elif math.isfinite(time):
+            right = max(right, time)
+        found.append((reason, right))
+    return found
+
+
+def merged(bases: Sequence[Sequence[tuple[float, float | None]]]) -> list[tuple[Any, ...]]:
+    """All rows as (place, base, row, time, value, reason, held): the value of base 0 is held."""
+    rows, said = [], []
+    number = 0
+    for of, samples in enumerate(bases):
+        judged = reason_and_place([time for time, _ in samples])
+        for (time, value), (reason, place) in zip(samples, judged, strict=True):
+            number += 1
+            rows.append((place, of, number, time, value, reason))
+            if of == 0 and reason is None and value is not None and math.isfinite(time):
+                said.append((time, value))
+    rows.sort(key=lambda row: row[0])
+    whole = []
+    for row in rows:
+        before = [(time, value) for time, value in said if time <= row[0]]
+        held = before[-1][1] if before and row[0] - before[-1][0] <= GAP_S else None
+        whole.append((*row, held))
+    return whole
+
+
+times = st.integers(0, 60).map(lambda tenths: tenths / 10)
+moments = st.one_of(times, times, times, st.sampled_from([math.nan, math.inf, 1e6]))
+samples = st.lists(st.tuples(moments, st.one_of(st.none(), st.floats(0, 9))), max_size=25)
+
+
+@settings(max_examples=300)
+@given(
+    st.lists(samples, min_size=2, max_size=4),
+    st.lists(st.booleans(), min_size=4, max_size=4),
+    st.integers(1, 30),
+    st.integers(1, 30),
+)
+def test_windows_say_what_the_whole_says(
+    told: list[list[tuple[float, float | None]]], ordered: list[bool], window: int, batch: int
+) -> None:
+    bases = [
+        sorted(rows, key=lambda row: row[0]) if flag else rows
+        for rows, flag in zip(told, ordered, strict=False)
+    ]
+    frames = [
+        pl.DataFrame(rows, schema={OWN_TIME: pl.Float64, f"v{i}": pl.Float64}, orient="row")
+        for i, rows in enumerate(bases)
+    ]
+    source = FakeSource(frames, batch)
+    columns = [f"v{i}" for i in range(len(frames))]
+    with mock.patch.object(time_bases, "WINDOW_ROWS", window):
+        windows = list(merge_bases(source.bases(columns), OWN_TIME, ["v0"], GAP_S))
+    some = [rows for rows in bases if rows]
+    if len(some) < 2:
+        found = [row for rows in windows for row in rows.select(OWN_TIME, *columns).rows()]
+        expected = [row for frame in frames for row in frame.rows()]
+        assert repr([tuple(v for v in row if v is not None) for row in found]) == repr(
+            [tuple(v for v in row if v is not None) for row in expected]
+        )
+        return
+    if not bases[0]:
+        return  # the held column is of a base without rows
+    value = pl.coalesce(columns).alias("value")
+    told_by = [rows.select(ROW, OWN_TIME, value, DISORDER, HELD + "v0") for rows in windows]
+    found = [row for rows in told_by for row in rows.rows()]
+    expected = [row[2:] for row in merged(some)]
+    assert repr(sorted(found, key=itemgetter(0))) == repr(sorted(expected, key=itemgetter(0)))
+    assert usable(found) == usable(expected)
+
+
+def usable(rows: list[tuple[Any, ...]]) -> list[int]:
+    """Numbers of the rows at right times, in their order; where the others are does not matter."""
+    return [number for number, time, _, reason, _ in rows if not reason and math.isfinite(time)]
+
+
+def read_in(
+    folder: Path, frames: Sequence[pl.DataFrame], mapping: Any, window: int, batch: int
+) -> MeasuredLog | str:
+    """Read bases as one file, so many rows at once."""
+
+    @contextmanager
+    def opened(*_: object) -> Iterator[FakeSource]:
+        yield FakeSource(frames, batch)
+
+    file = folder / "log.mf4"
+    file.write_bytes(b"in memory")
+    with ExitStack() as patched:
+        patched.enter_context(mock.patch.object(log_rows, "_open_part", opened))
+        patched.enter_context(mock.patch.object(log_rows, "BATCH_ROWS", max(batch // 2, 1)))
+        patched.enter_context(mock.patch.object(time_bases, "WINDOW_ROWS", window))
+        patched.enter_context(mock.patch.object(stream, "RATE_ROWS", 60))
+        patched.enter_context(mock.patch.object(stream, "FEWEST_STEPS", 20))
+        patched.enter_context(mock.patch.object(stream, "LONGEST_DRIVE_S", 0.8))
+        try:
+            return read_measured(file, mapping)
+        except InputError as error:
+            return str(error)
+
+
+@st.composite
+def clocks(draw: st.DrawFn, rate_hz: float) -> FloatArray:
+    """Times of a base: with jitter, gaps, what comes late, twice, or never, and wild ones."""
+    rng = np.random.default_rng(draw(st.integers(0, 10**6)))
+    time_s = np.arange(draw(st.floats(0, 1)), 2, 1 / rate_hz)
+    if draw(st.booleans()):
+        time_s = time_s + rng.normal(0, 0.1 / rate_hz, time_s.size)
+    for gap_s in draw(st.lists(st.floats(0, 2), max_size=2)):
+        time_s = time_s + (time_s > gap_s) * 1.5
+    for late_s in draw(st.lists(st.sampled_from([0.03, 0.4, 2.0, -3.0, -1e5, np.nan]), max_size=4)):
+        time_s[rng.integers(0, time_s.size)] -= late_s
+    if draw(st.booleans()):
+        place = rng.integers(1, time_s.size)
+        time_s[place] = time_s[place - 1]
+    return np.asarray(time_s[rng.random(time_s.size) > draw(st.sampled_from([0, 0.2]))])
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.data())
+def test_what_becomes_of_a_log_does_not_depend_on_windows(
+    tmp_path_factory: Any, data: st.DataObject
+) -> None:
+    folder = tmp_path_factory.mktemp("windows")
+    frames = []
+    for name in ("ax", "ay", "beta", "fix"):
+        rate_hz = 5.0 if name == "fix" else data.draw(st.sampled_from([10.0, 40.0, 100.0, 130.0]))
+        time_s = data.draw(clocks(rate_hz))
+        values = np.floor(time_s % 3) if name == "fix" else np.sin(3 * time_s)
+        values = np.where(np.isfinite(values), values, 0)
+        frames.append(pl.DataFrame({OWN_TIME: time_s, name: values}))
+    keys: dict[str, Any] = {"unit": "m/s^2"}
+    if data.draw(st.booleans()):
+        keys["delay_s"] = data.draw(st.floats(-0.2, 0.2))
+    more: dict[str, Any] = data.draw(
+        st.sampled_from(
+            [{}, {"where": [{"column": "fix", "at_least": 1}]}, {"drive": {"column": "fix"}}]
+        )
+    )
+    mapping = a_mapping(
+        time={"column": None, "unit": None, "own_clock": True, "longest_gap_s": 0.15},
+        signals={
+            "ax": {"column": "ax", **keys},
+            "ay": {"column": "ay", "unit": "m/s^2", "longest_gap_s": 0.4},
+            "sideslip": {"column": "beta", "unit": "rad"},
+        },
+        **more,
+    )
+    whole = read_in(folder, frames, mapping, 10**9, 10**9)
+    window, batch = data.draw(st.integers(8, 200)), data.draw(st.integers(8, 200))
+    found = read_in(folder, frames, mapping, window, batch)
+    if isinstance(whole, str) or isinstance(found, str):
+        assert found == whole
+        return
+    assert found.drives.equals(whole.drives)
+    order = [(name, "ascending") for name in ("row", "reason", "signal")]
+    assert found.quarantine.sort_by(order).equals(whole.quarantine.sort_by(order))
+    assert found.counts == whole.counts
+
+
+def test_stretches_are_numbered_in_the_order_of_time(tmp_path: Path) -> None:
+    """Whatever base the first samples after a gap are of."""
+    time_s = np.concatenate([np.arange(0, 0.7, 0.01) + 10 * part for part in range(4)])
+    early = {1: 0.004, 2: -0.004, 3: 0.004}
+    shifted = time_s + [early.get(int(time // 10), 0) for time in time_s]
+    frames = [
+        pl.DataFrame({OWN_TIME: 1.7e9 + time_s, "ax": np.sin(time_s)}),
+        pl.DataFrame({OWN_TIME: 1.7e9 + shifted, "beta": np.sin(time_s)}),
+    ]
+    mapping = a_mapping(
+        time={"column": None, "unit": None, "own_clock": True},
+        drive={"day": None},
+        signals={
+            "ax": {"column": "ax", "unit": "m/s^2"},
+            "sideslip": {"column": "beta", "unit": "rad"},
+        },
+    )
+    log = read_in(tmp_path, frames, mapping, 10**9, 10**9)
+    assert not isinstance(log, str)
+    begins = {row["drive_id"]: row["started_at"] for row in log.drives.to_pylist()}
+    assert len(begins) == 4
+    assert [begins[name] for name in sorted(begins)] == sorted(begins.values())
+    assert len(log.drives["trip_id"].unique()) == 1
