@@ -23,8 +23,20 @@ def drives(*told: tuple[str, str, float | None, float]) -> pa.Table:
             "drive_id": [name for _, name, *_ in told],
             "started_at": pa.array(at, pa.timestamp("us", tz="UTC")),
             "duration_s": [lasted for *_, lasted in told],
+            "source": ["measured"] * len(told),
+            "n": [0] * len(told),
         }
     )
+
+
+def received(car: str, start_s: float, rows: int) -> pa.Table:
+    """A drive without a log."""
+    name = f"{car}-{BEGAN + timedelta(seconds=start_s):%Y%m%dT%H%M%SZ}"
+    table = drives((car, name, None, 0.0))
+    table = table.set_column(2, "started_at", pa.nulls(1, table.schema.field(2).type))
+    table = table.set_column(3, "duration_s", pa.nulls(1, pa.float64()))
+    table = table.set_column(4, "source", [["received"]])
+    return table.set_column(5, "n", [[rows]])
 
 
 def test_the_later_of_two_drives_at_once_is_named() -> None:
@@ -43,6 +55,28 @@ def test_the_later_of_two_drives_at_once_is_named() -> None:
         "beyond": "50 s are in long",
     }
     assert {fault.kind for fault in found.values()} == {"repeated"}
+
+
+def test_of_a_drive_without_a_log_and_a_log_at_once_that_without_is_named() -> None:
+    found = find_repeated(
+        pa.concat_tables(
+            [
+                received("car", 0, 4000),
+                drives(("car", "resampled", 0.25, 39.5), ("car", "next", 41, 100)),
+                received("car", 60, 1000),
+                received("car", 60, 3000),  # another set of signals of the same drive
+                received("car", 150, 1000),
+                received("car", 155, 1000),
+                received("other", 0, 1000),
+                received("other", 9, 1000),  # its clock has whole seconds
+            ]
+        )
+    )
+    assert {name: fault.figure for name, fault in found.items()} == {
+        "car-20240531T080000Z": "40 s are in resampled",
+        "car-20240531T080100Z": "40 s are in next",
+        "car-20240531T080235Z": "5 s are in car-20240531T080230Z",
+    }
 
 
 def test_a_log_through_a_corrected_mapping_counts_twice_and_quality_says_so(
