@@ -72,18 +72,31 @@ class DriveCutter:
         return pl.concat(good), join_refused(bad)
 
     def _go_on(self, stretch: "_Stretch", *, last: bool) -> tuple[pl.DataFrame, pl.DataFrame]:
-        """Cut a stretch; at once if nothing happens in it but that an open part goes on."""
+        """Cut a stretch; at once if nothing happens in it but that a part begins or goes on."""
         rows = stretch.rows
         if not stretch.is_steady or self._waiting is not None:
             return self._cut(rows, last=last)
         group, time = int(rows["group"][0]), rows["time"].to_numpy()
-        if group >= self._last.size or self._part[group] < 0:
+        if group >= self._last.size or np.isnan(self._last[group]):
+            if time.size < 2 or time[-1] - time[0] >= self._longest_s:
+                return self._cut(rows, last=last)
+            self._grow(rows)
+            self._start[group], self._part[group], self._piece[group] = time[0], self._parts, 0
+            self._parts += 1
+            return self._with_part(rows, group, time[-1])
+        if self._part[group] < 0:
             return self._cut(rows, last=last)
         near = all(abs(time[0] - at[group]) <= self._gap_s for at in (self._last, self._kept))
         piece = (time[-1] - self._start[group]) // self._longest_s
         if not near or time[0] <= self._latest[group] or piece != self._piece[group]:
             return self._cut(rows, last=last)
-        self._last[group] = self._kept[group] = self._latest[group] = time[-1]
+        return self._with_part(rows, group, time[-1])
+
+    def _with_part(
+        self, rows: pl.DataFrame, group: int, last_s: float
+    ) -> tuple[pl.DataFrame, pl.DataFrame]:
+        """Return rows that are all of their group's open part."""
+        self._last[group] = self._kept[group] = self._latest[group] = last_s
         part = pl.lit(int(self._part[group]), pl.Int64)
         return rows.with_columns(part.alias("part")), no_rows()
 
