@@ -101,7 +101,9 @@ class MdfSource:
 
     def _signals(self, number: int, indices: dict[str, int], start: int, records: int) -> list[Any]:
         with reading_with(self._file, "asammdf"):
-            signals = self._mdf.select(
+            # Of 200 MiB and more `select` reads all records, however few it is asked for.
+            select = getattr(self._mdf, "_select_fallback", self._mdf.select)
+            signals = select(
                 [(None, number, index) for index in indices.values()],
                 record_offset=start,
                 record_count=records,

@@ -138,6 +138,21 @@ def test_a_group_of_an_mdf_file_is_read_window_by_window(
     assert log.drives["sideslip"].null_count == (15 if flags else 0)
 
 
+def test_a_large_group_of_an_mdf_file_is_not_read_as_a_whole_for_each_window(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What asammdf takes for large, from 200 MiB on, is here every group."""
+    file = write_mdf(tmp_path, [a_x(), beta()])
+    whole = read_measured(file, mdf_mapping())
+
+    def read_all(*_: Any) -> None:
+        raise AssertionError("all records are read")
+
+    monkeypatch.setattr("asammdf.mdf.validate_blocks", lambda *_: True)
+    monkeypatch.setattr("asammdf.mdf.get_channel_raw_bytes_complete", read_all)
+    assert read_measured(file, mdf_mapping()).drives.equals(whole.drives)
+
+
 def test_an_unfinalised_mdf_file_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
