@@ -3,9 +3,28 @@
 import re
 from collections.abc import Sequence
 
+from fleet_slip.canonical import sha256_of
 from fleet_slip.export.program import Program
+from fleet_slip.models.model_version import ModelVersion
 
 LARGEST_32 = 2**31 - 1
+
+LONGEST_PREFIX = 24
+"""C99 tells external names apart by 31 characters, and so does rule 5.1 of MISRA C:2012. After the
+prefix `_gram_` and one more do."""
+
+
+def file_prefix(version: ModelVersion) -> str:
+    """Return what the names of the files of a version begin with, but for those in C."""
+    return f"{version.manifest.label.signal}_{version.manifest.name}"
+
+
+def c_prefix(version: ModelVersion) -> str:
+    """Return what all names in C and of its files begin with: shortened, with a hash, if long."""
+    prefix = file_prefix(version)
+    if len(prefix) <= LONGEST_PREFIX:
+        return prefix
+    return f"{prefix[: LONGEST_PREFIX - 7]}_{sha256_of(prefix)[:6]}"
 
 
 def field_names(program: Program) -> dict[str, tuple[str, ...]]:

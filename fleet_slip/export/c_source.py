@@ -6,17 +6,12 @@ from fleet_slip.catalogue.columns import LARGEST_FACT
 from fleet_slip.catalogue.signals import COUNT_MAX
 from fleet_slip.export.c_columns import ColumnWriter, missing_of, ring_width, sum_type, summed
 from fleet_slip.export.c_helpers import HELPERS
-from fleet_slip.export.c_names import field_names, literal, plain_text
+from fleet_slip.export.c_names import c_prefix, field_names, literal, plain_text
 from fleet_slip.export.c_state import state_fields
 from fleet_slip.export.program import Numbered, Program
 from fleet_slip.models.model_version import ModelVersion
 
 INDENT = "    "
-
-
-def c_prefix(version: ModelVersion) -> str:
-    """Return what all names in the files begin with."""
-    return f"{version.manifest.label.signal}_{version.manifest.name}"
 
 
 def c_header(version: ModelVersion, program: Program) -> str:

@@ -8,7 +8,8 @@ from typing import Any, Literal, get_args
 from fleet_slip.errors import ConfigError, UsageError
 from fleet_slip.export.c_checks import c_fuzz_target, c_self_test
 from fleet_slip.export.c_gram import c_gram_header, c_gram_source
-from fleet_slip.export.c_source import c_header, c_prefix, c_source
+from fleet_slip.export.c_names import c_prefix, file_prefix
+from fleet_slip.export.c_source import c_header, c_source
 from fleet_slip.export.checks import Check, make_checks
 from fleet_slip.export.checks_table import checks_csv
 from fleet_slip.export.compile import compile_program
@@ -64,7 +65,8 @@ def export_files(
     }
     if to != "json":  # that says all of it itself
         manifest = manifest_of(version, subject.program, to, files)
-        files[f"{c_prefix(version)}_manifest.json"] = render(manifest).encode("utf-8")
+        prefix = c_prefix(version) if to == "c" else file_prefix(version)
+        files[f"{prefix}_manifest.json"] = render(manifest).encode("utf-8")
     return files
 
 
@@ -116,7 +118,7 @@ def _c(subject: Subject) -> dict[str, str]:
 
 def _sql(subject: Subject) -> dict[str, str]:
     version, program = subject.version, subject.program
-    prefix = c_prefix(version)
+    prefix = file_prefix(version)
     return {
         f"{prefix}.sql": sql_statement(version, program),
         f"{prefix}_macro.sql": sql_macro(version, program),
@@ -125,7 +127,7 @@ def _sql(subject: Subject) -> dict[str, str]:
 
 
 def _dbc(subject: Subject) -> dict[str, str]:
-    prefix = c_prefix(subject.version)
+    prefix = file_prefix(subject.version)
     return {
         f"{prefix}.dbc": dbc_text(subject.version, subject.program),
         f"{prefix}_checks.csv": checks_csv(subject.program, subject.checks),
@@ -140,7 +142,7 @@ def _onnx(subject: Subject) -> dict[str, str | bytes]:
             f"ONNX needs the package {error.name}. Run: pip install 'fleet-slip[onnx]'"
         ) from None
     version, program = subject.version, subject.program
-    prefix = c_prefix(version)
+    prefix = file_prefix(version)
     return {
         f"{prefix}_float32.onnx": onnx_model(version, program, "float32"),
         f"{prefix}_float64.onnx": onnx_model(version, program, "float64"),
@@ -150,7 +152,7 @@ def _onnx(subject: Subject) -> dict[str, str | bytes]:
 
 def _fmu(subject: Subject) -> dict[str, bytes]:
     version, program = subject.version, subject.program
-    prefix, checks = c_prefix(version), checks_csv(program, subject.checks)
+    prefix, checks = file_prefix(version), checks_csv(program, subject.checks)
     return {
         f"{prefix}_fmi2.fmu": fmu(version, program, checks, 2),
         f"{prefix}_fmi3.fmu": fmu(version, program, checks, 3),

@@ -170,3 +170,28 @@ def test_gram_rows_go_with_c_alone() -> None:
         export_files(version, None, "json", with_gram=True)
     names = [*export_files(version, None, "c", with_gram=True)]
     assert {"sideslip_any_gram.h", "sideslip_any_gram.c"} <= {*names}
+
+
+def test_external_names_of_long_models_differ_in_31_characters(tmp_path: Path) -> None:
+    """As C99 and rule 5.1 of MISRA C:2012 ask for; two models, linked into one program."""
+    names = [f"waterford_of_summer_with_windows_{end}" for end in ("a", "b")]
+    stems = []
+    for name in [*names, "short"]:
+        version = ModelVersion(1, model_of(MODELS["signals"], name=name), "0" * 64)
+        files = export_files(version, None, "c", with_gram=True)
+        for file, content in files.items():
+            (tmp_path / file).write_bytes(content)
+        (stem,) = {file.removesuffix("_gram.c") for file in files if file.endswith("_gram.c")}
+        stems += [stem, f"{stem}_gram"]
+    assert stems[-2] == "sideslip_short"
+    (tmp_path / "main.c").write_text("int main(void) { return 0; }\n")
+    program = compile_c(tmp_path, [*(f"{stem}.c" for stem in stems), "main.c"])
+    listed = run(
+        ["nm", "--defined-only", "--extern-only", program],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    symbols = [line.split()[-1] for line in listed.stdout.splitlines() if "sideslip_" in line]
+    assert len(symbols) == 3 * 5
+    assert len({symbol[:31] for symbol in symbols}) == len(symbols)

@@ -14,9 +14,9 @@ from fleet_slip.models.model_version import ModelVersion
 from tests.export.compiled import STRICT
 from tests.export.models import MODELS, export_texts, model_of
 
-DEVIATIONS = {"misra-c2012-15.5", "misra-c2012-2.5"}
-"""Both are advisory: a feature returns where a value is missing, and the header names the version.
-docs/export.md says so."""
+DEVIATIONS = {"misra-c2012-15.5", "misra-c2012-2.5", "misra-c2012-8.7"}
+"""All are advisory: a feature returns where a value is missing, the header names the version, and
+the functions are called from elsewhere, which recent versions look for. docs/export.md says so."""
 
 
 @pytest.fixture(params=MODELS)
