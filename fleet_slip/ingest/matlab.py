@@ -1,4 +1,4 @@
-"""Reads MATLAB files, version 5 through scipy and 7.3 (HDF5) through h5py.
+"""Reads MATLAB files, version 5, and 7.3 (HDF5) through h5py, some rows at once.
 
 A column is the path of a vector, `Data.Vehicle.yawRate`, or one column of a matrix, `wheels(:,2)`.
 """
@@ -7,14 +7,14 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import polars as pl
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import describe_missing, shown
-from fleet_slip.ingest.matlab_check import require_sound_tags
+from fleet_slip.ingest.matlab_elements import open_matrices
 from fleet_slip.ingest.source import Channel, as_column, reading_with
 
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
@@ -24,7 +24,22 @@ MAT5_MAGIC = b"MATLAB 5.0 MAT-file"
 
 _COLUMN = re.compile(r"(.+)\(:,(\d+)\)")
 _MOST_COLUMNS = 64
+WINDOW_ROWS = 2**17
+"""Rows that are read at once."""
 Array = np.ndarray[Any, Any]
+
+
+class _Matrix(Protocol):
+    """A matrix in a file."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Length of its axes."""
+        ...
+
+    def read(self, column: int, start: int, end: int) -> Array:
+        """Return some rows of a column."""
+        ...
 
 
 class MatSource:
@@ -32,96 +47,96 @@ class MatSource:
 
     has_clock = False
 
-    def __init__(self, file: Path, vectors: Mapping[str, Any]) -> None:
-        """Take the file's path, and an array, or what becomes one, for each path."""
-        self._file, self._vectors = file, vectors
+    def __init__(self, file: Path, matrices: Mapping[str, _Matrix]) -> None:
+        """Take the file's path, and its matrices by path."""
+        self._file, self._matrices = file, matrices
 
     def channels(self) -> list[Channel]:
         """Return all vectors, and the columns of matrices."""
         found = []
-        for path, vector in self._vectors.items():
-            rows, columns = _rows_columns(vector.shape)
+        for path, matrix in self._matrices.items():
+            rows, columns = _rows_columns(matrix.shape)
             names = [path] if columns == 1 else [f"{path}(:,{i + 1})" for i in range(columns)]
             if rows > 1 and columns <= _MOST_COLUMNS:
                 found += [Channel(name, "", f"{rows} rows") for name in names]
         return found
 
     def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
-        """Yield all rows at once. Raises `InputError` if columns differ in length."""
-        found = [as_column(self._file, name, self._column(name)) for name in columns]
-        for column in found:
-            if len(column) != len(found[0]):
+        """Yield all rows, some at once. Raises `InputError` if columns differ in length."""
+        found = {name: self._find(name) for name in columns}
+        lengths = {name: _rows_columns(matrix.shape)[0] for name, (matrix, _) in found.items()}
+        first, rows = next(iter(lengths.items()))
+        for name, length in lengths.items():
+            if length != rows:
                 raise InputError(
-                    f"{shown(self._file)}: {column.name!r} has {len(column):,} values and "
-                    f"{found[0].name!r} has {len(found[0]):,}. Give the signal the time that goes "
-                    'with it: time = "…".'
+                    f"{shown(self._file)}: {name!r} has {length:,} values and {first!r} has "
+                    f'{rows:,}. Give the signal the time that goes with it: time = "…".'
                 )
-        yield pl.DataFrame(found)
+        for start in range(0, max(rows, 1), WINDOW_ROWS):
+            end = min(start + WINDOW_ROWS, rows)
+            yield pl.DataFrame(
+                as_column(self._file, name, matrix.read(column, start, end)).alias(name)
+                for name, (matrix, column) in found.items()
+            )
 
-    def _column(self, name: str) -> Array:
-        whole = self._vectors.get(name)
+    def _find(self, name: str) -> tuple[_Matrix, int]:
+        """Return a matrix, and which of its columns is meant."""
+        whole = self._matrices.get(name)
         if whole is not None:
-            values: Array = np.asarray(whole)
-            return values.ravel() if 1 in values.shape or not values.size else values
+            if _rows_columns(whole.shape)[1] != 1:
+                axes = " x ".join(map(str, whole.shape)) or "1"
+                raise InputError(
+                    f"{shown(self._file)}: channel {name!r} has {axes} values, not one a row. Map "
+                    "one of its columns."
+                )
+            return whole, 0
         found = _COLUMN.fullmatch(name)
-        matrix = self._vectors.get(found[1]) if found else None
-        if found is None or matrix is None or not 1 <= int(found[2]) <= matrix.shape[-1]:
-            names = [channel.name for channel in self.channels()]
-            raise InputError(f"{shown(self._file)}: {describe_missing(name, names)}")
-        return np.asarray(matrix)[:, int(found[2]) - 1]
+        matrix = self._matrices.get(found[1]) if found else None
+        if found and matrix and 1 <= int(found[2]) <= _rows_columns(matrix.shape)[1]:
+            return matrix, int(found[2]) - 1
+        names = [channel.name for channel in self.channels()]
+        raise InputError(f"{shown(self._file)}: {describe_missing(name, names)}")
 
 
 class _Dataset:
-    """A dataset of HDF5, which has the axes of MATLAB in reverse, read when it is asked for."""
+    """A dataset of HDF5, which has the axes of MATLAB in reverse."""
 
     def __init__(self, dataset: Any) -> None:
-        self._dataset, self.shape = dataset, tuple(reversed(dataset.shape))
+        self._dataset = dataset
+        self.shape = tuple(size for size in reversed(dataset.shape) if size != 1)
 
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
-        values: Array = np.asarray(self._dataset[()]).T
-        return values if dtype is None else values.astype(dtype)
+    def read(self, column: int, start: int, end: int) -> Array:
+        """Return some rows of a column."""
+        wanted = iter([column, slice(start, end)][-len(self.shape) :])
+        places = tuple(0 if size == 1 else next(wanted) for size in self._dataset.shape)
+        return np.asarray(self._dataset[places])
 
 
 def _rows_columns(shape: Sequence[int]) -> tuple[int, int]:
+    """Return rows and columns; what has more axes has no rows of one value."""
     if len(shape) == 1:
         return shape[0], 1
-    if len(shape) != 2:
-        return 0, 0
-    return (max(shape), 1) if 1 in shape else (shape[0], shape[1])
+    return (shape[0], shape[1]) if len(shape) == 2 else (0, 0)
 
 
 @contextmanager
 def open_mat(file: Path) -> Iterator[MatSource]:
-    """Open a MATLAB file of version 4 to 7. Raises `InputError`."""
-    require_sound_tags(file)
-    with reading_with(file, "scipy.io") as scipy_io:
-        content = scipy_io.loadmat(file, simplify_cells=True)
-    vectors: dict[str, Array] = {}
-    for name, value in content.items():
-        if not name.startswith("__"):
-            _flatten(name, value, vectors)
-    yield MatSource(file, vectors)
-
-
-def _flatten(path: str, value: Any, vectors: dict[str, Array]) -> None:
-    if isinstance(value, dict):
-        for name, part in value.items():
-            _flatten(f"{path}.{name}", part, vectors)
-    elif isinstance(value, np.ndarray) and value.ndim and value.dtype.kind in "iufbUS":
-        vectors[path] = value
+    """Open a MATLAB file of version 5 to 7. Raises `InputError`."""
+    with open_matrices(file) as matrices:
+        yield MatSource(file, {path: one for path, one in matrices.items() if one.shape})
 
 
 @contextmanager
 def open_mat73(file: Path) -> Iterator[MatSource]:
     """Open a MATLAB file of version 7.3, or any HDF5 file. Raises `InputError`."""
     with reading_with(file, "h5py") as h5py, h5py.File(file, "r") as root:
-        vectors: dict[str, _Dataset] = {}
+        matrices: dict[str, _Dataset] = {}
 
         def visit(path: str, item: Any) -> None:
             if isinstance(item, h5py.Dataset) and not path.startswith("#refs#"):
                 kind = item.attrs.get("MATLAB_class", b"")
                 if item.shape and item.dtype.kind in "iufb" and kind != b"char":
-                    vectors[path.replace("/", ".")] = _Dataset(item)
+                    matrices[path.replace("/", ".")] = _Dataset(item)
 
         root.visititems(visit)
-        yield MatSource(file, vectors)
+        yield MatSource(file, matrices)

@@ -6,11 +6,25 @@ The file has no name: it is gone with the process, however that ends.
 import tempfile
 from collections import defaultdict
 from collections.abc import Hashable, Iterator
+from contextlib import contextmanager
 
 from fleet_slip.errors import InputError
 
 IN_MEMORY_BYTES = 2**24
 """As long as there is no more, there is no file."""
+
+
+@contextmanager
+def needing_room(written: int) -> Iterator[None]:
+    """Raise `InputError` where a temporary file, so long already, cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(
+            f"{tempfile.gettempdir()}: no room for a temporary copy of more than {written:,} bytes "
+            f"({error.strerror}). Free some, or name another folder in the environment variable "
+            "TMPDIR."
+        ) from None
 
 
 class Spool:
@@ -24,16 +38,10 @@ class Spool:
 
     def add(self, key: Hashable, piece: bytes) -> None:
         """Keep a piece. Raises `InputError` if the disk is full."""
-        try:
+        with needing_room(self._end):
             self._file.seek(self._end)
             self._file.write(piece)
             self._file.flush()
-        except OSError as error:
-            raise InputError(
-                f"{tempfile.gettempdir()}: no room for a temporary copy of more than "
-                f"{self._end:,} bytes ({error.strerror}). Free some, or name another folder in the "
-                "environment variable TMPDIR."
-            ) from None
         self._pieces[key].append((self._end, len(piece)))
         self._end += len(piece)
 

@@ -10,6 +10,7 @@ from typing import Any
 import duckdb
 import h5py
 import numpy as np
+import polars as pl
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -18,7 +19,7 @@ import scipy.sparse
 from asammdf import MDF, Signal
 
 from fleet_slip.errors import ExtraError, InputError
-from fleet_slip.ingest import Mapping, MeasuredLog, mdf, read_measured
+from fleet_slip.ingest import Mapping, MeasuredLog, matlab, matlab_elements, mdf, read_measured
 from fleet_slip.ingest.preview import preview_log
 from fleet_slip.ingest.source import reading_with
 from tests.support.measured import a_mapping, ticks
@@ -427,3 +428,60 @@ def test_matlab_files_of_all_kinds_are_sound(tmp_path: Path) -> None:
         only = {"ax": {"column": "ax", "unit": "m/s^2"}}
         log = read_measured(file, a_mapping(signals=only))
         assert log.drives["ax"].to_pylist() == AX_COUNTS
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_matlab_5_is_read_as_scipy_reads_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compressed: bool
+) -> None:
+    monkeypatch.setattr(matlab, "WINDOW_ROWS", 3)
+    rng = np.random.default_rng(1)
+    kinds = [f"{sign}{size}" for sign in "iu" for size in (1, 2, 4, 8)] + ["f4", "f8", "?"]
+    content: dict[str, Any] = {
+        f"n_{kind.replace('?', 'flag')}": rng.integers(0, 2, (7, 1)).astype(kind) for kind in kinds
+    }
+    content |= {
+        "row": rng.normal(size=(1, 8)), "wide": rng.normal(size=(9, 3)), "one": 4.0,
+        "cube": rng.normal(size=(2, 3, 4)), "empty": np.zeros((0, 1)), "long": np.zeros((1, 0)),
+        "words": "words", "names": np.array(["ab", "cde", "fu", "x"]),
+        "s": {"t": rng.normal(size=5), "deep": {"x": rng.normal(size=(5, 2))}},
+        "structs": np.array([(1.0,), (2.0,)], dtype=[("a", "f8")]),
+        "complex": rng.normal(size=6) + 1j, "cell": np.array([1, "a"], dtype=object),
+        "sparse": scipy.sparse.eye(4).tocsc(),
+    }  # fmt: skip
+    file = tmp_path / "log.mat"
+    scipy.io.savemat(file, content, do_compression=compressed)
+    expected: dict[str, Any] = {}
+
+    def flatten(path: str, value: Any) -> None:
+        if isinstance(value, dict):
+            for name, part in value.items():
+                flatten(f"{path}.{name}", part)
+        elif isinstance(value, np.ndarray) and value.ndim and value.dtype.kind in "iufbUS":
+            expected[path] = value
+
+    for name, value in scipy.io.loadmat(file, simplify_cells=True).items():
+        if not name.startswith("__"):
+            flatten(name, value)
+    with matlab.open_mat(file) as source:
+        assert source._matrices.keys() == expected.keys()
+        listed = {channel.name for channel in source.channels()}
+        assert {"row", "wide(:,3)", "s.deep.x(:,2)", "names", "n_flag"} <= listed
+        for name, value in expected.items():
+            columns = [name] if value.ndim == 1 else []
+            columns += (
+                [f"{name}(:,{i + 1})" for i in range(value.shape[1])] if value.ndim == 2 else []
+            )
+            for i, column in enumerate(columns):
+                found = pl.concat(source.batches([column]))[column].to_list()
+                whole = value if value.ndim == 1 else value[:, i]
+                assert found == (whole.astype(float) if whole.dtype.kind != "U" else whole).tolist()
+
+
+def test_a_matlab_5_bomb_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(matlab_elements, "_LARGEST", 2**20)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    file = tmp_path / "log.mat"
+    scipy.io.savemat(file, {"t": np.zeros(2**22)}, do_compression=True)
+    assert "a compressed element of more than 1,048,576 bytes" in failure(file, mat_mapping())
+    assert list(tmp_path.iterdir()) == [file]
