@@ -24,7 +24,7 @@ MAT5_MAGIC = b"MATLAB 5.0 MAT-file"
 
 _COLUMN = re.compile(r"(.+)\(:,(\d+)\)")
 _MOST_COLUMNS = 64
-WINDOW_ROWS = 2**17
+WINDOW_ROWS = 2**15
 """Rows that are read at once."""
 Array = np.ndarray[Any, Any]
 

@@ -5,13 +5,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import polars as pl
 import pytest
 from mcap.writer import CompressionType
 from mcap.writer import Writer as PlainWriter
 from mcap_ros2.writer import Writer
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import Mapping, read_measured
+from fleet_slip.ingest import Mapping, mcap_log, mcap_messages, read_measured
+from fleet_slip.ingest.source import OWN_TIME
 from tests.ingest.test_formats import AX, AX_COUNTS, BETA_DEG, START, TIME_S, require_the_drive
 from tests.support.measured import a_mapping
 from tests.support.reported import call
@@ -114,6 +116,49 @@ def test_json_has_the_times_at_which_it_was_published(tmp_path: Path) -> None:
     clock = {"column": None, "unit": None, "own_clock": True}
     plain = a_mapping(time=clock, drive={"day": None}, signals=only)
     assert read_measured(tmp_path / "log.mcap", plain).drives["ax"].to_pylist() == AX_COUNTS
+
+
+def write_json(file: Path, messages: list[Any]) -> Path:
+    with file.open("wb") as stream:
+        writer = PlainWriter(stream)
+        writer.start()
+        schema = writer.register_schema("imu", "jsonschema", b"{}")
+        channels = [writer.register_channel("imu", "json", schema) for _ in range(2)]
+        for i, message in enumerate(messages):
+            now = START_NS + i * 10**7
+            writer.add_message(channels[i % 2], now, json.dumps(message).encode(), now)
+        writer.finish()  # type: ignore[no-untyped-call]
+    return file
+
+
+@pytest.mark.parametrize("piece", [3, 10**6])
+def test_a_field_with_a_text_far_down_is_one_of_texts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, piece: int
+) -> None:
+    monkeypatch.setattr(mcap_log, "PIECE_ROWS", piece)
+    messages: list[Any] = [{"a": i / 4, "b": i, "c": None} for i in range(20)]
+    messages[0]["b"] = messages[0]["c"] = None
+    messages[17] |= {"b": "late", "c": 5}
+    file = write_json(tmp_path / "log.mcap", messages)
+    with mcap_log.open_mcap(file) as source:
+        (base,) = source.bases(["imu.a", "imu.b", "imu.c"])
+        found = pl.concat(base.read())
+        assert base.count_rows() == found.height == 20
+        assert found["imu.a"].to_list() == [i / 4 for i in range(20)]
+        expected = [None, *(str(i) for i in range(1, 20))]
+        expected[17] = "late"
+        assert found["imu.b"].to_list() == expected
+        assert found["imu.c"].to_list() == [None] * 17 + [5.0, None, None]
+        assert found[OWN_TIME].is_sorted()  # two channels of one topic, in the file's order
+        assert next(f.columns for f in source.batches(["imu.a"])) == [OWN_TIME, "imu.a"]
+
+
+def test_a_chunk_too_large_for_the_memory_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mcap_messages, "_LARGEST_RECORD", 1000)
+    file = write(tmp_path / "log.mcap")
+    assert "at most 1,000 are read at once. Write it again in smaller chunks" in failure(file)
 
 
 def test_what_is_in_it_is_listed(tmp_path: Path) -> None:
