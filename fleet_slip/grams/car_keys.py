@@ -129,9 +129,15 @@ def load_car_keys() -> CarKeys | None:
 def _load(path: Path, _changed_ns: int) -> CarKeys:
     try:
         with path.open(newline="", encoding="utf-8") as stream:
-            rows = list(csv.DictReader(stream, strict=True))
+            lines = csv.DictReader(stream, strict=True)
+            rows, columns = list(lines), lines.fieldnames or ()
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ConfigError(f"{path}: the list of keys cannot be read: {error}.") from None
+    if absent := {"vehicle_id", "public_key"}.difference(columns):
+        raise ConfigError(
+            f"{path}: the list of keys has no column {max(absent)}. Its first line names the "
+            "columns: vehicle_id,public_key,valid_from,valid_until,revoked_since"
+        )
     told = [{name or "": value for name, value in row.items() if value} for row in rows]
     try:
         return CarKeys.model_validate({"keys": told})

@@ -64,6 +64,7 @@ def receive_files(
     `progress` counts files. Raises `InputError` for a file that cannot be read, once those before
     it have landed; `StorageError`; and `ConflictError` if other processes keep changing the tables.
     """
+    load_car_keys()  # a list that cannot be read is told, though all files may have landed
     batch: dict[Path, bytes] = {}
     failure: InputError | None = None
     for at, path in enumerate(files):

@@ -267,6 +267,27 @@ def test_a_wrong_list_of_keys_is_refused(
         receive(fleet, tmp_path, message(1))
 
 
+@pytest.mark.parametrize("text", ["", "bad,header\n", "vehicle_id;public_key\nVIN1;x\n"])
+def test_a_list_without_its_columns_is_no_list_of_no_keys(
+    fleet: fleet_slip.Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str
+) -> None:
+    receive(fleet, tmp_path, message(1))
+    (tmp_path / "keys.csv").write_text(text)
+    monkeypatch.setenv(KEYS_VARIABLE, str(tmp_path / "keys.csv"))
+    for asked in (fleet.quality, fleet.verify):
+        with pytest.raises(ConfigError, match="has no column"):
+            asked()
+
+
+def test_a_wrong_list_is_told_though_all_has_landed(
+    fleet: fleet_slip.Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    receive(fleet, tmp_path, message(1))
+    monkeypatch.setenv(KEYS_VARIABLE, "no/such/file")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        receive(fleet, tmp_path, message(1))
+
+
 @pytest.mark.parametrize("value", ["", " ", "no/such/file"])
 def test_a_list_that_cannot_be_read_does_not_switch_signatures_off(
     fleet: fleet_slip.Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, value: str
