@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import shutil
 from hashlib import sha256
 from pathlib import Path
 
@@ -190,6 +191,12 @@ FORGED = (
 """Gram rows that nobody measured."""
 
 
+@pytest.fixture(scope="module")
+def root_to_fail_in(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Path:
+    """A copy of the root that all tests share: what failed in it is told by `status`."""
+    return shutil.copytree(smoke_root, tmp_path_factory.mktemp("mistakes") / "data")
+
+
 @pytest.mark.parametrize(
     ("arguments", "exit_code", "message"),
     [
@@ -222,9 +229,13 @@ FORGED = (
     ],
 )
 def test_a_mistake_is_one_line_and_its_exit_code(
-    run_command: RunCommand, smoke_root: Path, arguments: list[str], exit_code: int, message: str
+    run_command: RunCommand,
+    root_to_fail_in: Path,
+    arguments: list[str],
+    exit_code: int,
+    message: str,
 ) -> None:
-    done = run_command(*arguments, root=smoke_root)
+    done = run_command(*arguments, root=root_to_fail_in)
     assert done.exit_code == exit_code, done
     assert message in done.stderr
     assert done.stdout == ""

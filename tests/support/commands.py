@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
+from tests.support.once import require_no_failed_run
 from tests.support.prepared import server, without_test
 
 COMMAND = str(Path(sys.executable).with_name("fleet-slip"))
@@ -69,6 +70,7 @@ def run_on(root: object, *arguments: str | Path, **options: Any) -> Finished:
     prepared = options.keys() <= {"cwd", "env"}
     done = run_prepared(words, **options) if prepared else run(words, **options)
     assert "Traceback" not in done.stderr, done.stderr
+    require_no_failed_run(root)
     return done
 
 

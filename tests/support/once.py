@@ -9,6 +9,8 @@ import pytest
 
 from fleet_slip.files.local_folder import LocalFolder
 
+_made: set[Path] = set()
+
 
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
     """Return a folder that the first process to ask for it makes, while the others wait."""
@@ -20,4 +22,13 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
             shutil.rmtree(begun, ignore_errors=True)  # of a process that was killed
             make(begun)
             begun.rename(made)
+    _made.add(made)
     return made
+
+
+def require_no_failed_run(root: object) -> None:
+    """Fail if a command failed in a data root that is made once: `status` tells others of it."""
+    if Path(str(root)) in _made:
+        for file in Path(str(root), "runs").glob("*.jsonl"):
+            failed = '"outcome":"failed"' in file.read_text(encoding="utf-8")
+            assert not failed, f"a command failed in {root}, which other tests use. Copy it first."

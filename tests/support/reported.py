@@ -7,6 +7,7 @@ from typing import Any
 from typer.testing import CliRunner
 
 from fleet_slip.cli.main import app
+from tests.support.once import require_no_failed_run
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,7 @@ class Reported:
 
 def call(root: Path, *words: str) -> Any:
     result = CliRunner().invoke(app, ["--root", str(root), *words])
+    require_no_failed_run(root)
     if result.exception is not None:
         raise result.exception
     return result.stdout
