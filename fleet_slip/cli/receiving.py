@@ -1,6 +1,5 @@
 """The command that takes in messages of cars that send Gram rows: receive."""
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,6 +8,7 @@ import typer
 from fleet_slip.cli.output import Json, print_json, say
 from fleet_slip.cli.progress import progress
 from fleet_slip.cli.recorded import record_run
+from fleet_slip.errors import InputError
 from fleet_slip.words import number_of
 
 if TYPE_CHECKING:
@@ -29,17 +29,23 @@ def receive(
     """Take in messages of cars that send Gram rows instead of logs.
 
     What is damaged or impossible goes to the quarantine with a reason: fleet-slip sql "FROM
-    quarantine"
+    quarantine"; a file of which all does is an error.
 
     Example: **fleet-slip receive messages/2024-05-01**
     """
     with progress("receive", "files") as show:
         reports = context.obj.receive(files, progress=show)
     if json:
-        print_json([asdict(report) for report in reports])
-        return
-    for report in reports:
-        say(_said(report))
+        print_json(reports)
+    else:
+        for report in reports:
+            say(_said(report))
+    if useless := [report.file for report in reports if report.is_useless]:
+        raise InputError(
+            f"{useless[0]}: no message in it can be used"
+            + (f", nor in {number_of(len(useless) - 1, 'other file')}" if useless[1:] else "")
+            + '. Why is in the quarantine: fleet-slip sql "FROM quarantine"'
+        )
 
 
 def _said(report: "ReceiveReport") -> str:

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -54,6 +55,15 @@ class ReceiveReport:
     duplicates: int = 0
     forgotten: int = 0
     refused: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def is_useless(self) -> bool:
+        """Whether all of a new file was refused."""
+        return self.new and bool(self.refused) and sum(self.refused.values()) >= self.messages
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `receive --json` prints."""
+        return vars(self) | {"refused": dict(self.refused)}
 
 
 def receive_files(

@@ -14,8 +14,14 @@ import pyarrow.compute as pc
 from fleet_slip.arrays import BoolArray
 from fleet_slip.files.folder import Folder
 from fleet_slip.grams.received_rows import ReceivedRows, Refused
+from fleet_slip.runs.log import LOGGER
 from fleet_slip.warehouse.audit import Audit, Barred
 from fleet_slip.warehouse.cleared_cars import Cleared, ClearedCars
+from fleet_slip.words import number_of
+
+MANY = 500
+SECONDS_A_NAME = 0.02
+"""On two cores. Of more names than `MANY` it is said before how long that takes."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +67,13 @@ def screen(root: Folder, rows: Sequence[ReceivedRows], refused: Sequence[Refused
     cars = _names(rows, _vehicle_ids) | {one.vehicle_id for one in refused if one.vehicle_id}
     known = ClearedCars(root).read()
     unknown = cars - known.names if known and known.entries >= asked else cars
+    if len(unknown) > MANY:
+        LOGGER.info(
+            "%s that came for the first time are compared with what was forgotten, once: some "
+            "%.0f s",
+            number_of(len(unknown), "car"),
+            len(unknown) * SECONDS_A_NAME,
+        )
     watched = audit.with_forgotten_drives(unknown)
     drives = {one.drive_id for one in refused if one.drive_id and one.vehicle_id in watched}
     if watched:

@@ -16,6 +16,7 @@ from fleet_slip.grams.messages import read_messages
 from fleet_slip.maintenance.forget import forget
 from fleet_slip.regression.gram import Gram
 from fleet_slip.warehouse.audit import Forgettable
+from tests.support.commands import done_on, run_on
 from tests.support.messages import START_S, gram_of, message_of, parse_messages
 
 
@@ -300,3 +301,18 @@ def test_the_command_says_what_became_of_a_folder(
             assert "3 messages, 3 new Gram rows of 1,500 rows" in said
             assert "2 duplicates; in quarantine: 1 does not begin as a message does" in said
     assert [one["new"] for one in json.loads(capsys.readouterr().out)] == [False, False]
+
+
+def test_a_file_without_a_message_that_can_be_used_is_an_error(tmp_path: Path) -> None:
+    folder = tmp_path / "messages"
+    folder.mkdir()
+    write(folder / "1", *drives(2))
+    write(folder / "2", b"no message at all")
+    done = run_on(tmp_path / "data", "receive", folder, "--json")
+    assert done.exit_code == InputError.exit_code
+    assert [(one["received"], one["refused"]) for one in done.json] == [
+        (2, {}),
+        (0, {"does not begin as a message does": 1}),
+    ]
+    assert f"{folder / '2'}: no message in it can be used" in done.stderr
+    assert done_on(tmp_path / "data", "receive", folder), "once landed, it is nothing to do"

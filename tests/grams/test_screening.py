@@ -10,9 +10,11 @@ import pytest
 
 import fleet_slip
 from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.grams import screening
 from fleet_slip.grams.receiving import ReceiveReport
 from fleet_slip.maintenance.forget import forget
 from fleet_slip.maintenance.retention import Retention, retain
+from fleet_slip.runs.log import LOGGER
 from fleet_slip.warehouse import audit
 from fleet_slip.warehouse.audit import Audit, Forgettable
 from fleet_slip.warehouse.cleared_cars import Cleared, ClearedCars
@@ -242,3 +244,20 @@ def test_the_record_says_whose_drive_it_was_by_a_hash(fleet: fleet_slip.Fleet, s
     assert record.with_forgotten_drives(["VIN0", "VIN1"]) == {"VIN1"}
     fleet.allow(drive="VIN1-20240501T100000Z")
     assert record.with_forgotten_drives(["VIN0", "VIN1"]) == frozenset()
+
+
+def test_what_takes_long_is_said_before(
+    send: Send, fleet: fleet_slip.Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[str] = []
+    monkeypatch.setattr(screening, "MANY", 1)
+    monkeypatch.setattr(LOGGER, "info", lambda text, *given: told.append(text % given))
+    send(0, "A", "B")
+    assert not [one for one in told if "compared" in one]
+    fleet.forget(vehicle="A", now=True)
+    send(1, "C", "D", "E")
+    assert [one for one in told if "compared" in one] == [
+        "3 cars that came for the first time are compared with what was forgotten, once: some 0 s"
+    ]
+    send(2, "C", "D", "E")
+    assert len([one for one in told if "compared" in one]) == 1
