@@ -13,7 +13,8 @@ from fleet_slip.delta.change import Change, Unit, rows_in
 from fleet_slip.delta.conflicts import retry_conflicts
 from fleet_slip.delta.encoding import Encoded, Encoding, only_used_values
 from fleet_slip.delta.files import TableFile, absent_columns
-from fleet_slip.delta.table import Snapshot, Table
+from fleet_slip.delta.snapshot import Snapshot
+from fleet_slip.delta.table import Table
 from fleet_slip.files.checksums import checksum_in, checksum_of
 
 __all__ = [

@@ -1,29 +1,25 @@
-"""A Delta table of a data root, and one version of it: reading, writing files, committing."""
+"""A Delta table of a data root: its files, and what it takes to open and make it."""
 
-import hashlib
-import math
 import uuid
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import date
-from functools import cached_property
 
 import pyarrow as pa
 import pyarrow.parquet as pq
-from deltalake import CommitProperties, DeltaTable, Transaction
+from deltalake import CommitProperties, DeltaTable
 from deltalake.exceptions import CommitFailedError, TableNotFoundError
 from deltalake.transaction import AddAction
 
-from fleet_slip.delta.change import Change, addition, columns_in
-from fleet_slip.delta.checkpoints import seal_new_checkpoint
+from fleet_slip.delta.change import addition, columns_in
 from fleet_slip.delta.conflicts import is_conflict, retry_conflicts
 from fleet_slip.delta.encoding import Encoded, Encoding
-from fleet_slip.delta.files import TableFile, active_files, have_same_columns, read_actions
+from fleet_slip.delta.files import TableFile
 from fleet_slip.delta.log_check import require_sound_log
 from fleet_slip.delta.preface import read_preface
 from fleet_slip.delta.schema import require_readable, require_writable
 from fleet_slip.delta.sealing import NOTE, seal_note
-from fleet_slip.delta.units import read_landed_units
+from fleet_slip.delta.snapshot import Snapshot
 from fleet_slip.errors import ConflictError, StorageError
 from fleet_slip.files.checksums import checksum_in
 from fleet_slip.files.folder import Folder
@@ -34,9 +30,6 @@ FENCE = "fleet_slip.fence"
 
 ALL_STATISTICS = {"delta.dataSkippingNumIndexedCols": "-1"}
 """Property of a table of which all columns have statistics: as a rule Delta reads those of 32."""
-
-MANY_UNITS = 8
-"""So many units of work are not asked for one by one."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +49,7 @@ class Table:
         """The schema without the optional columns."""
         return pa.schema([field for field in self.schema if field.name not in self.optional])
 
-    def snapshot(self, version: int | None = None) -> "Snapshot":
+    def snapshot(self, version: int | None = None) -> Snapshot:
         """Return the table as it is now; a table that nobody has written yet is empty.
 
         Raises `StorageError` for an earlier version that is no longer known, and a damaged log.
@@ -68,7 +61,7 @@ class Table:
             require_readable(self.folder, self.schema, delta)
         return Snapshot(self, delta)
 
-    def unchecked_snapshot(self) -> "Snapshot":
+    def unchecked_snapshot(self) -> Snapshot:
         """Return the table as it is now, though its log may be damaged: to look for damage."""
         delta = self.open_delta()
         if delta is not None:
@@ -187,10 +180,10 @@ class Table:
                     ),
                 )
             except CommitFailedError as error:
-                raise self._conflict(error) from None
+                raise self.conflict_of(error) from None
             self.folder.settle_commits(delta.version() - 1)
 
-    def _conflict(self, error: CommitFailedError) -> Exception:
+    def conflict_of(self, error: CommitFailedError) -> Exception:
         """Return what a failed commit is to be raised as: a conflict, or the fault that it is."""
         if not is_conflict(error):
             return error
@@ -216,149 +209,3 @@ class Table:
             commit_properties=CommitProperties(custom_metadata={NOTE: seal_note({}, [], {})}),
         )
         return (self.open_delta(version=0) if delta.version() else delta) or delta
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """One version of a table. Reading it is not disturbed by later commits."""
-
-    table: Table
-    delta: DeltaTable | None
-    without: frozenset[str] = frozenset()
-    """Paths of files that are left out."""
-
-    @property
-    def version(self) -> int | None:
-        """Version of the Delta table; None before the first commit."""
-        return None if self.delta is None else self.delta.version()
-
-    @cached_property
-    def files(self) -> tuple[TableFile, ...]:
-        """Active files, sorted by path."""
-        if self.delta is None:
-            return ()
-        with storage_errors(self.table.folder):
-            every = active_files(self._actions, self.table.folder)
-        return tuple(file for file in every if file.path not in self.without)
-
-    @property
-    def has_same_columns(self) -> bool:
-        """Whether all active files have the same ones of the table's columns."""
-        with storage_errors(self.table.folder):
-            return have_same_columns(self._actions, self.table.schema.names)
-
-    @cached_property
-    def _actions(self) -> pa.Table:
-        return read_actions(self.delta)
-
-    @property
-    def paths(self) -> list[str]:
-        """Where the active files are, as DuckDB knows it, sorted."""
-        return [self.table.uri(file.path) for file in self.files]
-
-    @property
-    def rows(self) -> int:
-        """Number of rows of all active files."""
-        return sum(file.rows for file in self.files)
-
-    @property
-    def size_bytes(self) -> int:
-        """Size of all active files."""
-        return sum(file.size_bytes for file in self.files)
-
-    def renewed(self) -> "Snapshot":
-        """Return the newest version: this very snapshot, if nobody has committed since.
-
-        If somebody has, this snapshot is not to be used any more.
-        """
-        if self.delta is None:
-            return self.table.snapshot()
-        version = self.version
-        with storage_errors(self.table.folder):
-            self.delta.update_incremental()
-        return self if self.version == version else self.table.snapshot()
-
-    def removed(self, before_hours: float = 0) -> set[str]:
-        """Return the paths of files that a commit removed, so many hours ago or earlier.
-
-        Those of the last week at least; checkpoints forget what was removed before.
-        """
-        if self.delta is None:
-            return set()
-        with storage_errors(self.table.folder):
-            found = self.delta.vacuum(
-                math.ceil(before_hours), dry_run=True, enforce_retention_duration=False, full=False
-            )
-        return set(found)
-
-    def landed(self, unit_name: str) -> int | None:
-        """Return the version of a unit of work that has landed, or None."""
-        if self.delta is None:
-            return None
-        with storage_errors(self.table.folder):
-            return self.delta.transaction_version(unit_name)
-
-    def landed_among(self, number: int) -> Callable[[str], bool]:
-        """Return what tells of a unit whether it has landed, for so many questions.
-
-        Many are answered by reading the log once.
-        """
-        if self.version is None or number < MANY_UNITS:
-            return lambda name: self.landed(name) is not None
-        return self._units.__contains__
-
-    @cached_property
-    def _units(self) -> frozenset[str]:
-        with storage_errors(self.table.folder):
-            return read_landed_units(self.table.folder, self.version or 0)
-
-    def moment(self, version: int) -> str | None:
-        """Return the digest of the commit that made a version of this table's past, or present.
-
-        Where it is what it was, so is all that had landed until then. None if there is none such.
-        """
-        if self.version is None or version > self.version:
-            return None
-        try:
-            content = (self.table.folder / "_delta_log").read(f"{version:020}.json")
-        except StorageError:
-            return None
-        return hashlib.sha256(content).hexdigest()
-
-    def commit_or_discard(self, change: Change) -> None:
-        """Apply a change like `commit`; after a conflict delete the files that it was to add.
-
-        For who writes its files anew in the next attempt.
-        """
-        try:
-            self.commit(change)
-        except ConflictError:
-            self.table.discard(change.add)
-            raise
-
-    def commit(self, change: Change) -> None:
-        """Apply a change in one atomic commit on top of this snapshot.
-
-        Raises `ConflictError` if another process landed one of the same units meanwhile, or removed
-        a file; and `StorageError` if the log cannot be written.
-        """
-        table, actions = self.table, change.actions()
-        note = seal_note(change.note, actions, {u.name: u.version for u in change.units})
-        with storage_errors(table.folder):
-            try:
-                delta = self.delta or table.create()
-                require_writable(table.folder, table.schema, delta, table.unneeded(change.add))
-                delta.create_write_transaction(
-                    actions,
-                    mode="append",
-                    schema=table.schema,
-                    partition_by=list(table.partition_by),
-                    commit_properties=CommitProperties(
-                        custom_metadata={NOTE: note},
-                        app_transactions=[Transaction(u.name, u.version) for u in change.units],
-                    ),
-                )
-            except CommitFailedError as error:
-                raise table._conflict(error) from None
-            table.folder.settle_commits(self.version)
-            seal_new_checkpoint(table.folder, self.version)

@@ -14,7 +14,7 @@ from fleet_slip.catalogue.car_numbers import CALIBRATION
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import ALL_DRIVES, LONGEST_PAUSE_S, TRAINING_DRIVES
-from fleet_slip.delta.table import Snapshot
+from fleet_slip.delta import Snapshot
 from fleet_slip.errors import DataError
 from fleet_slip.grams.backlog import find_backlog
 from fleet_slip.grams.car_keys import load_car_keys
