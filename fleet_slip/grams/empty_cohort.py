@@ -29,7 +29,8 @@ def empty_cohort_error(opened: OpenedGrams, condition: Condition) -> DataError:
             "sent Gram rows of the logged signals and no log. Select with features = signals."
         )
     examples = opened.database.execute(
-        "SELECT string_agg(DISTINCT source, ', '), string_agg(DISTINCT campaign, ', ') FROM grams"
+        "SELECT string_agg(DISTINCT source, ', ' ORDER BY source), "
+        "string_agg(DISTINCT campaign, ', ' ORDER BY campaign) FROM grams"
     ).fetchone()
     sources, campaigns = examples or ("", "")
     return DataError(
