@@ -92,3 +92,9 @@ def smoke_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
         done_on(root, "run", "--campaign", "smoke")
 
     return made_once(tmp_path_factory, "smoke", make)
+
+
+@pytest.fixture(scope="session")
+def root_to_fail_in(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Path:
+    """A copy of it in which commands may fail: `status` tells of them from then on."""
+    return shutil.copytree(smoke_root, tmp_path_factory.mktemp("mistakes") / "data")

@@ -107,11 +107,35 @@ _OF_FILES = (
 )
 
 
+_STREAMED: dict[str, type[Exception]] = {
+    "Conversion Error": duckdb.ConversionException,
+    "Out of Range Error": duckdb.OutOfRangeException,
+    "Invalid Input Error": duckdb.InvalidInputException,
+    "IO Error": duckdb.IOException,
+    "INTERNAL Error": duckdb.InternalException,
+    "Out of Memory Error": duckdb.OutOfMemoryException,
+    "INTERRUPT Error": duckdb.InterruptException,
+}
+
+
+@contextlib.contextmanager
+def _errors_of_streams() -> Iterator[None]:
+    """Raise what DuckDB raised: of an answer that is read batch by batch, pyarrow hides it."""
+    try:
+        yield
+    except OSError as error:
+        kind = _STREAMED.get(str(error).partition(":")[0])
+        if kind is None:
+            raise
+        raise kind(str(error)) from None
+
+
 @contextlib.contextmanager
 def database_errors(doing: str) -> Iterator[None]:
     """Turn DuckDB's errors into ours, saying what was being done."""
     try:
-        yield
+        with _errors_of_streams():
+            yield
     except FleetSlipError:
         raise
     except duckdb.InterruptException:

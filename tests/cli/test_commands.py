@@ -3,7 +3,6 @@
 import csv
 import io
 import json
-import shutil
 from hashlib import sha256
 from pathlib import Path
 
@@ -189,12 +188,6 @@ FORGED = (
     "FROM range(1, 9) r(i) WHERE (true"
 )
 """Gram rows that nobody measured."""
-
-
-@pytest.fixture(scope="module")
-def root_to_fail_in(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Path:
-    """A copy of the root that all tests share: what failed in it is told by `status`."""
-    return shutil.copytree(smoke_root, tmp_path_factory.mktemp("mistakes") / "data")
 
 
 @pytest.mark.parametrize(

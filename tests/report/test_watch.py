@@ -103,10 +103,10 @@ def test_a_film_moves(smoke_root: Path, tmp_path: Path) -> None:
 
 
 def test_an_mp4_needs_an_extra_that_is_named(
-    smoke_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    root_to_fail_in: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    fleet = fleet_slip.open(smoke_root)
+    fleet = fleet_slip.open(root_to_fail_in)
     with pytest.raises(ExtraError, match=r"fleet-slip\[watch\]"):
         fleet.watch(DRIVE, "smoke", tmp_path / "film.mp4", from_s=5.0, until_s=5.1)
     assert list(tmp_path.iterdir()) == []
@@ -139,8 +139,8 @@ def test_an_mp4_plays_as_long_as_the_drive(smoke_root: Path, tmp_path: Path) -> 
     assert int(pictures) == int(different) == round(0.5 * FRAMES_PER_S) + 1
 
 
-def test_what_cannot_be_shown_is_told(smoke_root: Path, tmp_path: Path) -> None:
-    fleet = fleet_slip.open(smoke_root)
+def test_what_cannot_be_shown_is_told(root_to_fail_in: Path, tmp_path: Path) -> None:
+    fleet = fleet_slip.open(root_to_fail_in)
     with pytest.raises(UsageError, match="suffix"):
         fleet.watch(DRIVE, "smoke", tmp_path / "film.avi")
     with pytest.raises(QuestionError, match="no drive of the logs, and no scenario"):

@@ -19,6 +19,7 @@ from fleet_slip.models.score import score_statement
 from fleet_slip.monitoring.monitor import monitor
 from fleet_slip.monitoring.quality import examine_drives
 from fleet_slip.warehouse.condition import asking, drive_columns, parse_condition
+from fleet_slip.warehouse.database import open_database
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import land, log_rows, random_counts
 from tests.support.manifests import manifest
@@ -243,3 +244,13 @@ def test_a_wrong_regular_expression_is_a_wrong_question(
     for ask in (load_cohort, lambda w, c: sum_cohort(w, Folding(), c)):
         with pytest.raises(QuestionError, match="cannot be asked"):
             ask(warehouse, condition)
+
+
+def test_what_fails_in_the_middle_of_an_answer_is_a_wrong_question() -> None:
+    """pyarrow makes an OSError of what DuckDB says of a batch that is not the first."""
+    query = "SELECT CAST(if(i < 9000, '1', 'spa') AS INTEGER) FROM range(10000) t(i)"
+    with open_database() as database:
+        batches = database.sql(query).to_arrow_reader(1000)
+        asked = parse_condition("campaign = 1")
+        with pytest.raises(QuestionError, match="string 'spa'"), asking(database, asked):
+            assert not list(batches)
