@@ -1,6 +1,7 @@
 """Logs that lie on an object store: what comes in is what would of files of this machine."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,12 @@ import pytest
 from fleet_slip.errors import InputError
 from fleet_slip.files.object_client import client
 from fleet_slip.files.object_inputs import copy_object, find_object
+from fleet_slip.ingest.local_copies import local_copy
 from tests.ingest.test_as_one import MAPPING as PLAIN
 from tests.ingest.test_as_one import write_parts
 from tests.ingest.test_folders import MAPPING, write_log
 from tests.support.commands import Finished, run_on
+from tests.support.dask_processes import dask_processes
 from tests.support.prepared import server as prepared_server
 from tests.support.s3_server import Server, command_on
 from tests.support.state import state
@@ -205,3 +208,24 @@ def test_an_object_is_looked_at_before_it_is_stored(here: Path, bucket: str) -> 
     assert several.exit_code == 2
     assert "Give one of them" in several.stderr
     assert not copies(here)
+
+
+@pytest.mark.parametrize("path", ["landing/../../../x.csv", "/x.csv"])
+def test_no_name_of_an_object_leads_out_of_the_temporary_folder(
+    here: Path, bucket: str, path: str
+) -> None:
+    found = find_object(f"{bucket}/landing/day 0/münchen 0.csv")
+    assert found is not None
+    with (
+        pytest.raises(InputError, match="leads out of the bucket"),
+        local_copy(replace(found, path=path)),
+    ):
+        pass
+    assert not list(here.rglob("x.csv"))
+
+
+def test_workers_of_a_cluster_fetch_for_themselves(here: Path, bucket: str) -> None:
+    ingest(here / "local", str(here / "landing"))
+    with dask_processes(here) as dask:
+        ingest(here / "root", f"{bucket}/landing", "--cluster", dask.address)
+    assert state(here / "root") == state(here / "local")
