@@ -17,18 +17,8 @@ from fleet_slip.ingest.source import OWN_TIME
 from tests.ingest.test_formats import AX, AX_COUNTS, BETA_DEG, START, TIME_S, require_the_drive
 from tests.support.measured import a_mapping
 from tests.support.reported import call
+from tests.support.ros2 import HEADER
 
-HEADER = """std_msgs/Header header
-{}
-================================================================================
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-================================================================================
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-"""
 VECTOR = """================================================================================
 MSG: geometry_msgs/Vector3
 float64 x
