@@ -30,20 +30,20 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
+from fleet_slip.comparison.observers import ekf
+from fleet_slip.comparison.observers.signals import DriveSignals, read_drive
+from fleet_slip.comparison.rivals.compare import all_signals, cross_validate_learner
+from fleet_slip.comparison.rivals.inputs import Inputs
+from fleet_slip.comparison.rivals.learner import one_thread
+from fleet_slip.comparison.rivals.learners import ANFIS, PERCEPTRON, TREES
+from fleet_slip.comparison.rivals.sample import draw_sample
 from fleet_slip.files.data_root import data_root
 from fleet_slip.grams import expansion, fold_sums
 from fleet_slip.grams.calibration import Calibration, calibrate
 from fleet_slip.grams.cohort import assign_folds, load_cohort
 from fleet_slip.grams.fold_sums import sum_cohort
 from fleet_slip.grams.folding import Folding
-from fleet_slip.observers import ekf
-from fleet_slip.observers.signals import DriveSignals, read_drive
 from fleet_slip.regression.crossval import cross_validate_inputs
-from fleet_slip.rivals.compare import all_signals, cross_validate_learner
-from fleet_slip.rivals.inputs import Inputs
-from fleet_slip.rivals.learner import one_thread
-from fleet_slip.rivals.learners import ANFIS, PERCEPTRON, TREES
-from fleet_slip.rivals.sample import draw_sample
 from fleet_slip.simulation.campaign import DriveSpec, load_campaign
 from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
 from fleet_slip.views import connect

@@ -17,8 +17,8 @@ from datetime import date, timedelta
 from pathlib import Path
 
 import fleet_slip
+from fleet_slip.monitoring.night_page import write_summary
 from fleet_slip.monitoring.night_report import NightReport
-from fleet_slip.report.night_page import write_summary
 from tests.support.commands import COMMAND
 from tests.support.landing import Landing
 from tests.support.state import state

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from fleet_slip.observers import ekf, kalman, luenberger, sliding_mode
-from fleet_slip.observers.signals import STEP_S, DriveSignals
+from fleet_slip.comparison.observers import ekf, kalman, luenberger, sliding_mode
+from fleet_slip.comparison.observers.signals import STEP_S, DriveSignals
 from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
 
 ROWS = 30_000

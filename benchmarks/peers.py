@@ -33,9 +33,9 @@ from benchmarks.peer_ways import COLUMNS, INPUTS, LABEL, WAYS, thread_variables
 from benchmarks.pipeline import prepare
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.pages.style import PALETTE, STYLE
 from fleet_slip.regression.exact import LinearModel, fit
 from fleet_slip.regression.gram import Gram
-from fleet_slip.report.style import PALETTE, STYLE
 from fleet_slip.warehouse.tables import Warehouse
 
 MOST_DIGITS = 16.0

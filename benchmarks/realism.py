@@ -24,15 +24,15 @@ from benchmarks.documents import insert
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.evaluation.estimators import (
+from fleet_slip.comparison.evaluation.estimators import (
     ColumnEstimate,
     LinearEstimate,
     as_counts,
     published_estimate,
 )
-from fleet_slip.observers import ekf, kalman
-from fleet_slip.observers.signals import DriveSignals, LabelledDrive
-from fleet_slip.observers.tuning import tune
+from fleet_slip.comparison.observers import ekf, kalman
+from fleet_slip.comparison.observers.signals import DriveSignals, LabelledDrive
+from fleet_slip.comparison.observers.tuning import tune
 from fleet_slip.regression.exact import fit
 from fleet_slip.regression.gram import Gram
 from fleet_slip.selection.model_list import load_model_list

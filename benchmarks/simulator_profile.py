@@ -30,8 +30,8 @@ from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.simulation.campaign import Batch, load_campaign
 from fleet_slip.simulation.drives import lane_drive, simulate_logs, tabulate
 from fleet_slip.simulation.sensors import Recorder
-from fleet_slip.vehicle import kernel
-from fleet_slip.vehicle.lanes import LaneDrive, simulate_blocks, simulate_drives
+from fleet_slip.vehicle.lanes import kernel
+from fleet_slip.vehicle.lanes.lane_drives import LaneDrive, simulate_blocks, simulate_drives
 from fleet_slip.warehouse.tables import Warehouse
 
 ROUNDS = 5

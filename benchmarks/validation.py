@@ -21,13 +21,13 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.vehicle.driver import handling
 from fleet_slip.vehicle.imperfections import PERFECT, CarImperfections
-from fleet_slip.vehicle.lanes import LaneDrive, Truth, simulate_drives
+from fleet_slip.vehicle.lanes.lane_drives import LaneDrive, Truth, simulate_drives
+from fleet_slip.vehicle.lanes.road import Road
 from fleet_slip.vehicle.parameters import (
     GRAVITY_MPS2,
     VehicleParameters,
     load_vehicle,
 )
-from fleet_slip.vehicle.road import Road
 from tests.support.linear_bicycle import LinearBicycle
 from tests.support.open_loop import Response, steer
 

@@ -18,10 +18,10 @@ def _():
     from matplotlib.figure import Figure
 
     import fleet_slip
+    from fleet_slip.comparison.watch.frames import drive_frames
     from fleet_slip.errors import FleetSlipError
-    from fleet_slip.report.figures.control import control_chart
-    from fleet_slip.report.frames import drive_frames
-    from fleet_slip.report.style import DESK, STYLE, colour
+    from fleet_slip.monitoring.control_chart import control_chart
+    from fleet_slip.pages.style import DESK, STYLE, colour
     from fleet_slip.words import number_of
 
     return (

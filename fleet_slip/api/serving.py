@@ -18,14 +18,14 @@ from fleet_slip.models.versions import Registry
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from fleet_slip.evaluation.evaluate import TrainRivals
+    from fleet_slip.comparison.evaluation.evaluate import TrainRivals
+    from fleet_slip.comparison.report.write import Written
     from fleet_slip.export.estimator import Estimator
     from fleet_slip.export.files import Target
     from fleet_slip.files.documents import Document
     from fleet_slip.models.diff import Difference
     from fleet_slip.models.publish import Publication
     from fleet_slip.models.score import Score
-    from fleet_slip.report.write import Written
     from fleet_slip.selection.request import RequestedSelection
 
 
@@ -183,15 +183,15 @@ class Serving(Rooted):
         Raises `ConfigError` for a scenario that is not valid, `DataError`, `RefusedError` for a
         scenario that was changed since its drive was simulated, and what `model` raises.
         """
-        from fleet_slip.evaluation.evaluate import evaluate
-        from fleet_slip.evaluation.results import keep
-        from fleet_slip.evaluation.runs import simulate_scenarios
+        from fleet_slip.comparison.evaluation.evaluate import evaluate
+        from fleet_slip.comparison.evaluation.results import keep
+        from fleet_slip.comparison.evaluation.runs import simulate_scenarios
         from fleet_slip.files.documents import Document
         from fleet_slip.simulation.scenario import load_scenario, shipped_scenarios
 
         train_rivals: TrainRivals | None = None
         if rivals:
-            from fleet_slip.rivals import compare  # an optional extra
+            from fleet_slip.comparison.rivals import compare  # an optional extra
 
             train_rivals = compare.train_rivals
         chosen = tuple(map(load_scenario, scenarios)) if scenarios else shipped_scenarios()
@@ -213,7 +213,7 @@ class Serving(Rooted):
         from fleet_slip.files.local_folder import LocalFolder
 
         with needed("report", "the report"):
-            from fleet_slip.report.write import write_report
+            from fleet_slip.comparison.report.write import write_report
 
         folder = LocalFolder(output) if output else self.root / "report"
         return write_report(self.warehouse, self.resolve(model), folder)
@@ -239,9 +239,13 @@ class Serving(Rooted):
         drive, `ExtraError` without the extra `watch`, and what `model` raises.
         """
         with needed("watch", "a page or a film of a drive"):
-            from fleet_slip.report.film import write_film
-            from fleet_slip.report.frames import drive_frames, is_scenario, scenario_frames
-            from fleet_slip.report.watch_page import write_page
+            from fleet_slip.comparison.watch.film import write_film
+            from fleet_slip.comparison.watch.frames import (
+                drive_frames,
+                is_scenario,
+                scenario_frames,
+            )
+            from fleet_slip.comparison.watch.watch_page import write_page
 
         writers = {".html": write_page, ".mp4": write_film, ".gif": write_film}
         if output.suffix not in writers:

@@ -103,7 +103,7 @@ def nightly(
         )
     if output is not None:
         with needed("report", "a summary in files"):
-            from fleet_slip.report.night_page import write_summary  # noqa: PLC0415 - draws
+            from fleet_slip.monitoring.night_page import write_summary  # noqa: PLC0415 - draws
 
         write_summary(report, output)
     if json:

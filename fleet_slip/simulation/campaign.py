@@ -31,8 +31,8 @@ from fleet_slip.simulation.speed_profile import SpeedLimits, SpeedProfile, speed
 from fleet_slip.simulation.surface import surface
 from fleet_slip.simulation.track import Track
 from fleet_slip.simulation.trials import TrialPlan
+from fleet_slip.vehicle.lanes.road import Surface
 from fleet_slip.vehicle.parameters import VehicleParameters
-from fleet_slip.vehicle.road import Surface
 
 ROAD_SPACING_M = 1.0
 """Spacing of the points at which curvature and target speed are tabulated, in m."""

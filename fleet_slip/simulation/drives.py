@@ -10,8 +10,8 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.simulation.campaign import Batch, DriveSpec
 from fleet_slip.simulation.manoeuvres import road_with
 from fleet_slip.simulation.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ, Measurement, Recorder
-from fleet_slip.vehicle.lanes import LaneDrive, simulate_blocks
-from fleet_slip.vehicle.road import Road
+from fleet_slip.vehicle.lanes.lane_drives import LaneDrive, simulate_blocks
+from fleet_slip.vehicle.lanes.road import Road
 
 DRIVES_AT_ONCE = 128
 """Drives of a batch that are simulated together, which bounds the memory for their roads."""

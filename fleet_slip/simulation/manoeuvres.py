@@ -13,7 +13,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.vehicle.road import Road
+from fleet_slip.vehicle.lanes.road import Road
 
 Kind = Literal["step", "slalom", "braking"]
 KINDS: tuple[Kind, ...] = get_args(Kind)

@@ -12,8 +12,8 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.compiling import kernel
 from fleet_slip.simulation.imperfections import RoadImperfections
 from fleet_slip.simulation.track import Track
+from fleet_slip.vehicle.lanes.road import Surface
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2
-from fleet_slip.vehicle.road import Surface
 
 KNOTS_M = 60.0
 """Distance of the knots: the length of a bend, a patch or a gust."""

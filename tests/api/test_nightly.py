@@ -15,8 +15,8 @@ import fleet_slip
 from fleet_slip.api.nightly import Night
 from fleet_slip.errors import UsageError
 from fleet_slip.models.gate import floor
+from fleet_slip.monitoring.night_page import render_night
 from fleet_slip.monitoring.night_report import NightReport
-from fleet_slip.report.night_page import render_night
 from tests.support.commands import Finished, run_on, start_on
 from tests.support.landing import Landing
 from tests.support.once import made_once

@@ -39,9 +39,9 @@ def test_the_architecture_lists_every_folder_once_and_none_besides() -> None:
 
 def test_the_architecture_lists_folders_in_the_order_that_is_enforced() -> None:
     tools = tomllib.loads((HERE / "pyproject.toml").read_text())["tool"]
-    (contract,) = tools["importlinter"]["contracts"]
+    package, *_ = tools["importlinter"]["contracts"]
     folders = names_of(DOCS / "architecture.md", "folder")
-    layers = [f"{name}/" for layer in reversed(contract["layers"]) for name in layer.split(" | ")]
+    layers = [f"{name}/" for layer in reversed(package["layers"]) for name in layer.split(" | ")]
     assert folders == [name for name in layers if name in folders]
 
 

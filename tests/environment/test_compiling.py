@@ -9,7 +9,7 @@ from types import ModuleType
 import pytest
 
 from fleet_slip import kept_code
-from fleet_slip.vehicle import kernel as lanes
+from fleet_slip.vehicle.lanes import kernel as lanes
 
 SOURCE = """
 from fleet_slip.compiling import kernel

@@ -10,7 +10,7 @@ from fleet_slip.simulation.lags import Delay, LowPass
 from fleet_slip.simulation.pulses import Pulses
 from fleet_slip.simulation.wander import Wander
 from fleet_slip.vehicle.imperfections import CarImperfections
-from fleet_slip.vehicle.lane_blocks import CHANNELS, IMPERFECT_CHANNELS
+from fleet_slip.vehicle.lanes.lane_blocks import CHANNELS, IMPERFECT_CHANNELS
 
 TICKS = 3000
 TIME_S = np.arange(TICKS) / 100

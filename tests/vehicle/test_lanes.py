@@ -11,11 +11,11 @@ import pytest
 from fleet_slip.errors import ConfigError
 from fleet_slip.simulation.speed_profile import SpeedLimits, speed_profile
 from fleet_slip.simulation.track import load_track
-from fleet_slip.vehicle import kernel
-from fleet_slip.vehicle.lane_blocks import BLOCK, CHANNELS
-from fleet_slip.vehicle.lanes import LaneDrive, Truth, simulate_blocks, simulate_drives
+from fleet_slip.vehicle.lanes import kernel
+from fleet_slip.vehicle.lanes.lane_blocks import BLOCK, CHANNELS
+from fleet_slip.vehicle.lanes.lane_drives import LaneDrive, Truth, simulate_blocks, simulate_drives
+from fleet_slip.vehicle.lanes.road import Road
 from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
-from fleet_slip.vehicle.road import Road
 from tests.support.rolling import SEDAN
 
 MASSES_KG = (1000.0, 1320.0, 1740.0)

@@ -1,0 +1,153 @@
+"""An evaluation from end to end: estimators, scenarios, figures, checks and comparisons."""
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from fleet_slip.comparison.evaluation.comparison import FleetComparison, compare_fleets
+from fleet_slip.comparison.evaluation.estimators import Estimate, TrainedModels, train_models
+from fleet_slip.comparison.evaluation.filters import Bank, FilterEstimate, filter_bank
+from fleet_slip.comparison.evaluation.gps_noise import GpsSweep, sweep_gps_noise
+from fleet_slip.comparison.evaluation.ranking import Ranking, rank
+from fleet_slip.comparison.evaluation.results import document
+from fleet_slip.comparison.evaluation.runs import EvaluatedScenario, run_all
+from fleet_slip.comparison.evaluation.targets import Check, check_filter_targets, check_targets
+from fleet_slip.grams.cohort import Cohort
+from fleet_slip.models.manifest import Manifest
+from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.simulation.scenario import Scenario, load_scenario
+from fleet_slip.warehouse.tables import Warehouse
+
+
+class Rival(Protocol):
+    """What an evaluation asks of a learned rival; `fleet_slip.comparison.rivals` has them."""
+
+    @property
+    def name(self) -> str:
+        """Name among the estimators."""
+
+    @property
+    def estimate(self) -> Estimate:
+        """What estimates side-slip in rad of a drive; NaN where an input is null."""
+
+    def description(self) -> Mapping[str, Any]:
+        """Return what a document says of it as an estimator."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what a document says of its accuracy and cost."""
+
+
+TrainRivals = Callable[[Warehouse, Cohort, Manifest, Bank], Sequence[Rival]]
+"""Trains the rivals on the rows of a cohort, also on the columns of a published model."""
+
+
+@dataclass(frozen=True)
+class Competitors:
+    """All estimators that compete, by name, and what a document says of each."""
+
+    one_car: TrainedModels
+    fleets: tuple[TrainedModels, ...]
+    rivals: tuple[Rival, ...]
+    estimators: Mapping[str, Estimate]
+    descriptions: Mapping[str, Mapping[str, Any]]
+
+    @property
+    def using_gps(self) -> frozenset[str]:
+        """Names of the estimators that need satellite navigation."""
+        return frozenset(name for name, one in self.descriptions.items() if one.get("gps"))
+
+    @property
+    def gps_filters(self) -> dict[str, FilterEstimate]:
+        """The filters that need satellite navigation, by name."""
+        return {
+            name: one
+            for name, one in self.estimators.items()
+            if isinstance(one, FilterEstimate) and one.filter.gps
+        }
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Everything that an evaluation found, with the drives and estimates behind it."""
+
+    competitors: Competitors
+    runs: tuple[EvaluatedScenario, ...]
+    checks: tuple[Check, ...]
+    comparisons: tuple[FleetComparison, ...]
+    ranking: Ranking
+    gps_noise: GpsSweep | None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the evaluation's document."""
+        cohort = self.competitors.one_car.selection.cohort
+        return document(
+            self.runs,
+            self.competitors.descriptions,
+            logs_version=cohort.logs_version,
+            grams_version=cohort.grams_version,
+            checks=[check.as_dict() for check in self.checks],
+            comparisons=[comparison.as_dict() for comparison in self.comparisons],
+            rivals=[rival.as_dict() for rival in self.competitors.rivals],
+            ranking=self.ranking.as_dict(),
+            gps_noise=self.gps_noise.as_dict() if self.gps_noise else None,
+        )
+
+
+def train_competitors(
+    warehouse: Warehouse,
+    one_car: ModelVersion,
+    fleets: Sequence[ModelVersion],
+    executor: Executor,
+    train_rivals: TrainRivals | None,
+) -> Competitors:
+    """Fit, tune and train all that compete, on cohorts without any drive of a scenario.
+
+    Filters and learned rivals get the training drives of the one-car model.
+    """
+    first = train_models(warehouse, one_car)
+    others = tuple(train_models(warehouse, version) for version in fleets)
+    estimators: dict[str, Estimate] = {}
+    descriptions: dict[str, Mapping[str, Any]] = {}
+    for trained in (first, *others):
+        estimators |= trained.estimators()
+        descriptions |= trained.descriptions()
+    cohort = first.selection.cohort
+    bank = filter_bank(warehouse, cohort, load_scenario("nominal").car, executor)
+    learned = train_rivals(warehouse, cohort, one_car.manifest, bank) if train_rivals else ()
+    return Competitors(
+        one_car=first,
+        fleets=others,
+        rivals=tuple(learned),
+        estimators=estimators | bank.estimators | {one.name: one.estimate for one in learned},
+        descriptions=(
+            descriptions | bank.descriptions | {one.name: one.description() for one in learned}
+        ),
+    )
+
+
+def evaluate(
+    warehouse: Warehouse,
+    scenarios: Sequence[Scenario],
+    one_car: ModelVersion,
+    fleets: Sequence[ModelVersion],
+    executor: Executor,
+    train_rivals: TrainRivals | None = None,
+) -> Evaluation:
+    """Evaluate a model and all that competes with it on scenarios that are in the logs."""
+    competitors = train_competitors(warehouse, one_car, fleets, executor, train_rivals)
+    runs = run_all(warehouse, scenarios, competitors.estimators)
+    first = competitors.one_car
+    return Evaluation(
+        competitors=competitors,
+        runs=runs,
+        checks=(
+            *check_targets(runs, first.table_one, first.linear_estimators()),
+            *check_filter_targets(runs, first.table_one),
+        ),
+        comparisons=tuple(
+            row for fleet in competitors.fleets for row in compare_fleets(runs, first, fleet)
+        ),
+        ranking=rank(runs, first.version.reference, competitors.using_gps),
+        gps_noise=sweep_gps_noise(runs, competitors.gps_filters, list(first.estimators())),
+    )

@@ -1,0 +1,103 @@
+"""Who wins a test drive: the smallest RMSE among all estimators without satellite navigation."""
+
+from collections.abc import Collection, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from fleet_slip.comparison.evaluation.runs import EvaluatedScenario
+
+LEAST_COVERAGE = 0.99
+"""Share of a drive's rows that a competitor must have estimates for: who skips rows cannot win."""
+
+CLOSE = 1.25
+"""Ratio to the winner's RMSE up to which a lost drive counts as close."""
+
+
+@dataclass(frozen=True)
+class Standing:
+    """How one estimator stands on one test drive against the others.
+
+    Attributes:
+        scenario: name of the test drive.
+        winner, winner_rmse_deg: who has the smallest RMSE; None where nobody competes.
+        rmse_deg: of the one estimator; None where it has too few estimates to compete.
+        best_other, best_other_rmse_deg: the best of the others.
+    """
+
+    scenario: str
+    winner: str | None
+    winner_rmse_deg: float | None
+    rmse_deg: float | None
+    best_other: str | None
+    best_other_rmse_deg: float | None
+
+    @property
+    def won(self) -> bool:
+        """Whether the one estimator wins the drive."""
+        return self.winner is not None and self.winner != self.best_other
+
+    @property
+    def ratio(self) -> float | None:
+        """RMSE over that of the winner: 1 where it wins."""
+        if self.rmse_deg is None or not self.winner_rmse_deg:
+            return None
+        return self.rmse_deg / self.winner_rmse_deg
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """How one estimator stands on all test drives."""
+
+    estimator: str
+    standings: tuple[Standing, ...]
+
+    @property
+    def won(self) -> int:
+        """Number of drives that it wins."""
+        return sum(one.won for one in self.standings)
+
+    @property
+    def close(self) -> int:
+        """Number of drives that it loses with at most `CLOSE` times the winner's RMSE."""
+        return sum(
+            one.ratio is not None and one.ratio <= CLOSE and not one.won for one in self.standings
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what a JSON document needs."""
+        return {
+            "estimator": self.estimator,
+            "least_coverage": LEAST_COVERAGE,
+            "close_ratio": CLOSE,
+            "drives": len(self.standings),
+            "won": self.won,
+            "close": self.close,
+            "standings": [
+                {**asdict(one), "won": one.won, "ratio": one.ratio} for one in self.standings
+            ],
+        }
+
+
+def rank(runs: Sequence[EvaluatedScenario], estimator: str, gps: Collection[str]) -> Ranking:
+    """Rank an estimator on every drive against all but those that use satellite navigation.
+
+    The RMSE is over the whole drive. The one estimator wins a tie.
+    """
+    return Ranking(estimator, tuple(_stand(run, estimator, gps) for run in runs))
+
+
+def _stand(run: EvaluatedScenario, estimator: str, gps: Collection[str]) -> Standing:
+    errors = {
+        name: result.whole.rmse_deg
+        for name, result in run.results.items()
+        if name not in gps
+        and result.whole.rmse_deg is not None
+        and result.whole.coverage >= LEAST_COVERAGE
+    }
+    ours = errors.pop(estimator, None)
+    other = min(errors, key=lambda name: errors[name], default=None)
+    others = None if other is None else errors[other]
+    winner, least = other, others
+    if ours is not None and (others is None or ours <= others):
+        winner, least = estimator, ours
+    return Standing(run.scenario.name, winner, least, ours, other, others)

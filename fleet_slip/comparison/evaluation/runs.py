@@ -1,0 +1,138 @@
+"""Runs test drives that are missing, and every estimator on every test drive."""
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from fleet_slip.arrays import BoolArray, FloatArray
+from fleet_slip.comparison.evaluation.errors import ErrorFigures, error_figures
+from fleet_slip.comparison.evaluation.estimators import Estimate
+from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive, load_drives
+from fleet_slip.comparison.evaluation.stability import CRITERION, find_unstable
+from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.grams.job import update_grams
+from fleet_slip.progress import Progress, no_progress
+from fleet_slip.simulation.job import SimulationReport, simulate_batches
+from fleet_slip.simulation.scenario import Scenario
+from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
+from fleet_slip.warehouse.tables import Warehouse
+
+GPS_OUTAGE_S = 1.0
+"""Time without a fix after which satellite navigation counts as lost."""
+
+
+@runtime_checkable
+class InDrive(Protocol):
+    """An estimator that is told something of the car, or of the road, before a drive."""
+
+    def in_drive(self, drive: EvaluatedDrive) -> Estimate:
+        """Return the estimator for a drive."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of a drive on which errors are also taken by themselves; `rows` has shape (ticks,)."""
+
+    name: str
+    criterion: str
+    rows: BoolArray
+
+
+@dataclass(frozen=True)
+class Result:
+    """Figures of one estimator on one drive; inside and outside of each section by its name."""
+
+    whole: ErrorFigures
+    inside: Mapping[str, ErrorFigures]
+    outside: Mapping[str, ErrorFigures]
+
+
+@dataclass(frozen=True)
+class EvaluatedScenario:
+    """One scenario: the drive, its sections, and estimates and results by estimator."""
+
+    drive: EvaluatedDrive
+    sections: tuple[Section, ...]
+    estimates: Mapping[str, FloatArray]
+    results: Mapping[str, Result]
+
+    @property
+    def scenario(self) -> Scenario:
+        """What the drive is a test of."""
+        return self.drive.scenario
+
+
+def simulate_scenarios(
+    warehouse: Warehouse,
+    scenarios: Sequence[Scenario],
+    executor: Executor,
+    progress: Progress = no_progress,
+) -> SimulationReport:
+    """Write the drives that are not in the logs yet, and bring the Gram rows up to date.
+
+    Raises `RefusedError` if a scenario was changed since its drive was simulated.
+    """
+    batches = {scenario.drive_id: scenario.batch() for scenario in scenarios}
+    report = simulate_batches(warehouse, list(batches.values()), executor, progress)
+    if report.changed:
+        update_grams(warehouse)
+    return report
+
+
+def run_all(
+    warehouse: Warehouse, scenarios: Sequence[Scenario], estimators: Mapping[str, Estimate]
+) -> tuple[EvaluatedScenario, ...]:
+    """Evaluate estimators on scenarios whose drives are in the logs."""
+    return tuple(evaluate_drive(drive, estimators) for drive in load_drives(warehouse, scenarios))
+
+
+def evaluate_drive(drive: EvaluatedDrive, estimators: Mapping[str, Estimate]) -> EvaluatedScenario:
+    """Evaluate estimators on one drive. An estimator sees its signals and nothing else."""
+    parts = sections(drive)
+    estimates = {name: _estimates(drive, estimate) for name, estimate in estimators.items()}
+    results = {name: _result(drive, parts, rad) for name, rad in estimates.items()}
+    return EvaluatedScenario(drive, parts, estimates, results)
+
+
+def _estimates(drive: EvaluatedDrive, estimate: Estimate) -> FloatArray:
+    """Return the estimates; none where the drive lacks what the estimator needs to begin."""
+    try:
+        if isinstance(estimate, InDrive):
+            estimate = estimate.in_drive(drive)
+        return estimate(drive.signals)
+    except (DataError, QuestionError):
+        return np.full(len(drive.time_s), np.nan)
+
+
+def _result(drive: EvaluatedDrive, parts: Sequence[Section], estimate_rad: FloatArray) -> Result:
+    def figures(among: BoolArray) -> ErrorFigures:
+        return error_figures(estimate_rad, drive.sideslip_rad, among & drive.evaluated)
+
+    return Result(
+        whole=figures(np.ones(len(estimate_rad), dtype=np.bool_)),
+        inside={part.name: figures(part.rows) for part in parts},
+        outside={part.name: figures(~part.rows) for part in parts},
+    )
+
+
+def sections(drive: EvaluatedDrive) -> tuple[Section, ...]:
+    """Return the sections of a drive that have any rows."""
+    found = (
+        Section("unstable", CRITERION, find_unstable(drive)),
+        Section(
+            "gps_outage",
+            f"more than {GPS_OUTAGE_S:g} s since the last fix of satellite navigation",
+            _without_gps(drive),
+        ),
+    )
+    return tuple(section for section in found if section.rows.any())
+
+
+def _without_gps(drive: EvaluatedDrive) -> BoolArray:
+    fixes = np.isfinite(drive.signals["gps_vx_mps"])
+    ticks = np.arange(len(fixes))
+    latest = np.maximum.accumulate(np.where(fixes, ticks, 0))
+    return (ticks - latest) > GPS_OUTAGE_S * SAMPLE_RATE_HZ

@@ -1,0 +1,257 @@
+"""What the estimators must reach on the paper's scenarios, checked; a miss is explained.
+
+Table II and the sentences of sections III.A to III.D, put into numbers.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.comparison.evaluation.errors import ErrorFigures
+from fleet_slip.comparison.evaluation.estimators import LinearEstimate
+from fleet_slip.comparison.evaluation.runs import GPS_OUTAGE_S, EvaluatedScenario
+from fleet_slip.comparison.evaluation.stability import find_stretches, rear_compliance
+from fleet_slip.simulation.sensors import Sensors
+
+TABLE_TWO_STD_DEG = {"1": 0.3018, "2": 0.1754, "3": 0.1556, "4": 0.1549, "5": 0.1505}
+"""The paper's error standard deviations on its nominal drive."""
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """A limit on a figure of a scenario, which may be compared with that of the nominal drive.
+
+    `found` takes the figures of the nominal drive and those of the scenario outside of unstable
+    sections. The limit is a largest value, or the `least` one.
+    """
+
+    text: str
+    scenario: str
+    found: Callable[[ErrorFigures, ErrorFigures], float]
+    limit: float
+    least: bool = False
+
+
+def _requirements(table_one: str) -> tuple[Requirement, ...]:
+    """Return what is asked of a model of Table I."""
+    return (
+        Requirement(
+            "nominal: error std at most Table II's, deg",
+            "nominal",
+            lambda _, here: _number(here.error_std_deg),
+            TABLE_TWO_STD_DEG[table_one],
+        ),
+        Requirement(
+            "nominal: size of the mean error at most 0.02, deg",
+            "nominal",
+            lambda _, here: abs(_number(here.error_mean_deg)),
+            0.02,
+        ),
+        Requirement(
+            "noise doubled: error std grows by at most 0.1, deg",
+            NOISE,
+            lambda nominal, here: _number(here.error_std_deg) - _number(nominal.error_std_deg),
+            0.1,
+        ),
+        *(
+            Requirement(
+                f"{mass}: error std within 0.1 of nominal, deg",
+                mass,
+                lambda nominal, here: abs(
+                    _number(here.error_std_deg) - _number(nominal.error_std_deg)
+                ),
+                0.1,
+            )
+            for mass in ("mass_1000", "mass_1740")
+        ),
+        Requirement(
+            "adhesion 0.7: correlation at least 0.95",
+            "adhesion_0_7",
+            lambda _, here: _number(here.correlation),
+            0.95,
+            least=True,
+        ),
+        Requirement(
+            "adhesion 0.4: correlation at least 0.9 while stable",
+            "adhesion_0_4",
+            lambda _, here: _number(here.correlation),
+            0.9,
+            least=True,
+        ),
+        Requirement(
+            "Melbourne: correlation lower than nominal by at most 0.05",
+            "melbourne",
+            lambda nominal, here: _number(nominal.correlation) - _number(here.correlation),
+            0.05,
+        ),
+    )
+
+
+NOISE = "noise_doubled"
+
+
+@dataclass(frozen=True)
+class Check:
+    """One requirement on one estimator: `found` against `limit`.
+
+    Both are NaN where there are no estimates. `explanation` is empty where it is reached.
+    """
+
+    requirement: str
+    scenario: str
+    estimator: str
+    found: float
+    limit: float
+    reached: bool
+    explanation: str = ""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what a JSON document needs."""
+        content = dict(vars(self))
+        for key in ("found", "limit"):
+            content[key] = content[key] if math.isfinite(content[key]) else None
+        return content
+
+
+def check_targets(
+    runs: Sequence[EvaluatedScenario],
+    models: Mapping[str, str],
+    estimators: Mapping[str, LinearEstimate],
+) -> tuple[Check, ...]:
+    """Check the models of Table I, given the name of each one's estimator.
+
+    A requirement whose scenario is not among the runs is left out, and all without the nominal one.
+    """
+    by_name = {run.scenario.name: run for run in runs}
+    if "nominal" not in by_name:
+        return ()
+    found = [
+        _check(requirement, by_name["nominal"], by_name[requirement.scenario], name, estimators)
+        for number, name in models.items()
+        for requirement in _requirements(number)
+        if requirement.scenario in by_name
+    ]
+    order = list(dict.fromkeys(check.requirement for check in found))
+    return tuple(sorted(found, key=lambda check: order.index(check.requirement)))
+
+
+def _check(
+    requirement: Requirement,
+    nominal: EvaluatedScenario,
+    run: EvaluatedScenario,
+    name: str,
+    estimators: Mapping[str, LinearEstimate],
+) -> Check:
+    found = requirement.found(nominal.results[name].whole, stable(run, name))
+    limit = requirement.limit
+    reached = found >= limit if requirement.least else found <= limit
+    explanation = ""
+    if not reached:
+        noisy = run.scenario.name == NOISE
+        explanation = _noise(estimators[name], nominal, run) if noisy else _compliance(run, nominal)
+    return Check(requirement.text, run.scenario.name, name, found, limit, reached, explanation)
+
+
+FILTER_SCENARIOS = ("nominal", "gps_clear", "gps_urban", "gps_tunnel")
+THE_PAPERS_CHOICE = "4"
+"""The model of Table I that the paper compares with the Kalman filter."""
+
+
+def check_filter_targets(
+    runs: Sequence[EvaluatedScenario], models: Mapping[str, str]
+) -> tuple[Check, ...]:
+    """Check that the regression has a smaller error than the paper's Kalman filter has.
+
+    As it is and tuned; over the drive, and while satellite navigation is out in the tunnel.
+    """
+    name = models.get(THE_PAPERS_CHOICE)
+    if name is None:
+        return ()
+    return tuple(
+        check
+        for run in runs
+        if run.scenario.name in FILTER_SCENARIOS
+        for rival in ("kalman", "kalman_tuned")
+        if rival in run.results
+        for check in _check_filters(run, name, rival)
+    )
+
+
+def _check_filters(run: EvaluatedScenario, name: str, rival: str) -> Iterator[Check]:
+    ours, theirs = run.results[name], run.results[rival]
+    parts = [("error std", ours.whole, theirs.whole, _CORRECTED)]
+    if "gps_outage" in ours.inside:
+        inside, outside = ours.inside["gps_outage"], theirs.inside["gps_outage"]
+        parts.append(("error std in outages", inside, outside, _drift(run)))
+    for figure, our, their, why in parts:
+        found, limit = _number(our.error_std_deg), _number(their.error_std_deg)
+        reached = found < limit
+        yield Check(
+            f"{run.scenario.name}: {figure} below that of {rival}, deg",
+            run.scenario.name,
+            name,
+            found,
+            limit,
+            reached,
+            "" if reached else why,
+        )
+
+
+_CORRECTED = (
+    "The filter is corrected by the true velocity with every fix of satellite navigation, which "
+    "the regression does without; while fixes come, its error is what their noise allows."
+)
+
+
+def _drift(run: EvaluatedScenario) -> str:
+    (section,) = (part for part in run.sections if part.name == "gps_outage")
+    longest_s = max(s.until_s - s.from_s for s in find_stretches(run.drive, section.rows))
+    return (
+        f"The longest outage of this drive lasts {longest_s + GPS_OUTAGE_S:.0f} s. With biases "
+        "known from before, the integrated accelerations drift no further in that time than the "
+        "regression is off."
+    )
+
+
+def stable(run: EvaluatedScenario, estimator: str) -> ErrorFigures:
+    """Return the figures outside of the unstable section, or of all where there is none."""
+    result = run.results[estimator]
+    return result.outside.get("unstable", result.whole)
+
+
+def _number(figure: float | None) -> float:
+    """Return a figure; an estimator without estimates reaches nothing."""
+    return math.nan if figure is None else figure
+
+
+def passed_noise_deg(model: LinearEstimate, sensors: Sensors) -> float:
+    """Return the standard deviation that white noise of the signals gives the estimate.
+
+    Noises of different signals are independent: sqrt(sum (coefficient * std)²).
+    """
+    stds = {catalogue()[name].column: std for name, (_, std) in sensors.bias_and_std.items()}
+    squares = [(weight * stds[column]) ** 2 for column, weight in model.coefficients.items()]
+    return math.degrees(math.sqrt(math.fsum(squares)))
+
+
+def _noise(model: LinearEstimate, nominal: EvaluatedScenario, noisy: EvaluatedScenario) -> str:
+    before = passed_noise_deg(model, nominal.scenario.sensors)
+    after = passed_noise_deg(model, noisy.scenario.sensors)
+    return (
+        "White noise of its signals alone reaches the estimate with a standard deviation of "
+        f"{before:.3f} deg at the initial noise and {after:.3f} deg here, the root of the sum of "
+        "(coefficient * standard deviation) squared. The fewer signals a model has, the larger "
+        "the coefficients that it puts on the noisy ones."
+    )
+
+
+def _compliance(run: EvaluatedScenario, nominal: EvaluatedScenario) -> str:
+    here = math.degrees(rear_compliance(run.drive))
+    there = math.degrees(rear_compliance(nominal.drive))
+    return (
+        f"The rear axle slips by {here:.3f} deg per m/s² of lateral acceleration here and by "
+        f"{there:.3f} in the nominal drive. Side-slip is b r / vx less that slip, and no signal of "
+        "the model tells how much load, tyres and road have changed it."
+    )

@@ -1,0 +1,149 @@
+"""The yaw rate by a Kalman filter of its own, which the paper's filter assumes to be there.
+
+The state is x = [r, b]: yaw rate and bias of the gyroscope, as Bevly, Ryu and Gerdes ("Integrating
+INS sensors with GPS measurements for continuous estimation of vehicle sideslip, roll, and tire
+cornering stiffness", IEEE Transactions on Intelligent Transportation Systems 7, 2006) estimate a
+gyroscope's bias against an absolute reference. The reference here is not the GPS heading, which a
+log has not, but the difference of wheel speeds (`wheel_speeds`), which no tunnel takes away:
+
+    r(k) = r(k−1) + Δt w_r        gyroscope   z_g = r + b + w_g
+    b(k) = b(k−1)                 wheels      z_w = r + w_w
+
+Wheels that brake in a corner slip more on the unloaded side: rows of braking give no z_w.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple, Self
+
+import numpy as np
+from pydantic import Field, FiniteFloat
+
+from fleet_slip.arrays import FloatArray
+from fleet_slip.comparison.observers.signals import STEP_S, DriveSignals
+from fleet_slip.comparison.observers.wheel_speeds import undriven_axle
+from fleet_slip.compiling import kernel
+from fleet_slip.config import Config
+from fleet_slip.simulation.sensors import Sensors
+from fleet_slip.vehicle.parameters import VehicleParameters
+
+INITIAL_STD_RAD_S = 1.0
+"""Of the yaw rate before the first measurement: nothing is known."""
+
+
+BRAKING_MPS2 = -0.5
+"""Longitudinal acceleration below which wheels are taken to brake; a coasting car stays above."""
+
+
+class YawRateNoise(Config):
+    """Standard deviations of the yaw rate filter; the defaults are the paper's initial noise."""
+
+    gyro_std_rad_s: FiniteFloat = Field(default=0.01, gt=0)
+    gyro_bias_std_rad_s: FiniteFloat = Field(default=0.01, gt=0)
+    """Of the bias before the drive."""
+    wheel_yaw_rate_std_rad_s: FiniteFloat = Field(default=0.006, gt=0)
+    """Of the yaw rate from wheel speeds: √2 R σ_ω / track with σ_ω of 0.02 rad/s."""
+    yaw_acceleration_std_rad_s2: FiniteFloat = Field(default=0.5, gt=0)
+    """How fast the yaw rate may change."""
+
+    @classmethod
+    def of(cls, sensors: Sensors, car: VehicleParameters, gyro_bias_std_rad_s: float) -> Self:
+        """Return the noise that the sensors of a car state."""
+        lever = np.sqrt(2) * car.tyre.rolling_radius_m / car.body.track_rear_m
+        return cls(
+            gyro_std_rad_s=sensors.yaw_rate_std_rad_s,
+            gyro_bias_std_rad_s=gyro_bias_std_rad_s,
+            wheel_yaw_rate_std_rad_s=lever * sensors.wheel_speed_std_rad_s,
+        )
+
+
+TUNABLE = (
+    "yaw_rate.gyro_std_rad_s",
+    "yaw_rate.wheel_yaw_rate_std_rad_s",
+    "yaw_rate.yaw_acceleration_std_rad_s2",
+)
+"""What is worth tuning of an estimator's `yaw_rate: YawRateNoise`."""
+
+
+@dataclass(frozen=True)
+class YawRateEstimate:
+    """Yaw rate and bias of the gyroscope at every row."""
+
+    yaw_rate_rad_s: FloatArray
+    gyro_bias_rad_s: FloatArray
+
+
+class Belief(NamedTuple):
+    """Mean of [r, b] and its covariance, upper triangle."""
+
+    r: float
+    b: float
+    p00: float
+    p01: float
+    p11: float
+
+
+@kernel
+def predict(x: Belief, step_variance: float) -> Belief:
+    """Return the belief one step later: P + diag((Δt σ)², 0)."""
+    return Belief(x.r, x.b, x.p00 + step_variance, x.p01, x.p11)
+
+
+@kernel
+def update(x: Belief, z: float, on_bias: float, variance: float) -> Belief:
+    """Return the belief given z = r + on_bias · b + w, in Joseph form.
+
+        K = P Hᵀ / (H P Hᵀ + R),   P ← (I − K H) P (I − K H)ᵀ + K R Kᵀ,   H = [1, on_bias]
+
+    A missing measurement, NaN, changes nothing.
+    """
+    if np.isnan(z):
+        return x
+    ph0 = x.p00 + on_bias * x.p01
+    ph1 = x.p01 + on_bias * x.p11
+    innovation_variance = ph0 + on_bias * ph1 + variance
+    k0, k1 = ph0 / innovation_variance, ph1 / innovation_variance
+    innovation = z - x.r - on_bias * x.b
+    a00, a01 = 1.0 - k0, -k0 * on_bias
+    a10, a11 = -k1, 1.0 - k1 * on_bias
+    return Belief(
+        x.r + k0 * innovation,
+        x.b + k1 * innovation,
+        a00 * (a00 * x.p00 + a01 * x.p01) + a01 * (a00 * x.p01 + a01 * x.p11) + k0 * variance * k0,
+        a10 * (a00 * x.p00 + a01 * x.p01) + a11 * (a00 * x.p01 + a01 * x.p11) + k0 * variance * k1,
+        a10 * (a10 * x.p00 + a11 * x.p01) + a11 * (a10 * x.p01 + a11 * x.p11) + k1 * variance * k1,
+    )
+
+
+@kernel
+def _filter(
+    gyro: FloatArray,
+    wheels: FloatArray,
+    first: Belief,
+    gyro_var: float,
+    wheel_var: float,
+    step_var: float,
+) -> FloatArray:
+    estimates = np.empty((2, len(gyro)))
+    belief = first
+    for k in range(len(gyro)):
+        belief = predict(belief, step_var)
+        belief = update(belief, gyro[k], 1.0, gyro_var)
+        belief = update(belief, wheels[k], 0.0, wheel_var)
+        estimates[0, k] = belief.r
+        estimates[1, k] = belief.b
+    return estimates
+
+
+def estimate(drive: DriveSignals, car: VehicleParameters, noise: YawRateNoise) -> YawRateEstimate:
+    """Estimate the yaw rate at every row from what was measured up to it; gaps are bridged."""
+    first = Belief(0.0, 0.0, INITIAL_STD_RAD_S**2, 0.0, noise.gyro_bias_std_rad_s**2)
+    rolling = drive.ax_mps2 > BRAKING_MPS2
+    yaw_rate, bias = _filter(
+        drive.yaw_rate_rad_s,
+        np.where(rolling, undriven_axle(drive, car).yaw_rate_rad_s, np.nan),
+        first,
+        noise.gyro_std_rad_s**2,
+        noise.wheel_yaw_rate_std_rad_s**2,
+        (STEP_S * noise.yaw_acceleration_std_rad_s2) ** 2,
+    )
+    return YawRateEstimate(yaw_rate, bias)

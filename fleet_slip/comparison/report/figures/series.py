@@ -1,0 +1,191 @@
+"""Side-slip angles over time, true and estimated, and beneath them the differences."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from fleet_slip.arrays import FloatArray
+from fleet_slip.comparison.evaluation.runs import EvaluatedScenario
+from fleet_slip.comparison.evaluation.stability import find_stretches
+from fleet_slip.comparison.report.figures.lines import band
+from fleet_slip.pages.style import Size, colour
+from fleet_slip.pages.text import degrees
+
+ANGLE_IN = 1.75
+STRIP_IN = 0.62
+GAP_IN = 0.12
+HEAD_IN = 0.42
+FOOT_IN = 0.42
+LEFT_IN = 0.42
+RIGHT_IN = 0.08
+REACHES_DEG = (0.2, 0.4, 0.6, 1.0, 2.0, 4.0, 6.0, 10.0, 20.0, 40.0, 90.0, 180.0, 360.0)
+COMPARABLE = 3
+"""Largest ratio of scales at which the smaller one is given up."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """One estimator in a figure."""
+
+    estimator: str
+    label: str
+    colour: str
+
+
+@dataclass(frozen=True)
+class Block:
+    """One drive in a figure.
+
+    Attributes:
+        title: what is special about the drive.
+        run: the drive with its estimates.
+        lines: drawn with the true angle; each also has a strip with its difference.
+        strips: more estimators, of which the difference alone is drawn.
+        shaded: name of the section to mark.
+    """
+
+    title: str
+    run: EvaluatedScenario
+    lines: tuple[Line, ...]
+    strips: tuple[Line, ...] = ()
+    shaded: str | None = None
+
+    @property
+    def all_strips(self) -> tuple[Line, ...]:
+        """All estimators of which the difference is drawn."""
+        return (*self.lines, *self.strips)
+
+    @property
+    def height_in(self) -> float:
+        """Height with its strips, head and foot."""
+        return HEAD_IN + ANGLE_IN + len(self.all_strips) * (STRIP_IN + GAP_IN) + FOOT_IN
+
+
+def side_slip(blocks: Sequence[Block], size: Size) -> Figure:
+    """Draw the blocks one above another."""
+    height = sum(block.height_in for block in blocks)
+    figure = Figure(figsize=(size.width_in, height))
+    top = height
+    for block, reach in zip(blocks, _reaches(blocks), strict=True):
+        _draw(figure, block, top, reach, size)
+        top -= block.height_in
+    return figure
+
+
+def _draw(figure: Figure, block: Block, top_in: float, reach: float, size: Size) -> None:
+    angle, *strips = _panels(figure, block, top_in)
+    time_s = block.run.drive.time_s
+    truth_deg = np.degrees(block.run.drive.sideslip_rad)
+    for axes in (angle, *strips):
+        axes.set_xlim(time_s[0], time_s[-1])
+        _shade(axes, block)
+    for line in block.lines:
+        _plot(axes=angle, x=time_s, y=_estimate_deg(block, line), line=line, size=size)
+    truth = band(time_s, truth_deg, size.bins)
+    angle.plot(truth.x, truth.mean, color=colour("truth"), linewidth=1.1)
+    _legend(figure, angle, block, top_in)
+    angle.set_ylabel("side-slip angle (deg)" if size.wide else "deg", labelpad=2)
+    for axes, line in zip(strips, block.all_strips, strict=True):
+        _plot(axes, time_s, _estimate_deg(block, line) - truth_deg, line, size)
+        axes.set_ylim(-reach, reach)
+        axes.set_yticks([-reach / 2, 0, reach / 2])
+        _caption(axes, block, line, size)
+    for axes in (angle, *strips[:-1]):
+        axes.tick_params(labelbottom=False, bottom=False)
+        axes.spines["bottom"].set_visible(False)
+    last = strips[-1] if strips else angle
+    last.set_xlabel("time (s)", labelpad=2)
+
+
+def _panels(figure: Figure, block: Block, top_in: float) -> Iterator[Axes]:
+    width, height = figure.get_size_inches()
+    across = (LEFT_IN / width, 1 - (LEFT_IN + RIGHT_IN) / width)
+    bottom = top_in - HEAD_IN - ANGLE_IN
+    yield figure.add_axes((across[0], bottom / height, across[1], ANGLE_IN / height))
+    for _ in block.all_strips:
+        bottom -= GAP_IN + STRIP_IN
+        yield figure.add_axes((across[0], bottom / height, across[1], STRIP_IN / height))
+
+
+def _estimate_deg(block: Block, line: Line) -> FloatArray:
+    drive = block.run.drive
+    estimate: FloatArray = np.where(
+        drive.evaluated, np.degrees(block.run.estimates[line.estimator]), np.nan
+    )
+    return estimate
+
+
+def _plot(axes: Axes, x: FloatArray, y: FloatArray, line: Line, size: Size) -> None:
+    series = band(x, y, size.bins)
+    tone = colour(line.colour)
+    axes.fill_between(series.x, series.low, series.high, color=tone, alpha=0.3, linewidth=0)
+    axes.plot(series.x, series.mean, color=tone, linewidth=1.0)
+
+
+def _reaches(blocks: Sequence[Block]) -> list[float]:
+    """Return the half-height of each block's strips: the same for all where that can be read."""
+    reaches = [_reach(block) for block in blocks]
+    comparable = max(reaches) <= COMPARABLE * min(reaches)
+    return [max(reaches)] * len(reaches) if comparable else reaches
+
+
+def _reach(block: Block) -> float:
+    """Return a round number that is larger than all differences of a block, in deg."""
+    truth = np.degrees(block.run.drive.sideslip_rad)
+    sizes = [np.abs(_estimate_deg(block, line) - truth) for line in block.all_strips]
+    largest = max(float(np.nanmax(values)) for values in sizes)
+    return next(reach for reach in REACHES_DEG if largest < reach)
+
+
+def _shade(axes: Axes, block: Block) -> None:
+    for section in block.run.sections:
+        if section.name == block.shaded:
+            name = "unstable" if section.name == "unstable" else "outage"
+            for stretch in find_stretches(block.run.drive, section.rows):
+                axes.axvspan(
+                    stretch.from_s, stretch.until_s, color=colour(name), alpha=0.16, linewidth=0
+                )
+
+
+def _legend(figure: Figure, axes: Axes, block: Block, top_in: float) -> None:
+    """Write the title, and beneath it the name of each line in its colour."""
+    width, height = figure.get_size_inches()
+    figure.text(LEFT_IN / width, (top_in - 0.05) / height, block.title, fontweight="bold", va="top")
+    names = [("true", "truth"), *((line.label, line.colour) for line in block.lines)]
+    if block.shaded and any(section.name == block.shaded for section in block.run.sections):
+        shade = ("unstable", "unstable") if block.shaded == "unstable" else ("no GPS", "outage")
+        names.append(shade)
+    left = LEFT_IN
+    for name, tone in names:
+        figure.text(
+            left / width,
+            (top_in - 0.24) / height,
+            f"\N{EM DASH} {name}"
+            if tone not in ("unstable", "outage")
+            else f"\N{BLACK SQUARE} {name}",
+            color=colour(tone),
+            va="top",
+        )
+        left += 0.07 * (len(name) + 3.5)
+    axes.margins(y=0.06)
+
+
+def _caption(axes: Axes, block: Block, line: Line, size: Size) -> None:
+    figures = block.run.results[line.estimator].whole
+    text = f"{line.label} \N{MINUS SIGN} true"
+    if figures.error_std_deg is not None and figures.error_mean_deg is not None:
+        std, mean = degrees(figures.error_std_deg), degrees(figures.error_mean_deg, sign=True)
+        text += f": std {std}, mean {mean}" if size.wide else f": std {std}"
+    axes.text(
+        0.0,
+        1.0,
+        text,
+        transform=axes.transAxes,
+        color=colour(line.colour),
+        fontsize=8.5,
+        va="center",
+        bbox={"facecolor": colour("surface"), "edgecolor": "none", "pad": 1.0, "alpha": 0.8},
+    )

@@ -1,0 +1,1 @@
+"""What a report knows: gathered from the warehouse, the registry and a kept evaluation."""

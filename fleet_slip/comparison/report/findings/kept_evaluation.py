@@ -1,0 +1,115 @@
+"""A kept evaluation, read back: the document that every number of a report comes from."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+from fleet_slip.comparison.evaluation.errors import ErrorFigures
+from fleet_slip.comparison.evaluation.results import evaluations_of
+from fleet_slip.errors import DataError
+from fleet_slip.files.documents import Document
+from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.warehouse.tables import Warehouse
+
+Side = Literal["inside", "outside"]
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """One evaluation of a model version.
+
+    Attributes:
+        document: the evaluation as it was kept.
+        group: the model version that it is about, `NAME@VERSION`.
+    """
+
+    document: Document
+    group: str
+
+    @property
+    def estimators(self) -> Mapping[str, Mapping[str, Any]]:
+        """What the document says of each estimator, by name."""
+        estimators: Mapping[str, Mapping[str, Any]] = self.document.content["estimators"]
+        return estimators
+
+    @cached_property
+    def scenarios(self) -> Mapping[str, Mapping[str, Any]]:
+        """What the document says of each scenario, by name, in its order."""
+        return {one["name"]: one for one in self.document.content["scenarios"]}
+
+    def rows(self, key: Literal["checks", "comparisons", "rivals"]) -> Sequence[Mapping[str, Any]]:
+        """Return one of the document's lists."""
+        rows: Sequence[Mapping[str, Any]] = self.document.content[key]
+        return rows
+
+    @property
+    def gps_noise(self) -> Mapping[str, Any] | None:
+        """The filters' errors over the noise of GPS; None in evaluations without it."""
+        sweep: Mapping[str, Any] | None = self.document.content.get("gps_noise")
+        return sweep
+
+    @cached_property
+    def models(self) -> Mapping[str, str]:
+        """The estimator's name of each model of Table I that the cohort could serve."""
+        return {
+            about["table_one"]: name
+            for name, about in self.estimators.items()
+            if about["group"] == self.group and "table_one" in about
+        }
+
+    def of_kind(self, kind: str) -> list[str]:
+        """Return the names of the estimators of a kind: regression, filter or rival."""
+        return [name for name, about in self.estimators.items() if about["kind"] == kind]
+
+    def figures(self, scenario: str, estimator: str) -> ErrorFigures | None:
+        """Return the error figures over a whole drive; None if that was not evaluated."""
+        found = self._result(scenario, estimator)
+        return None if found is None else _figures(found)
+
+    def part(self, scenario: str, estimator: str, side: Side, section: str) -> ErrorFigures | None:
+        """Return the error figures inside or outside of a section of a drive.
+
+        None if that was not evaluated, or the drive has no such section.
+        """
+        found = self._result(scenario, estimator)
+        if found is None or section not in found[side]:
+            return None
+        return _figures(found[side][section])
+
+    def stretches(self, scenario: str, section: str) -> list[tuple[float, float]]:
+        """Return begin and end in s of the stretches of a section; none if there is no such."""
+        sections = self.scenarios[scenario]["sections"] if scenario in self.scenarios else []
+        return [
+            (stretch["from_s"], stretch["until_s"])
+            for found in sections
+            if found["name"] == section
+            for stretch in found["stretches"]
+        ]
+
+    def _result(self, scenario: str, estimator: str) -> Mapping[str, Any] | None:
+        if scenario not in self.scenarios:
+            return None
+        result: Mapping[str, Any] | None = self.scenarios[scenario]["results"].get(estimator)
+        return result
+
+
+def _figures(found: Mapping[str, Any]) -> ErrorFigures:
+    return ErrorFigures(**{name: found[name] for name in ErrorFigures.__dataclass_fields__})
+
+
+def latest_of(warehouse: Warehouse, version: ModelVersion) -> Evaluated:
+    """Return the latest evaluation that is about a model version.
+
+    Raises `DataError` if there is none.
+    """
+    kept = evaluations_of(warehouse)
+    for number in reversed(kept.numbers()):
+        document = kept.read(number)
+        first = next(iter(document.content["estimators"].values()))
+        if first["group"] == version.reference:
+            return Evaluated(document, version.reference)
+    raise DataError(
+        f"{version.reference} has not been evaluated. Run: fleet-slip evaluate --one-car "
+        f"{version.reference}"
+    )

@@ -1,0 +1,168 @@
+"""What columns over time buy: error by number of columns, and error without each column or window.
+
+Everything but the errors on test drives comes from Gram rows.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fleet_slip.arrays import FloatArray
+from fleet_slip.catalogue.features import features, input_scales
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.comparison.evaluation.errors import error_figures
+from fleet_slip.comparison.evaluation.estimators import as_counts
+from fleet_slip.comparison.evaluation.runs import EvaluatedScenario
+from fleet_slip.grams.cohort import Cohort
+from fleet_slip.grams.column_plan import ColumnPlan
+from fleet_slip.grams.columns import DriveColumns
+from fleet_slip.grams.folding import Folding
+from fleet_slip.models.manifest import Manifest
+from fleet_slip.regression.crossval import CrossValidation, cross_validate_inputs
+from fleet_slip.regression.folds import CohortFolds
+from fleet_slip.selection.model_list import Search
+from fleet_slip.selection.stepwise import SearchedModels, search_models
+from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
+
+DRIVES = ("nominal", "melbourne", "noise_doubled", "style_sporty")
+"""Test drives whose errors stand beside the cross-validated one."""
+
+THIS_SAMPLE = "this sample"
+SINCE_START = "since the start"
+
+
+@dataclass(frozen=True)
+class Without:
+    """The cross-validated RMSE of a model refitted without some of its columns.
+
+    Attributes:
+        name: what is left out.
+        columns: how many columns that is.
+        rmse_deg: without them.
+    """
+
+    name: str
+    columns: int
+    rmse_deg: float
+
+
+@dataclass(frozen=True)
+class Memory:
+    """What memory buys a published model.
+
+    Attributes:
+        searched: models of 1, 2, ... columns that a search finds among all inputs of its set.
+        on_drives: RMSE in deg of these models on test drives, by scenario, each shape (sizes,).
+        rmse_deg: cross-validated, of the published model's columns as they stand. (The figure of a
+            search is larger: there they are chosen again in every fold.)
+        columns: without one of its columns, the dearest first.
+        windows: without all columns of one length, from short to long.
+    """
+
+    searched: SearchedModels
+    on_drives: Mapping[str, FloatArray]
+    rmse_deg: float
+    columns: tuple[Without, ...]
+    windows: tuple[Without, ...]
+
+    @property
+    def cross_validated_deg(self) -> FloatArray:
+        """Cross-validated RMSE of each size, shape (sizes,)."""
+        return np.array([model.pooled.rmse_deg for model in self.searched.models])
+
+
+def looks_back(manifest: Manifest) -> bool:
+    """Return whether a model has columns over time."""
+    return any(term.definition and term.definition.over for term in manifest.terms)
+
+
+def weigh_memory(
+    cohort: Cohort,
+    manifest: Manifest,
+    folding: Folding,
+    runs: Mapping[str, EvaluatedScenario],
+) -> Memory:
+    """Weigh the columns of a published model, given the cohort with the Gram rows of its set."""
+    search = Search(method="exchange", most=len(manifest.terms))  # as configs/models/estimator.toml
+    searched = search_models(
+        cohort, cohort.inputs, folding, search, intercept=not manifest.through_origin
+    )
+    folds = cohort.folds(folding.by, folding.count)
+    whole = _refit(folds, manifest, manifest.signals)
+    columns = _without(folds, manifest, {name: [name] for name in manifest.signals})
+    return Memory(
+        searched=searched,
+        on_drives={
+            name: _errors_on(runs[name], searched.models, cohort.feature_set)
+            for name in DRIVES
+            if name in runs
+        },
+        rmse_deg=whole.pooled.rmse_deg,
+        columns=tuple(sorted(columns, key=lambda one: -one.rmse_deg)),
+        windows=tuple(_without(folds, manifest, by_length(manifest))),
+    )
+
+
+def by_length(manifest: Manifest) -> dict[str, list[str]]:
+    """Return the columns of each length of window, from short to long."""
+    found: dict[float, list[str]] = {}
+    for term in manifest.terms:
+        one = term.definition
+        ticks = one.ticks or np.inf if one and one.over else 0
+        found.setdefault(ticks, []).append(term.signal)
+    return {_length(ticks): found[ticks] for ticks in sorted(found)}
+
+
+def _length(ticks: float) -> str:
+    if not ticks:
+        return THIS_SAMPLE
+    return SINCE_START if np.isinf(ticks) else f"{ticks / SAMPLE_RATE_HZ:.2f} s"
+
+
+def _without(
+    folds: CohortFolds, manifest: Manifest, groups: Mapping[str, Sequence[str]]
+) -> Iterator[Without]:
+    for name, left_out in groups.items():
+        kept = [signal for signal in manifest.signals if signal not in left_out]
+        if kept:
+            yield Without(name, len(left_out), _refit(folds, manifest, kept).pooled.rmse_deg)
+
+
+def _refit(folds: CohortFolds, manifest: Manifest, signals: Sequence[str]) -> CrossValidation:
+    return cross_validate_inputs(
+        "",
+        folds,
+        signals,
+        catalogue().label,
+        input_scales(),
+        intercept=not manifest.through_origin,
+    )
+
+
+def _errors_on(
+    run: EvaluatedScenario, models: Sequence[CrossValidation], feature_set: str
+) -> FloatArray:
+    """Return the RMSE in deg of each model on a drive, from the columns that a car would have."""
+    used = {name for model in models for name in model.signals}
+    whole = ColumnPlan.of_set(features(), feature_set)
+    names = tuple(name for name in whole.names if name in used)
+    plan = ColumnPlan.of(
+        names,
+        {name: whole.rows[name] for name in names if name in whole.rows},
+        {name: whole.windows[name] for name in names if name in whole.windows},
+    )
+    drive = run.drive
+    columns = DriveColumns(plan, as_counts(drive.signals, plan.signals, drive.facts)).compute()
+    physical = {
+        name: column * float(input_scales()[name])
+        for name, column in zip(names, columns, strict=True)
+    }
+    errors = []
+    for model in models:
+        weights = model.model.weights
+        terms = [weight * physical[name] for name, weight in weights.items()]
+        estimate = np.sum(terms, axis=0) + model.model.offset
+        found = error_figures(estimate, drive.sideslip_rad, drive.evaluated).rmse_deg
+        errors.append(np.nan if found is None else found)
+    return np.array(errors)

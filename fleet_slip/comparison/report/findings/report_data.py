@@ -1,0 +1,297 @@
+"""Everything that a report shows, gathered from warehouse, registry and evaluation."""
+
+import hashlib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from fleet_slip.canonical import canonical_json, sha256_of
+from fleet_slip.catalogue.feature_sets import PLAIN
+from fleet_slip.catalogue.features import features
+from fleet_slip.catalogue.sources import SCENARIO
+from fleet_slip.comparison.evaluation.estimators import (
+    TABLE_ONE,
+    Estimate,
+    LinearEstimate,
+    TrainedModels,
+    published_estimate,
+    train_models,
+)
+from fleet_slip.comparison.evaluation.filters import rebuild
+from fleet_slip.comparison.evaluation.runs import EvaluatedScenario, run_all
+from fleet_slip.comparison.evaluation.targets import THE_PAPERS_CHOICE
+from fleet_slip.comparison.report.findings.cars import Cars, weigh_cars
+from fleet_slip.comparison.report.findings.coefficients import Coefficients, coefficient_table
+from fleet_slip.comparison.report.findings.histogram import Histogram, held_out_histogram
+from fleet_slip.comparison.report.findings.kept_evaluation import Evaluated, latest_of
+from fleet_slip.comparison.report.findings.memory import Memory, looks_back, weigh_memory
+from fleet_slip.comparison.report.findings.ordering import Ordering, compare_orders
+from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.grams.cohort import Cohort, load_cohort
+from fleet_slip.grams.folding import BANDS, Folding
+from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.regression.crossval import CrossValidation
+from fleet_slip.regression.nested_choice import NestedDistances
+from fleet_slip.resources import config_file
+from fleet_slip.selection.compare import Selection, select
+from fleet_slip.selection.model_list import load_model_list
+from fleet_slip.selection.search import try_distances
+from fleet_slip.simulation.scenario import Scenario, load_scenario, shipped_scenarios
+from fleet_slip.views import connect
+from fleet_slip.warehouse.database import reading_files
+from fleet_slip.warehouse.tables import Warehouse
+
+DRAWN_FILTERS = ("kalman", "kalman_tuned")
+DRAWN_SCENARIOS = (
+    "nominal",
+    "noise_doubled",
+    "mass_1000",
+    "mass_1740",
+    "adhesion_0_7",
+    "adhesion_0_4",
+    "melbourne",
+    "gps_tunnel",
+    "style_gentle",
+    "style_brisk",
+    "style_sporty",
+    "style_limit",
+)
+MOST_TERMS = 60
+"""Of a larger model, neither standard errors nor what each column buys are shown: hundreds of rows
+tell nothing, and take an hour to compute."""
+
+SAME = 1e-6
+"""Relative difference below which two figures of the same estimates are the same."""
+
+
+@dataclass(frozen=True)
+class TableSize:
+    """One table of the warehouse: its version, and what it holds."""
+
+    name: str
+    version: int | None
+    files: int
+    rows: int
+    size_bytes: int
+    drives: int | None
+
+
+@dataclass(frozen=True)
+class ConfigHash:
+    """One configuration and the checksum of what it says."""
+
+    name: str
+    sha256: str
+
+
+@dataclass(frozen=True)
+class ReportData:
+    """All that a report shows.
+
+    Attributes:
+        version: the model version that it is about.
+        evaluated: its latest evaluation.
+        trained: its cohort, and the models of Table I on it.
+        runs: drives of the evaluation's scenarios with the estimates that figures show.
+        coefficients: of the paper's choice, then of the published model if it is another and small.
+        histogram: held-out estimates of all training rows by the paper's choice.
+        ordering: what the order of the signals is worth.
+        by_speed: the models of Table I with whole bands of speed left out, by name; empty where all
+            drives are of one speed.
+        distances: of the nested models of all signals in their declared order, or why there are
+            none.
+        memory: what columns over time are worth; None if the model has none, or too many.
+        cars: what a car's own numbers are worth; None without a fleet in the data root.
+        tables: of the warehouse.
+        campaigns: of the drives that the model was trained on.
+        configs: checksums of what determines the results.
+        shipped: names of all shipped scenarios, evaluated or not.
+    """
+
+    version: ModelVersion
+    evaluated: Evaluated
+    trained: TrainedModels
+    runs: Mapping[str, EvaluatedScenario]
+    coefficients: tuple[Coefficients, ...]
+    histogram: Histogram
+    ordering: Ordering
+    by_speed: Mapping[str, CrossValidation]
+    distances: NestedDistances | str
+    memory: Memory | None
+    cars: Cars | None
+    tables: tuple[TableSize, ...]
+    campaigns: tuple[str, ...]
+    configs: tuple[ConfigHash, ...]
+    shipped: tuple[str, ...]
+
+    @property
+    def choice(self) -> str:
+        """Estimator's name of the model that the paper settles on."""
+        return self.evaluated.models[self.choice_number]
+
+    @property
+    def choice_number(self) -> str:
+        """Its number in Table I; of the last that the training drives have the signals for."""
+        return _choose(list(self.evaluated.models))
+
+
+def _choose(names: Sequence[str]) -> str:
+    """Return the paper's choice, or the last model where the drives lack signals of that."""
+    return THE_PAPERS_CHOICE if THE_PAPERS_CHOICE in names else names[-1]
+
+
+def _paper_choice(models: Sequence[CrossValidation]) -> CrossValidation:
+    chosen = _choose([model.name for model in models])
+    return next(model for model in models if model.name == chosen)
+
+
+def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
+    """Gather a report about a model version.
+
+    Raises `DataError` if the version has not been evaluated, or if its cohort or a drive of a
+    scenario has changed since: all numbers of a report must be of the same data.
+    """
+    evaluated = latest_of(warehouse, version)
+    trained = train_models(warehouse, version)
+    _same_models(evaluated, trained)
+    shipped = shipped_scenarios()
+    scenarios = [one for one in shipped if one.name in evaluated.scenarios]
+    drawn = [one for one in scenarios if one.name in DRAWN_SCENARIOS]
+    runs = {
+        run.scenario.name: run
+        for run in run_all(warehouse, drawn, drawn_estimators(evaluated, version))
+    }
+    _same_figures(evaluated, runs)
+    cohort, models = trained.selection.cohort, trained.selection.models
+    own = _own_cohort(warehouse, trained)
+    manifest = version.manifest
+    choice = _paper_choice(models)
+    signals = tuple(dict.fromkeys(models[-1].signals))
+    return ReportData(
+        version=version,
+        evaluated=evaluated,
+        trained=trained,
+        runs=runs,
+        coefficients=_coefficients(trained, own),
+        histogram=held_out_histogram(warehouse, trained.selection, choice),
+        ordering=compare_orders(cohort, signals),
+        by_speed=_by_speed(trained.selection),
+        distances=try_distances(cohort, signals, trained.selection.folds),
+        memory=weigh_memory(own, manifest, trained.selection.folds, runs)
+        if looks_back(manifest) and len(manifest.terms) <= MOST_TERMS
+        else None,
+        cars=weigh_cars(warehouse),
+        tables=_tables(warehouse),
+        campaigns=tuple(sorted(set(cohort.drives["campaign"].to_pylist()))),
+        configs=_configs(scenarios),
+        shipped=tuple(one.name for one in shipped),
+    )
+
+
+def drawn_estimators(evaluated: Evaluated, version: ModelVersion) -> dict[str, Estimate]:
+    """Return the estimators that figures show, rebuilt from what the evaluation says of them."""
+    car = load_scenario("nominal").car
+    estimators: dict[str, Estimate] = {}
+    for name in evaluated.models.values():
+        about = evaluated.estimators[name]
+        estimators[name] = LinearEstimate(about["intercept"], about["coefficients"])
+    for name in DRAWN_FILTERS:
+        if name in evaluated.estimators:
+            estimators[name] = rebuild(name, evaluated.estimators[name], car)
+    return estimators | {version.reference: published_estimate(version.manifest)}
+
+
+def _same_models(evaluated: Evaluated, trained: TrainedModels) -> None:
+    now = {name: model.as_dict() for name, model in trained.estimators().items()}
+    for name in evaluated.models.values():
+        kept = evaluated.estimators[name]
+        if name not in now or now[name] != {key: kept.get(key) for key in now[name]}:
+            raise DataError(_changed(evaluated, f"the cohort of {evaluated.group}"))
+
+
+def _same_figures(evaluated: Evaluated, runs: Mapping[str, EvaluatedScenario]) -> None:
+    for scenario, run in runs.items():
+        for name, result in run.results.items():
+            kept = evaluated.figures(scenario, name)
+            found = result.whole.rmse_deg
+            if kept is None or not _same(kept.rmse_deg, found):
+                raise DataError(_changed(evaluated, f"the drive of {scenario}, or {name},"))
+
+
+def _same(first: float | None, second: float | None) -> bool:
+    if first is None or second is None:
+        return first is second
+    return math.isclose(first, second, rel_tol=SAME)
+
+
+def _changed(evaluated: Evaluated, what: str) -> str:
+    return (
+        f"{what} has changed since evaluation {evaluated.document.number}. Run: fleet-slip "
+        f"evaluate --one-car {evaluated.group}"
+    )
+
+
+def _by_speed(selection: Selection) -> dict[str, CrossValidation]:
+    """Return the same models with as many whole bands of speed left out, one after another."""
+    bands = Folding(by=BANDS, count=selection.folds.count)
+    try:
+        found = select(selection.cohort, load_model_list(TABLE_ONE).model, bands)
+    except (DataError, QuestionError):
+        return {}
+    return {model.name: model for model in found.models}
+
+
+def _own_cohort(warehouse: Warehouse, trained: TrainedModels) -> Cohort:
+    """Return the cohort with the Gram rows that the published model was made of."""
+    cohort = trained.selection.cohort
+    name = features().name_of(trained.version.manifest.trained_on.feature_set)
+    return cohort if name == PLAIN else load_cohort(warehouse, cohort.condition, name)
+
+
+def _coefficients(trained: TrainedModels, own: Cohort) -> tuple[Coefficients, ...]:
+    cohort, published = trained.selection.cohort, trained.version
+    choice = _paper_choice(trained.selection.models)
+    tables = [coefficient_table(cohort, f"model {choice.name}", choice.signals)]
+    signals = published.manifest.signals
+    if set(signals) != set(choice.signals) and len(signals) <= MOST_TERMS:
+        intercept = not published.manifest.through_origin
+        tables.append(coefficient_table(own, published.reference, signals, intercept=intercept))
+    return tuple(tables)
+
+
+def _tables(warehouse: Warehouse) -> tuple[TableSize, ...]:
+    with connect(warehouse.root) as database, reading_files(database, "counting drives"):
+        counted = database.execute(
+            "SELECT source = $scenario, count(*) FROM drives GROUP BY ALL", {"scenario": SCENARIO}
+        ).fetchall()
+    drives = sum(number for _, number in counted)
+    sizes = []
+    for table in (warehouse.logs, warehouse.grams, warehouse.quarantine):
+        snapshot = table.snapshot()
+        sizes.append(
+            TableSize(
+                name=table.folder.name,
+                version=snapshot.version,
+                files=len(snapshot.files),
+                rows=snapshot.rows,
+                size_bytes=snapshot.size_bytes,
+                drives=drives if table is warehouse.logs else None,
+            )
+        )
+    return tuple(sizes)
+
+
+def _configs(scenarios: list[Scenario]) -> tuple[ConfigHash, ...]:
+    signals = config_file("signals.toml").read_bytes()
+    hashes = [
+        ConfigHash("configs/signals.toml", hashlib.sha256(signals).hexdigest()),
+        ConfigHash(f"configs/models/{TABLE_ONE}.toml", load_model_list(TABLE_ONE).sha256),
+    ]
+    return (*hashes, *(_of_scenario(one) for one in scenarios))
+
+
+def _of_scenario(scenario: Scenario) -> ConfigHash:
+    """Return the checksum of all that determines a scenario's drive, and of its failures."""
+    failures = [failure.model_dump(mode="json") for failure in scenario.failures]
+    text = canonical_json({"drive": scenario.batch().digest, "failures": failures})
+    return ConfigHash(f"configs/scenarios/{scenario.name}.toml", sha256_of(text))

@@ -1,0 +1,138 @@
+"""The report as one static page, without a request to anywhere."""
+
+from collections import Counter
+from collections.abc import Sequence
+
+from fleet_slip.comparison.report.claims import Judged, judge_claims
+from fleet_slip.comparison.report.claims.claim import Status
+from fleet_slip.comparison.report.findings.report_data import ReportData
+from fleet_slip.comparison.report.pictures.road_pictures import standings
+from fleet_slip.comparison.report.tables import further_tables, paper_tables
+from fleet_slip.pages.drawing import draw
+from fleet_slip.pages.picture import Picture
+from fleet_slip.pages.table import ReportTable, Tile
+from fleet_slip.pages.templating import fill_in
+from fleet_slip.pages.text import count, degrees, size
+from fleet_slip.words import number_of
+
+SECTIONS = ("figure-", "memory-", "road-", "fleet-")
+"""What the keys of pictures begin with that have sections of their own."""
+
+
+def render(data: ReportData, shown: Sequence[Picture]) -> str:
+    """Return the page."""
+    drawn = [draw(one) for one in shown]
+    claims = judge_claims(data)
+    return fill_in(
+        "report.html.j2",
+        version=data.version,
+        evaluation=data.evaluated.document,
+        paper=[one for one in drawn if one.picture.key.startswith("figure-")],
+        beyond=[one for one in drawn if not one.picture.key.startswith(SECTIONS)],
+        memory=[one for one in drawn if one.picture.key.startswith("memory-")],
+        roads=[one for one in drawn if one.picture.key.startswith("road-")],
+        fleet=[one for one in drawn if one.picture.key.startswith("fleet-")],
+        table_one=paper_tables.table_one(data),
+        table_two=paper_tables.table_two(data),
+        distances=paper_tables.distances(data),
+        targets=list(paper_tables.targets(data)),
+        further=_further(data),
+        coefficients=list(further_tables.coefficient_tables(data)),
+        storage=further_tables.storage(data),
+        tiles=_tiles(data, claims),
+        claims=claims,
+        tally=_tally(claims),
+        statuses=list(Status),
+        missing=missing_scenarios(data),
+        provenance=_provenance(data),
+        configs=data.configs,
+        commands=_commands(data),
+    )
+
+
+def missing_scenarios(data: ReportData) -> list[str]:
+    """Return the names of the shipped scenarios that the evaluation left out."""
+    return [one for one in data.shipped if one not in data.evaluated.scenarios]
+
+
+def _further(data: ReportData) -> list[ReportTable]:
+    learned = further_tables.rivals(data)
+    return [
+        further_tables.scenarios(data),
+        standings(data),
+        *further_tables.fleets(data),
+        *([learned] if learned else []),
+    ]
+
+
+def _tally(claims: Sequence[Judged]) -> dict[Status, int]:
+    counted = Counter(one.verdict.status for one in claims)
+    return {status: counted[status] for status in Status}
+
+
+def _tiles(data: ReportData, claims: Sequence[Judged]) -> list[Tile]:
+    tally = _tally(claims)
+    cohort = data.trained.selection.cohort
+    tiles = [
+        Tile(
+            f"{tally[Status.REPRODUCED]} of "
+            f"{tally[Status.REPRODUCED] + tally[Status.NOT_REPRODUCED]}",
+            f"testable claims reproduced; {tally[Status.NOT_TESTABLE]} cannot be tested here",
+        ),
+        Tile(
+            count(cohort.rows),
+            f"training rows of {number_of(data.version.manifest.trained_on.drives, 'drive')}",
+        ),
+    ]
+    nominal = data.evaluated.figures("nominal", data.choice)
+    if nominal is not None and nominal.error_std_deg is not None:
+        number = data.choice_number
+        paper = paper_tables.PAPER_TABLE_TWO[number][1]
+        tiles.append(
+            Tile(
+                degrees(nominal.error_std_deg),
+                f"error std of model {number} on the nominal drive; the paper: {degrees(paper)}",
+            )
+        )
+    logs = data.tables[0]
+    tiles.append(
+        Tile(size(logs.size_bytes), f"of logs, {logs.size_bytes / logs.rows:.1f} bytes a row")
+    )
+    return tiles
+
+
+def _provenance(data: ReportData) -> list[tuple[str, str]]:
+    manifest = data.version.manifest
+    trained = manifest.trained_on
+    there = [one for one in data.tables if one.version is not None]
+    now = ", ".join(f"{one.name} {one.version}" for one in there)
+    return [
+        ("model version", data.version.reference),
+        ("its SHA-256", data.version.sha256),
+        ("signals", ", ".join(manifest.signals)),
+        ("cohort", trained.cohort),
+        ("trained on", f"{number_of(trained.drives, 'drive')}, {count(trained.rows)} rows"),
+        (
+            "table versions",
+            f"logs {trained.logs_version}, grams {trained.grams_version} when it was published; "
+            f"{now} now",
+        ),
+        ("model list", f"{manifest.selected_by.model_list}, {manifest.selected_by.config_sha256}"),
+        ("evaluation", f"evaluations/{data.evaluated.document.number}.json"),
+        ("its SHA-256", data.evaluated.document.sha256),
+        ("package", f"fleet-slip {data.evaluated.document.content['package_version']}"),
+    ]
+
+
+def _commands(data: ReportData) -> list[str]:
+    reference = data.version.reference
+    fleets = dict.fromkeys(
+        row["fleet"].rpartition("/")[0] for row in data.evaluated.rows("comparisons")
+    )
+    options = "".join(f" --fleet {name}" for name in fleets)
+    options += " --rivals" if data.evaluated.rows("rivals") else ""
+    return [
+        *(f"fleet-slip run --campaign {name}" for name in data.campaigns),
+        f"fleet-slip evaluate --one-car {reference}{options}",
+        f"fleet-slip report --model {reference}",
+    ]

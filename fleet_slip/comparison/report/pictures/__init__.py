@@ -1,0 +1,1 @@
+"""Which figures a report has, with their captions."""

@@ -1,0 +1,212 @@
+"""A Kalman filter with a decision tree: the tree says how far the model can be trusted.
+
+After Coyte et al., "Decision tree assisted EKF for vehicle slip angle estimation using inertial
+motion sensors", International Joint Conference on Neural Networks (2014): a tree sorts the inertial
+signals into kinds of driving, and each kind has error covariances of its own. Here the filter is
+`ekf_class`, tuned. A regression tree parts the training rows by how far that filter is off; the
+variance of the model's errors in each of its leaves is then sought like every other parameter.
+"""
+
+import time
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from pydantic import Field, FiniteFloat
+
+from fleet_slip.arrays import FloatArray, IntArray
+from fleet_slip.comparison.evaluation.errors import ErrorFigures, error_figures
+from fleet_slip.comparison.evaluation.estimators import Signals
+from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive
+from fleet_slip.comparison.evaluation.filters import FilterEstimate, seen
+from fleet_slip.comparison.observers import ekf
+from fleet_slip.comparison.observers.axle_forces import follow
+from fleet_slip.comparison.observers.signals import DriveSignals, LabelledDrive, hold_last
+from fleet_slip.comparison.observers.single_track import measured_speed_mps
+from fleet_slip.comparison.observers.tuning import tune
+from fleet_slip.comparison.rivals.learner import SEED, scikit_learn
+from fleet_slip.config import Config
+from fleet_slip.vehicle.parameters import VehicleParameters
+
+NAME = "ekf_tree"
+GROUP = "rivals"
+BASE = "ekf_class_tuned"
+"""The filter whose noise the tree changes."""
+
+LEAVES = 6
+LEAST_SHARE = 0.01
+"""Of the rows, in each leaf."""
+
+LAG = 0.05
+"""Share of a new sample in the inertial signals that the tree sees: they follow within 0.2 s."""
+
+SIGNALS = ("ax", "ay", "yaw_rate", "wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr", "steer_fl",
+           "steer_fr")  # fmt: skip
+
+
+class LeafNoise(Config):
+    """Variance of the model's errors in each leaf, over that of the filter."""
+
+    leaf_0: FiniteFloat = Field(default=1.0, ge=1e-3, le=1e4)
+    leaf_1: FiniteFloat = Field(default=1.0, ge=1e-3, le=1e4)
+    leaf_2: FiniteFloat = Field(default=1.0, ge=1e-3, le=1e4)
+    leaf_3: FiniteFloat = Field(default=1.0, ge=1e-3, le=1e4)
+    leaf_4: FiniteFloat = Field(default=1.0, ge=1e-3, le=1e4)
+    leaf_5: FiniteFloat = Field(default=1.0, ge=1e-3, le=1e4)
+
+    @property
+    def factors(self) -> FloatArray:
+        """The leaves' factors, shape (leaves,)."""
+        return np.array(list(self.model_dump().values()))
+
+
+def kinds(drive: DriveSignals, car: VehicleParameters) -> FloatArray:
+    """Return what tells kinds of driving apart, shape (rows, 4): |ax|, |ay|, |r| and |ay − r vx|.
+
+    The last is how fast the car slides sideways, and what its biases leave. Raises `DataError` if
+    a sensor is absent.
+    """
+    ax, ay = hold_last(drive.ax_mps2, "ax"), hold_last(drive.ay_mps2, "ay")
+    turning = hold_last(drive.yaw_rate_rad_s, "yaw rate")
+    sliding = ay - turning * measured_speed_mps(drive, car)
+    return np.stack([np.abs(follow(x, LAG)) for x in (ax, ay, turning, sliding)], axis=1)
+
+
+@dataclass(frozen=True)
+class TreeFilter:
+    """The filter with its tree, in a car.
+
+    Attributes:
+        base: the filter whose noise the tree changes.
+        tree: scikit-learn's regression tree on `kinds`.
+        leaves: number of the node of each leaf, in order.
+        noise: factor of each leaf.
+    """
+
+    base: FilterEstimate
+    tree: Any
+    leaves: IntArray
+    noise: LeafNoise
+
+    def in_drive(self, drive: EvaluatedDrive) -> "TreeFilter":
+        """Return the filter in the car of a drive."""
+        return replace(self, base=self.base.in_drive(drive))
+
+    def __call__(self, signals: Signals) -> FloatArray:
+        """Return the estimate at each tick."""
+        return self.estimate(seen(signals), self.base.car, self.noise)
+
+    def leaf(self, drive: DriveSignals, car: VehicleParameters) -> IntArray:
+        """Return the number of the leaf of each row, shape (rows,)."""
+        nodes = self.tree.apply(kinds(drive, car).astype(np.float32))
+        return np.asarray(np.searchsorted(self.leaves, nodes), dtype=np.int64)
+
+    def estimate(self, drive: DriveSignals, car: VehicleParameters, noise: LeafNoise) -> FloatArray:
+        """Estimate side-slip in rad at every row, with these factors."""
+        factors = noise.factors[self.leaf(drive, car)]
+        parameters = ekf.EkfNoise.model_validate(self.base.parameters.model_dump())
+        return ekf.estimate(drive, car, parameters, factors)
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes of the tree's nodes and of the leaves' factors."""
+        return int(self.tree.tree_.node_count * 24 + self.noise.factors.nbytes)
+
+
+def fit_tree_filter(
+    base: FilterEstimate, drives: Sequence[LabelledDrive], executor: Executor
+) -> TreeFilter:
+    """Fit the tree to the filter's squared errors, and seek the leaves' factors.
+
+    Raises `ExtraError` without scikit-learn.
+    """
+    car = base.car
+    seen_kinds = np.concatenate([kinds(drive.signals, car) for drive in drives])
+    parameters = ekf.EkfNoise.model_validate(base.parameters.model_dump())
+    errors = np.concatenate(
+        [ekf.estimate(drive.signals, car, parameters) - drive.sideslip_rad for drive in drives]
+    )
+    known = np.isfinite(errors)
+    tree = scikit_learn("tree").DecisionTreeRegressor(
+        max_leaf_nodes=LEAVES, min_samples_leaf=LEAST_SHARE, random_state=SEED
+    )
+    tree.fit(seen_kinds[known], errors[known] ** 2)
+    leaves = np.flatnonzero(tree.tree_.children_left < 0)
+    start = TreeFilter(base, tree, leaves, LeafNoise())
+    names = [f"leaf_{number}" for number in range(len(leaves))]
+    found = tune(start.estimate, start.noise, names, drives, car, executor)
+    return replace(start, noise=found.parameters)
+
+
+@dataclass(frozen=True)
+class TreeRival:
+    """The filter with its tree as a rival that was trained.
+
+    Attributes:
+        estimate: fitted to all training drives.
+        cross_validated: figures on each training drive, by a tree that has not seen it.
+        rows: rows of the training drives.
+        training_s: time to fit.
+        one_estimate_us: time of one step.
+    """
+
+    estimate: TreeFilter
+    cross_validated: ErrorFigures
+    rows: int
+    training_s: float
+    one_estimate_us: float
+    name: str = NAME
+
+    def description(self) -> dict[str, Any]:
+        """Return what a JSON document says of it as an estimator."""
+        return {
+            "kind": "rival",
+            "group": GROUP,
+            "signals": list(SIGNALS),
+            "told": "class",
+            "factors": self.estimate.noise.model_dump(),
+        }
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what a JSON document says of its accuracy and cost."""
+        return {
+            "name": self.name,
+            "learner": f"Kalman filter with a decision tree of {LEAVES} leaves",
+            "signals": list(SIGNALS),
+            "rows": self.rows,
+            "cross_validated": self.cross_validated.as_dict(),
+            "training_s": self.training_s,
+            "size_bytes": self.estimate.size_bytes,
+            "one_estimate_us": self.one_estimate_us,
+            "each_of_many_us": self.one_estimate_us,
+        }
+
+
+def train_tree_filter(
+    base: FilterEstimate, drives: Sequence[LabelledDrive], executor: Executor
+) -> TreeRival:
+    """Fit the filter with a tree to drives, and to all but each of them; measure it."""
+    started = time.perf_counter()
+    fitted = fit_tree_filter(base, drives, executor)
+    training_s = time.perf_counter() - started
+    started = time.perf_counter()
+    for drive in drives:
+        fitted.estimate(drive.signals, base.car, fitted.noise)
+    rows = sum(len(drive.signals) for drive in drives)
+    step_s = (time.perf_counter() - started) / rows
+    estimates = [_held_out(base, drives, number, executor) for number in range(len(drives))]
+    truth = np.concatenate([drive.sideslip_rad for drive in drives])
+    figures = error_figures(np.concatenate(estimates), truth, np.isfinite(truth))
+    return TreeRival(fitted, figures, rows, training_s, step_s * 1e6)
+
+
+def _held_out(
+    base: FilterEstimate, drives: Sequence[LabelledDrive], number: int, executor: Executor
+) -> FloatArray:
+    """Return the estimates of a drive by a filter that was fitted without it."""
+    drive = drives[number]
+    others = [*drives[:number], *drives[number + 1 :]] or drives
+    fitted = fit_tree_filter(base, others, executor)
+    return fitted.estimate(drive.signals, base.car, fitted.noise)

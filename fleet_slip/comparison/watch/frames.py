@@ -1,0 +1,216 @@
+"""What is to be seen of a drive: where the car is, its angles, its wheels, and its gates."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from fleet_slip.arrays import FloatArray
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
+from fleet_slip.comparison.evaluation.evaluated_drives import load_drives
+from fleet_slip.comparison.evaluation.runs import simulate_scenarios
+from fleet_slip.comparison.report.findings.gate_openings import gates_on
+from fleet_slip.errors import DataError, QuestionError, UsageError
+from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.resources import config_names
+from fleet_slip.simulation.scenario import load_scenario
+from fleet_slip.simulation.track import load_track
+from fleet_slip.views import connect
+from fleet_slip.warehouse.tables import Warehouse
+
+FRAMES_PER_S = 25
+SPACING_M = 3.0
+SMOOTHED_TICKS = 51
+WHEELS = ("fl", "fr", "rl", "rr")
+FACTS = ("vehicle_model", "mass_kg")
+
+
+@dataclass(frozen=True)
+class Frames:
+    """A drive at 25 frames a second; arrays have shape (frames,).
+
+    Attributes:
+        model: the version that estimates, NAME@VERSION.
+        x_m, y_m, heading_rad: place and direction of the car on the ground.
+        sideslip_deg: the reference; NaN where the drive has none.
+        estimate_deg: the estimate; NaN where the model lacks a signal.
+        wheel_rad_s: speeds of fl, fr, rl, rr; NaN where they were not logged.
+        steer_rad: mean angle of the front wheels.
+        gates: how far each gate of the model is open, from 0 to 1.
+        track: x and y of the track's centre line; empty where no track is known.
+    """
+
+    title: str
+    model: str
+    time_s: FloatArray
+    speed_mps: FloatArray
+    x_m: FloatArray
+    y_m: FloatArray
+    heading_rad: FloatArray
+    sideslip_deg: FloatArray
+    estimate_deg: FloatArray
+    wheel_rad_s: Mapping[str, FloatArray]
+    steer_rad: FloatArray
+    gates: Mapping[str, FloatArray]
+    track: tuple[FloatArray, FloatArray]
+
+    def part(self, from_s: float, until_s: float | None) -> "Frames":
+        """Return the frames of a part of the drive. Raises `UsageError` if it has none."""
+        wanted = self.time_s >= from_s
+        if until_s is not None:
+            wanted &= self.time_s <= until_s
+        if wanted.sum() < 2:
+            raise UsageError(
+                f"the drive lasts from {self.time_s[0]:.1f} to {self.time_s[-1]:.1f} s; choose a "
+                "part of it."
+            )
+        changed: dict[str, Any] = {}
+        for name, value in vars(self).items():
+            if isinstance(value, np.ndarray):
+                changed[name] = value[wanted]
+            elif isinstance(value, Mapping):
+                changed[name] = {key: array[wanted] for key, array in value.items()}
+        return replace(self, **changed)
+
+
+def is_scenario(what: str) -> bool:
+    """Whether a name or path is that of a scenario, not of a drive."""
+    return what.endswith(".toml") or what in config_names("scenarios")
+
+
+def scenario_frames(
+    warehouse: Warehouse, name: str, version: ModelVersion, executor: Any
+) -> Frames:
+    """Return the frames of a test drive, which is simulated if it is not in the logs.
+
+    Raises `ConfigError` for an unknown scenario.
+    """
+    scenario = load_scenario(name)
+    simulate_scenarios(warehouse, [scenario], executor)
+    (drive,) = load_drives(warehouse, [scenario])
+    columns = {
+        **drive.signals,
+        "sideslip_rad": drive.sideslip_rad,
+        "vx_mps": drive.vx_mps,
+        "vy_mps": drive.vy_mps,
+        "station_m": drive.station_m,
+        "lateral_offset_m": drive.lateral_offset_m,
+    }
+    facts = {**drive.facts, "track": scenario.track.name, "drive_id": scenario.drive_id}
+    title = f"{scenario.name}: {scenario.description}"
+    return _frames(title, columns, facts, drive.time_s, version)
+
+
+def drive_frames(warehouse: Warehouse, drive_id: str, version: ModelVersion) -> Frames:
+    """Return the frames of a drive of the logs. Raises `QuestionError` if there is none."""
+    names = [one.column for one in catalogue().signals.values()]
+    query = f"SELECT time_s, track, vehicle_model, mass_kg, {', '.join(names)} FROM log"
+    with connect(warehouse.root, query=query) as database:
+        statement = f"{query} WHERE drive_id = $drive ORDER BY time_s"
+        rows = database.sql(statement, params={"drive": drive_id}).to_arrow_table()
+    if not rows.num_rows:
+        raise QuestionError(
+            f"{drive_id!r} is no drive of the logs, and no scenario. See: "
+            'fleet-slip sql "SELECT drive_id FROM drives"'
+        )
+    columns = {name: _floats(rows, name) for name in names}
+    facts = {name: rows[name][0].as_py() for name in (*FACTS, "track")}
+    facts["drive_id"] = drive_id
+    return _frames(drive_id, columns, facts, _floats(rows, "time_s"), version)
+
+
+def _floats(rows: pa.Table, name: str) -> FloatArray:
+    values: FloatArray = rows[name].to_numpy().astype(np.float64)
+    return values
+
+
+def _frames(
+    title: str,
+    columns: Mapping[str, FloatArray],
+    facts: Mapping[str, Any],
+    time_s: FloatArray,
+    version: ModelVersion,
+) -> Frames:
+    seen = np.flatnonzero(np.diff(np.floor((time_s - time_s[0]) * FRAMES_PER_S + 1e-6), prepend=-1))
+    estimate = version.predict(_as_table(columns, facts, time_s))
+    vx, vy = _velocity(columns)
+    x, y, heading, track = _places(columns, facts, time_s, vx, vy)
+    gates = gates_on(version.manifest, columns, facts)
+    return Frames(
+        title=title,
+        model=version.reference,
+        time_s=time_s[seen],
+        speed_mps=np.hypot(vx, vy)[seen],
+        x_m=x[seen],
+        y_m=y[seen],
+        heading_rad=heading[seen],
+        sideslip_deg=np.degrees(columns["sideslip_rad"])[seen],
+        estimate_deg=np.degrees(np.asarray(estimate, dtype=np.float64))[seen],
+        wheel_rad_s={wheel: columns[f"wheel_{wheel}_rad_s"][seen] for wheel in WHEELS},
+        steer_rad=((columns["steer_fl_rad"] + columns["steer_fr_rad"]) / 2)[seen],
+        gates={name: values[seen] for name, values in gates.items()},
+        track=track,
+    )
+
+
+def _as_table(
+    columns: Mapping[str, FloatArray], facts: Mapping[str, Any], time_s: FloatArray
+) -> pa.Table:
+    """Return the drive as the view `log` has it; NaN is null there."""
+    arrays = {name: pa.array(values, from_pandas=True) for name, values in columns.items()}
+    known = {name: pa.array([value] * len(time_s)) for name, value in facts.items()}
+    return pa.table({**known, "time_s": time_s, **arrays})
+
+
+def _velocity(columns: Mapping[str, FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """Return vx and vy: the true ones, else by wheels and the reference angle.
+
+    Raises `DataError` if neither velocity nor wheel speeds were logged.
+    """
+    vx, vy = columns["vx_mps"], columns["vy_mps"]
+    if np.isfinite(vx).any():
+        return np.nan_to_num(vx), np.nan_to_num(vy)
+    wheels = [columns[f"wheel_{wheel}_rad_s"] for wheel in WHEELS]
+    if not np.isfinite(wheels).any():
+        raise DataError("the drive has neither a velocity nor wheel speeds: nothing can be shown.")
+    rolling = 0.31 * np.nan_to_num(np.nanmean(wheels, axis=0))
+    return rolling, rolling * np.tan(np.nan_to_num(columns["sideslip_rad"]))
+
+
+def _smooth(values: FloatArray) -> FloatArray:
+    """Return the mean over half a second around each tick, over less at the ends."""
+    window = np.ones(SMOOTHED_TICKS)
+    weights = np.convolve(np.ones(len(values)), window, "same")
+    smoothed: FloatArray = values[0] + np.convolve(values - values[0], window, "same") / weights
+    return smoothed
+
+
+def _places(
+    columns: Mapping[str, FloatArray],
+    facts: Mapping[str, Any],
+    time_s: FloatArray,
+    vx: FloatArray,
+    vy: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray, tuple[FloatArray, FloatArray]]:
+    """Return x, y and heading of the car, and the line of the track, if that is known."""
+    station, offset = columns["station_m"], columns["lateral_offset_m"]
+    empty = np.empty(0)
+    if facts.get("track") and np.isfinite(station).all():
+        track = load_track(str(facts["track"]))
+        line = track.centre_line(SPACING_M)
+        # The log has stations in steps of 0.25 m, which the car would jump.
+        smooth_m, offset = _smooth(np.unwrap(station, period=track.length_m)), _smooth(offset)
+        x, y, along = (
+            np.interp(smooth_m % track.length_m, line.station_m, values)
+            for values in (line.x_m, line.y_m, line.heading_rad)
+        )
+        x, y = x - offset * np.sin(along), y + offset * np.cos(along)
+        course = np.unwrap(np.arctan2(np.gradient(y), np.gradient(x)))
+        return x, y, course - np.arctan2(vy, np.maximum(vx, 0.5)), (line.x_m, line.y_m)
+    step = np.diff(time_s, prepend=time_s[0] - float(SAMPLE_TIME_S))
+    heading = np.cumsum(np.nan_to_num(columns["yaw_rate_rad_s"]) * step)
+    x = np.cumsum((vx * np.cos(heading) - vy * np.sin(heading)) * step)
+    y = np.cumsum((vx * np.sin(heading) + vy * np.cos(heading)) * step)
+    return x, y, heading, (empty, empty)

@@ -1,0 +1,1 @@
+"""What every page shares: its look, its drawings, its tables and its templates."""

@@ -1,0 +1,1 @@
+"""Many drives at once: each is a lane of a compiled loop."""

@@ -1,0 +1,124 @@
+"""The parts of a report that need no data root."""
+
+import math
+import re
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from matplotlib.figure import Figure
+
+from fleet_slip.comparison.report.figures.labels import apart
+from fleet_slip.comparison.report.figures.lines import band, smooth
+from fleet_slip.pages.drawing import inline, inline_svgs
+from fleet_slip.pages.picture import Picture
+from fleet_slip.pages.style import PALETTE, Size, colour
+from fleet_slip.pages.text import degrees, listed, number, percent, scientific, size
+
+
+def test_numbers_read_well() -> None:
+    assert number(-0.12345) == "−0.123"
+    assert number(None) == "–"
+    assert degrees(0.5, 1, sign=True) == "+0.5°"
+    assert percent(0.999, 1) == "99.9 %"
+    assert scientific(8.561e-4, 2) == "8.56 × 10⁻⁴"
+    assert scientific(-0.0421, 2) == "−0.0421"
+    assert size(36_164_683) == "36.2 MB"
+    assert size(999) == "999 B"
+    assert listed(["a", "b", "c"]) == "a, b and c"
+
+
+@given(
+    arrays(np.float64, st.integers(1, 300), elements=st.floats(-10, 10)),
+    st.integers(1, 40),
+)
+def test_a_band_holds_every_sample(values: np.ndarray, bins: int) -> None:
+    x = np.arange(len(values), dtype=np.float64)
+    found = band(x, values, bins)
+    assert len(found.x) <= bins
+    assert found.low.min() == values.min()
+    assert found.high.max() == values.max()
+    assert (found.low <= found.mean + 1e-9).all()
+    assert (found.mean <= found.high + 1e-9).all()
+
+
+def test_a_band_has_a_gap_where_there_is_no_value() -> None:
+    values = np.array([1.0, 2.0, np.nan, np.nan, 5.0])
+    found = band(np.arange(5.0), values, 3)
+    np.testing.assert_array_equal(found.mean, [1.5, np.nan, 5.0])
+    np.testing.assert_array_equal(found.x, [0.5, 2.5, 4.0])
+
+
+def test_smoothing_keeps_a_constant() -> None:
+    np.testing.assert_allclose(smooth(np.full(7, 3.0), 4), 3.0)
+
+
+@given(st.lists(st.floats(0, 1), min_size=1, max_size=6))
+def test_labels_are_apart_and_in_order(places: list[float]) -> None:
+    moved = apart(sorted(places), 0.1)
+    assert all(b - a >= 0.1 - 1e-9 for a, b in pairwise(moved))
+    assert moved[-1] <= 1
+
+
+def _luminance(hexadecimal: str) -> float:
+    channels = [int(hexadecimal[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in channels]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+def _contrast(first: str, second: str) -> float:
+    low, high = sorted((_luminance(first), _luminance(second)))
+    return (high + 0.05) / (low + 0.05)
+
+
+MODELS = tuple(f"model_{n}" for n in range(1, 6))
+WRITTEN_IN = ("ink", "muted", "truth", "unstable", "kalman", "kalman_tuned", *MODELS)
+
+
+@pytest.mark.parametrize("name", WRITTEN_IN)
+def test_text_is_legible_on_light_and_dark_pages(name: str) -> None:
+    """WCAG 2.2, success criterion 1.4.3: a contrast of at least 4.5."""
+    ground, tone = PALETTE["surface"], PALETTE[name]
+    assert _contrast(tone.light, ground.light) >= 4.5
+    assert _contrast(tone.dark, ground.dark) >= 4.5
+
+
+def test_no_two_colours_are_the_same() -> None:
+    lights = [tone.light for tone in PALETTE.values()]
+    assert len(set(lights)) == len(lights)
+
+
+def _draw(size: Size) -> Figure:
+    figure = Figure(figsize=(size.width_in, 2))
+    axes = figure.add_subplot()
+    axes.plot([0, 1, 2], [0, 1, math.pi], color=colour("model_4"))
+    axes.set_title("a <b> & c", color=colour("muted"))
+    return figure
+
+
+def test_a_drawing_on_the_page_takes_its_colours_from_the_page() -> None:
+    picture = Picture("key", "title", "caption", 'says "x" & <y>', _draw)
+    drawings = inline_svgs(picture)
+    for svg in drawings.values():
+        assert "var(--model-4)" in svg
+        assert not [tone.light for tone in PALETTE.values() if tone.light in svg]
+        assert "<style" not in svg
+        assert 'aria-label="says &quot;x&quot; &amp; &lt;y>"' in svg
+    names = [set(re.findall(r'\bid="([^"]+)"', svg)) for svg in drawings.values()]
+    assert names[0]
+    assert not names[0] & names[1]
+
+
+def test_references_follow_their_names() -> None:
+    svg = (
+        '<?xml version="1.0"?><svg viewBox="0 0 72 36"><defs><clipPath id="p1"/></defs>'
+        '<use xlink:href="#p1"/><g clip-path="url(#p1)"/></svg>'
+    )
+    found = inline(svg, "one", "text")
+    assert 'id="one-p1"' in found
+    assert 'href="#one-p1"' in found
+    assert "url(#one-p1)" in found
+    assert "max-width: 96px" in found
