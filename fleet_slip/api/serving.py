@@ -302,7 +302,7 @@ class Serving(Rooted):
         `with_gram` adds to C what counts Gram rows in the car, whose messages `receive` takes.
 
         Every export carries the version's checksum, the hash of the drives that made it, and
-        checks: inputs, among them the first ticks of a drive of the logs, and the angles.
+        checks: inputs that are made up, and the angles. No tick of a drive of the logs is in it.
 
         Raises `RefusedError` if no bound of the angle's error can be stated or counts mean
         something else now, `UsageError` for an unknown target, `ConfigError` if what it needs is

@@ -1,5 +1,6 @@
-"""Checks of a program that travel with it: ticks of a real drive and hostile ones, and the angles.
+"""Checks of a program that travel with it: ticks of made-up drives, and the angles.
 
+No tick is of a drive of the warehouse: an export goes to people who may not see the logs.
 The angles come from the columns as the warehouse's kernel computes them, which knows nothing of
 programs, and from exact integers.
 """
@@ -12,14 +13,13 @@ import pyarrow as pa
 
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.signals import COUNT_MAX
-from fleet_slip.export.program import Car, CarFact, Input, Program
+from fleet_slip.export.program import UNKNOWN_CAR, Car, CarFact, Input, Program
 from fleet_slip.grams.columns import DriveCounts
-from fleet_slip.grams.drive_rows import counts_of, read_drives
+from fleet_slip.grams.drive_rows import counts_of
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predictor import Predictor
-from fleet_slip.warehouse.tables import Warehouse
 
-REAL_TICKS = 300
+SMOOTH_TICKS = 300
 HOSTILE_TICKS = 200
 
 Sample = tuple[int | None, ...]
@@ -44,20 +44,18 @@ class Check:
     angles: tuple[int | None, ...]
 
 
-def make_checks(
-    manifest: Manifest, program: Program, warehouse: Warehouse | None
-) -> tuple[Check, ...]:
-    """Return the first ticks of a drive of the warehouse, if it has one, and hostile drives."""
-    known = _hostile_car(program)
-    found = [
-        _check(manifest, program, "extremes", known, _extremes(program, np.random.default_rng(1))),
-        _check(manifest, program, "holes", Car({}, {}), _holes(program, np.random.default_rng(2))),
-        _check(
-            manifest, program, "standstill", known, _standstill(program, np.random.default_rng(3))
-        ),
-    ]
-    real = None if warehouse is None else _real(manifest, program, warehouse)
-    return (real, *found) if real else tuple(found)
+def make_checks(manifest: Manifest, program: Program) -> tuple[Check, ...]:
+    """Return a smooth drive and hostile ones, each with the angle at every tick."""
+    hostile = _hostile_car(program)
+    drives: dict[str, tuple[Car, Iterable[Sample]]] = {
+        "smooth": (UNKNOWN_CAR, _smooth(program)),
+        "extremes": (hostile, _extremes(program, np.random.default_rng(1))),
+        "holes": (UNKNOWN_CAR, _holes(program, np.random.default_rng(2))),
+        "standstill": (hostile, _standstill(program, np.random.default_rng(3))),
+    }
+    return tuple(
+        _check(manifest, program, name, car, samples) for name, (car, samples) in drives.items()
+    )
 
 
 def angles_by_kernel(
@@ -112,26 +110,18 @@ def _check(
     return Check(name, car.fact_counts(program), car.number_counts(program), ticks, angles)
 
 
-def _real(manifest: Manifest, program: Program, warehouse: Warehouse) -> Check | None:
-    """Return the first ticks of the first drive of the logs; None without logs."""
-    plan = Predictor.of(manifest).plan
-    for file in warehouse.logs.snapshot().files[:1]:
-        for drive in read_drives(warehouse, file, plan):
-            counts = drive.counts
-            at = {int(tick): row for row, tick in enumerate(counts.ticks[:REAL_TICKS])}
-            samples = [
-                tuple(
-                    int(counts.counts[one.name][at[tick]])
-                    if tick in at
-                    and (one.name not in counts.present or counts.present[one.name][at[tick]])
-                    else None
-                    for one in program.signals
-                )
-                for tick in range(REAL_TICKS)
-            ]
-            car = Car({one.name: counts.facts.get(one.name) for one in program.facts}, {})
-            return _check(manifest, program, f"drive {drive.drive_id}", car, samples)
-    return None
+def _smooth(program: Program) -> Iterable[Sample]:
+    """Yield a drive of whole counts without holes: every signal swings with a period of its own."""
+    for tick in range(SMOOTH_TICKS):
+        yield tuple(_swing(one, tick, 60 + 14 * i) for i, one in enumerate(program.signals))
+
+
+def _swing(signal: Input, tick: int, period: int) -> int:
+    """Return a count at a tick of a triangle that is an eighth of the range high."""
+    height = (signal.max_count - signal.min_count) // 8
+    middle = (signal.min_count + signal.max_count) // (4 if signal.min_count >= 0 else 2)
+    distance = abs(2 * (tick % period) - period)  # from the middle of the period, 0 to `period`
+    return middle + height * distance // period - height // 2
 
 
 def _hostile_car(program: Program) -> Car:

@@ -50,9 +50,9 @@ def export_files(
 
     `with_gram` adds to C what counts Gram rows in the car.
 
-    The checks in it have the first ticks of a drive of the warehouse, if there is one. Raises
-    `UsageError` for an unknown target, what `compile_program` raises, and `StorageError` if the
-    hashes of its drives are gone. `ConfigError` says that a library is not installed.
+    Nothing in it is of a drive of the warehouse. Raises `UsageError` for an unknown target, what
+    `compile_program` raises, and `StorageError` if the hashes of its drives are gone. `ConfigError`
+    says that a library is not installed.
     """
     if to not in _WRITERS:
         raise UsageError(f"{to!r}: export to one of {', '.join(get_args(Target))}.")
@@ -74,7 +74,7 @@ def _subject(
     version: ModelVersion, warehouse: Warehouse | None, *, with_gram: bool = False
 ) -> Subject:
     program = compile_program(version.manifest)
-    checks = make_checks(version.manifest, program, warehouse)
+    checks = make_checks(version.manifest, program)
     drives = None
     if warehouse is not None:
         folder = Registry(warehouse.root / "models").folder_of(version.manifest.name)

@@ -37,7 +37,7 @@ def test_every_kind_of_column_has_an_angle_in_the_checks() -> None:
     for name in DEFINITIONS:
         manifest = model_of({name: Fraction(1, 3)})
         program = compile_program(manifest)
-        checks = make_checks(manifest, program, None)
+        checks = make_checks(manifest, program)
         angles = {angle for check in checks for angle in check.angles}
         assert None in angles, name
         assert len(angles) > (2 if name == "tyres" else 5), name
