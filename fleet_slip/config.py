@@ -1,10 +1,13 @@
 """Reads a TOML file into a pydantic model; says what is wrong with it by file, key and reason."""
 
+import os
 import re
+import stat
 import tomllib
 from collections.abc import Mapping
 from decimal import Decimal
 from importlib.resources.abc import Traversable
+from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -60,18 +63,41 @@ LONGEST_FAULT = 300
 """Characters of one fault that are shown; what was given may stand in it."""
 
 
+def read_named_file(file: Traversable, most_bytes: int = LONGEST_FILE_BYTES) -> bytes:
+    """Return the content of a file that a person, a variable or another config names.
+
+    It must be a regular file, since a device has no end and a pipe may never begin. No error here
+    or in what parses it may quote a line before it is known to be such a file: a name such as
+    `/etc/shadow` must not show its content. Raises `ConfigError`.
+    """
+    try:
+        if not isinstance(file, Path):  # of an installation that is an archive
+            return file.read_bytes()
+        # Without this flag, opening a pipe waits for someone to write into it.
+        descriptor = os.open(file, os.O_RDONLY | os.O_NONBLOCK)
+        with os.fdopen(descriptor, "rb") as stream:
+            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                raise ConfigError(f"{file}: not a regular file. Give the path of a file.")
+            content = stream.read(most_bytes + 1)
+    except FileNotFoundError:
+        is_link = isinstance(file, Path) and file.is_symlink()
+        what = "a link to a file that does not exist" if is_link else "no such file"
+        raise ConfigError(f"{file}: {what}.") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or "no file can have this name"
+        raise ConfigError(f"{file}: cannot be read: {reason}.") from None
+    if len(content) > most_bytes:
+        raise ConfigError(f"{file}: larger than {most_bytes:,} bytes. Is it the right file?")
+    return content
+
+
 def load_toml(file: Traversable) -> dict[str, Any]:
     """Parse a TOML file, decimal numbers as exact `Decimal`. Raises `ConfigError`."""
+    content = read_named_file(file)
     try:
-        with file.open("rb") as stream:
-            content = stream.read(LONGEST_FILE_BYTES + 1)
-        if len(content) > LONGEST_FILE_BYTES:
-            raise ConfigError(f"{file}: larger than {LONGEST_FILE_BYTES:,} bytes. Is it TOML?")
         return tomllib.loads(content.decode("utf-8"), parse_float=Decimal)
-    except FileNotFoundError:
-        raise ConfigError(f"{file}: no such file.") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{file}: cannot be read: {error}") from None
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{file}: not UTF-8 text, from byte {error.start:,} on.") from None
     except RecursionError:
         raise ConfigError(f"{file}: nested too deeply.") from None
     except (ValueError, ArithmeticError) as error:  # of TOML, of a date, of a number's size

@@ -1,8 +1,8 @@
 """Finds the SQL and TOML files that ship with the package, and one's own configs laid over them."""
 
+import os
 from importlib.resources import files
 from importlib.resources.abc import Traversable
-from os import environ
 from pathlib import Path
 from typing import Literal
 
@@ -33,14 +33,18 @@ def read_sql(name: ShippedFolder, file: str) -> str:
 def own_configs() -> Path | None:
     """Return the folder of configs that is laid over the shipped ones, if there is one.
 
-    Raises `ConfigError` if it is no folder, or has a file that is no config.
+    Raises `ConfigError` if it is not a folder that can be read, or has a file that is no config.
     """
-    chosen = environ.get(CONFIG_VARIABLE)
+    chosen = os.environ.get(CONFIG_VARIABLE)
     if not chosen:
         return None
     folder_of_own = Path(chosen)
     if not folder_of_own.is_dir():
         raise ConfigError(f"{chosen}: no such folder of configs.")
+    for place in (folder_of_own, *(folder_of_own / kind for kind in CONFIG_FOLDERS)):
+        # What cannot be looked into would count as empty, and the shipped configs would be used.
+        if os.path.lexists(place) and not (place.is_dir() and os.access(place, os.R_OK | os.X_OK)):
+            raise ConfigError(f"{place}: not a folder that can be read.")
     for file in sorted(folder_of_own.rglob("*.toml")):
         _require_kind(file.relative_to(folder_of_own).as_posix(), file)
     return folder_of_own
@@ -56,9 +60,13 @@ def _require_kind(name: str, file: Path) -> None:
 
 
 def config_file(name: str) -> Traversable:
-    """Return a config file such as `monitor.toml`: one's own, else the shipped one."""
+    """Return a config file such as `monitor.toml`: one's own, else the shipped one.
+
+    One's own counts as soon as something has its name: a link that leads nowhere is an error of
+    whoever reads it, and never the shipped file.
+    """
     own = own_configs()
-    return own / name if own and (own / name).is_file() else folder("configs") / name
+    return own / name if own and os.path.lexists(own / name) else folder("configs") / name
 
 
 def config_files() -> dict[str, Traversable]:
@@ -96,7 +104,7 @@ def find_config(kind: str, name_or_path: str) -> Traversable:
             return path
         raise ConfigError(f"{path}: no such file. Give the path of a {kind} TOML file.")
     file = config_file(f"{kind}/{name_or_path}.toml")
-    if _is_file(file):
+    if _is_file(file) or os.path.islink(str(file)):  # noqa: PTH114 - see `config_file`
         return file
     known = ", ".join(config_names(kind))
     raise ConfigError(

@@ -13,6 +13,7 @@ revoked key signed is what the car sent of these days.
 import base64
 import binascii
 import csv
+import io
 import os
 from collections.abc import Iterator
 from datetime import date
@@ -24,10 +25,12 @@ from typing import Annotated
 from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from fleet_slip.catalogue.sources import RECEIVED
-from fleet_slip.config import Config, faults_of
+from fleet_slip.config import Config, faults_of, read_named_file
 from fleet_slip.errors import ConfigError
 
 KEYS_VARIABLE = "FLEET_SLIP_CAR_KEYS"
+MOST_BYTES = 2**28
+"""Size of the largest list that is read: one of a million cars."""
 """Environment variable: path of the list of keys. If it is set, messages must be signed."""
 
 _DER = bytes.fromhex("302a300506032b6570032100")
@@ -128,10 +131,10 @@ def load_car_keys() -> CarKeys | None:
 @lru_cache(4)
 def _load(path: Path, _changed_ns: int) -> CarKeys:
     try:
-        with path.open(newline="", encoding="utf-8") as stream:
-            lines = csv.DictReader(stream, strict=True)
-            rows, columns = list(lines), lines.fieldnames or ()
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        content = io.StringIO(read_named_file(path, MOST_BYTES).decode("utf-8"), newline="")
+        lines = csv.DictReader(content, strict=True)
+        rows, columns = list(lines), lines.fieldnames or ()
+    except (UnicodeDecodeError, csv.Error) as error:
         raise ConfigError(f"{path}: the list of keys cannot be read: {error}.") from None
     if absent := {"vehicle_id", "public_key"}.difference(columns):
         raise ConfigError(

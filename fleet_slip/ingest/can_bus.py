@@ -5,7 +5,7 @@ from pathlib import Path
 
 from pydantic import Field
 
-from fleet_slip.config import Config
+from fleet_slip.config import Config, read_named_file
 from fleet_slip.errors import ConfigError
 from fleet_slip.ingest.names import Name
 
@@ -36,12 +36,7 @@ def read_can_database(bus: CanBus, folder: Path) -> CanBus:
     file = folder / bus.database
     if file.suffix.lower() not in FORMATS:
         raise ConfigError(f"{file}: a CAN database is a file {', '.join(FORMATS)}.")
-    try:
-        if file.stat().st_size > MAX_DATABASE_BYTES:
-            raise ConfigError(f"{file}: larger than {MAX_DATABASE_BYTES:,} bytes.")
-        content = file.read_bytes()
-    except OSError as error:
-        raise ConfigError(f"{file}: the CAN database cannot be read: {error.strerror}.") from None
+    content = read_named_file(file, MAX_DATABASE_BYTES)
     try:
         text = content.decode("utf-8")
     except UnicodeDecodeError:

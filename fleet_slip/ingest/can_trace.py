@@ -5,6 +5,7 @@ passed over. A value that the database gives a name, such as `SNA`, is no number
 a signal that has no other values the name itself.
 """
 
+import re
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -203,6 +204,17 @@ def open_can_trace(file: Path, bus: CanBus) -> Iterator[CanSource]:
 
 
 def parse_database(bus: CanBus) -> Any:
-    """Return the messages that a database describes. Raises `InputError`."""
-    with reading_with(Path(bus.database), "cantools") as cantools:
-        return cantools.database.load_string(bus.text, bus.format, strict=False)
+    """Return the messages that a database describes. Raises `InputError`.
+
+    What cantools says of a text that it cannot parse quotes a line of it; only the place is told.
+    """
+    database = Path(bus.database)
+    with reading_with(database, "cantools") as cantools:
+        try:
+            return cantools.database.load_string(bus.text, bus.format, strict=False)
+        except Exception as error:
+            place = re.search(r"line \d+", str(error))
+            raise InputError(
+                f"{shown(database)}: cantools cannot read it as {bus.format.upper()}"
+                f"{f', from {place[0]} on' if place else ''}. Is it the right file, and complete?"
+            ) from None

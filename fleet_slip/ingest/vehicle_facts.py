@@ -1,13 +1,14 @@
 """What is known of each car, from a table beside the mapping."""
 
 import csv
+import io
 from pathlib import Path
 from typing import Annotated, TypeVar
 
 from pydantic import AfterValidator, Field, ValidationError
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.config import LONGEST_FILE_BYTES, Config, faults_of
+from fleet_slip.config import Config, faults_of, read_named_file
 from fleet_slip.errors import ConfigError
 from fleet_slip.ingest.names import Name, PositiveFloat
 
@@ -40,13 +41,17 @@ def read_vehicle_facts(file: Path) -> tuple[VehicleFacts, ...]:
 
     Raises `ConfigError` with line and column of what is wrong.
     """
+    content = read_named_file(file)
     try:
-        if file.stat().st_size > LONGEST_FILE_BYTES:
-            raise ConfigError(f"{file}: larger than {LONGEST_FILE_BYTES:,} bytes.")
-        with file.open(encoding="utf-8-sig", newline="") as stream:
-            rows = list(csv.DictReader(stream, strict=True))
-    except (OSError, ValueError, csv.Error) as error:
-        raise ConfigError(f"{file}: cannot be read as a CSV file: {error}") from None
+        lines = csv.DictReader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True)
+        columns, rows = lines.fieldnames or (), list(lines)
+    except (ValueError, csv.Error):
+        columns, rows = (), []
+    if "vehicle_id" not in columns:
+        raise ConfigError(
+            f"{file}: vehicle_id is missing. A table of cars is CSV in UTF-8, whose first line "
+            f"names its columns: {', '.join(VehicleFacts.model_fields)}."
+        )
     found = tuple(_facts(file, line, row) for line, row in enumerate(rows, 2))
     names = [facts.vehicle_id for facts in found]
     if twice := next((name for name in names if names.count(name) > 1), None):

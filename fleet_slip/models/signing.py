@@ -14,6 +14,7 @@ import stat
 from pathlib import Path
 from types import ModuleType
 
+from fleet_slip.config import read_named_file
 from fleet_slip.errors import ConfigError, RefusedError, StorageError
 from fleet_slip.extras import needed
 from fleet_slip.files.folder import Folder
@@ -121,11 +122,7 @@ def _read_private_key(path: Path) -> bytes:
 
 def _read_key(path: Path) -> tuple[bytes, int]:
     """Return a key's file and its mode."""
-    try:
-        with path.open("rb") as stream:
-            return stream.read(LONGEST_FILE_BYTES), os.fstat(stream.fileno()).st_mode
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{path}: the key cannot be read: {error}") from None
+    return read_named_file(path), path.stat().st_mode
 
 
 def _write_new(path: Path, content: bytes, mode: int) -> None:

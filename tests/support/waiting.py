@@ -1,7 +1,10 @@
 """Waiting for what must happen, for a while."""
 
+import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
 
 from tests.support.commands import PATIENCE_S
 
@@ -12,3 +15,19 @@ def until(condition: Callable[[], object], seconds: float = PATIENCE_S) -> None:
     while not condition():
         assert time.monotonic() < end, f"waited {seconds:.0f} s in vain"
         time.sleep(0.02)
+
+
+@contextmanager
+def within(seconds: int = 60) -> Iterator[None]:
+    """Raise `AssertionError` in what hangs; of the main thread."""
+
+    def stop(*_: Any) -> None:
+        raise AssertionError(f"not done within {seconds} s")
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.alarm(seconds)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
