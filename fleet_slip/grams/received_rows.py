@@ -1,6 +1,7 @@
 """Messages of cars as rows, many at once: what they say, and which of them cannot be."""
 
 import re
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
@@ -10,7 +11,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.arrays import BoolArray, IntArray
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.catalogue.sources import RECEIVED_FILES
 from fleet_slip.grams.messages import (
     LONGEST_VEHICLE,
@@ -25,13 +26,17 @@ from fleet_slip.grams.signed_rows import keep_signatures
 FIRST_START_S = 946_684_800
 """2000-01-01: a car's clock that says less has not been set."""
 
-LAST_START_S = 4_102_444_800
-"""2100-01-01."""
+MARGIN_S = 86_400
+"""A car's clock may be ahead by a day, no more: it has a satellite receiver or a network."""
+
+LONGEST_ROWS = 86_400 * round(1 / SAMPLE_TIME_S)
+"""Rows of a day: a drive is over by then. A message that says more would outvote a fleet."""
 
 OTHER_SIGNALS = "is of signals that mean something else here"
 NO_PARTS = "is of signals or parts that there are not"
 NO_VEHICLE = "has no name of a car"
-NO_MOMENT = "begins at no time between 2000 and 2100"
+NO_MOMENT = "begins before 2000, or ends in the future"
+TOO_LONG = "is of a drive longer than a day"
 LACKS_ROWS = "lacks rows of its drive"
 
 _IN_NAMES = np.array([bool(re.match(rb"[A-Za-z0-9._-]", bytes([b]))) for b in range(256)])
@@ -182,7 +187,8 @@ def sort_out(
 def _without_name(run: ReceivedRows) -> tuple[ReceivedRows, list[Refused]]:
     """Divide messages into those that tell a drive of today's signals, and the others."""
     said = run.messages
-    start_s = said["start_s"]
+    start_s, latest_s = said["start_s"], int(time.time()) + MARGIN_S
+    ends_s = np.minimum(start_s, latest_s) + said["rows"] * float(SAMPLE_TIME_S)
     left = np.ones(len(said), dtype=np.bool_)
     refused: list[Refused] = []
     for reason, wrong in (
@@ -192,7 +198,7 @@ def _without_name(run: ReceivedRows) -> tuple[ReceivedRows, list[Refused]]:
             (said["mask"] >> len(catalogue().gram_signals) != 0) | (said["place"] >= said["parts"]),
         ),
         (NO_VEHICLE, ~_is_name(said["vehicle"])),
-        (NO_MOMENT, (start_s < FIRST_START_S) | (start_s >= LAST_START_S)),
+        (NO_MOMENT, (start_s < FIRST_START_S) | (start_s > latest_s) | (ends_s > latest_s)),
     ):
         bad = left & wrong
         left &= ~wrong
@@ -224,7 +230,9 @@ def _possible(rows: ReceivedRows) -> tuple[ReceivedRows, list[Refused]]:
     """Divide messages of the same signals into those that counts can have, and the others."""
     lacking = rows.messages["lost"] != 0
     refused = list(rows.refuse(lacking, LACKS_ROWS))
-    whole = rows.take(~lacking)
+    long = rows.n > LONGEST_ROWS
+    refused += rows.refuse(long & ~lacking, TOO_LONG)
+    whole = rows.take(~(lacking | long))
     signals = catalogue()
     names = [name for name in signals_of(rows.mask).split(",") if name]
     ranges = [(signals[name].min_count, signals[name].max_count) for name in names]

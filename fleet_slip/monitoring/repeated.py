@@ -2,7 +2,8 @@
 
 A drive without a log began when its name says, and lasted as long as its rows: it has no more. Of
 such a drive and a log that overlap it is named, since the log is what counts where both come; of
-two logs, or of two drives without one, the one that begins later.
+two drives without one the longer, since one message that covers a day must not accuse all others of
+that day; of two logs the one that begins later.
 """
 
 from collections.abc import Mapping
@@ -40,14 +41,22 @@ def find_repeated(drives: pa.Table) -> dict[str, Fault]:
             longest = row
             continue
         common_s = min(_ends_s(longest), _ends_s(row)) - row["start_s_min"]
-        of_log = common_s > LEAST_S and longest["received_min"] and not row["received_min"]
+        earlier = common_s > LEAST_S and _is_suspect(longest, row)
         if common_s > LEAST_S:
-            named, other = (longest, row) if of_log else (row, longest)
+            named, other = (longest, row) if earlier else (row, longest)
             figure = f"{common_s:.0f} s are in {other['drive_id']}"
             found.setdefault(named["drive_id"], Fault("repeated", (), figure))
-        if of_log or _ends_s(row) > _ends_s(longest):
+        if earlier or _ends_s(row) > _ends_s(longest):
             longest = row
     return found
+
+
+def _is_suspect(earlier: Mapping[str, Any], later: Mapping[str, Any]) -> bool:
+    """Whether the earlier of two drives at once is named, not the later."""
+    if not (earlier["received_min"] and later["received_min"]):
+        return bool(earlier["received_min"])
+    lasted_s = (_ends_s(drive) - drive["start_s_min"] for drive in (earlier, later))
+    return bool(next(lasted_s) > next(lasted_s))
 
 
 def _timed(drives: pa.Table) -> pa.Table:

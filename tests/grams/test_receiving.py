@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import time
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -102,6 +103,12 @@ def broken(gram: Gram, **fields: Any) -> Gram:
     )
 
 
+def scaled(gram: Gram, times: int) -> Gram:
+    """The Gram of the rows of a drive, each so many times."""
+    numbers = ([times * number for number in some] for some in (gram.sums, gram.products))
+    return Gram(gram.signals, times * gram.n, *map(tuple, numbers))
+
+
 GRAM = gram_of(5)
 FIRST, SECOND, *REST = GRAM.products
 SUM = message_of(broken(GRAM, sums=(10**9, *GRAM.sums[1:])))
@@ -127,8 +134,10 @@ INDEFINITE = message_of(broken(GRAM, products=(FIRST, FIRST * 5, *REST)))
         (message_of(GRAM, ""), "has no name of a car"),
         (message_of(GRAM, "a\nb"), "has no name of a car"),
         (message_of(GRAM, "a\0b"), "has no name of a car"),
-        (message_of(GRAM, start_s=0), "begins at no time between 2000 and 2100"),
-        (message_of(GRAM, start_s=2**64 - 1), "begins at no time between 2000 and 2100"),
+        (message_of(GRAM, start_s=0), "begins before 2000, or ends in the future"),
+        (message_of(GRAM, start_s=2**64 - 1), "begins before 2000, or ends in the future"),
+        (message_of(GRAM, start_s=4_070_908_800), "begins before 2000, or ends in the future"),
+        (message_of(scaled(GRAM, 20_000)), "is of a drive longer than a day"),
         (message_of(GRAM, lost=1), "lacks rows of its drive"),
         (message_of(GRAM, rows=0), "has no rows, or more than a drive can have"),
         (SUM, "has sums outside the ranges of its signals"),
@@ -144,6 +153,17 @@ def test_what_cannot_be_goes_to_the_quarantine(
     assert report.refused == {reason: 1}
     assert [(row[0], row[3]) for row in reasons(fleet)] == [(2, f"the message {reason}")]
     assert [row["vehicle_id"] for row in stored(fleet)] == ["GOOD"]
+
+
+def test_a_drive_may_last_a_day_and_end_a_day_ahead_of_our_clock(
+    fleet: fleet_slip.Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    day = scaled(gram_of(5, 8640), 1000)
+    monkeypatch.setattr(time, "time", lambda: START_S + 0.5)
+    messages = [message_of(day, "IN", START_S), message_of(day, "LATE", START_S + 1)]
+    (report,) = fleet.receive(write(tmp_path / "m", *messages))
+    assert report.refused == {"begins before 2000, or ends in the future": 1}
+    assert [(row["vehicle_id"], row["n"]) for row in stored(fleet)] == [("IN", 8_640_000)]
 
 
 def test_messages_are_read_as_one_by_one() -> None:
@@ -200,7 +220,7 @@ def test_files_before_one_that_cannot_be_read_land(fleet: fleet_slip.Fleet, tmp_
 
 
 def test_names_of_drives_say_when_they_began(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
-    moments = [946_684_800, 951_782_399, 951_868_800, 1_735_689_599, 4_102_444_799]
+    moments = [946_684_800, 951_782_399, 951_868_800, 1_735_689_599]
     fleet.receive(write(tmp_path / "m", *(message_of(GRAM, "V", at) for at in moments)))
     told = [datetime.fromtimestamp(at, UTC) for at in moments]
     found = fleet.sql("SELECT drive_id, day FROM drives ORDER BY day").fetchall()

@@ -4,6 +4,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pyarrow as pa
+import pytest
 
 import fleet_slip
 from fleet_slip.ingest import Mapping
@@ -77,6 +78,15 @@ def test_of_a_drive_without_a_log_and_a_log_at_once_that_without_is_named() -> N
         "car-20240531T080100Z": "40 s are in next",
         "car-20240531T080235Z": "5 s are in car-20240531T080230Z",
     }
+
+
+@pytest.mark.parametrize("start_s", [-300, 300])
+def test_one_message_of_a_day_does_not_accuse_the_drives_of_that_day(start_s: int) -> None:
+    honest = [received("car", 3600 * hour, 60_000) for hour in range(12)]
+    forged = received("car", start_s, 8_640_000)
+    assert (
+        list(find_repeated(pa.concat_tables([*honest, forged]))) == forged["drive_id"].to_pylist()
+    )
 
 
 def test_a_log_through_a_corrected_mapping_counts_twice_and_quality_says_so(
