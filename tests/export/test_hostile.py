@@ -72,7 +72,7 @@ def test_c_with_the_longest_names_passes_its_self_test(tmp_path: Path) -> None:
     assert len(stem) == 24
     program = compile_c(tmp_path, [f"{stem}.c", f"{stem}_test.c"])
     done = subprocess.run([program], capture_output=True, text=True, check=False, timeout=60)
-    assert (done.returncode, done.stdout) == (0, f"{LONGEST}@1: 0 of 600 angles are wrong\n")
+    assert (done.returncode, done.stdout) == (0, f"{LONGEST}@1: 0 of 900 angles are wrong\n")
 
 
 def test_fmus_have_a_parameter_for_each_fact(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -118,7 +118,7 @@ def test_sql_gives_the_angles_of_its_checks(tmp_path: Path) -> None:
             "SELECT count(*) FILTER (angle IS NOT DISTINCT FROM expected_angle) "
             f"FROM checks JOIN sideslip_{LONGEST}('checks') USING (drive_id, tick)"
         ).fetchall()
-    assert right == [(600,)]
+    assert right == [(900,)]
 
 
 def test_onnx_takes_no_car_at_all() -> None:

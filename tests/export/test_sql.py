@@ -128,5 +128,5 @@ def test_the_table_of_checks_holds(tmp_path: Path) -> None:
             "count(DISTINCT angle) FROM checks JOIN sideslip_every_kind('checks') "
             "USING (drive_id, tick)"
         ).fetchall()[0]
-    assert rows == right == 600
+    assert rows == right == 900
     assert angles > 50
