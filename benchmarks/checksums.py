@@ -21,8 +21,8 @@ from unittest import mock
 
 from fleet_slip.files import checksums
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.aggregation import compute_grams
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.rows.aggregation import compute_grams
+from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.models.publish import manifest_of
 from fleet_slip.models.score import score
 from fleet_slip.selection.answer import answer_request

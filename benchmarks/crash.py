@@ -31,7 +31,8 @@ from typing import Any
 import pyarrow.parquet as pq
 from deltalake import DeltaTable
 
-import fleet_slip.ingest.job  # whatever a command imports late is here before the fork
+# Whatever a command imports late is here before the fork.
+import fleet_slip.ingest.landing.ingest_job
 import fleet_slip.maintenance.repair
 import fleet_slip.simulation.job  # noqa: F401
 from benchmarks.crash_commands import COMMANDS, Command, prepare_inputs
@@ -40,8 +41,8 @@ from fleet_slip.cli.main import main as fleet_slip_main
 from fleet_slip.delta import Table
 from fleet_slip.errors import PendingError
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.backlog import BEING_WRITTEN_HOURS
-from fleet_slip.ingest.mapping import load_mapping
+from fleet_slip.grams.rows.backlog import BEING_WRITTEN_HOURS
+from fleet_slip.ingest.mapping.mapping import load_mapping
 from fleet_slip.maintenance.verify import verify
 from fleet_slip.models.versions import Registry
 from fleet_slip.simulation.campaign import load_campaign

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.models.publish import manifest_of, publish
 from fleet_slip.models.versions import Registry
 from fleet_slip.monitoring.chart import draw

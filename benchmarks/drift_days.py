@@ -17,13 +17,13 @@ import numpy as np
 
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.cohorts.cohort import load_cohort
 from fleet_slip.monitoring.monitor import Limits
 from fleet_slip.monitoring.thresholds import thresholds
-from fleet_slip.regression.exact import LinearModel, fit
-from fleet_slip.regression.figures import error_sums
-from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.gram_table import GramTable
+from fleet_slip.regression.exact.figures import error_sums
+from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.regression.exact.gram_table import GramTable
+from fleet_slip.regression.exact.least_squares import LinearModel, fit
 from fleet_slip.warehouse.tables import Warehouse
 
 WHEELS = ("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")

@@ -27,8 +27,8 @@ from benchmarks.pipeline import SIGNALS, prepare
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.delta.encoding import ROW_GROUP_ROWS, WRITE_BATCH_ROWS
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.aggregation import FILES_PER_QUERY
-from fleet_slip.grams.statement import gram_statement
+from fleet_slip.grams.rows.aggregation import FILES_PER_QUERY
+from fleet_slip.grams.rows.statement import gram_statement
 from fleet_slip.warehouse.tables import Warehouse
 
 ROUNDS = 3

@@ -17,13 +17,13 @@ from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohort import Cohort, load_cohort
-from fleet_slip.grams.job import update_grams
-from fleet_slip.regression.crossval import held_out_errors
-from fleet_slip.regression.exact import fit
-from fleet_slip.regression.figures import Figures
-from fleet_slip.regression.folds import CohortFolds, by_hash
-from fleet_slip.regression.gram import Gram
+from fleet_slip.grams.cohorts.cohort import Cohort, load_cohort
+from fleet_slip.grams.rows.gram_job import update_grams
+from fleet_slip.regression.exact.figures import Figures
+from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.regression.exact.least_squares import fit
+from fleet_slip.regression.validation.crossval import held_out_errors
+from fleet_slip.regression.validation.folds import CohortFolds, by_hash
 from fleet_slip.selection.regimes import regime_names
 from fleet_slip.warehouse.tables import Warehouse
 

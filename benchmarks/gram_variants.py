@@ -18,7 +18,7 @@ import duckdb
 from benchmarks.pipeline import SIGNALS, prepare
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.statement import LOGS, gram_statement
+from fleet_slip.grams.rows.statement import LOGS, gram_statement
 from fleet_slip.warehouse.tables import Warehouse
 
 ROUNDS = 7

@@ -43,8 +43,8 @@ SIGNALS = {
 }  # fmt: skip
 
 _INGEST = """
-from fleet_slip.ingest.job import ingest_files
-from fleet_slip.ingest.mapping import load_mapping
+from fleet_slip.ingest.landing.ingest_job import ingest_files
+from fleet_slip.ingest.mapping.mapping import load_mapping
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
 mapping = load_mapping({mapping!r})

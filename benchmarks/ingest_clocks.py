@@ -20,8 +20,8 @@ from benchmarks.logs_with_clocks import ROWS_PER_S, WRITERS, pieces, write_mappi
 
 _INGEST = """
 import os, threading
-from fleet_slip.ingest.job import ingest_files
-from fleet_slip.ingest.mapping import load_mapping
+from fleet_slip.ingest.landing.ingest_job import ingest_files
+from fleet_slip.ingest.mapping.mapping import load_mapping
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
 mapping = load_mapping({mapping!r})

@@ -23,8 +23,8 @@ from fleet_slip.maintenance.marks import marked_models
 from fleet_slip.maintenance.verify import verify
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.versions import Registry
-from fleet_slip.regression.exact import fit
-from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.regression.exact.least_squares import fit
 from fleet_slip.warehouse.tables import Warehouse
 
 

@@ -15,7 +15,7 @@ from typing import Any
 
 from benchmarks.documents import insert
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
-from fleet_slip.regression.gram import packed_size
+from fleet_slip.regression.exact.gram import packed_size
 
 FIGURES = Path(__file__).parent / "figures" / "billion.json"
 INTEGERS = packed_size(len(catalogue().gram_signals) + 1)

@@ -58,10 +58,10 @@ def _read(paths: list[str]) -> NDArray[np.float64]:
 
 
 def fleet_slip(threads: int) -> Fit:
-    from fleet_slip.grams.aggregation import FILES_PER_QUERY  # noqa: PLC0415
-    from fleet_slip.grams.statement import gram_statement  # noqa: PLC0415
-    from fleet_slip.regression.exact import fit  # noqa: PLC0415
-    from fleet_slip.regression.gram import Gram  # noqa: PLC0415
+    from fleet_slip.grams.rows.aggregation import FILES_PER_QUERY  # noqa: PLC0415
+    from fleet_slip.grams.rows.statement import gram_statement  # noqa: PLC0415
+    from fleet_slip.regression.exact.gram import Gram  # noqa: PLC0415
+    from fleet_slip.regression.exact.least_squares import fit  # noqa: PLC0415
 
     statement = gram_statement(catalogue(), whole=True)
 

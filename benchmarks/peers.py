@@ -34,8 +34,8 @@ from benchmarks.pipeline import prepare
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.pages.style import PALETTE, STYLE
-from fleet_slip.regression.exact import LinearModel, fit
-from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.regression.exact.least_squares import LinearModel, fit
 from fleet_slip.warehouse.tables import Warehouse
 
 MOST_DIGITS = 16.0

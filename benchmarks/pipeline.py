@@ -23,9 +23,9 @@ import pyarrow.parquet as pq
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.delta import Change
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.grams.job import update_grams
-from fleet_slip.grams.statement import gram_statement
+from fleet_slip.grams.cohorts.cohort import load_cohort
+from fleet_slip.grams.rows.gram_job import update_grams
+from fleet_slip.grams.rows.statement import gram_statement
 from fleet_slip.selection.compare import select
 from fleet_slip.selection.model_list import load_model_list
 from fleet_slip.simulation.campaign import load_campaign

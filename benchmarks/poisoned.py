@@ -23,13 +23,13 @@ import numpy as np
 
 import fleet_slip
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.regression.drive_moments import DriveMoments
-from fleet_slip.regression.exact import LinearModel, fit
-from fleet_slip.regression.figures import error_sums
-from fleet_slip.regression.gram import Gram, packed_position
-from fleet_slip.regression.gram_table import GramTable
-from fleet_slip.regression.influential import find_influential
+from fleet_slip.grams.cohorts.cohort import load_cohort
+from fleet_slip.regression.exact.figures import error_sums
+from fleet_slip.regression.exact.gram import Gram, packed_position
+from fleet_slip.regression.exact.gram_table import GramTable
+from fleet_slip.regression.exact.least_squares import LinearModel, fit
+from fleet_slip.regression.inference.drive_moments import DriveMoments
+from fleet_slip.regression.inference.influential import find_influential
 
 INPUTS = (
     *("ax", "ay", "yaw_rate", "steering_wheel"),

@@ -33,8 +33,8 @@ from fleet_slip.comparison.evaluation.estimators import (
 from fleet_slip.comparison.observers import ekf, kalman
 from fleet_slip.comparison.observers.signals import DriveSignals, LabelledDrive
 from fleet_slip.comparison.observers.tuning import tune
-from fleet_slip.regression.exact import fit
-from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.regression.exact.least_squares import fit
 from fleet_slip.selection.model_list import load_model_list
 from fleet_slip.simulation.campaign import DriveSpec, load_campaign
 from fleet_slip.simulation.drives import DriveLog, simulate_logs

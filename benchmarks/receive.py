@@ -24,11 +24,11 @@ import numpy as np
 import fleet_slip
 from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.car_keys import KEYS_VARIABLE, load_car_keys
-from fleet_slip.grams.messages import message_size, message_type, signals_definition
-from fleet_slip.grams.signatures import sign_messages
+from fleet_slip.grams.received.car_keys import KEYS_VARIABLE, load_car_keys
+from fleet_slip.grams.received.messages import message_size, message_type, signals_definition
+from fleet_slip.grams.received.signatures import sign_messages
 from fleet_slip.models.ed25519 import generate
-from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.exact.gram import Gram
 from tests.support.messages import START_S, gram_of, message_of
 
 UNKNOWN = 100

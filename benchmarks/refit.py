@@ -17,10 +17,10 @@ from typing import Any
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.grams.fold_sums import sum_cohort
-from fleet_slip.grams.reader import GramReader
-from fleet_slip.regression.exact import fit
+from fleet_slip.grams.cohorts.cohort import load_cohort
+from fleet_slip.grams.cohorts.fold_sums import sum_cohort
+from fleet_slip.grams.cohorts.reader import GramReader
+from fleet_slip.regression.exact.least_squares import fit
 from fleet_slip.selection.answer import answer_request
 from fleet_slip.selection.model_list import load_model_list
 from fleet_slip.selection.request import SelectionRequest

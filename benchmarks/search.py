@@ -25,9 +25,9 @@ import pyarrow.compute as pc
 from fleet_slip.catalogue.features import features
 from fleet_slip.delta import Change
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.fold_sums import sum_cohort
-from fleet_slip.grams.gram_files import write_rows
-from fleet_slip.regression.stepwise import METHODS
+from fleet_slip.grams.cohorts.fold_sums import sum_cohort
+from fleet_slip.grams.rows.gram_files import write_rows
+from fleet_slip.regression.choice.stepwise import METHODS
 from fleet_slip.selection.model_list import Search, load_model_list
 from fleet_slip.selection.stepwise import search_models
 from fleet_slip.warehouse.tables import Warehouse

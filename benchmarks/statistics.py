@@ -17,27 +17,27 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.linear_model import LinearRegression
 
-from fleet_slip.regression.crossval import cross_validate_inputs
-from fleet_slip.regression.drive_moments import DriveMoments
-from fleet_slip.regression.exact import correlation_matrix, fit
-from fleet_slip.regression.folds import CohortFolds, by_hash
-from fleet_slip.regression.gram_table import GramTable
-from fleet_slip.regression.inference import infer_by_clusters
-from fleet_slip.regression.nested_choice import (
+from fleet_slip.regression.choice.nested_choice import (
     Rule,
     Training,
     cross_validate_selection,
     select_nested,
 )
-from fleet_slip.regression.ranking import RANKINGS, rank
-from fleet_slip.regression.resampling import (
+from fleet_slip.regression.choice.ranking import RANKINGS, rank
+from fleet_slip.regression.choice.subsets import all_rss, best_subsets
+from fleet_slip.regression.choice.winner import choose
+from fleet_slip.regression.exact.gram_table import GramTable
+from fleet_slip.regression.exact.least_squares import correlation_matrix, fit
+from fleet_slip.regression.inference.drive_moments import DriveMoments
+from fleet_slip.regression.inference.resampling import (
     bootstrap_coefficients,
     bootstrap_correlations,
     held_out_products,
     repeated_cross_validation,
 )
-from fleet_slip.regression.subsets import all_rss, best_subsets
-from fleet_slip.regression.winner import choose
+from fleet_slip.regression.inference.standard_errors import infer_by_clusters
+from fleet_slip.regression.validation.crossval import cross_validate_inputs
+from fleet_slip.regression.validation.folds import CohortFolds, by_hash
 
 INPUTS = tuple(f"x{i}" for i in range(1, 12))
 LABEL = "sideslip"

@@ -14,30 +14,30 @@ from matplotlib.figure import Figure
 from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.regression.criteria import CRITERIA, criterion_values
-from fleet_slip.regression.disturbance import disturb
-from fleet_slip.regression.drive_moments import DriveMoments, serving_drives
-from fleet_slip.regression.evidence import Evidence
-from fleet_slip.regression.exact import correlation_matrix, fit
-from fleet_slip.regression.folds import CohortFolds, by_hash
-from fleet_slip.regression.inference import infer_by_clusters, infer_classically
-from fleet_slip.regression.nested import nested_fits
-from fleet_slip.regression.nested_choice import (
+from fleet_slip.grams.cohorts.cohort import load_cohort
+from fleet_slip.regression.choice.criteria import CRITERIA, criterion_values
+from fleet_slip.regression.choice.nested import nested_fits
+from fleet_slip.regression.choice.nested_choice import (
     CROSS_VALIDATION,
     Rule,
     Training,
     cross_validate_nested,
     cross_validate_selection,
 )
-from fleet_slip.regression.ranking import RANKINGS, rank
-from fleet_slip.regression.resampling import (
+from fleet_slip.regression.choice.ranking import RANKINGS, rank
+from fleet_slip.regression.choice.subsets import all_rss, best_subsets, pick_sizes, subset_sizes
+from fleet_slip.regression.exact.least_squares import correlation_matrix, fit
+from fleet_slip.regression.inference.drive_moments import DriveMoments, serving_drives
+from fleet_slip.regression.inference.evidence import Evidence
+from fleet_slip.regression.inference.resampling import (
     bootstrap_correlations,
     held_out_products,
     percentile_interval,
     repeated_cross_validation,
 )
-from fleet_slip.regression.subsets import all_rss, best_subsets, pick_sizes, subset_sizes
+from fleet_slip.regression.inference.standard_errors import infer_by_clusters, infer_classically
+from fleet_slip.regression.shrinkage.disturbance import disturb
+from fleet_slip.regression.validation.folds import CohortFolds, by_hash
 from fleet_slip.warehouse.tables import Warehouse
 
 IMAGES = Path(__file__).parents[1] / "docs" / "images"

@@ -26,7 +26,7 @@ from benchmarks.peer_ways import COLUMNS, INPUTS
 from benchmarks.peers import digits, exact_model, in_process
 from benchmarks.pipeline import prepare
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.regression.exact import LinearModel
+from fleet_slip.regression.exact.least_squares import LinearModel
 from fleet_slip.warehouse.tables import Warehouse
 
 JAR = Path("/usr/share/java/weka.jar")

@@ -25,12 +25,12 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.windows import Window
 from fleet_slip.delta import TableFile
 from fleet_slip.files.data_root import data_root
-from fleet_slip.grams import aggregation, statement, wide
-from fleet_slip.grams.aggregation import aggregate, by_sql
 from fleet_slip.grams.column_plan import ColumnPlan
 from fleet_slip.grams.columns import Workspace
 from fleet_slip.grams.drive_rows import read_drives
-from fleet_slip.grams.parts import Parts
+from fleet_slip.grams.rows import aggregation, statement, wide
+from fleet_slip.grams.rows.aggregation import aggregate, by_sql
+from fleet_slip.grams.rows.parts import Parts
 from fleet_slip.warehouse.tables import Warehouse
 
 COLUMNS = (12, 52, 100, 200)

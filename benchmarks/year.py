@@ -29,7 +29,7 @@ from benchmarks.documents import insert
 from benchmarks.receive import messages_of
 from benchmarks.usage import measured
 from fleet_slip.errors import AlarmError
-from fleet_slip.grams.rollup import CELLS, DRIVES, VEHICLES
+from fleet_slip.grams.rows.rollup import CELLS, DRIVES, VEHICLES
 from fleet_slip.warehouse.tables import Warehouse
 
 FIRST_DAY = datetime(2024, 1, 1, 5, tzinfo=UTC)

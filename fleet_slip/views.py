@@ -98,8 +98,8 @@ def add_calibration(database: duckdb.DuckDBPyConnection, query: str) -> None:
 
 def _calibrate(database: duckdb.DuckDBPyConnection) -> None:
     # Imported when it is asked for: most queries are not about it.
-    from fleet_slip.grams.calibration import calibration_table  # noqa: PLC0415
-    from fleet_slip.grams.reader import OpenedGrams  # noqa: PLC0415
+    from fleet_slip.grams.calibration.calibration import calibration_table  # noqa: PLC0415
+    from fleet_slip.grams.cohorts.reader import OpenedGrams  # noqa: PLC0415
 
     opened = OpenedGrams(database, features().identity(CALIBRATION), 0, 0)
     add_table(database, CALIBRATION, calibration_table(opened))

@@ -9,10 +9,10 @@ from fleet_slip.warehouse.tables import Warehouse
 
 if TYPE_CHECKING:
     from fleet_slip.api.subject import Examined
-    from fleet_slip.grams.cohort import Cohort
-    from fleet_slip.grams.folding import Folding, FoldKey
+    from fleet_slip.grams.cohorts.cohort import Cohort
+    from fleet_slip.grams.cohorts.folding import Folding, FoldKey
     from fleet_slip.models.model_version import ModelVersion
-    from fleet_slip.regression.drive_moments import ClusterUnit
+    from fleet_slip.regression.inference.drive_moments import ClusterUnit
     from fleet_slip.selection.diagnostics import Diagnosis
     from fleet_slip.selection.regimes import RegimeComparison
     from fleet_slip.selection.request import RequestedSelection
@@ -179,7 +179,7 @@ class FleetCohort(Rooted):
         """
         from fleet_slip.catalogue.signals import catalogue
         from fleet_slip.models.counts_model import counts_model
-        from fleet_slip.regression.exact import fit
+        from fleet_slip.regression.exact.least_squares import fit
         from fleet_slip.selection.what_if import what_if
 
         if not noise and not bias:
@@ -249,7 +249,7 @@ class FleetCohort(Rooted):
         return compare_shrinkage(cohort, inputs, folding, naive=naive, cluster=cluster)
 
     def _load(self, feature_set: str, condition: str | None = None) -> "Cohort":
-        from fleet_slip.grams.cohort import load_cohort
+        from fleet_slip.grams.cohorts.cohort import load_cohort
 
         return load_cohort(self.warehouse, condition or self.condition, feature_set)
 
@@ -263,6 +263,6 @@ class FleetCohort(Rooted):
 
 
 def _folding(by: "FoldKey", count: int | str | None) -> "Folding":
-    from fleet_slip.grams.folding import Folding, make_folding
+    from fleet_slip.grams.cohorts.folding import Folding, make_folding
 
     return make_folding(by, count, Folding().count)

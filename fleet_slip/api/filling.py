@@ -19,13 +19,13 @@ from fleet_slip.progress import Progress, no_progress
 from fleet_slip.runs.log import step
 
 if TYPE_CHECKING:
-    from fleet_slip.grams.check import CheckReport
-    from fleet_slip.grams.job import GramReport
-    from fleet_slip.grams.receiving import ReceiveReport
-    from fleet_slip.ingest.job import IngestReport
-    from fleet_slip.ingest.log_files import Log
-    from fleet_slip.ingest.mapping import Mapping
-    from fleet_slip.ingest.preview import Preview
+    from fleet_slip.grams.received.receiving import ReceiveReport
+    from fleet_slip.grams.rows.check import CheckReport
+    from fleet_slip.grams.rows.gram_job import GramReport
+    from fleet_slip.ingest.drafting.preview import Preview
+    from fleet_slip.ingest.landing.ingest_job import IngestReport
+    from fleet_slip.ingest.landing.log_files import Log
+    from fleet_slip.ingest.mapping.mapping import Mapping
     from fleet_slip.maintenance.migration import MigrationReport
     from fleet_slip.simulation.campaign import Campaign
     from fleet_slip.simulation.job import SimulationReport
@@ -86,7 +86,7 @@ class Filling(Rooted):
         Raises `InputError` for a file that cannot be read; `StorageError`; and `ConflictError` if
         other processes keep changing the tables.
         """
-        from fleet_slip.grams.receiving import find_messages, receive_files
+        from fleet_slip.grams.received.receiving import find_messages, receive_files
 
         given = [Path(files)] if isinstance(files, Path | str) else [Path(file) for file in files]
         paths = find_messages(given)
@@ -127,10 +127,10 @@ class Filling(Rooted):
         for files that cannot be used, of which nothing is written; `StorageError` and
         `ClusterError`.
         """
-        from fleet_slip.ingest.folders import KnownFiles
-        from fleet_slip.ingest.job import ingest_files
-        from fleet_slip.ingest.log_files import find_logs, find_whole_logs, names_several
-        from fleet_slip.ingest.mapping import load_mapping
+        from fleet_slip.ingest.landing.folders import KnownFiles
+        from fleet_slip.ingest.landing.ingest_job import ingest_files
+        from fleet_slip.ingest.landing.log_files import find_logs, find_whole_logs, names_several
+        from fleet_slip.ingest.mapping.mapping import load_mapping
 
         plan = load_mapping(mapping) if isinstance(mapping, str) else mapping
         given = [files] if isinstance(files, Path | str) else list(files)
@@ -179,9 +179,9 @@ class Filling(Rooted):
         looks wrong in the longest drive: a sign, a unit, swapped wheels, a delay of the label.
         Of a folder every log is read, or with `as_one` all as one. Raises like `ingest`.
         """
-        from fleet_slip.ingest.log_files import find_logs, find_whole_logs
-        from fleet_slip.ingest.mapping import load_mapping
-        from fleet_slip.ingest.preview import preview_log
+        from fleet_slip.ingest.drafting.preview import preview_log
+        from fleet_slip.ingest.landing.log_files import find_logs, find_whole_logs
+        from fleet_slip.ingest.mapping.mapping import load_mapping
 
         plan = load_mapping(mapping) if isinstance(mapping, str) else mapping
         given = [files] if isinstance(files, Path | str) else list(files)
@@ -208,8 +208,8 @@ class Filling(Rooted):
         Raises `QuestionError` for an unknown set, `StorageError`, `ConflictError` and
         `ClusterError`.
         """
-        from fleet_slip.grams.job import update_grams
-        from fleet_slip.grams.reader import cohort_files
+        from fleet_slip.grams.cohorts.reader import cohort_files
+        from fleet_slip.grams.rows.gram_job import update_grams
         from fleet_slip.warehouse.condition import parse_condition
 
         among = cohort_files(self.warehouse, parse_condition(cohort)) if cohort else None
@@ -236,7 +236,7 @@ class Filling(Rooted):
         Raises `StorageError` naming the first drive whose Gram rows differ, and `DataError` if
         there is nothing to check.
         """
-        from fleet_slip.grams.check import check_grams
+        from fleet_slip.grams.rows.check import check_grams
 
         return check_grams(self.warehouse, files, count_from_start(progress), begin)
 
@@ -258,7 +258,7 @@ class Filling(Rooted):
 
 def _rows_of(logs: "Iterable[Log]", told: Progress) -> Progress:
     """Return what counts the rows read of each log among about so many that all have."""
-    from fleet_slip.ingest.expected_rows import expected_rows
+    from fleet_slip.ingest.landing.expected_rows import expected_rows
 
     total = sum(map(expected_rows, logs))
     left = total

@@ -13,8 +13,8 @@ from fleet_slip.api.calls import ShowProgress, Workers
 from fleet_slip.api.retraining import Training
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.errors import DataError, FleetSlipError, InputError
-from fleet_slip.ingest.log_files import Place, find_logs, is_url
-from fleet_slip.ingest.mapping import load_mapping
+from fleet_slip.ingest.landing.log_files import Place, find_logs, is_url
+from fleet_slip.ingest.mapping.mapping import load_mapping
 from fleet_slip.models.aliases import CANDIDATE
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.monitoring.night_report import NightReport, NightStep, State

@@ -3,7 +3,7 @@
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-from fleet_slip.grams.job import GramReport
+from fleet_slip.grams.rows.gram_job import GramReport
 from fleet_slip.models.publish import Publication
 from fleet_slip.selection.request import RequestedSelection
 

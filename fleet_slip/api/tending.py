@@ -19,7 +19,7 @@ from fleet_slip.errors import QuestionError, RefusedError, UsageError
 from fleet_slip.runs.log import step
 
 if TYPE_CHECKING:
-    from fleet_slip.grams.calibration import Calibration
+    from fleet_slip.grams.calibration.calibration import Calibration
     from fleet_slip.maintenance.compaction import CompactionReport
     from fleet_slip.maintenance.forget import ForgetReport
     from fleet_slip.maintenance.retention import RetentionReport
@@ -83,7 +83,7 @@ class Tending(Serving):
         been computed or no drive satisfies the condition, and `QuestionError` for one that is no
         condition.
         """
-        from fleet_slip.grams.calibration import calibrate
+        from fleet_slip.grams.calibration.calibration import calibrate
 
         return calibrate(self.warehouse, cohort)
 

@@ -9,10 +9,10 @@ from typing import Annotated, Any, TypeVar
 import typer
 
 from fleet_slip.cli.completing import complete_config, complete_feature_set
-from fleet_slip.regression.criteria import CRITERIA
-from fleet_slip.regression.drive_moments import ClusterUnit
-from fleet_slip.regression.ranking import RANKINGS
-from fleet_slip.regression.stepwise import METHODS
+from fleet_slip.regression.choice.criteria import CRITERIA
+from fleet_slip.regression.choice.ranking import RANKINGS
+from fleet_slip.regression.choice.stepwise import METHODS
+from fleet_slip.regression.inference.drive_moments import ClusterUnit
 from fleet_slip.selection.model_list import DEFAULT_MOST
 from fleet_slip.selection.request import DEFAULT_MODELS, SelectionRequest
 

@@ -1,12 +1,12 @@
 """Gram rows in C99: what a car counts at each tick of a drive, and the messages that tell it.
 
-The layout of a message is that of `fleet_slip.grams.messages`. Counts have 16 bits, so that a
-product is at most 2^30 and a sum of `MOST_ROWS` of them below 2^61: nothing overflows.
+The layout of a message is that of `fleet_slip.grams.received.messages`. Counts have 16 bits, so
+that a product is at most 2^30 and a sum of `MOST_ROWS` of them below 2^61: nothing overflows.
 """
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.export.c_names import literal
-from fleet_slip.grams.messages import (
+from fleet_slip.grams.received.messages import (
     HEADER_BYTES,
     LAYOUT,
     LONGEST_VEHICLE,
@@ -16,7 +16,7 @@ from fleet_slip.grams.messages import (
     message_size,
     signals_definition,
 )
-from fleet_slip.regression.gram import packed_size
+from fleet_slip.regression.exact.gram import packed_size
 
 
 def c_gram_header(prefix: str) -> str:

@@ -28,7 +28,7 @@ from fleet_slip.grams.operations import (
     C,
     D,
 )
-from fleet_slip.grams.product_sums import add_products, add_sums
+from fleet_slip.grams.rows.product_sums import add_products, add_sums
 
 COMPLETE, LACKING, BAD_DIVISOR = 0, 1, 2
 """What became of a block."""

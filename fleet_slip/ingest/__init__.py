@@ -1,8 +1,8 @@
 """Brings measured logs in: a file and a mapping become counts at 100 Hz."""
 
-from fleet_slip.ingest.mapping import Mapping, load_mapping
+from fleet_slip.ingest.drives.totals import IngestCounts
+from fleet_slip.ingest.mapping.mapping import Mapping, load_mapping
 from fleet_slip.ingest.measured import MeasuredLog, read_measured
-from fleet_slip.ingest.totals import IngestCounts
 
 __all__ = [
     "IngestCounts",

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pyarrow as pa
 
-from fleet_slip.ingest.mapping import Mapping
-from fleet_slip.ingest.measured_drives import log_table
-from fleet_slip.ingest.stream import open_measured
-from fleet_slip.ingest.totals import IngestCounts
+from fleet_slip.ingest.drives.measured_drives import log_table
+from fleet_slip.ingest.drives.stream import open_measured
+from fleet_slip.ingest.drives.totals import IngestCounts
+from fleet_slip.ingest.mapping.mapping import Mapping
 
 
 @dataclass(frozen=True)

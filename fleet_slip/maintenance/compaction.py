@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import date
 
 from fleet_slip.delta import Snapshot, TableFile, retry_conflicts
-from fleet_slip.grams.job import reconcile
+from fleet_slip.grams.rows.gram_job import reconcile
 from fleet_slip.maintenance.rewriting import Rewriting, rewrite
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.tables import Warehouse

@@ -10,7 +10,7 @@ import pyarrow.compute as pc
 from fleet_slip.delta import Snapshot
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.files.folder import StoredFile
-from fleet_slip.grams.backlog import BEING_WRITTEN_HOURS
+from fleet_slip.grams.rows.backlog import BEING_WRITTEN_HOURS
 from fleet_slip.maintenance.vacuum import find_replaced, find_temporary_files, find_unreferenced
 from fleet_slip.warehouse.audit import Forgettable
 from fleet_slip.warehouse.tables import Warehouse

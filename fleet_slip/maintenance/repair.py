@@ -21,8 +21,8 @@ from fleet_slip.delta.checkpoints import (
 )
 from fleet_slip.errors import FleetSlipError, StorageError
 from fleet_slip.files.storage_errors import storage_errors
-from fleet_slip.grams.gram_files import is_of_received
-from fleet_slip.grams.job import reconcile
+from fleet_slip.grams.rows.gram_files import is_of_received
+from fleet_slip.grams.rows.gram_job import reconcile
 from fleet_slip.maintenance.verification import Verification
 from fleet_slip.maintenance.verify_files import problem_of
 from fleet_slip.resources import config_names

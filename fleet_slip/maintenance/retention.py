@@ -8,7 +8,7 @@ from pydantic import Field
 
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import ConfigError, RefusedError
-from fleet_slip.grams.gram_files import is_of_received
+from fleet_slip.grams.rows.gram_files import is_of_received
 from fleet_slip.maintenance.forget import ForgetReport, forget
 from fleet_slip.maintenance.vacuum import RETENTION_HOURS, VacuumReport, vacuum
 from fleet_slip.progress import Progress, no_progress

@@ -17,7 +17,7 @@ from fleet_slip.delta.commit_check import find_commit_faults
 from fleet_slip.errors import FleetSlipError, StorageError
 from fleet_slip.files.documents import DocumentFolder
 from fleet_slip.files.folder import StoredFile
-from fleet_slip.grams.backlog import named_files
+from fleet_slip.grams.rows.backlog import named_files
 from fleet_slip.maintenance.vacuum import find_replaced, find_temporary_files, find_unreferenced
 from fleet_slip.maintenance.verification import Damage, Verification
 from fleet_slip.maintenance.verify_documents import verify_documents, verify_models

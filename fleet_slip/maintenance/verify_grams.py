@@ -7,18 +7,18 @@ from functools import partial
 
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.delta import TableFile
-from fleet_slip.grams.car_keys import load_car_keys
-from fleet_slip.grams.check import (
+from fleet_slip.grams.received.car_keys import load_car_keys
+from fleet_slip.grams.received.received_check import find_unsound
+from fleet_slip.grams.received.signature_check import check_signed_rows
+from fleet_slip.grams.rows.check import (
     DriveGrams,
     differing_drives,
     grams_by_blocks,
     read_counts,
     stored_grams,
 )
-from fleet_slip.grams.gram_files import is_of_received
-from fleet_slip.grams.received_check import find_unsound
-from fleet_slip.grams.rollup import is_rollup_of, read_rollup
-from fleet_slip.grams.signature_check import check_signed_rows
+from fleet_slip.grams.rows.gram_files import is_of_received
+from fleet_slip.grams.rows.rollup import is_rollup_of, read_rollup
 from fleet_slip.maintenance.verification import Damage, Verification
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.database import database_errors, open_database

@@ -2,7 +2,7 @@
 
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.models.manifest import Manifest
-from fleet_slip.regression.exact import LinearModel
+from fleet_slip.regression.exact.least_squares import LinearModel
 
 
 def counts_model(manifest: Manifest) -> LinearModel:

@@ -19,20 +19,20 @@ from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import DataError
-from fleet_slip.grams.folding import FoldKey
+from fleet_slip.grams.cohorts.folding import FoldKey
 from fleet_slip.models.counts_model import counts_model
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.regression.crossval import (
+from fleet_slip.regression.choice.winner import Shortfall, Worth
+from fleet_slip.regression.exact.figures import error_sums
+from fleet_slip.regression.validation.crossval import (
     CrossValidation,
     assemble,
     cross_validate,
     least_squares,
 )
-from fleet_slip.regression.figures import error_sums
-from fleet_slip.regression.folds import Folds
-from fleet_slip.regression.paired import compare_paired
-from fleet_slip.regression.winner import Shortfall, Worth
+from fleet_slip.regression.validation.folds import Folds
+from fleet_slip.regression.validation.paired import compare_paired
 from fleet_slip.resources import config_file
 from fleet_slip.selection.compare import Selection
 from fleet_slip.words import number_of

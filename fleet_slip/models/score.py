@@ -12,9 +12,9 @@ from fleet_slip.catalogue.column_sql import with_windows
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.grams.calibration import calibrate
+from fleet_slip.grams.calibration.calibration import calibrate
+from fleet_slip.grams.cohorts.expansion import CarCounts
 from fleet_slip.grams.drive_rows import counts_of, drives_of_stream
-from fleet_slip.grams.expansion import CarCounts
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predictor import Predictor
 from fleet_slip.resources import read_sql

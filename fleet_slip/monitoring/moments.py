@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.regression.gram_table import GramTable
+from fleet_slip.regression.exact.gram_table import GramTable
 
 AT_ONCE = 2**12
 """Drives whose matrices are held at once: some 1.4 KB each."""

@@ -18,16 +18,16 @@ from statistics import fmean, stdev
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.errors import DataError, StorageError
-from fleet_slip.grams.day_sums import sum_days
+from fleet_slip.grams.cohorts.day_sums import sum_days
 from fleet_slip.models.counts_model import counts_model
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.monitoring.thresholds import MonitorThresholds, thresholds
-from fleet_slip.regression.crossval import least_squares
-from fleet_slip.regression.exact import LinearModel
-from fleet_slip.regression.figures import error_sums
-from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.special import student_t_quantile
+from fleet_slip.regression.exact.figures import error_sums
+from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.regression.exact.least_squares import LinearModel
+from fleet_slip.regression.exact.special import student_t_quantile
+from fleet_slip.regression.validation.crossval import least_squares
 from fleet_slip.warehouse.condition import Condition, parse_condition
 from fleet_slip.warehouse.tables import Warehouse
 from fleet_slip.words import number_of

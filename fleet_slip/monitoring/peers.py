@@ -22,7 +22,7 @@ from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.monitoring.moments import DriveBatches, MeanMoments
 from fleet_slip.monitoring.plausibility import Fault
 from fleet_slip.monitoring.thresholds import QualityThresholds
-from fleet_slip.regression.gram_table import GramTable
+from fleet_slip.regression.exact.gram_table import GramTable
 
 PAIRS = (("wheel_fl", "wheel_fr"), ("wheel_rl", "wheel_rr"), ("steer_fl", "steer_fr"))
 """Signals whose plugs may be exchanged."""

@@ -13,16 +13,16 @@ from fleet_slip.arrays import BoolArray
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.grams.cohort import Cohort, load_cohort, require_training
-from fleet_slip.grams.empty_cohort import empty_cohort_error
-from fleet_slip.grams.reader import GramReader
+from fleet_slip.grams.cohorts.cohort import Cohort, load_cohort, require_training
+from fleet_slip.grams.cohorts.empty_cohort import empty_cohort_error
+from fleet_slip.grams.cohorts.reader import GramReader
 from fleet_slip.monitoring.moments import DriveBatches
 from fleet_slip.monitoring.peers import settle
 from fleet_slip.monitoring.plausibility import Fault, find_implausible
 from fleet_slip.monitoring.repeated import find_repeated
 from fleet_slip.monitoring.reversed_label import find_reversed_labels
 from fleet_slip.monitoring.thresholds import QualityThresholds, thresholds
-from fleet_slip.regression.gram_table import GramTable
+from fleet_slip.regression.exact.gram_table import GramTable
 from fleet_slip.warehouse.condition import Condition, asking, parse_condition
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -75,7 +75,7 @@ def examine_drives(
 ) -> QualityReport:
     """Examine the drives that satisfy a condition, with one vehicle model's at a time in memory.
 
-    Raises like `fleet_slip.grams.cohort.load_cohort`.
+    Raises like `fleet_slip.grams.cohorts.cohort.load_cohort`.
     """
     drives = parse_condition(condition)
     with GramReader(warehouse) as reader:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.monitoring.moments import DriveBatches
 from fleet_slip.monitoring.plausibility import Fault
-from fleet_slip.regression.gram_table import GramTable
+from fleet_slip.regression.exact.gram_table import GramTable
 
 ROUNDS = 20
 LEAST_EXPLAINED = 0.5

@@ -11,7 +11,7 @@ from fleet_slip.delta import Snapshot
 from fleet_slip.errors import DataError, QuestionError, RefusedError, StorageError
 from fleet_slip.files.folder import Folder
 from fleet_slip.files.storage_errors import storage_errors
-from fleet_slip.grams.backlog import find_backlog
+from fleet_slip.grams.rows.backlog import find_backlog
 from fleet_slip.models.versions import Registry
 from fleet_slip.monitoring.thresholds import StatusThresholds, thresholds
 from fleet_slip.resources import read_sql

@@ -7,11 +7,11 @@ from fleet_slip.canonical import canonical_json, sha256_of
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.errors import QuestionError, UsageError
-from fleet_slip.grams.cohort import Cohort, load_cohort
-from fleet_slip.grams.fold_sums import SummedCohort, sum_cohort
-from fleet_slip.grams.folding import EACH, ROW_FOLDS, Folding, make_folding
-from fleet_slip.regression.nested_choice import Rule
-from fleet_slip.regression.stepwise import METHODS
+from fleet_slip.grams.cohorts.cohort import Cohort, load_cohort
+from fleet_slip.grams.cohorts.fold_sums import SummedCohort, sum_cohort
+from fleet_slip.grams.cohorts.folding import EACH, ROW_FOLDS, Folding, make_folding
+from fleet_slip.regression.choice.nested_choice import Rule
+from fleet_slip.regression.choice.stepwise import METHODS
 from fleet_slip.selection.compare import Selection, select
 from fleet_slip.selection.influential_cars import influential_cars, without_vehicles
 from fleet_slip.selection.inputs import WHOLE_SET, inputs_of, require_inputs

@@ -8,27 +8,32 @@ from fleet_slip.catalogue.feature_sets import LAG, lag_signals
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError
-from fleet_slip.grams.cohort import Cohort, Served
-from fleet_slip.grams.training import clustered_moments
-from fleet_slip.regression.coefficient_tests import ChowTest, WaldTest, chow_test, wald_test
-from fleet_slip.regression.drive_moments import ClusterUnit, DriveMoments, serving_drives
-from fleet_slip.regression.evidence import Evidence
-from fleet_slip.regression.exact import Fit, LinearModel, condition_number, fit
-from fleet_slip.regression.inference import (
-    Inference,
-    infer_by_clusters,
-    infer_classically,
-    variance_inflation,
+from fleet_slip.grams.cohorts.cohort import Cohort, Served
+from fleet_slip.grams.cohorts.training import clustered_moments
+from fleet_slip.regression.choice.nested import nested_fits
+from fleet_slip.regression.exact.least_squares import Fit, LinearModel, condition_number, fit
+from fleet_slip.regression.inference.coefficient_tests import (
+    ChowTest,
+    WaldTest,
+    chow_test,
+    wald_test,
 )
-from fleet_slip.regression.nested import nested_fits
-from fleet_slip.regression.ridge import fit_errors_in_variables
-from fleet_slip.regression.serial import (
+from fleet_slip.regression.inference.drive_moments import ClusterUnit, DriveMoments, serving_drives
+from fleet_slip.regression.inference.evidence import Evidence
+from fleet_slip.regression.inference.serial import (
     AutoregressiveFit,
     LagGram,
     SerialCorrelation,
     fit_autoregressive,
     serial_correlation,
 )
+from fleet_slip.regression.inference.standard_errors import (
+    Inference,
+    infer_by_clusters,
+    infer_classically,
+    variance_inflation,
+)
+from fleet_slip.regression.shrinkage.ridge import fit_errors_in_variables
 from fleet_slip.words import number_of
 
 

@@ -10,7 +10,7 @@ from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import Identifier
 from fleet_slip.config import Config, load_config
-from fleet_slip.grams.folding import Folding
+from fleet_slip.grams.cohorts.folding import Folding
 from fleet_slip.resources import find_config
 
 
@@ -51,7 +51,7 @@ class Search(Config):
         method: forward, backward, exchange or lars.
         most: largest number of columns that a model may have.
         rule: `best` takes the best cross-validated correlation; `worth` the fewest columns whose
-            error is negligibly larger, see `fleet_slip.regression.winner`.
+            error is negligibly larger, see `fleet_slip.regression.choice.winner`.
     """
 
     method: Literal["forward", "backward", "exchange", "lars"] = "forward"

@@ -11,15 +11,15 @@ from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.grams.cohort import Cohort, assign_folds
-from fleet_slip.grams.folding import FOLD_KEYS, PARTS, ROW_FOLDS, Folding
-from fleet_slip.grams.parts import UNKNOWN_PART
-from fleet_slip.regression.crossval import held_out_errors
-from fleet_slip.regression.drive_moments import require_serving_drives
-from fleet_slip.regression.exact import LinearModel, fit
-from fleet_slip.regression.figures import ErrorSums, Figures
-from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.winner import DEFAULT_WORTH, Worth
+from fleet_slip.grams.cohorts.cohort import Cohort, assign_folds
+from fleet_slip.grams.cohorts.folding import FOLD_KEYS, PARTS, ROW_FOLDS, Folding
+from fleet_slip.grams.rows.parts import UNKNOWN_PART
+from fleet_slip.regression.choice.winner import DEFAULT_WORTH, Worth
+from fleet_slip.regression.exact.figures import ErrorSums, Figures
+from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.regression.exact.least_squares import LinearModel, fit
+from fleet_slip.regression.inference.drive_moments import require_serving_drives
+from fleet_slip.regression.validation.crossval import held_out_errors
 
 ROWS_PER_COEFFICIENT = 100
 """A regime with fewer training rows, one second of driving a coefficient, uses the pooled model."""

@@ -8,14 +8,11 @@ import numpy as np
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.grams.cohort import Cohort
-from fleet_slip.grams.folding import ROW_FOLDS, Folding
-from fleet_slip.grams.training import drive_folds, row_training
-from fleet_slip.regression.criteria import CRITERIA
-from fleet_slip.regression.crossval import CrossValidation
-from fleet_slip.regression.drive_moments import ClusterUnit
-from fleet_slip.regression.evidence import Evidence
-from fleet_slip.regression.nested_choice import (
+from fleet_slip.grams.cohorts.cohort import Cohort
+from fleet_slip.grams.cohorts.folding import ROW_FOLDS, Folding
+from fleet_slip.grams.cohorts.training import drive_folds, row_training
+from fleet_slip.regression.choice.criteria import CRITERIA
+from fleet_slip.regression.choice.nested_choice import (
     CROSS_VALIDATION,
     FEWEST_FOLDS,
     NestedDistances,
@@ -25,9 +22,12 @@ from fleet_slip.regression.nested_choice import (
     measure_distances,
     select_nested,
 )
-from fleet_slip.regression.nested_choice import NestedChoice as NestedSelection
-from fleet_slip.regression.subsets import SizeResult, best_subsets, pick_sizes
-from fleet_slip.regression.winner import Winner, choose
+from fleet_slip.regression.choice.nested_choice import NestedChoice as NestedSelection
+from fleet_slip.regression.choice.subsets import SizeResult, best_subsets, pick_sizes
+from fleet_slip.regression.choice.winner import Winner, choose
+from fleet_slip.regression.inference.drive_moments import ClusterUnit
+from fleet_slip.regression.inference.evidence import Evidence
+from fleet_slip.regression.validation.crossval import CrossValidation
 
 ALL_SUBSETS = "all-subsets"
 """Instead of a ranking: the best subset of every size."""

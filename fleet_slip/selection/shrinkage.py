@@ -8,10 +8,18 @@ import numpy as np
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError
-from fleet_slip.grams.cohort import Cohort
-from fleet_slip.grams.folding import Folding
-from fleet_slip.grams.training import drive_folds
-from fleet_slip.regression.crossval import (
+from fleet_slip.grams.cohorts.cohort import Cohort
+from fleet_slip.grams.cohorts.folding import Folding
+from fleet_slip.grams.cohorts.training import drive_folds
+from fleet_slip.regression.choice.lars import fit_lasso
+from fleet_slip.regression.choice.nested import nested_fits
+from fleet_slip.regression.choice.nested_choice import FEWEST_FOLDS
+from fleet_slip.regression.exact.least_squares import Scales
+from fleet_slip.regression.inference.drive_moments import ClusterUnit
+from fleet_slip.regression.inference.evidence import Evidence
+from fleet_slip.regression.shrinkage.pace import ESTIMATORS, Estimator, shrink
+from fleet_slip.regression.shrinkage.ridge import fit_ridge
+from fleet_slip.regression.validation.crossval import (
     CrossValidation,
     Procedure,
     assemble,
@@ -19,15 +27,7 @@ from fleet_slip.regression.crossval import (
     held_out_errors,
     least_squares,
 )
-from fleet_slip.regression.drive_moments import ClusterUnit
-from fleet_slip.regression.evidence import Evidence
-from fleet_slip.regression.exact import Scales
-from fleet_slip.regression.folds import Folds
-from fleet_slip.regression.lars import fit_lasso
-from fleet_slip.regression.nested import nested_fits
-from fleet_slip.regression.nested_choice import FEWEST_FOLDS
-from fleet_slip.regression.pace import ESTIMATORS, Estimator, shrink
-from fleet_slip.regression.ridge import fit_ridge
+from fleet_slip.regression.validation.folds import Folds
 
 PENALTIES = tuple(float(10.0**exponent) for exponent in np.arange(-6, 0.01, 0.5))
 """Penalties on the correlation matrix that ridge and lasso choose from."""

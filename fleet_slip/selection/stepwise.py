@@ -11,17 +11,17 @@ from typing import Any
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError
-from fleet_slip.grams.cohort import Cohort
-from fleet_slip.grams.fold_sums import SummedCohort
-from fleet_slip.grams.folding import Folding
-from fleet_slip.regression.crossval import CrossValidation, assemble, held_out_errors
-from fleet_slip.regression.exact import Fit, fit
-from fleet_slip.regression.figures import ErrorSums
-from fleet_slip.regression.folds import Folds
-from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.nested import nested_fits
-from fleet_slip.regression.stepwise import stepwise_order
-from fleet_slip.regression.winner import DEFAULT_WORTH, Winner, Worth, choose
+from fleet_slip.grams.cohorts.cohort import Cohort
+from fleet_slip.grams.cohorts.fold_sums import SummedCohort
+from fleet_slip.grams.cohorts.folding import Folding
+from fleet_slip.regression.choice.nested import nested_fits
+from fleet_slip.regression.choice.stepwise import stepwise_order
+from fleet_slip.regression.choice.winner import DEFAULT_WORTH, Winner, Worth, choose
+from fleet_slip.regression.exact.figures import ErrorSums
+from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.regression.exact.least_squares import Fit, fit
+from fleet_slip.regression.validation.crossval import CrossValidation, assemble, held_out_errors
+from fleet_slip.regression.validation.folds import Folds
 from fleet_slip.selection.model_list import Search
 
 

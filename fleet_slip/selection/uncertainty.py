@@ -3,18 +3,18 @@
 from dataclasses import dataclass
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.cohort import Cohort
-from fleet_slip.grams.folding import EACH, Folding
-from fleet_slip.grams.training import drive_folds
-from fleet_slip.regression.crossval import CrossValidation, least_squares
-from fleet_slip.regression.drive_moments import ClusterUnit, DriveMoments
-from fleet_slip.regression.resampling import (
+from fleet_slip.grams.cohorts.cohort import Cohort
+from fleet_slip.grams.cohorts.folding import EACH, Folding
+from fleet_slip.grams.cohorts.training import drive_folds
+from fleet_slip.regression.inference.drive_moments import ClusterUnit, DriveMoments
+from fleet_slip.regression.inference.resampling import (
     Interval,
     bootstrap_correlations,
     held_out_products,
     percentile_interval,
     repeated_cross_validation,
 )
+from fleet_slip.regression.validation.crossval import CrossValidation, least_squares
 
 SEED = 1
 """Resampling is reproducible: the same command prints the same figures."""
@@ -50,7 +50,7 @@ def estimate_uncertainty(
 ) -> Uncertainty:
     """Draw the drives with replacement `bootstrap` times, deal the folds anew `repeat` times.
 
-    Of several cars, whole cars are drawn, see `fleet_slip.grams.training.clustered_moments`.
+    Of several cars, whole cars are drawn, see `clustered_moments`.
 
     Raises `QuestionError` for folds of rows, `DataError` for too few drives.
     """

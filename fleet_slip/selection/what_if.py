@@ -6,11 +6,11 @@ from typing import Any
 
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.errors import QuestionError
-from fleet_slip.grams.cohort import Cohort
-from fleet_slip.regression.disturbance import disturb
-from fleet_slip.regression.exact import LinearModel
-from fleet_slip.regression.figures import Figures, error_sums
-from fleet_slip.regression.ridge import fit_noise_matched
+from fleet_slip.grams.cohorts.cohort import Cohort
+from fleet_slip.regression.exact.figures import Figures, error_sums
+from fleet_slip.regression.exact.least_squares import LinearModel
+from fleet_slip.regression.shrinkage.disturbance import disturb
+from fleet_slip.regression.shrinkage.ridge import fit_noise_matched
 
 
 @dataclass(frozen=True)

@@ -4,10 +4,10 @@ import math
 import re
 
 from fleet_slip.errors import UsageError
-from fleet_slip.regression.winner import Worth
+from fleet_slip.regression.choice.winner import Worth
 
 WORTH = "0.005deg"
-"""`fleet_slip.regression.winner.DEFAULT_WORTH` as it is asked for."""
+"""`fleet_slip.regression.choice.winner.DEFAULT_WORTH` as it is asked for."""
 
 _WORTH = re.compile(r"(\d+(?:\.\d*)?|\.\d+) ?(deg|%)")
 

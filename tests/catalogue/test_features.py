@@ -20,16 +20,15 @@ from fleet_slip.catalogue.features import features, load_features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.delta import Change, Unit
 from fleet_slip.errors import ConfigError, DataError, QuestionError
-from fleet_slip.grams import aggregation
-from fleet_slip.grams import job as gram_job
-from fleet_slip.grams import statement as gram_statement
-from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.cohorts.cohort import load_cohort
 from fleet_slip.grams.column_plan import ColumnPlan
 from fleet_slip.grams.columns import DriveColumns, DriveCounts
-from fleet_slip.grams.job import update_grams
 from fleet_slip.grams.row_code import RowColumn
-from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.gram_table import GramTable
+from fleet_slip.grams.rows import aggregation, gram_job
+from fleet_slip.grams.rows import statement as gram_statement
+from fleet_slip.grams.rows.gram_job import update_grams
+from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.regression.exact.gram_table import GramTable
 from fleet_slip.resources import folder
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import land, log_rows, random_counts

@@ -11,7 +11,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.api.session import Session
-from fleet_slip.cli.shell import Completer, Typed
+from fleet_slip.cli.data.shell_command import Completer, Typed
 from tests.support.commands import COMMAND, PATIENCE_S, Finished, RunCommand
 
 
@@ -52,7 +52,9 @@ def test_a_name_of_a_view_is_no_sql(
     session: Session, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[str] = []
-    monkeypatch.setattr("fleet_slip.cli.shell.answer", lambda *given: asked.append(given[1]))
+    monkeypatch.setattr(
+        "fleet_slip.cli.data.shell_command.answer", lambda *given: asked.append(given[1])
+    )
     typed = Typed(session)
     assert typed.obey(".schema grams")
     assert typed.obey(".schema x' OR '1' = '1")

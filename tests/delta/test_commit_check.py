@@ -12,7 +12,7 @@ from deltalake import DeltaTable
 
 from fleet_slip.delta import Change, Unit
 from fleet_slip.delta.commit_check import find_commit_faults
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.maintenance.compaction import compact
 from fleet_slip.maintenance.verify import verify
 from fleet_slip.warehouse.tables import Warehouse

@@ -12,10 +12,10 @@ import pytest
 from fleet_slip.errors import FleetSlipError, StorageError
 from fleet_slip.files import checksums
 from fleet_slip.files.checksums import check_local_files, checksum_in, checksum_of
-from fleet_slip.grams.aggregation import aggregate
-from fleet_slip.grams.fold_sums import sum_cohort
-from fleet_slip.grams.folding import Folding
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.cohorts.fold_sums import sum_cohort
+from fleet_slip.grams.cohorts.folding import Folding
+from fleet_slip.grams.rows.aggregation import aggregate
+from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.views import connect
 from fleet_slip.warehouse.database import reading_files
 from fleet_slip.warehouse.tables import Warehouse

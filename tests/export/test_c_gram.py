@@ -15,9 +15,9 @@ import fleet_slip
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import UsageError
 from fleet_slip.export.files import export_files
-from fleet_slip.grams.messages import message_size, signals_definition
+from fleet_slip.grams.received.messages import message_size, signals_definition
 from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.exact.gram import Gram
 from tests.export.compiled import SANITIZED, can_sanitize, compile_c, needs_cc
 from tests.export.models import MODELS, model_of
 from tests.support.messages import parse_messages

@@ -12,15 +12,15 @@ import pytest
 from fleet_slip.catalogue.car_numbers import CAR_NUMBERS
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.grams.calibration import calibrate
-from fleet_slip.grams.car_evidence import Evidence
-from fleet_slip.grams.car_numbers import KINDS, course_shape, tell_numbers
-from fleet_slip.grams.drive_sums import collect_sums
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.calibration.calibration import calibrate
+from fleet_slip.grams.calibration.car_evidence import Evidence
+from fleet_slip.grams.calibration.car_numbers import KINDS, course_shape, tell_numbers
+from fleet_slip.grams.cohorts.drive_sums import collect_sums
+from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.maintenance.forget import forget
-from fleet_slip.regression.exact import fit
-from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.plane import PlaneShape, fit_plane
+from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.regression.exact.least_squares import fit
+from fleet_slip.regression.exact.plane import PlaneShape, fit_plane
 from fleet_slip.views import connect
 from fleet_slip.warehouse.audit import Forgettable
 from fleet_slip.warehouse.tables import Warehouse

@@ -9,7 +9,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.errors import CohortError, ConfigError, QuestionError
-from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.warehouse.minimum_cohort import MINIMUM_VARIABLE
 from tests.support.messages import START_S, gram_of, message_of
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from benchmarks.poisoned import INPUTS, LABEL, left_out, told
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.exact.gram import Gram
 
 SIGNALS = (*INPUTS, LABEL)
 

@@ -14,9 +14,9 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.cli.main import app
 from fleet_slip.delta import Change
 from fleet_slip.errors import FleetSlipError, RefusedError
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.maintenance.retention import Retention, retain
-from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.exact.gram import Gram
 from tests.support.logs import land, log_rows
 from tests.support.messages import START_S, drive_counts, gram_of, message_of
 

@@ -13,9 +13,9 @@ import pytest
 import fleet_slip
 from fleet_slip.cli.main import app
 from fleet_slip.errors import InputError, QuestionError
-from fleet_slip.grams.messages import read_messages
+from fleet_slip.grams.received.messages import read_messages
 from fleet_slip.maintenance.forget import forget
-from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.warehouse.audit import Forgettable
 from tests.support.commands import done_on, run_on
 from tests.support.messages import START_S, gram_of, message_of, parse_messages

@@ -17,15 +17,16 @@ from benchmarks.receive import messages_of
 from fleet_slip.delta import Change
 from fleet_slip.errors import CohortError, FleetSlipError, StorageError
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams import cells, rollup
-from fleet_slip.grams.car_keys import KEYS_VARIABLE
-from fleet_slip.grams.day_sums import sum_days
-from fleet_slip.grams.fold_sums import sum_cohort
-from fleet_slip.grams.folding import EACH, FoldCount, Folding, FoldKey
-from fleet_slip.grams.gram_files import write_rows
-from fleet_slip.grams.members import hash_numbers
-from fleet_slip.grams.reader import GramReader
-from fleet_slip.grams.rollup import Rollup, make_rollup, read_rollup
+from fleet_slip.grams.cohorts import cells
+from fleet_slip.grams.cohorts.day_sums import sum_days
+from fleet_slip.grams.cohorts.fold_sums import sum_cohort
+from fleet_slip.grams.cohorts.folding import EACH, FoldCount, Folding, FoldKey
+from fleet_slip.grams.cohorts.members import hash_numbers
+from fleet_slip.grams.cohorts.reader import GramReader
+from fleet_slip.grams.received.car_keys import KEYS_VARIABLE
+from fleet_slip.grams.rows import rollup
+from fleet_slip.grams.rows.gram_files import write_rows
+from fleet_slip.grams.rows.rollup import Rollup, make_rollup, read_rollup
 from fleet_slip.maintenance.retention import Retention, retain
 from fleet_slip.models.versions import Registry
 from fleet_slip.warehouse.condition import parse_condition

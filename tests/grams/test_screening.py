@@ -10,8 +10,8 @@ import pytest
 
 import fleet_slip
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams import screening
-from fleet_slip.grams.receiving import ReceiveReport
+from fleet_slip.grams.received import screening
+from fleet_slip.grams.received.receiving import ReceiveReport
 from fleet_slip.maintenance.forget import forget
 from fleet_slip.maintenance.retention import Retention, retain
 from fleet_slip.runs.log import LOGGER

@@ -16,12 +16,12 @@ from fleet_slip.catalogue.columns import WEIGHT, Definition, Fact, Gate, limit_o
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError
-from fleet_slip.grams.aggregation import aggregate, by_sql
-from fleet_slip.grams.check import grams_of
 from fleet_slip.grams.column_plan import ColumnPlan
 from fleet_slip.grams.columns import DriveColumns, DriveCounts
-from fleet_slip.grams.job import update_grams
-from fleet_slip.grams.wide import wide_grams
+from fleet_slip.grams.rows.aggregation import aggregate, by_sql
+from fleet_slip.grams.rows.check import grams_of
+from fleet_slip.grams.rows.gram_job import update_grams
+from fleet_slip.grams.rows.wide import wide_grams
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import land, log_rows, random_counts
 

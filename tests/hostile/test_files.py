@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.job import ingest_file
+from fleet_slip.ingest.landing.ingest_job import ingest_file
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.measured import a_mapping, csv_text, good_columns
 

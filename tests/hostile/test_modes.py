@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.models.versions import Registry
 from fleet_slip.progress import no_progress
 from fleet_slip.warehouse.tables import Warehouse

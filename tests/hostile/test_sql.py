@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 
 from fleet_slip.errors import FleetSlipError, QuestionError, StorageError
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.cohorts.cohort import load_cohort
+from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.progress import no_progress
 from fleet_slip.views import connect
 from fleet_slip.warehouse.database import database_errors, interruptible

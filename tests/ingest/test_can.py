@@ -18,12 +18,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet_slip.errors import ConfigError, InputError
-from fleet_slip.ingest import MeasuredLog, can_frames, load_mapping, read_measured
-from fleet_slip.ingest.can_bus import CanBus, read_can_database
-from fleet_slip.ingest.can_decoding import physical, raw_numbers
-from fleet_slip.ingest.can_frames import CanFrames
-from fleet_slip.ingest.can_trace import open_can_trace
-from fleet_slip.ingest.spool import Spool
+from fleet_slip.ingest import MeasuredLog, load_mapping, read_measured
+from fleet_slip.ingest.formats import can_frames
+from fleet_slip.ingest.formats.can_bus import CanBus, read_can_database
+from fleet_slip.ingest.formats.can_decoding import physical, raw_numbers
+from fleet_slip.ingest.formats.can_frames import CanFrames
+from fleet_slip.ingest.formats.can_trace import open_can_trace
+from fleet_slip.ingest.formats.spool import Spool
 from tests.support.logs import without_names
 from tests.support.measured import ticks
 

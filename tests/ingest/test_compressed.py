@@ -8,8 +8,9 @@ import pyarrow as pa
 import pytest
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import csv_batches, read_measured
-from fleet_slip.ingest.csv_batches import BLOCK_BYTES
+from fleet_slip.ingest import read_measured
+from fleet_slip.ingest.formats import csv_batches
+from fleet_slip.ingest.formats.csv_batches import BLOCK_BYTES
 from tests.support.logs import without_names
 from tests.support.measured import a_mapping, csv_text, good_columns, read_text
 

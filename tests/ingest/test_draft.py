@@ -12,8 +12,8 @@ from asammdf import MDF, Signal
 
 from fleet_slip.errors import InputError, UsageError
 from fleet_slip.ingest import load_mapping, read_measured
-from fleet_slip.ingest.guessing import parts_of
-from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS
+from fleet_slip.ingest.drafting.guessing import parts_of
+from fleet_slip.ingest.drafting.suspicion import RADIUS_M, WHEELS
 from tests.support.reported import call
 from tests.support.suggested import LOGS, wrong_guesses
 from tests.support.suggested import suggest as suggest_of

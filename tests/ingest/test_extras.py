@@ -9,9 +9,9 @@ import pytest
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import CATALOGUE_VARIABLE, catalogue
 from fleet_slip.errors import RefusedError
-from fleet_slip.grams.aggregation import by_sql
-from fleet_slip.grams.job import update_grams
-from fleet_slip.ingest.job import ingest_file
+from fleet_slip.grams.rows.aggregation import by_sql
+from fleet_slip.grams.rows.gram_job import update_grams
+from fleet_slip.ingest.landing.ingest_job import ingest_file
 from fleet_slip.maintenance.compaction import compact
 from fleet_slip.maintenance.migration import migrate
 from fleet_slip.maintenance.verify import verify

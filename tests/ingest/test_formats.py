@@ -19,9 +19,10 @@ import scipy.sparse
 from asammdf import MDF, Signal
 
 from fleet_slip.errors import ExtraError, InputError
-from fleet_slip.ingest import Mapping, MeasuredLog, matlab, matlab_elements, mdf, read_measured
-from fleet_slip.ingest.preview import preview_log
-from fleet_slip.ingest.source import reading_with
+from fleet_slip.ingest import Mapping, MeasuredLog, read_measured
+from fleet_slip.ingest.drafting.preview import preview_log
+from fleet_slip.ingest.formats import matlab, matlab_elements, mdf
+from fleet_slip.ingest.formats.source import reading_with
 from tests.support.measured import a_mapping, ticks
 
 START = datetime(2024, 5, 31, 12, tzinfo=UTC)

@@ -9,7 +9,7 @@ import pyarrow as pa
 import pytest
 
 from fleet_slip.catalogue.counts import as_arrow
-from fleet_slip.ingest.measured_drives import SHARED_ROWS, MeasuredDrive, log_table
+from fleet_slip.ingest.drives.measured_drives import SHARED_ROWS, MeasuredDrive, log_table
 from tests.support.commands import run
 from tests.support.measured import a_mapping, csv_text, good_columns
 
@@ -17,8 +17,8 @@ INGEST = """
 import sys
 from pathlib import Path
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.ingest.job import ingest_file
-from fleet_slip.ingest.mapping import Mapping
+from fleet_slip.ingest.landing.ingest_job import ingest_file
+from fleet_slip.ingest.mapping.mapping import Mapping
 from fleet_slip.warehouse.tables import Warehouse
 root, log, mapping = sys.argv[1:]
 warehouse = Warehouse(LocalFolder(Path(root)))

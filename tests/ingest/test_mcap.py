@@ -12,8 +12,9 @@ from mcap.writer import Writer as PlainWriter
 from mcap_ros2.writer import Writer
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import Mapping, mcap_log, mcap_messages, read_measured
-from fleet_slip.ingest.source import OWN_TIME
+from fleet_slip.ingest import Mapping, read_measured
+from fleet_slip.ingest.formats import mcap_log, mcap_messages
+from fleet_slip.ingest.formats.source import OWN_TIME
 from tests.ingest.test_formats import AX, AX_COUNTS, BETA_DEG, START, TIME_S, require_the_drive
 from tests.support.measured import a_mapping
 from tests.support.reported import call

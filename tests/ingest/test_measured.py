@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import checking, load_mapping, read_measured, stream
+from fleet_slip.ingest import load_mapping, read_measured
+from fleet_slip.ingest.drives import checking, stream
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA
 from tests.support.logs import schema_without, without_names
 from tests.support.measured import (

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.ingest.resampling import (
+from fleet_slip.ingest.drives.resampling import (
     average,
     build_resampler,
     choose_method,

@@ -14,21 +14,16 @@ from hypothesis import strategies as st
 
 from fleet_slip.errors import InputError
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.ingest import (
-    csv_batches,
-    drive_cutter,
-    landing,
-    open_drives,
-    read_measured,
-    stream,
-    writing,
-)
-from fleet_slip.ingest import read_ahead as read_ahead_module
-from fleet_slip.ingest.csv_batches import PlainNumbers, open_csv
-from fleet_slip.ingest.csv_format import CsvFormat
-from fleet_slip.ingest.drive_cutter import DriveCutter
-from fleet_slip.ingest.job import ingest_file
-from fleet_slip.ingest.read_ahead import AHEAD, map_ahead, read_ahead
+from fleet_slip.ingest import read_measured
+from fleet_slip.ingest.drives import drive_cutter, open_drives, stream
+from fleet_slip.ingest.drives import read_ahead as read_ahead_module
+from fleet_slip.ingest.drives.drive_cutter import DriveCutter
+from fleet_slip.ingest.drives.read_ahead import AHEAD, map_ahead, read_ahead
+from fleet_slip.ingest.formats import csv_batches
+from fleet_slip.ingest.formats.csv_batches import PlainNumbers, open_csv
+from fleet_slip.ingest.formats.csv_format import CsvFormat
+from fleet_slip.ingest.landing import landing, writing
+from fleet_slip.ingest.landing.ingest_job import ingest_file
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.measured import a_mapping, csv_text, good_columns, read_columns, ticks
 

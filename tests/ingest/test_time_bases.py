@@ -16,9 +16,10 @@ from hypothesis import strategies as st
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import MeasuredLog, log_rows, read_measured, stream, time_bases
-from fleet_slip.ingest.source import OWN_TIME, Base, Channel
-from fleet_slip.ingest.time_bases import DISORDER, HELD, ROW, merge_bases
+from fleet_slip.ingest import MeasuredLog, read_measured
+from fleet_slip.ingest.drives import log_rows, stream, time_bases
+from fleet_slip.ingest.drives.time_bases import DISORDER, HELD, ROW, merge_bases
+from fleet_slip.ingest.formats.source import OWN_TIME, Base, Channel
 from tests.support.measured import a_mapping
 
 GAP_S = 1.0

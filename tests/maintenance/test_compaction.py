@@ -16,7 +16,7 @@ import fleet_slip
 from fleet_slip.delta import Change
 from fleet_slip.files.folder import TEMPORARY_PREFIX
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.maintenance.compaction import compact
 from fleet_slip.maintenance.vacuum import find_expired, find_unreferenced, preview_vacuum, vacuum
 from fleet_slip.warehouse.tables import Warehouse

@@ -10,7 +10,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip import Fleet
-from fleet_slip.grams.signatures import sign_messages
+from fleet_slip.grams.received.signatures import sign_messages
 from fleet_slip.models.ed25519 import generate
 from tests.support.messages import gram_of, message_of
 

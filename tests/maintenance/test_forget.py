@@ -17,17 +17,17 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.delta import Change
 from fleet_slip.errors import QuestionError, RefusedError, StorageError
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams import job as gram_job
-from fleet_slip.grams.aggregation import compute_grams
-from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.grams.job import update_grams
-from fleet_slip.ingest.job import ingest_file
+from fleet_slip.grams.cohorts.cohort import load_cohort
+from fleet_slip.grams.rows import gram_job
+from fleet_slip.grams.rows.aggregation import compute_grams
+from fleet_slip.grams.rows.gram_job import update_grams
+from fleet_slip.ingest.landing.ingest_job import ingest_file
 from fleet_slip.maintenance.compaction import compact
 from fleet_slip.maintenance.find_drives import Located, drives_by_file, locate
 from fleet_slip.maintenance.forget import forget
 from fleet_slip.maintenance.retention import Retention, retain
 from fleet_slip.maintenance.vacuum import find_unreferenced
-from fleet_slip.regression.exact import fit
+from fleet_slip.regression.exact.least_squares import fit
 from fleet_slip.warehouse.audit import Audit, Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand

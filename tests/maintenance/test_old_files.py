@@ -8,7 +8,7 @@ import pyarrow as pa
 import pytest
 
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.maintenance.compaction import compact
 from fleet_slip.maintenance.old_files import (
     find_old_files,

@@ -15,10 +15,10 @@ import pytest
 import fleet_slip
 from fleet_slip.delta import Change, Snapshot
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams import job as gram_job
-from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.grams.job import update_grams
-from fleet_slip.ingest.job import ingest_file
+from fleet_slip.grams.cohorts.cohort import load_cohort
+from fleet_slip.grams.rows import gram_job
+from fleet_slip.grams.rows.gram_job import update_grams
+from fleet_slip.ingest.landing.ingest_job import ingest_file
 from fleet_slip.maintenance import compaction
 from fleet_slip.maintenance.compaction import compact
 from fleet_slip.maintenance.forget import forget

@@ -16,7 +16,7 @@ from fleet_slip.delta import Change
 from fleet_slip.errors import StorageError
 from fleet_slip.files.documents import DocumentFolder
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.maintenance.compaction import compact
 from fleet_slip.maintenance.repair import repair
 from fleet_slip.maintenance.vacuum import vacuum

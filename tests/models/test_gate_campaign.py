@@ -11,7 +11,7 @@ import pytest
 
 from fleet_slip.errors import RefusedError
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.models.publish import Publication, manifest_of, publish
 from fleet_slip.models.versions import Registry
 from fleet_slip.resources import find_config

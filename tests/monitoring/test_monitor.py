@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from fleet_slip.errors import DataError
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.publish import manifest_of, publish
 from fleet_slip.models.versions import Registry
 from fleet_slip.monitoring.monitor import Chart, Limits, monitor
-from fleet_slip.regression.special import student_t_quantile
+from fleet_slip.regression.exact.special import student_t_quantile
 from fleet_slip.selection.answer import answer_request
 from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.views import connect

@@ -16,7 +16,7 @@ from fleet_slip.errors import (
     UsageError,
 )
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.monitoring.status import status_of
 from fleet_slip.runs.log import recording
 from fleet_slip.warehouse.tables import Warehouse

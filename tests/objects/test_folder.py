@@ -22,7 +22,7 @@ from fleet_slip.files.data_root import data_root
 from fleet_slip.files.documents import DocumentFolder
 from fleet_slip.files.folder import Folder
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import DAY, land, log_rows, random_counts

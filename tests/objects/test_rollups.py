@@ -8,9 +8,9 @@ from benchmarks.receive import messages_of
 from fleet_slip.files import object_files
 from fleet_slip.files.folder import Folder
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.fold_sums import SummedCohort, sum_cohort
-from fleet_slip.grams.folding import Folding
-from fleet_slip.grams.receiving import receive_files
+from fleet_slip.grams.cohorts.fold_sums import SummedCohort, sum_cohort
+from fleet_slip.grams.cohorts.folding import Folding
+from fleet_slip.grams.received.receiving import receive_files
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.messages import START_S
 

@@ -12,10 +12,16 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.regression.crossval import CrossValidation, cross_validate_inputs
-from fleet_slip.regression.folds import CohortFolds, by_band, by_hash, by_value, hash_fold
-from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.winner import Worth, choose
+from fleet_slip.regression.choice.winner import Worth, choose
+from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.regression.validation.crossval import CrossValidation, cross_validate_inputs
+from fleet_slip.regression.validation.folds import (
+    CohortFolds,
+    by_band,
+    by_hash,
+    by_value,
+    hash_fold,
+)
 from tests.support.counts import dense_fit, gram_of, names, random_drives, table_of
 
 SCALES = {**{name: Fraction(1, 100) for name in names(6)}, "y": Fraction(1, 10_000)}

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet_slip.regression.eigenvalues import symmetric_eigenvalues
+from fleet_slip.regression.exact.eigenvalues import symmetric_eigenvalues
 
 
 @given(st.integers(1, 12), st.integers(0, 10**6))

@@ -8,16 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet_slip.errors import DataError
-from fleet_slip.regression.elimination import eliminate, inverse_matrix
-from fleet_slip.regression.exact import (
+from fleet_slip.regression.choice.nested import nested_fits
+from fleet_slip.regression.exact.elimination import eliminate, inverse_matrix
+from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.regression.exact.least_squares import (
     condition_number,
     correlation_matrix,
     dependence,
     fit,
 )
-from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.nested import nested_fits
-from fleet_slip.regression.rounding import sqrt
+from fleet_slip.regression.exact.rounding import sqrt
 from tests.support.counts import dense_fit, gram_of, names, random_drives
 
 

@@ -8,12 +8,12 @@ from hypothesis import strategies as st
 from scipy.special import betainc
 
 from fleet_slip.errors import DataError
-from fleet_slip.regression import special
-from fleet_slip.regression.coefficient_tests import chow_test
-from fleet_slip.regression.drive_moments import DriveMoments, serving_drives
-from fleet_slip.regression.exact import fit
-from fleet_slip.regression.gram_table import GramTable
-from fleet_slip.regression.inference import (
+from fleet_slip.regression.exact import special
+from fleet_slip.regression.exact.gram_table import GramTable
+from fleet_slip.regression.exact.least_squares import fit
+from fleet_slip.regression.inference.coefficient_tests import chow_test
+from fleet_slip.regression.inference.drive_moments import DriveMoments, serving_drives
+from fleet_slip.regression.inference.standard_errors import (
     cluster_covariance,
     infer_by_clusters,
     infer_classically,

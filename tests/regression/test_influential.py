@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet_slip.errors import DataError
-from fleet_slip.regression.drive_moments import DriveMoments
-from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.influential import LEAST_CARS, find_influential
+from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.regression.inference.drive_moments import DriveMoments
+from fleet_slip.regression.inference.influential import LEAST_CARS, find_influential
 from tests.support.counts import table_of
 
 SIGNALS = ("a", "b", "y")

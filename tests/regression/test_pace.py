@@ -7,8 +7,8 @@ import pytest
 from scipy import stats
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.regression.mixture import ChiSquareKernel, Mixture, fit_mixture
-from fleet_slip.regression.pace import pace1, pace2, pace3, pace4, pace5, pace6
+from fleet_slip.regression.shrinkage.mixture import ChiSquareKernel, Mixture, fit_mixture
+from fleet_slip.regression.shrinkage.pace import pace1, pace2, pace3, pace4, pace5, pace6
 
 EFFECTS = np.array([30, 8, 4, 2.5, 0.4, 0.2, -0.3, 0.1])
 """Four effects, and four that are noise."""

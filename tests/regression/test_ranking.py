@@ -11,17 +11,22 @@ from scipy import integrate, stats
 from sklearn.linear_model import ElasticNet, lars_path_gram
 
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.regression import criteria
-from fleet_slip.regression.drive_moments import DriveMoments
-from fleet_slip.regression.evidence import Evidence
-from fleet_slip.regression.exact import correlation_matrix, fit
-from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.inference import infer_by_clusters
-from fleet_slip.regression.lars import fit_lasso, lars_path, lasso_path, lasso_path_of_moments
-from fleet_slip.regression.leaps import best_by_leaps
-from fleet_slip.regression.nested import nested_fits
-from fleet_slip.regression.ranking import RANKINGS, rank, replacement_sets
-from fleet_slip.regression.subsets import all_rss, best_subsets, candidates, signals_of
+from fleet_slip.regression.choice import criteria
+from fleet_slip.regression.choice.lars import (
+    fit_lasso,
+    lars_path,
+    lasso_path,
+    lasso_path_of_moments,
+)
+from fleet_slip.regression.choice.leaps import best_by_leaps
+from fleet_slip.regression.choice.nested import nested_fits
+from fleet_slip.regression.choice.ranking import RANKINGS, rank, replacement_sets
+from fleet_slip.regression.choice.subsets import all_rss, best_subsets, candidates, signals_of
+from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.regression.exact.least_squares import correlation_matrix, fit
+from fleet_slip.regression.inference.drive_moments import DriveMoments
+from fleet_slip.regression.inference.evidence import Evidence
+from fleet_slip.regression.inference.standard_errors import infer_by_clusters
 from tests.support.counts import dense_fit, gram_of, names, random_drives, table_of, unit_scales
 from tests.support.evidence import evidence
 

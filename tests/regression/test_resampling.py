@@ -4,13 +4,10 @@ import numpy as np
 import pytest
 
 from fleet_slip.errors import DataError
-from fleet_slip.regression.crossval import cross_validate, least_squares
-from fleet_slip.regression.drive_moments import DriveMoments
-from fleet_slip.regression.exact import fit
-from fleet_slip.regression.folds import CohortFolds, by_value
-from fleet_slip.regression.gram_table import GramTable
-from fleet_slip.regression.inference import infer_by_clusters
-from fleet_slip.regression.resampling import (
+from fleet_slip.regression.exact.gram_table import GramTable
+from fleet_slip.regression.exact.least_squares import fit
+from fleet_slip.regression.inference.drive_moments import DriveMoments
+from fleet_slip.regression.inference.resampling import (
     bootstrap_coefficients,
     bootstrap_correlations,
     held_out_products,
@@ -19,6 +16,9 @@ from fleet_slip.regression.resampling import (
     solve,
     to_counts,
 )
+from fleet_slip.regression.inference.standard_errors import infer_by_clusters
+from fleet_slip.regression.validation.crossval import cross_validate, least_squares
+from fleet_slip.regression.validation.folds import CohortFolds, by_value
 from tests.support.counts import gram_of, names, random_drives, table_of, unit_scales
 
 INPUTS = names(4)[:-1]

@@ -11,27 +11,27 @@ from hypothesis.extra import numpy as hnp
 from sklearn.linear_model import Ridge
 
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.regression.crossval import Procedure, cross_validate
-from fleet_slip.regression.evidence import Evidence
-from fleet_slip.regression.exact import fit
-from fleet_slip.regression.folds import Folds
-from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.mixture import (
+from fleet_slip.regression.choice.nested import nested_fits
+from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.regression.exact.least_squares import fit
+from fleet_slip.regression.inference.evidence import Evidence
+from fleet_slip.regression.shrinkage.mixture import (
     ChiSquareKernel,
     NormalKernel,
     fit_mixture,
     separable_groups,
 )
-from fleet_slip.regression.nested import nested_fits
-from fleet_slip.regression.nnls import nonnegative_least_squares
-from fleet_slip.regression.orthogonal import OrthogonalResponses
-from fleet_slip.regression.pace import ESTIMATORS, james_stein, shrink
-from fleet_slip.regression.ridge import (
+from fleet_slip.regression.shrinkage.nnls import nonnegative_least_squares
+from fleet_slip.regression.shrinkage.orthogonal import OrthogonalResponses
+from fleet_slip.regression.shrinkage.pace import ESTIMATORS, james_stein, shrink
+from fleet_slip.regression.shrinkage.ridge import (
     fit_errors_in_variables,
     fit_noise_matched,
     fit_penalised,
     fit_ridge,
 )
+from fleet_slip.regression.validation.crossval import Procedure, cross_validate
+from fleet_slip.regression.validation.folds import Folds
 from tests.support.counts import gram_of, names, random_drives, unit_scales
 from tests.support.weka import threshold
 

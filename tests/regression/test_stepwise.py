@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from fleet_slip.errors import QuestionError
-from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.ranking import rank, replacement_sets
-from fleet_slip.regression.stepwise import METHODS, stepwise_order
+from fleet_slip.regression.choice.ranking import rank, replacement_sets
+from fleet_slip.regression.choice.stepwise import METHODS, stepwise_order
+from fleet_slip.regression.exact.gram import Gram
 
 
 def correlated(seed: int, inputs: int, rows: int = 400) -> Gram:

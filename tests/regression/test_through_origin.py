@@ -6,15 +6,15 @@ import statsmodels.api as sm
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.regression.coefficient_tests import chow_test, wald_test
-from fleet_slip.regression.drive_moments import DriveMoments
-from fleet_slip.regression.evidence import Evidence
-from fleet_slip.regression.exact import fit
-from fleet_slip.regression.inference import infer_by_clusters, infer_classically
-from fleet_slip.regression.nested import nested_fits
-from fleet_slip.regression.ranking import rank
-from fleet_slip.regression.resampling import repeated_cross_validation
-from fleet_slip.regression.subsets import best_subsets
+from fleet_slip.regression.choice.nested import nested_fits
+from fleet_slip.regression.choice.ranking import rank
+from fleet_slip.regression.choice.subsets import best_subsets
+from fleet_slip.regression.exact.least_squares import fit
+from fleet_slip.regression.inference.coefficient_tests import chow_test, wald_test
+from fleet_slip.regression.inference.drive_moments import DriveMoments
+from fleet_slip.regression.inference.evidence import Evidence
+from fleet_slip.regression.inference.resampling import repeated_cross_validation
+from fleet_slip.regression.inference.standard_errors import infer_by_clusters, infer_classically
 from tests.support.counts import Matrix, gram_of, names, random_drives, table_of, unit_scales
 
 INPUTS = names(4)[:-1]

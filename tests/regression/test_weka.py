@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleet_slip.regression.crossval import CrossValidation, cross_validate
-from fleet_slip.regression.evidence import Evidence
-from fleet_slip.regression.exact import LinearModel, fit
-from fleet_slip.regression.folds import Folds
-from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.nested import nested_fits
-from fleet_slip.regression.pace import ESTIMATORS, shrink
-from fleet_slip.regression.ranking import backward
+from fleet_slip.regression.choice.nested import nested_fits
+from fleet_slip.regression.choice.ranking import backward
+from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.regression.exact.least_squares import LinearModel, fit
+from fleet_slip.regression.inference.evidence import Evidence
+from fleet_slip.regression.shrinkage.pace import ESTIMATORS, shrink
+from fleet_slip.regression.validation.crossval import CrossValidation, cross_validate
+from fleet_slip.regression.validation.folds import Folds
 from tests.support.counts import columns_to_counts
 from tests.support.evidence import EVIDENCE, evidence
 from tests.support.weka import WEKA_ESTIMATORS, threshold, weka_linear_regression, weka_pace

@@ -12,7 +12,7 @@ from fleet_slip.catalogue.feature_sets import LAG, lag_signals
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError
-from fleet_slip.regression.drive_moments import ClusterUnit
+from fleet_slip.regression.inference.drive_moments import ClusterUnit
 from fleet_slip.selection.diagnostics import diagnose
 from tests.support.cohorts import INPUTS, LABEL, Driven, cohort_of, driven, rows_of
 from tests.support.counts import dense_fit

@@ -7,9 +7,9 @@ from sklearn.model_selection import LeaveOneGroupOut, cross_val_predict
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError
-from fleet_slip.grams import cohort as cohorts
-from fleet_slip.grams.cohort import assign_folds
-from fleet_slip.grams.folding import EACH, FoldCount, Folding
+from fleet_slip.grams.cohorts import cohort as cohorts
+from fleet_slip.grams.cohorts.cohort import assign_folds
+from fleet_slip.grams.cohorts.folding import EACH, FoldCount, Folding
 from fleet_slip.selection.compare import select
 from fleet_slip.selection.model_list import CandidateModel
 from tests.support.cohorts import INPUTS, LABEL, cohort_of, driven

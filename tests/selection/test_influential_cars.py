@@ -8,7 +8,7 @@ import pytest
 import fleet_slip
 from fleet_slip import Fleet
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand
 from tests.support.logs import land, log_rows

@@ -7,9 +7,9 @@ import pytest
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError
-from fleet_slip.grams.cohort import assign_folds
-from fleet_slip.grams.folding import Folding
-from fleet_slip.regression.winner import Worth
+from fleet_slip.grams.cohorts.cohort import assign_folds
+from fleet_slip.grams.cohorts.folding import Folding
+from fleet_slip.regression.choice.winner import Worth
 from fleet_slip.selection.regimes import (
     ROWS_PER_COEFFICIENT,
     band_order,

@@ -8,12 +8,12 @@ import pytest
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.grams.cohort import assign_folds
-from fleet_slip.grams.folding import Folding
-from fleet_slip.grams.training import drive_folds
-from fleet_slip.regression.crossval import cross_validate, least_squares
-from fleet_slip.regression.drive_moments import ClusterUnit
-from fleet_slip.regression.nested_choice import CROSS_VALIDATION, Rule, select_nested
+from fleet_slip.grams.cohorts.cohort import assign_folds
+from fleet_slip.grams.cohorts.folding import Folding
+from fleet_slip.grams.cohorts.training import drive_folds
+from fleet_slip.regression.choice.nested_choice import CROSS_VALIDATION, Rule, select_nested
+from fleet_slip.regression.inference.drive_moments import ClusterUnit
+from fleet_slip.regression.validation.crossval import cross_validate, least_squares
 from fleet_slip.selection.search import (
     ALL_SUBSETS,
     require_criterion,

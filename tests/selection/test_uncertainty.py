@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from fleet_slip.errors import QuestionError
-from fleet_slip.grams.cohort import assign_folds
-from fleet_slip.grams.folding import Folding
-from fleet_slip.regression.crossval import CrossValidation, cross_validate_inputs
-from fleet_slip.regression.drive_moments import ClusterUnit
+from fleet_slip.grams.cohorts.cohort import assign_folds
+from fleet_slip.grams.cohorts.folding import Folding
+from fleet_slip.regression.inference.drive_moments import ClusterUnit
+from fleet_slip.regression.validation.crossval import CrossValidation, cross_validate_inputs
 from fleet_slip.selection.uncertainty import estimate_uncertainty
 from tests.support.cohorts import INPUTS, LABEL, Driven, cohort_of, driven, rows_of
 

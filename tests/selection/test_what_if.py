@@ -8,7 +8,7 @@ import pytest
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError
-from fleet_slip.regression.exact import LinearModel, fit
+from fleet_slip.regression.exact.least_squares import LinearModel, fit
 from fleet_slip.selection.what_if import what_if
 from tests.support.cohorts import INPUTS, LABEL, Driven, cohort_of, driven, rows_of
 

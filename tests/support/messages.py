@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.messages import signals_definition
-from fleet_slip.regression.gram import Gram
+from fleet_slip.grams.received.messages import signals_definition
+from fleet_slip.regression.exact.gram import Gram
 
 START_S = 1_714_557_600
 """2024-05-01, 10:00 in UTC."""

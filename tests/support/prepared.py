@@ -28,7 +28,7 @@ from typing import Any, Never
 
 import fleet_slip
 from fleet_slip.cli.main import main as fleet_slip_main
-from fleet_slip.ingest.units import require_unit
+from fleet_slip.ingest.mapping.units import require_unit
 
 READ_LATE = ("AWS_", "FLEET_SLIP_", "XDG_CACHE_HOME", "CACHE_DIRECTORY", "TMPDIR")
 """How variables begin that nothing reads while importing."""

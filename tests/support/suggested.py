@@ -13,11 +13,11 @@ import polars as pl
 import scipy.io
 from asammdf import MDF, Signal
 
-from fleet_slip.ingest.can_bus import CanBus
-from fleet_slip.ingest.draft import Draft, draft_mapping, signal_keys
-from fleet_slip.ingest.profile import FileFormats, profile_file
-from fleet_slip.ingest.signal_column import SignalColumn
-from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS
+from fleet_slip.ingest.drafting.draft import Draft, draft_mapping, signal_keys
+from fleet_slip.ingest.drafting.profile import FileFormats, profile_file
+from fleet_slip.ingest.drafting.suspicion import RADIUS_M, WHEELS
+from fleet_slip.ingest.formats.can_bus import CanBus
+from fleet_slip.ingest.mapping.signal_column import SignalColumn
 from tests.support.textbook_car import Car, a_car
 
 G_MPS2 = 9.80665

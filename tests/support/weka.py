@@ -13,21 +13,21 @@ from typing import Literal
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.regression import rounding
-from fleet_slip.regression.exact import LinearModel
-from fleet_slip.regression.figures import error_sums
-from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.mixture import ChiSquareKernel, Mixture, fit_mixture
-from fleet_slip.regression.orthogonal import OrthogonalResponses
-from fleet_slip.regression.pace import (
+from fleet_slip.regression.choice.ranking import backward
+from fleet_slip.regression.exact import rounding
+from fleet_slip.regression.exact.figures import error_sums
+from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.regression.exact.least_squares import LinearModel
+from fleet_slip.regression.shrinkage.mixture import ChiSquareKernel, Mixture, fit_mixture
+from fleet_slip.regression.shrinkage.orthogonal import OrthogonalResponses
+from fleet_slip.regression.shrinkage.pace import (
     Estimator,
     empirical_bayes,
     half_contributions,
     normal_contributions,
     pace5,
 )
-from fleet_slip.regression.ranking import backward
-from fleet_slip.regression.ridge import fit_penalised
+from fleet_slip.regression.shrinkage.ridge import fit_penalised
 
 Selection = Literal["none", "m5", "greedy"]
 

@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.delta import Change, Table, Unit, retry_conflicts
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.maintenance.compaction import compact
 from fleet_slip.maintenance.vacuum import vacuum
 from fleet_slip.maintenance.verify import verify

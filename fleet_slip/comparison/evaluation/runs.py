@@ -13,7 +13,7 @@ from fleet_slip.comparison.evaluation.estimators import Estimate
 from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive, load_drives
 from fleet_slip.comparison.evaluation.stability import CRITERION, find_unstable
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.simulation.job import SimulationReport, simulate_batches
 from fleet_slip.simulation.scenario import Scenario

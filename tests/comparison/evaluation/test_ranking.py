@@ -8,7 +8,7 @@ from rich.text import Text
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.cli.evaluation_tables import print_ranking
+from fleet_slip.cli.accuracy.evaluation_tables import print_ranking
 from fleet_slip.comparison.evaluation.estimators import Signals
 from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive, visible_signals
 from fleet_slip.comparison.evaluation.ranking import Ranking, rank

@@ -21,11 +21,11 @@ from fleet_slip.comparison.report.findings.report_data import ReportData
 from fleet_slip.comparison.report.page import render
 from fleet_slip.comparison.report.pictures.all_pictures import draw_pictures
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohort import Cohort, assign_folds
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.cohorts.cohort import Cohort, assign_folds
+from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.pages.style import DESK, PHONE
-from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.gram_table import GramTable
+from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.regression.exact.gram_table import GramTable
 from fleet_slip.warehouse.condition import parse_condition
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import land, log_rows, random_counts

@@ -31,11 +31,11 @@ from fleet_slip.comparison.report.tables import paper_tables
 from fleet_slip.errors import DataError
 from fleet_slip.files.documents import Document
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.cohorts.cohort import load_cohort
 from fleet_slip.pages.drawing import png_file, svg_file
 from fleet_slip.pages.style import DESK, PHONE
 from fleet_slip.pages.text import degrees, number
-from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.selection.compare import validate
 from fleet_slip.selection.model_list import CandidateModel
 from fleet_slip.views import connect

@@ -23,7 +23,7 @@ from fleet_slip.comparison.rivals.networks import (
     kernel_mean,
 )
 from fleet_slip.comparison.rivals.sample import Sample
-from fleet_slip.regression.folds import by_hash
+from fleet_slip.regression.validation.folds import by_hash
 
 
 def sample(rows: int = 1200, drives: int = 12) -> Sample:

@@ -27,11 +27,11 @@ from fleet_slip.errors import FleetSlipError
 from fleet_slip.files.data_root import data_root
 from fleet_slip.files.documents import checksum
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.grams.folding import FoldKey
-from fleet_slip.grams.job import update_grams
-from fleet_slip.ingest.job import ingest_file
-from fleet_slip.ingest.mapping import Mapping, load_mapping
+from fleet_slip.grams.cohorts.cohort import load_cohort
+from fleet_slip.grams.cohorts.folding import FoldKey
+from fleet_slip.grams.rows.gram_job import update_grams
+from fleet_slip.ingest.landing.ingest_job import ingest_file
+from fleet_slip.ingest.mapping.mapping import Mapping, load_mapping
 from fleet_slip.maintenance.retention import load_retention
 from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.score import score

@@ -14,7 +14,7 @@ from fleet_slip.comparison.report.findings.report_data import ReportData
 from fleet_slip.comparison.report.findings.stretches import BLOCK_S, blocks_won
 from fleet_slip.comparison.report.tables.paper_tables import PAPER_TABLE_TWO
 from fleet_slip.pages.text import count, degrees, number
-from fleet_slip.regression.winner import Winner
+from fleet_slip.regression.choice.winner import Winner
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 
 LAST_TWO = frozenset({"4", "5"})

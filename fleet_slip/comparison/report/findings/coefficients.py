@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.cohort import Cohort
-from fleet_slip.grams.training import clustered_moments
-from fleet_slip.regression.drive_moments import ClusterUnit
-from fleet_slip.regression.exact import fit
-from fleet_slip.regression.inference import (
+from fleet_slip.grams.cohorts.cohort import Cohort
+from fleet_slip.grams.cohorts.training import clustered_moments
+from fleet_slip.regression.exact.least_squares import fit
+from fleet_slip.regression.inference.drive_moments import ClusterUnit
+from fleet_slip.regression.inference.standard_errors import (
     INTERCEPT,
     infer_by_clusters,
     infer_classically,

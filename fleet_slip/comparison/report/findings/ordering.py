@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.cohort import Cohort
-from fleet_slip.regression.nested import nested_fits
-from fleet_slip.regression.ranking import RANKINGS, rank
-from fleet_slip.regression.subsets import best_subsets
+from fleet_slip.grams.cohorts.cohort import Cohort
+from fleet_slip.regression.choice.nested import nested_fits
+from fleet_slip.regression.choice.ranking import RANKINGS, rank
+from fleet_slip.regression.choice.subsets import best_subsets
 
 CLOSE = 0.001
 """A model explains nearly all if it leaves no more than this of the variance to the full one."""

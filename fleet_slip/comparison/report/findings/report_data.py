@@ -27,11 +27,11 @@ from fleet_slip.comparison.report.findings.kept_evaluation import Evaluated, lat
 from fleet_slip.comparison.report.findings.memory import Memory, looks_back, weigh_memory
 from fleet_slip.comparison.report.findings.ordering import Ordering, compare_orders
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.grams.cohort import Cohort, load_cohort
-from fleet_slip.grams.folding import BANDS, Folding
+from fleet_slip.grams.cohorts.cohort import Cohort, load_cohort
+from fleet_slip.grams.cohorts.folding import BANDS, Folding
 from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.regression.crossval import CrossValidation
-from fleet_slip.regression.nested_choice import NestedDistances
+from fleet_slip.regression.choice.nested_choice import NestedDistances
+from fleet_slip.regression.validation.crossval import CrossValidation
 from fleet_slip.resources import config_file
 from fleet_slip.selection.compare import Selection, select
 from fleet_slip.selection.model_list import load_model_list

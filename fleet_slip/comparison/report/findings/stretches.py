@@ -8,7 +8,7 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.comparison.evaluation.runs import EvaluatedScenario
-from fleet_slip.regression.special import student_t_two_sided
+from fleet_slip.regression.exact.special import student_t_two_sided
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 
 BLOCK_S = 5.0

@@ -1,0 +1,176 @@
+"""The command diagnose: a model's coefficients on a cohort, and how far to trust them."""
+
+from typing import Annotated
+
+import typer
+
+from fleet_slip.catalogue.features import features
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalogue.sources import TRAINING_DRIVES
+from fleet_slip.cli.options import Cluster, Cohort
+from fleet_slip.cli.output import Json, print_json, print_table, say, stdout
+from fleet_slip.cli.subject import FeatureSetOption, Model, Signals, quantities
+from fleet_slip.regression.inference.standard_errors import INTERCEPT, Estimate
+from fleet_slip.selection.diagnostics import CohortComparison, Diagnosis
+from fleet_slip.words import number_of
+
+
+def diagnose(
+    context: typer.Context,
+    model: Model = None,
+    signals: Signals = None,
+    feature_set: FeatureSetOption = None,
+    cohort: Cohort = TRAINING_DRIVES,
+    against: Annotated[
+        str | None,
+        typer.Option(help="Condition of another cohort: does it have the same coefficients?"),
+    ] = None,
+    serial: Annotated[
+        bool,
+        typer.Option(
+            "--serial",
+            help="Durbin-Watson and AR(1) generalised least squares, from lagged Gram rows: "
+            "fleet-slip gram --features lags",
+        ),
+    ] = False,
+    cluster: Cluster = None,
+    sensor_noise: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Noise that the logs already have, such as ay=0.1 in SI units: shows the "
+            "coefficients without it (errors in variables). May be repeated."
+        ),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Fit a model's signals to a cohort and examine the fit, from Gram rows.
+
+    Standard errors by drives, or by cars where there are several, are the ones to believe: at
+    100 Hz a row says little that the one before did not say, and a car's drives share its biases.
+
+    Example: **fleet-slip diagnose waterford**
+    """
+    result = context.obj.cohort(cohort).diagnose(
+        model,
+        signals=signals,
+        features=feature_set,
+        against=against,
+        serial=serial,
+        sensor_noise=quantities(sensor_noise, "--sensor-noise"),
+        cluster=cluster,
+    )
+    if json:
+        print_json({"cohort": cohort, **result.as_dict()})
+    else:
+        _print_diagnosis(result)
+
+
+def _print_diagnosis(result: Diagnosis) -> None:
+    print_table(
+        f"{number_of(result.drives, 'drive')}, {number_of(result.fitted.gram.n, 'row')}, worth "
+        f"{result.evidence.rows:,.0f} independent ones; R squared {result.fitted.r_squared:.4f}, "
+        f"condition {result.condition_number:.3g}",
+        _coefficient_header(result),
+        _coefficient_rows(result),
+        left=2,
+    )
+    if result.cluster == "row":
+        say(
+            "there is one drive only: its rows are taken for independent evidence, which they are "
+            "not at 100 Hz, so that the standard errors are far too small."
+        )
+    if result.serial is not None:
+        found = result.serial
+        stdout().print(
+            f"residuals: correlation {found.correlation.rho:.4f} with the row before, "
+            f"Durbin-Watson {found.correlation.durbin_watson:.4f} (2 if independent); AR(1) with "
+            f"rho {found.autoregressive.rho:.4f}.",
+            markup=False,
+        )
+    if result.comparison is not None:
+        _print_comparison(result, result.comparison)
+
+
+def _coefficient_header(result: Diagnosis) -> list[str]:
+    header = [
+        "signal",
+        "unit",
+        "coefficient",
+        f"s.e. by {result.cluster}s",
+        "t",
+        "s.e. by rows",
+        "VIF",
+    ]
+    if result.serial is not None:
+        header += ["AR(1)", "s.e. AR(1)"]
+    if result.noise_free is not None:
+        header += ["without noise"]
+    return header
+
+
+def _coefficient_rows(result: Diagnosis) -> list[list[str]]:
+    rows = []
+    for i, (robust, naive) in enumerate(
+        zip(result.robust.estimates, result.naive.estimates, strict=True)
+    ):
+        constant = robust.name == INTERCEPT
+        row = [
+            robust.name,
+            catalogue()[catalogue().label].unit if constant else features().of(robust.name).unit,
+            f"{robust.value:.6g}",
+            f"{robust.standard_error:.2g}",
+            f"{robust.t:.1f}",
+            f"{naive.standard_error:.2g}",
+            "" if constant else f"{result.inflation[robust.name]:.3g}",
+        ]
+        if result.serial is not None:
+            estimate = result.serial.inference.estimates[i]
+            slope = [f"{estimate.value:.6g}", f"{estimate.standard_error:.2g}"]
+            row += ["", ""] if constant else slope
+        if result.noise_free is not None:
+            free = result.noise_free
+            row += [f"{free.offset if constant else free.weights[robust.name]:.6g}"]
+        rows.append(row)
+    return rows
+
+
+def _print_comparison(result: Diagnosis, found: CohortComparison) -> None:
+    print_table(
+        f"\nthe same signals where {found.condition}",
+        ["signal", "coefficient here", "there", "s.e. there", "difference / s.e."],
+        [
+            [
+                here.name,
+                f"{here.value:.6g}",
+                f"{there.value:.6g}",
+                f"{there.standard_error:.2g}",
+                f"{_standardised(here, there):+.1f}",
+            ]
+            for here, there in zip(result.robust.estimates, found.other.estimates, strict=True)
+        ],
+    )
+    tests = [(found.drives, f"Wald, by {result.cluster}s"), (found.rows, "Chow, by rows")]
+    for test, kind in tests:
+        if test is None:
+            continue
+        stdout().print(
+            f"the same coefficients? {kind}: F({test.numerator}, {test.denominator}) = "
+            f"{test.f:,.2f}, p = {test.p:.2g}.",
+            markup=False,
+        )
+    if found.drives is None:
+        say(
+            f"there are too few {result.cluster}s to compare so many coefficients by them. Chow's "
+            "test takes neighbouring rows for independent evidence, which they are not: its p is "
+            "far too small, and only a large one says something."
+        )
+    elif found.drives.p > 0.05 >= found.rows.p:
+        say(
+            f"by {result.cluster}s, the difference is no more than chance: the rows only look like "
+            "evidence."
+        )
+
+
+def _standardised(here: Estimate, there: Estimate) -> float:
+    spread = float((here.standard_error**2 + there.standard_error**2) ** 0.5)
+    return (there.value - here.value) / spread

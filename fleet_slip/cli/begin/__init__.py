@@ -1,0 +1,1 @@
+"""The commands of the first minutes: run, sql, select, publish."""

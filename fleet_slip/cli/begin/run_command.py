@@ -1,0 +1,114 @@
+"""The command that does the whole job: simulate what is missing, gram, select, publish."""
+
+from typing import Annotated
+
+import typer
+
+from fleet_slip.api.calls import open_workers
+from fleet_slip.api.fleet import RUN_MODELS, Fleet
+from fleet_slip.api.run_report import RunReport
+from fleet_slip.catalogue.feature_sets import PLAIN
+from fleet_slip.cli.begin.publish_command import print_publication
+from fleet_slip.cli.begin.select_command import print_selection
+from fleet_slip.cli.completing import complete_config
+from fleet_slip.cli.data.log_commands import Days, Through, last_day
+from fleet_slip.cli.models.signing_commands import signing_key
+from fleet_slip.cli.next_steps import next_steps
+from fleet_slip.cli.options import Worth
+from fleet_slip.cli.output import Json, print_json, say
+from fleet_slip.cli.progress import progress_of_steps
+from fleet_slip.cli.recorded import record_run
+from fleet_slip.cli.workers import Cluster, Threads
+from fleet_slip.selection.worth import WORTH
+from fleet_slip.words import number_of
+
+DEFAULT_CAMPAIGN = "waterford"
+
+
+@record_run
+def run(
+    context: typer.Context,
+    campaign: Annotated[
+        str,
+        typer.Option(
+            help="A campaign of configs/campaigns, or the path of a TOML file.",
+            autocompletion=complete_config("campaigns"),
+        ),
+    ] = DEFAULT_CAMPAIGN,
+    days: Days = None,
+    through: Through = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name of the model. Default: the campaign's.")
+    ] = None,
+    models: Annotated[
+        str,
+        typer.Option(
+            help="A model list of configs/models, or a TOML file.",
+            autocompletion=complete_config("models"),
+        ),
+    ] = RUN_MODELS,
+    worth: Worth = WORTH,
+    threads: Threads = None,
+    cluster: Cluster = None,
+    json: Json = False,
+) -> None:
+    """Do the whole job: simulate what is missing, gram, select, publish if it is not worse.
+
+    It can be repeated at any time, and after any interruption: what is done is not done again. A
+    second run of the campaign at the same time waits for the first. A nightly run appends the next
+    day with --through today.
+
+    Example: **fleet-slip run --campaign smoke**
+    """
+    from fleet_slip.simulation.campaign import load_campaign  # noqa: PLC0415 - the simulator takes a while
+
+    fleet: Fleet = context.obj
+    plan = load_campaign(campaign)
+    doing = {"simulate": f"simulate {plan.name}", "gram": f"gram {PLAIN}"}
+    with (
+        open_workers(fleet.root, cluster or threads) as executor,
+        progress_of_steps("rows", executor) as show,
+    ):
+        report = fleet.run(
+            plan,
+            days=days,
+            through=last_day(through),
+            name=name,
+            models=models,
+            worth=worth,
+            sign_key=signing_key(None),
+            workers=executor,
+            progress=lambda step, done, total: show(doing.get(step, step), done, total),
+            waiting=lambda: say(f"{plan.name}: waiting for another run"),
+        )
+    if json:
+        print_json(report)
+    else:
+        _print_report(report)
+        if (made := report.publication) and made.new and made.version.version == 1:
+            model = made.version.reference.partition("@")[0]
+            say("next:")
+            for line in next_steps(fleet, plan.name, model):
+                say(f"  {line}")
+
+
+def _print_report(report: RunReport) -> None:
+    simulated, gram, publication = report.simulation, report.gram, report.publication
+    if not report.changed:
+        kept = publication.version.reference if publication else report.refusal
+        say(f"{report.campaign}: nothing to do, {kept} is up to date ({report.seconds:.1f} s)")
+        return
+    say(f"simulated {number_of(simulated.drives, 'drive')}, {number_of(simulated.rows, 'row')}")
+    say(f"gram: {number_of(gram.rows_read, 'row')} read, {number_of(gram.gram_rows, 'Gram row')}")
+    if wide := report.gram_features:
+        say(
+            f"gram {wide.feature_set}: {number_of(wide.rows_read, 'row')} read, "
+            f"{number_of(wide.gram_rows, 'Gram row')}"
+        )
+    if report.selection:
+        print_selection(report.selection)
+    if publication:
+        print_publication(publication)
+    else:
+        say(report.refusal)
+    say(f"done in {report.seconds:.1f} s")

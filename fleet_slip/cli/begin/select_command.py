@@ -1,0 +1,261 @@
+"""Selecting: the command select, and how a selection is printed."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import typer
+
+from fleet_slip.api.fleet import Fleet
+from fleet_slip.catalogue.features import features
+from fleet_slip.catalogue.sources import TRAINING_DRIVES
+from fleet_slip.cli.left_out import say_revoked, say_without_log
+from fleet_slip.cli.options import selection_options
+from fleet_slip.cli.output import Json, print_json, print_table, say, stdout
+from fleet_slip.grams.cohorts.folding import BANDS, PARTS, ROW_FOLDS
+from fleet_slip.regression.choice.nested_choice import (
+    CROSS_VALIDATION,
+    NestedChoice,
+    NestedDistances,
+)
+from fleet_slip.regression.inference.evidence import Evidence
+from fleet_slip.regression.validation.crossval import CrossValidation
+from fleet_slip.selection.compare import Selection
+from fleet_slip.selection.request import RequestedSelection, SelectionRequest
+from fleet_slip.selection.search import SearchChoice
+from fleet_slip.selection.uncertainty import Uncertainty
+from fleet_slip.words import number_of
+
+MANY_SIGNALS = 30
+"""Of more, a table names families."""
+
+DISTANCES = ("contribution A", "D to full", "expected D")
+
+FIGURES = ("drives", "correlation", "RMSE deg", "mean deg", "std deg", "condition")
+
+
+@selection_options()
+def select(context: typer.Context, request: SelectionRequest, json: Json = False) -> None:
+    """Compare models on a cohort by cross-validation and choose one. Reads Gram rows only.
+
+    Compare a list of models: **fleet-slip select --models table1**
+
+    Find an order and a place to stop: **fleet-slip select --rank backward --criterion bic**
+
+    Choose among many columns: **fleet-slip select --features windows --search exchange --most 12**
+
+    Search all subsets: **fleet-slip select --all-subsets --criterion cv --bootstrap 1000**
+    """
+    selection = answer(context.obj, request)
+    if json:
+        print_json(selection)
+    else:
+        print_selection(selection)
+
+
+def answer(fleet: Fleet, request: SelectionRequest) -> RequestedSelection:
+    """Select as asked on the command line."""
+    options = asdict(request)
+    return fleet.cohort(options.pop("cohort")).select(**options)
+
+
+def print_selection(selection: Selection[Any]) -> None:
+    """Print the table of a selection, the winner and why, and how sure that is."""
+    where = selection.cohort.condition
+    # The signals of an order or of subsets stand in the table above it.
+    listed = selection.choice is None
+    if selection.choice is not None:
+        _print_choice(selection.choice)
+    if isinstance(selection.distances, NestedDistances):
+        _print_distances(selection.distances)
+    print_table(
+        f"{number_of(selection.cohort.drive_count, 'drive')}, "
+        f"{number_of(selection.cohort.rows, 'row')}"
+        + ("" if where == TRAINING_DRIVES else f" where {where}")
+        + f"; {number_of(len(selection.models[0].folds), 'fold')} by {selection.folds.by}"
+        + ("" if selection.intercept else "; no intercept"),
+        ["model", *(["signals"] if listed else []), *FIGURES],
+        [
+            [model.name, *([_columns_of(model, selection)] if listed else []), *_figures(model)]
+            for model in selection.models
+        ],
+        left=1 + listed,
+    )
+    _say_left_out(selection)
+    if selection.folds.by in (PARTS, BANDS):
+        _print_folds(selection.winner.model)
+    if selection.folds.by == ROW_FOLDS:
+        say(
+            "folds of rows leak: each test row's neighbours at 100 Hz are training rows, so that "
+            "these figures are those of the fit, not of prediction. Compare with --by drive."
+        )
+    if isinstance(selection.distances, str):
+        say(f"the distances of the nested models cannot be told: {selection.distances}")
+    for name, reason in selection.skipped.items():
+        say(f"model {name} was left out: {reason}")
+    stdout().print(
+        f"winner: {selection.winner.model.name}. {selection.winner.reason}", markup=False
+    )
+    if selection.choice is not None and selection.choice.honest is not None:
+        _print_honest(selection.choice.honest)
+    if selection.uncertainty is not None:
+        _print_uncertainty(selection.uncertainty)
+
+
+def _say_left_out(selection: Selection[Any]) -> None:
+    """Say which drives of the cohort the models were not made of, and which have no log."""
+    if without_log := selection.cohort.members.count_received:
+        say(f"{number_of(without_log, 'drive')} of these without a log: their cars sent Gram rows.")
+    say_without_log(selection.cohort.left_out, selection.cohort.feature_set)
+    say_revoked(selection.cohort.revoked)
+    if isinstance(selection, RequestedSelection):
+        for car, times in selection.left_out.items():
+            say(f"{car} left out: its influence on the model is {times:.0f} times the median one.")
+
+
+def _print_folds(model: CrossValidation) -> None:
+    print_table(
+        f"\nmodel {model.name}, each fold left out in turn",
+        ["fold", "rows", "correlation", "RMSE deg", "mean deg", "std deg"],
+        [
+            [
+                name,
+                f"{found.rows:,}",
+                f"{found.correlation:.4f}",
+                f"{found.rmse_deg:.4f}",
+                f"{found.error_mean_deg:+.4f}",
+                f"{found.error_std_deg:.4f}",
+            ]
+            for name, found in zip(model.fold_names, model.folds, strict=True)
+        ],
+    )
+
+
+def _columns_of(model: CrossValidation, selection: Selection[Any]) -> str:
+    """Return a model's signals; of one that a search found, what its size changed."""
+    found = selection.searched.models if selection.searched else ()
+    if model not in found or model is selection.winner.model:
+        return in_families(model.signals)
+    before = found[len(model.signals) - 2].signals if len(model.signals) > 1 else ()
+    added = [f"+{name}" for name in model.signals if name not in before]
+    removed = [f"-{name}" for name in before if name not in model.signals]
+    return " ".join([*added, *removed])
+
+
+def in_families(signals: Sequence[str]) -> str:
+    """Return the names of signals; of more than `MANY_SIGNALS`, whole families by their own."""
+    if len(signals) <= MANY_SIGNALS:
+        return " ".join(signals)
+    known = features()
+    shown = {name: name for name in signals}
+    for family in (*known.windows, *known.gates):
+        members = known.members(family)
+        if shown.keys() >= set(members):
+            shown |= dict.fromkeys(members, f"{family}({len(members)})")
+    return f"{len(signals)}: " + " ".join(dict.fromkeys(shown.values()))
+
+
+def _figures(model: CrossValidation) -> list[str]:
+    return [
+        f"{model.drives:,}",
+        f"{model.correlation:.4f}",
+        f"{model.pooled.rmse_deg:.4f}",
+        f"{model.pooled.error_mean_deg:+.4f}",
+        f"{model.pooled.error_std_deg:.4f}",
+        f"{model.condition_number:.3g}",
+    ]
+
+
+def _worth(evidence: Evidence) -> str:
+    return f"taking {evidence.kind} for independent, the cohort is worth {evidence.rows:,.0f} rows"
+
+
+def _print_distances(found: NestedDistances) -> None:
+    print_table(
+        f"distance D of equation (2) by the number of signals; {_worth(found.evidence)}",
+        ["", "added", *DISTANCES],
+        _distance_rows(found.order, found.evidence),
+        left=2,
+    )
+    stdout().print(
+        f"without any signal: RMSE {found.null.pooled.rmse_deg:.4f} deg.\n", markup=False
+    )
+
+
+def _print_choice(choice: SearchChoice) -> None:
+    worth = _worth(choice.evidence)
+    if choice.nested is not None:
+        nested = choice.nested
+        print_table(
+            f"order by {choice.rule.ranking}; {worth}",
+            ["", "added", *DISTANCES, _criterion_name(choice)],
+            _order_rows(nested),
+            left=2,
+        )
+    if choice.subsets is not None and choice.picks is not None:
+        print_table(
+            f"best subset of every size; {worth}",
+            ["size", "signals", "picked by", "R squared", "gap to second"],
+            [
+                [
+                    str(result.best.size),
+                    " ".join(result.best.model.signals),
+                    " ".join(c for c, size in choice.picks.items() if size == result.best.size),
+                    f"{result.best.r_squared:.6f}",
+                    "" if result.gap is None else f"{result.gap:.2g}",
+                ]
+                for result in choice.subsets
+            ],
+            left=3,
+        )
+
+
+def _criterion_name(choice: SearchChoice) -> str:
+    if choice.rule.criterion == CROSS_VALIDATION:
+        return "minus correlation"
+    return choice.rule.criterion
+
+
+def _order_rows(nested: NestedChoice) -> Iterator[list[str]]:
+    """Return a line for each of the k+1 models, with the criterion's value."""
+    lines = _distance_rows(nested.order, nested.evidence)
+    for j, (line, value) in enumerate(zip(lines, nested.values, strict=True)):
+        mark = " <" if j == nested.size else "  "
+        yield [*line, f"{value:,.4f}{mark}"]
+
+
+def _distance_rows(order: Sequence[str], evidence: Evidence) -> Iterator[list[str]]:
+    """Return a line for each of the k+1 models of an order, the empty one first.
+
+    The distance D is that of the paper's equation (2), in units of the noise: from the full model,
+    and as it is to be expected from the true one.
+    """
+    columns = zip(evidence.excess(), evidence.distances(), strict=True)
+    for j, (to_full, expected) in enumerate(columns):
+        added = order[j - 1] if j else "(none)"
+        contribution = f"{evidence.contributions[j - 1]:,.1f}" if j else ""
+        yield [str(j), added, contribution, f"{to_full:,.1f}", f"{expected:,.1f}"]
+
+
+def _print_honest(honest: CrossValidation) -> None:
+    stdout().print(
+        "made again inside every training fold, the whole choice has a correlation of "
+        f"{honest.correlation:.4f} and an RMSE of {honest.pooled.rmse_deg:.4f} deg.",
+        markup=False,
+    )
+
+
+def _print_uncertainty(found: Uncertainty) -> None:
+    if found.interval is not None:
+        stdout().print(
+            f"{found.interval.level:.0%} interval of the winner's correlation, drawing its "
+            f"{found.drawn}s {found.interval.replicates:,} times: {found.interval.low:.4f} to "
+            f"{found.interval.high:.4f}.",
+            markup=False,
+        )
+    if found.repeated_mean is not None and found.repeated_spread is not None:
+        stdout().print(
+            f"{found.repeats} other deals of the drives into folds: correlation "
+            f"{found.repeated_mean:.5f} +- {found.repeated_spread:.5f}.",
+            markup=False,
+        )

@@ -1,0 +1,83 @@
+"""Two model versions beside each other: the command diff, and score --against."""
+
+from typing import Any
+
+import typer
+
+from fleet_slip.cli.models.version_commands import Reference
+from fleet_slip.cli.output import Json, print_json, print_table, say
+from fleet_slip.models.diff import Difference
+from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.models.score import score as score_rows
+from fleet_slip.warehouse.condition import parse_condition, row_columns
+from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.words import number_of
+
+
+def diff(context: typer.Context, one: Reference, other: Reference, json: Json = False) -> None:
+    """Tell two model versions apart: their data, signals, coefficients and figures.
+
+    Example: **fleet-slip diff waterford@1 waterford@2**
+    """
+    found = context.obj.diff(one, other)
+    if json:
+        print_json(found)
+    else:
+        _print_difference(found)
+
+
+def _print_difference(found: Difference) -> None:
+    one, other = found.one.reference, found.other.reference
+    if not found.facts and all(term.same for term in found.terms):
+        say(f"{one} and {other} are the same estimator from the same data")
+        return
+    print_table(
+        "", ["signal", "unit", one, other], [_coefficients(term) for term in found.terms], left=2
+    )
+    if found.drives is not None:
+        shared = found.drives
+        say(
+            f"drives: {shared.both:,} made both, {shared.only_one:,} only {one}, "
+            f"{shared.only_other:,} only {other}"
+        )
+    rows = [[name, _shown(a), _shown(b)] for name, (a, b) in found.facts.items()]
+    print_table("", ["what differs", one, other], rows, left=3)
+
+
+def _coefficients(term: Any) -> list[str]:
+    shown = ["" if value is None else repr(value) for value in (term.one, term.other)]
+    return [term.signal, term.unit, shown[0], "the same" if term.same else shown[1]]
+
+
+def _shown(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def score_against(
+    warehouse: Warehouse, one: ModelVersion, other: ModelVersion, cohort: str, json: bool
+) -> None:
+    """Print the figures of two versions on the rows that have the signals of both."""
+    needed = {*one.manifest.columns, *other.manifest.columns}
+    complete = " AND ".join(f"{name} IS NOT NULL" for name in sorted(needed))
+    both = parse_condition(cohort, row_columns()) & parse_condition(complete, row_columns())
+    first, second = (
+        score_rows(warehouse, version.manifest, both).as_dict() for version in (one, other)
+    )
+    if json:
+        models = {one.reference: first, other.reference: second}
+        print_json({"cohort": cohort, "models": models})
+        return
+    print_table(
+        f"{one.reference} and {other.reference} on the same {number_of(first['rows'], 'row')}",
+        ["figure", one.reference, other.reference, "difference"],
+        [
+            [
+                name.replace("_deg", ", deg").replace("_", " "),
+                f"{value:.4f}",
+                f"{second[name]:.4f}",
+                f"{value - second[name]:+.4f}",
+            ]
+            for name, value in first.items()
+            if name != "rows" and value is not None and second[name] is not None
+        ],
+    )

@@ -1,0 +1,294 @@
+"""Commands that serve models: models, show, promote, rollback, pin, unpin."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fleet_slip.api.fleet import Fleet
+from fleet_slip.cli.completing import complete_model
+from fleet_slip.cli.models.signing_commands import signing_key
+from fleet_slip.cli.output import Json, print_json, print_table, say
+from fleet_slip.cli.recorded import record_run
+from fleet_slip.errors import UsageError
+from fleet_slip.export.costs import costs_content, describe_costs
+from fleet_slip.models.aliases import CHAMPION
+from fleet_slip.models.manifest import ImportedFrom, ModelTerm
+from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.words import number_of
+
+Reference = Annotated[
+    str,
+    typer.Argument(
+        help="NAME, NAME@VERSION or NAME@ALIAS. NAME alone is its champion.",
+        autocompletion=complete_model,
+    ),
+]
+Alias = Annotated[str, typer.Option(help="The alias to move.")]
+
+
+def models(
+    context: typer.Context,
+    name: Annotated[
+        str | None,
+        typer.Argument(
+            help="Show one model's versions and history. Or: import, and a FILE that export --to "
+            "json wrote, to bring its version in."
+        ),
+    ] = None,
+    file: Annotated[Path | None, typer.Argument(help="The file to import.")] = None,
+    json: Json = False,
+) -> None:
+    """List the published model versions, or bring one in from elsewhere: models import FILE.
+
+    Example: **fleet-slip models**
+    """
+    fleet: Fleet = context.obj
+    if file is not None:
+        _import_model(fleet, name, file, json)
+        return
+    if name == "import" and name not in fleet.registry().names():
+        raise UsageError("which file? Run: fleet-slip models import FILE")
+    rows = fleet.models(name).to_pylist()
+    if json:
+        print_json(rows)
+        return
+    if not rows:
+        say("no model has been published yet. Run: fleet-slip publish NAME")
+        return
+    print_table(
+        "",
+        [
+            "model",
+            "aliases",
+            "signals",
+            "published",
+            "correlation",
+            "RMSE deg",
+            "std deg",
+            "drives",
+            "rows",
+        ],
+        [
+            [
+                f"{row['name']}@{row['version']}",
+                row["aliases"],
+                row["signals"].replace(",", " "),
+                f"{row['published_at']:%Y-%m-%d %H:%M}" if row["published_at"] else "",
+                f"{row['correlation']:.4f}",
+                f"{row['rmse_deg']:.4f}",
+                f"{row['error_std_deg']:.4f}",
+                f"{row['drives']:,}",
+                f"{row['rows']:,}",
+            ]
+            for row in rows
+        ],
+        left=4,
+    )
+    for row in rows:
+        if row["trained_on_forgotten"]:
+            say(f"{row['name']}@{row['version']} was trained on drives that were forgotten since")
+    if name:
+        print_table(
+            "\nhistory of aliases",
+            ["at", "command", "alias", "version"],
+            [
+                [f"{move.at:%Y-%m-%d %H:%M:%S}", move.command, move.alias, str(move.version)]
+                for move in fleet.registry().history(name).moves()
+            ],
+            left=3,
+        )
+
+
+def _import_model(fleet: Fleet, word: str | None, file: Path, json: bool) -> None:
+    if word != "import":
+        raise UsageError(f"{word!r}: a file is for import. Run: fleet-slip models import {file}")
+    version = fleet.import_model(file, sign_key=signing_key(None))
+    origin = version.manifest.imported_from
+    if json:
+        told = origin.model_dump() if origin else None
+        print_json({"model": version.reference, "sha256": version.sha256, "imported_from": told})
+        return
+    came = f"imported from {origin.reference}" if origin else "is there already, made here"
+    say(f"{version.reference}: {came}. To use it: fleet-slip promote {version.reference}")
+
+
+def show(context: typer.Context, reference: Reference, json: Json = False) -> None:
+    """Show one model version: coefficients, figures, and the data that made it.
+
+    Example: **fleet-slip show waterford**
+    """
+    version: ModelVersion = context.obj.model(reference)
+    if json:
+        content = version.manifest.model_dump(mode="json")
+        facts = {
+            "version": version.version,
+            "sha256": version.sha256,
+            "on_board": costs_content(version.manifest),
+        }
+        print_json({**facts, **content})
+    else:
+        _print_version(version)
+
+
+def _definition_row(term: ModelTerm) -> list[str]:
+    one = term.definition
+    if one is None:
+        return []
+    ticks = str(one.ticks) if one.ticks else ""
+    times = [one.fact.name] if one.fact else []
+    if gate := one.gate:
+        knots = [str(knot) for knot in (gate.low, gate.peak, gate.high) if knot is not None]
+        times.append(f"{gate.by.over or ''} {gate.by.of} {gate.by.ticks or ''}: {' '.join(knots)}")
+    return [
+        term.signal,
+        f"{term.scale} {term.unit}",
+        one.of,
+        one.over or "",
+        ticks,
+        str(one.bits),
+        ", ".join(times).strip(),
+    ]
+
+
+def _origin(origin: ImportedFrom) -> str:
+    return f"from {origin.reference} of another data root, sha256 {origin.sha256}"
+
+
+def _print_version(version: ModelVersion) -> None:
+    manifest = version.manifest
+    figures, trained = manifest.cross_validation, manifest.trained_on
+    label = manifest.label
+    constant = [["intercept", label.unit, repr(manifest.intercept), ""]]
+    print_table(
+        f"{version.reference}: {label.column} = "
+        + ("" if manifest.through_origin else "intercept + ")
+        + "sum of coefficient * signal"
+        + (", through the origin" if manifest.through_origin else ""),
+        ["signal", "unit", "coefficient", "per count"],
+        [
+            *([] if manifest.through_origin else constant),
+            *(
+                [
+                    term.column,
+                    term.unit,
+                    repr(term.coefficient),
+                    f"{float(term.coefficient_exact * term.scale_exact):.9g}",
+                ]
+                for term in manifest.terms
+            ),
+        ],
+        left=2,
+    )
+    if manifest.features:
+        print_table(
+            "\nfeatures: SQL over the counts of log_counts, clipped to +-32767, times the scale",
+            ["feature", "scale", "SQL"],
+            [[t.signal, f"{t.scale} {t.unit}", t.sql] for t in manifest.terms if t.sql],
+            left=3,
+        )
+    if manifest.definitions:
+        print_table(
+            "\ncolumns over time (docs/memory.md): counts, times the scale",
+            ["column", "scale", "of", "over", "ticks", "bits", "times"],
+            [_definition_row(term) for term in manifest.terms if term.definition],
+            left=4,
+        )
+    print_table(
+        "",
+        ["", ""],
+        [
+            [
+                "correlation",
+                f"{figures.correlation:.4f} (s.e. {figures.correlation_standard_error:.2g})",
+            ],
+            ["RMSE", f"{figures.rmse_deg:.4f} deg"],
+            ["error std", f"{figures.error_std_deg:.4f} deg"],
+            ["error mean", f"{figures.error_mean_deg:+.4f} deg"],
+            ["on board", describe_costs(manifest)],
+            ["cross-validation", f"{number_of(figures.folds, 'fold')} by {figures.folds_by}"],
+            [
+                "cohort",
+                f"{trained.cohort}: {number_of(trained.drives, 'drive')}"
+                + (
+                    f" of {number_of(trained.vehicles, 'car')}"
+                    if trained.vehicles is not None
+                    else ""
+                )
+                + f", {number_of(trained.rows, 'row')}",
+            ],
+            ["tables", f"logs version {trained.logs_version}, grams {trained.grams_version}"],
+            [
+                "selected",
+                f"model {manifest.selected_by.model} of {manifest.selected_by.model_list}",
+            ],
+            ["why", manifest.selected_by.reason],
+            *([["imported", _origin(origin)]] if (origin := manifest.imported_from) else []),
+            ["sha256", version.sha256],
+        ],
+        left=2,
+    )
+
+
+@record_run
+def promote(
+    context: typer.Context,
+    reference: Annotated[
+        str,
+        typer.Argument(help="NAME@VERSION to point the alias at.", autocompletion=complete_model),
+    ],
+    alias: Alias = CHAMPION,
+) -> None:
+    """Point an alias, the champion unless told otherwise, at a version.
+
+    Example: **fleet-slip promote waterford@2**
+    """
+    version = context.obj.promote(reference, alias)
+    say(f"{version.manifest.name}@{alias} is now version {version.version}")
+
+
+@record_run
+def rollback(
+    context: typer.Context,
+    name: Annotated[str, typer.Argument(help="Name of the model.", autocompletion=complete_model)],
+    alias: Alias = CHAMPION,
+) -> None:
+    """Point an alias back at the version that it had before; no publication moves it from there.
+
+    Until promote or unpin.
+
+    Example: **fleet-slip rollback waterford**
+    """
+    version = context.obj.rollback(name, alias)
+    say(
+        f"{name}@{alias} is version {version.version} again, and stays so until: fleet-slip "
+        f"promote, or fleet-slip unpin {name}"
+    )
+
+
+@record_run
+def pin(
+    context: typer.Context,
+    name: Annotated[str, typer.Argument(help="Name of the model.", autocompletion=complete_model)],
+    alias: Alias = CHAMPION,
+) -> None:
+    """Keep an alias where it is: publications become candidates, until promote or unpin.
+
+    Example: **fleet-slip pin waterford**
+    """
+    version = context.obj.pin(name, alias)
+    say(f"{name}@{alias} is pinned to version {version.version}")
+
+
+@record_run
+def unpin(
+    context: typer.Context,
+    name: Annotated[str, typer.Argument(help="Name of the model.", autocompletion=complete_model)],
+    alias: Alias = CHAMPION,
+) -> None:
+    """Let publications move an alias again, after pin or rollback.
+
+    Example: **fleet-slip unpin waterford**
+    """
+    version = context.obj.unpin(name, alias)
+    say(f"{name}@{alias} is version {version.version}; the next publication may move it")

@@ -1,0 +1,118 @@
+"""How the sensors of cars are off: the command calibrate."""
+
+from collections.abc import Mapping, Sequence
+from statistics import median, pstdev
+from typing import Annotated
+
+import typer
+
+from fleet_slip.catalogue.car_numbers import CAR_NUMBERS, NumberName
+from fleet_slip.catalogue.sources import ALL_DRIVES
+from fleet_slip.cli.options import Cohort
+from fleet_slip.cli.output import Json, print_json, print_table, say
+from fleet_slip.grams.calibration.calibration import Calibration
+from fleet_slip.grams.calibration.car_evidence import Calibrated
+from fleet_slip.words import number_of
+
+
+def calibrate(
+    context: typer.Context,
+    car: Annotated[
+        str | None,
+        typer.Option(help="Show this car's numbers, and how they go on board.", show_default=False),
+    ] = None,
+    cohort: Cohort = ALL_DRIVES,
+    json: Json = False,
+) -> None:
+    """Tell from each car's own drives how its sensors are off: no label, no log row is read.
+
+    Offsets of gyroscope, accelerometer and steering, tyre radius, steering and understeer, each
+    with its uncertainty and how fast it shrinks with drives. Needs the Gram rows of: **fleet-slip
+    gram --features calibration**. SQL sees the same: **fleet-slip sql "FROM calibration"**
+
+    Example: **fleet-slip calibrate**
+    """
+    found: Calibration = context.obj.calibrate(cohort)
+    if json:
+        shown = found.as_dict()
+        if car is not None:
+            found.car(car)  # that there is such a car
+            shown["cars"] = {car: shown["cars"][car]}
+        print_json(shown)
+    elif car is not None:
+        _print_car(car, found.car(car))
+    else:
+        _print_fleet(found)
+
+
+def _print_car(car: str, numbers: Mapping[NumberName, Calibrated]) -> None:
+    print_table(
+        f"{car}, by its own drives",
+        ["number", "unit", "value", "+-", "drives", "count on board", "of"],
+        [
+            [
+                name,
+                CAR_NUMBERS[name].unit,
+                f"{one.value:.6g}",
+                _error(one.uncertainty),
+                str(one.drives),
+                str(one.count),
+                str(CAR_NUMBERS[name].grain),
+            ]
+            for name, one in numbers.items()
+        ],
+        left=2,
+    )
+    if missing := [name for name in CAR_NUMBERS if name not in numbers]:
+        say(
+            f"not told by its drives, which lack a signal, or are too straight or even: "
+            f"{', '.join(missing)}"
+        )
+
+
+def _print_fleet(found: Calibration) -> None:
+    by_number = {
+        name: [cars[name] for cars in found.cars.values() if name in cars] for name in CAR_NUMBERS
+    }
+    print_table(
+        f"{number_of(len(found.cars), 'car')}, by their own drives",
+        ["number", "unit", "cars", "median", "differs by", "known to +-"],
+        [
+            [
+                name,
+                CAR_NUMBERS[name].unit,
+                f"{len(cars):,}",
+                f"{median(one.value for one in cars):.3g}",
+                f"{pstdev(one.value for one in cars):.2g}",
+                _error(_median([one.uncertainty for one in cars])),
+            ]
+            for name, cars in by_number.items()
+            if cars
+        ],
+        left=2,
+    )
+    print_table(
+        "\nhow sure after so many drives of a car; measured: by the next so many drives",
+        ["number", "drives", "cars", "known to +-", "measured"],
+        [
+            [
+                row.number,
+                str(row.drives),
+                f"{row.cars:,}",
+                f"{row.stated:.2g}",
+                _error(row.measured),
+            ]
+            for row in found.convergence()
+        ],
+    )
+    if not any(one.uncertainty for cars in found.cars.values() for one in cars.values()):
+        say("no car has two drives: how sure the numbers are cannot be told")
+
+
+def _median(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return median(known) if known else None
+
+
+def _error(value: float | None) -> str:
+    return "" if value is None else f"{value:.2g}"

@@ -1,0 +1,1 @@
+"""How the sensors of cars are off, from the Gram rows of their drives."""

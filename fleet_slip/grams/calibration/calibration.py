@@ -1,0 +1,137 @@
+"""How the sensors of every car are off, from the Gram rows of its drives: no label, no log row.
+
+The numbers of a car are exact functions of the sum of its drives' Gram rows (`car_numbers`), so
+that they are the same in whatever order drives came, and a drive that is forgotten is gone from
+them. `car_evidence` tells how sure they are.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import pyarrow as pa
+
+from fleet_slip.catalogue.car_numbers import CALIBRATION, CAR_NUMBERS, NumberName
+from fleet_slip.catalogue.sources import ALL_DRIVES
+from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.grams.calibration.car_evidence import Calibrated, Convergence, Evidence
+from fleet_slip.grams.calibration.car_numbers import KINDS
+from fleet_slip.grams.cohorts.drive_sums import collect_sums
+from fleet_slip.grams.cohorts.reader import GramReader, OpenedGrams, open_grams
+from fleet_slip.warehouse.condition import Condition, parse_condition
+from fleet_slip.warehouse.tables import Warehouse
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The numbers of every car of a cohort.
+
+    Attributes:
+        cars: the numbers of each car, by its `vehicle_id`; a number is missing that its drives do
+            not tell.
+        logs_version, grams_version: versions of the Delta tables that were read.
+        evidence: sums and variances that the numbers came from.
+    """
+
+    cars: Mapping[str, Mapping[NumberName, Calibrated]]
+    logs_version: int
+    grams_version: int
+    evidence: Evidence
+
+    def car(self, vehicle_id: str) -> Mapping[NumberName, Calibrated]:
+        """Return the numbers of a car. Raises `QuestionError` if no drive is of it."""
+        if vehicle_id not in self.cars:
+            raise QuestionError(
+                f"no drive of a car {vehicle_id!r} tells its numbers. See: fleet-slip sql "
+                '"SELECT DISTINCT vehicle_id FROM drives"'
+            )
+        return self.cars[vehicle_id]
+
+    def counts(self) -> dict[str, dict[str, int]]:
+        """Return the integer counts of every car's numbers."""
+        return {
+            car: {name: one.count for name, one in numbers.items()}
+            for car, numbers in self.cars.items()
+        }
+
+    def convergence(self) -> tuple[Convergence, ...]:
+        """Return how sure the numbers are after 1, 2, 5, 10 ... drives of a car."""
+        return self.evidence.convergence()
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `calibrate --json` prints."""
+        return {
+            "logs_version": self.logs_version,
+            "grams_version": self.grams_version,
+            "numbers": {name: one.model_dump(mode="json") for name, one in CAR_NUMBERS.items()},
+            "cars": {
+                car: {name: vars(one) for name, one in numbers.items()}
+                for car, numbers in self.cars.items()
+            },
+            "convergence": [vars(one) for one in self.convergence()],
+        }
+
+
+TABLE = pa.schema(
+    [
+        ("vehicle_id", pa.string()),
+        ("number", pa.string()),
+        ("value", pa.float64()),
+        ("uncertainty", pa.float64()),
+        ("unit", pa.string()),
+        ("count", pa.int64()),
+        ("grain", pa.float64()),
+        ("drives", pa.int64()),
+        ("rows", pa.int64()),
+    ]
+)
+"""The table `calibration`."""
+
+
+def calibration_of(opened: OpenedGrams, condition: Condition) -> Calibration:
+    """Return the numbers of every car that the Gram rows of a cohort tell; none, if there are none.
+
+    `opened` are the Gram rows of the feature set `calibration`.
+    """
+    evidence = Evidence(collect_sums(opened.batches(condition), KINDS))
+    cars = {car: evidence.calibrated(car) for car in evidence.cars}
+    return Calibration(cars, opened.logs_version, opened.grams_version, evidence)
+
+
+def calibration_table(opened: OpenedGrams) -> pa.Table:
+    """Return the numbers as the table `calibration` that SQL sees, one row a car and number.
+
+    Of the Gram rows that there are: none are required.
+    """
+    found = calibration_of(opened, parse_condition(ALL_DRIVES))
+    rows = [
+        {
+            "vehicle_id": car,
+            "number": name,
+            **vars(one),
+            "unit": CAR_NUMBERS[name].unit,
+            "grain": float(CAR_NUMBERS[name].grain),
+        }
+        for car, numbers in found.cars.items()
+        for name, one in numbers.items()
+    ]
+    return pa.Table.from_pylist(rows, schema=TABLE)
+
+
+def calibrate(
+    source: Warehouse | GramReader, condition: str | Condition = ALL_DRIVES
+) -> Calibration:
+    """Return the numbers of every car that has drives of a cohort, from their Gram rows.
+
+    Drives without a label count as others do. Raises `QuestionError` for a condition that is none,
+    and `DataError` if no drive satisfies it or the Gram rows of `calibration` are missing.
+    """
+    condition = parse_condition(condition)
+    with open_grams(source, CALIBRATION, condition) as opened:
+        found = calibration_of(opened, condition)
+    if not found.cars:
+        raise DataError(
+            f"no drive of {condition.text!r} has yaw rate, ay and wheel speeds. Choose another "
+            "cohort."
+        )
+    return found

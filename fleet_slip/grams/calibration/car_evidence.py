@@ -1,0 +1,210 @@
+"""What a car's drives are evidence of: its numbers, and how sure they are.
+
+How sure they are is told by how much single drives move them: drives are the independent pieces of
+evidence. One drive has no other to differ from, so that the variance of residuals, as drives
+differ, is that of the whole fleet; how much a car's driving tells is its own.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import sqrt
+from typing import Any
+
+import numpy as np
+
+from fleet_slip.arrays import FloatArray
+from fleet_slip.catalogue.car_numbers import CAR_NUMBERS, NumberName
+from fleet_slip.grams.calibration.car_numbers import Telling, gradient_about, tell_numbers
+from fleet_slip.grams.cohorts.drive_sums import DriveSums
+from fleet_slip.regression.exact.plane import Influence, influence
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """One number of one car.
+
+    Attributes:
+        value: in its SI unit; the exact rational rounded once.
+        count: the integer count of its grain that models and boards use.
+        uncertainty: standard error in the same unit; None if no car has two drives.
+        drives, rows: what tells it.
+    """
+
+    value: float
+    count: int
+    uncertainty: float | None
+    drives: int
+    rows: int
+
+
+@dataclass(frozen=True)
+class Convergence:
+    """How sure a number is after so many drives of a car.
+
+    Attributes:
+        drives: the first so many of each car that has them.
+        cars: how many have.
+        stated: root mean square of the standard errors.
+        measured: the same by how much the next so many drives of a car differ; None if no car has.
+    """
+
+    number: NumberName
+    drives: int
+    cars: int
+    stated: float
+    measured: float | None
+
+
+STEPS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+"""Numbers of drives that a convergence is shown for."""
+
+
+class Evidence:
+    """Sums of the drives of all cars, and the variance of residuals as drives differ."""
+
+    def __init__(self, sums: Mapping[str, DriveSums]) -> None:
+        """Take the sums by kind of plane, and learn the variances."""
+        self.sums = sums
+        self._origins = {kind: one.origin() for kind, one in sums.items()}
+        self._moments = {kind: one.moments(self._origins[kind]) for kind, one in sums.items()}
+        self.cars = sorted({car for one in sums.values() for car in one.cars})
+        self.told = {car: self.tell(self._slices(car)) for car in self.cars}
+        self.variances = self._variances()
+
+    def _slices(self, car: str, first: int = 0, last: int | None = None) -> dict[str, slice]:
+        """Return where the drives of a car are, from the `first` to before the `last`, by kind."""
+        found = {}
+        for kind, one in self.sums.items():
+            if car in one.cars:
+                every = range(*one.cars[car].indices(len(one.drives)))[first:last]
+                found[kind] = slice(every.start, every.stop)
+        return found
+
+    def tell(self, slices: Mapping[str, slice]) -> dict[NumberName, Telling]:
+        """Return the numbers that some drives tell."""
+        return tell_numbers(
+            {
+                kind: self.sums[kind].table.take(_range(at)).total()
+                for kind, at in slices.items()
+                if at.stop > at.start
+            }
+        )
+
+    def influence(self, telling: Telling, at: slice) -> Influence | None:
+        """Return how drives move a number."""
+        signals = self.sums[telling.kind].table.signals
+        origin = np.array(self._origins[telling.kind], dtype=np.float64)
+        gradient = gradient_about(telling, signals, origin)
+        return influence(self._moments[telling.kind][at], telling.shape, signals, gradient)
+
+    def _variances(self) -> dict[NumberName, float]:
+        """Return the variance of residuals, as drives differ, of each number's plane.
+
+        A drive's shift, about its car's number, has the variance times its share times one less
+        the part of the share in the car's.
+        """
+        squares: dict[NumberName, list[float]] = {}
+        expected: dict[NumberName, list[float]] = {}
+        for car, told in self.told.items():
+            for name, telling in told.items():
+                found = self.influence(telling, self._slices(car)[telling.kind])
+                if found is None or len(found.shifts) < 2:
+                    continue
+                shares = found.shares
+                squares.setdefault(name, []).extend((found.shifts**2).tolist())
+                expected.setdefault(name, []).extend(
+                    (shares * (1 - shares / shares.sum())).tolist()
+                )
+        return {
+            name: sum(squares[name]) / total
+            for name in squares
+            if (total := sum(expected[name])) > 0
+        }
+
+    def uncertainties(
+        self, told: Mapping[NumberName, Telling], slices: Mapping[str, slice]
+    ) -> dict[NumberName, float]:
+        """Return the standard errors of what some drives tell."""
+        own: dict[NumberName, float] = {}
+        for name, telling in told.items():
+            found = self.influence(telling, slices[telling.kind])
+            if found is not None and name in self.variances:
+                own[name] = self.variances[name] * float(found.shares.sum())
+        return {
+            name: sqrt(variance + sum(d**2 * own.get(n, 0.0) for n, d in told[name].also.items()))
+            for name, variance in own.items()
+        }
+
+    def calibrated(self, car: str) -> dict[NumberName, Calibrated]:
+        """Return the numbers of a car."""
+        told, slices = self.told[car], self._slices(car)
+        sure = self.uncertainties(told, slices)
+        found: dict[NumberName, Calibrated] = {}
+        for name in CAR_NUMBERS:
+            if name in told:
+                at = slices[told[name].kind]
+                rows = int(self.sums[told[name].kind].table.n[at].sum())
+                count = CAR_NUMBERS[name].count(told[name].value)
+                found[name] = Calibrated(
+                    value=float(told[name].value),
+                    count=count or 0,
+                    uncertainty=_three_digits(sure[name]) if name in sure else None,
+                    drives=at.stop - at.start,
+                    rows=rows,
+                )
+        return found
+
+    def convergence(self) -> tuple[Convergence, ...]:
+        """Return how sure the numbers are after so many drives of a car."""
+        most = max(
+            (
+                len(range(*s.indices(s.stop)))
+                for one in self.sums.values()
+                for s in one.cars.values()
+            ),
+            default=0,
+        )
+        return tuple(row for step in STEPS if step <= most for row in self._converged(step))
+
+    def _converged(self, step: int) -> list[Convergence]:
+        stated: dict[NumberName, list[float]] = {}
+        differences: dict[NumberName, list[float]] = {}
+        for car in self.cars:
+            first, others = self._slices(car, 0, step), self._slices(car, step, 2 * step)
+            if any(at.stop - at.start < step for at in first.values()):
+                continue
+            told = self.tell(first)
+            for name, error in self.uncertainties(told, first).items():
+                stated.setdefault(name, []).append(error)
+            if all(at.stop - at.start == step for at in others.values()):
+                for name, other in self.tell(others).items():
+                    if name in told:
+                        apart = float(told[name].value - other.value)
+                        differences.setdefault(name, []).append(apart)
+        return [
+            Convergence(
+                name,
+                step,
+                len(stated[name]),
+                _three_digits(_root_mean_square(stated[name])),
+                _three_digits(_root_mean_square(differences[name]) / sqrt(2))
+                if name in differences
+                else None,
+            )
+            for name in CAR_NUMBERS
+            if name in stated
+        ]
+
+
+def _range(at: slice) -> Any:
+    return np.arange(at.start, at.stop)
+
+
+def _root_mean_square(values: Sequence[float]) -> float:
+    squares: FloatArray = np.square(values)
+    return float(np.sqrt(squares.mean()))
+
+
+def _three_digits(value: float) -> float:
+    """Return an uncertainty as it is stated, which is the same on every machine."""
+    return float(f"{value:.3g}")

@@ -1,0 +1,1 @@
+"""From Gram rows to the sums of cohorts, folds, days and cars."""

@@ -1,0 +1,120 @@
+"""The sums of a cohort over each day, from rollups, and from Gram rows read batch by batch."""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import date
+
+import pyarrow as pa
+
+from fleet_slip.catalogue.feature_sets import PLAIN
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalogue.sources import TRAINING_DRIVES
+from fleet_slip.grams.cohorts.cohort import require_training
+from fleet_slip.grams.cohorts.empty_cohort import empty_cohort
+from fleet_slip.grams.cohorts.expansion import expansion_of
+from fleet_slip.grams.cohorts.folding import EACH, Folding
+from fleet_slip.grams.cohorts.members import Hashed, Members, add_hashed, hash_numbers
+from fleet_slip.grams.cohorts.reader import GramReader, open_grams
+from fleet_slip.grams.rows.gram_rows import gram_table
+from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.regression.exact.gram_table import GramTable
+from fleet_slip.regression.inference.drive_moments import missing_signals_error
+from fleet_slip.warehouse.condition import Condition, parse_condition
+from fleet_slip.warehouse.tables import Warehouse
+
+
+@dataclass(frozen=True)
+class DailySums:
+    """The Gram of each day, and the number of drives in it.
+
+    Attributes:
+        left_out: drives of the condition that have no such Gram rows: their cars sent no log.
+        revoked: how many drives of a car are left out, since a revoked key signed them.
+    """
+
+    days: tuple[date, ...]
+    grams: tuple[Gram, ...]
+    drives: tuple[int, ...]
+    left_out: int
+    revoked: Mapping[str, int]
+
+
+def sum_days(
+    source: Warehouse | GramReader,
+    inputs: Sequence[str],
+    condition: str | Condition = TRAINING_DRIVES,
+    feature_set: str = PLAIN,
+) -> DailySums:
+    """Add up, day by day, the Gram rows of the drives that have the label and all the inputs.
+
+    Raises like `fleet_slip.grams.cohorts.cohort.load_cohort`, and `DataError`
+    if no drive has them all.
+    """
+    signals = (*inputs, catalogue().label)
+    days: dict[date, _Day] = defaultdict(lambda: _Day(Gram.zero(signals)))
+    found = False
+    condition = parse_condition(condition)
+    with open_grams(source, feature_set, condition, Folding(by="day", count=EACH)) as opened:
+        expansion = expansion_of(opened, feature_set)
+        if len(opened.cells.table):
+            found = True
+            require_training(opened.cells.table["source"].unique().to_pylist(), condition)
+        for (day, names), cells in opened.cells.by("day", "signals"):
+            if set(signals) <= set(names.split(",")):
+                days[day].add(
+                    names,
+                    gram_table(names, cells).restrict(signals).total(),
+                    opened.cells.drives(cells),
+                    opened.cells.vehicles(cells),
+                )
+        for batch in opened.batches(condition):
+            found = True
+            require_training(batch["source"].unique().to_pylist(), condition)
+            for names, table, chosen in expansion.tables(batch):
+                if set(signals) <= set(names.split(",")):
+                    rows = batch.filter(pa.array(chosen))
+                    _add_rows(days, names, table.restrict(signals), rows)
+        left_out, revoked = opened.count_left_out(condition), opened.revoked(condition)
+        if not found:
+            raise empty_cohort(source, condition, feature_set)
+    if not days:
+        raise missing_signals_error(signals)
+    order = sorted(days)
+    members = [Members(days[day].drives, days[day].vehicles) for day in order]
+    for day, known in zip(order, members, strict=True):
+        known.require_vehicles(known.vehicles, f"the cohort {condition.text!r} on {day}")
+    return DailySums(
+        tuple(order),
+        tuple(days[day].gram for day in order),
+        tuple(known.count_drives(known.drives) for known in members),
+        left_out,
+        revoked,
+    )
+
+
+@dataclass
+class _Day:
+    """What a day comes to: its Gram, and its drives and cars by their signals."""
+
+    gram: Gram
+    drives: dict[str, Hashed] = field(default_factory=dict)
+    vehicles: dict[str, Hashed] = field(default_factory=dict)
+
+    def add(self, names: str, gram: Gram, drives: Hashed, vehicles: Hashed) -> None:
+        """Add Gram rows of the same signals."""
+        self.gram += gram
+        add_hashed(self.drives, names, drives)
+        add_hashed(self.vehicles, names, vehicles)
+
+
+def _add_rows(days: dict[date, _Day], names: str, table: GramTable, rows: pa.RecordBatch) -> None:
+    """Add Gram rows of the same signals to their days."""
+    here = rows["day"].dictionary_encode()
+    number, values = here.indices.to_numpy(), here.dictionary.to_pylist()
+    ids = hash_numbers(rows["drive_id"])
+    once = bool(rows["part"].null_count == len(rows))
+    for i, total in enumerate(table.totals(number, len(values))):
+        mine = rows["vehicle_id"].filter(pa.array(number == i)).unique()
+        drives = Hashed.of(ids[number == i], once=once)
+        days[values[i]].add(names, total, drives, Hashed.of(hash_numbers(mine)))

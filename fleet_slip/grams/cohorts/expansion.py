@@ -1,0 +1,142 @@
+"""Calibrated columns of Gram rows: what follows from the rows and a number of each car, exactly.
+
+A column that is another times a number which is the same in all rows of a drive has sums that are
+that number times the other's, and products that are the product of both numbers times theirs. So
+no log row is read for it, and the numbers may be those of tonight.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from fleet_slip.arrays import BoolArray
+from fleet_slip.catalogue.car_numbers import CALIBRATION
+from fleet_slip.catalogue.columns import Number
+from fleet_slip.catalogue.features import features
+from fleet_slip.catalogue.sources import ALL_DRIVES
+from fleet_slip.grams.calibration.calibration import calibration_of
+from fleet_slip.grams.cohorts.reader import OpenedGrams
+from fleet_slip.grams.rows.gram_rows import by_signals, gram_table
+from fleet_slip.regression.exact.gram import packed_position
+from fleet_slip.regression.exact.gram_table import GramTable
+from fleet_slip.warehouse.condition import parse_condition
+
+_SAFE = 2.0**62
+
+CarCounts = Mapping[str, Mapping[str, int]]
+"""The counts of each car's numbers, by `vehicle_id` and name."""
+
+
+@dataclass(frozen=True)
+class Expansion:
+    """Adds the calibrated columns of a feature set to its Gram rows.
+
+    Attributes:
+        columns: the column that each is made of, and its number.
+        cars: the counts of the cars' numbers.
+    """
+
+    columns: Mapping[str, tuple[str, Number]]
+    cars: CarCounts
+
+    def tables(
+        self, batch: pa.RecordBatch | pa.Table
+    ) -> Iterator[tuple[str, GramTable, BoolArray]]:
+        """Yield the signals of Gram rows, their table with calibrated columns, and which they are.
+
+        Rows of a car without a number do not have the columns that need it.
+        """
+        for names, rows, here in by_signals(batch):
+            table = gram_table(names, rows)
+            if not self.columns:
+                yield names, table, here
+                continue
+            ids = rows["vehicle_id"].to_pylist()
+            known = np.array(["\0".join(sorted(self.cars.get(one) or ())) for one in ids])
+            at = np.flatnonzero(here)
+            for kind in np.unique(known):
+                chosen = known == kind
+                expanded = self._expand(
+                    table.take(chosen), [one for one, yes in zip(ids, chosen, strict=True) if yes]
+                )
+                mask = np.zeros(len(here), dtype=np.bool_)
+                mask[at[chosen]] = True
+                yield ",".join(expanded.signals), expanded, mask
+
+    def _expand(self, table: GramTable, ids: list[str]) -> GramTable:
+        """Return the table with the columns whose numbers all of its rows' cars have."""
+        known = self.cars.get(ids[0]) or {}
+        added = {
+            name: (of, number)
+            for name, (of, number) in self.columns.items()
+            if of in table.signals and number.name in known
+        }
+        if not added:
+            return table
+        factors = np.array(
+            [[self.cars[one][n.name] - n.less for _, n in added.values()] for one in ids],
+            dtype=np.int64,
+        )
+        bases = [0 if n.alone else 1 + table.signals.index(of) for of, n in added.values()]
+        return expand(table, tuple(added), bases, factors)
+
+
+def expand(
+    table: GramTable, names: tuple[str, ...], bases: list[int], factors: NDArray[np.int64]
+) -> GramTable:
+    """Return a table with more columns: each is a factor of the drive times a column.
+
+    `bases` number the columns from 1; 0 is the constant 1. `factors` have the shape (drives, new).
+    Exact: where products need more than 64 bits, the numbers are Python's.
+    """
+    k, new = len(table.signals), len(names)
+    source = np.concatenate([table.n[:, None], table.sums, table.products], axis=1)
+
+    def place(a: int, b: int) -> int:
+        """Return where the product of two columns stands in `source`."""
+        a, b = max(a, b), min(a, b)
+        return a if b == 0 else 1 + k + packed_position(a - 1, b - 1)
+
+    every = [*range(1, k + 1), *bases]
+    pairs = [(k + i, j) for i in range(new) for j in range(k + i + 1)]
+    at = np.array([place(every[i], every[j]) for i, j in pairs])
+    ones = np.ones((len(table), k), dtype=np.int64)
+    weights = np.concatenate([ones, factors], axis=1)
+    left, right = (np.array(side) for side in zip(*pairs, strict=True))
+    largest = np.abs(weights[:, left] * weights[:, right].astype(np.float64)) * np.abs(
+        source[:, at].astype(np.float64)
+    )
+    if largest.size and largest.max() >= _SAFE:
+        source, weights = source.astype(object), weights.astype(object)
+    products: NDArray[Any] = weights[:, left] * weights[:, right] * source[:, at]
+    sums = weights[:, k:] * source[:, [*bases]]
+    return GramTable(
+        (*table.signals, *names),
+        table.n,
+        np.concatenate([table.sums, sums], axis=1),
+        np.concatenate([table.products, products], axis=1),
+    )
+
+
+def expansion_of(opened: OpenedGrams, feature_set: str) -> Expansion:
+    """Return what adds the calibrated columns of a feature set, with the numbers as of now.
+
+    A number is told by all drives of a car that there are, whatever the cohort: it needs no label.
+    """
+    known = features()
+    names = known.feature_set(feature_set).calibrated
+    if not names:
+        return Expansion({}, {})
+    columns = {}
+    for name in names:
+        number = known.time_columns[name].definition.number
+        if number is not None:
+            columns[name] = (known.calibrated[name].of, number)
+    calibration = OpenedGrams(
+        opened.database, known.identity(CALIBRATION), opened.logs_version, opened.grams_version
+    )
+    return Expansion(columns, calibration_of(calibration, parse_condition(ALL_DRIVES)).counts())

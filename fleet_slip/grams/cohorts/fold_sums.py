@@ -1,0 +1,275 @@
+"""The sums of a cohort over its folds, from rollups, and from Gram rows read batch by batch.
+
+Comparing given models needs no single drive, only the Gram of each fold. So any number of Gram
+rows is added up in the memory of one batch; and of a file whose rollup serves, no row is read.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from fleet_slip.arrays import IntArray
+from fleet_slip.catalogue.feature_sets import PLAIN
+from fleet_slip.catalogue.features import features
+from fleet_slip.catalogue.sources import TRAINING_DRIVES
+from fleet_slip.errors import DataError
+from fleet_slip.grams.cohorts.cells import Cells, dealt_folds
+from fleet_slip.grams.cohorts.cohort import (
+    assign_folds,
+    gram_condition,
+    require_divided,
+    require_training,
+)
+from fleet_slip.grams.cohorts.empty_cohort import empty_cohort
+from fleet_slip.grams.cohorts.expansion import Expansion, expansion_of
+from fleet_slip.grams.cohorts.folding import (
+    FOLD_KEYS,
+    FoldCount,
+    Folding,
+    FoldKey,
+)
+from fleet_slip.grams.cohorts.members import (
+    Hashed,
+    Hashes,
+    Members,
+    add_hashed,
+    hash_numbers,
+    received_among,
+)
+from fleet_slip.grams.cohorts.reader import GramReader, OpenedGrams, open_grams
+from fleet_slip.grams.rows.gram_rows import by_signals, gram_table
+from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.regression.exact.gram_table import GramTable
+from fleet_slip.regression.validation.folds import CohortFolds
+from fleet_slip.warehouse.condition import Condition, asking, parse_condition
+from fleet_slip.warehouse.tables import Warehouse
+
+
+@dataclass(frozen=True)
+class SummedCohort:
+    """What a selection from given models needs of a cohort.
+
+    Attributes:
+        condition: which drives, by the columns of the view `drives`.
+        folding: how the cohort was divided.
+        sums: the Gram of each fold.
+        rows, drive_count: number of rows of the logs, and of drives, behind the cohort.
+        logs_version, grams_version: versions of the Delta tables that were read.
+        members: which drives and cars the Gram rows are of.
+        source: where they were read, and can be read again over other folds.
+        feature_set: which Gram rows were read.
+        left_out: drives of the condition that have no such Gram rows: their cars sent no log.
+        revoked: how many drives of a car are left out, since a revoked key signed them.
+    """
+
+    condition: Condition
+    folding: Folding
+    sums: CohortFolds
+    rows: int
+    drive_count: int
+    logs_version: int
+    grams_version: int
+    members: Members
+    source: Warehouse | GramReader
+    feature_set: str = PLAIN
+    left_out: int = 0
+    revoked: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Signals and features that any of the drives has, in the order of the feature set."""
+        found = {name for grams in self.sums.tables for name in grams[0].signals}
+        return tuple(
+            name for name in features().feature_set(self.feature_set).inputs if name in found
+        )
+
+    def folds(self, by: FoldKey, count: FoldCount) -> CohortFolds:
+        """Return the folds; for others than the cohort was read over, its Gram rows as of now.
+
+        Raises what `sum_cohort` raises.
+        """
+        if (by, count) == (self.folding.by, self.folding.count):
+            return self.sums
+        folding = Folding(by=by, count=count)
+        return sum_cohort(self.source, folding, self.condition, self.feature_set).sums
+
+    def gram_condition(self, inputs: Sequence[str]) -> str:
+        """Return the SQL condition on the view `grams` of the rows that a model is made of."""
+        return gram_condition(self.condition, self.feature_set, inputs)
+
+
+def sum_cohort(
+    warehouse: Warehouse | GramReader,
+    folding: Folding,
+    condition: str | Condition = TRAINING_DRIVES,
+    feature_set: str = PLAIN,
+) -> SummedCohort:
+    """Add up the Gram rows of the drives that satisfy a condition, over each fold.
+
+    Raises like `fleet_slip.grams.cohorts.cohort.load_cohort`, and `DataError`
+    if there are not two folds.
+    """
+    condition = parse_condition(condition)
+    require_divided(feature_set, folding.by, folding.count)
+    with open_grams(warehouse, feature_set, condition, folding) as opened:
+        folds = _find_folds(opened, folding, condition)
+        if folds is None:
+            raise empty_cohort(warehouse, condition, feature_set)
+        sums = _Sums(folds, expansion_of(opened, feature_set))
+        sums.add_cells(opened.cells, condition)
+        for batch in opened.batches(condition):
+            require_training(batch["source"].unique().to_pylist(), condition)
+            sums.add(batch)
+        left_out, revoked = opened.count_left_out(condition), opened.revoked(condition)
+        if not sums.tables:
+            raise empty_cohort(warehouse, condition, feature_set)
+    members = sums.members
+    for signals in members.vehicles:
+        of = f"the cohort {condition.text!r} with the signals {signals}"
+        members.require_vehicles([signals], of)
+    return SummedCohort(
+        condition=condition,
+        folding=folding,
+        sums=sums.of_folds(members),
+        rows=sum(gram.n for grams in sums.tables.values() for gram in grams),
+        drive_count=members.count_drives(members.drives),
+        logs_version=opened.logs_version,
+        grams_version=opened.grams_version,
+        members=members,
+        source=warehouse,
+        feature_set=feature_set,
+        left_out=left_out,
+        revoked=revoked,
+    )
+
+
+@dataclass(frozen=True)
+class _Folds:
+    """The folds that there may be.
+
+    Attributes:
+        names: what they are called.
+        of_rows: tells the fold of each Gram row, from its metadata and its drive's hash.
+        of_cells: tells the fold of each cell of rollups.
+        key: what was dealt into the buckets of the cells that folds are made of.
+    """
+
+    names: Sequence[str]
+    of_rows: Callable[[pa.RecordBatch, Hashes], IntArray]
+    of_cells: Callable[[pa.Table], IntArray]
+    key: str = "drive"
+
+
+def _find_folds(opened: OpenedGrams, folding: Folding, condition: Condition) -> _Folds | None:
+    """Return the folds of a cohort; None of an empty one. Raises like `sum_cohort`."""
+    cells, key, few = opened.cells.table, FOLD_KEYS[folding.by], dealt_folds(folding)
+    found = pa.array([], pa.null())
+    if not (few and len(cells)):  # else the cells alone tell that there are more than folds
+        text = opened.statement("cohort_sums.sql", condition)
+        query = f"SELECT DISTINCT {key} FROM ({text}){f' LIMIT {few + 1}' if few else ''}"
+        with asking(opened.database, condition):
+            found = opened.database.sql(query).to_arrow_table()[key].combine_chunks()
+    if few and (len(cells) or len(found) > few):
+        return _Folds(
+            [str(fold + 1) for fold in range(few)],
+            lambda rows, drives: (_dealt(rows, drives, key) % few).astype(np.int64),
+            lambda cells: cells["bucket"].to_numpy() % few,
+            folding.by,
+        )
+    if len(cells):
+        of_cells = cells[key].combine_chunks().unique().cast(found.type)
+        found = pa.concat_arrays([found, of_cells]).unique()
+    if not len(found):
+        return None
+    assignment = assign_folds(found.to_pylist(), folding.by, folding.count)
+
+    def fold_of(rows: pa.RecordBatch | pa.Table) -> IntArray:
+        at: IntArray = pc.index_in(rows[key].cast(found.type), value_set=found).to_numpy()
+        return assignment.fold[at]
+
+    return _Folds(assignment.names, lambda rows, _: fold_of(rows), fold_of)
+
+
+def _dealt(rows: pa.RecordBatch, drives: Hashes, key: str) -> Hashes:
+    """Return the hash of each Gram row's car, or of its trip, mostly that of its drive."""
+    if key == "vehicle_id":
+        return hash_numbers(rows[key])
+    alone = pc.equal(rows["trip"], rows["drive_id"]).to_numpy(zero_copy_only=False)
+    if alone.all():
+        return drives
+    trips = drives.copy()
+    trips[~alone] = hash_numbers(rows["trip"].filter(pa.array(~alone)))
+    return trips
+
+
+@dataclass
+class _Sums:
+    """Adds up Gram rows by set of signals and fold, and remembers which drives they are of."""
+
+    known: _Folds
+    expansion: Expansion
+    tables: dict[str, list[Gram]] = field(default_factory=dict)
+    drives: dict[str, Hashed] = field(default_factory=dict)
+    vehicles: dict[str, Hashed] = field(default_factory=dict)
+    received: dict[str, Hashed] = field(default_factory=dict)
+
+    def add(self, batch: pa.RecordBatch) -> None:
+        """Add a batch of Gram rows."""
+        drives = hash_numbers(batch["drive_id"])
+        folds, came = self.known.of_rows(batch, drives), received_among(batch)
+        once = bool(batch["part"].null_count == len(batch))  # else a drive may have several
+        for signals, table, here in self.expansion.tables(batch):
+            self._add(signals, table, folds[here])
+            cars = hash_numbers(batch["vehicle_id"].filter(pa.array(here)).unique())
+            add_hashed(self.drives, signals, Hashed.of(drives[here], once=once))
+            add_hashed(self.vehicles, signals, Hashed.of(cars))
+            add_hashed(self.received, signals, Hashed.of(drives[here & came], once=once))
+
+    def add_cells(self, cells: Cells, condition: Condition) -> None:
+        """Add cells of rollups. Raises `RefusedError` for those of scenarios."""
+        if not len(cells.table):
+            return
+        require_training(cells.table["source"].unique().to_pylist(), condition)
+        dealt = cells.dealt(self.known.key).combine_chunks()
+        folds = self.known.of_cells(dealt)
+        [batch] = dealt.to_batches()
+        for signals, some, here in by_signals(batch):
+            self._add(signals, gram_table(signals, some), folds[here])
+        for (signals,), mine in cells.by("signals"):
+            add_hashed(self.drives, signals, cells.drives(mine))
+            add_hashed(self.vehicles, signals, cells.vehicles(mine))
+            add_hashed(self.received, signals, cells.received(mine))
+
+    def _add(self, signals: str, table: GramTable, folds: IntArray) -> None:
+        totals = table.totals(folds, len(self.known.names))
+        before = self.tables.get(signals)
+        self.tables[signals] = (
+            [a + b for a, b in zip(before, totals, strict=True)] if before else totals
+        )
+
+    @property
+    def members(self) -> Members:
+        """Which drives and cars the Gram rows are of."""
+        return Members(self.drives, self.vehicles, self.received)
+
+    def of_folds(self, members: Members) -> CohortFolds:
+        """Return the folds that a drive fell into. Raises `DataError` if it is one only."""
+        names, order = self.known.names, sorted(self.tables)
+        used = [
+            fold
+            for fold in range(len(names))
+            if any(self.tables[signals][fold].n for signals in order)
+        ]
+        if len(used) < 2:
+            raise DataError(
+                "cross-validation needs at least two folds, and the cohort has one: "
+                f"{names[used[0]]}. Widen the cohort, or fold by another key."
+            )
+        return CohortFolds(
+            tuple(names[fold] for fold in used),
+            tuple(tuple(self.tables[signals][fold] for fold in used) for signals in order),
+            lambda tables: members.count_drives([order[i] for i in tables]),
+        )

@@ -1,0 +1,133 @@
+"""Which drives and cars the Gram rows of a cohort are of."""
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from hashlib import sha256
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from fleet_slip.arrays import BoolArray
+from fleet_slip.catalogue.sources import RECEIVED
+from fleet_slip.warehouse.minimum_cohort import minimum_vehicles, require_vehicles
+
+Hashes = NDArray[np.uint64]
+"""Hashes of drives or cars, `hash_number`: what tells one from others, in 8 bytes."""
+
+AT_ONCE = 2**21
+"""So many hashes of cars, most of them again and again, are looked through at once."""
+
+
+@dataclass(frozen=True)
+class Hashed:
+    """Drives or cars, whose hashes are read when they are asked for.
+
+    Attributes:
+        parts: what return the hashes.
+        once: how many there are, if each is there once.
+        least: so many there are at least.
+    """
+
+    parts: tuple[Callable[[], Hashes], ...]
+    once: int | None = None
+    least: int = 0
+
+    @classmethod
+    def of(cls, hashes: Hashes, *, once: bool = False) -> "Hashed":
+        """Return hashes that are here."""
+        return cls((lambda: hashes,), len(hashes) if once else None)
+
+    def __add__(self, other: "Hashed") -> "Hashed":
+        """Return both; each is there once if it was, and none is in both."""
+        both = None if self.once is None or other.once is None else self.once + other.once
+        return Hashed(self.parts + other.parts, both, max(self.least, other.least))
+
+
+@dataclass(frozen=True)
+class Members:
+    """The drives and cars of Gram rows, by the signals that these have.
+
+    Attributes:
+        drives: the drive of each Gram row, by the row's signals, separated by commas.
+        vehicles: the cars, by the same.
+        received: the drives whose cars sent Gram rows and no log, by the same.
+    """
+
+    drives: Mapping[str, Hashed]
+    vehicles: Mapping[str, Hashed]
+    received: Mapping[str, Hashed] = field(default_factory=dict)
+
+    def drives_with(self, signals: Collection[str]) -> Hashes:
+        """Return the hashes of the drives that have all of some signals, each once, sorted."""
+        return _union([self.drives[kind] for kind in _kinds_with(self.drives, signals)])
+
+    def count_drives(self, kinds: Collection[str]) -> int:
+        """Return the number of drives that have a Gram row of one of some sets of signals."""
+        return _count(self.drives, frozenset(kinds))
+
+    def count_received_with(self, signals: Collection[str]) -> int:
+        """Return the number of drives without a log that have all of some signals."""
+        return _count(self.received, _kinds_with(self.received, signals))
+
+    @property
+    def count_received(self) -> int:
+        """Number of drives without a log."""
+        return self.count_received_with(())
+
+    def count_vehicles_with(self, signals: Collection[str]) -> int:
+        """Return the number of cars that have all of some signals."""
+        return _count(self.vehicles, _kinds_with(self.vehicles, signals))
+
+    def require_vehicles(self, kinds: Collection[str], of: str) -> None:
+        """Raise `CohortError` if too few cars have one of some sets of signals.
+
+        See `fleet_slip.warehouse.minimum_cohort`.
+        """
+        least = minimum_vehicles()
+        if least is not None and all(self.vehicles[kind].least < least for kind in kinds):
+            require_vehicles(_count(self.vehicles, frozenset(kinds)), of)
+
+
+def add_hashed(known: dict[str, Hashed], signals: str, more: Hashed | None) -> None:
+    """Add drives or cars of Gram rows of some signals, none of which is there, to the others."""
+    if more is not None:
+        known[signals] = known[signals] + more if signals in known else more
+
+
+def received_among(rows: pa.Table | pa.RecordBatch) -> BoolArray:
+    """Return which Gram rows are of drives whose cars sent them, by the column `source`."""
+    came = pc.fill_null(pc.equal(rows["source"].cast(pa.string()), RECEIVED), False)
+    found: BoolArray = np.asarray(came.to_numpy(zero_copy_only=False), dtype=np.bool_)
+    return found
+
+
+def hash_numbers(ids: pa.Array | pa.ChunkedArray) -> Hashes:
+    """Return the hash of each id of a drive or a car, see `Hashes`."""
+    first = b"".join([sha256(one.encode("utf-8")).digest()[:8] for one in ids.to_pylist()])
+    return np.frombuffer(first, dtype=">u8").astype(np.uint64)
+
+
+def _kinds_with(hashed: Mapping[str, Hashed], signals: Collection[str]) -> frozenset[str]:
+    """Return the sets of signals that have all of some."""
+    return frozenset(names for names in hashed if set(signals) <= set(names.split(",")))
+
+
+def _count(hashed: Mapping[str, Hashed], kinds: frozenset[str]) -> int:
+    """Return the number of hashes of some sets of signals."""
+    found = [hashed[names] for names in hashed if names in kinds]
+    if len(found) == 1 and found[0].once is not None:
+        return found[0].once
+    return len(_union(found))
+
+
+def _union(found: Sequence[Hashed]) -> Hashes:
+    """Return the hashes, each once, sorted; hashes that repeat take no memory for long."""
+    known, waiting, many = np.array([], dtype=np.uint64), list[Hashes](), 0
+    for read in (part for one in found for part in one.parts):
+        waiting.append(read())
+        many += len(waiting[-1])
+        if many > max(AT_ONCE, len(known)):
+            known, waiting, many = np.unique(np.concatenate([known, *waiting])), [], 0
+    return np.unique(np.concatenate([known, *waiting])) if waiting else known

@@ -1,0 +1,225 @@
+"""Opens the Gram rows of a warehouse, once for cohort after cohort."""
+
+import contextlib
+import shlex
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Self
+
+import duckdb
+import pyarrow as pa
+
+from fleet_slip.catalogue.car_numbers import CALIBRATION
+from fleet_slip.catalogue.feature_sets import PLAIN
+from fleet_slip.catalogue.features import features
+from fleet_slip.catalogue.sources import ALL_DRIVES, LONGEST_PAUSE_S, TRAINING_DRIVES
+from fleet_slip.delta import Snapshot
+from fleet_slip.errors import DataError
+from fleet_slip.grams.cohorts.cells import NO_CELLS, Cells, RollupReader
+from fleet_slip.grams.cohorts.folding import Folding
+from fleet_slip.grams.received.car_keys import load_car_keys
+from fleet_slip.grams.rows.backlog import find_backlog
+from fleet_slip.regression.exact.gram import packed_size
+from fleet_slip.resources import read_sql
+from fleet_slip.warehouse.condition import Condition, asking
+from fleet_slip.warehouse.table_views import gram_snapshots, lock, open_tables
+from fleet_slip.warehouse.tables import Warehouse
+
+BATCH_ROWS = 2**13
+"""Gram rows of one batch: some 700 bytes each."""
+
+BATCH_NUMBERS = 2**20
+"""Most sums and products of one batch: wide rows come in smaller ones."""
+
+
+@dataclass(frozen=True)
+class OpenedGrams:
+    """A connection to the Gram rows of a feature set, and what stood in the warehouse then.
+
+    Instead of the rows of some files it has their `cells`.
+    """
+
+    database: duckdb.DuckDBPyConnection
+    identity: str
+    logs_version: int
+    grams_version: int
+    cells: Cells = NO_CELLS
+
+    def statement(self, name: str, condition: Condition) -> str:
+        """Return a statement of `jobs/` for a condition, but for what revoked keys signed."""
+        keys = load_car_keys()
+        revoked = [key.condition for key in keys.revoked()] if keys else []
+        sql = f"{condition.sql} AND NOT ({' OR '.join(revoked)})" if revoked else condition.sql
+        trips = read_sql("jobs", "trips.sql").format(
+            feature_set=self.identity, longest_pause_s=LONGEST_PAUSE_S
+        )
+        return read_sql("jobs", name).format(condition=sql, feature_set=self.identity, trips=trips)
+
+    def revoked(self, condition: Condition) -> dict[str, int]:
+        """Return how many drives of each car a cohort lacks, since a key of it was revoked."""
+        keys = load_car_keys()
+        some = [key.condition for key in keys.revoked()] if keys else []
+        if not some:
+            return {}
+        sql = f"{condition.sql} AND ({' OR '.join(some)})"
+        statement = read_sql("jobs", "count_revoked.sql").format(condition=sql)
+        with asking(self.database, condition):
+            return dict(self.database.execute(statement).fetchall())
+
+    def batches(self, condition: Condition) -> Iterator[pa.RecordBatch]:
+        """Yield the Gram rows of a cohort in any order, with what their fold is told from."""
+        statement = self.statement("cohort_sums.sql", condition)
+        with asking(self.database, condition):
+            yield from self.database.sql(statement).to_arrow_reader(self._batch_rows)
+
+    def count_left_out(self, condition: Condition) -> int:
+        """Return how many drives of a cohort have no Gram rows, since their cars sent no log."""
+        if self.identity == features().identity(PLAIN):
+            return 0
+        statement = self.statement("count_without_log.sql", condition)
+        with asking(self.database, condition):
+            return int(self.database.execute(statement).fetchall()[0][0])
+
+    def files(self, condition: Condition) -> set[str]:
+        """Return the log files that have a drive of a cohort."""
+        statement = self.statement("cohort_files.sql", condition)
+        with asking(self.database, condition):
+            return {file for (file,) in self.database.sql(statement).fetchall()}
+
+    @property
+    def _batch_rows(self) -> int:
+        name = features().name_of(self.identity)
+        numbers = packed_size(len(features().feature_set(name).columns))
+        return max(1, min(BATCH_ROWS, BATCH_NUMBERS // numbers))
+
+
+class GramReader:
+    """The Gram rows of a warehouse, for one cohort after another.
+
+    Each is read from the newest version. What was opened for the one before is used again if nobody
+    has committed since: then a cohort costs its query and no more. Not for several threads at once.
+    """
+
+    def __init__(self, warehouse: Warehouse) -> None:
+        """Open nothing yet."""
+        self._warehouse = warehouse
+        self._logs: Snapshot | None = None
+        self._grams: Snapshot | None = None
+        self._without: frozenset[str] = frozenset()
+        self._database: duckdb.DuckDBPyConnection | None = None
+        self._rollups = RollupReader()
+
+    def __enter__(self) -> Self:
+        """Return the reader."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the connection."""
+        self._close()
+
+    def opened(
+        self, feature_set: str, condition: Condition, folding: Folding | None = None
+    ) -> OpenedGrams:
+        """Return the Gram rows of a feature set, until the next call.
+
+        For a cohort's sums over folds, cells stand in for the rows of files that have rollups.
+        Raises `DataError` if there are no Gram rows, or if those of the feature set are not
+        complete for a cohort.
+        """
+        grams, logs = gram_snapshots(self._warehouse, self._grams, self._logs)
+        if grams is not self._grams or logs is not self._logs:
+            self._close()
+        self._logs, self._grams = logs, grams
+        if not grams.rows:
+            fill = "fleet-slip simulate CAMPAIGN (or fleet-slip ingest FILE --mapping M), then "
+            raise DataError(
+                f"{self._warehouse.root}: there are no Gram rows yet. "
+                f"Run: {'' if logs.rows else fill}fleet-slip gram."
+            )
+        calibrated = bool(features().feature_set(feature_set).calibrated)
+        for name in (feature_set, *([CALIBRATION] if calibrated else [])):
+            if name != PLAIN:
+                rows = partial(self._opened, grams, logs, name)
+                _require_complete(logs, grams, rows, name, condition)
+        cells = NO_CELLS
+        if folding and not calibrated:
+            identity, revoked = features().identity(feature_set), _revoked_cars()
+            cells = self._rollups.cells(grams, logs, identity, condition, folding, revoked)
+        return self._opened(grams, logs, feature_set, cells)
+
+    def _opened(
+        self, grams: Snapshot, logs: Snapshot, feature_set: str, cells: Cells = NO_CELLS
+    ) -> OpenedGrams:
+        if self._database is None or cells.paths != self._without:
+            self._close()
+            read = replace(grams, without=cells.paths) if cells.paths else grams
+            self._database = open_tables(self._warehouse, {"grams"}, [read, logs])
+            self._without = cells.paths
+            lock(self._database, read.paths)
+        return OpenedGrams(
+            self._database,
+            features().identity(feature_set),
+            logs.version or 0,
+            grams.version or 0,
+            cells,
+        )
+
+    def _close(self) -> None:
+        if self._database is not None:
+            self._database.close()
+            self._database = None
+
+
+@contextlib.contextmanager
+def open_grams(
+    source: Warehouse | GramReader,
+    feature_set: str,
+    condition: Condition,
+    folding: Folding | None = None,
+) -> Iterator[OpenedGrams]:
+    """Open the Gram rows of a feature set, anew unless by a reader; see `opened`."""
+    if isinstance(source, GramReader):
+        yield source.opened(feature_set, condition, folding)
+    else:
+        with GramReader(source) as reader:
+            yield reader.opened(feature_set, condition, folding)
+
+
+def _revoked_cars() -> frozenset[str]:
+    keys = load_car_keys()
+    return frozenset(key.vehicle_id for key in keys.revoked()) if keys else frozenset()
+
+
+def _require_complete(
+    logs: Snapshot,
+    grams: Snapshot,
+    opened: Callable[[], OpenedGrams],
+    feature_set: str,
+    condition: Condition,
+) -> None:
+    backlog = find_backlog(logs, grams, features().identity(feature_set))
+    if not backlog.missing and not backlog.stale:
+        return
+    files = opened().files(condition)
+    missing = [file for file in backlog.missing if file.path in files]
+    if missing or backlog.stale & files:
+        everything = condition.text in {ALL_DRIVES, TRAINING_DRIVES}
+        cohort = "" if everything else f" --cohort {shlex.quote(condition.text)}"
+        raise DataError(
+            f"the feature set {feature_set}, as it is defined now, has not been computed for "
+            f"{len(missing)} of {len(files)} log files of the cohort. Run: fleet-slip gram "
+            f"--features {feature_set}{cohort}"
+        )
+
+
+def cohort_files(source: Warehouse | GramReader, condition: Condition) -> set[str]:
+    """Return the log files that have a drive of a cohort, by the Gram rows of the logged signals.
+
+    Raises `DataError` if no drive satisfies the condition.
+    """
+    with open_grams(source, PLAIN, condition) as opened:
+        found = opened.files(condition)
+    if not found:
+        raise DataError(f"no drive satisfies {condition.text!r}.")
+    return found

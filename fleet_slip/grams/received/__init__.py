@@ -1,0 +1,1 @@
+"""Gram rows that cars send instead of logs."""

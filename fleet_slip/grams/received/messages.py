@@ -1,0 +1,232 @@
+"""The message of a car that sends a Gram row instead of a log: its layout, and reading many.
+
+All numbers are little-endian. A message is
+
+    0   4   "FSGR"                          36  8  when the drive began, s since 1970 in UTC
+    4   2   layout, 1; signed: 2            44  4  which signals it is of, a bit for each
+    6   2   length with the checksum        48  4  n, rows
+    8   8   what the signals mean, below    56  .. sums, 8 bytes each, of these signals
+    16  16  the car, ASCII, zeros behind    ..  .. products, 8 bytes each, packed lower triangle
+    32  2   place among the drive's         ..  4  CRC-32 of all before, as in Ethernet and zlib
+    34  2   number of them
+    52  4   rows that are in none of them
+
+A drive has a message for each set of signals that its rows have. What the signals mean are the
+first 8 bytes of the SHA-256 of the canonical JSON of name, scale and range of each.
+
+A signed message has its signature, 64 bytes, before the checksum (`signatures`).
+Messages of one length that stand one behind the other are read at once, as an array.
+"""
+
+import zlib
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_slip.canonical import canonical_json, sha256_of
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.regression.exact.gram import packed_size
+
+MAGIC = b"FSGR"
+LAYOUT = 1
+SIGNED_LAYOUT = 2
+SIGNATURE_BYTES = 64
+HEADER_BYTES = 56
+CHECKSUM_BYTES = 4
+LONGEST_VEHICLE = 16
+MOST_PARTS = 4
+"""Sets of signals that a car keeps apart within a drive."""
+
+MOST_ROWS = 2**31 - 1
+"""Rows of a drive: 248 days. No sum of so many products of int16 counts reaches 2^61."""
+
+MOST_SIGNALS = 32
+"""There is a bit for each."""
+
+MOST_AT_ONCE = 8192
+"""Messages that are looked at as an array; after a damaged one, one, two, four, ..."""
+
+CUT_OFF = "is cut off"
+NO_MESSAGE = "does not begin as a message does"
+OTHER_LAYOUT = "has another layout"
+WRONG_LENGTH = "has a length that does not fit its signals"
+WRONG_CHECKSUM = "has a wrong checksum"
+
+Messages = NDArray[Any]
+"""Messages of the same length: an array with the fields of `message_type`."""
+
+
+@dataclass
+class Found:
+    """What some bytes hold.
+
+    Attributes:
+        runs: messages whose checksum is right, of one length and one behind the other: the number
+            of the first among all that was found, from 1, and they.
+        refused: what is no message: its number, and why.
+    """
+
+    runs: list[tuple[int, Messages]] = field(default_factory=list)
+    refused: list[tuple[int, str]] = field(default_factory=list)
+    count: int = 0
+
+
+@cache
+def message_size(signals: int) -> int:
+    """Return the bytes of a message of so many signals."""
+    return HEADER_BYTES + 8 * (signals + packed_size(signals)) + CHECKSUM_BYTES
+
+
+@cache
+def message_type(signals: int, *, signed: bool = False) -> np.dtype[Any]:
+    """Return the fields of a message of so many signals.
+
+    `rows` are n, `lost` rows of the drive that none of its messages has; `numbers` are sums, then
+    products.
+    """
+    return np.dtype(
+        [
+            ("magic", "S4"),
+            ("layout", "<u2"),
+            ("length", "<u2"),
+            ("definition", "<u8"),
+            ("vehicle", f"S{LONGEST_VEHICLE}"),
+            ("place", "<u2"),
+            ("parts", "<u2"),
+            ("start_s", "<u8"),
+            ("mask", "<u4"),
+            ("rows", "<u4"),
+            ("lost", "<u4"),
+            ("numbers", "<i8", (signals + packed_size(signals),)),
+            *([("signature", "V64")] if signed else []),
+            ("checksum", "<u4"),
+        ]
+    )
+
+
+@cache
+def signals_definition() -> int:
+    """Return what the signals of today's catalogue mean, as messages say it."""
+    signals = catalogue()
+    known = [
+        [name, f"{s.scale:f}", s.min_count, s.max_count]
+        for name in signals.gram_signals
+        for s in [signals[name]]
+    ]
+    return int.from_bytes(bytes.fromhex(sha256_of(canonical_json(known))[:16]), "little")
+
+
+def read_messages(content: bytes) -> Found:
+    """Read messages that stand one behind the other.
+
+    After what is none, reading goes on where the next begins with "FSGR".
+    """
+    found = Found()
+    at, end, most = 0, len(content), 1
+    while at < end:
+        messages = _read_run(content, at, most)
+        found.count += 1
+        if len(messages):
+            begun = _continued(found, messages, content, at)
+            found.runs.append(begun or (found.count, messages))
+            found.count += len(messages) - 1
+            at += messages.nbytes
+            most = min(2 * most, MOST_AT_ONCE)
+        else:
+            found.refused.append((found.count, _why_none(content, at)))
+            following = content.find(MAGIC, at + 1)
+            at, most = following if following >= 0 else end, 1
+    return found
+
+
+def _continued(
+    found: Found, messages: Messages, content: bytes, at: int
+) -> tuple[int, Messages] | None:
+    """Take back the last run if messages go on with it; return both as one."""
+    if not found.runs:
+        return None
+    first, before = found.runs[-1]
+    if before.dtype != messages.dtype or first + len(before) != found.count:
+        return None
+    found.runs.pop()
+    count = len(before) + len(messages)
+    return first, np.frombuffer(content, messages.dtype, count, at - before.nbytes)
+
+
+@cache
+def _types() -> dict[tuple[int, int], tuple[int, np.dtype[Any]]]:
+    """Return the number of signals and the fields of a message, by its layout and its length."""
+    return {
+        (layout, kind.itemsize): (signals, kind)
+        for layout in (LAYOUT, SIGNED_LAYOUT)
+        for signals in range(MOST_SIGNALS + 1)
+        for kind in [message_type(signals, signed=layout == SIGNED_LAYOUT)]
+    }
+
+
+def _read_run(content: bytes, at: int, most: int) -> Messages:
+    """Return messages from a place on that are as long as the first; none if it is none."""
+    layout, size = (int.from_bytes(content[at + i : at + i + 2], "little") for i in (4, 6))
+    if (layout, size) not in _types():
+        return np.empty(0, message_type(0))
+    signals, kind = _types()[layout, size]
+    count = min(most, (len(content) - at) // size)
+    messages = np.frombuffer(content, kind, count, at)
+    right = (
+        (messages["magic"] == MAGIC)
+        & (messages["layout"] == layout)
+        & (messages["length"] == size)
+        & (_bit_counts(messages["mask"]) == signals)
+    )
+    messages = messages[: _leading(right)]
+    view = memoryview(content)
+    places = range(at, at + messages.nbytes, size)
+    summed = [zlib.crc32(view[place : place + size - CHECKSUM_BYTES]) for place in places]
+    return messages[: _leading(messages["checksum"] == np.array(summed, dtype=np.uint32))]
+
+
+def _leading(right: NDArray[np.bool_]) -> int:
+    """Return how many are right before the first that is not."""
+    wrong = np.flatnonzero(~right)
+    return int(wrong[0]) if len(wrong) else len(right)
+
+
+def _bit_counts(masks: NDArray[np.uint32]) -> NDArray[np.int64]:
+    """Return the number of bits that are set in each mask."""
+    each = np.ascontiguousarray(masks).view(np.uint8).reshape(-1, 4)
+    counts: NDArray[np.int64] = np.unpackbits(each, axis=1).sum(axis=1, dtype=np.int64)
+    return counts
+
+
+def _why_none(content: bytes, at: int) -> str:
+    """Return why no message is at a place."""
+    if not content.startswith(MAGIC, at):
+        return NO_MESSAGE
+    size = HEADER_BYTES
+    if len(content) >= at + size:
+        size = int.from_bytes(content[at + 6 : at + 8], "little")
+    if len(content) < at + size:
+        return CUT_OFF
+    if size < HEADER_BYTES + CHECKSUM_BYTES:
+        return WRONG_LENGTH
+    layout = int.from_bytes(content[at + 4 : at + 6], "little")
+    if layout not in (LAYOUT, SIGNED_LAYOUT):
+        return OTHER_LAYOUT
+    mask = int.from_bytes(content[at + 44 : at + 48], "little")
+    fitting = message_type(mask.bit_count(), signed=layout == SIGNED_LAYOUT).itemsize
+    return WRONG_LENGTH if size != fitting else WRONG_CHECKSUM
+
+
+def without_signatures(messages: Messages) -> Messages:
+    """Return messages as they were before they were signed, but for their checksums."""
+    names = messages.dtype.names or ()
+    if "signature" not in names:
+        return messages
+    kept = [name for name in names if name != "signature"]
+    plain = np.empty(len(messages), [(name, messages.dtype[name]) for name in kept])
+    for name in kept:
+        plain[name] = messages[name]
+    return plain

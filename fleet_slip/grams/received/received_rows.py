@@ -1,0 +1,266 @@
+"""Messages of cars as rows, many at once: what they say, and which of them cannot be."""
+
+import re
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from fleet_slip.arrays import BoolArray, IntArray
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
+from fleet_slip.catalogue.sources import RECEIVED_FILES
+from fleet_slip.grams.received.messages import (
+    LONGEST_VEHICLE,
+    Found,
+    Messages,
+    signals_definition,
+    without_signatures,
+)
+from fleet_slip.grams.received.plausible import find_impossible
+from fleet_slip.grams.received.signed_rows import keep_signatures
+
+FIRST_START_S = 946_684_800
+"""2000-01-01: a car's clock that says less has not been set."""
+
+MARGIN_S = 86_400
+"""A car's clock may be ahead by a day, no more: it has a satellite receiver or a network."""
+
+LONGEST_ROWS = 86_400 * round(1 / SAMPLE_TIME_S)
+"""Rows of a day: a drive is over by then. A message that says more would outvote a fleet."""
+
+OTHER_SIGNALS = "is of signals that mean something else here"
+NO_PARTS = "is of signals or parts that there are not"
+NO_VEHICLE = "has no name of a car"
+NO_MOMENT = "begins before 2000, or ends in the future"
+TOO_LONG = "is of a drive longer than a day"
+LACKS_ROWS = "lacks rows of its drive"
+
+_IN_NAMES = np.array([bool(re.match(rb"[A-Za-z0-9._-]", bytes([b]))) for b in range(256)])
+
+
+@dataclass(frozen=True)
+class Refused:
+    """A message that does not land: its file, its number there, why, and drive and car if known."""
+
+    file: int
+    number: int
+    reason: str
+    drive_id: str | None = None
+    vehicle_id: str | None = None
+
+
+@dataclass(frozen=True)
+class ReceivedRows:
+    """Messages of the same signals, in the order in which they came.
+
+    Attributes:
+        file: which of some files each is from, shape (m,).
+        number: which message of its file, from 1.
+        messages: what they say, without signatures.
+        kept: what is kept of their signatures.
+    """
+
+    file: IntArray
+    number: IntArray
+    messages: Messages
+    kept: Messages
+
+    def __len__(self) -> int:
+        """Return how many messages they are."""
+        return len(self.messages)
+
+    def take(self, rows: BoolArray | IntArray) -> "ReceivedRows":
+        """Return some of them; them, if a mask has them all."""
+        if rows.dtype == np.bool_ and rows.all():
+            return self
+        return ReceivedRows(*(one[rows] for one in self._arrays))
+
+    @property
+    def _arrays(self) -> tuple[IntArray, IntArray, Messages, Messages]:
+        return self.file, self.number, self.messages, self.kept
+
+    @classmethod
+    def joined(cls, runs: Sequence["ReceivedRows"]) -> "ReceivedRows":
+        """Return messages of the same signals behind each other."""
+        if len(runs) == 1:
+            return runs[0]
+        each = zip(*(run._arrays for run in runs), strict=True)
+        return cls(*(np.concatenate(arrays) for arrays in each))
+
+    @property
+    def mask(self) -> int:
+        """Which signals they are of, a bit for each."""
+        return int(self.messages["mask"][0])
+
+    @property
+    def n(self) -> IntArray:
+        """Numbers of rows, shape (m,)."""
+        return self.messages["rows"].astype(np.int64)
+
+    @cached_property
+    def numbers(self) -> IntArray:
+        """Sums of the k signals, then products, shape (m, k + k(k+1)/2)."""
+        return np.ascontiguousarray(self.messages["numbers"])
+
+    @property
+    def sums(self) -> IntArray:
+        """Sums, shape (m, k)."""
+        return self.numbers[:, : self.mask.bit_count()]
+
+    @property
+    def products(self) -> IntArray:
+        """Packed lower triangles, shape (m, k(k+1)/2)."""
+        return self.numbers[:, self.mask.bit_count() :]
+
+    @cached_property
+    def vehicle_ids(self) -> pa.StringArray:
+        """Names of the cars."""
+        return pa.array(np.ascontiguousarray(self.messages["vehicle"])).cast(pa.string())
+
+    @cached_property
+    def drive_ids(self) -> pa.StringArray:
+        """Names of the drives: the car and the moment."""
+        moments = pa.array(_moments(self.messages["start_s"])).cast(pa.string())
+        return pc.binary_join_element_wise(self.vehicle_ids, moments, "-")
+
+    @property
+    def days(self) -> pa.Date32Array:
+        """Days on which the drives began, in UTC."""
+        days = self.messages["start_s"] // np.uint64(86_400)
+        return pa.array(days.astype(np.int32)).cast(pa.date32())
+
+    def refuse(self, rows: BoolArray | IntArray, reason: str) -> Iterator[Refused]:
+        """Yield some of them as refused."""
+        some = self.take(rows)
+        columns = (some.file, some.number, some.drive_ids, some.vehicle_ids)
+        for file, number, drive, vehicle in zip(*(c.tolist() for c in columns), strict=True):
+            yield Refused(file, number, reason, drive, vehicle)
+
+
+@cache
+def signals_of(mask: int) -> str:
+    """Return the names of a message's signals, as the table `grams` has them."""
+    return ",".join(n for i, n in enumerate(catalogue().gram_signals) if mask >> i & 1)
+
+
+def is_received(rows: pa.Table) -> pa.ChunkedArray:
+    """Return which rows of `grams` came without a log."""
+    return pc.starts_with(rows["file"].cast(pa.string()), RECEIVED_FILES)
+
+
+Judge = Callable[["ReceivedRows"], Iterable[str | None]]
+"""Tells why each of some messages is not to be believed, None where it is."""
+
+
+def sort_out(
+    found: Iterable[tuple[int, Found]], judge: Judge | None = None
+) -> tuple[list[ReceivedRows], list[Refused]]:
+    """Return what may land of the messages of some files, by their signals, and what may not."""
+    refused: list[Refused] = []
+    runs: dict[int, list[ReceivedRows]] = {}
+    for file, one in found:
+        refused += [Refused(file, number, reason) for number, reason in one.refused]
+        for first, messages in one.runs:
+            numbers = np.arange(first, first + len(messages))
+            kept_of = keep_signatures(messages)
+            run = ReceivedRows(np.full(len(messages), file), numbers, messages, kept_of)
+            told, nameless = _without_name(run)
+            refused += nameless
+            if judge is not None and len(told):
+                told, forged = _believed(told, judge(told))
+                refused += forged
+            told = replace(told, messages=without_signatures(told.messages))
+            for mask in np.unique(told.messages["mask"]).tolist():
+                runs.setdefault(mask, []).append(told.take(told.messages["mask"] == mask))
+    kept: list[ReceivedRows] = []
+    for mask in sorted(runs):
+        rows, impossible = _possible(ReceivedRows.joined(runs[mask]))
+        refused += impossible
+        kept += [rows] if len(rows) else []
+    return kept, refused
+
+
+def _without_name(run: ReceivedRows) -> tuple[ReceivedRows, list[Refused]]:
+    """Divide messages into those that tell a drive of today's signals, and the others."""
+    said = run.messages
+    start_s, latest_s = said["start_s"], int(time.time()) + MARGIN_S
+    ends_s = np.minimum(start_s, latest_s) + said["rows"] * float(SAMPLE_TIME_S)
+    left = np.ones(len(said), dtype=np.bool_)
+    refused: list[Refused] = []
+    for reason, wrong in (
+        (OTHER_SIGNALS, said["definition"] != signals_definition()),
+        (
+            NO_PARTS,
+            (said["mask"] >> len(catalogue().gram_signals) != 0) | (said["place"] >= said["parts"]),
+        ),
+        (NO_VEHICLE, ~_is_name(said["vehicle"])),
+        (NO_MOMENT, (start_s < FIRST_START_S) | (start_s > latest_s) | (ends_s > latest_s)),
+    ):
+        bad = left & wrong
+        left &= ~wrong
+        places = zip(run.file[bad].tolist(), run.number[bad].tolist(), strict=True)
+        refused += [Refused(file, number, reason) for file, number in places]
+    return run.take(left), refused
+
+
+def _believed(rows: ReceivedRows, why: Iterable[str | None]) -> tuple[ReceivedRows, list[Refused]]:
+    """Divide messages by whether there is a reason against each."""
+    reasons = np.array(list(why), dtype=object)
+    refused: list[Refused] = []
+    for reason in sorted({reason for reason in reasons if reason}):
+        refused += rows.refuse(reasons == reason, reason)
+    return rows.take(reasons == None), refused  # noqa: E711 - element by element
+
+
+def _is_name(vehicles: Messages) -> BoolArray:
+    """Whether bytes are the name of a car: characters of names, then zeros."""
+    letters = np.ascontiguousarray(vehicles).view(np.uint8).reshape(-1, LONGEST_VEHICLE)
+    zero = letters == 0
+    resumed = zero[:, :-1] & ~zero[:, 1:]
+    found: BoolArray = (_IN_NAMES[letters] | zero).all(axis=1) & ~zero[:, 0]
+    found &= ~resumed.any(axis=1)
+    return found
+
+
+def _possible(rows: ReceivedRows) -> tuple[ReceivedRows, list[Refused]]:
+    """Divide messages of the same signals into those that counts can have, and the others."""
+    lacking = rows.messages["lost"] != 0
+    refused = list(rows.refuse(lacking, LACKS_ROWS))
+    long = rows.n > LONGEST_ROWS
+    refused += rows.refuse(long & ~lacking, TOO_LONG)
+    whole = rows.take(~(lacking | long))
+    signals = catalogue()
+    names = [name for name in signals_of(rows.mask).split(",") if name]
+    ranges = [(signals[name].min_count, signals[name].max_count) for name in names]
+    why = find_impossible(whole.n, whole.sums, whole.products, ranges) if len(whole) else {}
+    left = np.ones(len(whole), dtype=np.bool_)
+    for reason, at in why.items():
+        refused += whole.refuse(at, reason)
+        left[at] = False
+    return whole.take(left), refused
+
+
+def _moments(start_s: Messages) -> Messages:
+    """Return moments as names of drives have them, such as 20240501T100000Z."""
+    seconds = np.ascontiguousarray(start_s).astype("M8[s]")
+    day = seconds.astype("M8[D]")
+    month = day.astype("M8[M]")
+    since_midnight = (seconds - day).astype(np.int64)
+    since_1970 = month.astype(np.int64)
+    parts = (
+        (since_1970 // 12 + 1970, 0, 4),
+        (since_1970 % 12 + 1, 4, 2),
+        ((day - month).astype(np.int64) + 1, 6, 2),
+        (since_midnight // 3600, 9, 2),
+        (since_midnight // 60 % 60, 11, 2),
+        (since_midnight % 60, 13, 2),
+    )
+    text = np.tile(np.frombuffer(b"00000000T000000Z", np.uint8), (len(seconds), 1))
+    for value, first, digits in parts:
+        for i in range(digits):
+            text[:, first + i] += (value // 10 ** (digits - 1 - i) % 10).astype(np.uint8)
+    return text.view("S16").reshape(-1)

@@ -1,0 +1,170 @@
+"""Takes in messages of cars that send Gram rows: rows without a log, beside those with one.
+
+A received Gram row names no log file but `received/` and a digest of the file of messages that
+brought it; its drive has the source `received`. A file of messages lands once. So does a message:
+the same one again is a duplicate, another one of the same drive is refused. What is refused goes to
+the quarantine with the reason, first. Files land many at once, in one commit.
+"""
+
+import hashlib
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fleet_slip.delta import retry_conflicts
+from fleet_slip.errors import InputError
+from fleet_slip.grams.received.car_keys import load_car_keys
+from fleet_slip.grams.received.message_landing import MessageFile, land_refused, land_rows
+from fleet_slip.grams.received.messages import read_messages
+from fleet_slip.grams.received.new_messages import NewMessages, choose_new
+from fleet_slip.grams.received.received_rows import sort_out
+from fleet_slip.grams.received.signatures import judge_signatures
+from fleet_slip.progress import Progress, no_progress
+from fleet_slip.warehouse.tables import Warehouse
+
+LARGEST_FILE_BYTES = 2**28
+BATCH_BYTES = 2**26
+"""Files of so many bytes together land in one commit: some 100,000 messages."""
+
+
+@dataclass
+class ReceiveReport:
+    """What became of a file of messages.
+
+    Attributes:
+        file: its path.
+        new: whether it had not landed before.
+        messages: in it, the refused ones included.
+        received: Gram rows that landed.
+        rows: of drives, in these.
+        duplicates: messages that had landed.
+        forgotten: messages of cars or drives that were forgotten: left out.
+        refused: how many messages went to the quarantine, by reason.
+    """
+
+    file: str
+    new: bool = True
+    messages: int = 0
+    received: int = 0
+    rows: int = 0
+    duplicates: int = 0
+    forgotten: int = 0
+    refused: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def is_useless(self) -> bool:
+        """Whether all of a new file was refused."""
+        return self.new and bool(self.refused) and sum(self.refused.values()) >= self.messages
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `receive --json` prints."""
+        return vars(self) | {"refused": dict(self.refused)}
+
+
+def receive_files(
+    warehouse: Warehouse, files: Sequence[Path], progress: Progress = no_progress
+) -> Iterator[ReceiveReport]:
+    """Take in files of messages; yield a report of each once it has landed.
+
+    `progress` counts files. Raises `InputError` for a file that cannot be read, once those before
+    it have landed; `StorageError`; and `ConflictError` if other processes keep changing the tables.
+    """
+    load_car_keys()  # a list that cannot be read is told, though all files may have landed
+    batch: dict[Path, bytes] = {}
+    failure: InputError | None = None
+    for at, path in enumerate(files):
+        try:
+            batch[path] = _read(path)
+        except InputError as error:
+            failure = error
+        full = sum(map(len, batch.values())) >= BATCH_BYTES
+        if batch and (full or failure or at + 1 == len(files)):
+            yield from _receive_batch(warehouse, batch)
+            progress(len(batch), len(files))
+            batch = {}
+        if failure:
+            raise failure
+
+
+def find_messages(given: Iterable[Path]) -> list[Path]:
+    """Return files, and those in folders at any depth, in the order of their names.
+
+    Raises `InputError` for what is neither, and for a folder without files.
+    """
+    found: list[Path] = []
+    for path in given:
+        inside = sorted(one for one in path.rglob("*") if one.is_file()) if path.is_dir() else []
+        if not inside and not path.is_file():
+            raise InputError(f"{path}: is no file of messages, and no folder that has some.")
+        found += inside or [path]
+    return found
+
+
+def _receive_batch(warehouse: Warehouse, batch: dict[Path, bytes]) -> list[ReceiveReport]:
+    """Land files in one commit; return the report of each."""
+    snapshot = warehouse.grams.snapshot()
+    reports = {path: ReceiveReport(str(path), new=False) for path in batch}
+    files: list[MessageFile] = []
+    fresh: list[ReceiveReport] = []
+    found = []
+    for path, content in batch.items():
+        file = MessageFile(path.name, hashlib.sha256(content).hexdigest())
+        known = any(one.digest == file.digest for one in files)
+        if not known and snapshot.landed(file.unit.name) is None:
+            reports[path].new = True
+            found.append((len(files), read_messages(content)))
+            files.append(file)
+            fresh.append(reports[path])
+    if not files:
+        return list(reports.values())
+    keys = load_car_keys()
+    rows, refused = sort_out(found, None if keys is None else partial(judge_signatures, keys=keys))
+
+    def attempt() -> NewMessages:
+        new = choose_new(warehouse, rows, refused)
+        land_refused(warehouse, files, new.refused)
+        land_rows(warehouse, files, new)
+        return new
+
+    new = retry_conflicts(attempt)
+    new.screened.remember(warehouse.root, new.new)
+    for report, (_, one) in zip(fresh, found, strict=True):
+        report.messages = one.count
+    _tell(fresh, new)
+    return list(reports.values())
+
+
+def _tell(reports: Sequence[ReceiveReport], new: NewMessages) -> None:
+    """Tell the report of each file what of it landed."""
+    for one in new.refused:
+        reports[one.file].refused[one.reason] += 1
+    for rows in new.new:
+        for at in np.unique(rows.file).tolist():
+            mine = rows.file == at
+            reports[at].received += int(mine.sum())
+            reports[at].rows += int(rows.n[mine].sum())
+    for at in new.duplicates.tolist():
+        reports[at].duplicates += 1
+    for at in new.forgotten.tolist():
+        reports[at].forgotten += 1
+
+
+def _read(path: Path) -> bytes:
+    try:
+        with path.open("rb") as stream:
+            content = stream.read(LARGEST_FILE_BYTES + 1)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}.") from None
+    if len(content) > LARGEST_FILE_BYTES:
+        raise InputError(
+            f"{path}: has more than {LARGEST_FILE_BYTES:,} bytes. Messages stand one behind the "
+            "other, so that a file can be cut between them."
+        )
+    if not content:
+        raise InputError(f"{path}: is empty.")
+    return content

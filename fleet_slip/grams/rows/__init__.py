@@ -1,0 +1,1 @@
+"""Gram rows: computed from log files, kept beside them, checked."""

@@ -1,0 +1,252 @@
+"""Checks the Gram rows against two other ways to compute them, bit for bit."""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from fleet_slip.catalogue.feature_sets import PLAIN
+from fleet_slip.catalogue.features import features
+from fleet_slip.delta import TableFile
+from fleet_slip.errors import DataError, StorageError
+from fleet_slip.grams.received.received_rows import is_received
+from fleet_slip.grams.rows.aggregation import aggregate, by_sql
+from fleet_slip.grams.rows.backlog import find_backlog
+from fleet_slip.grams.rows.gram_job import unit_name
+from fleet_slip.grams.rows.wide import wide_grams
+from fleet_slip.progress import Progress, no_progress
+from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.warehouse.tables import Warehouse
+
+SQL_COSTS = 4
+"""The SQL of windows takes minutes for a file: one of so many files is checked."""
+
+INTEGER_ROWS = 5_000
+"""Rows of a drive that are also summed by Python integers, which take 50 us a row."""
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """What was compared. All of it was equal, or `StorageError` would have been raised."""
+
+    files: int
+    rows: int
+    drives: int
+    drives_by_integers: int
+    wide_sets: tuple[str, ...] = ()
+    wide_drives: int = 0
+
+
+def check_grams(
+    warehouse: Warehouse,
+    count: int,
+    progress: Progress = no_progress,
+    begin: int = 0,
+) -> CheckReport:
+    """Check the Gram rows of evenly chosen log files.
+
+    `begin` numbers the sample: that of the next number is of the next files, until all had their
+    turn. Raises `StorageError` naming the first drive whose Grams differ, and `DataError` if there
+    is nothing to check.
+    """
+    logs = warehouse.logs.snapshot()
+    if not logs.files:
+        raise DataError(f"{warehouse.root}: no logs yet. Run: fleet-slip simulate CAMPAIGN")
+    chosen = _evenly(logs.files, count, begin)
+    stored = stored_grams(warehouse)
+    drives = by_integers = rows = wide_drives = 0
+    wide = _computed_wide_sets(warehouse)
+    for file in chosen:
+        from_sql = grams_of(aggregate(warehouse, [file]))
+        _compare(file, "the stored Gram rows", from_sql, stored.get(file.path, {}))
+        counts = read_counts(warehouse, file)
+        _compare(file, "float64 blocks", from_sql, grams_by_blocks(warehouse, counts))
+        by_integers += _check_by_integers(warehouse, file, counts)
+        drives += len(from_sql)
+        rows += file.rows
+        progress(1, len(chosen))
+    for name in wide:
+        missing = find_backlog(logs, warehouse.grams.snapshot(), features().identity(name)).missing
+        computed = [file for file in logs.files if file not in missing]
+        some = _evenly(computed, max(1, count // SQL_COSTS), begin)
+        wide_drives += sum(_check_wide(warehouse, file, name) for file in some)
+    return CheckReport(len(chosen), rows, drives, by_integers, wide, wide_drives)
+
+
+def _evenly(files: Sequence[TableFile], count: int, begin: int) -> list[TableFile]:
+    """Return some of the files, evenly chosen, from the one of the number `begin` on."""
+    many = len(files)
+    return [files[(begin + i * many // count) % many] for i in range(min(count, many))]
+
+
+def _computed_wide_sets(warehouse: Warehouse) -> tuple[str, ...]:
+    """Return the feature sets with windows that Gram rows were computed of."""
+    known, grams = features(), warehouse.grams.snapshot()
+    return tuple(
+        name
+        for name in known.sets
+        if known.feature_set(name).windows
+        and grams.landed(unit_name(known.identity(name))) is not None
+    )
+
+
+def _check_wide(warehouse: Warehouse, file: TableFile, feature_set: str) -> int:
+    """Compare the kernel with the SQL that defines it, and with what is stored; count drives.
+
+    A file that the set was not computed for has nothing to compare.
+    """
+    identity = features().identity(feature_set)
+    kept = grams_of_file(warehouse, file, identity)
+    if not kept:
+        return 0
+    rows = by_sql(warehouse, [file], feature_set)
+    from_sql = grams_of(rows)
+    _compare(file, "the kernel", from_sql, grams_of(wide_grams(warehouse, [file], feature_set)))
+    _compare(file, f"the stored Gram rows of {feature_set}", from_sql, kept)
+    return len(rows["drive_id"].unique())
+
+
+def grams_of_file(warehouse: Warehouse, file: TableFile, identity: str) -> "DriveGrams":
+    """Return the stored Gram rows of a log file and a feature set, as its rows carry it."""
+    found: DriveGrams = {}
+    for gram_file in warehouse.grams.snapshot().files:
+        names = warehouse.grams.read(gram_file.path, ["feature_set", "file"])
+        here = pc.and_(pc.equal(names["feature_set"], identity), pc.equal(names["file"], file.path))
+        if pc.any(here).as_py():
+            found |= grams_of(warehouse.grams.read(gram_file.path).filter(here))
+    return found
+
+
+DriveGrams = dict[tuple[str, tuple[str, ...]], Gram]
+"""Gram of each drive and set of signals."""
+
+
+def grams_of(rows: pa.Table) -> DriveGrams:
+    """Return rows of the table `grams` as Grams; a part of a drive goes by the names of both."""
+    found = {}
+    for row in rows.select(["drive_id", "part", "signals", "n", "sums", "products"]).to_pylist():
+        signals = tuple(row["signals"].split(",")) if row["signals"] else ()
+        drive = row["drive_id"] if row["part"] is None else f"{row['drive_id']}, {row['part']}"
+        found[drive, signals] = Gram(signals, row["n"], tuple(row["sums"]), tuple(row["products"]))
+    return found
+
+
+def differing_drives(one: DriveGrams, two: DriveGrams) -> list[str]:
+    """Return the drives whose Grams differ, sorted.
+
+    The order of the signals does not count: it is that of the catalogue when a row was made.
+    """
+    one, two = _in_one_order(one), _in_one_order(two)
+    return sorted({key[0] for key in one.keys() | two.keys() if one.get(key) != two.get(key)})
+
+
+def _in_one_order(grams: DriveGrams) -> DriveGrams:
+    ordered = ((drive, tuple(sorted(signals)), gram) for (drive, signals), gram in grams.items())
+    return {(drive, signals): gram.restrict(signals) for drive, signals, gram in ordered}
+
+
+def stored_grams(
+    warehouse: Warehouse, files: Sequence[TableFile] | None = None
+) -> dict[str, DriveGrams]:
+    """Return the stored Gram rows of the logged signals, by log file; of some files, or all.
+
+    Those that came without a log are left out.
+    """
+    by_file: dict[str, DriveGrams] = defaultdict(dict)
+    for gram_file in warehouse.grams.snapshot().files if files is None else files:
+        every = warehouse.grams.read(gram_file.path)
+        plain = pc.equal(every["feature_set"], PLAIN)
+        rows = every.filter(pc.and_(plain, pc.invert(is_received(every))))
+        for file in rows["file"].unique().to_pylist():
+            by_file[file] |= grams_of(rows.filter(pc.equal(rows["file"], file)))
+    return by_file
+
+
+def read_counts(warehouse: Warehouse, file: TableFile) -> pa.Table:
+    """Return the columns of a log file that its Gram rows are made of, null where it has none."""
+    names = ["drive_id", *warehouse.catalogue.gram_signals]
+    present = warehouse.logs.read_metadata(file.path).schema.to_arrow_schema().names
+    rows = warehouse.logs.read(file.path, [name for name in names if name in present])
+    for name in names:
+        if name not in present:
+            rows = rows.append_column(name, pa.nulls(len(rows), pa.int16()))
+    return rows.select(names)
+
+
+def _drives(rows: pa.Table) -> list[tuple[str, pa.Table]]:
+    ids = pc.dictionary_encode(rows["drive_id"].cast(pa.string()).combine_chunks())
+    drive_of_row = ids.indices.to_numpy()
+    order = np.argsort(drive_of_row, kind="stable")
+    if (order[1:] < order[:-1]).any():
+        rows, drive_of_row = rows.take(order), drive_of_row[order]
+    starts = np.flatnonzero(np.diff(drive_of_row, prepend=-1))
+    return [
+        (ids.dictionary[int(drive_of_row[start])].as_py(), rows.slice(start, end - start))
+        for start, end in pairwise([*starts.tolist(), rows.num_rows])
+    ]
+
+
+def grams_by_blocks(warehouse: Warehouse, counts: pa.Table) -> DriveGrams:
+    """Compute Gram rows by matrix products in float64, exact because blocks are small."""
+    found: DriveGrams = {}
+    for drive, rows in _drives(counts):
+        for signals, matrix in _complete_parts(warehouse, rows):
+            found[drive, signals] = Gram.from_counts(signals, matrix)
+    return found
+
+
+def _complete_parts(
+    warehouse: Warehouse, rows: pa.Table
+) -> list[tuple[tuple[str, ...], np.ndarray[Any, np.dtype[np.int64]]]]:
+    """Divide rows by the signals that they have; return each part's signals and counts."""
+    names = warehouse.catalogue.gram_signals
+    columns = [rows[name].combine_chunks() for name in names]
+    present = np.column_stack(
+        [column.is_valid().to_numpy(zero_copy_only=False) for column in columns]
+    )
+    values = np.column_stack(
+        [column.fill_null(0).to_numpy(zero_copy_only=False).astype(np.int64) for column in columns]
+    )
+    parts = []
+    number_of_row = present @ (1 << np.arange(len(names)))
+    for number in np.unique(number_of_row).tolist():
+        pattern = [bool(number >> i & 1) for i in range(len(names))]
+        signals = tuple(name for name, there in zip(names, pattern, strict=True) if there)
+        parts.append((signals, values[number_of_row == number][:, pattern]))
+    return parts
+
+
+def _check_by_integers(warehouse: Warehouse, file: TableFile, counts: pa.Table) -> int:
+    """Compare the float64 blocks with plain Python sums on the first drive's first rows."""
+    drive, rows = _drives(counts)[0]
+    for signals, matrix in _complete_parts(warehouse, rows.slice(0, INTEGER_ROWS)):
+        columns = [[int(count) for count in column] for column in matrix.T]
+        by_integers = Gram(
+            signals,
+            len(matrix),
+            tuple(map(sum, columns)),
+            tuple(
+                sum(a * b for a, b in zip(columns[i], columns[j], strict=True))
+                for i in range(len(columns))
+                for j in range(i + 1)
+            ),
+        )
+        by_blocks = Gram.from_counts(signals, matrix)
+        _compare(
+            file, "Python integers", {(drive, signals): by_blocks}, {(drive, signals): by_integers}
+        )
+    return 1
+
+
+def _compare(file: TableFile, other: str, one: DriveGrams, two: DriveGrams) -> None:
+    if drives := differing_drives(one, two):
+        raise StorageError(
+            f"{file.path}: the Gram of drive {drives[0]} by SQL and by {other} differ. If the Gram "
+            "job has not run since the logs changed, run: fleet-slip gram. Otherwise the file or "
+            "a library is damaged: keep both and report it."
+        )

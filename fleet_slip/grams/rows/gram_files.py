@@ -1,0 +1,130 @@
+"""Writes Gram rows to files: of one feature set each, neither too many nor too large."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import accumulate
+
+import pyarrow as pa
+import pyarrow.compute as pc
+from deltalake.transaction import AddAction
+
+from fleet_slip.catalogue.sources import RECEIVED_FILES
+from fleet_slip.delta import Snapshot, Table, TableFile
+from fleet_slip.grams.rows.rollup import make_rollup
+from fleet_slip.warehouse.tables import Warehouse
+
+FILE_ROWS = 100_000
+"""Gram rows of a file, some 700 bytes each; a file with fewer is small. Rewriting takes the memory
+of a few files, however many Gram rows there are."""
+
+FILE_BYTES = 2**28
+"""Most bytes of the Gram rows of a file; a row of 200 columns has 160,000."""
+
+RECEIVED_NAME = "received-"
+"""Before the name of a file of rows that cars sent."""
+
+SMALL_FILES_MAX = 32
+"""So many small Gram files may stand side by side before a commit merges some."""
+
+
+def write_rows(warehouse: Warehouse, parts: Iterable[pa.Table]) -> list[AddAction]:
+    """Write Gram rows part by part; return the actions that add the files."""
+    actions: list[AddAction] = []
+    waiting: list[pa.Table] = []
+    for part in parts:
+        step = max(1, min(FILE_ROWS, FILE_BYTES * len(part) // max(1, part.nbytes)))
+        for first in range(0, part.num_rows, step):
+            waiting.append(part.slice(first, step))
+            rows = sum(some.num_rows for some in waiting)
+            if rows >= FILE_ROWS or sum(some.nbytes for some in waiting) >= FILE_BYTES:
+                actions += _write_files(warehouse, _together(waiting))
+                waiting.clear()
+    return actions + (_write_files(warehouse, _together(waiting)) if waiting else [])
+
+
+def _together(parts: Sequence[pa.Table]) -> pa.Table:
+    return pa.concat_tables(parts, promote_options="default")  # some lack an optional column
+
+
+def _write_files(warehouse: Warehouse, rows: pa.Table) -> list[AddAction]:
+    """Write one file for each feature set, so that reading one set reads no other.
+
+    Rows that cars sent have files of their own: these cannot be computed again.
+    """
+    came = pc.starts_with(rows["file"].cast(pa.string()), RECEIVED_FILES)
+    actions = []
+    for prefix, some in ((RECEIVED_NAME, came), ("", pc.invert(came))):
+        mine = _only(rows, some)
+        for identity in sorted(mine["feature_set"].unique().to_pylist()):
+            part = _only(mine, pc.equal(mine["feature_set"], identity))
+            empty = [name for name in warehouse.grams.optional if _is_empty(part, name)]
+            part = part.drop_columns(empty)
+            name = f"{prefix}{identity}"
+            actions.append(warehouse.grams.write_file(name, part, preface=make_rollup(part)))
+    return actions
+
+
+def _is_empty(rows: pa.Table, name: str) -> bool:
+    return name in rows.column_names and rows[name].null_count == len(rows)
+
+
+def _only(rows: pa.Table, some: pa.ChunkedArray) -> pa.Table:
+    """Return some rows; not copied if that is all."""
+    return rows if pc.all(some).as_py() else rows.filter(some)
+
+
+def is_of_received(file: TableFile) -> bool:
+    """Whether a Gram file is of rows that cars sent."""
+    return file.path.startswith(RECEIVED_NAME)
+
+
+def files_to_rewrite(grams: Snapshot, stale: frozenset[str]) -> list[TableFile]:
+    """Return the Gram files that name stale log files, and small ones to merge, if too many."""
+    merged = _files_to_merge(grams)
+    return [
+        file
+        for file in grams.files
+        if file.path in merged or (stale and not stale.isdisjoint(_log_files_of(grams, file)))
+    ]
+
+
+def _files_to_merge(grams: Snapshot) -> set[str]:
+    """Return the smallest files, enough for one file of the usual size, where too many are small.
+
+    Each night merges a few, so that none has to merge all.
+    """
+    small = sorted((_fullness(file), file.path) for file in grams.files if _fullness(file) < 1)
+    if len(small) <= SMALL_FILES_MAX:
+        return set()
+    full = list(accumulate(fullness for fullness, _ in small))
+    return {path for (_, path), so_far in zip(small, full, strict=True) if so_far <= 2}
+
+
+def _fullness(file: TableFile) -> float:
+    """Return how full a file is; encoded, Gram rows take down to a quarter of their memory."""
+    return max(file.rows / FILE_ROWS, file.size_bytes / (FILE_BYTES / 4))
+
+
+def _log_files_of(grams: Snapshot, file: TableFile) -> set[str]:
+    return set(grams.table.read(file.path, ["file"])["file"].unique().to_pylist())
+
+
+def rows_to_keep(
+    grams: Snapshot, files: Sequence[TableFile], stale: frozenset[str]
+) -> Iterator[pa.Table]:
+    """Yield the Gram rows of files without those of stale log files."""
+    dropped = pa.array(sorted(stale), pa.string())
+    for file in files:
+        rows = read_rows(grams.table, file)
+        yield rows.filter(pc.invert(pc.is_in(rows["file"], dropped)))
+
+
+def read_rows(grams: Table, file: TableFile) -> pa.Table:
+    """Return the Gram rows of a file in the schema of the table; null in columns that it lacks."""
+    rows = grams.read(file.path)
+    columns = [
+        rows[field.name].cast(field.type)
+        if field.name in rows.column_names
+        else pa.nulls(len(rows), field.type)
+        for field in grams.schema
+    ]
+    return pa.table(columns, schema=grams.schema)

@@ -1,0 +1,214 @@
+"""Makes the table `grams` agree with the active files of `logs`.
+
+Log files without Gram rows of a feature set are aggregated; Gram rows of any set
+whose file is no longer active are dropped; both in one commit. That one rule covers new days,
+interrupted runs, repeated runs, deletions and compaction.
+"""
+
+from collections.abc import Collection, Iterable, Iterator
+from concurrent.futures import Executor
+from dataclasses import dataclass, field
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from fleet_slip.catalogue.feature_sets import PLAIN
+from fleet_slip.catalogue.features import features
+from fleet_slip.delta import Change, Snapshot, TableFile, Unit, retry_conflicts
+from fleet_slip.errors import ConflictError, StorageError
+from fleet_slip.grams.rows.aggregation import compute_grams
+from fleet_slip.grams.rows.backlog import Backlog, find_backlog
+from fleet_slip.grams.rows.gram_files import files_to_rewrite, rows_to_keep, write_rows
+from fleet_slip.grams.rows.same_drives import LoggedDrives, has_received
+from fleet_slip.progress import Progress, no_progress
+from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.words import number_of
+
+
+@dataclass(frozen=True)
+class GramReport:
+    """What a run of the job did for one feature set."""
+
+    feature_set: str
+    files_read: int
+    rows_read: int
+    files_dropped: int
+    gram_rows: int
+    logs_version: int | None
+    grams_version: int | None
+    received_dropped: int = 0
+    """Gram rows that cars had sent, of drives whose logs have come since."""
+
+    @property
+    def changed(self) -> bool:
+        """Whether there was anything to do."""
+        return bool(self.files_read or self.files_dropped)
+
+
+def update_grams(
+    warehouse: Warehouse,
+    progress: Progress = no_progress,
+    feature_set: str = PLAIN,
+    executor: Executor | None = None,
+    among: Collection[str] | None = None,
+) -> GramReport:
+    """Bring the Gram rows of a feature set up to date. Running it again does nothing.
+
+    An executor runs the queries elsewhere; see `compute_grams`. With `among`, only log files of
+    these paths are read. Raises `QuestionError` for an unknown
+    set, `StorageError`, `ConflictError` if other processes keep changing the table, or
+    `ClusterError`.
+    """
+    return retry_conflicts(lambda: _update_once(warehouse, progress, feature_set, executor, among))
+
+
+def reconcile(
+    warehouse: Warehouse, progress: Progress = no_progress, *, unreadable: Collection[str] = ()
+) -> list[GramReport]:
+    """Bring the Gram rows of every feature set up to date that was ever computed here.
+
+    A set that was computed for some drives only is brought up to date for the files of these.
+    `unreadable` log files are left for later.
+    """
+    grams = warehouse.grams.snapshot()
+    identities = {name: features().identity(name) for name in (PLAIN, *features().sets)}
+    used = [n for n, i in identities.items() if grams.landed(unit_name(i)) is not None]
+    over_time = [name for name in used if features().feature_set(name).windows]
+    drives = {name: _drives_of(grams, identities[name]) for name in over_time}
+    reports = []
+    for name in used:
+        among = None
+        if name in drives:
+            among = _files_of(warehouse.grams.snapshot(), drives[name])
+        if unreadable:
+            active = {file.path for file in warehouse.logs.snapshot().files}
+            among = (active if among is None else among).difference(unreadable)
+        reports.append(update_grams(warehouse, progress, name, among=among))
+    return reports
+
+
+def _drives_of(grams: Snapshot, identity: str) -> set[str]:
+    """Return the drives that have Gram rows of a feature set."""
+    found: set[str] = set()
+    for file in grams.files:
+        rows = grams.table.read(file.path, ["feature_set", "drive_id"])
+        mine = rows.filter(pc.equal(rows["feature_set"], identity))
+        found.update(mine["drive_id"].unique().to_pylist())
+    return found
+
+
+def _files_of(grams: Snapshot, drives: Collection[str]) -> set[str]:
+    """Return the log files that have one of some drives, by the Gram rows of the plain set."""
+    found: set[str] = set()
+    for file in grams.files:
+        rows = grams.table.read(file.path, ["feature_set", "drive_id", "file"])
+        plain = rows.filter(pc.equal(rows["feature_set"], PLAIN)).select(["drive_id", "file"])
+        for row in plain.to_pylist():
+            if row["drive_id"] in drives:
+                found.add(row["file"])
+    return found
+
+
+def unit_name(identity: str) -> str:
+    """Return the name of the unit of work that lands Gram rows of a feature set."""
+    return f"gram/{identity}"
+
+
+def _update_once(
+    warehouse: Warehouse,
+    progress: Progress,
+    feature_set: str,
+    executor: Executor | None,
+    among: Collection[str] | None,
+) -> GramReport:
+    # The logs are looked at last: if they lose a drive from now on, whoever removed it changes its
+    # Gram rows after this snapshot of them, and this job's commit is a conflict.
+    grams = warehouse.grams.snapshot()
+    logs = warehouse.logs.snapshot()
+    identity = features().identity(feature_set)
+    backlog = find_backlog(logs, grams, identity)
+    if logs.version is None and backlog.stale:
+        raise StorageError(
+            f"{warehouse.logs.folder}: the logs that Gram rows were computed from are gone, of "
+            f"{number_of(len(backlog.stale), 'file')}. Nothing is changed: restore the folder from "
+            "a backup."
+        )
+    if among is not None:
+        chosen = tuple(file for file in backlog.missing if file.path in among)
+        backlog = Backlog(chosen, backlog.stale)
+    version, gram_rows = grams.version, grams.rows
+    logs_version = logs.version
+    dropped = 0
+    if backlog.missing or backlog.stale:
+        new_rows = compute_grams(warehouse, backlog.missing, progress, None, feature_set, executor)
+        merged = _Merged(grams, backlog.stale, LoggedDrives())
+        grams.commit_or_discard(
+            Change(
+                add=write_rows(warehouse, merged.parts(new_rows)),
+                remove=merged.replaced,
+                units=[Unit(unit_name(identity), logs_version or 0)],
+                note={
+                    "job": "gram",
+                    "feature_set": identity,
+                    "logs_version": logs_version,
+                },
+            )
+        )
+        _require_active(logs, backlog.missing)
+        after = warehouse.grams.snapshot()
+        version, gram_rows = after.version, after.rows
+        dropped = merged.logged.found
+    return GramReport(
+        feature_set=identity,
+        files_read=len(backlog.missing),
+        rows_read=sum(file.rows for file in backlog.missing),
+        files_dropped=len(backlog.stale),
+        gram_rows=gram_rows,
+        logs_version=logs_version,
+        grams_version=version,
+        received_dropped=dropped,
+    )
+
+
+@dataclass
+class _Merged:
+    """New Gram rows, and those of the files that are written again with them.
+
+    Attributes:
+        grams, stale: what there is, and the log files that are gone.
+        logged: the drives of the new rows: what cars sent of them goes.
+        replaced: the files that are written again, once all parts were taken.
+    """
+
+    grams: Snapshot
+    stale: frozenset[str]
+    logged: LoggedDrives
+    replaced: list[TableFile] = field(default_factory=list)
+
+    def parts(self, new_rows: Iterable[pa.Table]) -> Iterator[pa.Table]:
+        """Yield the new rows, then those that stay of the files that are written again."""
+        looked_for = has_received(self.grams)
+        for rows in new_rows:
+            if looked_for:
+                self.logged.add(rows)
+            yield rows
+        paths = {file.path for file in files_to_rewrite(self.grams, self.stale)}
+        if looked_for:
+            paths.update(file.path for file in self.logged.files_with_received(self.grams))
+        self.replaced += [file for file in self.grams.files if file.path in paths]
+        for rows in rows_to_keep(self.grams, self.replaced, self.stale):
+            yield self.logged.without_received(rows) if looked_for else rows
+
+
+def _require_active(logs: Snapshot, files: Iterable[TableFile]) -> None:
+    """Raise `ConflictError` if the logs have lost a file whose Gram rows have just landed.
+
+    Who removed it may have found no Gram row of its drives, and so have changed none. The next
+    attempt drops those that landed.
+    """
+    lost = {file.path for file in files} - {file.path for file in logs.renewed().files}
+    if lost:
+        raise ConflictError(
+            f"{logs.table.folder}: other processes keep removing files, such as {min(lost)}. Run "
+            "the same command again."
+        )

@@ -1,0 +1,49 @@
+"""Gram rows as they are read, turned into arrays: by which signals they have."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from fleet_slip.arrays import BoolArray, IntArray
+from fleet_slip.regression.exact.gram import packed_size
+from fleet_slip.regression.exact.gram_table import GramTable
+
+
+def by_signals(batch: pa.RecordBatch) -> Iterator[tuple[str, pa.RecordBatch, BoolArray]]:
+    """Yield each set of signals in a batch of Gram rows, its rows, and which those are."""
+    names = batch["signals"].unique().to_pylist()
+    if len(names) == 1:
+        yield names[0], batch, np.ones(len(batch), dtype=np.bool_)
+        return
+    for signals in names:
+        mask = pc.equal(batch["signals"], signals)
+        yield signals, batch.filter(mask), mask.to_numpy(zero_copy_only=False)
+
+
+def gram_table(signals: str, rows: pa.Table | pa.RecordBatch) -> GramTable:
+    """Return Gram rows, all of the same signals, as arrays."""
+    names = tuple(signals.split(","))
+    k = len(names)
+    return GramTable(
+        names,
+        rows["n"].to_numpy(),
+        _matrix(rows["sums"], k),
+        _matrix(rows["products"], packed_size(k)),
+    )
+
+
+def _matrix(lists: pa.ChunkedArray | pa.ListArray, width: int) -> IntArray:
+    chunks = lists.chunks if isinstance(lists, pa.ChunkedArray) else [lists]
+    parts = [chunk.flatten().to_numpy() for chunk in chunks]
+    values: IntArray = parts[0] if len(parts) == 1 else np.concatenate(parts)
+    return values.reshape(-1, width)
+
+
+def list_array(values: IntArray) -> pa.ListArray:
+    """Return a list for each row of a matrix."""
+    rows, width = values.shape
+    flat = pa.array(np.ascontiguousarray(values).reshape(-1), pa.int64())
+    offsets = pa.array(np.arange(rows + 1, dtype=np.int32) * width, pa.int32())
+    return pa.ListArray.from_arrays(offsets, flat)

@@ -1,0 +1,99 @@
+"""Fills in `jobs/gram.sql` for a feature set: its columns, and what divides a drive's rows."""
+
+from collections.abc import Sequence
+
+from fleet_slip.catalogue.column_sql import over_windows, with_absent, with_features
+from fleet_slip.catalogue.feature_sets import LAG, PLAIN
+from fleet_slip.catalogue.features import features
+from fleet_slip.catalogue.signals import COUNT_MAX, SignalCatalogue
+from fleet_slip.grams.rows.parts import Parts
+from fleet_slip.resources import read_sql
+
+LOGS = "read_parquet(getvariable('log_files'), union_by_name => true, hive_partitioning => false)"
+
+_SEPARATOR = ",\n            "
+
+BITS = 63
+"""Bits of a BIGINT that are no sign."""
+
+
+def gram_statement(
+    signals: SignalCatalogue,
+    feature_set: str = PLAIN,
+    *,
+    whole: bool = False,
+    absent: Sequence[str] = (),
+) -> str:
+    """Return the statement that computes the Gram rows of a feature set.
+
+    `whole` states that no file has a column of the set in only some of its rows; `absent` are the
+    columns that no file has, since they came to the catalogue later. Raises
+    `QuestionError` for an unknown set.
+    """
+    known = features()
+    one = known.feature_set(feature_set)
+    names = one.columns
+    windows = known.definitions(feature_set)
+    regimes = [known.regimes[name].of for name in one.regimes]
+    looked_at = [*regimes, *(part.of for one in windows.values() for part in one.parts)]
+    used = {
+        name: known.features[name]
+        for name in dict.fromkeys([*one.features, *looked_at])
+        if name in known.features
+    }
+    definitions = {name: feature.sql for name, feature in used.items()}
+    logs = with_absent(LOGS, absent)
+    if one.lagged:
+        rows = _lagged(names, logs)
+    else:
+        rows = with_features(logs, definitions, {n: feature.limit for n, feature in used.items()})
+    if windows:
+        rows = over_windows(rows if used else f"(SELECT *, 0 AS clipped FROM {logs})", windows)
+    wide = windows or any(feature.limit > COUNT_MAX for feature in used.values())
+    kind = "BIGINT" if wide else "INTEGER"
+    parts = Parts.of_set(known, one)
+    return read_sql("jobs", "gram.sql").format(
+        drive_columns=", ".join(
+            signals.null_sql(name) if name in absent else name for name in signals.drive
+        ),
+        qualified_drive_columns=", ".join(f"drive.{name}" for name in signals.drive),
+        absent="0" if whole else _absent(names),
+        part=parts.number_sql if parts else "NULL",
+        clipped="sum(clipped)::BIGINT" if definitions or windows else "0",
+        sums=_SEPARATOR.join(f"sum({name})" for name in names),
+        products=_SEPARATOR.join(
+            f"sum({a}::{kind} * {b}::{kind})" for i, a in enumerate(names) for b in names[: i + 1]
+        ),
+        counts=rows,
+        group=", ".join(_group(whole=whole, divided=bool(parts))),
+        part_name=parts.name_sql("gram.part") if parts else "NULL::VARCHAR",
+        names=", ".join(f"'{name}'" for name in names),
+    )
+
+
+def _group(*, whole: bool, divided: bool) -> list[str]:
+    """Return the columns to group by. DuckDB hashes a dictionary's entries, not its rows, if the
+    dictionary's column is the only one; so a constant is left out."""
+    return ["drive_id", *([] if whole else ["absent"]), *(["part"] if divided else [])]
+
+
+def _absent(names: Sequence[str]) -> str:
+    """Return SQL of a number with a bit for each column that a row lacks; of many, a list."""
+    if len(names) < BITS:
+        kind = "INTEGER" if len(names) < 32 else "BIGINT"
+        return " + ".join(f"({name} IS NULL)::{kind} * {1 << i}" for i, name in enumerate(names))
+    parts = [_absent(names[first : first + BITS - 1]) for first in range(0, len(names), BITS - 1)]
+    # The last columns come first, so that lists sort as the one large number would.
+    return f"[{', '.join(f'({part})::BIGINT' for part in reversed(parts))}]"
+
+
+def _lagged(names: Sequence[str], logs: str) -> str:
+    """Return the rows that have a predecessor in their drive, with both rows' counts."""
+    now = [name for name in names if not name.endswith(LAG)]
+    lags = _SEPARATOR.join(f"lag({name}) OVER before AS {name}{LAG}" for name in now)
+    return (
+        f"(\n        SELECT\n            drive_id,\n            {', '.join(now)},\n"
+        f"            {lags}\n        FROM {logs}\n"
+        "        WINDOW before AS (PARTITION BY drive_id ORDER BY tick)\n"
+        "        QUALIFY lag(tick) OVER before = tick - 1\n    )"
+    )

@@ -1,0 +1,183 @@
+"""Gram rows of feature sets with windows, from the columns of log files: what SQL says, faster.
+
+Each drive is gone through once in the order of time. Blocks of its columns are integers below 2^19
+in binary64; every product and every sum of so many rows is an integer below 2^53, so that it is
+exact in whatever order it is added. Sums of blocks are 64-bit integers.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from fleet_slip.arrays import FloatArray, IntArray
+from fleet_slip.catalogue.features import features
+from fleet_slip.delta import TableFile
+from fleet_slip.errors import DataError, StorageError
+from fleet_slip.grams.column_plan import ColumnPlan
+from fleet_slip.grams.columns import DriveCounts, Workspace
+from fleet_slip.grams.drive_rows import LoggedDrive, read_drives
+from fleet_slip.grams.operations import BLOCK_ROWS
+from fleet_slip.grams.rows.parts import UNKNOWN, Parts
+from fleet_slip.warehouse.tables import Warehouse
+
+_EXACT = 2**53
+_INT64 = 2**63
+
+
+def wide_grams(warehouse: Warehouse, files: Sequence[TableFile], feature_set: str) -> pa.Table:
+    """Return the Gram rows of log files for a feature set, as `jobs/gram.sql` would.
+
+    Sorted by file and drive. Raises `DataError` for a drive that cannot be looked back on, and
+    `StorageError` for one whose sums need more than 64 bits.
+    """
+    plan = ColumnPlan.of_set(features(), feature_set)
+    workspace = Workspace(plan)
+    parts = Parts.of_set(features(), features().feature_set(feature_set))
+    identity = features().identity(feature_set)
+    columns: dict[str, list[Any]] = {name: [] for name in warehouse.grams.usual_schema.names}
+    # Files are shared out among threads; a BLAS with threads of its own would be in their way.
+    with threadpool_limits(1, user_api="blas"):
+        for file in sorted(files, key=lambda one: one.path):
+            for drive in sorted(read_drives(warehouse, file, plan), key=lambda one: one.drive_id):
+                _append_rows(
+                    columns,
+                    workspace,
+                    parts,
+                    drive,
+                    {"feature_set": identity, "file": file.path, "day": file.day},
+                )
+    return pa.table(columns, schema=warehouse.grams.usual_schema)
+
+
+def _append_rows(
+    columns: dict[str, list[Any]],
+    workspace: Workspace,
+    parts: Parts,
+    drive: LoggedDrive,
+    known: Mapping[str, Any],
+) -> None:
+    plan = workspace.plan
+    where = f"{known['file']}: drive {drive.drive_id}"
+    try:
+        found = drive_sums(workspace, parts, drive.counts)
+    except DataError as error:
+        raise DataError(f"{where}: {error}") from None
+    for absent, part in sorted(found, key=_last_if_unknown):
+        sums = found[absent, part]
+        names = [name for i, name in enumerate(plan.names) if not absent >> i & 1]
+        lower = np.tril_indices(len(names))
+        row = {
+            **drive.metadata,
+            **known,
+            "part": parts.name(part),
+            "signals": ",".join(names),
+            "n": sums.n,
+            "clipped": sums.clipped,
+            "sums": sums.sums,
+            "products": sums.products[lower],
+        }
+        for name, values in columns.items():
+            values.append(row[name])
+
+
+@dataclass
+class DriveSums:
+    """Sums of the rows of a drive, or of a part of it, that have the same columns."""
+
+    size: int
+    n: int = 0
+    clipped: int = 0
+    sums: NDArray[np.int64] = field(init=False)
+    products: NDArray[np.int64] = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Begin with nothing."""
+        self.sums = np.zeros(self.size, dtype=np.int64)
+        self.products = np.zeros((self.size, self.size), dtype=np.int64)
+
+    def add(self, block: FloatArray, clipped: FloatArray) -> None:
+        """Add complete rows, shape (columns, rows), and what was clipped in each."""
+        self.n += block.shape[1]
+        self.clipped += int(clipped.sum())
+        self.sums += block.sum(axis=1).astype(np.int64)
+        self.products += (block @ block.T).astype(np.int64)
+
+    def add_totals(self, totals: NDArray[np.int64]) -> None:
+        """Add what `Workspace.add_blocks` has added up: a lower triangle, and sums."""
+        lower = np.tril(totals[: self.size, : self.size])
+        self.products += lower + np.tril(lower, -1).T
+        self.sums += totals[-1, : self.size]
+
+
+Kind = tuple[int, int]
+"""Which columns rows lack, a number of one bit each, and which part of the drive they are."""
+
+
+def _last_if_unknown(kind: Kind) -> tuple[int, bool, int]:
+    """Sort as SQL does: an unknown part, which is null there, comes last."""
+    absent, part = kind
+    return absent, part == UNKNOWN, part
+
+
+def drive_sums(workspace: Workspace, parts: Parts, counts: DriveCounts) -> dict[Kind, DriveSums]:
+    """Return the sums of a drive's rows, by which columns they lack and by part.
+
+    Raises `DataError` for a drive that cannot be looked back on, and `StorageError` if sums of
+    products could need more than 64 bits.
+    """
+    plan, total = workspace.plan, len(counts.ticks)
+    largest = max(plan.limits)
+    exact_rows = (_EXACT - 1) // largest**2
+    if exact_rows < BLOCK_ROWS or total * largest**2 >= _INT64:
+        raise StorageError(f"the drive has {total:,} rows: too many for 64-bit sums.")
+    workspace.load(counts)
+    complete, totals = DriveSums(len(plan.names)), workspace.totals()
+    found = {(0, 0): complete}
+    first = 0
+    while first < total:
+        if parts:
+            workspace.compute_block(first)
+        else:
+            first, lacks, rows, clipped = workspace.add_blocks(first, exact_rows, totals)
+            complete.n += rows
+            complete.clipped += clipped
+            if not lacks:
+                continue
+        first += _add_by_kind(found, workspace, parts, counts.ticks, first)
+    complete.add_totals(totals)
+    return {kind: sums for kind, sums in found.items() if sums.n}
+
+
+def _add_by_kind(
+    found: dict[Kind, DriveSums],
+    workspace: Workspace,
+    parts: Parts,
+    ticks: NDArray[Any],
+    first: int,
+) -> int:
+    """Add the rows of a block, which are of several kinds; return how many there are."""
+    block, clipped = workspace.block(first)
+    last = first + len(clipped)
+    numbers = parts.numbers(ticks[first:last], workspace.beside(first)) if parts else None
+    for (absent, part), rows in _kinds(block, numbers):
+        has = [i for i in range(len(block)) if not absent >> i & 1]
+        few = block[np.ix_(np.array(has, dtype=np.int64), rows)]
+        found.setdefault((absent, part), DriveSums(len(has))).add(few, clipped[rows])
+    return len(clipped)
+
+
+def _kinds(block: FloatArray, numbers: IntArray | None) -> Iterator[tuple[Kind, NDArray[np.int64]]]:
+    """Yield each kind of rows in a block, and which rows those are."""
+    packed = np.packbits(np.isnan(block), axis=0, bitorder="little")
+    patterns, pattern_of_row = np.unique(packed, axis=1, return_inverse=True)
+    part = np.zeros(block.shape[1], dtype=np.int64) if numbers is None else numbers
+    both = np.stack([pattern_of_row.reshape(-1), part])
+    kinds, kind_of_row = np.unique(both, axis=1, return_inverse=True)
+    for kind, (pattern, number) in enumerate(kinds.T.tolist()):
+        absent = int.from_bytes(patterns[:, pattern].tobytes(), "little")
+        yield (absent, number), np.flatnonzero(kind_of_row.reshape(-1) == kind)

@@ -1,0 +1,111 @@
+"""What ingesting a file would do: nothing is stored."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from fleet_slip.arrays import FloatArray
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.ingest.drafting.suspicion import Suspicion, find_suspicions
+from fleet_slip.ingest.drives.measured_drives import MeasuredDrive
+from fleet_slip.ingest.drives.stream import open_measured
+from fleet_slip.ingest.drives.totals import IngestCounts
+from fleet_slip.ingest.landing.local_copies import local_copy
+from fleet_slip.ingest.landing.log_files import Log
+from fleet_slip.ingest.mapping.mapping import Mapping
+
+MOST_TICKS = 200_000
+"""Ticks of the longest drive that are looked at: half an hour."""
+
+
+@dataclass(frozen=True)
+class SignalRange:
+    """The values of a signal in a file, in the catalogue's unit."""
+
+    signal: str
+    unit: str
+    low: float
+    high: float
+    missing: float
+    """Part of the ticks without a value."""
+
+
+@dataclass(frozen=True)
+class Preview:
+    """What would become of a file."""
+
+    file: str
+    counts: IngestCounts
+    ranges: tuple[SignalRange, ...]
+    suspicions: tuple[Suspicion, ...]
+    longest: dict[str, FloatArray]
+    """The signals of the longest drive, on consecutive ticks from its first."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `ingest --dry-run --json` prints."""
+        return {
+            "file": self.file,
+            **vars(self.counts),
+            "ranges": [vars(one) for one in self.ranges],
+            "suspicions": [vars(one) for one in self.suspicions],
+        }
+
+
+def preview_log(log: Log, mapping: Mapping) -> Preview:
+    """Read a log through a mapping, and look at what came out. Raises `InputError`."""
+    longest: MeasuredDrive | None = None
+    found = {name: _Found() for name in mapping.signals}
+    with local_copy(log) as file, open_measured(file, mapping) as stream:
+        for piece in stream.pieces():
+            for drive in piece.drives:
+                if longest is None or drive.ticks.size > longest.ticks.size:
+                    longest = drive
+                for name, counts in drive.counts.items():
+                    found[name].add(counts)
+    signals = signals_of(longest) if longest is not None else {}
+    ranges = tuple(_range(name, found[name]) for name in mapping.signals)
+    suspicions = (*stream.suspicions(), *find_suspicions(signals))
+    return Preview(str(log), stream.counts(), ranges, suspicions, signals)
+
+
+def signals_of(drive: MeasuredDrive) -> dict[str, FloatArray]:
+    """Return the signals of a drive's begin in SI units, NaN where there is no value."""
+    ticks = drive.ticks - drive.ticks[0]
+    kept = ticks < MOST_TICKS
+    signals = {}
+    for name, counts in drive.counts.items():
+        values = np.full(int(ticks[kept][-1]) + 1, np.nan)
+        numbers = pl.Series(counts).cast(pl.Float64).to_numpy()  # Arrow's own would load pandas
+        values[ticks[kept]] = numbers[kept] * float(catalogue()[name].scale)
+        signals[name] = values
+    return signals
+
+
+@dataclass
+class _Found:
+    """Counts of a signal so far."""
+
+    low: int | None = None
+    high: int | None = None
+    values: int = 0
+    ticks: int = 0
+
+    def add(self, counts: pa.Array) -> None:
+        self.ticks += len(counts)
+        self.values += len(counts) - counts.null_count
+        ends = pc.min_max(counts).as_py()
+        if ends["min"] is not None:
+            self.low = ends["min"] if self.low is None else min(self.low, ends["min"])
+            self.high = ends["max"] if self.high is None else max(self.high, ends["max"])
+
+
+def _range(name: str, found: _Found) -> SignalRange:
+    signal = catalogue()[name]
+    low, high = (
+        np.nan if end is None else end * float(signal.scale) for end in (found.low, found.high)
+    )
+    return SignalRange(name, signal.unit, low, high, 1 - found.values / max(found.ticks, 1))

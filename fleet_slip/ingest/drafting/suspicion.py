@@ -1,0 +1,259 @@
+"""What looks wrong in a drive whose values are all well formed: a sign, a unit, swapped wheels, a
+label that comes late.
+
+Nothing here is certain: a suspicion is a relation of vehicle dynamics that a drive contradicts,
+with the figure that shows it, and what to try. Axes and signs are ISO 8855.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+
+from fleet_slip.arrays import FloatArray
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
+from fleet_slip.catalogue.turning import WITNESSES
+from fleet_slip.ingest.drafting.label_delay import find_delay
+from fleet_slip.ingest.drafting.relations import FEWEST_TICKS, fit, moving, slope_of
+
+Signals: TypeAlias = Mapping[str, FloatArray]
+"""Values in SI units on consecutive ticks, NaN where there is none; all of one shape (n_ticks,)."""
+
+RADIUS_M, TRACK_M = 0.31, 1.55
+"""Of a passenger car: what is looked for is a factor of 3.6, 9.8 or 57."""
+WHEELS = ("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")
+ROAD_WHEELS = ("steer_fl", "steer")
+LEAST_CORRELATION, SURE_CORRELATION = 0.6, 0.9
+LARGEST_REFUSED, FEWEST_REFUSED = 0.1, 10
+_REFUSED = {
+    "out_of_range": ("unit", "Check its unit."),
+    "not_a_number": ("texts", "Name those that mean no value under missing."),
+    "not_finite": ("values", 'Write missing = ["nan"] if they mean no value.'),
+}
+_FACTORS = {57.3: "degrees and radians", 9.81: "g and m/s^2", 3.6: "km/h and m/s"}
+
+
+@dataclass(frozen=True)
+class Suspicion:
+    """What looks wrong.
+
+    Attributes:
+        kind: sign, swapped, unit, delay, stuck or absent.
+        signals: those concerned.
+        figure: what shows it.
+        remedy: what to try in the mapping.
+        value: for a delay, its seconds.
+    """
+
+    kind: str
+    signals: tuple[str, ...]
+    figure: str
+    remedy: str
+    value: float | None = None
+
+    def __str__(self) -> str:
+        """Return it as one line."""
+        return f"{self.kind} of {', '.join(self.signals)}? {self.figure}. {self.remedy}"
+
+
+def find_suspicions(signals: Signals) -> list[Suspicion]:
+    """Return what looks wrong in the signals of one drive; little data raises few suspicions."""
+    still = list(_still(signals))
+    usual = {name: v for name, v in signals.items() if name not in {s.signals[0] for s in still}}
+    speed = speed_mps(usual)
+    found = [*still, *_turning(usual, speed)]
+    for check in (_wheels_differ, _rates_differ, _accelerates, _axles_swapped):
+        found += check(usual, speed)
+    if not any({"ay", "yaw_rate"} & set(one.signals) for one in found):
+        found += _label(usual, speed)  # which is judged by them
+    return found
+
+
+def find_refusals(refused: Mapping[tuple[str, str], int], rows: int) -> Iterator[Suspicion]:
+    """Yield the signals of which more than a tenth of a file's rows were refused, by reason."""
+    for (name, reason), count in refused.items():
+        if count > max(rows * LARGEST_REFUSED, FEWEST_REFUSED):
+            kind, remedy = _REFUSED.get(reason, ("values", "Look at the column."))
+            figure = f"{count:,} of {rows:,} rows are refused for it, {reason}"
+            yield Suspicion(kind, (name,), figure, remedy)
+
+
+def speed_mps(signals: Signals) -> FloatArray | None:
+    """Return a rough speed: that of the wheels, else `vx` or the car's own; None without any."""
+    wheels = [signals[name] for name in WHEELS if name in signals]
+    if wheels:
+        return np.asarray(np.median(wheels, axis=0) * RADIUS_M, dtype=np.float64)
+    return signals.get("vx", signals.get("vehicle_speed"))
+
+
+def speed_ratio(signals: Signals) -> float | None:
+    """Return the lateral acceleration over yaw rate times speed, None if they do not go together.
+
+    It is 1 in steady driving; where the wheels' radius or unit is another, that factor.
+    """
+    speed = speed_mps(signals)
+    if speed is None or not {"ay", "yaw_rate"} <= set(signals):
+        return None
+    slope, correlation = slope_of(signals["ay"], signals["yaw_rate"] * speed, moving(speed))
+    return abs(slope) if abs(correlation) > SURE_CORRELATION and slope else None
+
+
+def _still(signals: Signals) -> Iterator[Suspicion]:
+    for name, values in signals.items():
+        present = values[np.isfinite(values)]
+        if not present.size:
+            yield Suspicion("absent", (name,), "it has no value at all", "Map another column.")
+        elif present.size >= FEWEST_TICKS and present.min() == present.max():
+            figure = f"it is {present[0]:g} {catalogue()[name].unit} all the time"
+            yield Suspicion("stuck", (name,), figure, "Map another column.")
+
+
+def _turning(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
+    """Compare the signs of all that tells left from right.
+
+    Two axles that agree with one another settle the matter: more often are the axes not ISO 8855
+    than all wheels swapped. Without them the majority counts.
+    """
+    known = {
+        name: np.asarray(sum(k * signals[s] for s, k in parts.items()))
+        for name, parts in {**WITNESSES, "steer": {"steer": 1}}.items()
+        if set(parts) <= set(signals)
+    }
+    known = {name: values for name, values in known.items() if np.nanstd(values) > 0}
+    if len(known) < 2:
+        return
+    names, values = list(known), np.array(list(known.values()))
+    rows = moving(speed) & np.isfinite(values).all(axis=0)
+    if rows.sum() < FEWEST_TICKS:
+        return
+    correlations = np.nan_to_num(np.corrcoef(values[:, rows]))
+    loadings = np.linalg.eigh(correlations)[1][:, -1]
+    axles = [loadings[names.index(n)] for n in ("front wheels", "rear wheels") if n in names]
+    agree = len(axles) == 2 and min(map(abs, axles)) > 0.2 and axles[0] * axles[1] > 0
+    loadings *= np.sign(axles[0] if agree else loadings.sum()) or 1
+    for name, loading in zip(names, loadings, strict=True):
+        if loading > -0.2:
+            continue
+        concerned = tuple(WITNESSES.get(name, (name,)))
+        others = np.where(loadings > 0, correlations[names.index(name)], 0.0)
+        against = int(np.argmin(others))
+        figure = f"its correlation with {names[against]} is {others[against]:+.2f}"
+        if len(concerned) == 2:
+            yield Suspicion("swapped", concerned, figure, "Swap their columns.")
+        else:
+            yield Suspicion("sign", concerned, figure, "Write negate = true.")
+
+
+def _wheels_differ(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
+    if speed is None:
+        return
+    for name in (*WHEELS, "vx", "vehicle_speed"):
+        if name in signals:
+            own = signals[name] * (RADIUS_M if name in WHEELS else 1.0)
+            yield from _of_scale(own, speed, (name,), "the speed of the wheels", (0.7, 1.4), speed)
+
+
+def _rates_differ(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
+    if speed is None or "yaw_rate" not in signals:
+        return
+    yaw_rate, wide = signals["yaw_rate"], (0.4, 2.5)
+    if {"wheel_rl", "wheel_rr"} <= set(signals):
+        turn = (signals["wheel_rr"] - signals["wheel_rl"]) * RADIUS_M / TRACK_M
+        of = "what the rear wheels tell"
+        yield from _of_scale(yaw_rate, turn, ("yaw_rate",), of, wide, speed)
+    if "ay" in signals:
+        both, of = ("ay", "yaw_rate"), "yaw rate times speed"
+        yield from _of_scale(signals["ay"], yaw_rate * speed, both, of, wide, speed)
+    angle = next((name for name in ROAD_WHEELS if name in signals), None)
+    if angle is not None and "steering_wheel" in signals:
+        both, of = ("steering_wheel", angle), "15 times the other"
+        wheel, road = signals["steering_wheel"], 15 * signals[angle]
+        yield from _of_scale(wheel, road, both, of, wide, speed)
+
+
+def _accelerates(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
+    """Compare `ax` with the change of speed over a second."""
+    if speed is None or "ax" not in signals or speed.size < 4 * FEWEST_TICKS:
+        return
+    second = round(1 / float(SAMPLE_TIME_S))
+    change = np.full(speed.size, np.nan)
+    change[second // 2 : -second // 2] = speed[second:] - speed[:-second]
+    smooth = np.convolve(np.nan_to_num(signals["ax"]), np.ones(second) / second, "same")
+    slope, correlation = slope_of(smooth, change, moving(speed))
+    if correlation < -LEAST_CORRELATION:
+        figure = f"its correlation with the change of speed is {correlation:+.2f}"
+        yield Suspicion("sign", ("ax",), figure, "Write negate = true.")
+    elif correlation > LEAST_CORRELATION:
+        yield from _wrong_scale(slope, ("ax",), "the change of speed", (0.4, 2.5))
+
+
+def _axles_swapped(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
+    """Compare axles in tight bends: the front one drives the longer way."""
+    if speed is None or not {"yaw_rate", *WHEELS} <= set(signals):
+        return
+    front, rear = (signals[f"wheel_{a}l"] + signals[f"wheel_{a}r"] for a in "fr")
+    with np.errstate(divide="ignore", invalid="ignore"):
+        tightness, longer = (signals["yaw_rate"] / speed) ** 2, front / rear - 1
+    rows = moving(speed) & (speed < 12)
+    if np.nanmax(tightness, initial=0, where=rows & np.isfinite(tightness)) < 0.05**2:
+        return
+    slope, correlation = slope_of(longer, tightness, rows)
+    if correlation < -LEAST_CORRELATION and slope < -1:
+        figure = f"in tight bends the front wheels are slower (correlation {correlation:+.2f})"
+        yield Suspicion("swapped", WHEELS, figure, "Swap the front columns with the rear ones.")
+
+
+def _label(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
+    """Look for the label's delay behind its inputs, its sign, and its unit."""
+    label = catalogue().label
+    if label not in signals or speed is None or not {"yaw_rate", "ay"} <= set(signals):
+        return
+    rows = moving(speed)
+    angle = signals[label]
+    large = np.abs(angle[rows & (speed > 8) & np.isfinite(angle)])
+    if large.size >= FEWEST_TICKS and np.median(large) > 0.5:
+        figure = f"half of the time it is above {np.degrees(np.median(large)):.0f} deg"
+        yield Suspicion("unit", (label,), figure, "Check its unit: degrees or radians?")
+        return
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inputs = [signals["ay"], signals["yaw_rate"] / speed, signals["yaw_rate"] * speed]
+    steering = [signals[n] for n in ("steering_wheel", *ROAD_WHEELS) if n in signals]
+    delay = find_delay(angle, signals["ay"], signals["yaw_rate"], speed, [*inputs, *steering])
+    if delay is not None:
+        seconds, gain = delay
+        figure = f"its inputs explain it best {abs(seconds):.2f} s " + (
+            "earlier" if seconds > 0 else "later"
+        )
+        figure += f", with {gain:.0%} less of its variance left"
+        yield Suspicion("delay", (label,), figure, f"Try delay_s = {seconds:.2f}.", seconds)
+    fitted, explained = fit(angle, np.array(inputs[:2]), rows & (speed < 20))
+    if explained > LEAST_CORRELATION and fitted[1] < -0.3:
+        figure = (
+            f"turning slowly it goes against the yaw rate ({fitted[1]:+.1f} m, should be +1 to +2)"
+        )
+        yield Suspicion("sign", (label,), figure, "Write negate = true.")
+
+
+def _of_scale(
+    values: FloatArray,
+    expected: FloatArray,
+    concerned: tuple[str, ...],
+    of: str,
+    sound: tuple[float, float],
+    speed: FloatArray,
+) -> Iterator[Suspicion]:
+    slope, correlation = slope_of(values, expected, moving(speed))
+    if abs(correlation) > LEAST_CORRELATION:
+        yield from _wrong_scale(abs(slope), concerned, of, sound)
+
+
+def _wrong_scale(
+    slope: float, concerned: tuple[str, ...], of: str, sound: tuple[float, float]
+) -> Iterator[Suspicion]:
+    if sound[0] <= slope <= sound[1] or slope <= 0:
+        return
+    large = max(slope, 1 / slope)
+    factor = min(_FACTORS, key=lambda f: abs(np.log(f / large)))
+    near = f" ({factor:g} is between {_FACTORS[factor]})" if 0.6 < factor / large < 1.7 else ""
+    yield Suspicion("unit", concerned, f"it is {slope:.3g} times {of}{near}", "Check the units.")

@@ -1,0 +1,125 @@
+"""Reads the rows of a log, which is a file or several, in bounded batches.
+
+A batch is a Polars frame with the columns that a mapping uses: text (CSV, text in Parquet), 64-bit
+floats, dates or timestamps. CSV fields stay text, so that what is not a number can be quarantined
+as it was written.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+
+import polars as pl
+
+from fleet_slip.errors import InputError
+from fleet_slip.ingest.drives.spread_bases import PartBases, join_parts
+from fleet_slip.ingest.drives.time_bases import merge_bases
+from fleet_slip.ingest.formats.columns import shown
+from fleet_slip.ingest.formats.parquet_batches import BATCH_ROWS
+from fleet_slip.ingest.formats.reading import file_errors, open_source
+from fleet_slip.ingest.formats.source import Base, ClockSource, Source
+from fleet_slip.ingest.landing.log_files import parts_of
+from fleet_slip.ingest.mapping.mapping import Mapping
+
+_CLOCK = "this format says when each sample was taken: write own_clock = true under [time]"
+_NO_CLOCK = "this format has no clock of its own: write column or rate_hz under [time]"
+
+
+def read_batches(log: Path, mapping: Mapping) -> Iterator[pl.DataFrame]:
+    """Yield the columns of a log that a mapping uses, in its order, in bounded batches.
+
+    Rows of several time bases come as `merge_bases` says. Raises `InputError` if a file cannot be
+    read, or a column is missing or ambiguous.
+    """
+    wanted, parts, time = mapping.time_bases(), parts_of(log), mapping.time.key
+    if time is None or (len(wanted) == 1 and not mapping.time.own_clock):
+        for part in parts:
+            with _open_part(part, mapping) as source:
+                yield from source.batches(next(iter(wanted.values())))
+    elif len(parts) == 1:
+        with _open_part(log, mapping) as source:
+            yield from _merged(_bases_of(source, log, mapping, wanted), mapping)
+    else:
+        with PartBases(partial(_open_bases, mapping)) as opened:
+            yield from _merged(join_parts(log, parts, mapping, opened), mapping)
+
+
+def _merged(bases: list[Base], mapping: Mapping) -> Iterator[pl.DataFrame]:
+    """Yield the rows of time bases as those of one table."""
+    time, held = str(mapping.time.key), mapping.common_columns()
+    for rows in merge_bases(bases, time, held, mapping.time.split_gap_s):
+        yield from rows.iter_slices(BATCH_ROWS)
+
+
+@contextmanager
+def _open_part(part: Path, mapping: Mapping) -> Iterator[Source]:
+    """Open a file that says times as the mapping does. Raises `InputError`."""
+    with file_errors(part), open_source(part, mapping) as source:
+        if source.has_clock != mapping.time.own_clock:
+            raise InputError(
+                f"{shown(part)}: {_CLOCK if source.has_clock else _NO_CLOCK}, in the mapping "
+                f"{mapping.name!r}."
+            )
+        yield source
+
+
+@contextmanager
+def _open_bases(mapping: Mapping, part: Path) -> Iterator[tuple[list[Base], set[str]]]:
+    """Open a file of a log for those wanted columns that it has; yield its time bases, and these.
+
+    It may lack columns that another file has.
+    """
+    wanted = mapping.time_bases()
+    with _open_part(part, mapping) as source:
+        names = {channel.name for channel in source.channels()}
+        # What several groups of one file have is called NAME@GROUP, there only.
+        all_names = {name for columns in wanted.values() for name in columns}
+        there = names | {name for name in all_names if name.rpartition("@")[0] in names}
+        found = {
+            own: [name for name in columns if name in there]
+            for own, columns in wanted.items()
+            if own is None or own in there
+        }
+        found = {own: columns for own, columns in found.items() if columns}
+        columns = {name for columns in found.values() for name in columns}
+        yield _bases_of(source, part, mapping, found), columns
+
+
+def _bases_of(
+    source: Source, part: Path, mapping: Mapping, wanted: dict[str | None, list[str]]
+) -> list[Base]:
+    """Return the time bases of a file that have one of the wanted columns."""
+    if isinstance(source, ClockSource):
+        return [base for columns in wanted.values() for base in source.bases(columns)]
+    time = str(mapping.time.key)
+    return [
+        Base(
+            str(own),
+            partial(_count_rows, source, str(own), own == time),
+            partial(_read_with_times, source, part, columns, str(own), time),
+        )
+        for own, columns in wanted.items()
+    ]
+
+
+def _count_rows(source: Source, own: str, is_main: bool) -> int:
+    """Return how many rows a base has: those with a time, where it has times of its own."""
+    batches = source.batches([own])
+    return sum(batch.height - (0 if is_main else batch[own].null_count()) for batch in batches)
+
+
+def _read_with_times(
+    source: Source, part: Path, columns: list[str], own: str, time: str
+) -> Iterator[pl.DataFrame]:
+    """Yield the rows of a base, its times under the name that all times have."""
+    for batch in source.batches(columns):
+        if not batch[own].dtype.is_numeric():
+            raise InputError(
+                f"{shown(part)}: the time {own!r} is not of numbers; signals with times of their "
+                "own need them."
+            )
+        if own == time:
+            yield batch
+        else:
+            yield batch.filter(pl.col(own).is_not_null()).rename({own: time})

@@ -1,0 +1,264 @@
+"""Makes drives of checked rows: their names, their ticks and counts, their Arrow table."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, date, datetime, timedelta
+from functools import partial
+from itertools import groupby
+from operator import itemgetter
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from fleet_slip.arrays import FloatArray
+from fleet_slip.catalogue.counts import as_arrow, round_chunks
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.errors import InputError
+from fleet_slip.ingest.drives.open_drives import DriveRows
+from fleet_slip.ingest.drives.resampling import (
+    SNAP_TOLERANCE_S,
+    STEP_S,
+    Method,
+    Resampler,
+    build_resampler,
+    choose_method,
+)
+from fleet_slip.ingest.mapping.mapping import FromColumn, Mapping
+
+SOURCE = "measured"
+SHARED_ROWS = 2**14
+"""Rows of a drive that share the memory of what is the same in all of them."""
+_SECONDS_PER_DAY = 86_400
+_EARLIEST_S = 10**8
+"""Times before 1973 are counted from the start of a recording, not from 1970."""
+_POLARS_TYPES: dict[pa.DataType, type[pl.DataType] | pl.DataType] = {
+    pa.string(): pl.String,
+    pa.float64(): pl.Float64,
+    pa.int64(): pl.Int64,
+    pa.int32(): pl.Int32,
+    pa.date32(): pl.Date,
+    pa.timestamp("us", tz="UTC"): pl.Datetime("us", "UTC"),
+}
+_FROM_FILE = ("drive_name", "source_file", "trip_id")
+_FROM_MAPPING = ("vehicle_id", "vehicle_model", "track", "mass_kg", "tyres", "adhesion", "day")
+
+
+@dataclass(frozen=True)
+class MeasuredDrive:
+    """One uninterrupted stretch of a file on ticks.
+
+    Attributes:
+        metadata: what is known of it, by column of `logs`.
+        counts: an int16 array for each signal.
+    """
+
+    drive_id: str
+    metadata: dict[str, Any]
+    method: Method
+    ticks: NDArray[np.int32]
+    counts: dict[str, pa.Array]
+
+    @property
+    def num_rows(self) -> int:
+        """Number of its rows, as a table has it."""
+        return self.ticks.size
+
+
+def drive_id(prefix: str, group: int, stretch: int = 1) -> str:
+    """Return the name of the n-th stretch (from 1) of the drive with this number (from 0)."""
+    return f"{prefix}-{group + 1}" + (f"-{stretch}" if stretch > 1 else "")
+
+
+def to_ticks(
+    rows: DriveRows,
+    mapping: Mapping,
+    intervals_s: dict[int, float],
+    name: str,
+    known: dict[str, Any],
+) -> MeasuredDrive:
+    """Bring one drive's signals, SI units at times in s, to counts at 100 Hz.
+
+    Ticks at which no signal has a value are left out. `intervals_s` are the usual times between
+    the samples of each time base; `known` is what is known of the drive, by column of `logs`.
+    Raises `InputError` for what nobody says.
+    """
+    start_s = rows.start_s
+    resampler = _build_resampler(rows, intervals_s)
+    method, ticks = resampler.method, resampler.ticks.astype(np.int32)
+    counts, somewhere = {}, np.zeros(ticks.size, dtype=np.bool_)
+    for signal, source in mapping.signals.items():
+        if method == "snap" and source.interpolate and not source.delay_s:
+            values = rows.chunks(signal)
+        elif len(intervals_s) == 1:
+            values = [_resample(rows.column(signal), resampler, signal, mapping)]
+        else:
+            samples = rows.samples(signal)
+            own = _on_own_times(samples, start_s, resampler, intervals_s)
+            values = [_resample(samples[signal].to_numpy(), own, signal, mapping)]
+        # Rounding clips a resampled value's last bit, no more: the rest is in quarantine.
+        counts[signal] = round_chunks(values, catalogue()[signal])
+        if not counts[signal].null_count:
+            somewhere[:] = True
+        elif not somewhere.all():
+            somewhere |= pl.Series(counts[signal]).is_not_null().to_numpy()
+    if not somewhere.all():
+        kept = pl.Series(somewhere).to_arrow()
+        counts = {key: array.filter(kept) for key, array in counts.items()}
+        ticks = ticks[somewhere]
+    metadata = _metadata(name, known, start_s, mapping)
+    if len(ticks):
+        metadata |= {"rows": len(ticks), "duration_s": (int(ticks[-1]) - int(ticks[0])) * STEP_S}
+    return MeasuredDrive(name, metadata, method, ticks, counts)
+
+
+def _resample(
+    values: FloatArray, resampler: Resampler, signal: str, mapping: Mapping
+) -> FloatArray:
+    """Return a signal on the ticks of its drive."""
+    source = mapping.signals[signal]
+    if not source.interpolate:
+        return resampler.place(values, source.delay_s)
+    longest_gap_s = source.longest_gap_s or mapping.time.longest_gap_s
+    between = resampler.hold if catalogue()[signal].stepwise else resampler.resample
+    resample = partial(between, delay_s=source.delay_s, longest_gap_s=longest_gap_s)
+    return _on_the_circle(resample, values) if signal == catalogue().label else resample(values)
+
+
+def _build_resampler(rows: DriveRows, intervals_s: dict[int, float]) -> Resampler:
+    """Return what says the ticks of a drive, and brings its signals there if they share times."""
+    if len(intervals_s) == 1:
+        (interval_s,) = intervals_s.values()
+        time_s = rows.time_s - rows.start_s
+        return build_resampler(time_s, choose_method(time_s, interval_s))
+    return build_resampler(np.array([0.0, rows.end_s - rows.start_s]), "interpolate")
+
+
+def _on_own_times(
+    samples: pl.DataFrame, start_s: float, ticks: Resampler, intervals_s: dict[int, float]
+) -> Resampler:
+    """Return what brings the samples of one time base of several onto a drive's ticks."""
+    interval_s = intervals_s[samples["base"][0]] if len(samples) else STEP_S
+    fast = interval_s < STEP_S - SNAP_TOLERANCE_S
+    time_s = samples["time"].to_numpy() - start_s
+    return replace(ticks, time_s=time_s, method="average" if fast else "interpolate")
+
+
+def _on_the_circle(resample: Callable[[FloatArray], FloatArray], angle: FloatArray) -> FloatArray:
+    """Resample an angle without passing through 0 where it wraps from π to -π: the car spins."""
+    present = ~np.isnan(angle)
+    unwrapped = angle.copy()
+    unwrapped[present] = np.unwrap(angle[present])
+    resampled = resample(unwrapped)
+    return np.asarray(resampled - 2 * np.pi * np.rint(resampled / (2 * np.pi)), dtype=np.float64)
+
+
+def log_table(drives: Sequence[MeasuredDrive], mapping: Mapping) -> pa.Table:
+    """Return the rows of `logs` for these drives; strings are dictionary-encoded."""
+    sizes = [drive.ticks.size for drive in drives]
+    columns = {}
+    for field in catalogue().log_schema:
+        if field.name == "tick":
+            columns[field.name] = pa.chunked_array(
+                [as_arrow(drive.ticks) for drive in drives], field.type
+            )
+        elif field.name in mapping.signals:
+            columns[field.name] = pa.chunked_array([drive.counts[field.name] for drive in drives])
+        elif field.name in catalogue().extras:
+            continue
+        elif field.name in catalogue().signals:
+            absent = _shared(pa.nulls(SHARED_ROWS, field.type), sum(sizes))
+            columns[field.name] = pa.chunked_array(absent, field.type)
+        else:
+            values = [drive.metadata.get(field.name) for drive in drives]
+            columns[field.name] = _repeat(values, field.type, sizes)
+    return pa.table(columns)
+
+
+def _repeat(values: Sequence[Any], kind: pa.DataType, times: Sequence[int]) -> pa.ChunkedArray:
+    """Return each value as often as it is told; texts as codes of a dictionary."""
+    if pa.types.is_string(kind):
+        texts = list(dict.fromkeys(text for text in values if text is not None))
+        codes = {text: i for i, text in enumerate(texts)}
+        repeated = _repeat([codes.get(text) for text in values], pa.int32(), times)
+        named = _as_arrow(texts, kind)
+        return pa.chunked_array(
+            [pa.DictionaryArray.from_arrays(chunk, named, safe=False) for chunk in repeated.chunks],
+            pa.dictionary(pa.int32(), kind),
+        )
+    runs = [
+        (value, sum(number for _, number in run))
+        for value, run in groupby(zip(values, times, strict=True), key=itemgetter(0))
+    ]
+    scalars = zip(_as_arrow([value for value, _ in runs], kind), runs, strict=True)
+    chunks = [
+        chunk
+        for scalar, (_, number) in scalars
+        for chunk in _shared(pa.repeat(scalar, min(number, SHARED_ROWS)), number)
+    ]
+    repeated = pa.chunked_array(chunks, kind)
+    many_short_runs = len(runs) * SHARED_ROWS > sum(times)
+    return pa.chunked_array([repeated.combine_chunks()]) if many_short_runs else repeated
+
+
+def _shared(rows: pa.Array, number: int) -> list[pa.Array]:
+    """Return so many rows that are all the same, in chunks of some that share their memory."""
+    return [
+        rows.slice(0, min(SHARED_ROWS, number - start)) for start in range(0, number, SHARED_ROWS)
+    ]
+
+
+def _as_arrow(values: Sequence[Any], kind: pa.DataType) -> pa.Array:
+    """Return values as Arrow has them; not by `pa.array`, which imports pandas if it is there."""
+    return pl.Series(values, dtype=_POLARS_TYPES[kind]).to_arrow().cast(kind)
+
+
+def _metadata(name: str, told: dict[str, Any], start_s: float, mapping: Mapping) -> dict[str, Any]:
+    """Return what is known of a drive, by column of `logs`. Raises `InputError`."""
+    given = {key: getattr(mapping.drive, key) for key in _FROM_MAPPING}
+    known = {key: value for key, value in given.items() if not isinstance(value, FromColumn)}
+    if given["day"] is None:  # then time is in timestamps, or those of the file's own clock
+        if mapping.time.own_clock and start_s < _EARLIEST_S:
+            raise InputError("its clock does not tell the date. Give it in the mapping: drive.day.")
+        known["day"] = date.fromordinal(
+            date(1970, 1, 1).toordinal() + int(start_s // _SECONDS_PER_DAY)
+        )
+    known |= {key: value for key, value in told.items() if key in given or key in _FROM_FILE}
+    dated = mapping.time.is_dated and start_s >= _EARLIEST_S
+    return {
+        **known,
+        "started_at": _moment(start_s) if dated else None,
+        **_facts_of(mapping, known),
+        "drive_id": name,
+        "source": SOURCE,
+        "campaign": mapping.name,
+        "saturated": 0,  # what is outside its range is quarantined, not clipped
+    }
+
+
+def _moment(time_s: float) -> datetime:
+    """Return a time in s since 1970 to the microsecond."""
+    return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=time_s)
+
+
+def _facts_of(mapping: Mapping, known: dict[str, Any]) -> dict[str, Any]:
+    """Return what the mapping's table says of a drive's car and nobody said before.
+
+    Raises `InputError` if the car is not in the table, or nobody says its model.
+    """
+    vehicles = mapping.vehicle_facts()
+    if not vehicles:
+        return {}
+    vehicle = known["vehicle_id"]
+    facts = next((facts for facts in vehicles if facts.vehicle_id == vehicle), None)
+    if facts is None:
+        raise InputError(
+            f"the car {vehicle!r} is not in the table of vehicles of the mapping "
+            f"{mapping.name!r}. Add a row for it."
+        )
+    told = {name: fact for name, fact in facts.model_dump().items() if known.get(name) is None}
+    if told.get("vehicle_model", "") is None:
+        raise InputError(f"nobody says the vehicle_model of the car {vehicle!r}. Add it.")
+    return told

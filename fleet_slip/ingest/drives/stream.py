@@ -1,0 +1,298 @@
+"""From a measured file to drives in counts, piece by piece: few drives are in memory at once."""
+
+import os
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pyarrow as pa
+
+from fleet_slip.canonical import canonical_ascii
+from fleet_slip.errors import InputError
+from fleet_slip.ingest.drafting.suspicion import Suspicion, find_refusals
+from fleet_slip.ingest.drives.checking import Block, RowChecker
+from fleet_slip.ingest.drives.drive_cutter import (
+    LONGEST_DRIVE_S,
+    DriveCutter,
+    sample_intervals_s,
+)
+from fleet_slip.ingest.drives.measured_drives import MeasuredDrive, drive_id, to_ticks
+from fleet_slip.ingest.drives.open_drives import MAX_OPEN_ROWS, DriveRows, OpenDrives
+from fleet_slip.ingest.drives.quarantine import describe_refused, join_refused, no_rows
+from fleet_slip.ingest.drives.read_ahead import read_ahead
+from fleet_slip.ingest.drives.resampling import STEP_S, TIME_EPSILON_S
+from fleet_slip.ingest.drives.totals import IngestCounts, Totals
+from fleet_slip.ingest.drives.trips import Trips
+from fleet_slip.ingest.formats.columns import shown
+from fleet_slip.ingest.formats.parquet_batches import partition_keys
+from fleet_slip.ingest.formats.reading import log_digest, require_unchanged_log
+from fleet_slip.ingest.landing.log_files import parts_of
+from fleet_slip.ingest.landing.look_alikes import find_look_alikes
+from fleet_slip.ingest.mapping.mapping import Mapping
+from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA
+from fleet_slip.words import number_of
+
+RATE_ROWS = 2**17
+"""The usual time between rows is that of the first ones of a file, so many at least."""
+FEWEST_STEPS = 1000
+MAX_DRIVES = 10_000
+"""Short drives in one file. More means that time or the drive's column is not what is said."""
+SHORT_ROWS = 1000
+MAX_TICKS = 40_000_000
+"""Length of all drives of one file together, in ticks, where rows are few for it."""
+MOST_TICKS_A_ROW = 1000
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Drives of a file that have ended, and rows that were refused meanwhile.
+
+    Attributes:
+        drives: in an order that depends on the file and the mapping only.
+        refused: `row`, `group`, `reason`, `signal` and `value`.
+    """
+
+    drives: list[MeasuredDrive]
+    refused: pl.DataFrame
+
+
+class MeasuredStream:
+    """A measured file, open for reading through a mapping.
+
+    The result depends on the file's bytes and the mapping only, not on its path (but for keys in
+    the names of folders, `car=A7`, that the mapping uses), nor on how it is read. Drives are called
+    `<mapping>-<digest>-<number>`, and `-2`, `-3` … follow where a gap in time cut one.
+    """
+
+    def __init__(self, file: Path, mapping: Mapping, digest: str) -> None:
+        """Take the file, the mapping, and the digest of both."""
+        self.file, self.mapping, self.digest = file, mapping, digest
+        self.prefix = f"{mapping.name}-{digest[:12]}"
+        self.checker = RowChecker(file, mapping)
+        self.totals = Totals()
+        self._open = OpenDrives()
+        self._stretches: Counter[int] = Counter()
+        self._trips = Trips()
+        self._name = os.fsencode(file.name).decode("utf-8", "replace")
+        self._stem = self._name.split(".", 1)[0] or self._name
+        self._first_refused: dict[str, Any] | None = None
+
+    def pieces(self) -> Iterator[Piece]:
+        """Yield what the file becomes, in order, once. Raises `InputError`, at its end too."""
+        with closing(read_ahead(self.checker.blocks())) as blocks:
+            early, intervals_s = self._usual_intervals(blocks)
+            longest_s = LONGEST_DRIVE_S * min([1.0, *(s / STEP_S for s in intervals_s.values())])
+            cutter = DriveCutter(self.mapping.time, longest_s)
+            for block in chain(early, blocks):
+                yield self._piece(cutter, block, intervals_s)
+            yield self._piece(cutter, _no_more(block), intervals_s, last=True)
+        self._require_usable()
+
+    def _usual_intervals(self, blocks: Iterator[Block]) -> tuple[list[Block], dict[int, float]]:
+        """Return the first blocks, and the usual time between samples of each time base in them.
+
+        It is that of rows up to a number that is the same however a file is cut into blocks. Of a
+        time base that is not among them, its first drive tells it.
+        """
+        early: list[Block] = []
+        enough = RATE_ROWS
+        for block in blocks:
+            early.append(block)
+            while _reach(early) >= enough:
+                first = _trial(self.mapping, early, enough)
+                if first["part"].is_duplicated().sum() > FEWEST_STEPS:
+                    return early, sample_intervals_s(first)
+                enough += RATE_ROWS
+        return early, sample_intervals_s(_trial(self.mapping, early, _reach(early)))
+
+    def _piece(
+        self,
+        cutter: DriveCutter,
+        block: Block,
+        intervals_s: dict[int, float],
+        *,
+        last: bool = False,
+    ) -> Piece:
+        rows, misplaced = cutter.cut(block.rows, last=last)
+        refused = [block.refused, misplaced]
+        self._open.add(rows)
+        drives = []
+        for ended in self._open.take([*cutter.ended, *(cutter.open_parts() if last else ())]):
+            if ended.end_s - ended.start_s < STEP_S - TIME_EPSILON_S:
+                refused.append(describe_refused(ended.frame(), None, "too_short"))
+            else:
+                drives.append(self._drive(ended, intervals_s))
+        if self._open.number_of_rows > MAX_OPEN_ROWS:
+            raise InputError(
+                f"{shown(self.file)}: more than {MAX_OPEN_ROWS:,} rows of drives that alternate, "
+                "and none of them ends. Sort the file by drive and time."
+            )
+        bad = join_refused(refused)
+        self._note_refused(bad)
+        return Piece(drives, bad)
+
+    def _drive(self, rows: DriveRows, intervals_s: dict[int, float]) -> MeasuredDrive:
+        group = rows.group
+        self._stretches[group] += 1
+        name = drive_id(self.prefix, group, self._stretches[group])
+        told = self.checker.keys.metadata[group]
+        known = {
+            **told,
+            "drive_name": told.get("drive", self._stem),
+            "source_file": self._name,
+            "trip_id": self._trips.name(name, group, rows.start_s, rows.end_s),
+        }
+        for base in set(rows.bases) - intervals_s.keys():
+            steps_s = np.diff(rows.times_of(base)[:RATE_ROWS])
+            intervals_s[base] = float(np.median(steps_s)) if steps_s.size else STEP_S
+        try:
+            drive = to_ticks(rows, self.mapping, intervals_s, name, known)
+        except InputError as error:
+            raise InputError(f"{shown(self.file)}: {error}") from None
+        self.totals.add(rows, drive)
+        self._require_sane_drives()
+        return drive
+
+    def _note_refused(self, refused: pl.DataFrame) -> None:
+        if refused.height:
+            self.totals.quarantined.update(refused["reason"])
+            of_signals = refused.filter(pl.col("signal").is_in(list(self.mapping.signals)))
+            self.totals.refused.update(zip(of_signals["signal"], of_signals["reason"], strict=True))
+            first = refused.row(refused["row"].arg_min() or 0, named=True)
+            self._first_refused = min(self._first_refused or first, first, key=lambda r: r["row"])
+
+    def _require_sane_drives(self) -> None:
+        totals = self.totals
+        if totals.drives > MAX_DRIVES and totals.rows_kept < SHORT_ROWS * totals.drives:
+            raise InputError(
+                f"{shown(self.file)}: it falls into more than {MAX_DRIVES:,} drives, of "
+                f"{totals.rows_kept / totals.drives:.0f} rows on average. Check time, split_gap_s "
+                f"and the drive's column in the mapping {self.mapping.name!r}."
+            )
+        if totals.ticks > MAX_TICKS and totals.ticks > MOST_TICKS_A_ROW * totals.rows_kept:
+            raise InputError(
+                f"{shown(self.file)}: {totals.rows_kept:,} rows last {totals.ticks:,} ticks of "
+                "100 Hz. Check the unit of time and split_gap_s in the mapping "
+                f"{self.mapping.name!r}."
+            )
+
+    def _require_usable(self) -> None:
+        totals, name = self.totals, self.mapping.name
+        if not totals.rows_kept and self._first_refused is not None:
+            reasons = ", ".join(f"{n:,} {reason}" for reason, n in totals.quarantined.most_common())
+            first = self._first_refused
+            example = f"{first['signal'] or 'the row'} = {first['value']!r} in row {first['row']}"
+            raise InputError(
+                f"{shown(self.file)}: none of its "
+                f"{number_of(totals.quarantined.total(), 'row')} is usable ({reasons}; first: "
+                f"{example}). Check columns, units and time in the mapping {name!r}."
+            )
+        if not totals.ticks:
+            raise InputError(
+                f"{shown(self.file)}: no row is on a tick of 100 Hz, and longest_gap_s = "
+                f"{self.mapping.time.longest_gap_s:g} forbids to interpolate. Raise it in the "
+                f"mapping {name!r} if the signals change slowly enough."
+            )
+        for signal, source in self.mapping.signals.items():
+            if totals.samples[signal] and not totals.values[signal]:
+                raise InputError(
+                    f"{shown(self.file)}: {signal} has "
+                    f"{number_of(totals.samples[signal], 'value')} in {source.column!r}, and none "
+                    "is on a tick of 100 Hz: they are further apart than longest_gap_s. Give the "
+                    f"signal in the mapping {name!r} a longest_gap_s of its own, or interpolate = "
+                    "false."
+                )
+
+    def quarantine_table(self, refused: Sequence[pl.DataFrame]) -> pa.Table:
+        """Return refused rows as those of the table `quarantine`, in the file's order."""
+        bad = join_refused(refused).sort("row", maintain_order=True)
+        groups = bad["group"].unique().drop_nulls()
+        ids = {group: drive_id(self.prefix, group) for group in groups}
+        stated = self.mapping.drive.vehicle_id
+        vehicle = stated if isinstance(stated, str) else None
+        metadata = self.checker.keys.metadata
+        vehicles = {str(group): metadata[group].get("vehicle_id", vehicle) for group in groups}
+        frame = bad.select(
+            pl.lit(self._name).alias("file"),
+            "row",
+            pl.col("group").replace_strict(ids, return_dtype=pl.String).alias("drive_id"),
+            pl.col("group")
+            .cast(pl.String)
+            .replace_strict(vehicles, return_dtype=pl.String)
+            .fill_null(pl.lit(vehicle, pl.String))
+            .alias("vehicle_id"),
+            "reason",
+            "signal",
+            "value",
+        )
+        return frame.to_arrow().cast(QUARANTINE_SCHEMA)
+
+    def counts(self) -> IngestCounts:
+        """Return what became of the rows, once all pieces were taken."""
+        totals = self.totals
+        return IngestCounts(
+            rows_read=self.checker.rows,
+            rows_left_out=self.checker.left_out,
+            rows_kept=totals.rows_kept,
+            quarantined=dict(sorted(totals.quarantined.items())),
+            drives=totals.drives,
+            drives_resampled=totals.drives_resampled,
+            ticks=totals.ticks,
+        )
+
+    def suspicions(self) -> tuple[Suspicion, ...]:
+        """Return the signals of which many values were refused, once all pieces were taken."""
+        return tuple(find_refusals(self.totals.refused, self.checker.rows))
+
+    def look_alikes(self) -> tuple[tuple[str, ...], ...]:
+        """Return names of drives or cars in the file that differ only in their Unicode form."""
+        told = {value for key in self.checker.keys.metadata for value in key.values()}
+        return find_look_alikes({value for value in told if isinstance(value, str)})
+
+
+@contextmanager
+def open_measured(file: Path, mapping: Mapping) -> Iterator[MeasuredStream]:
+    """Open a measured file. Raises `InputError`, if it changes until the end too."""
+    with require_unchanged_log(file):
+        yield MeasuredStream(file, mapping, _identity(file, mapping))
+
+
+def _identity(file: Path, mapping: Mapping) -> str:
+    digest = log_digest(file)
+    used = {name for names in mapping.time_bases().values() for name in names}
+    for part in parts_of(file):
+        if keys := {key: text for key, text in partition_keys(part).items() if key in used}:
+            digest.update(canonical_ascii(keys).encode())
+    digest.update(mapping.canonical_json().encode())
+    return digest.hexdigest()
+
+
+def _reach(blocks: list[Block]) -> int:
+    """Return how many rows there are to tell the usual time between them.
+
+    Those of several time bases are numbered base by base, so that good ones are counted.
+    """
+    if "base" in blocks[-1].rows.columns:
+        return sum(block.rows.height for block in blocks)
+    return blocks[-1].read
+
+
+def _trial(mapping: Mapping, blocks: list[Block], until: int) -> pl.DataFrame:
+    """Return the rows of the first blocks up to a number, cut into parts."""
+    rows = blocks[0].rows if len(blocks) == 1 else pl.concat([block.rows for block in blocks])
+    several = "base" in rows.columns
+    if several:
+        rows = rows.head(until)
+    elif until < blocks[-1].read:
+        rows = rows.filter(pl.col("row") <= until)
+    return DriveCutter(mapping.time).cut(rows, last=several)[0]
+
+
+def _no_more(block: Block) -> Block:
+    return Block(block.rows.clear(), no_rows(), block.read)

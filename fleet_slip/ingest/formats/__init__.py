@@ -1,0 +1,1 @@
+"""Measured files of every format, read in batches of columns."""

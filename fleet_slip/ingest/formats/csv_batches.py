@@ -1,0 +1,222 @@
+"""Reads CSV in blocks of whole lines, each field as the text that it is, plain numbers as such."""
+
+import csv
+from collections.abc import Iterator, Sequence, Set
+from contextlib import contextmanager
+from dataclasses import dataclass
+from io import BufferedReader, BytesIO
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import polars as pl
+import pyarrow as pa
+
+from fleet_slip.arrays import is_finite
+from fleet_slip.errors import InputError
+from fleet_slip.ingest.drives.read_ahead import map_ahead
+from fleet_slip.ingest.formats.columns import require_columns, shown
+from fleet_slip.ingest.formats.csv_format import CsvFormat
+from fleet_slip.ingest.formats.source import Channel
+
+BLOCK_BYTES = 2**22
+"""CSV is parsed in blocks of about this size."""
+
+MAX_LINE_BYTES = 2**20
+LINE_BLOCKS = 4
+"""Blocks that one line may fill: more often a quote is not closed."""
+MOST_UNFOLDED, MOST_BYTES = 200, 2**30
+"""How many times its size a compressed file may become, beyond so many bytes: more is a bomb."""
+
+EXTRA_FIELDS = "\0extra fields"
+"""Column of a CSV batch: what a line has after the header's last column, null if nothing."""
+
+
+COMPRESSED = {b"\x1f\x8b": "gzip", b"\x28\xb5\x2f\xfd": "zstd"}
+"""What compressed files begin with."""
+
+
+@dataclass(frozen=True)
+class PlainNumbers:
+    """Columns that are nothing but numbers wherever they are used, and numbers that are none.
+
+    They are parsed as numbers at once, three times as fast as by way of text. Where that is not
+    what the texts say (one is empty, is no number, or means "no value"), text it is.
+    """
+
+    columns: frozenset[str] = frozenset()
+    missing: tuple[float, ...] = ()
+
+    def are_in(self, column: pl.Series) -> bool:
+        """Whether a column that was parsed as numbers has one in every row."""
+        if column.null_count() or not is_finite(column.to_numpy()):
+            return False
+        return not (self.missing and column.is_in(self.missing).any())
+
+
+@dataclass(frozen=True)
+class CsvSource:
+    """A CSV file, or one that is compressed."""
+
+    file: Path
+    csv_format: CsvFormat
+    numbers: PlainNumbers
+    has_clock = False
+
+    def channels(self) -> list[Channel]:
+        """Return the columns of the header."""
+        with self.file.open("rb") as stream:
+            names = _csv_header(_decompressed(stream), self.file, self.csv_format)
+        return [Channel(name) for name in names if names.count(name) == 1]
+
+    def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
+        """Yield the named columns, and `EXTRA_FIELDS`. Raises `InputError`.
+
+        All are text, but for plain numbers.
+        """
+        with self.file.open("rb") as stream:
+            plain = _decompressed(stream)
+            names = _csv_header(plain, self.file, self.csv_format)
+            positions = require_columns(self.file, names, columns)
+            numbers = set(self.numbers.columns & set(columns))
+
+            def parse(block: bytes) -> pl.DataFrame:
+                # Reading on over bad numbers is reading on over bad quotes.
+                fit = frozenset() if b'"' in block else frozenset(numbers)
+                parsed = self._parse(block, len(names), positions, fit)
+                texts = {name for name in fit if not self.numbers.are_in(parsed[name])}
+                if texts:
+                    numbers.difference_update(texts)  # so that others need not be parsed twice
+                    again = self._parse(block, len(names), {n: positions[n] for n in texts}, set())
+                    parsed = parsed.with_columns(again.select(sorted(texts)))
+                return parsed
+
+            # A line of separators before each block fixes the number of fields and keeps a block
+            # from looking like a compressed file.
+            padding = self.csv_format.separator.encode() * len(names) + b"\n"
+            blocks = _whole_lines(plain, self.file, padding)
+            if plain is not stream:
+                blocks = _without_bomb(blocks, self.file)
+            yield from map_ahead(parse, blocks)
+
+    def _parse(
+        self, block: bytes, width: int, positions: dict[str, int], numbers: Set[str]
+    ) -> pl.DataFrame:
+        """Parse all lines but the first. Columns are read by position: Polars renames doubles."""
+        fields = [f"column {i}" for i in range(width)] + [EXTRA_FIELDS]
+        schema: dict[str, type[pl.DataType]] = dict.fromkeys(fields, pl.String)
+        schema |= {fields[positions[name]]: pl.Float64 for name in numbers}
+        frame = pl.scan_csv(
+            BytesIO(block),
+            has_header=False,
+            separator=self.csv_format.separator,
+            schema=schema,
+            truncate_ragged_lines=True,
+            ignore_errors=bool(numbers),
+            decimal_comma=self.csv_format.decimal_comma,
+        )
+        selection = [pl.col(fields[i]).alias(name) for name, i in positions.items()]
+        return frame.select(*selection, EXTRA_FIELDS).collect().slice(1)
+
+
+@contextmanager
+def open_csv(
+    file: Path, csv_format: CsvFormat, numbers: PlainNumbers | None = None
+) -> Iterator[CsvSource]:
+    """Open a CSV file."""
+    yield CsvSource(file, csv_format, numbers or PlainNumbers())
+
+
+def _decompressed(stream: BinaryIO) -> BinaryIO:
+    """Return the text of a stream, whatever it is compressed with."""
+    start = stream.read(max(map(len, COMPRESSED)))
+    stream.seek(0)
+    for magic, codec in COMPRESSED.items():
+        if start.startswith(magic):
+            # Text is read in blocks: what a small file may become is never in memory at once.
+            plain = pa.CompressedInputStream(stream, codec)
+            return BufferedReader(plain, BLOCK_BYTES)
+    return stream
+
+
+def _without_bomb(blocks: Iterator[bytes], file: Path) -> Iterator[bytes]:
+    """Yield the blocks of a compressed file, as long as they are not absurdly many."""
+    unfolded = 0
+    for block in blocks:
+        unfolded += len(block)
+        if unfolded > MOST_BYTES and unfolded > MOST_UNFOLDED * file.stat().st_size:
+            raise InputError(
+                f"{shown(file)}: it unfolds to more than {MOST_UNFOLDED} times its size, which no "
+                "log does. Unpack it and look at what is in it."
+            )
+        yield block
+
+
+def _csv_header(stream: BinaryIO, file: Path, csv_format: CsvFormat) -> list[str]:
+    line = stream.readline(MAX_LINE_BYTES + 1)
+    if not line.strip():
+        raise InputError(
+            f"{shown(file)}: {'its first line is' if line else 'it is'} empty. Export it again."
+        )
+    if len(line) > MAX_LINE_BYTES:
+        raise InputError(
+            f"{shown(file)}: the header is longer than {MAX_LINE_BYTES:,} bytes. Is it a CSV file?"
+        )
+    text = _decode(line.removeprefix(b"\xef\xbb\xbf"), file).rstrip("\r\n")
+    try:
+        names = next(csv.reader([text], delimiter=csv_format.separator, strict=True))
+    except csv.Error as error:
+        raise InputError(f"{shown(file)}: its header is not CSV: {error}.") from None
+    return [name.strip() for name in names]
+
+
+def _whole_lines(stream: BinaryIO, file: Path, padding: bytes) -> Iterator[bytes]:
+    """Yield blocks of UTF-8 that end with a line; a line break in quotes does not end one.
+
+    Each begins with the padding, a line of its own: put here, the block is not copied for it.
+    """
+    rest = padding
+    while more := stream.read(BLOCK_BYTES):
+        block = rest + more
+        end = _end_of_lines(block)
+        if end > len(padding):
+            whole, rest = block[:end], padding + block[end:]
+            _require_text(whole, file)
+            yield whole
+            continue
+        if len(block) > LINE_BLOCKS * BLOCK_BYTES:
+            raise InputError(
+                f"{shown(file)}: a line is longer than {LINE_BLOCKS * BLOCK_BYTES:,} bytes. "
+                "Is a quote not closed?"
+            )
+        rest = block
+    if len(rest) > len(padding):
+        _require_text(rest, file)
+        yield rest
+
+
+def _end_of_lines(block: bytes) -> int:
+    """Return where the last whole line ends: behind a line break with no open quote before it."""
+    end = block.rfind(b"\n") + 1
+    if b'"' not in block or block.count(b'"', 0, end) % 2 == 0:
+        return end
+    characters = np.frombuffer(block[:end], dtype=np.uint8)
+    open_quote = np.logical_xor.accumulate(characters == ord('"'))
+    ends = np.flatnonzero((characters == ord("\n")) & ~open_quote)
+    return int(ends[-1]) + 1 if ends.size else 0
+
+
+def _require_text(block: bytes, file: Path) -> None:
+    if b"\0" in block or not block.isascii():
+        _decode(block, file)
+
+
+def _decode(block: bytes, file: Path) -> str:
+    advice = "Save it as UTF-8 text, or give a Parquet file."
+    if b"\0" in block:
+        raise InputError(f"{shown(file)}: binary or UTF-16, not a UTF-8 CSV file. {advice}")
+    try:
+        return block.decode("utf-8")
+    except UnicodeDecodeError as error:
+        line = block[error.start - min(error.start, 20) : error.start + 20]
+        raise InputError(f"{shown(file)}: not UTF-8, near {line!r}. {advice}") from None

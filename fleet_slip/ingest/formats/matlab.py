@@ -1,0 +1,142 @@
+"""Reads MATLAB files, version 5, and 7.3 (HDF5) through h5py, some rows at once.
+
+A column is the path of a vector, `Data.Vehicle.yawRate`, or one column of a matrix, `wheels(:,2)`.
+"""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import polars as pl
+
+from fleet_slip.errors import InputError
+from fleet_slip.ingest.formats.columns import describe_missing, shown
+from fleet_slip.ingest.formats.matlab_elements import open_matrices
+from fleet_slip.ingest.formats.source import Channel, as_column, reading_with
+
+HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+HDF5_AT = 512
+"""Where a 7.3 file becomes HDF5: MATLAB's own header is before it."""
+MAT5_MAGIC = b"MATLAB 5.0 MAT-file"
+
+_COLUMN = re.compile(r"(.+)\(:,(\d+)\)")
+_MOST_COLUMNS = 64
+WINDOW_ROWS = 2**15
+"""Rows that are read at once."""
+Array = np.ndarray[Any, Any]
+
+
+class _Matrix(Protocol):
+    """A matrix in a file."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Length of its axes."""
+        ...
+
+    def read(self, column: int, start: int, end: int) -> Array:
+        """Return some rows of a column."""
+        ...
+
+
+class MatSource:
+    """The vectors of an open MATLAB file. Time is one of them."""
+
+    has_clock = False
+
+    def __init__(self, file: Path, matrices: Mapping[str, _Matrix]) -> None:
+        """Take the file's path, and its matrices by path."""
+        self._file, self._matrices = file, matrices
+
+    def channels(self) -> list[Channel]:
+        """Return all vectors, and the columns of matrices."""
+        found = []
+        for path, matrix in self._matrices.items():
+            rows, columns = _rows_columns(matrix.shape)
+            names = [path] if columns == 1 else [f"{path}(:,{i + 1})" for i in range(columns)]
+            if rows > 1 and columns <= _MOST_COLUMNS:
+                found += [Channel(name, "", f"{rows} rows") for name in names]
+        return found
+
+    def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
+        """Yield all rows, some at once. Raises `InputError` if columns differ in length."""
+        found = {name: self._find(name) for name in columns}
+        lengths = {name: _rows_columns(matrix.shape)[0] for name, (matrix, _) in found.items()}
+        first, rows = next(iter(lengths.items()))
+        for name, length in lengths.items():
+            if length != rows:
+                raise InputError(
+                    f"{shown(self._file)}: {name!r} has {length:,} values and {first!r} has "
+                    f'{rows:,}. Give the signal the time that goes with it: time = "…".'
+                )
+        for start in range(0, max(rows, 1), WINDOW_ROWS):
+            end = min(start + WINDOW_ROWS, rows)
+            yield pl.DataFrame(
+                as_column(self._file, name, matrix.read(column, start, end)).alias(name)
+                for name, (matrix, column) in found.items()
+            )
+
+    def _find(self, name: str) -> tuple[_Matrix, int]:
+        """Return a matrix, and which of its columns is meant."""
+        whole = self._matrices.get(name)
+        if whole is not None:
+            if _rows_columns(whole.shape)[1] != 1:
+                axes = " x ".join(map(str, whole.shape)) or "1"
+                raise InputError(
+                    f"{shown(self._file)}: channel {name!r} has {axes} values, not one a row. Map "
+                    "one of its columns."
+                )
+            return whole, 0
+        found = _COLUMN.fullmatch(name)
+        matrix = self._matrices.get(found[1]) if found else None
+        if found and matrix and 1 <= int(found[2]) <= _rows_columns(matrix.shape)[1]:
+            return matrix, int(found[2]) - 1
+        names = [channel.name for channel in self.channels()]
+        raise InputError(f"{shown(self._file)}: {describe_missing(name, names)}")
+
+
+class _Dataset:
+    """A dataset of HDF5, which has the axes of MATLAB in reverse."""
+
+    def __init__(self, dataset: Any) -> None:
+        self._dataset = dataset
+        self.shape = tuple(size for size in reversed(dataset.shape) if size != 1)
+
+    def read(self, column: int, start: int, end: int) -> Array:
+        """Return some rows of a column."""
+        wanted = iter([column, slice(start, end)][-len(self.shape) :])
+        places = tuple(0 if size == 1 else next(wanted) for size in self._dataset.shape)
+        return np.asarray(self._dataset[places])
+
+
+def _rows_columns(shape: Sequence[int]) -> tuple[int, int]:
+    """Return rows and columns; what has more axes has no rows of one value."""
+    if len(shape) == 1:
+        return shape[0], 1
+    return (shape[0], shape[1]) if len(shape) == 2 else (0, 0)
+
+
+@contextmanager
+def open_mat(file: Path) -> Iterator[MatSource]:
+    """Open a MATLAB file of version 5 to 7. Raises `InputError`."""
+    with open_matrices(file) as matrices:
+        yield MatSource(file, {path: one for path, one in matrices.items() if one.shape})
+
+
+@contextmanager
+def open_mat73(file: Path) -> Iterator[MatSource]:
+    """Open a MATLAB file of version 7.3, or any HDF5 file. Raises `InputError`."""
+    with reading_with(file, "h5py") as h5py, h5py.File(file, "r") as root:
+        matrices: dict[str, _Dataset] = {}
+
+        def visit(path: str, item: Any) -> None:
+            if isinstance(item, h5py.Dataset) and not path.startswith("#refs#"):
+                kind = item.attrs.get("MATLAB_class", b"")
+                if item.shape and item.dtype.kind in "iufb" and kind != b"char":
+                    matrices[path.replace("/", ".")] = _Dataset(item)
+
+        root.visititems(visit)
+        yield MatSource(file, matrices)

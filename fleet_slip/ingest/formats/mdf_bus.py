@@ -1,0 +1,92 @@
+"""Reads the CAN frames that a logger stored in an MDF 4 file (bus logging), through a database.
+
+ASAM's associated standard names the channels: a group of frames has `CAN_DataFrame.ID` and others.
+"""
+
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_slip.errors import InputError
+from fleet_slip.ingest.formats.can_bus import CanBus
+from fleet_slip.ingest.formats.can_decoding import Bytes
+from fleet_slip.ingest.formats.can_trace import CanSource, parse_database
+from fleet_slip.ingest.formats.columns import shown
+from fleet_slip.ingest.formats.mdf import MdfSource, open_mdf
+from fleet_slip.ingest.formats.spool import Spool
+
+_FRAME = "CAN_DataFrame."
+_EXTENDED = 1 << 31
+"""Bit of an identifier that marks one of 29 bits, where there is no channel for it."""
+_IDENTIFIER = (1 << 29) - 1
+
+
+class MdfBus(CanSource):
+    """The CAN messages of an MDF file."""
+
+    def __init__(
+        self, file: Path, bus: CanBus, database: Any, spool: Spool, mdf: MdfSource
+    ) -> None:
+        """Take what a trace does, and the open file."""
+        super().__init__(file, bus, database, spool)
+        self._mdf = mdf
+
+    def _read_trace(self) -> None:
+        """Keep the frames of the wanted messages, and note the numbers of all."""
+        for number, places in self._mdf.groups_with(f"{_FRAME}ID"):
+            names = ("ID", "DataBytes", "DataLength", "IDE", "BusChannel")
+            there = {n: places[_FRAME + n] for n in names if _FRAME + n in places}
+            if "DataBytes" not in there:
+                raise InputError(
+                    f"{shown(self._file)}: group {number} has frames without {_FRAME}DataBytes. "
+                    "Export it again, with payloads."
+                )
+            for window in self._mdf.windows(number, there):
+                self._keep(dict(zip(there, window, strict=True)))
+        if not self._numbers:
+            raise InputError(
+                f"{shown(self._file)}: there is no CAN frame in it ({_FRAME}ID). Map its channels "
+                "without [can] in the mapping."
+            )
+
+    def _keep(self, found: dict[str, Any]) -> None:
+        """Keep some frames of a group."""
+        numbers = found["ID"].samples.astype(np.int64)
+        extended = numbers & _EXTENDED != 0
+        if "IDE" in found:
+            extended |= found["IDE"].samples.astype(np.int64) != 0
+        payloads = _payloads(found["DataBytes"].samples)
+        sizes = np.full(len(numbers), payloads.shape[1])
+        if "DataLength" in found:
+            sizes = np.minimum(sizes, found["DataLength"].samples.astype(np.int64))
+        buses = np.zeros(len(numbers), dtype=np.int64)
+        if "BusChannel" in found:
+            buses = found["BusChannel"].samples.astype(np.int64)
+        times_s = self._mdf.times_s(found["ID"])
+        keys = (numbers & _IDENTIFIER) << 1 | extended
+        for key in np.unique(keys).tolist():
+            of = key >> 1, bool(key & 1)
+            self._note(of)
+            if of in self._frames:
+                some = keys == key
+                self._frames[of].extend(times_s[some], buses[some], sizes[some], payloads[some])
+
+
+def _payloads(samples: NDArray[Any]) -> Bytes:
+    """Return payloads as a matrix of bytes, those that are shorter filled up."""
+    if samples.ndim > 1:
+        return samples.astype(np.uint8, copy=False)
+    found = np.asarray(samples, dtype="S64" if samples.dtype.kind == "O" else samples.dtype)
+    return np.ascontiguousarray(found).view(np.uint8).reshape(len(found), -1)
+
+
+@contextmanager
+def open_mdf_bus(file: Path, bus: CanBus) -> Iterator[MdfBus]:
+    """Open an MDF file for the CAN frames in it. Raises `InputError`."""
+    database = parse_database(bus)
+    with closing(Spool()) as spool, open_mdf(file) as mdf:
+        yield MdfBus(file, bus, database, spool, mdf)

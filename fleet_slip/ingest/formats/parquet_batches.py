@@ -1,0 +1,167 @@
+"""Reads Parquet in batches: text, numbers as float64, dates and timestamps."""
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from datetime import date
+from pathlib import Path
+from urllib.parse import unquote
+
+import polars as pl
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from fleet_slip.errors import InputError
+from fleet_slip.ingest.formats.columns import require_columns, shown
+from fleet_slip.ingest.formats.source import Channel
+
+BATCH_ROWS = 2**15
+"""Parquet is read in batches of this many rows."""
+
+BUFFER_BYTES = 2**16
+"""Bytes of a column that are read at once."""
+MAX_FOOTER_BYTES = 2**24
+MAX_TEXT = 1_000
+"""Characters of one text in Parquet: a dictionary can repeat a long one for the price of a bit."""
+
+PARQUET_MAGIC = b"PAR1"
+_PER_DAY = {unit: 86_400 * 10**power for unit, power in {"s": 0, "ms": 3, "us": 6, "ns": 9}.items()}
+_FIRST_DAY = date.min.toordinal() - date(1970, 1, 1).toordinal()
+_END_DAY = date.max.toordinal() + 1 - date(1970, 1, 1).toordinal()
+
+
+class ParquetSource:
+    """An open Parquet file. Keys in the names of its folders, `car=A7`, are columns of text."""
+
+    has_clock = False
+
+    def __init__(self, file: Path, stream: pa.NativeFile) -> None:
+        """Take the file's path and its bytes."""
+        _require_sane_footer(stream, file)
+        self._file, self._stream = file, stream
+        self._schema = pq.ParquetFile(stream).schema_arrow
+        self._keys = {
+            name: text
+            for name, text in partition_keys(file).items()
+            if name not in self._schema.names
+        }
+
+    def channels(self) -> list[Channel]:
+        """Return the columns."""
+        readable = [f.name for f in self._schema if is_readable(f.type)]
+        return [Channel(name) for name in (*readable, *self._keys)]
+
+    def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
+        """Yield rows. Raises `InputError`."""
+        require_columns(self._file, [*self._schema.names, *self._keys], columns)
+        inside = [name for name in columns if name not in self._keys]
+        keys = [pl.lit(self._keys[name]).alias(name) for name in columns if name in self._keys]
+        for batch in _parquet_batches(self._stream, self._file, inside):
+            yield batch.with_columns(keys)
+
+
+@contextmanager
+def open_parquet(file: Path) -> Iterator[ParquetSource]:
+    """Open a Parquet file. Raises `InputError`."""
+    # Not Python's own file: each read of Arrow's threads would wait for the interpreter.
+    with pa.OSFile(os.fsencode(file), "rb") as stream:
+        yield ParquetSource(file, stream)
+
+
+def partition_keys(file: Path) -> dict[str, str]:
+    """Return what the folders above a file say of it, as Hive writes it: `key=value`."""
+    named = (part.partition("=") for part in file.parts[:-1])
+    return {key: unquote(text) for key, equals, text in named if key and equals}
+
+
+def _parquet_batches(
+    stream: pa.NativeFile, file: Path, columns: Sequence[str]
+) -> Iterator[pl.DataFrame]:
+    schema = pq.ParquetFile(stream).schema_arrow
+    texts = [name for name in columns if _is_text(schema.field(name).type)]
+    # Buffered before, the bytes of the whole file would stay in memory until its end; and without
+    # a buffer those of each column of a row group, of which a file may have a single one.
+    parquet = pq.ParquetFile(
+        stream,
+        read_dictionary=texts,
+        page_checksum_verification=True,
+        pre_buffer=False,
+        buffer_size=BUFFER_BYTES,
+    )
+    for batch in parquet.iter_batches(BATCH_ROWS, columns=list(columns)):
+        plain = {name: plain_column(batch.column(name), name, file) for name in columns}
+        yield pl.DataFrame(pa.table(plain))
+
+
+def _require_sane_footer(stream: pa.NativeFile, file: Path) -> None:
+    size = stream.seek(0, 2)
+    stream.seek(max(0, size - 8))
+    tail = stream.read(8)
+    stream.seek(0)
+    if tail[4:] != PARQUET_MAGIC or size < 12:
+        raise InputError(
+            f"{shown(file)}: begins as a Parquet file but has no footer: it is truncated. "
+            "Copy it again."
+        )
+    if int.from_bytes(tail[:4], "little") > MAX_FOOTER_BYTES:
+        raise InputError(
+            f"{shown(file)}: its footer is too large. Write fewer columns or row groups."
+        )
+
+
+def is_readable(kind: pa.DataType) -> bool:
+    """Whether a column of this type is text, a number or a time."""
+    if pa.types.is_dictionary(kind):
+        kind = kind.value_type
+    tests = (_is_text, pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal)
+    times = (pa.types.is_date, pa.types.is_timestamp, pa.types.is_null)
+    return any(is_it(kind) for is_it in (*tests, *times))
+
+
+def _is_text(arrow_type: pa.DataType) -> bool:
+    if pa.types.is_dictionary(arrow_type):
+        arrow_type = arrow_type.value_type
+    return bool(pa.types.is_string(arrow_type) or pa.types.is_large_string(arrow_type))
+
+
+def plain_column(array: pa.Array, name: str, file: Path) -> pa.Array:
+    """Return a column as text, float64, date or timestamp. Raises `InputError` for others."""
+    array.validate(full=True)  # what Parquet calls text need not be UTF-8, and Polars trusts it
+    if pa.types.is_dictionary(array.type):
+        longest = pc.max(pc.utf8_length(array.dictionary)).as_py() if _is_text(array.type) else 0
+        if longest is not None and longest > MAX_TEXT:
+            raise InputError(
+                f"{shown(file)}: column {name!r} has texts of {longest:,} characters, "
+                f"at most {MAX_TEXT:,} are read."
+            )
+        array = array.dictionary_decode()
+    kind = array.type
+    if _is_text(kind):
+        return array
+    if pa.types.is_date(kind) or pa.types.is_timestamp(kind):
+        return _in_calendar(array)
+    if pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_decimal(kind):
+        return pc.cast(array, pa.float64(), safe=False)
+    if pa.types.is_null(kind):
+        return pc.cast(array, pa.float64())
+    raise InputError(
+        f"{shown(file)}: column {name!r} has the type {shown(kind)[:80]}, which is neither a "
+        "number, text nor a time. Convert it or map another one."
+    )
+
+
+def _in_calendar(array: pa.Array) -> pa.Array:
+    """Return dates or timestamps with null for those outside the years 1 to 9999.
+
+    They are no times of a drive, and Polars panics when it should show one.
+    """
+    kind = array.type
+    if pa.types.is_date32(kind):
+        counts, per_day = pc.cast(pc.cast(array, pa.int32()), pa.int64()), 1
+    else:
+        unit = "ms" if pa.types.is_date64(kind) else kind.unit
+        counts, per_day = pc.cast(array, pa.int64()), _PER_DAY[unit]
+    first, end = (max(-(2**63), min(2**63 - 1, days * per_day)) for days in (_FIRST_DAY, _END_DAY))
+    inside = pc.and_(pc.greater_equal(counts, first), pc.less(counts, end))
+    return pc.if_else(inside, array, pa.scalar(None, kind))

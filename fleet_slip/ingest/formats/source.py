@@ -1,0 +1,125 @@
+"""What every format is read as: a table of named columns for each time base of a file.
+
+A format whose files say when each sample was taken (MDF, CAN traces) has clocks of its own: its
+times stand in the column `OWN_TIME`, in s, since 1970 where the file tells the date. In all others
+time is a column like any other.
+"""
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+import polars as pl
+
+from fleet_slip.errors import FleetSlipError, InputError
+from fleet_slip.extras import needed
+from fleet_slip.ingest.formats.columns import shown
+
+OWN_TIME = "\0time"
+"""Column of times in s, where the file has clocks of its own."""
+BASE = "\0base"
+"""Column with the number of the time base that a row is of, where there are several."""
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A column that a file has.
+
+    Attributes:
+        name: as a mapping names it.
+        unit: as the file names it, empty if it does not.
+        base: which time base it is of; what has the same stands in one table.
+    """
+
+    name: str
+    unit: str = ""
+    base: str = ""
+
+
+@dataclass(frozen=True)
+class Base:
+    """The rows of a log that share their times.
+
+    Attributes:
+        name: what goes on in another file of the log has the same.
+        count_rows: returns how many rows there are.
+        read: yields them in the file's order, in bounded batches of the same columns, at least one.
+    """
+
+    name: str
+    count_rows: Callable[[], int]
+    read: Callable[[], Iterator[pl.DataFrame]]
+
+
+class Source(Protocol):
+    """A file that is open for reading."""
+
+    has_clock: bool
+    """Whether its times are in `OWN_TIME`. Such a file is a `ClockSource`."""
+
+    def channels(self) -> list[Channel]:
+        """Return all that can be read, in the file's order."""
+        ...
+
+    def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
+        """Yield rows that have the named columns: text, 64-bit floats, dates or timestamps.
+
+        With a clock, the rows of one time base come after those of another; each batch has
+        `OWN_TIME` and those of the columns that are of its base. Raises `InputError`, for a column
+        that is missing or ambiguous too.
+        """
+        ...
+
+
+@runtime_checkable
+class ClockSource(Source, Protocol):
+    """A file that says when each sample was taken."""
+
+    def bases(self, columns: Sequence[str]) -> list[Base]:
+        """Return the time bases that have one of the columns. Raises `InputError`."""
+        ...
+
+
+@contextmanager
+def reading_with(file: Path, package: str) -> Iterator[Any]:
+    """Give a package of the extra `logs`; turn what it raises at a file into an `InputError`.
+
+    Its authors raise whatever a damaged file leads to, so that there is no list to catch.
+    """
+    with needed("logs", f"{shown(file)}: its format"):
+        module = import_module(package)
+    logging.getLogger(package.partition(".")[0]).setLevel(logging.CRITICAL)
+    try:
+        yield module
+    except (FleetSlipError, MemoryError):
+        raise
+    except Exception as error:
+        reason = shown(str(error).strip().split("\n")[0][:200]) or type(error).__name__
+        raise InputError(
+            f"{shown(file)}: {package} cannot read it: {reason}. Is it complete? Copy it again, or "
+            "export it in another format."
+        ) from None
+
+
+def as_column(file: Path, name: str, values: np.ndarray[Any, Any]) -> pl.Series:
+    """Return an array as text or 64-bit floats. Raises `InputError` if it is neither."""
+    if values.ndim != 1:
+        raise InputError(
+            f"{shown(file)}: channel {name!r} has {' x '.join(map(str, values.shape))} values, "
+            "not one a row. Map one of its columns."
+        )
+    if values.dtype.kind == "S":
+        return pl.Series(name, [text.decode("utf-8", "replace").strip("\0") for text in values])
+    if values.dtype.kind in "UO":
+        return pl.Series(name, [str(text) for text in values], pl.String)
+    if values.dtype.kind not in "iufb":
+        raise InputError(
+            f"{shown(file)}: channel {name!r} is of the type {values.dtype}, neither a number nor "
+            "text. Map another one."
+        )
+    return pl.Series(name, np.ascontiguousarray(values, dtype=np.float64))

@@ -1,0 +1,1 @@
+"""How drives land in the warehouse, once."""

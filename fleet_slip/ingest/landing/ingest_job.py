@@ -1,0 +1,182 @@
+"""Brings measured logs into the warehouse; the same file through the same mapping lands once."""
+
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from fleet_slip.compute.tasks import run_tasks
+from fleet_slip.errors import InputError
+from fleet_slip.files.folder import StoredFile
+from fleet_slip.ingest.drafting.suspicion import Suspicion
+from fleet_slip.ingest.drives.totals import IngestCounts
+from fleet_slip.ingest.landing.folders import KnownFiles
+from fleet_slip.ingest.landing.landing import (
+    AskedFile,
+    FileOutcome,
+    Landing,
+    WrittenBatch,
+    unit_of,
+    write_batch,
+)
+from fleet_slip.ingest.landing.log_files import Log, StoredParts
+from fleet_slip.ingest.landing.look_alikes import find_vehicles_like
+from fleet_slip.ingest.mapping.mapping import Mapping
+from fleet_slip.progress import Progress, no_progress
+from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.words import number_of
+
+BATCH_BYTES = 2**24
+"""Files are read, written and committed together up to this size."""
+BATCH_FILES = 500
+FAILURES_SHOWN = 5
+
+Batch: TypeAlias = tuple[AskedFile, ...]
+
+
+@dataclass(frozen=True)
+class IngestReport:
+    """What became of one file."""
+
+    file: str
+    new: bool
+    counts: IngestCounts
+    look_alikes: tuple[tuple[str, ...], ...] = ()
+    """Names that differ only in their Unicode form: in the file, or of cars in the logs."""
+    drives_forgotten: int = 0
+    """Drives that were left out: of cars that were forgotten, or forgotten themselves."""
+    suspicions: tuple[Suspicion, ...] = ()
+    """What looks wrong in its longest drive; of small files that land together, in one of all."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `ingest --json` prints."""
+        return {
+            "file": self.file,
+            "new": self.new,
+            "rows_read": self.counts.rows_read,
+            "rows_left_out": self.counts.rows_left_out,
+            "rows_kept": self.counts.rows_kept,
+            "rows_quarantined": sum(self.counts.quarantined.values()),
+            "quarantined": self.counts.quarantined,
+            "drives": self.counts.drives,
+            "drives_forgotten": self.drives_forgotten,
+            "drives_resampled": self.counts.drives_resampled,
+            "ticks": self.counts.ticks,
+            "look_alikes": self.look_alikes,
+            "suspicions": [vars(one) for one in self.suspicions],
+        }
+
+
+def ingest_file(warehouse: Warehouse, file: Path, mapping: Mapping) -> IngestReport:
+    """Read a measured log and commit its drives, and its quarantined rows before them.
+
+    Raises `InputError` or `ConfigError` for a file or mapping that is not usable; then nothing is
+    written.
+    """
+    (report,) = ingest_files(warehouse, [file], mapping)
+    return report
+
+
+def ingest_files(
+    warehouse: Warehouse,
+    files: Iterable[Log],
+    mapping: Mapping,
+    executor: Executor | None = None,
+    known: KnownFiles | None = None,
+    progress: Progress = no_progress,
+) -> Iterator[IngestReport]:
+    """Ingest files, and yield a report of each as it is committed; small files land together.
+
+    With an executor batches are read and written by its workers, in any order; threads of this
+    process take those of small files only, since a large one keeps all cores and much of the
+    memory busy by itself. `known` remembers what landed, and refuses a file that has changed since.
+    `progress` counts rows of each file as it is read, but for those that an executor's workers
+    read.
+
+    A file that is not usable does not hold up the others: when they are done `InputError` tells
+    of it. Raises `ClusterError` at the end for files that workers died of.
+    """
+    write = partial(write_batch, warehouse, mapping)
+    if executor is None:
+        write = partial(write, progress=progress)
+    warehouse.logs.require_writable(mapping.signals)
+    failures: list[InputError] = []
+    asked = (AskedFile(file, known.digest_of(file) if known else None) for file in files)
+    for batch, written in _written(executor, write, _batches(asked)):
+        failures += written.failures
+        # Not the file's name: it may name a car, and the Delta log outlives what is forgotten.
+        note = {"job": "ingest", "mapping": mapping.name, "digest": written.digest}
+        landing = Landing(warehouse, partial(write, batch), written, note)
+        landing.commit("quarantine")
+        new = landing.commit("logs")
+        for outcome in landing.written.outcomes:
+            yield _report(warehouse, outcome, new)
+            new -= {unit_of(outcome.digest).name}  # the same content in another file is not new
+            if known is not None:
+                known.remember(outcome.file, outcome.digest)
+    if failures:
+        raise _joined(failures)
+
+
+def _written(
+    executor: Executor | None, write: Callable[[Batch], WrittenBatch], batches: Iterable[Batch]
+) -> Iterator[tuple[Batch, WrittenBatch]]:
+    """Yield batches as they are written."""
+    alone: list[Batch] = []
+    if isinstance(executor, ThreadPoolExecutor):
+        together: list[Batch] = []
+        for batch in batches:
+            (alone if _size_of(batch[0].file) >= BATCH_BYTES else together).append(batch)
+        batches = together
+    yield from run_tasks(executor, write, batches, lambda batch: str(batch[0].file))
+    yield from run_tasks(None, write, alone, str)
+
+
+def _batches(files: Iterable[AskedFile]) -> Iterator[Batch]:
+    """Group files, in their order, into batches of `BATCH_BYTES` and one file at least."""
+    batch: list[AskedFile] = []
+    size = 0
+    for asked in files:
+        more = _size_of(asked.file)
+        if batch and (size + more > BATCH_BYTES or len(batch) >= BATCH_FILES):
+            yield tuple(batch)
+            batch, size = [], 0
+        batch.append(asked)
+        size += more
+    if batch:
+        yield tuple(batch)
+
+
+def _size_of(log: Log) -> int:
+    if isinstance(log, StoredFile):
+        return log.size_bytes
+    if isinstance(log, StoredParts):
+        return BATCH_BYTES  # or more: it is a batch of its own
+    try:
+        return log.stat().st_size
+    except OSError:
+        return 0  # whoever reads it says what is wrong
+
+
+def _report(warehouse: Warehouse, outcome: FileOutcome, new: frozenset[str]) -> IngestReport:
+    is_new = unit_of(outcome.digest).name in new
+    vehicles = find_vehicles_like(warehouse, outcome.vehicles) if is_new else ()
+    look_alikes = tuple(sorted({*outcome.look_alikes, *vehicles}))
+    suspicions = outcome.suspicions if is_new else ()
+    return IngestReport(
+        str(outcome.file), is_new, outcome.counts, look_alikes, outcome.left_out, suspicions
+    )
+
+
+def _joined(failures: list[InputError]) -> InputError:
+    """Return one error that tells of all."""
+    if len(failures) == 1:
+        return failures[0]
+    told = " ".join(map(str, failures[:FAILURES_SHOWN]))
+    more = len(failures) - FAILURES_SHOWN
+    return InputError(
+        f"{number_of(len(failures), 'file')} cannot be used; all others are in. {told}"
+        + (f" And {more:,} more." if more > 0 else "")
+    )

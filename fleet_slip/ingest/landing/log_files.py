@@ -1,0 +1,139 @@
+"""Finds measured logs: files, those of a folder, and folders whose files are parts of one log.
+
+They are on this machine, or on an object store.
+"""
+
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from glob import glob
+from pathlib import Path
+from typing import TypeAlias
+
+from fleet_slip.errors import InputError, UsageError
+from fleet_slip.extras import needed
+from fleet_slip.files.folder import StoredFile
+from fleet_slip.ingest.formats.columns import shown
+
+SUFFIXES = (
+    ".csv", ".csv.gz", ".csv.zst", ".parquet", ".pq", ".mf4", ".mdf", ".mat", ".h5", ".hdf5",
+    ".blf", ".asc", ".log", ".trc", ".duckdb", ".ddb", ".mcap",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class StoredParts:
+    """A folder of an object store whose files are parts of one log; as text it is its URL."""
+
+    url: str
+
+    def __str__(self) -> str:
+        """Return the URL."""
+        return self.url
+
+
+Log: TypeAlias = Path | StoredFile | StoredParts
+"""A measured log: a file, or a folder whose files are its parts, here or on an object store."""
+
+Place: TypeAlias = Path | str
+"""What a person gives: a path, a pattern, or the URL of an object store."""
+
+
+def find_logs(given: Iterable[Place]) -> list[Log]:
+    """Return files as they are given, and those in folders that have the suffix of a log, sorted.
+
+    A path that is none may be a pattern, `2024-*/*.mf4`, for who gives it in quotes. Hidden files
+    and folders are passed over. Raises `InputError` for a folder or a pattern without any.
+    """
+    found: list[Log] = []
+    for place in given:
+        if is_url(place):
+            found += _stored(str(place))
+        else:
+            found += find_files(Path(place))
+    return found
+
+
+def find_whole_logs(given: Iterable[Place]) -> list[Log]:
+    """Return folders as logs whose files are their parts. Raises `UsageError` for what is none."""
+    found: list[Log] = []
+    for place in given:
+        if not is_url(place) and not Path(place).is_dir():
+            raise UsageError(f"{place}: only a folder has the files of one log. Give it.")
+        found.append(StoredParts(str(place).rstrip("/")) if is_url(place) else Path(place))
+    return found
+
+
+def find_files(path: Path) -> list[Path]:
+    """Return a file of this machine, or those that a folder or a pattern stands for."""
+    if is_pattern(path):
+        return _matching(path)
+    if not path.is_dir():
+        return [path]
+    inside = sorted(_logs_below(path))
+    if not inside:
+        raise InputError(f"{shown(path)}: {_NO_LOG}")
+    return inside
+
+
+def names_several(place: Place) -> bool:
+    """Whether it is a folder or a pattern, of which what is new is taken."""
+    if is_url(place):
+        return not str(place).lower().endswith(SUFFIXES) or is_pattern(str(place))
+    return Path(place).is_dir() or is_pattern(Path(place))
+
+
+def is_url(place: Place) -> bool:
+    """Whether a place is on an object store."""
+    return isinstance(place, str) and "://" in place
+
+
+def is_pattern(place: Place) -> bool:
+    """Whether a path stands for those that match it."""
+    return any(c in str(place) for c in "*?[") and (is_url(place) or not Path(place).exists())
+
+
+def parts_of(log: Path) -> list[Path]:
+    """Return the files that one log is in: itself, or those of its folder. Raises `InputError`."""
+    return find_files(log)
+
+
+def stored_parts(log: StoredFile | StoredParts) -> list[StoredFile]:
+    """Return the objects that one log is in. Raises `InputError` and `StorageError`."""
+    return [log] if isinstance(log, StoredFile) else _stored(log.url)
+
+
+_NO_LOG = f"no file in this folder has the suffix of a log: {', '.join(SUFFIXES)}."
+
+
+def _stored(url: str) -> list[StoredFile]:
+    with needed("objects", "a log on an object store"):
+        from fleet_slip.files.object_inputs import find_below, find_object  # noqa: PLC0415
+    if (one := find_object(url)) is not None:
+        return [one]
+    below = find_below(url)
+    seen = [file for file in below if "/." not in str(file) or "/." in url]
+    if is_pattern(url):
+        found, none = seen, "no object matches this pattern. Look at its folder."
+    else:
+        found = [file for file in seen if file.name.lower().endswith(SUFFIXES)]
+        none = _NO_LOG if below else "no such object, and no folder."
+    if not found:
+        raise InputError(f"{shown(url)}: {none}")
+    return found
+
+
+def _matching(pattern: Path) -> list[Path]:
+    names = sorted(glob(str(pattern), recursive=True))  # noqa: PTH207 - takes absolute ones
+    files = [path for path in map(Path, names) if path.is_file()]
+    if not files:
+        raise InputError(f"{shown(pattern)}: no file matches this pattern. Look at its folder.")
+    return files
+
+
+def _logs_below(folder: Path) -> Iterator[Path]:
+    for parent, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        for name in names:
+            if name.lower().endswith(SUFFIXES) and not name.startswith("."):
+                yield Path(parent, name)

@@ -1,0 +1,259 @@
+"""The mapping of a measured log: which column is which signal, in which unit, with which sign."""
+
+from datetime import UTC, date, datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import polars as pl
+from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
+
+from fleet_slip.canonical import canonical_ascii
+from fleet_slip.catalogue.signals import Identifier, catalogue
+from fleet_slip.config import Config, load_config
+from fleet_slip.errors import ConfigError
+from fleet_slip.ingest.formats.can_bus import CanBus, read_can_database
+from fleet_slip.ingest.formats.columns import describe_unknown
+from fleet_slip.ingest.formats.csv_batches import PlainNumbers
+from fleet_slip.ingest.formats.csv_format import CsvFormat
+from fleet_slip.ingest.formats.duckdb_table import DuckdbRows
+from fleet_slip.ingest.formats.source import OWN_TIME
+from fleet_slip.ingest.mapping.condition_text import text_conditions
+from fleet_slip.ingest.mapping.names import Name, PositiveFloat
+from fleet_slip.ingest.mapping.row_condition import RowCondition
+from fleet_slip.ingest.mapping.signal_column import SignalColumn
+from fleet_slip.ingest.mapping.units import require_unit
+from fleet_slip.ingest.mapping.vehicle_facts import (
+    VehicleFacts,
+    read_vehicle_facts,
+    require_tyres_column,
+)
+from fleet_slip.resources import find_config
+
+
+class FromColumn(Config):
+    """A drive's metadata that stand in a column of the file; a new value begins a new drive."""
+
+    column: Name
+
+
+class TimeBase(Config):
+    """Where time is from, and which gaps are bridged or end a drive.
+
+    Either `column` with a `unit` (numbers) or a `format` (timestamps as text, strftime codes; naive
+    ones are UTC; a Parquet timestamp column needs neither), or `rate_hz` for equally spaced rows,
+    or `own_clock` for a format that says itself when a sample was taken.
+    """
+
+    column: Name | None = None
+    unit: str | None = None
+    format: Name | None = None
+    rate_hz: Annotated[float, Field(ge=1, le=100_000)] | None = None
+    own_clock: bool = Field(default=False, exclude_if=lambda value: not value)
+    longest_gap_s: Annotated[PositiveFloat, Field(le=10)] = 0.1
+    """Samples of a signal that lie further apart are not interpolated between."""
+    split_gap_s: Annotated[PositiveFloat, Field(le=60)] = 1.0
+    """A step in time larger than this, forward or back, begins a new drive."""
+
+    @field_validator("format")
+    @classmethod
+    def _format_is_known(cls, text: str | None) -> str | None:
+        if text is not None and not _reads_back(text):
+            raise ValueError(f"{text!r} is not a strftime format with date and time")
+        return text
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "TimeBase":
+        if [self.column is None, self.rate_hz is None, not self.own_clock].count(False) != 1:
+            raise ValueError(
+                "needs either 'column' or 'rate_hz', or 'own_clock' for MDF files and CAN traces"
+            )
+        if self.column is None and (self.unit is not None or self.format is not None):
+            raise ValueError("'unit' and 'format' describe a column, and there is none")
+        if self.unit is not None and self.format is not None:
+            raise ValueError("'unit' is for numbers and 'format' for timestamps: give one of them")
+        if self.longest_gap_s > self.split_gap_s:
+            raise ValueError("longest_gap_s cannot be larger than split_gap_s")
+        if self.unit is not None:
+            try:
+                require_unit(self.unit, "s")
+            except ValueError as error:
+                raise ValueError(f"{self.column} {error}") from None
+        return self
+
+    @property
+    def is_dated(self) -> bool:
+        """Whether times can tell the day."""
+        return self.unit is None and self.rate_hz is None
+
+    @property
+    def key(self) -> str | None:
+        """The column that has the times of a batch, None if the rows are equally spaced."""
+        return OWN_TIME if self.own_clock else self.column
+
+
+def _is_empty(value: object) -> bool:
+    return value in ((), None)
+
+
+class DriveMetadata(Config):
+    """What is known of each drive, given here or taken from a column; absent stays null."""
+
+    column: Name | None = None
+    """Every value of this column is a drive of its own."""
+    day: date | FromColumn | None = None
+    """Date of the drive; with timestamps it may be left out and is that of the first row (UTC)."""
+    vehicle_id: Name | FromColumn
+    vehicle_model: Name | FromColumn | None = None
+    track: Name | FromColumn | None = None
+    mass_kg: PositiveFloat | FromColumn | None = None
+    tyres: Annotated[Name | FromColumn, AfterValidator(require_tyres_column)] | None = Field(
+        default=None, exclude_if=_is_empty
+    )
+    adhesion: PositiveFloat | FromColumn | None = None
+
+
+class Mapping(Config):
+    """How one kind of measured file becomes drives. Identifies itself by `name`."""
+
+    name: Identifier
+    missing: tuple[str, ...] = ()
+    """Texts that mean "no value", besides the empty one; `nan` also clears NaN in binary files."""
+    csv: CsvFormat = CsvFormat()
+    can: CanBus | None = Field(default=None, exclude_if=_is_empty)
+    duckdb: DuckdbRows | None = Field(default=None, exclude_if=_is_empty)
+    time: TimeBase
+    drive: DriveMetadata
+    signals: dict[str, SignalColumn] = Field(min_length=1)
+    where: tuple[RowCondition, ...] = Field(default=(), exclude_if=_is_empty)
+    """Conditions that a row meets, all of them, or is left out and only counted; also as text."""
+    vehicles: tuple[VehicleFacts, ...] | Name = Field(default=(), exclude_if=_is_empty)
+    """What is known of each car; a text is the path of a CSV file, seen from the mapping's own."""
+
+    @field_validator("where", mode="before")
+    @classmethod
+    def _texts_are_read(cls, where: Any, info: ValidationInfo) -> Any:
+        texts = [where] if isinstance(where, str) else where
+        if not isinstance(texts, list | tuple):
+            return where
+        signals = info.data.get("signals", {})
+        read = [text_conditions(t, signals) if isinstance(t, str) else [t] for t in texts]
+        return [condition for conditions in read for condition in conditions]
+
+    @model_validator(mode="after")
+    def _conditions_name_signals(self) -> "Mapping":
+        for condition in self.where:
+            if condition.signal is not None and condition.signal not in self.signals:
+                raise ValueError(f"where: {condition.signal!r} is no signal of this mapping")
+        return self
+
+    @model_validator(mode="after")
+    def _signals_fit_catalogue(self) -> "Mapping":
+        known = catalogue().signals
+        for name, column in self.signals.items():
+            if name not in known:
+                raise ValueError(describe_unknown(name, known))
+            try:
+                column.require_unit_of(name, known[name].unit)
+            except ValueError as error:
+                raise ValueError(f"signals.{name}: {column.column} {error}") from None
+        return self
+
+    @model_validator(mode="after")
+    def _day_is_known(self) -> "Mapping":
+        if self.drive.day is None and not self.time.is_dated:
+            raise ValueError("drive.day is needed: the time has no date. Give a date or a column")
+        return self
+
+    @model_validator(mode="after")
+    def _vehicle_model_is_known(self) -> "Mapping":
+        if self.drive.vehicle_model is None and not self.vehicles:
+            raise ValueError("drive.vehicle_model is needed, or 'vehicles', a table of the cars")
+        return self
+
+    @model_validator(mode="after")
+    def _times_are_numbers(self) -> "Mapping":
+        for name, signal in self.signals.items():
+            if signal.time is not None and self.time.unit is None:
+                raise ValueError(f"signals.{name}: 'time' needs [time] with 'column' and 'unit'")
+        return self
+
+    def __hash__(self) -> int:
+        """Return the hash of what identifies it."""
+        return hash(self.canonical_json())
+
+    def time_bases(self) -> dict[str | None, list[str]]:
+        """Return the columns that the mapping uses, each once, by the column of their times."""
+        own = {s.column for s in self.signals.values() if s.time not in {None, self.time.column}}
+        common = [name for name in self.common_columns() if name not in own]
+        bases = {self.time.column: [self.time.column, *common]}
+        for signal in self.signals.values():
+            time = self.time.column if signal.time is None else signal.time
+            bases.setdefault(time, [time]).append(signal.column)
+        return {
+            time: list(dict.fromkeys(name for name in names if name is not None))
+            for time, names in bases.items()
+        }
+
+    def common_columns(self) -> list[str]:
+        """Return the columns that say something of all signals: of the drive, and conditions."""
+        metadata = (getattr(self.drive, name) for name in DriveMetadata.model_fields)
+        names = [self.drive.column]
+        names += [source.column for source in metadata if isinstance(source, FromColumn)]
+        for condition in self.where:
+            of = condition.signal
+            names.append(condition.column if of is None else self.signals[of].column)
+        return list(dict.fromkeys(name for name in names if name is not None))
+
+    @property
+    def plain_numbers(self) -> PlainNumbers:
+        """Columns of which only the number counts, not how it is written."""
+        if len(self.time_bases()) > 1:
+            return PlainNumbers()
+        numbers = {signal.column for signal in self.signals.values()}
+        if self.time.column is not None and self.time.unit is not None:
+            numbers.add(self.time.column)
+        columns = frozenset(numbers - set(self.common_columns()))
+        return PlainNumbers(columns, tuple(float(text) for text in self.missing if is_number(text)))
+
+    def vehicle_facts(self) -> tuple[VehicleFacts, ...]:
+        """Return what is known of each car. Raises `ConfigError` if its file was not read."""
+        if isinstance(self.vehicles, str):
+            raise ConfigError(f"{self.vehicles}: not read. Load the mapping by its name or path.")
+        return self.vehicles
+
+    def canonical_json(self) -> str:
+        """The mapping as JSON that does not depend on the order or layout of its TOML file."""
+        return canonical_ascii(self.model_dump(mode="json"))
+
+
+def is_number(text: str) -> bool:
+    """Whether a text that means "no value" is also a number."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _reads_back(timestamp_format: str) -> bool:
+    """Whether a moment that is written in this format can be read, to the minute."""
+    moment = datetime(2024, 5, 31, 12, 34, tzinfo=UTC)
+    try:
+        written = pl.Series([moment]).dt.to_string(timestamp_format)
+        read = written.str.to_datetime(timestamp_format, strict=False)[0]
+    except (pl.exceptions.PolarsError, pl.exceptions.PanicException):
+        return False
+    return isinstance(read, datetime) and read.replace(tzinfo=UTC) == moment
+
+
+def load_mapping(name_or_path: str) -> Mapping:
+    """Load a mapping by name from `configs/mappings`, or by path. Raises `ConfigError`."""
+    file = find_config("mappings", name_or_path)
+    mapping = load_config(file, Mapping)
+    folder = Path(str(file)).parent
+    if isinstance(mapping.vehicles, str):
+        facts = read_vehicle_facts(folder / mapping.vehicles)
+        mapping = mapping.model_copy(update={"vehicles": facts})
+    if mapping.can is not None:
+        mapping = mapping.model_copy(update={"can": read_can_database(mapping.can, folder)})
+    return mapping

@@ -1,0 +1,124 @@
+"""How one column of a file becomes a signal: unit, sign, gain, offset, table, delay."""
+
+import itertools
+from typing import Annotated
+
+import numpy as np
+import polars as pl
+from pydantic import AfterValidator, Field, model_validator
+
+from fleet_slip.arrays import FloatArray
+from fleet_slip.config import Config
+from fleet_slip.ingest.mapping.names import Name
+from fleet_slip.ingest.mapping.units import conversion_factor, require_unit
+
+FiniteFloat = Annotated[float, Field(allow_inf_nan=False)]
+WHEELS = "wheel_"
+"""How the names of wheel speeds begin."""
+VELOCITY = "m/s"
+MAX_TABLE = 10_000
+
+
+def _increasing(table: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+    if table and len(table) < 2:
+        raise ValueError("needs two points at least")
+    if any(left >= right for (left, _), (right, _) in itertools.pairwise(table)):
+        raise ValueError("needs points in ascending order of their first number, each once")
+    return table
+
+
+Table = Annotated[
+    tuple[tuple[FiniteFloat, FiniteFloat], ...],
+    Field(max_length=MAX_TABLE),
+    AfterValidator(_increasing),
+]
+
+
+def _absent(value: object) -> bool:
+    """Whether a key says nothing, so that mappings without it stay what they were."""
+    return value in (None, (), 0.0)
+
+
+class SignalColumn(Config):
+    """One column of the file: `signal = factor(unit) * (±gain * table(value) + offset) / radius`.
+
+    Keys at their default are left out of the mapping's identity where they came after the first
+    release, so that a file is not ingested twice because a program learned a word.
+    """
+
+    column: Name
+    unit: str
+    negate: bool = False
+    """For axes that are not ISO 8855, such as y to the right."""
+    offset: FiniteFloat = 0.0
+    """Added after the sign, in the column's unit."""
+    gain: FiniteFloat = Field(default=1.0, exclude_if=lambda value: value == 1.0)
+    """Multiplies the value, such as the ratio of a steering gear."""
+    radius_m: Annotated[FiniteFloat, Field(ge=0.05, le=2)] | None = Field(
+        default=None, exclude_if=_absent
+    )
+    """Rolling radius of a wheel whose speed is logged as a velocity."""
+    table: Table = Field(default=(), exclude_if=_absent)
+    """Points (value, value in `unit`), straight lines between them; outside is out of range."""
+    delay_s: Annotated[FiniteFloat, Field(ge=-10, le=10, default=0.0, exclude_if=_absent)]
+    """How much later than it happened a value stands in the file."""
+    interpolate: bool = Field(default=True, exclude_if=bool)
+    """False: samples stand at the nearest tick, and ticks between them have no value."""
+    longest_gap_s: Annotated[FiniteFloat, Field(gt=0, le=10)] | None = Field(
+        default=None, exclude_if=_absent
+    )
+    """Instead of the mapping's, for a signal with a rate of its own."""
+    time: Name | None = Field(default=None, exclude_if=_absent)
+    """The column of this signal's times, where the file has several, in the unit of the others."""
+
+    @model_validator(mode="after")
+    def _gain_is_something(self) -> "SignalColumn":
+        if self.gain == 0:
+            raise ValueError("gain cannot be 0")
+        return self
+
+    def require_unit_of(self, signal: str, si_unit: str) -> None:
+        """Raise `ValueError` if the column cannot be this signal."""
+        is_wheel = signal.startswith(WHEELS)
+        if self.radius_m is not None and not is_wheel:
+            raise ValueError("has a radius_m, and radius_m is for wheel speeds")
+        if self.radius_m is None and is_wheel and self._is_velocity():
+            raise ValueError(
+                f"is a velocity in {self.unit!r}; {signal} needs an angular velocity: add "
+                "radius_m, the rolling radius of the wheel"
+            )
+        require_unit(self.unit, self._measured_in(si_unit), signal)
+
+    def linear(self, si_unit: str) -> tuple[float, float]:
+        """Return (gain, bias): `value in SI = gain * table(value in the file) + bias`."""
+        factor = conversion_factor(self.unit, self._measured_in(si_unit))
+        if self.radius_m is not None:
+            factor /= self.radius_m
+        return (-factor if self.negate else factor) * self.gain, factor * self.offset
+
+    def looked_up(self, number: pl.Expr) -> pl.Expr:
+        """Return table(value), NaN outside of the table; the value itself without one."""
+        return number.map_batches(self._interpolate, pl.Float64) if self.table else number
+
+    def is_outside_table(self, number: pl.Expr) -> pl.Expr:
+        """Whether a value is below or above all that the table has."""
+        if not self.table:
+            return pl.lit(value=False)
+        return (number < self.table[0][0]) | (number > self.table[-1][0])
+
+    def _interpolate(self, numbers: pl.Series) -> pl.Series:
+        points: FloatArray = np.array(self.table)
+        values = numbers.to_numpy().astype(np.float64)
+        found = np.interp(values, points[:, 0], points[:, 1], left=np.nan, right=np.nan)
+        found[np.isnan(values)] = np.nan
+        return pl.Series(numbers.name, found).set(numbers.is_null(), None)
+
+    def _measured_in(self, si_unit: str) -> str:
+        return si_unit if self.radius_m is None else VELOCITY
+
+    def _is_velocity(self) -> bool:
+        try:
+            require_unit(self.unit, VELOCITY)
+        except ValueError:
+            return False
+        return True

@@ -1,0 +1,1 @@
+"""Which inputs: nested models, subsets, orders and criteria."""

@@ -1,0 +1,216 @@
+"""Ranking and criterion together: which of the k+1 nested models, and how well that choice does.
+
+A choice made on the data flatters the figures of its winner. The honest figures come from making
+the whole choice again inside every training fold: ranking, evidence, criterion and fit.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from fleet_slip.arrays import IntArray
+from fleet_slip.errors import QuestionError
+from fleet_slip.regression.choice.criteria import best_size, criterion_values
+from fleet_slip.regression.choice.nested import nested_fits
+from fleet_slip.regression.choice.ranking import rank
+from fleet_slip.regression.choice.winner import DEFAULT_WORTH, Worth, choose
+from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.regression.exact.least_squares import Fit, Scales
+from fleet_slip.regression.inference.drive_moments import DriveMoments
+from fleet_slip.regression.inference.evidence import Evidence
+from fleet_slip.regression.validation.crossval import (
+    CrossValidation,
+    assemble,
+    cross_validate,
+    held_out_errors,
+    least_squares,
+)
+from fleet_slip.regression.validation.folds import Folds
+
+CROSS_VALIDATION = "cross-validation"
+"""The criterion that cross-validates all nested models; the smallest that is nearly best wins."""
+
+
+FEWEST_FOLDS = 3
+"""To make a choice again inside the training folds, two of them must be left."""
+
+
+@dataclass(frozen=True)
+class Rule:
+    """How to choose: a name in `RANKINGS`, and one in `CRITERIA` or `CROSS_VALIDATION`.
+
+    `worth` is what a signal must gain for cross-validation to keep it.
+    """
+
+    ranking: str
+    criterion: str
+    worth: Worth = DEFAULT_WORTH
+
+
+@dataclass(frozen=True)
+class NestedChoice:
+    """A choice among the nested models of an order.
+
+    Attributes:
+        order: the ranked signals.
+        size: how many of them are chosen.
+        fit: exact fit of the chosen ones, in counts.
+        evidence: what the criterion looked at.
+        values: of the criterion for 0..k signals, smaller is better; for cross-validation the
+            negative correlations.
+    """
+
+    order: tuple[str, ...]
+    size: int
+    fit: Fit
+    evidence: Evidence
+    values: tuple[float, ...]
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """The chosen signals."""
+        return self.order[: self.size]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what a JSON document needs."""
+        return {
+            "order": list(self.order),
+            "signals": list(self.signals),
+            "criterion_values": list(self.values),
+            **self.evidence.as_dict(),
+        }
+
+
+@dataclass(frozen=True)
+class NestedDistances:
+    """How far the k+1 nested models of a given order are from the full and from the true one.
+
+    Attributes:
+        order: the signals.
+        evidence: their contributions, and with these the distance D of equation (2).
+        null: the model without any signal, cross-validated.
+    """
+
+    order: tuple[str, ...]
+    evidence: Evidence
+    null: CrossValidation
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what a JSON document needs."""
+        return {
+            "order": list(self.order),
+            **self.evidence.as_dict(),
+            "null": self.null.as_dict(),
+        }
+
+
+@dataclass(frozen=True)
+class Training:
+    """The rows to choose on.
+
+    Attributes:
+        folds: their folds; the criteria use the total, cross-validation the folds.
+        drives: per-drive moments of the same rows; None takes rows for independent.
+        scales: physical value of one count of each signal.
+        intercept: whether models have one; without it the moments of the drives are about zero.
+    """
+
+    folds: Folds
+    drives: DriveMoments | None
+    scales: Scales
+    intercept: bool = True
+
+    @property
+    def total(self) -> Gram:
+        """The Gram to rank and search on."""
+        return self.folds.total if self.intercept else self.folds.total.about_origin()
+
+    def nested_fits(self, order: Sequence[str], label: str) -> list[Fit]:
+        """Return the k+1 nested fits of an order. Raises `DataError` for dependent signals."""
+        return nested_fits(self.folds.total, order, label, intercept=self.intercept)
+
+    def evidence(self, fits: Sequence[Fit]) -> Evidence:
+        """Return what the rows say of the nested models of an order; raises like `Evidence`."""
+        if self.drives is None:
+            return Evidence.naive(fits)
+        return Evidence.clustered(fits, self.drives)
+
+    def cross_validate(self, name: str, inputs: Sequence[str], label: str) -> CrossValidation:
+        """Cross-validate least squares on given inputs."""
+        procedure = least_squares(inputs, label, intercept=self.intercept)
+        return cross_validate(name, self.folds, procedure, self.scales)
+
+
+def select_nested(
+    training: Training, inputs: Sequence[str], label: str, rule: Rule
+) -> NestedChoice:
+    """Rank the inputs, and choose one of the nested models.
+
+    Raises `DataError` for dependent signals or a label without noise, and `QuestionError` for an
+    unknown rule.
+    """
+    order = rank(rule.ranking, training.total, inputs, label)
+    fits = training.nested_fits(order, label)
+    evidence = training.evidence(fits)
+    if rule.criterion == CROSS_VALIDATION:
+        models = cross_validate_nested(training, order, label)
+        size = len(choose(models, rule.worth).model.signals)
+        values = tuple(-model.correlation for model in models)
+    else:
+        size = best_size(rule.criterion, evidence)
+        values = tuple(criterion_values(rule.criterion, evidence).tolist())
+    return NestedChoice(order, size, fits[size], evidence, values)
+
+
+def measure_distances(training: Training, order: Sequence[str], label: str) -> NestedDistances:
+    """Return the distances of the nested models of an order as it is given.
+
+    Raises `DataError` for dependent signals or a label without noise.
+    """
+    evidence = training.evidence(training.nested_fits(order, label))
+    null = training.cross_validate("none", (), label)
+    return NestedDistances(tuple(order), evidence, null)
+
+
+def cross_validate_nested(
+    training: Training, order: Sequence[str], label: str
+) -> list[CrossValidation]:
+    """Cross-validate the k+1 nested models of a given order; model j is called "first j"."""
+    return [
+        training.cross_validate(f"first {size}", order[:size], label)
+        for size in range(len(order) + 1)
+    ]
+
+
+def cross_validate_selection(
+    name: str,
+    training: Training,
+    fold: IntArray,
+    inputs: Sequence[str],
+    label: str,
+    rule: Rule,
+) -> CrossValidation:
+    """Cross-validate the choice itself: nothing of a fold is seen in choosing for it.
+
+    `fold` says the fold of each of the drives. Raises `DataError` as `select_nested` does.
+    """
+    folds = training.folds
+    tests = []
+    for number, test in enumerate(folds.grams):
+        rest = _without(training, fold, number)
+        model = select_nested(rest, inputs, label, rule).fit.model
+        tests.append(held_out_errors(model, rest.folds.total, test))
+    chosen = select_nested(training, inputs, label, rule).fit.model
+    return assemble(name, folds, tests, chosen, training.scales)
+
+
+def _without(training: Training, fold: IntArray, number: int) -> Training:
+    if len(training.folds.grams) < FEWEST_FOLDS:
+        raise QuestionError("choosing inside the training folds needs at least three folds.")
+    drives = training.drives
+    rest = training.folds.without(number, int(np.count_nonzero(fold != number)))
+    return replace(
+        training, folds=rest, drives=drives.take(fold != number) if drives is not None else None
+    )

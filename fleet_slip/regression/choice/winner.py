@@ -1,0 +1,157 @@
+"""Which model wins: the fewest signals whose shortfall from the best is negligible.
+
+Two things are asked of a gain in error before it justifies a richer model. It must be worth having,
+which a user says; with enough rows every gain is certain, and none need matter. And it must be
+real: larger than its standard error. Models are compared on the same folds, so the error that
+counts is that of the difference, as in a paired test: the folds' difficulty is common to both and
+cancels. The one-standard-error rule of Breiman, Friedman, Olshen and Stone, Classification and
+Regression Trees (1984), section 3.4.3, takes the error of the best model's own figure instead,
+which may be ten times as large.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from fleet_slip.errors import QuestionError
+from fleet_slip.regression.validation.crossval import CrossValidation
+
+
+@dataclass(frozen=True)
+class Worth:
+    """The smallest gain in RMSE that is worth a signal: absolute in rad, or of the best's RMSE."""
+
+    amount: float
+    relative: bool = False
+
+    def of(self, rmse: float) -> float:
+        """Return it in rad, the best model having this RMSE."""
+        return self.amount * rmse if self.relative else self.amount
+
+    def __str__(self) -> str:
+        """Return it as it is asked for."""
+        if self.relative:
+            return f"{100 * self.amount:.3g} % of the best"
+        return f"{math.degrees(self.amount):.4g} deg"
+
+
+DEFAULT_WORTH = Worth(math.radians(0.005))
+"""A twentieth of what the best reference sensors are accurate to, about 0.1 deg."""
+
+
+@dataclass(frozen=True)
+class Shortfall:
+    """How much larger a model's RMSE is than that of the best, over the same folds.
+
+    Attributes:
+        model: the model.
+        rmse: the difference of the pooled RMSEs, in rad; negative if the model's is smaller.
+        standard_error: of it, over the folds.
+        worthless: whether a gain of so much is less than what is worth having.
+    """
+
+    model: CrossValidation
+    rmse: float
+    standard_error: float
+    worthless: bool
+
+    @property
+    def real(self) -> bool:
+        """Whether it is larger than its standard error."""
+        return self.rmse > self.standard_error
+
+    @property
+    def negligible(self) -> bool:
+        """Whether the best model is no reason to do without this one."""
+        return self.worthless or not self.real
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what a JSON document needs."""
+        return {
+            "rmse_deg": math.degrees(self.rmse),
+            "standard_error_deg": math.degrees(self.standard_error),
+            "real": self.real,
+            "negligible": self.negligible,
+        }
+
+    def __str__(self) -> str:
+        """Return the figure with its standard error, in degrees."""
+        return f"{math.degrees(self.rmse):.4f} +- {math.degrees(self.standard_error):.2g} deg"
+
+
+@dataclass(frozen=True)
+class Winner:
+    """The chosen model, the best-correlated one, and the reason in a sentence.
+
+    `shortfalls` are those of all models in their declared order; none if a criterion chose.
+    """
+
+    model: CrossValidation
+    best: CrossValidation
+    reason: str
+    shortfalls: tuple[Shortfall, ...] = ()
+
+
+def choose(models: Sequence[CrossValidation], worth: Worth = DEFAULT_WORTH) -> Winner:
+    """Return the winner of cross-validated models, given in their declared order.
+
+    The best pooled correlation is the reference. Among the models whose RMSE is negligibly larger,
+    the fewest signals win; then the higher exact correlation; then the declared order. Raises
+    `QuestionError` for an empty list.
+    """
+    if not models:
+        raise QuestionError("no model to choose from: the list of models is empty.")
+    best = max(models, key=lambda model: model.sums.signed_r_squared)
+    shortfalls = tuple(fall_short(model, best, worth) for model in models)
+    near = [one for one in shortfalls if one.model is best or one.negligible]
+    fewest = min(len(one.model.signals) for one in near)
+    smallest = [one for one in near if len(one.model.signals) == fewest]
+    winner = max(smallest, key=lambda one: one.model.sums.signed_r_squared)
+    reason = _reason(winner, best, len(near), len(models), worth)
+    return Winner(winner.model, best, reason, shortfalls)
+
+
+def fall_short(model: CrossValidation, best: CrossValidation, worth: Worth) -> Shortfall:
+    """Return how much larger a model's RMSE is than another's, over the same folds."""
+    difference = model.pooled.rmse - best.pooled.rmse
+    worthless = difference < worth.of(best.pooled.rmse)
+    return Shortfall(model, difference, _standard_error(model, best), worthless)
+
+
+def _standard_error(one: CrossValidation, other: CrossValidation) -> float:
+    """Return the standard error of the difference of two models' RMSEs, over the folds.
+
+    Where they were not tested on the same rows, since drives lack signals, nothing can be paired.
+    """
+    first, second = ([fold.rmse for fold in model.folds] for model in (one, other))
+    rows = [[fold.rows for fold in model.folds] for model in (one, other)]
+    if one.fold_names == other.fold_names and rows[0] == rows[1]:
+        return _error_of_mean([a - b for a, b in zip(first, second, strict=True)])
+    return math.hypot(_error_of_mean(first), _error_of_mean(second))
+
+
+def _error_of_mean(values: Sequence[float]) -> float:
+    mean = math.fsum(values) / len(values)
+    square = math.fsum((value - mean) ** 2 for value in values)
+    return math.sqrt(square / (len(values) - 1) / len(values))
+
+
+def _reason(winner: Shortfall, best: CrossValidation, near: int, total: int, worth: Worth) -> str:
+    if winner.model is best and near == total == 1:
+        return f"Model {best.name} is the only one."
+    rmse = f"RMSE {best.pooled.rmse_deg:.4f} deg"
+    if winner.model is best:
+        others = "every other model" if near == 1 else "every model with fewer signals"
+        return (
+            f"Model {best.name} has the best cross-validated correlation, {best.correlation:.4f}, "
+            f"with {rmse}. The error of {others} is larger by {worth} or more, and by more than "
+            "one standard error of the difference."
+        )
+    real = "real, but less than" if winner.real else "not real; worth having would be"
+    return (
+        f"Model {winner.model.name} has the fewest signals ({len(winner.model.signals)}) of the "
+        f"{near} models whose error is negligibly larger than that of model {best.name}, the best "
+        f"({len(best.signals)} signals, {rmse}). The difference, {winner} over the same folds, is "
+        f"{real} {worth}."
+    )

@@ -1,0 +1,148 @@
+"""Figures of merit from exact sums of predictions and labels."""
+
+import math
+import operator
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+from fleet_slip.regression.exact import rounding
+from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.regression.exact.least_squares import LinearModel
+
+
+@dataclass(frozen=True)
+class ErrorSums:
+    """Sums over rows of a prediction p and a label y; they add over folds.
+
+    Attributes:
+        n: number of rows.
+        p, y: sums of predictions and of labels.
+        pp, py, yy: sums of their products.
+        null: sum of (y - m)^2, with m the mean label of the training rows.
+    """
+
+    n: int
+    p: Fraction
+    y: Fraction
+    pp: Fraction
+    py: Fraction
+    yy: Fraction
+    null: Fraction
+
+    def __add__(self, other: "ErrorSums") -> "ErrorSums":
+        """Pool with the sums over other rows."""
+        return ErrorSums(
+            self.n + other.n,
+            self.p + other.p,
+            self.y + other.y,
+            self.pp + other.pp,
+            self.py + other.py,
+            self.yy + other.yy,
+            self.null + other.null,
+        )
+
+    @property
+    def squared_error(self) -> Fraction:
+        """Sum of (p - y)^2."""
+        return self.pp - 2 * self.py + self.yy
+
+    @property
+    def signed_r_squared(self) -> Fraction:
+        """Squared correlation with the correlation's sign: ranks models without rounding."""
+        covariance = self.py - self.p * self.y / self.n
+        variances = (self.pp - self.p**2 / self.n) * (self.yy - self.y**2 / self.n)
+        if variances <= 0:
+            return Fraction(0)
+        return covariance * abs(covariance) / variances
+
+    def figures(self, unit: Fraction) -> "Figures":
+        """Round each figure once; `unit` is the physical value of one count of the label."""
+        bias = (self.p - self.y) / self.n
+        spread = self.squared_error - self.n * bias**2
+        square = self.signed_r_squared
+        return Figures(
+            rows=self.n,
+            correlation=math.copysign(rounding.sqrt(abs(square)), square),
+            rmse=rounding.sqrt(self.squared_error / self.n * unit**2),
+            error_mean=float(bias * unit),
+            error_std=rounding.sqrt(spread / (self.n - 1) * unit**2) if self.n > 1 else 0.0,
+            relative_rmse=rounding.sqrt(self.squared_error / self.null) if self.null else math.inf,
+        )
+
+
+@dataclass(frozen=True)
+class Figures:
+    """How well a model predicts rows it was not fitted on.
+
+    Attributes:
+        rows: number of rows predicted.
+        correlation: of prediction and label (0 if one of them is constant), as in Table I.
+        rmse: root mean square error, in units of the label (rad).
+        error_mean, error_std: mean and standard deviation of prediction minus label (rad), as in
+            Table II.
+        relative_rmse: RMSE over that of always predicting the mean of the training rows.
+    """
+
+    rows: int
+    correlation: float
+    rmse: float
+    error_mean: float
+    error_std: float
+    relative_rmse: float
+
+    @property
+    def rmse_deg(self) -> float:
+        """Root mean square error in degrees."""
+        return math.degrees(self.rmse)
+
+    @property
+    def error_mean_deg(self) -> float:
+        """Mean error in degrees."""
+        return math.degrees(self.error_mean)
+
+    @property
+    def error_std_deg(self) -> float:
+        """Standard deviation of the error in degrees."""
+        return math.degrees(self.error_std)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the figures for a JSON document, errors in degrees."""
+        return {
+            "rows": self.rows,
+            "correlation": self.correlation,
+            "rmse_deg": self.rmse_deg,
+            "error_mean_deg": self.error_mean_deg,
+            "error_std_deg": self.error_std_deg,
+            "relative_rmse": self.relative_rmse,
+        }
+
+
+def error_sums(model: LinearModel, gram: Gram, training_mean: Fraction | None = None) -> ErrorSums:
+    """Return the sums for a model of counts over the rows of a Gram, exactly.
+
+    With v = (coefficients, -1), sum (p - y)^2 = v'Gv; nothing cancels, since nothing is rounded.
+    Without a training mean, the rows' own mean is the reference of `null`.
+    """
+    part = gram.restrict([*model.signals, model.label])
+    k, n = len(model.signals), part.n
+    numbers = (model.intercept, *model.coefficients)
+    denominator = math.lcm(*(number.denominator for number in numbers))
+    # Integers over one common denominator: far cheaper than a sum of fractions.
+    w = [int(b * denominator) for b in model.coefficients]
+    w0 = int(model.intercept * denominator)
+    raw = part.raw()
+    linear = sum(b * s for b, s in zip(w, part.sums, strict=False))
+    quadratic = sum(b * sum(map(operator.mul, w, row)) for b, row in zip(w, raw, strict=False))
+    cross = sum(w[i] * raw[i][k] for i in range(k))
+    y, yy = Fraction(part.sums[k]), Fraction(raw[k][k])
+    mean = y / n if training_mean is None else training_mean
+    return ErrorSums(
+        n=n,
+        p=Fraction(linear + n * w0, denominator),
+        y=y,
+        pp=Fraction(quadratic + 2 * w0 * linear + n * w0 * w0, denominator**2),
+        py=Fraction(cross + w0 * part.sums[k], denominator),
+        yy=yy,
+        null=yy - 2 * mean * y + n * mean**2,
+    )

@@ -1,0 +1,1 @@
+"""How sure coefficients are, and what they rest on."""

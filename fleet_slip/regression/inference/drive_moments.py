@@ -1,0 +1,177 @@
+"""Per-drive moments in float64 for what needs every drive: clusters and resampling.
+
+The moments are taken about the cohort's mean, rounded to a whole count, while they are still
+integers; so nothing is lost to cancellation before they are scaled to unit spread.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_slip.arrays import BoolArray, FloatArray, IntArray
+from fleet_slip.errors import DataError
+from fleet_slip.regression.exact.gram import packed_position, packed_size
+from fleet_slip.regression.exact.gram_table import GramTable
+from fleet_slip.regression.exact.least_squares import LinearModel
+
+ClusterUnit = Literal["drive", "vehicle"]
+"""What counts as one independent piece of evidence."""
+
+
+def missing_signals_error(signals: Sequence[str]) -> DataError:
+    """Return the error that no drive of a cohort has all of some signals."""
+    return DataError(
+        f"no drive of the cohort has all of {', '.join(signals)}. Use fewer signals, or another "
+        "cohort."
+    )
+
+
+def require_serving_drives(tables: Sequence[GramTable], signals: Sequence[str]) -> None:
+    """Raise `DataError` if no drive has all the signals."""
+    if not any(set(signals) <= set(table.signals) for table in tables):
+        raise missing_signals_error(signals)
+
+
+def serving_drives(
+    tables: Sequence[GramTable], signals: Sequence[str]
+) -> tuple[GramTable, BoolArray]:
+    """Return one table of the drives that have all the signals, and which drives those are.
+
+    The mask lists the drives of all tables one after another. Raises `DataError` if no
+    drive has all the signals.
+    """
+    require_serving_drives(tables, signals)
+    served = [set(signals) <= set(table.signals) for table in tables]
+    parts = [table.restrict(signals) for table, yes in zip(tables, served, strict=True) if yes]
+    mask = np.repeat(served, [len(table) for table in tables])
+    if len(parts) == 1:
+        return parts[0], mask
+    stacked = GramTable(
+        tuple(signals),
+        np.concatenate([part.n for part in parts]),
+        np.concatenate([part.sums for part in parts]),
+        np.concatenate([part.products for part in parts]),
+    )
+    return stacked, mask
+
+
+@dataclass(frozen=True)
+class DriveMoments:
+    """Moments of u = (1, (count - centre) / spread) of each drive; the label is last.
+
+    Attributes:
+        signals: inputs, then the label: k names.
+        centre: mean count of each signal over all drives, rounded to an integer.
+        spread: standard deviation of each signal's counts; 1 for a constant.
+        packed: lower triangle of the (k+1) x (k+1) moments of u, shape (drives, (k+1)(k+2)/2).
+        cluster: number of the piece of evidence that each drive belongs to, shape (drives,): drives
+            of a car share its biases and tyres. None: every drive is one of its own.
+        unit: what a piece of evidence is.
+    """
+
+    signals: tuple[str, ...]
+    centre: tuple[int, ...]
+    spread: FloatArray
+    packed: FloatArray
+    cluster: IntArray | None = None
+    unit: ClusterUnit = "drive"
+
+    @classmethod
+    def of(
+        cls,
+        table: GramTable,
+        cluster: IntArray | None = None,
+        unit: ClusterUnit = "drive",
+        *,
+        centred: bool = True,
+    ) -> "DriveMoments":
+        """Scale a table of drives, about zero unless centred.
+
+        Raises `DataError` if it has no rows.
+        """
+        total = table.total()
+        if total.n == 0:
+            raise DataError(f"no rows have all of {', '.join(table.signals)}.")
+        k = len(table.signals)
+        centre = tuple(round(s / total.n) if centred else 0 for s in total.sums)
+        squares = np.array([total.centred()[i][i] for i in range(k)], dtype=np.float64)
+        spread = np.where(squares > 0, np.sqrt(squares) / total.n, 1.0)
+        about = table.about(centre)
+        row, column = np.tril_indices(k)
+        packed = np.empty((len(table), packed_size(k + 1)))
+        packed[:, 0] = about.n
+        for i in range(k):
+            start = packed_position(i + 1, 0)
+            packed[:, start] = about.sums[:, i] / spread[i]
+        inner = [
+            packed_position(i, j)
+            for i, j in zip((row + 1).tolist(), (column + 1).tolist(), strict=True)
+        ]
+        packed[:, inner] = about.products / (spread[row] * spread[column])
+        return cls(table.signals, centre, spread, packed, cluster, unit)
+
+    def __len__(self) -> int:
+        """Return the number of drives."""
+        return len(self.packed)
+
+    @property
+    def size(self) -> int:
+        """Length of u: the constant, the inputs and the label."""
+        return len(self.signals) + 1
+
+    def take(self, rows: NDArray[Any]) -> "DriveMoments":
+        """Return the drives at an index array or a mask, with the same centre and spread."""
+        cluster = None if self.cluster is None else self.cluster[rows]
+        return replace(self, packed=self.packed[rows], cluster=cluster)
+
+    @property
+    def clusters(self) -> "DriveMoments":
+        """The moments of each independent piece of evidence, in the order of their numbers."""
+        if self.cluster is None:
+            return self
+        numbers = np.unique(self.cluster)
+        return replace(self, packed=self.sum_clusters(self.packed), cluster=numbers)
+
+    def sum_clusters(self, values: FloatArray) -> FloatArray:
+        """Add up what is given for each drive, shape (drives, columns), over each cluster."""
+        if self.cluster is None:
+            return values
+        order = np.argsort(self.cluster, kind="stable")
+        _, first = np.unique(self.cluster[order], return_index=True)
+        return np.add.reduceat(values[order], first, axis=0)
+
+    def matrix(self, packed: FloatArray) -> FloatArray:
+        """Unpack moments, shape (..., p), to symmetric matrices, shape (..., k+1, k+1)."""
+        k = range(self.size)
+        at = np.array([[packed_position(i, j) for j in k] for i in k])
+        return packed[..., at]
+
+    def direction(self, model: LinearModel) -> FloatArray:
+        """Return w with w'u = prediction minus label, in spreads of the label.
+
+        The model is one of counts; signals that it does not use get zero.
+        """
+        if model.label != self.signals[-1]:
+            raise ValueError(f"the moments end with {self.signals[-1]}, not {model.label}")
+        weights = dict(zip(model.signals, model.coefficients, strict=True))
+        inputs = self.signals[:-1]
+        level = model.intercept - self.centre[-1]
+        level += sum(weights.get(s, 0) * c for s, c in zip(inputs, self.centre, strict=False))
+        unit = self.spread[-1]
+        slopes = [
+            float(weights.get(s, 0)) * spread / unit
+            for s, spread in zip(inputs, self.spread, strict=False)
+        ]
+        return np.array([float(level) / unit, *slopes, -1.0])
+
+    def products_with(self, w: FloatArray) -> FloatArray:
+        """Return sum over a drive's rows of u times w'u, shape (drives, k+1)."""
+        k = self.size
+        expand = np.zeros((self.packed.shape[1], k))
+        for i in range(k):
+            for j in range(k):
+                expand[packed_position(i, j), i] += w[j]
+        return self.packed @ expand

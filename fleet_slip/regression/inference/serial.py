@@ -1,0 +1,135 @@
+"""Serial correlation of the residuals, from a Gram of signals and their previous values.
+
+A lag Gram has each signal twice, now and one sample before, over all rows that have a predecessor
+in their drive. It holds S0 = sum u_t u_t', S1 = sum u_t u_{t-1}' and
+Sm = sum u_{t-1} u_{t-1}'.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+
+from fleet_slip.errors import DataError
+from fleet_slip.regression.exact.figures import error_sums
+from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.regression.exact.least_squares import Fit, LinearModel, fit
+
+_GRID = 2**20
+_ROUNDS = 50
+
+
+@dataclass(frozen=True)
+class LagGram:
+    """A Gram of signals and their previous values.
+
+    Attributes:
+        gram: its signals are `x` and `x + suffix` for each signal `x`.
+        suffix: what the name of a previous value ends in.
+    """
+
+    gram: Gram
+    suffix: str
+
+    def before(self, name: str) -> str:
+        """Return the name of a signal's previous value."""
+        return name + self.suffix
+
+
+@dataclass(frozen=True)
+class SerialCorrelation:
+    """First-order correlation of a model's residuals.
+
+    Attributes:
+        rho: correlation of a residual with the one before.
+        durbin_watson: sum (e_t - e_{t-1})^2 / sum e_t^2; 2 if there is none, 0 if complete.
+    """
+
+    rho: float
+    durbin_watson: float
+
+
+def serial_correlation(model: LinearModel, gram: Gram, lagged: LagGram) -> SerialCorrelation:
+    """Return the serial correlation of a model of counts.
+
+    `gram` has all rows; `lagged` those with a predecessor. The residual is that of the model, its
+    intercept included. Raises `DataError` if there is no residual, or a lag is missing.
+    """
+    now_before, before = _residual_products(model, lagged)
+    steps = error_sums(_difference(model), _with_differences(model, lagged)).squared_error
+    total = error_sums(model, gram).squared_error
+    if total == 0 or before == 0:
+        raise DataError("the model has no residual: serial correlation is undefined.")
+    return SerialCorrelation(float(now_before / before), float(steps / total))
+
+
+def quasi_difference(lagged: LagGram, signals: Sequence[str], rho: Fraction) -> Gram:
+    """Return the Gram of q u_t - p u_{t-1} for rho = p / q, exactly.
+
+    Its counts are worth 1/q of the signals'; coefficients are unaffected, the intercept becomes
+    q - p times that of the levels.
+    """
+    p, q = rho.numerator, rho.denominator
+    return lagged.gram.combine({name: {name: q, lagged.before(name): -p} for name in signals})
+
+
+@dataclass(frozen=True)
+class AutoregressiveFit:
+    """Feasible generalised least squares with AR(1) residuals.
+
+    Attributes:
+        model: of counts, for the levels of the signals.
+        rho: the estimated autocorrelation.
+        differenced: the fit of the quasi-differenced signals; its errors are independent.
+    """
+
+    model: LinearModel
+    rho: float
+    differenced: Fit
+
+
+def fit_autoregressive(lagged: LagGram, inputs: Sequence[str], label: str) -> AutoregressiveFit:
+    """Return the AR(1) fit by iterated Cochrane-Orcutt (1949) from a lag Gram.
+
+    rho is kept on a grid of 2^-20, so that each step is exact; it stops when rho does not change.
+    Raises `DataError` for dependent signals, or residuals that a random walk explains.
+    """
+    signals = [*inputs, label]
+    rho = Fraction(0)
+    for _ in range(_ROUNDS):
+        differenced = fit(quasi_difference(lagged, signals, rho), inputs, label)
+        level = differenced.model.intercept / (rho.denominator - rho.numerator)
+        coefficients = differenced.model.coefficients
+        model = LinearModel(tuple(inputs), label, coefficients, level)
+        now_before, before = _residual_products(model, lagged)
+        if before == 0:
+            raise DataError("the model has no residual: serial correlation is undefined.")
+        new = Fraction(round(now_before / before * _GRID), _GRID)
+        if abs(new) >= 1:
+            raise DataError(f"the residuals are a random walk (rho = {float(new):.4f}).")
+        if new == rho:
+            break
+        rho = new
+    return AutoregressiveFit(model, float(rho), differenced)
+
+
+def _residual_products(model: LinearModel, lagged: LagGram) -> tuple[Fraction, Fraction]:
+    """Return sum e_t e_{t-1} and sum e_{t-1}^2."""
+    before = LinearModel(
+        tuple(map(lagged.before, model.signals)),
+        lagged.before(model.label),
+        model.coefficients,
+        model.intercept,
+    )
+    square = error_sums(before, lagged.gram).squared_error
+    now = error_sums(model, lagged.gram).squared_error
+    step = error_sums(_difference(model), _with_differences(model, lagged)).squared_error
+    # (e_t - e_{t-1})^2 = e_t^2 - 2 e_t e_{t-1} + e_{t-1}^2
+    return (now + square - step) / 2, square
+
+
+def _difference(model: LinearModel) -> LinearModel:
+    return LinearModel(model.signals, model.label, model.coefficients, Fraction(0))
+
+
+def _with_differences(model: LinearModel, lagged: LagGram) -> Gram:
+    return quasi_difference(lagged, [*model.signals, model.label], Fraction(1))

@@ -1,0 +1,217 @@
+"""Standard errors, tests and collinearity of a fit.
+
+Rows at 100 Hz depend on each other, so the classical standard errors are far too small; the
+cluster-robust ones treat each drive as one piece of evidence.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Literal
+
+import numpy as np
+
+from fleet_slip.arrays import FloatArray
+from fleet_slip.errors import DataError
+from fleet_slip.regression.exact import rounding, special
+from fleet_slip.regression.exact.elimination import inverse_matrix
+from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.regression.exact.least_squares import Fit, Scales, dependence, moments
+from fleet_slip.regression.inference.drive_moments import DriveMoments
+
+INTERCEPT = "intercept"
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One coefficient in physical units.
+
+    Attributes:
+        name: signal, or "intercept".
+        value: coefficient.
+        standard_error: of the value.
+        t: value / standard_error.
+        p: two-sided probability of a larger |t| if the true coefficient were zero.
+    """
+
+    name: str
+    value: float
+    standard_error: float
+    t: float
+    p: float
+
+
+@dataclass(frozen=True)
+class Inference:
+    """Coefficients with their uncertainty.
+
+    Attributes:
+        estimates: intercept first, if there is one.
+        residual_std: residual standard deviation in units of the label.
+        degrees_of_freedom: of the t distribution.
+        kind: "classical" (independent rows) or "cluster" (independent drives).
+    """
+
+    estimates: tuple[Estimate, ...]
+    residual_std: float
+    degrees_of_freedom: int
+    kind: Literal["classical", "cluster"]
+
+
+def noise_variance(fitted: Fit) -> Fraction:
+    """Return sigma^2 = RSS / (n - k - 1), in counts^2, exactly.
+
+    Raises `DataError` if there are no more rows than coefficients.
+    """
+    _require_noise(fitted)
+    return fitted.rss / fitted.degrees_of_freedom
+
+
+def _require_noise(fitted: Fit) -> None:
+    if fitted.degrees_of_freedom <= 0:
+        raise DataError(
+            f"{fitted.gram.n} rows cannot tell the noise of a model with {fitted.size} signals."
+        )
+
+
+def classical_variances(fitted: Fit, variance: Fraction) -> list[Fraction]:
+    """Return the variances of the intercept (if any) and coefficients, in counts, exactly.
+
+    Var b = sigma^2 S^-1; Var b0 = sigma^2 (1/n + m'S^-1 m), m the mean inputs.
+    """
+    inputs, gram = fitted.model.signals, fitted.gram
+    scale = gram.n if fitted.has_intercept else 1
+    part = gram.restrict(inputs)
+    inverse = inverse_matrix(moments(part, intercept=fitted.has_intercept))
+    slopes = [variance * scale * inverse[i][i] for i in range(fitted.size)]
+    if not fitted.has_intercept:
+        return slopes
+    k = range(fitted.size)
+    # S^-1 = n N^-1 and m = sums / n, so m'S^-1 m = sums'N^-1 sums / n.
+    form = sum(part.sums[i] * inverse[i][j] * part.sums[j] for i in k for j in k)
+    return [variance * (1 + form) / gram.n, *slopes]
+
+
+def infer_classically(fitted: Fit, scales: Scales, variance: Fraction | None = None) -> Inference:
+    """Return standard errors for independent rows, rounded once from exact rationals.
+
+    `variance` is that of the noise in counts^2 if it is from another model (the full one, for
+    nested models). Raises `DataError` if it is to be estimated and there are too few rows.
+    """
+    sigma2 = noise_variance(fitted) if variance is None else variance
+    units = _units(fitted, scales)
+    errors = [
+        rounding.sqrt(v * unit**2)
+        for v, unit in zip(classical_variances(fitted, sigma2), units, strict=True)
+    ]
+    return _inference(
+        fitted, scales, sigma2, errors, degrees=fitted.degrees_of_freedom, kind="classical"
+    )
+
+
+def infer_by_clusters(fitted: Fit, drives: DriveMoments, scales: Scales) -> Inference:
+    """Return cluster-robust standard errors, a cluster being a drive or a car.
+
+    After Cameron and Miller, A Practitioner's Guide to Cluster-Robust Inference (2015):
+    V = c B (sum_p s_p s_p') B with B = (X'X)^-1, s_p the cluster's sum of x times residual, and
+    c = P/(P-1) (n-1)/(n-k-1), their correction CR1 for few clusters. The t distribution has P - 1
+    degrees of freedom. Raises `DataError` if there is only one cluster.
+    """
+    covariance = cluster_covariance(fitted, drives)
+    units = [float(unit) for unit in _units(fitted, scales)]
+    variances = np.diag(covariance)[int(not fitted.has_intercept) :]
+    errors = [math.sqrt(v) * u for v, u in zip(variances, units, strict=True)]
+    sigma2 = noise_variance(fitted)
+    return _inference(
+        fitted, scales, sigma2, errors, degrees=len(drives.clusters) - 1, kind="cluster"
+    )
+
+
+def cluster_covariance(fitted: Fit, drives: DriveMoments) -> FloatArray:
+    """Return the cluster-robust covariance of (intercept, coefficients) in counts."""
+    half = cluster_influences(fitted, drives)
+    return np.asarray(half @ half.T, dtype=np.float64)
+
+
+def cluster_influences(fitted: Fit, drives: DriveMoments) -> FloatArray:
+    """Return how each cluster moves (intercept, coefficients), in counts, shape (k+1, clusters).
+
+    Their products sum up to the cluster-robust covariance. Raises `DataError` for one cluster.
+    """
+    at = _columns(fitted, drives)
+    scores = cluster_scores(fitted, drives)
+    total = drives.matrix(drives.packed.sum(axis=0))[np.ix_(at, at)]
+    factor = small_sample_factor(fitted, len(scores), drives.unit)
+    half = math.sqrt(factor) * np.linalg.solve(total, scores.T)
+    # From (1, (c - centre)/spread) in spreads of the label back to (1, c) in its counts.
+    spread = drives.spread[[i - 1 for i in at[1:]]]
+    centre = np.array([drives.centre[i - 1] for i in at[1:]], dtype=np.float64)
+    back = np.diag([1.0, *(1 / spread)])
+    back[0, 1:] = -centre / spread
+    return np.asarray(drives.spread[-1] * back @ half, dtype=np.float64)
+
+
+def cluster_scores(fitted: Fit, drives: DriveMoments) -> FloatArray:
+    """Return each cluster's sum of (1, inputs) times residual, standardised.
+
+    The shape is (clusters, k+1).
+    """
+    w = drives.direction(fitted.model)
+    scores = -drives.products_with(w)[:, _columns(fitted, drives)]
+    return drives.sum_clusters(scores)
+
+
+def small_sample_factor(fitted: Fit, clusters: int, unit: str = "drive") -> float:
+    """Return P/(P-1) (n-1)/(n-k-1). Raises `DataError` for a single cluster."""
+    if clusters < 2:
+        otherwise = ": take drives for independent, cluster drive" if unit == "vehicle" else ""
+        raise DataError(f"cluster-robust errors need at least two {unit}s{otherwise}.")
+    _require_noise(fitted)
+    return clusters / (clusters - 1) * (fitted.gram.n - 1) / fitted.degrees_of_freedom
+
+
+def variance_inflation(gram: Gram, inputs: Sequence[str]) -> dict[str, float]:
+    """Return 1 / (1 - R^2) of each input on the others: how much collinearity costs it.
+
+    Raises `DataError` for dependent inputs.
+    """
+    relations = dependence(gram, inputs)
+    if relations:
+        raise DataError(relations)
+    matrix = moments(gram.restrict(inputs))
+    inverse = inverse_matrix(matrix)
+    return {name: float(matrix[i][i] * inverse[i][i]) for i, name in enumerate(inputs)}
+
+
+def _columns(fitted: Fit, drives: DriveMoments) -> list[int]:
+    return [0, *(drives.signals.index(name) + 1 for name in fitted.model.signals)]
+
+
+def _units(fitted: Fit, scales: Scales) -> list[Fraction]:
+    label = scales[fitted.model.label]
+    slopes = [label / scales[name] for name in fitted.model.signals]
+    return [label, *slopes] if fitted.has_intercept else slopes
+
+
+def _inference(
+    fitted: Fit,
+    scales: Scales,
+    sigma2: Fraction,
+    errors: Sequence[float],
+    *,
+    degrees: int,
+    kind: Literal["classical", "cluster"],
+) -> Inference:
+    model = fitted.model.physical(scales)
+    names = [INTERCEPT] if fitted.has_intercept else []
+    values = [model.offset] if fitted.has_intercept else []
+    estimates = []
+    for name, value, error in zip(
+        [*names, *model.signals], [*values, *model.weights.values()], errors, strict=True
+    ):
+        t = value / error if error else math.copysign(math.inf, value)
+        p = special.student_t_two_sided(t, degrees)
+        estimates.append(Estimate(name, value, error, t, p))
+    residual_std = rounding.sqrt(sigma2 * scales[fitted.model.label] ** 2)
+    return Inference(tuple(estimates), residual_std, degrees, kind)

@@ -1,0 +1,1 @@
+"""Estimates other than least squares: Pace, ridge, errors in variables."""

@@ -1,0 +1,59 @@
+"""What sensor bias and noise do to a model's error, in closed form (the paper's section III-A).
+
+No drive is simulated again: if sensor j reads too much by d_j plus independent noise of standard
+deviation s_j, the prediction changes by b'd + sum b_j v_j, so every sum of the error changes by
+terms that are known.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from fractions import Fraction
+
+from fleet_slip.errors import QuestionError
+from fleet_slip.regression.exact.figures import ErrorSums
+from fleet_slip.regression.exact.least_squares import LinearModel, Scales
+
+
+def disturb(
+    sums: ErrorSums,
+    model: LinearModel,
+    scales: Scales,
+    *,
+    bias: Mapping[str, float] | None = None,
+    noise: Mapping[str, float] | None = None,
+) -> ErrorSums:
+    """Return the error sums to expect once bias and white noise are added to the signals.
+
+    MSE' = MSE + 2 e (b'd) + (b'd)^2 + sum b_j^2 s_j^2, with e the mean error. `model` is one of
+    counts, as are the sums; `bias` and `noise` (standard deviations) are in physical units and
+    come on top of what the logged signals already have.
+    Raises `QuestionError` for a signal that the model does not use.
+    """
+    shift = sum(
+        (model.coefficients[i] * value for i, value in _counts(model, scales, bias or {})),
+        Fraction(0),
+    )
+    variance = sum(
+        ((model.coefficients[i] * value) ** 2 for i, value in _counts(model, scales, noise or {})),
+        Fraction(0),
+    )
+    return replace(
+        sums,
+        p=sums.p + sums.n * shift,
+        pp=sums.pp + 2 * shift * sums.p + sums.n * (shift**2 + variance),
+        py=sums.py + shift * sums.y,
+    )
+
+
+def _counts(
+    model: LinearModel, scales: Scales, values: Mapping[str, float]
+) -> list[tuple[int, Fraction]]:
+    unused = [name for name in values if name not in model.signals]
+    if unused:
+        raise QuestionError(
+            f"the model does not use {', '.join(unused)}: it uses {', '.join(model.signals)}."
+        )
+    return [
+        (model.signals.index(name), Fraction(value) / scales[name])
+        for name, value in values.items()
+    ]

@@ -1,0 +1,98 @@
+"""Least squares with an added diagonal: ridge, sensor noise, and errors in variables.
+
+S b + Lambda b = S_xy. A positive Lambda shrinks: it is ridge regression, and with n times the
+variance of noise that will be added to the signals it is the exact minimiser of the expected
+error under that noise (Bishop 1995). A negative one corrects for noise that the signals already
+have (errors in variables, Fuller 1987).
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from fractions import Fraction
+
+import numpy as np
+
+from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.regression.exact.elimination import eliminate
+from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.regression.exact.least_squares import (
+    LinearModel,
+    Scales,
+    correlation_matrix,
+    moments,
+)
+from fleet_slip.regression.shrinkage.standard import from_standardised, through_means
+
+
+def fit_penalised(
+    gram: Gram, inputs: Sequence[str], label: str, penalties: Sequence[Fraction]
+) -> LinearModel:
+    """Solve (S + diag(penalties)) b = S_xy exactly; penalties in counts^2 of each input.
+
+    Raises `DataError` if the matrix is not positive definite.
+    """
+    part = gram.restrict([*inputs, label])
+    common = math.lcm(*(penalty.denominator for penalty in penalties))
+    matrix = [[common * entry for entry in row] for row in moments(part)]
+    for i, penalty in enumerate(penalties):
+        matrix[i][i] += int(part.n * common * penalty)
+    triangle = eliminate(matrix)
+    if triangle.singular is not None or min(triangle.minors) <= 0:
+        at = triangle.singular
+        if at is None:
+            at = next(i for i, minor in enumerate(triangle.minors) if minor <= 0) - 1
+        raise DataError(
+            f"the moments stop being positive definite at {inputs[at]}: the assumed noise is more "
+            "than the signal holds, or signals are linearly dependent."
+        )
+    numerators, determinant = triangle.solve(len(inputs))
+    slopes = {name: Fraction(x, determinant) for name, x in zip(inputs, numerators, strict=True)}
+    return through_means(part, label, slopes)
+
+
+def fit_noise_matched(
+    gram: Gram, inputs: Sequence[str], label: str, noise: Mapping[str, float], scales: Scales
+) -> LinearModel:
+    """Return the model of counts that is best once noise is added to the signals.
+
+    `noise` is the standard deviation of independent noise to come, in physical units.
+    """
+    return fit_penalised(gram, inputs, label, _variances(gram, inputs, noise, scales))
+
+
+def fit_errors_in_variables(
+    gram: Gram, inputs: Sequence[str], label: str, noise: Mapping[str, float], scales: Scales
+) -> LinearModel:
+    """Return the model of counts for signals without the noise that they were logged with.
+
+    `noise` is the standard deviation of the sensors, in physical units. Raises `DataError`
+    if there is less variance in the signals than that, and `QuestionError` for noise of a signal
+    that is not among the inputs.
+    """
+    variances = _variances(gram, inputs, noise, scales)
+    return fit_penalised(gram, inputs, label, [-variance for variance in variances])
+
+
+def fit_ridge(gram: Gram, inputs: Sequence[str], label: str, penalty: float) -> LinearModel:
+    """Return the ridge model of counts at one penalty, added to the correlation matrix.
+
+    From the eigendecomposition of that matrix, C = Q diag(l) Q'. `cross_validate` with this for a
+    procedure gives the figures at a penalty.
+    """
+    k = len(inputs)
+    matrix = correlation_matrix(gram.restrict([*inputs, label]))
+    eigenvalues, vectors = np.linalg.eigh(matrix[:k, :k])
+    in_eigenbasis = (vectors.T @ matrix[:k, k]) / (eigenvalues + penalty)
+    return from_standardised(gram, inputs, label, in_eigenbasis @ vectors.T)
+
+
+def _variances(
+    gram: Gram, inputs: Sequence[str], noise: Mapping[str, float], scales: Scales
+) -> list[Fraction]:
+    unknown = [name for name in noise if name not in inputs]
+    if unknown:
+        raise QuestionError(
+            f"noise is given for {', '.join(unknown)}, which the model does not use. "
+            f"It uses {', '.join(inputs)}."
+        )
+    return [gram.n * (Fraction(noise.get(name, 0)) / scales[name]) ** 2 for name in inputs]

@@ -1,0 +1,1 @@
+"""Cross-validation over folds of drives, and differences between models."""

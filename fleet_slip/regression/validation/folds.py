@@ -1,0 +1,214 @@
+"""Which fold a drive belongs to.
+
+A drive's fold is a function of the drive alone: the SHA-256 hash of its id modulo the number of
+folds. Adding or removing drives therefore never moves another one, so that models of yesterday
+and today are compared on the same split. No rule that also equalises the folds can do this: it
+would have to know the other drives. The price is that fold sizes vary as they do by chance; with
+fewer than about five drives a fold, one may be empty, which is an error and not a silent change.
+"""
+
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from fleet_slip.arrays import IntArray
+from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.regression.exact.gram import Gram, require_signals
+from fleet_slip.regression.exact.gram_table import GramTable
+from fleet_slip.words import number_of
+
+
+def hash_number(key: str) -> int:
+    """Return a key's number below 2^64, the same on every machine and for ever."""
+    return int.from_bytes(hashlib.sha256(key.encode("utf-8")).digest()[:8], "big")
+
+
+def hash_fold(key: str, count: int) -> int:
+    """Return the fold 0..count-1 of a key."""
+    return hash_number(key) % count
+
+
+@dataclass(frozen=True)
+class FoldAssignment:
+    """The fold of each drive of a cohort.
+
+    Attributes:
+        fold: fold 0..len(names)-1 of each drive, shape (drives,).
+        names: what each fold is called.
+    """
+
+    fold: IntArray
+    names: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        """Check that no fold is empty and that there are two. Raises `DataError`."""
+        used = set(self.fold.tolist())
+        if len(self.names) < 2:
+            raise DataError(
+                "cross-validation needs at least two folds, and the cohort has one: "
+                f"{', '.join(self.names) or 'no drives'}. Widen the cohort, or fold by another key."
+            )
+        empty = [name for number, name in enumerate(self.names) if number not in used]
+        if empty:
+            raise DataError(
+                f"no drive falls into fold {', '.join(empty)} of {len(self.names)}: the cohort has "
+                f"{number_of(len(self.fold), 'drive')}. Choose fewer folds, or more drives."
+            )
+
+
+def by_hash(keys: Sequence[str], count: int) -> FoldAssignment:
+    """Deal drives into `count` folds by the hash of a key: the drive id, or a vehicle or track.
+
+    Drives with the same key share a fold. A fold that no drive falls into, as happens in small
+    cohorts, is left out: a drive's fold must not depend on which other drives there are. Raises
+    `DataError` if fewer than two folds are left, `QuestionError` if fewer are asked for.
+    """
+    if count < 2:
+        raise QuestionError(f"cross-validation needs at least two folds, not {count}.")
+    numbers = [hash_fold(key, count) for key in keys]
+    used = sorted(set(numbers))
+    fold = np.searchsorted(used, numbers).astype(np.int64)
+    return FoldAssignment(fold, tuple(str(number + 1) for number in used))
+
+
+def by_value(values: Sequence[Any]) -> FoldAssignment:
+    """Make one fold of each distinct value: leave one vehicle, track, day or mass out.
+
+    Raises `DataError` if a drive has no value, or all have the same.
+    """
+    if any(value is None for value in values):
+        raise DataError(
+            "a drive has no value of the column to fold by: fold by another, or leave such drives "
+            "out of the cohort."
+        )
+    distinct = sorted(set(values))
+    number = {value: i for i, value in enumerate(distinct)}
+    fold = np.array([number[value] for value in values], dtype=np.int64)
+    return FoldAssignment(fold, tuple(str(value) for value in distinct))
+
+
+def by_band(values: Sequence[Any], count: int) -> FoldAssignment:
+    """Cut the range of a number into `count` bands of about as many distinct values each.
+
+    A fold is a whole band, so that a model is tested between or beyond the values that it was
+    fitted on. Unlike the other folds these move with the cohort. Raises `DataError` as `by_value`.
+    """
+    assignment = by_value(values)
+    if len(assignment.names) <= count:
+        return assignment
+    bands = np.array_split(np.arange(len(assignment.names)), count)
+    band = np.repeat(np.arange(count), [len(one) for one in bands])
+    names = tuple(f"{assignment.names[one[0]]} to {assignment.names[one[-1]]}" for one in bands)
+    return FoldAssignment(band[assignment.fold].astype(np.int64), names)
+
+
+@dataclass(frozen=True)
+class Folds:
+    """One Gram a fold, all of the same signals: what cross-validation needs.
+
+    Attributes:
+        grams: the rows of each fold.
+        names: what the folds are called.
+        drives: number of drives in all folds together.
+    """
+
+    grams: tuple[Gram, ...]
+    names: tuple[str, ...]
+    drives: int
+
+    @cached_property
+    def total(self) -> Gram:
+        """The Gram of all folds."""
+        return sum(self.grams[1:], self.grams[0])
+
+    def splits(self) -> Iterator[tuple[Gram, Gram]]:
+        """Yield for each fold the Gram of all others, to train on, and its own, to test on."""
+        for fold in self.grams:
+            yield self.total - fold, fold
+
+    def without(self, number: int, drives: int) -> "Folds":
+        """Return the other folds, which hold so many drives."""
+        return Folds(
+            self.grams[:number] + self.grams[number + 1 :],
+            self.names[:number] + self.names[number + 1 :],
+            drives,
+        )
+
+
+@dataclass(frozen=True)
+class CohortFolds:
+    """The folds of a cohort whose drives may have different signals.
+
+    Attributes:
+        names: what the folds are called.
+        tables: for each signal set, one Gram a fold.
+        count_drives: tells how many drives have a Gram row in some of the tables, by their places.
+    """
+
+    names: tuple[str, ...]
+    tables: tuple[tuple[Gram, ...], ...]
+    count_drives: Callable[[Sequence[int]], int]
+
+    @classmethod
+    def of(
+        cls,
+        tables: Sequence[GramTable],
+        assignment: FoldAssignment,
+        drives: IntArray | None = None,
+    ) -> "CohortFolds":
+        """Add up the Gram rows of each fold. The assignment lists the rows table after table.
+
+        `drives` numbers the drive of each row; without it, every row is a drive of its own.
+        """
+        sizes = [len(table) for table in tables]
+        if sum(sizes) != len(assignment.fold):
+            raise ValueError("the assignment is not of these drives")
+        stops = np.cumsum(sizes)[:-1]
+        parts = np.split(assignment.fold, stops)
+        numbers = np.arange(sum(sizes)) if drives is None else drives
+        grams = tuple(
+            tuple(table.totals(fold, len(assignment.names)))
+            for table, fold in zip(tables, parts, strict=True)
+        )
+        of_table = np.split(numbers, stops)
+
+        def count_drives(chosen: Sequence[int]) -> int:
+            rows_of_drive = np.bincount(np.concatenate([of_table[i] for i in chosen]))
+            return int(np.count_nonzero(rows_of_drive))
+
+        return cls(assignment.names, grams, count_drives)
+
+    def serving(self, inputs: Sequence[str], label: str, *, sparse: bool = False) -> Folds:
+        """Return the folds of the drives that have the label and all the inputs.
+
+        `sparse` leaves out folds without such a drive. Raises `DataError` if no drive has them all,
+        if a fold has no such row, or if there are not two folds that have.
+        """
+        signals = (*inputs, label)
+        served = [i for i, grams in enumerate(self.tables) if set(signals) <= set(grams[0].signals)]
+        if not served:
+            known = sorted({name for grams in self.tables for name in grams[0].signals})
+            require_signals(known, signals)
+            raise DataError(
+                f"no drive of the cohort has all of {', '.join(signals)}. Use fewer signals, or "
+                "another cohort."
+            )
+        folds = tuple(
+            sum((self.tables[i][f].restrict(signals) for i in served), Gram.zero(signals))
+            for f in range(len(self.names))
+        )
+        empty = [name for name, gram in zip(self.names, folds, strict=True) if gram.n == 0]
+        names = self.names
+        if sparse:
+            names = tuple(name for name in names if name not in empty)
+            folds = tuple(gram for gram in folds if gram.n)
+        if len(folds) < 2 or (empty and not sparse):
+            raise DataError(
+                f"fold {', '.join(empty)} has no rows with all of {', '.join(signals)}. Choose "
+                "fewer folds, another key to fold by, or fewer signals."
+            )
+        return Folds(folds, names, self.count_drives(served))
