@@ -23,6 +23,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.comparison.observers import yaw_rate
 from fleet_slip.comparison.observers.angle import sideslip_angle
 from fleet_slip.comparison.observers.axle_forces import Axles, Chassis, loaded_axles, rates
+from fleet_slip.comparison.observers.belief import Belief, Row, belief_of, condition, spread
 from fleet_slip.comparison.observers.signals import STEP_S, DriveSignals, hold_last
 from fleet_slip.comparison.observers.single_track import measured_speed_mps, measured_steer_rad
 from fleet_slip.comparison.observers.yaw_rate import YawRateNoise
@@ -81,97 +82,23 @@ class Variances(NamedTuple):
     r_ay: float
 
 
-class Belief(NamedTuple):
-    """Mean of [vx, vy, r, b] and its covariance, upper triangle."""
-
-    vx: float
-    vy: float
-    r: float
-    b: float
-    p00: float
-    p01: float
-    p02: float
-    p03: float
-    p11: float
-    p12: float
-    p13: float
-    p22: float
-    p23: float
-    p33: float
-
-
 @kernel
 def predict(
     x: Belief, ax: float, steer: float, dt: float, axles: Axles, c: Chassis, v: Variances
-) -> Belief:
-    """Return the belief one step later: x ← x + Δt f(x), P ← F P Fᵀ + Q, F = I + Δt ∂f/∂x."""
-    d = rates(x.vx, x.vy, x.r, steer, axles, c)
-    f00, f01, f02 = 1.0, dt * x.r, dt * x.vy
-    f10, f11, f12 = dt * (d.ay_vx - x.r), 1.0 + dt * d.ay_vy, dt * (d.ay_r - x.vx)
-    f20, f21, f22 = dt * d.yaw_vx, dt * d.yaw_vy, 1.0 + dt * d.yaw_r
-    a00 = f00 * x.p00 + f01 * x.p01 + f02 * x.p02
-    a01 = f00 * x.p01 + f01 * x.p11 + f02 * x.p12
-    a02 = f00 * x.p02 + f01 * x.p12 + f02 * x.p22
-    a10 = f10 * x.p00 + f11 * x.p01 + f12 * x.p02
-    a11 = f10 * x.p01 + f11 * x.p11 + f12 * x.p12
-    a12 = f10 * x.p02 + f11 * x.p12 + f12 * x.p22
-    a20 = f20 * x.p00 + f21 * x.p01 + f22 * x.p02
-    a21 = f20 * x.p01 + f21 * x.p11 + f22 * x.p12
-    a22 = f20 * x.p02 + f21 * x.p12 + f22 * x.p22
-    return Belief(
-        x.vx + dt * (ax + x.r * x.vy),
-        x.vy + dt * (d.ay - x.r * x.vx),
-        x.r + dt * d.yaw,
-        x.b,
-        a00 * f00 + a01 * f01 + a02 * f02 + v.q_vx,
-        a00 * f10 + a01 * f11 + a02 * f12,
-        a00 * f20 + a01 * f21 + a02 * f22,
-        f00 * x.p03 + f01 * x.p13 + f02 * x.p23,
-        a10 * f10 + a11 * f11 + a12 * f12 + v.q_vy,
-        a10 * f20 + a11 * f21 + a12 * f22,
-        f10 * x.p03 + f11 * x.p13 + f12 * x.p23,
-        a20 * f20 + a21 * f21 + a22 * f22 + v.q_r,
-        f20 * x.p03 + f21 * x.p13 + f22 * x.p23,
-        x.p33,
+) -> None:
+    """Carry the belief one step on: x ← x + Δt f(x), P ← F P Fᵀ + Q, F = I + Δt ∂f/∂x."""
+    vx, vy, r, _ = x.mean
+    d = rates(vx, vy, r, steer, axles, c)
+    x.mean[0] = vx + dt * (ax + r * vy)
+    x.mean[1] = vy + dt * (d.ay - r * vx)
+    x.mean[2] = r + dt * d.yaw
+    f = (
+        (1.0, dt * r, dt * vy, 0.0),
+        (dt * (d.ay_vx - r), 1.0 + dt * d.ay_vy, dt * (d.ay_r - vx), 0.0),
+        (dt * d.yaw_vx, dt * d.yaw_vy, 1.0 + dt * d.yaw_r, 0.0),
+        (0.0, 0.0, 0.0, 1.0),
     )
-
-
-@kernel
-def condition(
-    x: Belief, h: tuple[float, float, float, float], innovation: float, variance: float
-) -> Belief:
-    """Return the belief given one measurement with the row H, in Joseph form.
-
-    K = P Hᵀ / (H P Hᵀ + R). With u = P Hᵀ, Joseph's (I − K H) P (I − K H)ᵀ + K R Kᵀ is
-    P − K uᵀ + (K R − (u − K H u)) Kᵀ, whose last term is zero but for rounding.
-    """
-    u0 = x.p00 * h[0] + x.p01 * h[1] + x.p02 * h[2] + x.p03 * h[3]
-    u1 = x.p01 * h[0] + x.p11 * h[1] + x.p12 * h[2] + x.p13 * h[3]
-    u2 = x.p02 * h[0] + x.p12 * h[1] + x.p22 * h[2] + x.p23 * h[3]
-    u3 = x.p03 * h[0] + x.p13 * h[1] + x.p23 * h[2] + x.p33 * h[3]
-    known = h[0] * u0 + h[1] * u1 + h[2] * u2 + h[3] * u3
-    whole = known + variance
-    k0, k1, k2, k3 = u0 / whole, u1 / whole, u2 / whole, u3 / whole
-    e0 = k0 * variance - (u0 - k0 * known)
-    e1 = k1 * variance - (u1 - k1 * known)
-    e2 = k2 * variance - (u2 - k2 * known)
-    e3 = k3 * variance - (u3 - k3 * known)
-    return Belief(
-        x.vx + k0 * innovation,
-        x.vy + k1 * innovation,
-        x.r + k2 * innovation,
-        x.b + k3 * innovation,
-        x.p00 - k0 * u0 + e0 * k0,
-        x.p01 - k0 * u1 + e0 * k1,
-        x.p02 - k0 * u2 + e0 * k2,
-        x.p03 - k0 * u3 + e0 * k3,
-        x.p11 - k1 * u1 + e1 * k1,
-        x.p12 - k1 * u2 + e1 * k2,
-        x.p13 - k1 * u3 + e1 * k3,
-        x.p22 - k2 * u2 + e2 * k2,
-        x.p23 - k2 * u3 + e2 * k3,
-        x.p33 - k3 * u3 + e3 * k3,
-    )
+    spread(x, f, (v.q_vx, v.q_vy, v.q_r, 0.0))
 
 
 @kernel
@@ -184,15 +111,15 @@ def update(
     axles: Axles,
     c: Chassis,
     v: Variances,
-) -> Belief:
-    """Return the belief given wheel speed, yaw rate and lateral acceleration, one after the other.
+) -> None:
+    """Take in wheel speed, yaw rate and lateral acceleration, one after the other.
 
     Their noises are independent, so that the order does not matter but for the linearisation.
     """
-    x = condition(x, (1.0, 0.0, 0.0, 0.0), vx - x.vx, v.r_vx)
-    x = condition(x, (0.0, 0.0, 1.0, 0.0), yaw_rate - x.r, v.r_r)
-    d = rates(x.vx, x.vy, x.r, steer, axles, c)
-    return condition(x, (d.ay_vx, d.ay_vy, d.ay_r, 1.0), ay - d.ay - x.b, v.r_ay)
+    condition(x, (1.0, 0.0, 0.0, 0.0), vx - x.mean[0], v.r_vx)
+    condition(x, (0.0, 0.0, 1.0, 0.0), yaw_rate - x.mean[2], v.r_r)
+    d = rates(x.mean[0], x.mean[1], x.mean[2], steer, axles, c)
+    condition(x, (d.ay_vx, d.ay_vy, d.ay_r, 1.0), ay - d.ay - x.mean[3], v.r_ay)
 
 
 @kernel
@@ -204,20 +131,21 @@ def _filter(
     steer: FloatArray,
     loaded: FloatArray,
     model_noise: FloatArray,
-    x: Belief,
+    first_mean: Row,
+    first_variances: Row,
     c: Chassis,
     v: Variances,
 ) -> FloatArray:
     means = np.empty((2, len(ax)))
+    x = belief_of(first_mean, first_variances)
     for k in range(len(ax)):
         axles = Axles(loaded[0, k], loaded[1, k], loaded[2, k], loaded[3, k])
         if k > 0:
             noise = model_noise[k]
             w = Variances(v.q_vx, noise * v.q_vy, noise * v.q_r, v.r_vx, v.r_r, v.r_ay)
-            x = predict(x, ax[k], steer[k], STEP_S, axles, c, w)
-        x = update(x, vx[k], yaw_rate[k], ay[k], steer[k], axles, c, v)
-        means[0, k] = x.vx
-        means[1, k] = x.vy
+            predict(x, ax[k], steer[k], STEP_S, axles, c, w)
+        update(x, vx[k], yaw_rate[k], ay[k], steer[k], axles, c, v)
+        means[:, k] = x.mean[:2]
     return means
 
 
@@ -266,11 +194,6 @@ def estimate(
     turning = yaw_rate.estimate(drive, car, noise.yaw_rate).yaw_rate_rad_s
     vx_mps = measured_speed_mps(drive, car)
     ax_mps2, ay_mps2 = hold_last(drive.ax_mps2, "ax"), hold_last(drive.ay_mps2, "ay")
-    p0, p1, p2 = (std**2 for std in INITIAL_STD)
-    first = Belief(
-        vx_mps[0], 0.0, turning[0], 0.0,
-        p0, 0.0, 0.0, 0.0, p1, 0.0, 0.0, p2, 0.0, noise.ay_bias_std_mps2**2,
-    )  # fmt: skip
     means = _filter(
         ax_mps2,
         ay_mps2,
@@ -279,7 +202,8 @@ def estimate(
         measured_steer_rad(drive),
         axles_of(car, ax_mps2, ay_mps2, noise),
         np.ones(len(drive)) if model_noise is None else model_noise,
-        first,
+        (vx_mps[0], 0.0, turning[0], 0.0),
+        (*(std**2 for std in INITIAL_STD), noise.ay_bias_std_mps2**2),
         chassis(car),
         variances(noise),
     )

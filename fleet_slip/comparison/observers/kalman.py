@@ -14,6 +14,7 @@ from pydantic import Field, FiniteFloat
 from fleet_slip.arrays import FloatArray
 from fleet_slip.comparison.observers import yaw_rate
 from fleet_slip.comparison.observers.angle import sideslip_angle
+from fleet_slip.comparison.observers.belief import Belief, belief_of, condition, spread
 from fleet_slip.comparison.observers.signals import STEP_S, DriveSignals, hold_last
 from fleet_slip.comparison.observers.yaw_rate import YawRateNoise
 from fleet_slip.compiling import kernel
@@ -90,36 +91,15 @@ def covariances(noise: FilterNoise) -> Covariances:
     )
 
 
-class Belief(NamedTuple):
-    """Mean x of the state and its covariance P, whose upper triangle is all of it."""
-
-    ux: float
-    bx: float
-    uy: float
-    by: float
-    p00: float
-    p01: float
-    p02: float
-    p03: float
-    p11: float
-    p12: float
-    p13: float
-    p22: float
-    p23: float
-    p33: float
-
-
 @kernel
 def first_belief(gps_vx: float, gps_vy: float, c: Covariances) -> Belief:
     """Return the belief at the first fix: its velocity, and biases around zero."""
-    return Belief(
-        gps_vx, 0.0, gps_vy, 0.0, c.r_ux, 0.0, 0.0, 0.0, c.bias, 0.0, 0.0, c.r_uy, 0.0, c.bias
-    )
+    return belief_of((gps_vx, 0.0, gps_vy, 0.0), (c.r_ux, c.bias, c.r_uy, c.bias))
 
 
 @kernel
-def predict(x: Belief, ax: float, ay: float, yaw_rate: float, dt: float, c: Covariances) -> Belief:
-    """Return the belief one step later, equations (6), (7) and (9).
+def predict(x: Belief, ax: float, ay: float, yaw_rate: float, dt: float, c: Covariances) -> None:
+    """Carry the belief one step on, equations (6), (7) and (9).
 
         | 1      −Δt  ψ̇Δt   0  |            | Δt  0 |
     F = | 0       1    0    0  |   B1, B2 = | 0   0 |   x ← F x + B2 u
@@ -127,105 +107,18 @@ def predict(x: Belief, ax: float, ay: float, yaw_rate: float, dt: float, c: Cova
         | 0       0    0    1  |            | 0   0 |
     """
     turn = yaw_rate * dt
-    # Rows of F P; those of the biases are rows of P.
-    a00 = x.p00 - dt * x.p01 + turn * x.p02
-    a01 = x.p01 - dt * x.p11 + turn * x.p12
-    a02 = x.p02 - dt * x.p12 + turn * x.p22
-    a03 = x.p03 - dt * x.p13 + turn * x.p23
-    a21 = x.p12 - turn * x.p01 - dt * x.p13
-    a20 = x.p02 - turn * x.p00 - dt * x.p03
-    a22 = x.p22 - turn * x.p02 - dt * x.p23
-    a23 = x.p23 - turn * x.p03 - dt * x.p33
-    return Belief(
-        x.ux + dt * (ax - x.bx) + turn * x.uy,
-        x.bx,
-        x.uy + dt * (ay - x.by) - turn * x.ux,
-        x.by,
-        a00 - dt * a01 + turn * a02 + c.q_ux,
-        a01,
-        a02 - turn * a00 - dt * a03,
-        a03,
-        x.p11 + c.q_bias,
-        a21,
-        x.p13,
-        a22 - turn * a20 - dt * a23 + c.q_uy,
-        a23,
-        x.p33 + c.q_bias,
-    )
+    ux, bx, uy, by = x.mean
+    x.mean[0] = ux + dt * (ax - bx) + turn * uy
+    x.mean[2] = uy + dt * (ay - by) - turn * ux
+    f = ((1.0, -dt, turn, 0.0), (0.0, 1.0, 0.0, 0.0), (-turn, 0.0, 1.0, -dt), (0.0, 0.0, 0.0, 1.0))
+    spread(x, f, (c.q_ux, c.q_bias, c.q_uy, c.q_bias))
 
 
 @kernel
-def _gain(p0: float, p2: float, x: Belief, c: Covariances) -> tuple[float, float]:
-    """Return one row of K from the row of P Hᵀ."""
-    s00, s02, s22 = x.p00 + c.r_ux, x.p02, x.p22 + c.r_uy
-    determinant = s00 * s22 - s02 * s02
-    return (p0 * s22 - p2 * s02) / determinant, (p2 * s00 - p0 * s02) / determinant
-
-
-@kernel
-def _residual(
-    p0: float, p2: float, k: tuple[float, float], x: Belief, c: Covariances
-) -> tuple[float, float]:
-    """Return one row of K R − (I − K H) P Hᵀ, which is zero but for rounding."""
-    return (
-        k[0] * c.r_ux - (p0 - k[0] * x.p00 - k[1] * x.p02),
-        k[1] * c.r_uy - (p2 - k[0] * x.p02 - k[1] * x.p22),
-    )
-
-
-@kernel
-def _joseph(
-    p: float,
-    p0: float,
-    p2: float,
-    k: tuple[float, float],
-    residual: tuple[float, float],
-    across: tuple[float, float],
-) -> float:
-    """Return one element of (I − K H) P (I − K H)ᵀ + K R Kᵀ.
-
-    p is that of P, p0 and p2 those of H P in its column; k and residual belong to its row and
-    `across` is the row of K that belongs to its column.
-    """
-    return p - k[0] * p0 - k[1] * p2 + residual[0] * across[0] + residual[1] * across[1]
-
-
-@kernel
-def update(x: Belief, gps_vx: float, gps_vy: float, c: Covariances) -> Belief:
-    """Return the belief given a fix, equations (10) and (11), H selecting u_x and u_y.
-
-        K = P Hᵀ (H P Hᵀ + R)⁻¹
-        x ← x + K (z − H x)
-        P ← (I − K H) P (I − K H)ᵀ + K R Kᵀ
-
-    The paper's P (I − K H) loses symmetry and definiteness to rounding. This is Joseph's form of
-    it, of which the upper triangle alone is computed.
-    """
-    k0 = _gain(x.p00, x.p02, x, c)
-    k1 = _gain(x.p01, x.p12, x, c)
-    k2 = _gain(x.p02, x.p22, x, c)
-    k3 = _gain(x.p03, x.p23, x, c)
-    e0 = _residual(x.p00, x.p02, k0, x, c)
-    e1 = _residual(x.p01, x.p12, k1, x, c)
-    e2 = _residual(x.p02, x.p22, k2, x, c)
-    e3 = _residual(x.p03, x.p23, k3, x, c)
-    dx, dy = gps_vx - x.ux, gps_vy - x.uy
-    return Belief(
-        x.ux + k0[0] * dx + k0[1] * dy,
-        x.bx + k1[0] * dx + k1[1] * dy,
-        x.uy + k2[0] * dx + k2[1] * dy,
-        x.by + k3[0] * dx + k3[1] * dy,
-        _joseph(x.p00, x.p00, x.p02, k0, e0, k0),
-        _joseph(x.p01, x.p01, x.p12, k0, e0, k1),
-        _joseph(x.p02, x.p02, x.p22, k0, e0, k2),
-        _joseph(x.p03, x.p03, x.p23, k0, e0, k3),
-        _joseph(x.p11, x.p01, x.p12, k1, e1, k1),
-        _joseph(x.p12, x.p02, x.p22, k1, e1, k2),
-        _joseph(x.p13, x.p03, x.p23, k1, e1, k3),
-        _joseph(x.p22, x.p02, x.p22, k2, e2, k2),
-        _joseph(x.p23, x.p03, x.p23, k2, e2, k3),
-        _joseph(x.p33, x.p03, x.p23, k3, e3, k3),
-    )
+def update(x: Belief, gps_vx: float, gps_vy: float, c: Covariances) -> None:
+    """Take in a fix, equations (10) and (11); the noises of its two velocities are independent."""
+    condition(x, (1.0, 0.0, 0.0, 0.0), gps_vx - x.mean[0], c.r_ux)
+    condition(x, (0.0, 0.0, 1.0, 0.0), gps_vy - x.mean[2], c.r_uy)
 
 
 @kernel
@@ -243,13 +136,10 @@ def _filter(
     belief = first_belief(gps_vx[first_fix], gps_vy[first_fix], c)
     for k in range(first_fix, len(ax)):
         if k > first_fix:
-            belief = predict(belief, ax[k], ay[k], yaw_rate[k], dt, c)
+            predict(belief, ax[k], ay[k], yaw_rate[k], dt, c)
             if not np.isnan(gps_vx[k] + gps_vy[k]):
-                belief = update(belief, gps_vx[k], gps_vy[k], c)
-        means[0, k] = belief.ux
-        means[1, k] = belief.bx
-        means[2, k] = belief.uy
-        means[3, k] = belief.by
+                update(belief, gps_vx[k], gps_vy[k], c)
+        means[:, k] = belief.mean
     return means
 
 

@@ -13,12 +13,13 @@ Wheels that brake in a corner slip more on the unloaded side: rows of braking gi
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
 from pydantic import Field, FiniteFloat
 
 from fleet_slip.arrays import FloatArray
+from fleet_slip.comparison.observers.belief import belief_of, condition
 from fleet_slip.comparison.observers.signals import STEP_S, DriveSignals
 from fleet_slip.comparison.observers.wheel_speeds import undriven_axle
 from fleet_slip.compiling import kernel
@@ -72,76 +73,34 @@ class YawRateEstimate:
     gyro_bias_rad_s: FloatArray
 
 
-class Belief(NamedTuple):
-    """Mean of [r, b] and its covariance, upper triangle."""
-
-    r: float
-    b: float
-    p00: float
-    p01: float
-    p11: float
-
-
-@kernel
-def predict(x: Belief, step_variance: float) -> Belief:
-    """Return the belief one step later: P + diag((Δt σ)², 0)."""
-    return Belief(x.r, x.b, x.p00 + step_variance, x.p01, x.p11)
-
-
-@kernel
-def update(x: Belief, z: float, on_bias: float, variance: float) -> Belief:
-    """Return the belief given z = r + on_bias · b + w, in Joseph form.
-
-        K = P Hᵀ / (H P Hᵀ + R),   P ← (I − K H) P (I − K H)ᵀ + K R Kᵀ,   H = [1, on_bias]
-
-    A missing measurement, NaN, changes nothing.
-    """
-    if np.isnan(z):
-        return x
-    ph0 = x.p00 + on_bias * x.p01
-    ph1 = x.p01 + on_bias * x.p11
-    innovation_variance = ph0 + on_bias * ph1 + variance
-    k0, k1 = ph0 / innovation_variance, ph1 / innovation_variance
-    innovation = z - x.r - on_bias * x.b
-    a00, a01 = 1.0 - k0, -k0 * on_bias
-    a10, a11 = -k1, 1.0 - k1 * on_bias
-    return Belief(
-        x.r + k0 * innovation,
-        x.b + k1 * innovation,
-        a00 * (a00 * x.p00 + a01 * x.p01) + a01 * (a00 * x.p01 + a01 * x.p11) + k0 * variance * k0,
-        a10 * (a00 * x.p00 + a01 * x.p01) + a11 * (a00 * x.p01 + a01 * x.p11) + k0 * variance * k1,
-        a10 * (a10 * x.p00 + a11 * x.p01) + a11 * (a10 * x.p01 + a11 * x.p11) + k1 * variance * k1,
-    )
-
-
 @kernel
 def _filter(
     gyro: FloatArray,
     wheels: FloatArray,
-    first: Belief,
+    bias_var: float,
     gyro_var: float,
     wheel_var: float,
     step_var: float,
 ) -> FloatArray:
     estimates = np.empty((2, len(gyro)))
-    belief = first
+    x = belief_of((0.0, 0.0), (INITIAL_STD_RAD_S**2, bias_var))
     for k in range(len(gyro)):
-        belief = predict(belief, step_var)
-        belief = update(belief, gyro[k], 1.0, gyro_var)
-        belief = update(belief, wheels[k], 0.0, wheel_var)
-        estimates[0, k] = belief.r
-        estimates[1, k] = belief.b
+        x.covariance[0, 0] += step_var
+        if not np.isnan(gyro[k]):
+            condition(x, (1.0, 1.0), gyro[k] - x.mean[0] - x.mean[1], gyro_var)
+        if not np.isnan(wheels[k]):
+            condition(x, (1.0, 0.0), wheels[k] - x.mean[0], wheel_var)
+        estimates[:, k] = x.mean
     return estimates
 
 
 def estimate(drive: DriveSignals, car: VehicleParameters, noise: YawRateNoise) -> YawRateEstimate:
     """Estimate the yaw rate at every row from what was measured up to it; gaps are bridged."""
-    first = Belief(0.0, 0.0, INITIAL_STD_RAD_S**2, 0.0, noise.gyro_bias_std_rad_s**2)
     rolling = drive.ax_mps2 > BRAKING_MPS2
     yaw_rate, bias = _filter(
         drive.yaw_rate_rad_s,
         np.where(rolling, undriven_axle(drive, car).yaw_rate_rad_s, np.nan),
-        first,
+        noise.gyro_bias_std_rad_s**2,
         noise.gyro_std_rad_s**2,
         noise.wheel_yaw_rate_std_rad_s**2,
         (STEP_S * noise.yaw_acceleration_std_rad_s2) ** 2,

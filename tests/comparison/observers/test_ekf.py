@@ -14,7 +14,8 @@ from fleet_slip.comparison.observers.axle_forces import (
     loaded_axles,
     rates,
 )
-from fleet_slip.comparison.observers.ekf import Belief, EkfNoise, axles_of, chassis, variances
+from fleet_slip.comparison.observers.belief import Belief, belief_of, condition
+from fleet_slip.comparison.observers.ekf import EkfNoise, axles_of, chassis, variances
 from fleet_slip.comparison.observers.signals import STEP_S, DriveSignals
 from fleet_slip.comparison.observers.single_track import SingleTrack
 from fleet_slip.vehicle.parameters import load_vehicle
@@ -38,13 +39,9 @@ UNCERTAIN = np.array(
 
 
 def belief(vx: float, vy: float, r: float, b: float = 0.1) -> Belief:
-    return Belief(vx, vy, r, b, *UNCERTAIN[np.triu_indices(4)])
-
-
-def dense(x: Belief) -> FloatArray:
-    upper = np.zeros((4, 4))
-    upper[np.triu_indices(4)] = x[4:]
-    return upper + np.triu(upper, 1).T
+    uncertain = belief_of((vx, vy, r, b), (0.0, 0.0, 0.0, 0.0))
+    uncertain.covariance[:] = UNCERTAIN
+    return uncertain
 
 
 def fiala(alpha: float, stiffness: float, grip: float) -> float:
@@ -139,20 +136,21 @@ def test_prediction_and_measurement_are_the_textbook_algebra() -> None:
         d = rates(vx, vy, r, steer, AT_REST, CHASSIS)
         return state + STEP_S * np.array([ax + r * vy, d.ay - r * vx, d.yaw, 0.0])
 
-    state = np.array(x[:4])
+    state = x.mean.copy()
     columns = [(flow(state + e) - flow(state - e)) / (2 * h) for e in h * np.eye(4)]
     f = np.array(columns).T
     q = np.diag([NOISE.q_vx, NOISE.q_vy, NOISE.q_r, 0.0])
-    after = ekf.predict(x, ax, steer, STEP_S, AT_REST, CHASSIS, NOISE)
-    np.testing.assert_allclose(after[:4], flow(state), rtol=1e-14)
-    np.testing.assert_allclose(dense(after), f @ UNCERTAIN @ f.T + q, rtol=0, atol=1e-8)
+    ekf.predict(x, ax, steer, STEP_S, AT_REST, CHASSIS, NOISE)
+    np.testing.assert_allclose(x.mean, flow(state), rtol=1e-14)
+    np.testing.assert_allclose(x.covariance, f @ UNCERTAIN @ f.T + q, rtol=0, atol=1e-8)
 
     row = np.array([0.3, -1.0, 2.0, 1.0])
     gain = UNCERTAIN @ row / (row @ UNCERTAIN @ row + 0.1)
-    found = ekf.condition(x, (0.3, -1.0, 2.0, 1.0), 0.7, 0.1)
-    np.testing.assert_allclose(found[:4], state + gain * 0.7, rtol=0, atol=1e-14)
+    x = belief(*state)
+    condition(x, (0.3, -1.0, 2.0, 1.0), 0.7, 0.1)
+    np.testing.assert_allclose(x.mean, state + gain * 0.7, rtol=0, atol=1e-14)
     expected = UNCERTAIN - np.outer(gain, row) @ UNCERTAIN
-    np.testing.assert_allclose(dense(found), expected, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(x.covariance, expected, rtol=0, atol=1e-14)
 
 
 def drive_of_the_model(steer: FloatArray, vx: FloatArray) -> tuple[DriveSignals, FloatArray]:
@@ -220,10 +218,10 @@ def test_more_noise_of_the_model_is_believed_less() -> None:
 
 
 def test_covariance_stays_positive_definite() -> None:
-    x = belief(20, 0, 0)
+    x = belief(20.0, 0.0, 0.0)
     for k in range(20_000):
         steer = 0.1 * np.sin(0.01 * k)
         turning, ay = 0.2 * np.sin(0.01 * k), 4 * np.sin(0.01 * k)
-        x = ekf.predict(x, 0.0, steer, STEP_S, AT_REST, CHASSIS, NOISE)
-        x = ekf.update(x, 20.0, turning, ay, steer, AT_REST, CHASSIS, NOISE)
-    assert np.linalg.eigvalsh(dense(x)).min() > 0
+        ekf.predict(x, 0.0, steer, STEP_S, AT_REST, CHASSIS, NOISE)
+        ekf.update(x, 20.0, turning, ay, steer, AT_REST, CHASSIS, NOISE)
+    assert np.linalg.eigvalsh(x.covariance).min() > 0

@@ -11,8 +11,8 @@ from scipy import stats
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.comparison.observers import kalman
+from fleet_slip.comparison.observers.belief import Belief, belief_of
 from fleet_slip.comparison.observers.kalman import (
-    Belief,
     FilterNoise,
     covariances,
     fuse,
@@ -87,12 +87,6 @@ def generate(
     return replace(drive, gps_vx_mps=gps[0], gps_vy_mps=gps[1]), yaw_rate, truth
 
 
-def dense(belief: Belief) -> FloatArray:
-    upper = np.zeros((4, 4))
-    upper[np.triu_indices(4)] = belief[4:]
-    return upper + np.triu(upper, 1).T
-
-
 def stacked(found: kalman.KalmanEstimate) -> FloatArray:
     return np.stack([found.vx_mps, found.ax_bias_mps2, found.vy_mps, found.ay_bias_mps2])
 
@@ -128,17 +122,17 @@ def test_agrees_with_the_joint_gaussian_posterior() -> None:
     posterior = lever @ np.linalg.inv(whole.T @ whole) @ lever.T
 
     belief = last_belief(drive, yaw_rate, NOISE)
-    np.testing.assert_allclose(belief[:4], mean + lever @ solution, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(dense(belief), posterior, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(belief.mean, mean + lever @ solution, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(belief.covariance, posterior, rtol=0, atol=1e-9)
 
 
 def last_belief(drive: DriveSignals, yaw_rate: FloatArray, noise: FilterNoise) -> Belief:
     c = covariances(noise)
     belief = kalman.first_belief(drive.gps_vx_mps[0], drive.gps_vy_mps[0], c)
     for k in range(1, len(drive)):
-        belief = predict(belief, drive.ax_mps2[k], drive.ay_mps2[k], yaw_rate[k], STEP_S, c)
+        predict(belief, drive.ax_mps2[k], drive.ay_mps2[k], yaw_rate[k], STEP_S, c)
         if np.isfinite(drive.gps_vx_mps[k]):
-            belief = update(belief, drive.gps_vx_mps[k], drive.gps_vy_mps[k], c)
+            update(belief, drive.gps_vx_mps[k], drive.gps_vy_mps[k], c)
     return belief
 
 
@@ -150,15 +144,15 @@ def normalised_innovations(
     belief = kalman.first_belief(vx[0], vy[0], c)
     found = np.full((2, len(ax)), np.nan)
     for k in range(1, len(ax)):
-        belief = predict(belief, ax[k], ay[k], yaw_rate[k], STEP_S, c)
+        predict(belief, ax[k], ay[k], yaw_rate[k], STEP_S, c)
         if not np.isnan(vx[k]):
-            l00 = np.sqrt(belief.p00 + c.r_ux)
-            l10 = belief.p02 / l00
-            found[0, k] = (vx[k] - belief.ux) / l00
-            found[1, k] = (vy[k] - belief.uy - l10 * found[0, k]) / np.sqrt(
-                belief.p22 + c.r_uy - l10 * l10
-            )
-            belief = update(belief, vx[k], vy[k], c)
+            ux, _, uy, _ = belief.mean
+            p = belief.covariance
+            l00 = np.sqrt(p[0, 0] + c.r_ux)
+            l10 = p[0, 2] / l00
+            found[0, k] = (vx[k] - ux) / l00
+            found[1, k] = (vy[k] - uy - l10 * found[0, k]) / np.sqrt(p[2, 2] + c.r_uy - l10 * l10)
+            update(belief, vx[k], vy[k], c)
     return found
 
 
@@ -204,14 +198,13 @@ def test_innovations_of_a_wrong_noise_are_not_white() -> None:
 @numba.njit
 def covariances_over(steps: int, every: int, turn: float, c: Any) -> NDArray[np.float64]:
     belief = kalman.first_belief(20.0, 0.0, c)
-    kept = np.empty((steps // every, 10))
+    kept = np.empty((steps // every, 4, 4))
     for k in range(steps):
-        belief = predict(belief, 0.0, 0.0, turn * np.sin(0.001 * k), STEP_S, c)
+        predict(belief, 0.0, 0.0, turn * np.sin(0.001 * k), STEP_S, c)
         if k % 10 == 0:
-            belief = update(belief, 20.0, 0.0, c)
+            update(belief, 20.0, 0.0, c)
         if k % every == every - 1:
-            for i in range(10):
-                kept[k // every, i] = belief[4 + i]
+            kept[k // every] = belief.covariance
     return kept
 
 
@@ -219,8 +212,8 @@ def covariances_over(steps: int, every: int, turn: float, c: Any) -> NDArray[np.
 def test_covariance_stays_positive_definite_over_a_million_steps(gps_std: float) -> None:
     """With no bias walk the biases' variance falls for ever; that is where definiteness is lost."""
     noise = FilterNoise(gps_vx_std_mps=gps_std, gps_vy_std_mps=gps_std)
-    for packed in covariances_over(1_000_000, 1000, 0.4, covariances(noise)):
-        covariance = dense(Belief(0, 0, 0, 0, *packed))
+    for covariance in covariances_over(1_000_000, 1000, 0.4, covariances(noise)):
+        assert np.array_equal(covariance, covariance.T)
         scale = 1 / np.sqrt(np.diag(covariance))
         assert np.linalg.eigvalsh(covariance * np.outer(scale, scale)).min() > 0
 
@@ -228,10 +221,10 @@ def test_covariance_stays_positive_definite_over_a_million_steps(gps_std: float)
 def test_joseph_keeps_the_variance_that_rounding_would_lose() -> None:
     """P (I − K H) of a very precise fix after great uncertainty rounds to zero and below."""
     vague = FilterNoise(gps_vx_std_mps=1e-5, gps_vy_std_mps=1e-5)
-    before = Belief(0, 0, 0, 0, 1e10, 0, 0, 0, 1, 0, 0, 1e10, 0, 1)
-    after = update(before, 1.0, 2.0, covariances(vague))
-    np.testing.assert_allclose(after[:4], [1, 0, 2, 0], atol=1e-12)
-    np.testing.assert_allclose(np.diag(dense(after)), [1e-10, 1, 1e-10, 1], rtol=1e-9)
+    belief = belief_of((0.0, 0.0, 0.0, 0.0), (1e10, 1.0, 1e10, 1.0))
+    update(belief, 1.0, 2.0, covariances(vague))
+    np.testing.assert_allclose(belief.mean, [1, 0, 2, 0], atol=1e-12)
+    np.testing.assert_allclose(np.diag(belief.covariance), [1e-10, 1, 1e-10, 1], rtol=1e-9)
 
 
 def test_biases_are_found() -> None:
