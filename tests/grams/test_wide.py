@@ -1,5 +1,6 @@
 """Columns over time by the kernel, by SQL and by plain integers: the same, on hostile drives."""
 
+import re
 from fractions import Fraction
 from math import ceil, floor
 from typing import Any
@@ -18,9 +19,11 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError
 from fleet_slip.grams.column_plan import ColumnPlan
 from fleet_slip.grams.columns import DriveColumns, DriveCounts
+from fleet_slip.grams.rows import statement
 from fleet_slip.grams.rows.aggregation import aggregate, by_sql
 from fleet_slip.grams.rows.check import grams_of
 from fleet_slip.grams.rows.gram_job import update_grams
+from fleet_slip.grams.rows.statement import gram_statement
 from fleet_slip.grams.rows.wide import wide_grams
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import land, log_rows, random_counts
@@ -246,6 +249,31 @@ def test_gram_rows_of_the_kernel_are_those_of_the_statement(
     for name in kernel.column_names:
         assert kernel[name].to_pylist() == defined[name].to_pylist(), name
     assert aggregate(warehouse, files, feature_set=feature_set).equals(kernel)
+
+
+@pytest.mark.parametrize("feature_set", ["windows", "bands"])
+def test_products_of_many_columns_come_from_several_groupings(
+    warehouse: Warehouse, feature_set: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(statement, "MOST_SUMS", 1000)
+    land(warehouse, "one", hostile_drive("b", 400, 1), hostile_drive("a", 2, 2).slice(0, 1))
+    files = warehouse.logs.snapshot().files
+    kernel = wide_grams(warehouse, files, feature_set)
+    assert by_sql(warehouse, files, feature_set).cast(kernel.schema).equals(kernel)
+
+
+def test_duckdb_takes_as_many_sums_of_a_group_as_a_statement_has() -> None:
+    """Some 10,920 of them end DuckDB 2.0.0 with SIGFPE, and a set of 403 columns had 81,809.
+
+    To report upstream: `SELECT sum(i + 0), …, sum(i + 11000) FROM range(9) t(i) GROUP BY i % 3`.
+    """
+    text = gram_statement(catalogue(), "gated")
+    groupings = [len(re.findall(r"sum\(\w+::BIGINT \* ", one)) for one in text.split("GROUP BY")]
+    assert max(groupings) <= statement.MOST_SUMS < sum(groupings)
+    sums = ", ".join(f"sum(i + {n})" for n in range(statement.MOST_SUMS))
+    with duckdb.connect() as database:
+        rows = database.execute(f"SELECT {sums} FROM range(9) t(i) GROUP BY i % 3").fetchall()
+    assert sorted(row[0] for row in rows) == [9, 12, 15]
 
 
 def test_a_drive_that_goes_back_in_time_is_refused(warehouse: Warehouse) -> None:

@@ -16,6 +16,10 @@ _SEPARATOR = ",\n            "
 BITS = 63
 """Bits of a BIGINT that are no sign."""
 
+MOST_SUMS = 8_000
+"""Sums of one grouping: DuckDB 2.0.0 ends with SIGFPE where those of a group, 24 bytes each, are
+longer than its block of 262,144 bytes."""
+
 
 def gram_statement(
     signals: SignalCatalogue,
@@ -52,22 +56,59 @@ def gram_statement(
     wide = windows or any(feature.limit > COUNT_MAX for feature in used.values())
     kind = "BIGINT" if wide else "INTEGER"
     parts = Parts.of_set(known, one)
+    absent_sql, part = "0" if whole else _absent(names), parts.number_sql if parts else "NULL"
+    sums = [f"sum({name})" for name in names]
+    products = [
+        f"sum({a}::{kind} * {b}::{kind})" for i, a in enumerate(names) for b in names[: i + 1]
+    ]
+    first = MOST_SUMS - len(sums)
+    further = [products[i : i + MOST_SUMS] for i in range(first, len(products), MOST_SUMS)]
+    group = ", ".join(_group(whole=whole, divided=bool(parts)))
+    counted = ""
+    if further:
+        clipped = ", clipped" if definitions or windows else ""
+        columns = f"{absent_sql} AS absent, {part} AS part{clipped}, {', '.join(names)}"
+        counted = (
+            f"counted AS MATERIALIZED (\n    SELECT drive_id, {columns}\n    FROM {rows}\n),\n\n"
+        )
+        rows, absent_sql, part, group = "counted", "absent", "part", "drive_id, absent, part"
     return read_sql("jobs", "gram.sql").format(
         drive_columns=", ".join(
             signals.null_sql(name) if name in absent else name for name in signals.drive
         ),
         qualified_drive_columns=", ".join(f"drive.{name}" for name in signals.drive),
-        absent="0" if whole else _absent(names),
-        part=parts.number_sql if parts else "NULL",
+        absent=absent_sql,
+        part=part,
+        counted=counted,
         clipped="sum(clipped)::BIGINT" if definitions or windows else "0",
-        sums=_SEPARATOR.join(f"sum({name})" for name in names),
-        products=_SEPARATOR.join(
-            f"sum({a}::{kind} * {b}::{kind})" for i, a in enumerate(names) for b in names[: i + 1]
-        ),
+        sums=_SEPARATOR.join(sums),
+        products=_SEPARATOR.join(products[:first]),
         counts=rows,
-        group=", ".join(_group(whole=whole, divided=bool(parts))),
+        group=group,
+        further="".join(_further(i, some) for i, some in enumerate(further)),
+        joined="".join(_joined(i) for i in range(len(further))),
+        all_products=" || ".join(
+            ["gram.products", *(f"further_{i}.products" for i in range(len(further)))]
+        ),
         part_name=parts.name_sql("gram.part") if parts else "NULL::VARCHAR",
         names=", ".join(f"'{name}'" for name in names),
+    )
+
+
+def _further(number: int, products: Sequence[str]) -> str:
+    """Return further products of the groups, which have their keys to be joined by."""
+    return (
+        f",\n\nfurther_{number} AS (\n    SELECT\n        drive_id,\n        absent,\n"
+        f"        part,\n        [\n            {_SEPARATOR.join(products)}\n"
+        "        ]::BIGINT[] AS products\n    FROM counted\n    GROUP BY drive_id, absent, part\n)"
+    )
+
+
+def _joined(number: int) -> str:
+    other = f"further_{number}"
+    return (
+        f"\nJOIN {other} ON {other}.drive_id = gram.drive_id AND {other}.absent = gram.absent "
+        f"AND {other}.part IS NOT DISTINCT FROM gram.part"
     )
 
 
