@@ -23,7 +23,7 @@ from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.maintenance.compaction import compact
 from fleet_slip.maintenance.forget import forget
 from fleet_slip.maintenance.verify import verify
-from fleet_slip.maintenance.verify_files import problem_of
+from fleet_slip.maintenance.verify_files import read_whole
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.job import simulate_campaign
 from fleet_slip.warehouse.audit import Forgettable
@@ -45,7 +45,7 @@ def bits(warehouse: Warehouse, count: int) -> None:
         path = Path(table.uri(file.path))
         bit = rng.randrange(file.size_bytes * 8)
         _flip(path, bit)
-        found += problem_of(table, file) is not None
+        found += read_whole(table, file).problem is not None
         _flip(path, bit)
     assert not verify(warehouse).damage
     print(f"{count} bits flipped in {len(files)} files: {found} found", flush=True)

@@ -11,7 +11,7 @@ that is made again from its source takes its place without a commit.
 
 from fleet_slip.delta.change import Change, Unit, rows_in
 from fleet_slip.delta.conflicts import retry_conflicts
-from fleet_slip.delta.encoding import Encoded, Encoding, only_used_values
+from fleet_slip.delta.encoding import Encoded, Encoding
 from fleet_slip.delta.files import TableFile, absent_columns
 from fleet_slip.delta.snapshot import Snapshot
 from fleet_slip.delta.table import Table
@@ -28,7 +28,6 @@ __all__ = [
     "absent_columns",
     "checksum_in",
     "checksum_of",
-    "only_used_values",
     "retry_conflicts",
     "rows_in",
 ]

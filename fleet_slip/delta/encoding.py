@@ -57,11 +57,11 @@ class Encoding:
     ) -> Encoded:
         """Return the content of a file with these rows, without some of their columns.
 
-        The parts of a `preface` stand before them; see `fleet_slip.delta.preface`.
+        A dictionary is stored as far as the rows have its values. The parts of a `preface` stand
+        before the rows; see `fleet_slip.delta.preface`.
         """
-        stored = _required(
-            rows.drop_columns([name for name in omitted if name in rows.schema.names])
-        )
+        kept = rows.drop_columns([name for name in omitted if name in rows.schema.names])
+        stored = _required(_only_used_values(kept))
         sink = pa.BufferOutputStream()
         with pq.ParquetWriter(
             sink, stored.schema, write_batch_size=WRITE_BATCH_ROWS, **self.options()
@@ -72,14 +72,6 @@ class Encoding:
         content = sink.getvalue()
         statistics = json.dumps(_statistics(rows, stored.column_names))
         return Encoded(content, checksum_of(content), fast_checksum_of(content), statistics)
-
-
-def only_used_values(rows: pa.Table) -> pa.Table:
-    """Return rows whose dictionaries have the values that occur only, in the order they occur in.
-
-    A file has a dictionary as it is given, the names of rows that were left out with it.
-    """
-    return pa.table({name: _compact(rows[name].combine_chunks()) for name in rows.column_names})
 
 
 def _required(rows: pa.Table) -> pa.Table:
@@ -102,8 +94,23 @@ def _statistics(rows: pa.Table, stored: Sequence[str]) -> dict[str, Any]:
     return told
 
 
-def _compact(column: pa.Array) -> pa.Array:
+def _only_used_values(rows: pa.Table) -> pa.Table:
+    """Return rows whose dictionaries have the values that occur only, in the order they occur in.
+
+    Parquet stores a dictionary as it is given. One that is shared with rows of another file, or of
+    a drive that was forgotten, would bring their names along.
+    """
+    columns = [_compact(column) for column in rows.columns]
+    return pa.Table.from_arrays(columns, schema=rows.schema)
+
+
+def _compact(column: pa.ChunkedArray) -> pa.ChunkedArray:
     if not pa.types.is_dictionary(column.type):
         return column
-    codes = column.indices.dictionary_encode()
-    return pa.DictionaryArray.from_arrays(codes.indices, column.dictionary.take(codes.dictionary))
+    whole = column.combine_chunks()
+    used = whole.indices.unique().drop_null()
+    if used.to_pylist() == list(range(len(whole.dictionary))):
+        return column
+    codes = whole.indices.dictionary_encode()
+    values = whole.dictionary.take(codes.dictionary)
+    return pa.chunked_array([pa.DictionaryArray.from_arrays(codes.indices, values)])

@@ -16,6 +16,7 @@ from fleet_slip.delta.conflicts import is_conflict, retry_conflicts
 from fleet_slip.delta.encoding import Encoded, Encoding
 from fleet_slip.delta.files import TableFile
 from fleet_slip.delta.log_check import require_sound_log
+from fleet_slip.delta.names import Names, read_names
 from fleet_slip.delta.preface import read_preface
 from fleet_slip.delta.schema import require_readable, require_writable
 from fleet_slip.delta.sealing import NOTE, seal_note
@@ -105,6 +106,15 @@ class Table:
     def read_preface(self, path: str, part: int) -> bytes | None:
         """Return a part of what stands before a file's rows; see `fleet_slip.delta.preface`."""
         return read_preface(self.folder, path, part)
+
+    def read_names(self, path: str) -> dict[str, Names]:
+        """Return the names in the dictionaries of one of the table's files, by column."""
+        with storage_errors(f"{self.folder}/{path}"), self.folder.open(path) as file:
+            return read_names(file, self.encoding.dictionary)
+
+    def has_unused_names(self, path: str) -> bool:
+        """Whether a dictionary of one of the table's files has names that none of its rows has."""
+        return any(names.unused for names in self.read_names(path).values())
 
     def write_file(
         self, name: str, rows: pa.Table, day: date | None = None, preface: Sequence[bytes] = ()

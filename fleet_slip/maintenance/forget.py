@@ -32,6 +32,7 @@ from fleet_slip.maintenance.old_files import (
     remove_uncommitted_files,
 )
 from fleet_slip.maintenance.rewriting import Rewriting, rewrite
+from fleet_slip.maintenance.unused_names import drop_unused_names
 from fleet_slip.models.manifest import TrainedOn
 from fleet_slip.models.trained_drives import hash_drives, read_trained_drives
 from fleet_slip.models.versions import Registry
@@ -103,6 +104,8 @@ def forget(
         cleared.forget(audit, subject, present)
     _forget_quarantined(warehouse, subject, drives)
     rows, rewritten, removed = _rewrite_logs(warehouse, subject, located, progress)
+    if not audit.names_are_exact:
+        drop_unused_names(warehouse)
     if drives or state:
         warehouse.grams.fence()
     rows += forget_received(warehouse, subject)

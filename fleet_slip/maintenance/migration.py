@@ -1,6 +1,7 @@
 """Brings the table `logs` to the signal catalogue: new columns, other scales.
 
-The quarantine and the Gram rows get the columns that came later.
+The quarantine and the Gram rows get the columns that came later. Files of earlier versions that
+have names of other files in their dictionaries are written anew without them.
 
 New columns need no file to be touched: where a file lacks a column, its values are null. Another
 scale needs every count of the signal rewritten, and no reader may ever mix the two:
@@ -39,6 +40,7 @@ from fleet_slip.errors import ConflictError, RefusedError, StorageError
 from fleet_slip.files.storage_errors import storage_errors
 from fleet_slip.grams.rows.ahead import land_ahead
 from fleet_slip.maintenance.rewriting import read_kept_drives
+from fleet_slip.maintenance.unused_names import drop_unused_names
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -53,11 +55,13 @@ class MigrationReport:
     files_rewritten: int
     rows_rewritten: int
     logs_version: int | None
+    files_without_names: int = 0
+    """Files that were written anew because they had names that none of their rows has."""
 
     @property
     def changed(self) -> bool:
         """Whether there was anything to do but to record scales."""
-        return bool(self.added or self.rescaled)
+        return bool(self.added or self.rescaled or self.files_without_names)
 
 
 def migrate(warehouse: Warehouse, progress: Progress = no_progress) -> MigrationReport:
@@ -84,8 +88,11 @@ def migrate(warehouse: Warehouse, progress: Progress = no_progress) -> Migration
         files, rows = _rescale(warehouse, found, progress)
     elif found.migrating:
         _settle(table)
+    cleaned = drop_unused_names(warehouse)
     version = _now(table).version()
-    return MigrationReport(found.added, found.retired, found.rescaled, files, rows, version)
+    return MigrationReport(
+        found.added, found.retired, found.rescaled, files, rows, version, cleaned
+    )
 
 
 def _add_columns_that_came_later(table: Table) -> None:

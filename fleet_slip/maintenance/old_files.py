@@ -97,6 +97,8 @@ class OldFile:
     replaced: bool
     rows: pa.Table
     drives: frozenset[str] = frozenset()
+    has_unused_names: bool = False
+    """Whether it was replaced because of names of other files in it: they may be the subject's."""
 
     @property
     def is_young(self) -> bool:
@@ -112,9 +114,11 @@ def read_old_files(snapshot: Snapshot) -> Iterator[OldFile]:
         try:
             names = snapshot.table.read_metadata(file.path).schema.to_arrow_schema().names
             rows = snapshot.table.read(file.path, [name for name in names if name in wanted])
+            replaced = file.path in known
+            others = replaced and snapshot.table.has_unused_names(file.path)
         except FleetSlipError:
             continue  # half a file, or just deleted
-        yield OldFile(file, file.path in known, _with_day(file, rows))
+        yield OldFile(file, replaced, _with_day(file, rows), has_unused_names=others)
 
 
 def _with_day(file: StoredFile, rows: pa.Table) -> pa.Table:
@@ -128,7 +132,7 @@ def _with_day(file: StoredFile, rows: pa.Table) -> pa.Table:
 def _with_subject(snapshot: Snapshot, subject: Forgettable) -> Iterator[OldFile]:
     for one in read_old_files(snapshot):
         names = one.rows.filter(rows_of(one.rows, subject))["drive_id"].unique().to_pylist()
-        if names:
+        if names or one.has_unused_names:
             yield replace(one, drives=frozenset(names))
 
 

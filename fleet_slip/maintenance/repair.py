@@ -24,7 +24,7 @@ from fleet_slip.files.storage_errors import storage_errors
 from fleet_slip.grams.rows.gram_files import is_of_received
 from fleet_slip.grams.rows.gram_job import reconcile
 from fleet_slip.maintenance.verification import Verification
-from fleet_slip.maintenance.verify_files import problem_of
+from fleet_slip.maintenance.verify_files import read_whole
 from fleet_slip.resources import config_names
 from fleet_slip.simulation.campaign import Batch, Campaign, DriveSpec, load_campaign
 from fleet_slip.simulation.drives import simulate_batch
@@ -181,7 +181,7 @@ def _readable_grams(warehouse: Warehouse) -> dict[str, pa.Table]:
     """Return which drives and log files the Gram files name, of those that are whole."""
     found = {}
     for file in warehouse.grams.unchecked_snapshot().files:
-        if problem_of(warehouse.grams, file) is None:
+        if read_whole(warehouse.grams, file).problem is None:
             with contextlib.suppress(FleetSlipError):
                 found[file.path] = warehouse.grams.read(file.path, ["file", "drive_id"])
     return found

@@ -16,7 +16,7 @@ import pyarrow.compute as pc
 from deltalake.transaction import AddAction
 
 from fleet_slip.arrays import IntArray
-from fleet_slip.delta import Change, Snapshot, Table, TableFile, Unit, only_used_values
+from fleet_slip.delta import Change, Snapshot, Table, TableFile, Unit
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.grams.rows.ahead import land_ahead
 from fleet_slip.progress import Progress, no_progress
@@ -84,8 +84,7 @@ def read_kept_drives(
         rows = rows.take(order)
     empty = {name for name in table.optional if name in rows.column_names and _is_empty(rows[name])}
     names = dict.fromkeys([*table.schema.names, *rows.column_names])
-    rows = rows.select([name for name in names if name in rows.column_names and name not in empty])
-    return only_used_values(rows)
+    return rows.select([name for name in names if name in rows.column_names and name not in empty])
 
 
 def _is_empty(column: pa.ChunkedArray) -> bool:

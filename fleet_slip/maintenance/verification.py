@@ -10,7 +10,8 @@ class Damage:
 
     Attributes:
         kind: where it is. "damage" of a `file`, a `drive`, a `gram` row, a `document`, a `model`,
-            or the `log` of a table; or only a remark: "unreferenced", "backlog", or "unchecked".
+            the `log` of a table, or a `name` that was forgotten; or only a remark: "unreferenced",
+            "backlog", or "unchecked".
         path: the file below the root, or the drive or model version.
         problem: what is wrong.
     """
@@ -22,6 +23,7 @@ class Damage:
         "document",
         "model",
         "log",
+        "name",
         "unreferenced",
         "backlog",
         "unchecked",

@@ -2,7 +2,8 @@
 
 Every byte of every data file with the checksum in its name; files, sizes and counts with the Delta
 log; drives with the rule that they are whole; Gram rows with the logs by a path of their own;
-documents with their checksums; model versions with the tables that they were made of.
+documents with their checksums; model versions with the tables that they were made of; names of cars
+and drives with the record of what was forgotten.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,6 +24,7 @@ from fleet_slip.maintenance.verification import Damage, Verification
 from fleet_slip.maintenance.verify_documents import verify_documents, verify_models
 from fleet_slip.maintenance.verify_files import verify_files
 from fleet_slip.maintenance.verify_grams import SoundFiles, verify_drives, verify_grams
+from fleet_slip.maintenance.verify_names import verify_names
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.tables import Warehouse
 from fleet_slip.words import number_of
@@ -43,8 +45,9 @@ def verify(
     report = Verification()
     warehouse.require()
     snapshots = _open_tables(warehouse, report)
-    good = {table: verify_files(s, report, progress, executor) for table, s in snapshots.items()}
-    logs, grams = (good.get(table, []) for table in ("logs", "grams"))
+    read = {table: verify_files(s, report, progress, executor) for table, s in snapshots.items()}
+    logs, grams = ([one.file for one in read.get(table, [])] for table in ("logs", "grams"))
+    verify_names(warehouse, read, report, full)
     if logs:
         verify_drives(warehouse, logs, report)
     _report_missing_logs(snapshots, grams, report)

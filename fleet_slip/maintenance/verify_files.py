@@ -1,8 +1,9 @@
 """Compares data files with the checksums in their names, byte for byte, and with the Delta log."""
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
+from dataclasses import dataclass, field
 from functools import partial
 
 import pyarrow as pa
@@ -10,6 +11,7 @@ import pyarrow.parquet as pq
 
 from fleet_slip.compute.tasks import LocalThreads, run_tasks
 from fleet_slip.delta import Snapshot, Table, TableFile, checksum_in, checksum_of
+from fleet_slip.delta.names import Names, read_names
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.files.storage_errors import storage_errors
 from fleet_slip.maintenance.verification import Damage, Verification
@@ -21,27 +23,36 @@ TASK_FILES = 64
 """A task reads about so many bytes, or so many files."""
 
 
+@dataclass(frozen=True)
+class ReadFile:
+    """What was found in a data file: what is wrong with it, or the names in its dictionaries."""
+
+    file: TableFile
+    problem: str | None
+    names: Mapping[str, Names] = field(default_factory=dict)
+
+
 def verify_files(
     snapshot: Snapshot, report: Verification, progress: Progress, executor: Executor | None
-) -> list[TableFile]:
+) -> list[ReadFile]:
     """Return the files of a table that are what they must be."""
     table = snapshot.table
-    problems: dict[str, str | None] = {}
+    read: list[ReadFile] = []
     with LocalThreads(os.cpu_count() or 1) as threads:
         groups = _groups(snapshot.files)
-        task = partial(_problems_of, table)
+        task = partial(_read_files, table)
         for group, found in run_tasks(executor or threads, task, groups, _group_name):
-            problems |= found
+            read += found
             progress(sum(file.size_bytes for file in group), snapshot.size_bytes)
-    held = {file.path: file for file in snapshot.files}
-    for path, problem in sorted(problems.items()):
-        if problem:
-            told = f"{problem} (it held {held[path].rows:,} rows)"
-            report.findings.append(Damage("file", f"{table.folder.name}/{path}", told))
+    read.sort(key=lambda one: one.file.path)
+    for one in read:
+        if one.problem:
+            told = f"{one.problem} (it held {one.file.rows:,} rows)"
+            report.findings.append(Damage("file", f"{table.folder.name}/{one.file.path}", told))
     report.files += len(snapshot.files)
     report.size_bytes += snapshot.size_bytes
     report.rows += snapshot.rows if table.folder.name == "logs" else 0
-    return [file for file in snapshot.files if not problems[file.path]]
+    return [one for one in read if not one.problem]
 
 
 def _groups(files: Sequence[TableFile]) -> Iterator[tuple[TableFile, ...]]:
@@ -60,25 +71,27 @@ def _group_name(group: Sequence[TableFile]) -> str:
     return f"the bytes of {len(group)} files from {group[0].path}"
 
 
-def _problems_of(table: Table, files: Sequence[TableFile]) -> dict[str, str | None]:
-    return {file.path: problem_of(table, file) for file in files}
+def _read_files(table: Table, files: Sequence[TableFile]) -> list[ReadFile]:
+    return [read_whole(table, file) for file in files]
 
 
-def problem_of(table: Table, file: TableFile) -> str | None:
-    """Return what is wrong with a data file, or None."""
+def read_whole(table: Table, file: TableFile) -> ReadFile:
+    """Read every byte of a data file, and compare it with what tells of it."""
     path = f"{table.folder}/{file.path}"
     try:
         content = table.folder.read(file.path)
         if len(content) != file.size_bytes:
-            return f"has {len(content):,} bytes instead of {file.size_bytes:,}"
+            problem = f"has {len(content):,} bytes instead of {file.size_bytes:,}"
+            return ReadFile(file, problem)
         expected = checksum_in(file.path)
         if expected and checksum_of(content) != expected:
-            return "its bytes do not match the checksum in its name"
+            return ReadFile(file, "its bytes do not match the checksum in its name")
         with storage_errors(path):
             metadata = pq.read_metadata(pa.BufferReader(content))
+            names = read_names(pa.BufferReader(content), table.encoding.dictionary)
     except FleetSlipError as error:
-        return str(error).removeprefix(f"{path}: ")
-    return _contradiction(file, metadata)
+        return ReadFile(file, str(error).removeprefix(f"{path}: "))
+    return ReadFile(file, _contradiction(file, metadata), names)
 
 
 def _contradiction(file: TableFile, metadata: pq.FileMetaData) -> str | None:

@@ -107,18 +107,22 @@ class Audit:
         """Return all entries, oldest first."""
         return [_entry(self._folder, number) for number in self._folder.numbers()]
 
-    def barred(self, vehicles: Collection[str], drives: Collection[str]) -> Barred:
+    def barred(
+        self, vehicles: Collection[str], drives: Collection[str], *, ended: bool = False
+    ) -> Barred:
         """Return which of some cars and drives were forgotten: no row of theirs may land.
 
+        `ended` leaves out what is still being forgotten, or was interrupted: its rows are there.
         Each name takes some 40 ms to look up, once in a process, where a car, or a drive, was ever
         forgotten; nothing where none was.
         """
         last = self._last_events()
+        free = (ALLOWED, "begun") if ended else (ALLOWED,)
         found: dict[str, set[str]] = {"vehicle": set(), "drive": set()}
         for kind, names in (("vehicle", vehicles), ("drive", drives)):
             for salt in {key[1] for key in last if key[0] == kind}:
                 for name, digest in _digests(cast(Kind, kind), names, salt).items():
-                    if last.get((kind, salt, digest), ALLOWED) != ALLOWED:
+                    if last.get((kind, salt, digest), ALLOWED) not in free:
                         found[kind].add(name)
         return Barred(frozenset(found["vehicle"]), frozenset(found["drive"]))
 
@@ -180,7 +184,13 @@ class Audit:
 
     def end(self, subject: Forgettable, grams_version: int | None = None) -> None:
         """Record that it is forgotten, and since which version the Gram rows are without it."""
-        self._append(subject, {"event": "done", "grams_version": grams_version})
+        done = {"event": "done", "grams_version": grams_version, "names_are_exact": True}
+        self._append(subject, done)
+
+    @property
+    def names_are_exact(self) -> bool:
+        """Whether names that no row has were taken out of all files, as since then none has any."""
+        return any(entry.get("names_are_exact") for entry in self.entries())
 
     def allow(self, subject: Forgettable) -> None:
         """Record that a forgotten car or drive may come back."""

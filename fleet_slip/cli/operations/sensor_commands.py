@@ -161,6 +161,9 @@ def migrate(context: typer.Context, json: Json = False) -> None:
         say(f"added: {', '.join(report.added)}; null in the files that are there")
     for name, (old, new) in report.rescaled.items():
         say(f"{name}: counts of {old} are now counts of {new}")
+    if report.files_without_names:
+        files = number_of(report.files_without_names, "file")
+        say(f"{files} written anew, without names that none of their rows has")
     if report.files_rewritten:
         say(
             f"{number_of(report.files_rewritten, 'file')}, "

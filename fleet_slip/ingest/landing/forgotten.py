@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from fleet_slip.delta import only_used_values
 from fleet_slip.ingest.drives.measured_drives import MeasuredDrive
 from fleet_slip.warehouse.audit import Audit
 
@@ -62,4 +61,4 @@ def _without(rows: pa.Table, column: str, names: frozenset[str]) -> pa.Table:
     if not names:
         return rows
     unwanted = pc.is_in(rows[column].cast(pa.string()), pa.array(sorted(names), pa.string()))
-    return only_used_values(rows.filter(pc.invert(pc.fill_null(unwanted, False))))
+    return rows.filter(pc.invert(pc.fill_null(unwanted, False)))
