@@ -21,6 +21,9 @@ CATALOGUE_VARIABLE = "FLEET_SLIP_SIGNALS"
 COUNT_MAX = 2**15 - 1
 """Largest count. The range is symmetric, so that mirroring a drive never overflows."""
 
+HALF_TURN = COUNT_MAX + 1
+"""Counts of half a turn, of a signal that is a whole turn."""
+
 SAMPLE_TIME_S = Fraction(1, 100)
 """Time between two rows of a drive, in s: the paper's 0.01 s."""
 
@@ -48,14 +51,18 @@ class Signal(Config):
     role: Literal["input", "extra", "label", "truth"]
     stepwise: bool = False
     """Whether it changes in steps, such as a gear: between two samples the first one holds."""
+    cyclic: bool = False
+    """Whether it is an angle of which 65,536 counts are a whole turn, so that int16 wraps."""
     description: str = Field(min_length=1)
 
     @model_validator(mode="after")
     def _range_fits_counts(self) -> "Signal":
         if self.min >= self.max:
             raise ValueError(f"min {self.min} is not below max {self.max}")
+        if self.cyclic and not -self.min == self.max == HALF_TURN * self.scale:
+            raise ValueError(f"cyclic: the range must be from -{HALF_TURN} to {HALF_TURN} counts")
         largest = max(abs(self.min), abs(self.max)) / self.scale
-        if largest > COUNT_MAX:
+        if largest > COUNT_MAX and not self.cyclic:
             raise ValueError(f"the range needs counts up to {largest:f}, int16 ends at {COUNT_MAX}")
         return self
 
@@ -72,7 +79,7 @@ class Signal(Config):
     @property
     def max_count(self) -> int:
         """Largest valid count."""
-        return int(self.max / self.scale)
+        return COUNT_MAX if self.cyclic else int(self.max / self.scale)
 
 
 _ARROW_TYPES = {

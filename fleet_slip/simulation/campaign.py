@@ -11,7 +11,7 @@ from datetime import date, timedelta
 from functools import cached_property
 from itertools import groupby
 from operator import itemgetter
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 from pydantic import Field, TypeAdapter, model_validator
@@ -19,13 +19,14 @@ from pydantic import Field, TypeAdapter, model_validator
 from fleet_slip.arrays import FloatArray
 from fleet_slip.canonical import canonical_ascii, sha256_of
 from fleet_slip.catalogue.signals import Identifier
-from fleet_slip.config import Config, load_config
+from fleet_slip.config import Config, load_config, load_toml
 from fleet_slip.errors import ConfigError, UsageError
 from fleet_slip.resources import find_config
 from fleet_slip.simulation.distortion import Distortion
 from fleet_slip.simulation.drive_plan import FleetPlan, GridPlan, random_generator
 from fleet_slip.simulation.imperfections import NONE, Imperfections
 from fleet_slip.simulation.manoeuvres import Manoeuvre
+from fleet_slip.simulation.receivers import Receiver, Receivers
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ, Sensors
 from fleet_slip.simulation.speed_profile import SpeedLimits, SpeedProfile, speed_profile
 from fleet_slip.simulation.surface import surface
@@ -59,6 +60,9 @@ class DriveSpec:
     """Manoeuvres; a drive without any has the digest that it had before there were some."""
     flaws: Annotated[Imperfections, Field(exclude_if=lambda flaws: flaws == NONE)] = NONE
     """Not part of the digest where there are none: it is what it was before there were any."""
+    receiver: Annotated[Receiver | None, Field(exclude_if=lambda one: one is None)] = None
+    drawn_as: Annotated[str, Field(exclude_if=lambda name: not name)] = ""
+    """The campaign whose car, road and noise this drive has, if it is not its own."""
 
     @property
     def profile(self) -> SpeedProfile:
@@ -73,19 +77,28 @@ class DriveSpec:
 
     def generator(self) -> np.random.Generator:
         """Return the generator of the drive's sensor noise, at its start."""
-        return random_generator(self.seed, "sensors", self.drive_id)
+        return self._drawn("sensors", self.drive_id)
+
+    def satellite_generator(self) -> np.random.Generator:
+        """Return the generator of the satellite receiver's errors in the drive."""
+        return self._drawn("satellites", self.drive_id)
+
+    def _drawn(self, what: str, identity: str) -> np.random.Generator:
+        own = identity.removeprefix(self.campaign)
+        known_as = self.drawn_as + own if self.drawn_as else identity
+        return random_generator(self.seed, what, known_as)
 
     def distortion(self) -> Distortion | None:
         """Return what the sensors make of the truth, at the drive's start; None where nothing."""
         if self.flaws == NONE:
             return None
-        of_car = random_generator(self.seed, "pulses", self.vehicle_id)
-        return Distortion(self.flaws, of_car, random_generator(self.seed, "gps", self.drive_id))
+        of_car = self._drawn("pulses", self.vehicle_id)
+        return Distortion(self.flaws, of_car, self._drawn("gps", self.drive_id))
 
     def surface(self, station_m: FloatArray) -> Surface | None:
         """Return the road's surface at the stations of the profile."""
         of_track = random_generator(self.seed, "slopes", self.track.name)
-        of_drive = random_generator(self.seed, "weather", self.drive_id)
+        of_drive = self._drawn("weather", self.drive_id)
         return surface(self.flaws.road, self.track, station_m, of_track, of_drive)
 
 
@@ -109,7 +122,11 @@ _BATCH = TypeAdapter(Batch)
 
 
 class Campaign(Config):
-    """A plan of drives over days. A day's drives stay the same when days are added."""
+    """A plan of drives over days. A day's drives stay the same when days are added.
+
+    With a `base` it says only in what it differs from that campaign. Its cars, roads and noise are
+    drawn as those of the base are, so that what it leaves as it was has the same values.
+    """
 
     name: Identifier
     description: str = Field(min_length=1)
@@ -121,6 +138,22 @@ class Campaign(Config):
     rows_per_file: int = Field(gt=0, le=2_000_000)
     plan: Annotated[GridPlan | FleetPlan | TrialPlan, Field(discriminator="kind")]
     sensors: Sensors
+    base: Annotated[Identifier | None, Field(exclude_if=lambda one: one is None)] = None
+    receivers: Annotated[Receivers | None, Field(exclude_if=lambda one: one is None)] = None
+    """Satellite receivers that log course and speed; None: none does."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _inherit(cls, content: Any) -> Any:
+        if not isinstance(content, dict) or not isinstance(content.get("base"), str):
+            return content
+        try:
+            base = load_toml(find_config("campaigns", content["base"]))
+        except ConfigError as error:
+            raise ValueError(str(error)) from None
+        if "base" in base:
+            raise ValueError(f"the base {content['base']!r} has a base itself: take that one")
+        return {**base, **content}
 
     @model_validator(mode="after")
     def _open_tracks_have_no_laps(self) -> Self:
@@ -177,18 +210,24 @@ class Campaign(Config):
 
     def _drive(self, day: date, first: int, index: int) -> DriveSpec:
         plan, number = self.plan, first + index
-        drive_id = f"{self.name}-{day.isoformat()}-{index:04d}"
-        vehicle_id = f"{self.name}-{plan.car(number):04d}"
+        of_day, of_plan = f"-{day.isoformat()}-{index:04d}", f"-{plan.car(number):04d}"
+        drive_id, vehicle_id = self.name + of_day, self.name + of_plan
+        drawn_as = self.base or self.name
         if isinstance(plan, GridPlan):
             assignment = plan.assignment(number, self.sensors)
         else:
-            of_car = random_generator(self.seed, "car", vehicle_id)
-            of_drive = random_generator(self.seed, "drive", drive_id)
+            of_car = random_generator(self.seed, "car", drawn_as + of_plan)
+            of_drive = random_generator(self.seed, "drive", drawn_as + of_day)
             if isinstance(plan, TrialPlan):
                 assignment = plan.assignment(number, self.sensors, of_car, of_drive)
             else:
                 days = (day - self.first_day).days
                 assignment = plan.assignment(self.sensors, of_car, of_drive, days)
+        receiver = None
+        if self.receivers:
+            receiver = self.receivers.draw(
+                random_generator(self.seed, "receiver", drawn_as + of_plan)
+            )
         return DriveSpec(
             drive_id=drive_id,
             vehicle_id=vehicle_id,
@@ -204,6 +243,8 @@ class Campaign(Config):
             seed=self.seed,
             script=assignment.script,
             flaws=assignment.flaws,
+            receiver=receiver,
+            drawn_as=self.base or "",
         )
 
 

@@ -9,6 +9,7 @@ import pyarrow as pa
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.simulation.campaign import Batch, DriveSpec
 from fleet_slip.simulation.manoeuvres import road_with
+from fleet_slip.simulation.receivers import Fixes, ReceiverLog
 from fleet_slip.simulation.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ, Measurement, Recorder
 from fleet_slip.vehicle.lanes.lane_drives import LaneDrive, simulate_blocks
 from fleet_slip.vehicle.lanes.road import Road
@@ -27,6 +28,13 @@ class DriveLog:
     spec: DriveSpec
     measurement: Measurement
     lost_control_s: float | None
+    fixes: Fixes | None = None
+    """What its satellite receiver logged, if the campaign has receivers."""
+
+    @property
+    def signals(self) -> set[str]:
+        """Names of the signals that it has."""
+        return {*self.measurement.counts, *(self.fixes.counts if self.fixes else ())}
 
     @property
     def rows(self) -> int:
@@ -73,8 +81,8 @@ def lane_drive(spec: DriveSpec) -> LaneDrive:
 def simulate_batch(batch: Batch) -> pa.Table:
     """Simulate and measure the drives of a batch.
 
-    Returns a table in the order of `SignalCatalogue.log_schema`, without the signals that no
-    simulated car logs, with strings as dictionaries,
+    Returns a table in the order of `SignalCatalogue.log_schema`, without the extras that no car
+    of the batch logs, with strings as dictionaries,
     sorted by drive, then tick. It depends on the batch alone: any number of threads may simulate
     any batches in any order.
     """
@@ -90,16 +98,22 @@ def simulate_logs(specs: Sequence[DriveSpec]) -> list[DriveLog]:
     A block of a drive is measured as soon as it is there: of true signals nothing is kept.
     """
     recorders = [Recorder(s.sensors, s.generator(), s.distortion()) for s in specs]
+    receivers = [
+        ReceiverLog(s.receiver, s.satellite_generator()) if s.receiver else None for s in specs
+    ]
     logs: dict[int, DriveLog] = {}
     for block in simulate_blocks([lane_drive(spec) for spec in specs]):
-        recorder = recorders[block.drive]
+        recorder, receiver = recorders[block.drive], receivers[block.drive]
         recorder.record(block.channels)
+        if receiver:
+            receiver.record(block.channels)
         if block.last:
             lost = block.lost_control_tick
             logs[block.drive] = DriveLog(
                 specs[block.drive],
                 recorder.measurement(),
                 None if lost is None else lost / SAMPLE_RATE_HZ,
+                receiver.fixes() if receiver else None,
             )
     return [logs[drive] for drive in range(len(specs))]
 
@@ -115,7 +129,7 @@ def tabulate(batch: Batch, logs: Sequence[DriveLog]) -> pa.Table:
     ticks = pa.array(np.arange(max(rows), dtype=np.int32))
     columns["tick"] = pa.chunked_array([ticks[:n] for n in rows])
     for name in catalogue().signals:
-        if name not in catalogue().extras or any(name in log.measurement.counts for log in logs):
+        if name not in catalogue().extras or any(name in log.signals for log in logs):
             columns[name] = pa.chunked_array([_counts(log, name) for log in logs])
     names = [name for name in catalogue().log_schema.names if name in columns]
     return pa.table({name: columns[name] for name in names})
@@ -123,6 +137,8 @@ def tabulate(batch: Batch, logs: Sequence[DriveLog]) -> pa.Table:
 
 def _counts(log: DriveLog, name: str) -> pa.Array:
     """Return the counts of a signal without a copy; all null if the car lacks the sensor."""
+    if log.fixes and name in log.fixes.counts:
+        return pa.array(log.fixes.counts[name], mask=~log.fixes.fix)
     if name not in log.measurement.counts:
         return pa.nulls(log.rows, pa.int16())
     no_fix = ~log.measurement.gps_fix if name in GPS_SIGNALS else None

@@ -108,7 +108,7 @@ class Recorder:
         self._distortion = distortion
         self._sensors = sensors
         self._generator = generator
-        self._outages = _Outages(sensors.gps, generator)
+        self._outages = Outages(sensors.gps, generator)
         self._ticks = 0
         self._counts: dict[str, list[NDArray[np.int16]]] = {}
         self._gps_fix: list[BoolArray] = []
@@ -216,7 +216,7 @@ def _quantise(
     return clipped
 
 
-class _Outages:
+class Outages:
     """When a drive has a GPS fix: once a period, and never in an outage."""
 
     def __init__(self, gps: Gps, generator: np.random.Generator) -> None:
