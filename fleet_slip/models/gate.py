@@ -5,12 +5,16 @@ own coefficients, not its signals fitted anew. It is compared on the same held-o
 the error that counts is that of the difference, over what is independent in the data: cars where
 there are several, else drives. And so that many small steps do not lead downhill, the best of the
 champions so far is compared as well.
+
+Rows do not decide alone: a car that sends its rows may say that they are many. Where cars are held
+out, the median group of them must not be worse off either, each group having one vote.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import zip_longest
 from typing import Any
 
 from pydantic import Field
@@ -32,7 +36,7 @@ from fleet_slip.regression.validation.crossval import (
     least_squares,
 )
 from fleet_slip.regression.validation.folds import Folds
-from fleet_slip.regression.validation.paired import compare_paired
+from fleet_slip.regression.validation.paired import compare_paired, compare_typical
 from fleet_slip.resources import config_file
 from fleet_slip.selection.compare import Selection
 from fleet_slip.words import number_of
@@ -70,19 +74,25 @@ class Comparison:
         by: what was held out, vehicle or drive.
         challenger: fitted to all groups but the one that it is tested on.
         incumbents: the champion, and the best of the champions so far if that is another one.
-        shortfalls: of the challenger, from each of them.
+        shortfalls: of the challenger, from each of them, over all rows.
+        typical: the same in the median group, where cars are held out.
     """
 
     by: FoldKey
     challenger: CrossValidation
     incumbents: tuple[CrossValidation, ...]
     shortfalls: tuple[Shortfall, ...]
+    typical: tuple[Shortfall, ...] = ()
 
     @property
     def better(self) -> tuple[CrossValidation, ...]:
-        """Those that the challenger is worse than."""
-        pairs = zip(self.incumbents, self.shortfalls, strict=True)
-        return tuple(one for one, shortfall in pairs if not shortfall.negligible)
+        """Those that the challenger is worse than, over all rows or in the median group."""
+        both = zip_longest(self.shortfalls, self.typical)
+        return tuple(
+            incumbent
+            for incumbent, shortfalls in zip(self.incumbents, both, strict=True)
+            if not all(one is None or one.negligible for one in shortfalls)
+        )
 
     @property
     def contradicted(self) -> bool:
@@ -101,7 +111,10 @@ class Comparison:
         others = "; ".join(
             f"the coefficients of {one.name} have {one.pooled.rmse_deg:.4f} deg and "
             f"{one.pooled.correlation:.4f}, difference {shortfall}"
-            for one, shortfall in zip(self.incumbents, self.shortfalls, strict=True)
+            + (f", in the median group {typical}" if typical else "")
+            for one, shortfall, typical in zip_longest(
+                self.incumbents, self.shortfalls, self.typical
+            )
         )
         return (
             f"on the same {number_of(challenger.rows, 'row')} of "
@@ -130,7 +143,8 @@ def compare(selection: Selection[Any], incumbents: Sequence[ModelVersion]) -> Co
     others = tuple(_as_it_is(version, groups) for version in incumbents)
     worth = Worth(math.radians(floor().worth_deg))
     shortfalls = tuple(compare_paired(challenger, other, worth) for other in others)
-    return Comparison(by, challenger, others, shortfalls)
+    typical = tuple(compare_typical(challenger, other, worth) for other in others)
+    return Comparison(by, challenger, others, shortfalls, typical if by == "vehicle" else ())
 
 
 def _as_it_is(version: ModelVersion, folds: Folds) -> CrossValidation:

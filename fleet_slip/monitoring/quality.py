@@ -80,7 +80,7 @@ def examine_drives(
     drives = parse_condition(condition)
     with GramReader(warehouse) as reader:
         reports = [
-            examine(load_cohort(reader, drives & of_model), limits)
+            examine(load_cohort(reader, drives & of_model, training=False), limits)
             for of_model in _vehicle_models(reader, drives)
         ]
         revoked = reader.opened(PLAIN, drives).revoked(drives)

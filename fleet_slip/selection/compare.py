@@ -69,6 +69,7 @@ class Selection(Generic[AnyCohort]):
             "drives_without_log": self.cohort.members.count_received,
             "drives_left_out": self.cohort.left_out,
             "drives_revoked": dict(self.cohort.revoked),
+            "drives_outweighing": {one.vehicle_id: one.drives for one in self.cohort.outweighing},
             "intercept": self.intercept,
             "folds": {
                 "by": self.folds.by,

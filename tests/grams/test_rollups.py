@@ -17,7 +17,7 @@ from benchmarks.receive import messages_of
 from fleet_slip.delta import Change
 from fleet_slip.errors import CohortError, FleetSlipError, StorageError
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohorts import cells
+from fleet_slip.grams.cohorts import cells, outweighing
 from fleet_slip.grams.cohorts.day_sums import sum_days
 from fleet_slip.grams.cohorts.fold_sums import sum_cohort
 from fleet_slip.grams.cohorts.folding import EACH, FoldCount, Folding, FoldKey
@@ -29,11 +29,12 @@ from fleet_slip.grams.rows.gram_files import write_rows
 from fleet_slip.grams.rows.rollup import Rollup, make_rollup, read_rollup
 from fleet_slip.maintenance.retention import Retention, retain
 from fleet_slip.models.versions import Registry
+from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.warehouse.condition import parse_condition
 from fleet_slip.warehouse.minimum_cohort import MINIMUM_VARIABLE
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.growth_history import FIRST_DAY, SIGNALS, Drives, day_of, write_logs
-from tests.support.messages import START_S
+from tests.support.messages import START_S, gram_of, message_of
 
 CARS = 150
 INPUTS = tuple(SIGNALS[:4])
@@ -44,6 +45,7 @@ DAY_S = 86_400
 def rolled_up_by_many_columns() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(rollup, "ROWS_PER_CELL", 4)
+        patch.setattr(outweighing, "MOST_GROUPS", 10)  # 60 groups of 150 cars differ
         yield
 
 
@@ -356,3 +358,25 @@ def test_sums_of_more_than_64_bits_are_left_to_the_rows() -> None:
     assert not make_rollup(rows_of(products=products.tolist()))
     products[1:, 5] = -(2**40)  # one such drive does not cost the others theirs
     assert make_rollup(rows_of(products=products.tolist()))
+
+
+def test_a_car_that_outweighs_the_others_is_left_out_of_files_with_rollups(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(outweighing, "MOST_GROUPS", 2)
+    fleet = fleet_slip.open(tmp_path / "data")
+    receive(fleet, tmp_path, range(2))
+    gram = gram_of(1, 8640)
+    sums, products = ([1000 * number for number in some] for some in (gram.sums, gram.products))
+    day = Gram(gram.signals, 1000 * gram.n, tuple(sums), tuple(products))
+    content = message_of(day, "LIAR", START_S + 2 * DAY_S)
+    (tmp_path / "m").write_bytes(content + messages_of(CARS, START_S + 2 * DAY_S, seed=2))
+    fleet.receive(tmp_path / "m")
+    assert len(rollups_of(fleet.warehouse)) == 3
+    folding = Folding(by="vehicle", count=5)
+    (left_out,) = sum_cohort(fleet.warehouse, folding, "true").outweighing
+    assert (left_out.vehicle_id, left_out.drives) == ("LIAR", 1)
+    found = outcome(fleet.warehouse, folding, "true")
+    assert found == outcome(fleet.warehouse, folding, "vehicle_id <> 'LIAR'")
+    monkeypatch.setattr(cells, "read_rollup", lambda *_: None)
+    assert found == outcome(fleet.warehouse, folding, "true")

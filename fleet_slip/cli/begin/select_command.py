@@ -9,7 +9,7 @@ import typer
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.cli.left_out import say_revoked, say_without_log
+from fleet_slip.cli.left_out import say_outweighing, say_revoked, say_without_log
 from fleet_slip.cli.options import selection_options
 from fleet_slip.cli.output import Json, print_json, print_table, say, stdout
 from fleet_slip.grams.cohorts.folding import BANDS, PARTS, ROW_FOLDS
@@ -108,6 +108,7 @@ def _say_left_out(selection: Selection[Any]) -> None:
         say(f"{number_of(without_log, 'drive')} of these without a log: their cars sent Gram rows.")
     say_without_log(selection.cohort.left_out, selection.cohort.feature_set)
     say_revoked(selection.cohort.revoked)
+    say_outweighing(selection.cohort.outweighing)
     if isinstance(selection, RequestedSelection):
         for car, times in selection.left_out.items():
             say(f"{car} left out: its influence on the model is {times:.0f} times the median one.")

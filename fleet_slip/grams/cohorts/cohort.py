@@ -27,6 +27,7 @@ from fleet_slip.grams.cohorts.folding import (
     FoldKey,
 )
 from fleet_slip.grams.cohorts.members import Hashed, Members, hash_numbers, received_among
+from fleet_slip.grams.cohorts.outweighing import Outweighing
 from fleet_slip.grams.cohorts.reader import GramReader, open_grams
 from fleet_slip.regression.exact.gram_table import GramTable
 from fleet_slip.regression.inference.drive_moments import serving_drives
@@ -70,6 +71,7 @@ class Cohort:
         feature_set: which Gram rows these are.
         left_out: drives of the condition that have no such Gram rows: their cars sent no log.
         revoked: how many drives of a car are left out, since a revoked key signed them.
+        outweighing: which are, since their cars would outweigh the others with them.
     """
 
     condition: Condition
@@ -80,6 +82,7 @@ class Cohort:
     feature_set: str = PLAIN
     left_out: int = 0
     revoked: Mapping[str, int] = field(default_factory=dict)
+    outweighing: tuple[Outweighing, ...] = ()
 
     @property
     def rows(self) -> int:
@@ -168,14 +171,20 @@ class Cohort:
             self.feature_set,
             self.left_out,
             self.revoked,
+            self.outweighing,
         )
 
     def gram_condition(self, inputs: Sequence[str]) -> str:
         """Return the SQL condition on the view `grams` of the rows that a model is made of."""
-        return gram_condition(self.condition, self.feature_set, inputs)
+        return gram_condition(self.condition, self.feature_set, inputs, self.outweighing)
 
 
-def gram_condition(condition: Condition, feature_set: str, inputs: Sequence[str]) -> str:
+def gram_condition(
+    condition: Condition,
+    feature_set: str,
+    inputs: Sequence[str],
+    outweighing: Sequence[Outweighing],
+) -> str:
     """Return the SQL condition on the view `grams` of a cohort's rows that have some inputs."""
     known = features().calibrated
     stored = dict.fromkeys(known[name].of if name in known else name for name in inputs)
@@ -183,6 +192,7 @@ def gram_condition(condition: Condition, feature_set: str, inputs: Sequence[str]
     return (
         f"feature_set = '{features().identity(feature_set)}' AND {condition.sql} AND "
         f"list_has_all(string_split(signals, ','), [{wanted}])"
+        + "".join(f" AND NOT {one.condition}" for one in outweighing)
     )
 
 
@@ -242,15 +252,18 @@ def load_cohort(
     warehouse: Warehouse | GramReader,
     condition: str | Condition = TRAINING_DRIVES,
     feature_set: str = PLAIN,
+    *,
+    training: bool = True,
 ) -> Cohort:
     """Read the Gram rows of the drives that satisfy a condition.
 
-    Raises `QuestionError` if the condition is not one SQL expression on the columns of `drives`,
-    `DataError` if no drive satisfies it or the feature set has not been computed for all logs, and
-    `RefusedError` if a drive of an evaluation scenario satisfies it.
+    For `training` what outweighs the others is not among them. Raises `QuestionError` if the
+    condition is not one SQL expression on the columns of `drives`, `DataError` if no drive
+    satisfies it or the feature set has not been computed for all logs, and `RefusedError` if a
+    drive of an evaluation scenario satisfies it.
     """
     condition = parse_condition(condition)
-    with open_grams(warehouse, feature_set, condition) as opened:
+    with open_grams(warehouse, feature_set, condition, training=training) as opened:
         expansion = expansion_of(opened, feature_set)
         statement = opened.statement("cohort.sql", condition)
         with asking(opened.database, condition):
@@ -275,6 +288,7 @@ def load_cohort(
         feature_set=feature_set,
         left_out=left_out,
         revoked=revoked,
+        outweighing=opened.outweighing,
     )
 
 

@@ -39,6 +39,7 @@ from fleet_slip.grams.cohorts.members import (
     hash_numbers,
     received_among,
 )
+from fleet_slip.grams.cohorts.outweighing import Outweighing
 from fleet_slip.grams.cohorts.reader import GramReader, OpenedGrams, open_grams
 from fleet_slip.grams.rows.gram_rows import by_signals, gram_table
 from fleet_slip.regression.exact.gram import Gram
@@ -63,6 +64,7 @@ class SummedCohort:
         feature_set: which Gram rows were read.
         left_out: drives of the condition that have no such Gram rows: their cars sent no log.
         revoked: how many drives of a car are left out, since a revoked key signed them.
+        outweighing: which are, since their cars would outweigh the others with them.
     """
 
     condition: Condition
@@ -77,6 +79,7 @@ class SummedCohort:
     feature_set: str = PLAIN
     left_out: int = 0
     revoked: Mapping[str, int] = field(default_factory=dict)
+    outweighing: tuple[Outweighing, ...] = ()
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -98,7 +101,7 @@ class SummedCohort:
 
     def gram_condition(self, inputs: Sequence[str]) -> str:
         """Return the SQL condition on the view `grams` of the rows that a model is made of."""
-        return gram_condition(self.condition, self.feature_set, inputs)
+        return gram_condition(self.condition, self.feature_set, inputs, self.outweighing)
 
 
 def sum_cohort(
@@ -114,7 +117,7 @@ def sum_cohort(
     """
     condition = parse_condition(condition)
     require_divided(feature_set, folding.by, folding.count)
-    with open_grams(warehouse, feature_set, condition, folding) as opened:
+    with open_grams(warehouse, feature_set, condition, folding, training=True) as opened:
         folds = _find_folds(opened, folding, condition)
         if folds is None:
             raise empty_cohort(warehouse, condition, feature_set)
@@ -143,6 +146,7 @@ def sum_cohort(
         feature_set=feature_set,
         left_out=left_out,
         revoked=revoked,
+        outweighing=opened.outweighing,
     )
 
 

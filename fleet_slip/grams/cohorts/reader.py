@@ -18,8 +18,10 @@ from fleet_slip.delta import Snapshot
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohorts.cells import NO_CELLS, Cells, RollupReader
 from fleet_slip.grams.cohorts.folding import Folding
+from fleet_slip.grams.cohorts.outweighing import Outweighing, find_outweighing
 from fleet_slip.grams.received.car_keys import load_car_keys
 from fleet_slip.grams.rows.backlog import find_backlog
+from fleet_slip.grams.rows.same_drives import has_received
 from fleet_slip.regression.exact.gram import packed_size
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.condition import Condition, asking
@@ -37,7 +39,8 @@ BATCH_NUMBERS = 2**20
 class OpenedGrams:
     """A connection to the Gram rows of a feature set, and what stood in the warehouse then.
 
-    Instead of the rows of some files it has their `cells`.
+    Instead of the rows of some files it has their `cells`. Statements leave out what is
+    `outweighing`.
     """
 
     database: duckdb.DuckDBPyConnection
@@ -45,16 +48,19 @@ class OpenedGrams:
     logs_version: int
     grams_version: int
     cells: Cells = NO_CELLS
+    outweighing: tuple[Outweighing, ...] = ()
 
-    def statement(self, name: str, condition: Condition) -> str:
-        """Return a statement of `jobs/` for a condition, but for what revoked keys signed."""
+    def statement(self, name: str, condition: Condition, **values: str) -> str:
+        """Return a statement of `jobs/` for a condition, but for what is not to count."""
         keys = load_car_keys()
-        revoked = [key.condition for key in keys.revoked()] if keys else []
-        sql = f"{condition.sql} AND NOT ({' OR '.join(revoked)})" if revoked else condition.sql
+        without = [key.condition for key in keys.revoked()] if keys else []
+        without += [one.condition for one in self.outweighing]
+        sql = f"{condition.sql} AND NOT ({' OR '.join(without)})" if without else condition.sql
         trips = read_sql("jobs", "trips.sql").format(
             feature_set=self.identity, longest_pause_s=LONGEST_PAUSE_S
         )
-        return read_sql("jobs", name).format(condition=sql, feature_set=self.identity, trips=trips)
+        values |= {"condition": sql, "feature_set": self.identity, "trips": trips}
+        return read_sql("jobs", name).format(**values)
 
     def revoked(self, condition: Condition) -> dict[str, int]:
         """Return how many drives of each car a cohort lacks, since a key of it was revoked."""
@@ -119,11 +125,17 @@ class GramReader:
         self._close()
 
     def opened(
-        self, feature_set: str, condition: Condition, folding: Folding | None = None
+        self,
+        feature_set: str,
+        condition: Condition,
+        folding: Folding | None = None,
+        *,
+        training: bool = False,
     ) -> OpenedGrams:
         """Return the Gram rows of a feature set, until the next call.
 
-        For a cohort's sums over folds, cells stand in for the rows of files that have rollups.
+        For a cohort's sums over folds, cells stand in for the rows of files that have rollups. For
+        `training` what outweighs the others is left out (`fleet_slip.grams.cohorts.outweighing`).
         Raises `DataError` if there are no Gram rows, or if those of the feature set are not
         complete for a cohort.
         """
@@ -146,7 +158,14 @@ class GramReader:
         if folding and not calibrated:
             identity, revoked = features().identity(feature_set), _revoked_cars()
             cells = self._rollups.cells(grams, logs, identity, condition, folding, revoked)
-        return self._opened(grams, logs, feature_set, cells)
+        opened = self._opened(grams, logs, feature_set, cells)
+        if not (training and feature_set == PLAIN and has_received(grams)):
+            return opened
+        outweighing = find_outweighing(opened, condition)
+        if outweighing is None:
+            opened = self._opened(grams, logs, feature_set)
+            outweighing = find_outweighing(opened, condition)
+        return replace(opened, outweighing=outweighing or ())
 
     def _opened(
         self, grams: Snapshot, logs: Snapshot, feature_set: str, cells: Cells = NO_CELLS
@@ -177,13 +196,15 @@ def open_grams(
     feature_set: str,
     condition: Condition,
     folding: Folding | None = None,
+    *,
+    training: bool = False,
 ) -> Iterator[OpenedGrams]:
     """Open the Gram rows of a feature set, anew unless by a reader; see `opened`."""
     if isinstance(source, GramReader):
-        yield source.opened(feature_set, condition, folding)
+        yield source.opened(feature_set, condition, folding, training=training)
     else:
         with GramReader(source) as reader:
-            yield reader.opened(feature_set, condition, folding)
+            yield reader.opened(feature_set, condition, folding, training=training)
 
 
 def _revoked_cars() -> frozenset[str]:

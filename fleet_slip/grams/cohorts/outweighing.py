@@ -1,0 +1,129 @@
+"""Which drives are left out of training, since their car would outweigh the others with them.
+
+A car that sends Gram rows says itself how many rows they are of. So that none decides alone what is
+true, each counts with `MOST_CARS` times the rows of the mean car at most, these bounded likewise:
+with its logs, then with its shortest drives, whole ones, so that all sums stay exact. The mean and
+not the median: where most cars have sent little yet, the others are no liars.
+
+Rollups tell no single car, only the rows of `BUCKETS` groups of cars. While no group has more than
+`MOST_GROUPS` times the rows of the median group, no car weighs more than about a sixtieth of the
+cohort, and all count. So the answer is the same with rollups and without.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from fleet_slip.arrays import IntArray
+from fleet_slip.grams.cohorts.cells import Cells
+from fleet_slip.grams.cohorts.members import hash_numbers
+from fleet_slip.grams.rows.rollup import BUCKETS
+from fleet_slip.warehouse.condition import Condition, asking
+
+if TYPE_CHECKING:
+    from fleet_slip.grams.cohorts.reader import OpenedGrams
+
+MOST_CARS = 4
+MOST_GROUPS = 2
+
+LEAST_CARS = 10
+"""Of fewer cars the others tell little of what is usual."""
+
+
+@dataclass(frozen=True)
+class Outweighing:
+    """The drives of a car that are left out: of so many rows and more, counted by their names.
+
+    Attributes:
+        vehicle_id: the car.
+        rows, drive_id: the first Gram row that is left out, in the order of rows and drive.
+        drives: how many drives have such Gram rows.
+    """
+
+    vehicle_id: str
+    rows: int
+    drive_id: str
+    drives: int
+
+    @property
+    def condition(self) -> str:
+        """SQL condition of the Gram rows that are not to count."""
+        return (
+            f"(source = 'received' AND vehicle_id = {_literal(self.vehicle_id)} AND (n > "
+            f"{self.rows} OR (n = {self.rows} AND drive_id >= {_literal(self.drive_id)})))"
+        )
+
+
+def find_outweighing(opened: "OpenedGrams", condition: Condition) -> tuple[Outweighing, ...] | None:
+    """Return what is left out of a cohort; None if the rows of each car must tell, not rollups."""
+    with asking(opened.database, condition):
+        text = opened.statement("rows_of_cars.sql", condition)
+        cars = opened.database.sql(text).to_arrow_table()
+    rolled_up = len(opened.cells.table) > 0
+    if not rolled_up and not pc.any(cars["received"]).as_py():
+        return ()
+    if not _has_heavy_group(_rows_of_groups(cars, opened.cells)):
+        return ()
+    if rolled_up:
+        return None
+    if len(cars) < LEAST_CARS:
+        return ()
+    most = most_rows(cars["n"].to_numpy())
+    heavy = cars.filter(pc.and_(cars["received"], pc.greater(cars["n"], most)))
+    return _left_out(opened, condition, heavy["vehicle_id"].to_pylist(), most) if heavy else ()
+
+
+def most_rows(rows: IntArray) -> int:
+    """Return the largest c that is not above `MOST_CARS` times the mean of min(rows, c).
+
+    With the h largest at c and the others below it, that is c = m sum / (cars - m h). If it holds
+    for any c, as where many cars have most rows, it is the largest of `rows`.
+    """
+    ordered: list[int] = sorted(rows.tolist())
+    below, cars = sum(ordered), len(ordered)
+    for heavy, largest in enumerate(reversed(ordered)):
+        if cars <= MOST_CARS * heavy:
+            break
+        bound = MOST_CARS * below // (cars - MOST_CARS * heavy)
+        if largest <= bound:
+            return bound
+        below -= largest
+    return ordered[-1]
+
+
+def _left_out(
+    opened: "OpenedGrams", condition: Condition, cars: Sequence[str], most: int
+) -> tuple[Outweighing, ...]:
+    names = ", ".join(map(_literal, cars))
+    text = opened.statement("outweighing.sql", condition, cars=names, most=str(most))
+    with asking(opened.database, condition):
+        rows = opened.database.sql(text).fetchall()
+    found = []
+    for car, some in groupby(rows, key=lambda row: row[0]):
+        beyond = [(n, drive) for _, n, drive in some]
+        found.append(Outweighing(car, *beyond[0], len({drive for _, drive in beyond})))
+    return tuple(found)
+
+
+def _rows_of_groups(cars: pa.Table, cells: Cells) -> IntArray:
+    """Return the rows of each bucket of cars: of their Gram rows, and of cells."""
+    totals = np.zeros(BUCKETS, dtype=np.int64)
+    buckets = (hash_numbers(cars["vehicle_id"].cast(pa.string())) % BUCKETS).astype(np.int64)
+    np.add.at(totals, buckets, cars["n"].to_numpy())
+    if len(cells.table):
+        dealt = cells.dealt("vehicle")
+        np.add.at(totals, dealt["bucket"].to_numpy(), dealt["n"].to_numpy())
+    return totals
+
+
+def _has_heavy_group(rows: IntArray) -> bool:
+    return bool(rows.max() > MOST_GROUPS * np.sort(rows)[BUCKETS // 2])
+
+
+def _literal(text: str) -> str:
+    return "'" + text.replace("'", "''") + "'"
