@@ -3,8 +3,7 @@
 from collections import Counter
 from collections.abc import Sequence
 
-from fleet_slip.comparison.report.claims import Judged, judge_claims
-from fleet_slip.comparison.report.claims.claim import Status
+from fleet_slip.comparison.report.claims.judging import Judged, Status, judge_claims
 from fleet_slip.comparison.report.findings.report_data import ReportData
 from fleet_slip.comparison.report.pictures.road_pictures import standings
 from fleet_slip.comparison.report.tables import further_tables, paper_tables
@@ -66,7 +65,7 @@ def _further(data: ReportData) -> list[ReportTable]:
 
 
 def _tally(claims: Sequence[Judged]) -> dict[Status, int]:
-    counted = Counter(one.verdict.status for one in claims)
+    counted = Counter(one.status for one in claims)
     return {status: counted[status] for status in Status}
 
 

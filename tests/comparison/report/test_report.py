@@ -12,13 +12,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from jinja2 import meta
 
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.comparison.evaluation.ranking import LEAST_COVERAGE
 from fleet_slip.comparison.evaluation.results import keep
-from fleet_slip.comparison.report.claims import CLAIMS, judge_claims
-from fleet_slip.comparison.report.claims.claim import Status
-from fleet_slip.comparison.report.claims.conditions import noise_is_slight
+from fleet_slip.comparison.report.claims.facts import NAMES, Facts
+from fleet_slip.comparison.report.claims.judging import (
+    CLAIMS,
+    LIMITS,
+    TEXTS,
+    Status,
+    judge,
+    judge_claims,
+)
 from fleet_slip.comparison.report.findings.gate_openings import gates_of, opening
 from fleet_slip.comparison.report.findings.histogram import ANGLE_DEG, held_out_coefficients
 from fleet_slip.comparison.report.findings.memory import by_length, looks_back
@@ -36,6 +43,7 @@ from fleet_slip.pages.drawing import png_file, svg_file
 from fleet_slip.pages.style import DESK, PHONE
 from fleet_slip.pages.text import degrees, number
 from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.resources import config_names
 from fleet_slip.selection.compare import validate
 from fleet_slip.selection.model_list import CandidateModel
 from fleet_slip.views import connect
@@ -215,21 +223,33 @@ def changed(data: ReportData, content: Any) -> ReportData:
     return replace(data, evaluated=replace(data.evaluated, document=document))
 
 
+NOISE_IS_SLIGHT = CLAIMS["noise_is_slight"]
+
+
+def test_claims_name_nothing_but_scenarios_facts_and_limits() -> None:
+    """A scenario that is misspelt would pass for one that was not evaluated."""
+    known = {*NAMES, *LIMITS, *config_names("scenarios")}
+    for claim in CLAIMS.values():
+        texts = (claim.criterion, f"{{{{ {claim.holds} }}}}", claim.figure, claim.why)
+        for text in texts:
+            assert meta.find_undeclared_variables(TEXTS.parse(text)) <= known, text
+
+
 def test_every_claim_is_judged(data: ReportData) -> None:
     verdicts = judge_claims(data)
     assert len(verdicts) == len(CLAIMS)
     assert len({one.claim.statement for one in verdicts}) == len(CLAIMS)
     for one in verdicts:
-        assert one.verdict.why
-        assert bool(one.verdict.figure) == (one.verdict.status is not Status.NOT_TESTABLE)
+        assert one.why
+        assert bool(one.figure) == (one.status is not Status.NOT_TESTABLE)
 
 
 def test_a_verdict_follows_from_the_figures(data: ReportData) -> None:
-    assert noise_is_slight.judge(data).status is Status.NOT_REPRODUCED
+    assert judge(NOISE_IS_SLIGHT, Facts(data)).status is Status.NOT_REPRODUCED
     content = deepcopy(dict(data.evaluated.document.content))
     (noisy,) = (one for one in content["scenarios"] if one["name"] == "noise_doubled")
     noisy["results"][data.choice]["rmse_deg"] = 0.1
-    verdict = noise_is_slight.judge(changed(data, content))
+    verdict = judge(NOISE_IS_SLIGHT, Facts(changed(data, content)))
     assert verdict.status is Status.REPRODUCED
     assert "0.100°" in verdict.figure
 
@@ -237,7 +257,7 @@ def test_a_verdict_follows_from_the_figures(data: ReportData) -> None:
 def test_a_claim_without_its_drives_is_not_judged(data: ReportData) -> None:
     content = deepcopy(dict(data.evaluated.document.content))
     content["scenarios"] = [one for one in content["scenarios"] if one["name"] == "nominal"]
-    verdict = noise_is_slight.judge(changed(data, content))
+    verdict = judge(NOISE_IS_SLIGHT, Facts(changed(data, content)))
     assert verdict.status is Status.NOT_TESTABLE
     assert "noise_doubled" in verdict.why
     assert "fleet-slip evaluate" in verdict.why

@@ -1,0 +1,106 @@
+"""Judges the paper's claims, which `claims.toml` lists, by the report's data."""
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from importlib.resources import files
+from typing import Any
+
+from jinja2 import Environment, StrictUndefined, meta
+
+from fleet_slip.comparison.report.claims.facts import Facts, NotEvaluatedError
+from fleet_slip.comparison.report.findings.report_data import ReportData
+from fleet_slip.comparison.report.tables.paper_tables import PAPER_TABLE_TWO
+from fleet_slip.pages import text
+
+TEXTS = Environment(undefined=StrictUndefined, keep_trailing_newline=True)  # noqa: S701 - no HTML
+TEXTS.filters |= {
+    one.__name__: one
+    for one in (text.count, text.degrees, text.listed, text.number, text.percent, text.scientific)
+}
+
+
+class Status(StrEnum):
+    """What became of a claim."""
+
+    REPRODUCED = "reproduced"
+    NOT_REPRODUCED = "not reproduced"
+    NOT_TESTABLE = "not testable here"
+
+
+@dataclass(frozen=True)
+class Claim:
+    """One statement of the paper; the head of `claims.toml` says what the fields are."""
+
+    place: str
+    statement: str
+    criterion: str
+    why: str
+    holds: str | None = None
+    figure: str = ""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A claim with its criterion and how it turned out: what we found, and what it is due to."""
+
+    claim: Claim
+    criterion: str
+    status: Status
+    figure: str
+    why: str
+
+
+_TABLE = tomllib.loads((files(__package__) / "claims.toml").read_text(encoding="utf-8"))
+LIMITS: Mapping[str, float] = _TABLE.pop("limits")
+CLAIMS: Mapping[str, Claim] = {name: Claim(**table) for name, table in _TABLE.items()}
+"""In the paper's order."""
+
+
+def judge_claims(data: ReportData) -> tuple[Judged, ...]:
+    """Judge all claims."""
+    facts = Facts(data)
+    return tuple(judge(claim, facts) for claim in CLAIMS.values())
+
+
+def judge(claim: Claim, facts: Facts) -> Judged:
+    """Judge a claim; it is not testable where the evaluation lacks what it needs."""
+
+    def not_testable(why: str) -> Judged:
+        return Judged(claim, criterion, Status.NOT_TESTABLE, "", why)
+
+    criterion = _filled(claim.criterion, facts)
+    evaluated = facts.data.evaluated
+    absent = [name for name in PAPER_TABLE_TWO if name not in evaluated.models]
+    if absent:
+        return not_testable(
+            "The drives that the model was trained on lack signals of model "
+            f"{text.listed(absent)} of Table I, which the paper's statements are about."
+        )
+    try:
+        if claim.holds is None:
+            return not_testable(_filled(claim.why, facts))
+        criterion_met = TEXTS.compile_expression(claim.holds, undefined_to_none=False)
+        held = criterion_met(_names(f"{{{{ {claim.holds} }}}}", facts))
+        figure, why = _filled(claim.figure, facts), _filled(claim.why, facts)
+    except NotEvaluatedError as lacking:
+        return not_testable(
+            f"The evaluation has no {lacking}. Run: fleet-slip evaluate --one-car "
+            f"{evaluated.group} --fleet NAME --rivals"
+        )
+    status = Status.REPRODUCED if held else Status.NOT_REPRODUCED
+    return Judged(claim, criterion, status, figure, why)
+
+
+def _filled(template: str, facts: Facts) -> str:
+    return TEXTS.from_string(template).render(_names(template, facts))
+
+
+def _names(template: str, facts: Facts) -> dict[str, Any]:
+    """Return all that a template names, looked up in the order in which it stands there."""
+    names = meta.find_undeclared_variables(TEXTS.parse(template))
+    return {
+        name: LIMITS[name] if name in LIMITS else facts[name]
+        for name in sorted(names, key=template.index)
+    }
