@@ -83,8 +83,8 @@ class Filling(Rooted):
         there goes to the view `quarantine` with a reason. `each` is called with a report once its
         file has landed. Progress is in files.
 
-        Raises `InputError` for a file that cannot be read; `StorageError`; and `ConflictError` if
-        other processes keep changing the tables.
+        Raises `InputError` for a file that cannot be read, when all others are in; `StorageError`;
+        and `ConflictError` if other processes keep changing the tables.
         """
         from fleet_slip.grams.received.receiving import find_messages, receive_files
 

@@ -13,6 +13,7 @@ import pytest
 import fleet_slip
 from fleet_slip.cli.main import app
 from fleet_slip.errors import InputError, QuestionError
+from fleet_slip.grams.received import messages
 from fleet_slip.grams.received.messages import read_messages
 from fleet_slip.maintenance.forget import forget
 from fleet_slip.regression.exact.gram import Gram
@@ -171,7 +172,7 @@ def test_messages_are_read_as_one_by_one() -> None:
     content = b"".join(message_of(gram, f"CAR{i}") for i, gram in enumerate([*sets, *sets]))
     found = read_messages(content)
     assert not found.refused
-    read = [message for _, messages in found.runs for message in messages]
+    read = [message for _, some in found.runs for message in some]
     expected = parse_messages(content)
     assert len(found.runs) == 12
     assert [first for first, _ in found.runs] == list(range(1, 25, 2))
@@ -212,11 +213,50 @@ def test_files_land_together_and_each_has_its_report(
     assert len({row["file"] for row in stored(fleet)}) == 4
 
 
-def test_files_before_one_that_cannot_be_read_land(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
-    (tmp_path / "2").write_bytes(b"")
-    with pytest.raises(InputError, match="is empty"):
-        fleet.receive([write(tmp_path / "1", message_of(GRAM)), tmp_path / "2"])
-    assert len(stored(fleet)) == 1
+def test_files_beside_those_that_cannot_be_read_land(
+    fleet: fleet_slip.Fleet, tmp_path: Path
+) -> None:
+    folder = tmp_path / "messages"
+    folder.mkdir()
+    for name in ("2", "4"):
+        (folder / name).write_bytes(b"")
+    write(folder / "1", message_of(GRAM))
+    write(folder / "3", message_of(GRAM, "VIN3"))
+    with pytest.raises(InputError, match=r"2: is empty\. Nor can 1 other file be read: .*4: is e"):
+        fleet.receive(folder)
+    assert len(stored(fleet)) == 2
+    write(folder / "5", message_of(GRAM, "VIN5"))
+    done = run_on(tmp_path / "data", "receive", folder, "--json")
+    assert done.exit_code == InputError.exit_code
+    assert [one["received"] for one in done.json] == [0, 0, 1]
+
+
+@pytest.mark.parametrize("piece", [b"FSGR", b"xFSGR", b"FSGR\x01\0\x3c\0" + bytes(52)])
+def test_what_is_no_file_of_messages_is_not_read_to_its_end(piece: bytes) -> None:
+    found = read_messages(message_of(GRAM) + piece * 100_000)
+    assert [len(messages) for _, messages in found.runs] == [1]
+    assert len(found.refused) == 1001
+    assert found.refused[-1] == (
+        1002,
+        "and all that follows is not read, after 1,000 places that are no message",
+    )
+
+
+def test_a_file_has_so_many_messages_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(messages, "MOST_MESSAGES", 5)
+    found = read_messages(b"".join(drives(9)))
+    assert [len(some) for _, some in found.runs] == [5]
+    assert [number for number, _ in found.refused] == [6]
+
+
+def test_messages_of_two_lengths_by_turns_are_read_at_once(
+    fleet: fleet_slip.Fleet, tmp_path: Path
+) -> None:
+    sets = [GRAM, GRAM.restrict(GRAM.signals[:3])]
+    many = [message_of(sets[i % 2], f"VIN{i}") for i in range(40)]
+    (report,) = fleet.receive(write(tmp_path / "m", *many, b"x", many[0]))
+    assert (report.messages, report.received, report.duplicates) == (42, 40, 1)
+    assert [row[0] for row in reasons(fleet)] == [41]
 
 
 def test_names_of_drives_say_when_they_began(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:

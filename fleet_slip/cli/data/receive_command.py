@@ -29,17 +29,21 @@ def receive(
     """Take in messages of cars that send Gram rows instead of logs.
 
     What is damaged or impossible goes to the quarantine with a reason: fleet-slip sql "FROM
-    quarantine"; a file of which all does is an error.
+    quarantine"; a file of which all does is an error, and so is one that cannot be read, when the
+    others are in.
 
     Example: **fleet-slip receive messages/2024-05-01**
     """
-    with progress("receive", "files") as show:
-        reports = context.obj.receive(files, progress=show)
-    if json:
-        print_json(reports)
-    else:
-        for report in reports:
-            say(_said(report))
+    reports: list[ReceiveReport] = []
+    try:
+        with progress("receive", "files") as show:
+            context.obj.receive(files, each=reports.append, progress=show)
+    finally:
+        if json:
+            print_json(reports)
+        else:
+            for report in reports:
+                say(_said(report))
     if useless := [report.file for report in reports if report.is_useless]:
         raise InputError(
             f"{useless[0]}: no message in it can be used"

@@ -47,13 +47,21 @@ MOST_SIGNALS = 32
 """There is a bit for each."""
 
 MOST_AT_ONCE = 8192
-"""Messages that are looked at as an array; after a damaged one, one, two, four, ..."""
+"""Messages that are looked at as an array: one, two, four, ... while they are of one length."""
+
+MOST_MESSAGES = 500_000
+"""Of a file: 340 MB of messages of eleven signals."""
+
+MOST_REFUSED = 1000
+"""Places of a file that are no message. Beyond that it is something else."""
 
 CUT_OFF = "is cut off"
 NO_MESSAGE = "does not begin as a message does"
 OTHER_LAYOUT = "has another layout"
 WRONG_LENGTH = "has a length that does not fit its signals"
 WRONG_CHECKSUM = "has a wrong checksum"
+TOO_MANY = f"and all that follows is beyond the {MOST_MESSAGES:,} messages of a file: cut it"
+NO_FILE = f"and all that follows is not read, after {MOST_REFUSED:,} places that are no message"
 
 Messages = NDArray[Any]
 """Messages of the same length: an array with the fields of `message_type`."""
@@ -122,24 +130,36 @@ def signals_definition() -> int:
 def read_messages(content: bytes) -> Found:
     """Read messages that stand one behind the other.
 
-    After what is none, reading goes on where the next begins with "FSGR".
+    After what is none, reading goes on where the next begins with "FSGR". Beyond `MOST_MESSAGES` or
+    `MOST_REFUSED` all that is left is refused as one.
     """
     found = Found()
     at, end, most = 0, len(content), 1
     while at < end:
-        messages = _read_run(content, at, most)
+        if rest := _over_budget(found):
+            found.count += 1
+            found.refused.append((found.count, rest))
+            break
+        messages = _read_run(content, at, min(most, MOST_MESSAGES - found.count))
         found.count += 1
         if len(messages):
             begun = _continued(found, messages, content, at)
             found.runs.append(begun or (found.count, messages))
             found.count += len(messages) - 1
             at += messages.nbytes
-            most = min(2 * most, MOST_AT_ONCE)
+            most = min(2 * len(messages), MOST_AT_ONCE)
         else:
             found.refused.append((found.count, _why_none(content, at)))
             following = content.find(MAGIC, at + 1)
             at, most = following if following >= 0 else end, 1
     return found
+
+
+def _over_budget(found: Found) -> str:
+    """Return why nothing more is read of a file, if it is so."""
+    if len(found.refused) >= MOST_REFUSED:
+        return NO_FILE
+    return TOO_MANY if found.count >= MOST_MESSAGES else ""
 
 
 def _continued(
@@ -179,7 +199,7 @@ def _read_run(content: bytes, at: int, most: int) -> Messages:
         (messages["magic"] == MAGIC)
         & (messages["layout"] == layout)
         & (messages["length"] == size)
-        & (_bit_counts(messages["mask"]) == signals)
+        & (np.bitwise_count(messages["mask"]) == signals)
     )
     messages = messages[: _leading(right)]
     view = memoryview(content)
@@ -192,13 +212,6 @@ def _leading(right: NDArray[np.bool_]) -> int:
     """Return how many are right before the first that is not."""
     wrong = np.flatnonzero(~right)
     return int(wrong[0]) if len(wrong) else len(right)
-
-
-def _bit_counts(masks: NDArray[np.uint32]) -> NDArray[np.int64]:
-    """Return the number of bits that are set in each mask."""
-    each = np.ascontiguousarray(masks).view(np.uint8).reshape(-1, 4)
-    counts: NDArray[np.int64] = np.unpackbits(each, axis=1).sum(axis=1, dtype=np.int64)
-    return counts
 
 
 def _why_none(content: bytes, at: int) -> str:

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -164,10 +165,7 @@ def sort_out(
     runs: dict[int, list[ReceivedRows]] = {}
     for file, one in found:
         refused += [Refused(file, number, reason) for number, reason in one.refused]
-        for first, messages in one.runs:
-            numbers = np.arange(first, first + len(messages))
-            kept_of = keep_signatures(messages)
-            run = ReceivedRows(np.full(len(messages), file), numbers, messages, kept_of)
+        for run in _by_layout(file, one):
             told, nameless = _without_name(run)
             refused += nameless
             if judge is not None and len(told):
@@ -182,6 +180,22 @@ def sort_out(
         refused += impossible
         kept += [rows] if len(rows) else []
     return kept, refused
+
+
+def _by_layout(file: int, found: Found) -> Iterator[ReceivedRows]:
+    """Yield the messages of a file, those of one layout and length together."""
+    alike: dict[Any, list[tuple[int, Messages]]] = {}
+    for first, messages in found.runs:
+        kind = messages.dtype.itemsize, messages.dtype.names
+        alike.setdefault(kind, []).append((first, messages))
+    for runs in alike.values():
+        numbers = np.concatenate([np.arange(at, at + len(some)) for at, some in runs])
+        messages = runs[0][1]
+        if len(runs) > 1:
+            messages = np.frombuffer(b"".join(some.tobytes() for _, some in runs), messages.dtype)
+        yield ReceivedRows(
+            np.full(len(numbers), file), numbers, messages, keep_signatures(messages)
+        )
 
 
 def _without_name(run: ReceivedRows) -> tuple[ReceivedRows, list[Refused]]:

@@ -26,6 +26,7 @@ from fleet_slip.grams.received.received_rows import sort_out
 from fleet_slip.grams.received.signatures import judge_signatures
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.words import number_of
 
 LARGEST_FILE_BYTES = 2**28
 BATCH_BYTES = 2**26
@@ -71,24 +72,26 @@ def receive_files(
 ) -> Iterator[ReceiveReport]:
     """Take in files of messages; yield a report of each once it has landed.
 
-    `progress` counts files. Raises `InputError` for a file that cannot be read, once those before
-    it have landed; `StorageError`; and `ConflictError` if other processes keep changing the tables.
+    `progress` counts files. Raises `InputError` for files that cannot be read, once the others have
+    landed; `StorageError`; and `ConflictError` if other processes keep changing the tables.
     """
     load_car_keys()  # a list that cannot be read is told, though all files may have landed
     batch: dict[Path, bytes] = {}
-    failure: InputError | None = None
+    failures: list[str] = []
     for at, path in enumerate(files):
         try:
             batch[path] = _read(path)
         except InputError as error:
-            failure = error
+            failures.append(str(error))
         full = sum(map(len, batch.values())) >= BATCH_BYTES
-        if batch and (full or failure or at + 1 == len(files)):
+        if batch and (full or at + 1 == len(files)):
             yield from _receive_batch(warehouse, batch)
             progress(len(batch), len(files))
             batch = {}
-        if failure:
-            raise failure
+    if failures:
+        others = number_of(len(failures) - 1, "other file")
+        more = f" Nor can {others} be read: {' '.join(failures[1:4])}" if failures[1:] else ""
+        raise InputError(f"{failures[0]}{more}")
 
 
 def find_messages(given: Iterable[Path]) -> list[Path]:
