@@ -71,7 +71,7 @@ def test_canonical_json_does_not_depend_on_the_layout(tmp_path: Path) -> None:
         (
             "steer_fl =",
             "speed =",
-            "unknown signal 'speed'. Do you mean vehicle_speed? Known signals: ax, ay",
+            "unknown signal 'speed'. Do you mean vehicle_speed or satellite_speed? Known",
         ),
         ("negate", "negat", "signals.ax.negat: unknown key"),
         ('unit = "s"', 'unit = "m"', "t is in 'm', it needs a time"),

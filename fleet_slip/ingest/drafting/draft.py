@@ -31,6 +31,7 @@ from fleet_slip.ingest.drafting.suspicion import (
 )
 from fleet_slip.ingest.formats.columns import shown
 from fleet_slip.ingest.mapping.mapping import Mapping
+from fleet_slip.ingest.mapping.satellite_columns import COURSE, SPEED
 
 _TIME_NAMES = ("time", "timestamp", "zeit", "t", "sec", "seconds")
 _TIME_UNITS = {"s": "s", "sec": "s", "ms": "ms", "us": "us", "µs": "us", "ns": "ns"}
@@ -107,6 +108,8 @@ def draft_mapping(file: Path, profile: FileProfile) -> Draft:
 def as_mapping(profile: FileProfile, time: TimeGuess, guesses: dict[str, Guess]) -> Mapping:
     """Return a mapping of the guesses, with stand-ins for what nobody said of the drive."""
     signals = {name: signal_keys(guess) for name, guess in guesses.items()}
+    if COURSE in signals:
+        signals[COURSE] |= {"antenna_x_m": 0.0, "antenna_y_m": 0.0}
     formats = profile.formats
     given: dict[str, Any] = {"csv": formats.csv, "can": formats.can, "duckdb": formats.duckdb}
     return Mapping.model_validate(
@@ -121,8 +124,12 @@ def signal_keys(guess: Guess) -> dict[str, Any]:
         keys["radius_m"] = guess.radius_m
     if guess.negate:
         keys["negate"] = True
+    if guess.component is not None:
+        keys["component"] = guess.component
+    if guess.clockwise_from_north is not None:
+        keys["clockwise_from_north"] = guess.clockwise_from_north
     rate_hz = guess.profile.rate_hz
-    if rate_hz is not None and rate_hz < 20:
+    if rate_hz is not None and rate_hz < 20 and guess.signal not in {COURSE, SPEED}:
         keys["longest_gap_s"] = round(2 / rate_hz, 2)
     return keys
 
@@ -213,6 +220,9 @@ def _correct(guesses: dict[str, Guess], suspicions: list[Suspicion]) -> dict[str
     for one in suspicions:
         if one.kind == "sign":
             (name,) = one.signals
+            if name == COURSE:
+                corrected |= _turned_round(corrected, one.figure)
+                continue
             turned = not corrected[name].negate
             corrected[name] = corrected[name].because(one.figure, negate=turned)
         elif one.kind == "swapped" and len(one.signals) == 2:
@@ -222,6 +232,17 @@ def _correct(guesses: dict[str, Guess], suspicions: list[Suspicion]) -> dict[str
                 replace(corrected[left].because(one.figure), signal=right),
             )
     return corrected
+
+
+def _turned_round(guesses: dict[str, Guess], figure: str) -> dict[str, Guess]:
+    """Return the course counterclockwise, or with north and east swapped."""
+    course, speed = guesses[COURSE], guesses[SPEED]
+    if not course.component:
+        return {COURSE: course.because(figure, clockwise_from_north=False)}
+    return {
+        COURSE: replace(speed.because(figure), signal=COURSE, component="north"),
+        SPEED: replace(course.because(figure), signal=SPEED, component="east"),
+    }
 
 
 def _place_wheels(guesses: dict[str, Guess], drive: dict[str, FloatArray]) -> dict[str, Guess]:

@@ -6,6 +6,7 @@ from typing import Any
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.ingest.drafting.draft import Draft, signal_keys
 from fleet_slip.ingest.formats.columns import shown
+from fleet_slip.ingest.mapping.satellite_columns import COURSE, SPEED
 
 _HEAD = """\
 # A draft for {file}. Every line is a guess: check it, with
@@ -47,9 +48,16 @@ def _drive(draft: Draft) -> str:
 def _signals(draft: Draft) -> str:
     lines = ["[signals]"]
     for name, guess in draft.guesses.items():
+        keys = signal_keys(guess)
         lines.append(f"# {name}: {'; '.join(guess.reasons)}")
-        keys = ", ".join(f"{key} = {_value(value)}" for key, value in signal_keys(guess).items())
-        lines.append(f"{name} = {{ {keys} }}")
+        if guess.component == "east":  # stands beside north
+            continue
+        if guess.component:
+            east = draft.guesses[SPEED].profile.channel.name
+            keys = {"north": keys["column"], "east": east, "unit": keys["unit"]}
+        told = ", ".join(f"{key} = {_value(value)}" for key, value in keys.items())
+        end = "  # antenna_x_m and antenna_y_m: to be filled in" if name == COURSE else ""
+        lines.append(f"{name} = {{ {told} }}{end}")
     absent = [name for name in catalogue().signals if name not in draft.guesses]
     if absent:
         lines.append(f"# No channel looks like {', '.join(absent)}.")

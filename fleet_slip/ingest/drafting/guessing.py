@@ -12,6 +12,7 @@ import numpy as np
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.ingest.drafting.profile import Profile
 from fleet_slip.ingest.drafting.suspicion import RADIUS_M
+from fleet_slip.ingest.mapping.satellite_columns import COURSE, SPEED, Component
 from fleet_slip.ingest.mapping.units import conversion_factor
 
 NAMES: dict[str, tuple[str, ...]] = {
@@ -31,6 +32,13 @@ NAMES: dict[str, tuple[str, ...]] = {
     "brake_pressure": ("brake press", "brk press", "brake pres", "master cylinder", "brems druck"),
     "throttle": ("throttle", "accel pedal", "gas pedal", "fahrpedal", "drosselklappe"),
     "gear": ("gear", "gang"),
+    "course": ("course", "cog", "track angle", "heading motion", "kurs"),
+    "satellite_speed": (
+        "gps speed", "gnss speed", "gps vel", "gnss vel", "ground speed", "speed over ground",
+        "sog", "speed 2d",
+    ),
+    "north": ("vel north", "speed north", "v north", "vn", "vel n", "north vel", "north speed"),
+    "east": ("vel east", "speed east", "v east", "ve", "vel e", "east vel", "east speed"),
 }  # fmt: skip
 """Words by which a signal is called, each at the beginning of a part of the name."""
 _NOT_NAMES = {
@@ -42,6 +50,12 @@ _NOT_NAMES = {
     ),
     "gear": ("ratio", "box", "torque", "temp"),
     "steer": ("rear", "rate", "vel", "speed"),
+    "course": ("std", "acc", "accuracy", "error", "rate"),
+    "satellite_speed": (
+        "std", "acc", "accuracy", "error", "x", "y", "z", "east", "north", "up", "down",
+    ),
+    "north": ("std", "acc", "accuracy", "error"),
+    "east": ("std", "acc", "accuracy", "error"),
 }  # fmt: skip
 """Words that say that something else is called so."""
 _CORNERS = {
@@ -99,6 +113,8 @@ class Guess:
     reasons: tuple[str, ...]
     radius_m: float | None = None
     negate: bool = False
+    component: Component | None = None
+    clockwise_from_north: bool | None = None
 
     @property
     def is_without_unit(self) -> bool:
@@ -124,7 +140,27 @@ def guess_signals(profiles: tuple[Profile, ...]) -> dict[str, Guess]:
         if guess is not None:
             guesses[signal] = guess
             taken.add(profile.channel.name)
+    guesses = _satellites(guesses)
     return {name: guesses[name] for name in catalogue().signals if name in guesses}
+
+
+def _satellites(guesses: dict[str, Guess]) -> dict[str, Guess]:
+    """Return the guesses with the course as a mapping has it, or without it."""
+    found = dict(guesses)
+    north, east = found.pop("north", None), found.pop("east", None)
+    course, speed = found.get(COURSE), found.get(SPEED)
+    if north and east and north.unit == east.unit:
+        found[COURSE] = replace(north, signal=COURSE, component="north")
+        found[SPEED] = replace(east, signal=SPEED, component="east")
+    elif course and speed:
+        told = "clockwise from north, as receivers tell it"
+        found[COURSE] = course.because(told, clockwise_from_north=True)
+    if "yaw_rate" not in found or not {COURSE, SPEED} <= set(found):
+        found.pop(COURSE, None)
+        alone = found.pop(SPEED, None)
+        if alone and not alone.component:
+            found.setdefault("vehicle_speed", replace(alone, signal="vehicle_speed"))
+    return found
 
 
 def guess_unnamed_wheels(profiles: tuple[Profile, ...], taken: set[str]) -> list[Guess]:
@@ -177,7 +213,7 @@ def _score(words: str, name: str) -> int:
 
 def _guess(signal: str, profile: Profile, words: str) -> Guess | None:
     """Return a guess with a unit that the signal can have, or None."""
-    si_unit = catalogue()[signal].unit
+    si_unit = "m/s" if signal in {"north", "east"} else catalogue()[signal].unit
     named = f"its name has {words!r}"
     told = unit_of(profile)
     for unit, radius_m in ((told, None), (told, RADIUS_M)):
@@ -205,7 +241,7 @@ def _unit_of_values(si_unit: str, signal: str, largest: float) -> tuple[str, flo
     likely = {
         "m/s^2": (1.3, "g", "m/s^2"),
         "rad/s": (2.5, "rad/s", "deg/s"),
-        "rad": (0.9 if signal != "steering_wheel" else 14.0, "rad", "deg"),
+        "rad": ({"steering_wheel": 14.0, COURSE: 6.3}.get(signal, 0.9), "rad", "deg"),
         "m/s": (70.0, "m/s", "km/h"),
         "Pa": (400.0, "bar", "kPa"),
         "1": (1.2, "1", "%"),

@@ -14,6 +14,7 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.catalogue.turning import WITNESSES
+from fleet_slip.ingest.drafting.course_suspicion import course_fault
 from fleet_slip.ingest.drafting.label_delay import find_delay
 from fleet_slip.ingest.drafting.relations import FEWEST_TICKS, fit, moving, slope_of
 
@@ -67,6 +68,9 @@ def find_suspicions(signals: Signals) -> list[Suspicion]:
         found += check(usual, speed)
     if not any({"ay", "yaw_rate"} & set(one.signals) for one in found):
         found += _label(usual, speed)  # which is judged by them
+    if fault := course_fault(usual):
+        kind, figure, remedy = fault
+        found.append(Suspicion(kind, ("course",), figure, remedy))
     return found
 
 

@@ -18,6 +18,7 @@ from fleet_slip.errors import InputError
 from fleet_slip.ingest.drives.time_bases import DISORDER, HELD
 from fleet_slip.ingest.formats.csv_batches import EXTRA_FIELDS
 from fleet_slip.ingest.mapping.mapping import FromColumn, Mapping, is_number
+from fleet_slip.ingest.mapping.satellite_columns import count_range
 from fleet_slip.ingest.mapping.signal_column import SignalColumn
 from fleet_slip.ingest.mapping.units import conversion_factor
 
@@ -138,9 +139,9 @@ def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> Field:
     """A signal in SI units. Its range is checked on the count that it will become."""
     source = mapping.signals[name]
     raw, number, present = _number(source.column, schema, mapping)
-    signal, value = catalogue()[name], pl.col(name)
+    (signal, least, most), value = count_range(name, source), pl.col(name)
     count = value / float(signal.scale)
-    outside = (count <= signal.min_count - 0.5) | (count >= signal.max_count + 0.5)
+    outside = (count <= least - 0.5) | (count >= most + 0.5)
     problem = find_problems(
         (value.is_null() & present, "not_a_number"),
         (source.is_outside_table(number), "out_of_range"),
@@ -152,7 +153,7 @@ def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> Field:
         found = rows[name]
         if source.table or (found.null_count() and schema[RAW + source.column] == pl.String):
             return False
-        return _lies_within(found, signal.min_count - 0.5, signal.max_count + 0.5, signal.scale)
+        return _lies_within(found, least - 0.5, most + 0.5, signal.scale)
 
     return Field(name, "signal", raw, _si_value(name, source, number), problem, is_sound)
 

@@ -26,7 +26,9 @@ from fleet_slip.ingest.drives.resampling import (
     build_resampler,
     choose_method,
 )
+from fleet_slip.ingest.drives.satellite_fixes import Antenna, course_and_speed, fixes_on_ticks
 from fleet_slip.ingest.mapping.mapping import FromColumn, Mapping
+from fleet_slip.ingest.mapping.satellite_columns import COURSE, SPEED
 
 SOURCE = "measured"
 SHARED_ROWS = 2**14
@@ -90,6 +92,8 @@ def to_ticks(
     method, ticks = resampler.method, resampler.ticks.astype(np.int32)
     counts, somewhere = {}, np.zeros(ticks.size, dtype=np.bool_)
     for signal, source in mapping.signals.items():
+        if signal in {COURSE, SPEED} and COURSE in mapping.signals:
+            continue
         if method == "snap" and source.interpolate and not source.delay_s:
             values = rows.chunks(signal)
         elif len(intervals_s) == 1:
@@ -100,6 +104,9 @@ def to_ticks(
             values = [_resample(samples[signal].to_numpy(), own, signal, mapping)]
         # Rounding clips a resampled value's last bit, no more: the rest is in quarantine.
         counts[signal] = round_chunks(values, catalogue()[signal])
+    if COURSE in mapping.signals:
+        counts |= _fixes(rows, resampler, intervals_s, mapping, counts["yaw_rate"])
+    for signal in counts:
         if not counts[signal].null_count:
             somewhere[:] = True
         elif not somewhere.all():
@@ -112,6 +119,33 @@ def to_ticks(
     if len(ticks):
         metadata |= {"rows": len(ticks), "duration_s": (int(ticks[-1]) - int(ticks[0])) * STEP_S}
     return MeasuredDrive(name, metadata, method, ticks, counts)
+
+
+def _fixes(
+    rows: DriveRows,
+    resampler: Resampler,
+    intervals_s: dict[int, float],
+    mapping: Mapping,
+    yaw_rate: pa.Array,
+) -> dict[str, pa.Array]:
+    """Return the counts of course and speed over ground, null between fixes."""
+    source = mapping.signals[COURSE]
+    if len(intervals_s) == 1:
+        first, second = rows.column(COURSE), rows.column(SPEED)
+    else:
+        samples = rows.samples(COURSE).join(rows.samples(SPEED), on="time", how="inner")
+        resampler = _on_own_times(samples, rows.start_s, resampler, intervals_s)
+        first, second = samples[COURSE].to_numpy(), samples[SPEED].to_numpy()
+    told = pl.Series(yaw_rate).cast(pl.Float64).fill_null(float("nan")).to_numpy()
+    fixes = fixes_on_ticks(
+        *course_and_speed(source, first, second),
+        resampler,
+        source.delay_s,
+        Antenna(source.antenna_x_m or 0.0, source.antenna_y_m or 0.0),
+        told * float(catalogue()["yaw_rate"].scale),
+    )
+    both = zip((COURSE, SPEED), fixes, strict=True)
+    return {name: round_chunks([values], catalogue()[name]) for name, values in both}
 
 
 def _resample(

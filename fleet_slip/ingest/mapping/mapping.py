@@ -5,7 +5,14 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import polars as pl
-from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from fleet_slip.canonical import canonical_ascii
 from fleet_slip.catalogue.signals import Identifier, catalogue
@@ -20,6 +27,7 @@ from fleet_slip.ingest.formats.source import OWN_TIME
 from fleet_slip.ingest.mapping.condition_text import text_conditions
 from fleet_slip.ingest.mapping.names import Name, PositiveFloat
 from fleet_slip.ingest.mapping.row_condition import RowCondition
+from fleet_slip.ingest.mapping.satellite_columns import require_satellites, split_components
 from fleet_slip.ingest.mapping.signal_column import SignalColumn
 from fleet_slip.ingest.mapping.units import require_unit
 from fleet_slip.ingest.mapping.vehicle_facts import (
@@ -123,7 +131,9 @@ class Mapping(Config):
     duckdb: DuckdbRows | None = Field(default=None, exclude_if=_is_empty)
     time: TimeBase
     drive: DriveMetadata
-    signals: dict[str, SignalColumn] = Field(min_length=1)
+    signals: Annotated[
+        dict[str, SignalColumn], BeforeValidator(split_components), Field(min_length=1)
+    ]
     where: tuple[RowCondition, ...] = Field(default=(), exclude_if=_is_empty)
     """Conditions that a row meets, all of them, or is left out and only counted; also as text."""
     vehicles: tuple[VehicleFacts, ...] | Name = Field(default=(), exclude_if=_is_empty)
@@ -144,6 +154,8 @@ class Mapping(Config):
         for condition in self.where:
             if condition.signal is not None and condition.signal not in self.signals:
                 raise ValueError(f"where: {condition.signal!r} is no signal of this mapping")
+            if condition.signal is not None and self.signals[condition.signal].component:
+                raise ValueError(f"where: name the column of the file, not {condition.signal!r}")
         return self
 
     @model_validator(mode="after")
@@ -156,6 +168,7 @@ class Mapping(Config):
                 column.require_unit_of(name, known[name].unit)
             except ValueError as error:
                 raise ValueError(f"signals.{name}: {column.column} {error}") from None
+        require_satellites(self.signals)
         return self
 
     @model_validator(mode="after")

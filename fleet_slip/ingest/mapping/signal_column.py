@@ -1,7 +1,7 @@
 """How one column of a file becomes a signal: unit, sign, gain, offset, table, delay."""
 
 import itertools
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import polars as pl
@@ -13,6 +13,7 @@ from fleet_slip.ingest.mapping.names import Name
 from fleet_slip.ingest.mapping.units import conversion_factor, require_unit
 
 FiniteFloat = Annotated[float, Field(allow_inf_nan=False)]
+Place = Annotated[FiniteFloat, Field(ge=-15, le=15)]
 WHEELS = "wheel_"
 """How the names of wheel speeds begin."""
 VELOCITY = "m/s"
@@ -71,6 +72,21 @@ class SignalColumn(Config):
     time: Name | None = Field(default=None, exclude_if=_absent)
     """The column of this signal's times, where the file has several, in the unit of the others."""
 
+    component: Literal["north", "east"] | None = Field(default=None, exclude_if=_absent)
+    """Of the velocity over ground, if it is one: set for `course = { north = …, east = … }`."""
+    clockwise_from_north: bool | None = Field(default=None, exclude_if=lambda value: value is None)
+    """Whether the course is told so; False: counterclockwise from east."""
+    antenna_x_m: Place | None = Field(default=None, exclude_if=lambda value: value is None)
+    """How far the receiver's antenna is before the centre of gravity."""
+    antenna_y_m: Place | None = Field(default=None, exclude_if=lambda value: value is None)
+    """How far it is to the left of the centre of gravity."""
+
+    @property
+    def is_of_satellites(self) -> bool:
+        """Whether it has keys that are for the course."""
+        told = (self.clockwise_from_north, self.antenna_x_m, self.antenna_y_m, self.component)
+        return any(one is not None for one in told)
+
     @model_validator(mode="after")
     def _gain_is_something(self) -> "SignalColumn":
         if self.gain == 0:
@@ -114,7 +130,7 @@ class SignalColumn(Config):
         return pl.Series(numbers.name, found).set(numbers.is_null(), None)
 
     def _measured_in(self, si_unit: str) -> str:
-        return si_unit if self.radius_m is None else VELOCITY
+        return si_unit if self.radius_m is None and not self.component else VELOCITY
 
     def _is_velocity(self) -> bool:
         try:

@@ -1,0 +1,194 @@
+"""The course of measured logs: of the centre of gravity, at its fixes' ticks, whatever tells it."""
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from fleet_slip.ingest import MeasuredLog
+from fleet_slip.ingest.drafting.suspicion import find_suspicions
+from tests.support.measured import a_mapping, physical, read_columns
+from tests.support.reported import call
+
+ROWS = 3000
+ANTENNA = {"antenna_x_m": 1.2, "antenna_y_m": -0.4}
+YAW_RATE: dict[str, dict[str, Any]] = {"yaw_rate": {"column": "r", "unit": "rad/s"}}
+VELOCITIES: dict[str, dict[str, Any]] = {
+    **YAW_RATE,
+    "course": {"north": "vn", "east": "ve", "unit": "m/s", **ANTENNA},
+}
+ANGLE: dict[str, dict[str, Any]] = {
+    **YAW_RATE,
+    "course": {"column": "cog", "unit": "deg", "clockwise_from_north": True, **ANTENNA},
+    "satellite_speed": {"column": "sog", "unit": "km/h"},
+}
+FIX = 10
+Columns = dict[str, Any]
+
+
+def time_s() -> NDArray[np.float64]:
+    return np.arange(ROWS) / 100
+
+
+def heading(time: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The integral of 0.3 + 0.2 sin(t / 2) rad/s."""
+    return np.asarray(0.3 * time - 0.4 * np.cos(time / 2))
+
+
+def velocity(time: NDArray[np.float64], x: float = 0.0, y: float = 0.0) -> NDArray[np.complex128]:
+    """East and north velocity of a place of a car that slides, as a complex number."""
+    r = 0.3 + 0.2 * np.sin(time / 2)
+    moving = 15 - r * y + 1j * (0.3 * np.sin(1.1 * time) + r * x)
+    return np.asarray(moving * np.exp(1j * heading(time)))
+
+
+def logged(fix_s: NDArray[np.float64], rows: NDArray[np.int64]) -> Columns:
+    """A log at 100 Hz with fixes in some rows, taken at times of their own; else empty."""
+    seen = velocity(fix_s, ANTENNA["antenna_x_m"], ANTENNA["antenna_y_m"])
+    told = {
+        "vn": seen.imag,
+        "ve": seen.real,
+        "cog": np.degrees(np.pi / 2 - np.angle(seen)) % 360,
+        "sog": np.abs(seen) * 3.6,
+    }
+    columns: Columns = {
+        "t": [f"{t:.2f}" for t in time_s()],
+        "r": list(0.3 + 0.2 * np.sin(time_s() / 2)),
+    }
+    for name, values in told.items():
+        column: list[float | None] = [None] * ROWS
+        for row, value in zip(rows.tolist(), values.tolist(), strict=True):
+            column[row] = value
+        columns[name] = column
+    return columns
+
+
+def on_time() -> Columns:
+    rows = np.arange(0, ROWS, FIX)
+    return logged(rows / 100, rows)
+
+
+def course_error(log: MeasuredLog, shift_s: float = 0.0) -> NDArray[np.float64]:
+    """Return by how much the course at each fix is off, in rad."""
+    course = physical(log, "course", 2 * np.pi / 65536)
+    fixes = np.flatnonzero(~np.isnan(course))
+    true = np.angle(velocity(fixes / 100 - shift_s))
+    return np.asarray(np.angle(np.exp(1j * (course[fixes] - true))))
+
+
+@pytest.mark.parametrize("signals", [VELOCITIES, ANGLE], ids=["velocities", "angle"])
+def test_the_course_is_that_of_the_centre_of_gravity(tmp_path: Path, signals: Columns) -> None:
+    log = read_columns(tmp_path, on_time(), a_mapping(signals=signals))
+    error = course_error(log)
+    assert len(error) == ROWS / FIX
+    assert np.abs(error).max() < 4e-4, "the side-slip angle's share of 0.4 m is left"
+    speed = physical(log, "satellite_speed", 0.005)[::FIX]
+    assert speed == pytest.approx(np.abs(velocity(time_s()[::FIX])), abs=2e-2)
+
+
+def test_an_antenna_that_is_told_wrongly_is_seen(tmp_path: Path) -> None:
+    course = {**VELOCITIES["course"], "antenna_x_m": 0.0}
+    log = read_columns(tmp_path, on_time(), a_mapping(signals={**VELOCITIES, "course": course}))
+    assert np.abs(course_error(log)).max() > 0.03
+
+
+def test_a_fix_that_the_file_holds_is_one_fix(tmp_path: Path) -> None:
+    columns = on_time()
+    for name in ("vn", "ve"):
+        columns[name] = [columns[name][row - row % FIX] for row in range(ROWS)]
+    log = read_columns(tmp_path, columns, a_mapping(signals=VELOCITIES))
+    error = course_error(log)
+    assert len(error) == ROWS / FIX and np.abs(error).max() < 4e-4
+
+
+def test_a_fix_between_ticks_turns_to_its_tick_and_a_delay_is_taken_off(tmp_path: Path) -> None:
+    rows = np.arange(FIX, ROWS, FIX)
+    columns = logged(rows / 100 - 0.104, rows)
+    signals = {**VELOCITIES, "course": {**VELOCITIES["course"], "delay_s": 0.104}}
+    log = read_columns(tmp_path, columns, a_mapping(signals=signals))
+    assert np.abs(course_error(log)).max() < 5e-4
+
+
+def test_slow_and_sudden_courses_are_none(tmp_path: Path) -> None:
+    columns = on_time()
+    for name in ("vn", "ve"):
+        columns[name][1000:2000] = [v and v / 20 for v in columns[name][1000:2000]]
+    log = read_columns(tmp_path, columns, a_mapping(signals=VELOCITIES))
+    course, speed = (physical(log, name, 1.0) for name in ("course", "satellite_speed"))
+    assert np.isnan(course[1000:2000]).all() and not np.isnan(speed[1000:2000:FIX]).any()
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"antenna_x_m": None}, "say where the antenna is"),
+        ({"antenna_x_m": 1200}, "less than or equal to 15"),
+        ({"clockwise_from_north": None}, "say whether it is clockwise_from_north"),
+    ],
+)
+def test_what_a_course_needs_must_be_said(changes: Columns, said: str) -> None:
+    course = {k: v for k, v in {**ANGLE["course"], **changes}.items() if v is not None}
+    with pytest.raises(ValidationError, match=said):
+        a_mapping(signals={**ANGLE, "course": course})
+
+
+def test_a_course_comes_with_speed_and_yaw_rate() -> None:
+    for needed in ("satellite_speed", "yaw_rate"):
+        some = {name: column for name, column in ANGLE.items() if name != needed}
+        with pytest.raises(ValidationError, match=f"it needs {needed} beside it"):
+            a_mapping(signals=some)
+    with pytest.raises(ValidationError, match="tell the speed too"):
+        a_mapping(signals={**VELOCITIES, "satellite_speed": ANGLE["satellite_speed"]})
+    with pytest.raises(ValidationError, match="name the column of the file"):
+        a_mapping(signals=VELOCITIES, where="satellite_speed > 5 m/s")
+
+
+def test_a_course_that_turns_the_other_way_is_suspicious() -> None:
+    time = time_s()
+    course = np.where(np.arange(ROWS) % FIX == 0, np.angle(velocity(time)), np.nan)
+    signals = {"yaw_rate": 0.3 + 0.2 * np.sin(time / 2), "course": course}
+    assert not [s for s in find_suspicions(signals) if "course" in s.signals]
+    (turned,) = (s for s in find_suspicions({**signals, "course": -course}) if s.kind == "sign")
+    assert turned.signals == ("course",) and "-1.0" in turned.figure
+    strange = np.where(np.isnan(course), np.nan, np.sin(17 * time))
+    (other,) = (s for s in find_suspicions({**signals, "course": strange}) if s.kind == "values")
+    assert "hardly goes with the yaw rate" in other.figure
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (("VelNorth", "VelEast"), {"north": "VelNorth", "east": "VelEast", "unit": "m/s"}),
+        (("VelEast", "VelNorth"), {"north": "VelNorth", "east": "VelEast", "unit": "m/s"}),
+        (("COG", "GPS speed"), {"column": "COG", "unit": "deg", "clockwise_from_north": True}),
+    ],
+)
+def test_a_draft_finds_the_course_and_asks_for_the_antenna(
+    tmp_path: Path, names: tuple[str, str], expected: Columns
+) -> None:
+    columns = on_time()
+    first, second = ("cog", "sog") if names[0] == "COG" else ("vn", "ve")
+    if names[0] == "VelEast":
+        first, second = "ve", "vn"
+    file = tmp_path / "log.csv"
+    pl.DataFrame(
+        {
+            "time_s": time_s(),
+            "YawRate_rad_s": columns["r"],
+            f"{names[0]}{'' if names[0] == 'COG' else '_mps'}": columns[first],
+            f"{names[1]}{'_kmh' if names[0] == 'COG' else '_mps'}": columns[second],
+        }
+    ).write_csv(file)
+    written = tmp_path / "draft.toml"
+    call(tmp_path / "root", "mapping", "suggest", str(file), "--output", str(written))
+    text = written.read_text()
+    assert "antenna_x_m and antenna_y_m: to be filled in" in text
+    found = tomllib.loads(text)["signals"]["course"]
+    assert {k: v.removesuffix("_mps") if isinstance(v, str) else v for k, v in found.items()} == (
+        expected
+    )
