@@ -1,17 +1,20 @@
 """Finds the drives of a car, or of a time, in the log files."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
+import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.delta import Snapshot
 from fleet_slip.maintenance.old_files import rows_of
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.audit import Forgettable
 from fleet_slip.warehouse.database import open_database, reading_files
+from fleet_slip.warehouse.recordings import Recording, record_drive
 from fleet_slip.warehouse.tables import Warehouse
 
 FILES_PER_QUERY = 256
@@ -82,3 +85,22 @@ def drives_by_file(
                 names = frozenset(drive for drive, other in rows if other == uri)
                 found[paths[uri]] = names
     return found
+
+
+def recordings_of(
+    warehouse: Warehouse, subject: Forgettable, located: Located
+) -> Iterator[Recording]:
+    """Yield what tells a subject's drives again, file by file of the logs."""
+    logs = warehouse.logs.snapshot()
+    drives = drives_by_file(logs, subject, located)
+    for file in logs.files:
+        if file.path not in drives:
+            continue
+        signals = [name for name in catalogue().signals if name in file.null_counts]
+        rows = warehouse.logs.read(file.path, ["drive_id", "vehicle_id", "tick", *signals])
+        ids = rows["drive_id"].cast(pa.string())
+        for name in sorted(drives[file.path]):
+            mine = rows.filter(pc.equal(ids, name)).combine_chunks()
+            [batch] = mine.to_batches()
+            counts = {signal: batch[signal] for signal in signals}
+            yield record_drive(str(batch["vehicle_id"][0]), str(file.day), batch["tick"], counts)

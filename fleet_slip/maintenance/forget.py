@@ -23,7 +23,13 @@ from fleet_slip.delta import Change, retry_conflicts, rows_in
 from fleet_slip.errors import FleetSlipError, QuestionError
 from fleet_slip.grams.cohorts.members import hash_numbers
 from fleet_slip.grams.rows.gram_job import reconcile
-from fleet_slip.maintenance.find_drives import Located, cars_with_rows, drives_by_file, locate
+from fleet_slip.maintenance.find_drives import (
+    Located,
+    cars_with_rows,
+    drives_by_file,
+    locate,
+    recordings_of,
+)
 from fleet_slip.maintenance.forget_received import forget_received
 from fleet_slip.maintenance.marks import newest_versions
 from fleet_slip.maintenance.old_files import (
@@ -91,7 +97,7 @@ def forget(
         )
     models = audit.models_of(subject)
     if state == ALLOWED or (drives and state != "begun"):
-        models = _begin(warehouse, audit, subject, drives)
+        models = _begin(warehouse, audit, subject, drives, located)
     cleared, present = ClearedCars(warehouse.root), partial(cars_with_rows, warehouse)
     cleared.forget(audit, subject, present)
     for table in (warehouse.quarantine, warehouse.logs):
@@ -100,7 +106,7 @@ def forget(
     landed = _drives_of(warehouse, subject, located)
     if not landed <= drives:  # they landed before the fence
         drives |= landed
-        models = _begin(warehouse, audit, subject, drives)
+        models = _begin(warehouse, audit, subject, drives, located)
         cleared.forget(audit, subject, present)
     _forget_quarantined(warehouse, subject, drives)
     rows, rewritten, removed = _rewrite_logs(warehouse, subject, located, progress)
@@ -129,12 +135,17 @@ def forget(
 
 
 def _begin(
-    warehouse: Warehouse, audit: Audit, subject: Forgettable, drives: Collection[str]
+    warehouse: Warehouse,
+    audit: Audit,
+    subject: Forgettable,
+    drives: Collection[str],
+    located: Located,
 ) -> list[str]:
     """Record what is to be forgotten; return the model versions that were trained on it."""
     judged = newest_versions(warehouse.root)
     models = models_trained_on(warehouse, drives)
-    audit.begin(subject, len(drives), models, judged)
+    known = () if subject.kind == "before" else recordings_of(warehouse, subject, located)
+    audit.begin(subject, len(drives), models, judged, [one.kept() for one in known])
     return models
 
 

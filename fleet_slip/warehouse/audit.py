@@ -6,7 +6,8 @@ forgotten?" can be answered by who knows the name, and by no other.
     forgotten/1.json, 2.json, ...   "begun" before anything is changed, "done" after all of it,
                                     "allowed" where a car or drive may come back
 
-"begun" of a drive has the hash of the only car that can send a message of it, too.
+"begun" of a drive has the hash of the only car that can send a message of it, too; and that of a
+car or a drive has what tells the recordings again (`fleet_slip.warehouse.recordings`).
 
 Who lands rows asks `barred` between looking at the table and committing to it. Who forgets writes
 "begun" and then fences the table (`Table.fence`). So a commit either began after the fence, and its
@@ -26,6 +27,7 @@ from typing import Any, Literal, TypeAlias, cast
 from fleet_slip.catalogue.sources import sender_of
 from fleet_slip.files.documents import DocumentFolder
 from fleet_slip.files.folder import Folder
+from fleet_slip.warehouse.recordings import KnownRecordings
 
 FOLDER = "forgotten"
 ALLOWED = "allowed"
@@ -72,6 +74,11 @@ def _digest(text: str, salt: str) -> str:
 def _entry(folder: DocumentFolder, number: int) -> Mapping[str, Any]:
     """Return an entry, which never changes; a night reads each once."""
     return folder.read(number).content
+
+
+@functools.lru_cache(1)
+def _known(kept: tuple[str, ...]) -> KnownRecordings:
+    return KnownRecordings(kept)
 
 
 def _digests(kind: Kind, names: Collection[str], salt: str) -> dict[str, str]:
@@ -126,6 +133,17 @@ class Audit:
                         found[kind].add(name)
         return Barred(frozenset(found["vehicle"]), frozenset(found["drive"]))
 
+    def recordings(self) -> KnownRecordings | None:
+        """Return the recordings of cars and drives that were forgotten; None without any."""
+        last = self._last_events()
+        kept = tuple(
+            recording
+            for e in self.entries()
+            if last[e["kind"], e["salt"], e["subject"]] != ALLOWED
+            for recording in e.get("recordings", ())
+        )
+        return _known(kept) if kept else None
+
     def with_forgotten_drives(self, cars: Collection[str]) -> frozenset[str]:
         """Return which of some cars can send a message of a drive that was forgotten.
 
@@ -174,13 +192,15 @@ class Audit:
         drives: int,
         models: Collection[str],
         judged: Mapping[str, int] | None = None,
+        recordings: Collection[str] = (),
     ) -> None:
         """Record what is about to be forgotten.
 
         `models` were trained on it, of all versions up to the `judged` number of each model.
+        `recordings` are those of its drives, as `Recording.kept` returns them.
         """
         known = {"drives": drives, "models": sorted(models), "judged": dict(judged or {})}
-        self._append(subject, {"event": "begun", **known})
+        self._append(subject, {"event": "begun", **known, "recordings": sorted(recordings)})
 
     def end(self, subject: Forgettable, grams_version: int | None = None) -> None:
         """Record that it is forgotten, and since which version the Gram rows are without it."""

@@ -6,8 +6,10 @@ from dataclasses import dataclass
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from fleet_slip.catalogue.counts import as_arrow
 from fleet_slip.ingest.drives.measured_drives import MeasuredDrive
 from fleet_slip.warehouse.audit import Audit
+from fleet_slip.warehouse.recordings import Recording, record_drive
 
 
 @dataclass(frozen=True)
@@ -16,41 +18,52 @@ class KeptDrives:
 
     Attributes:
         vehicles: whose drives they are.
-        left_out: how many may not land.
+        left_out: the names of those that may not land.
     """
 
     drives: tuple[MeasuredDrive, ...]
     vehicles: frozenset[str]
-    left_out: int
+    left_out: frozenset[str]
 
 
 def keep_drives(drives: Sequence[MeasuredDrive], audit: Audit) -> KeptDrives:
-    """Return the drives that were not forgotten, nor their cars."""
-    vehicles = {str(drive.metadata["vehicle_id"]) for drive in drives}
-    barred = audit.barred(vehicles, {drive.drive_id for drive in drives})
-    kept = tuple(
-        drive
+    """Return the drives that were not forgotten under any name, nor their cars."""
+    barred = audit.barred(set(map(_car_of, drives)), {drive.drive_id for drive in drives})
+    known = audit.recordings()
+    left_out = frozenset(
+        drive.drive_id
         for drive in drives
-        if drive.drive_id not in barred.drives
-        and str(drive.metadata["vehicle_id"]) not in barred.vehicles
+        if drive.drive_id in barred.drives
+        or _car_of(drive) in barred.vehicles
+        or (known is not None and known.has(_recording_of(drive)))
     )
-    there = frozenset(str(drive.metadata["vehicle_id"]) for drive in kept)
-    return KeptDrives(kept, there, len(drives) - len(kept))
+    kept = tuple(drive for drive in drives if drive.drive_id not in left_out)
+    return KeptDrives(kept, frozenset(map(_car_of, kept)), left_out)
 
 
 def keep_refused(
-    refused: pa.Table, audit: Audit, drives: Collection[str] = ()
+    refused: pa.Table, audit: Audit, left_out: Collection[str] = ()
 ) -> tuple[pa.Table, frozenset[str]]:
-    """Return the refused rows that may land, and whose they are; their file has these drives.
+    """Return the refused rows that may land, and whose they are; drives of their file may not.
 
     A refused row goes with its car, or with the drive that it would have been of: the name of a
     drive that was cut at gaps in time begins with it.
     """
     vehicles, named = _names(refused, "vehicle_id"), _names(refused, "drive_id")
-    barred = audit.barred(vehicles, named | set(drives))
-    whole = {name for name in named if any(d.startswith(f"{name}-") for d in barred.drives)}
+    barred = audit.barred(vehicles, named)
+    drives = barred.drives | set(left_out)
+    whole = {name for name in named if any(drive.startswith(f"{name}-") for drive in drives)}
     kept = _without(refused, "vehicle_id", barred.vehicles)
-    return _without(kept, "drive_id", barred.drives | whole), vehicles - barred.vehicles
+    return _without(kept, "drive_id", drives | whole), vehicles - barred.vehicles
+
+
+def _car_of(drive: MeasuredDrive) -> str:
+    return str(drive.metadata["vehicle_id"])
+
+
+def _recording_of(drive: MeasuredDrive) -> Recording:
+    ticks = as_arrow(drive.ticks)
+    return record_drive(_car_of(drive), str(drive.metadata["day"]), ticks, drive.counts)
 
 
 def _names(rows: pa.Table, column: str) -> frozenset[str]:

@@ -52,7 +52,6 @@ class FileOutcome:
     counts: IngestCounts
     look_alikes: tuple[tuple[str, ...], ...]
     vehicles: frozenset[str] = frozenset()
-    drives: frozenset[str] = frozenset()
     left_out: int = 0
     suspicions: tuple[Suspicion, ...] = ()
 
@@ -67,10 +66,11 @@ class Part:
 
 @dataclass(frozen=True)
 class WrittenBatch:
-    """What a batch of files became."""
+    """What a batch of files became; `forgotten` are the entries that its drives were judged by."""
 
     outcomes: tuple[FileOutcome, ...]
     failures: tuple[InputError, ...]
+    forgotten: frozenset[int]
     quarantine: Part = Part()
     logs: Part = Part()
 
@@ -78,16 +78,6 @@ class WrittenBatch:
     def digest(self) -> str:
         """Digest of what landed first time, of all files together."""
         return _digest([outcome.digest for outcome in self.outcomes])
-
-    @property
-    def vehicles(self) -> frozenset[str]:
-        """Cars that the data files have."""
-        return frozenset().union(*(outcome.vehicles for outcome in self.outcomes))
-
-    @property
-    def drives(self) -> frozenset[str]:
-        """Drives that the data files have."""
-        return frozenset().union(*(outcome.drives for outcome in self.outcomes))
 
 
 def unit_of(digest: str) -> Unit:
@@ -107,6 +97,7 @@ def write_batch(
     before is not written again. The longest drive of what is new is looked at: one of a batch, so
     that a folder of small files is not held up. `progress` counts rows of each file.
     """
+    forgotten = Audit(warehouse.root).begun()
     longest: tuple[int, MeasuredDrive] | None = None
     outcomes: list[FileOutcome] = []
     failures: list[InputError] = []
@@ -150,7 +141,9 @@ def write_batch(
             found = (*outcomes[number].suspicions, *found)
             outcomes[number] = replace(outcomes[number], suspicions=found)
         done = {name: part.finish() for name, part in parts.items()}
-    return WrittenBatch(tuple(outcomes), tuple(failures), done["quarantine"], done["logs"])
+    return WrittenBatch(
+        tuple(outcomes), tuple(failures), forgotten, done["quarantine"], done["logs"]
+    )
 
 
 class _PartInTheMaking:
@@ -213,10 +206,9 @@ def _outcome(file: Log, stream: MeasuredStream, written: WrittenFile, *, new: bo
     return replace(
         outcome,
         vehicles=frozenset(written.vehicles),
-        drives=frozenset(written.drives),
-        left_out=written.left_out,
+        left_out=len(written.left_out),
         suspicions=stream.suspicions(),
-        counts=replace(counts, drives=counts.drives - written.left_out, ticks=written.ticks),
+        counts=replace(counts, drives=counts.drives - len(written.left_out), ticks=written.ticks),
     )
 
 
@@ -247,9 +239,7 @@ class Landing:
         snapshot = table.snapshot()
         # Asked after the snapshot: who forgets a car from now on makes this commit a conflict.
         audit = Audit(self._warehouse.root)
-        while audit.barred(self.written.vehicles, self.written.drives) or self._has_landed(
-            snapshot, name
-        ):
+        while audit.begun() != self.written.forgotten or self._has_landed(snapshot, name):
             self._warehouse.quarantine.discard(self.written.quarantine.files)
             self._warehouse.logs.discard(self.written.logs.files)
             self.written = self._write()

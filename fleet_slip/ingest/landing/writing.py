@@ -112,7 +112,7 @@ class WrittenFile:
 
     Attributes:
         rest: rows that wait for those of other files: those of a small file, or the last.
-        vehicles, drives: whose rows they are.
+        vehicles: whose rows they are.
         left_out: drives that were forgotten.
         longest: the drive with the most ticks.
     """
@@ -120,8 +120,7 @@ class WrittenFile:
     rest: dict[TableName, Rows] = field(default_factory=dict)
     files: dict[TableName, tuple[AddAction, ...]] = field(default_factory=dict)
     vehicles: set[str] = field(default_factory=set)
-    drives: set[str] = field(default_factory=set)
-    left_out: int = 0
+    left_out: set[str] = field(default_factory=set)
     ticks: int = 0
     longest: MeasuredDrive | None = None
 
@@ -185,7 +184,7 @@ class FileWriter:
         tables = refused.tables()
         table = next(tables, None)
         while table is not None:
-            kept, vehicles = keep_refused(table, self._audit, self._result.drives)
+            kept, vehicles = keep_refused(table, self._audit, self._result.left_out)
             self._result.vehicles |= vehicles
             table = next(tables, None)
             if kept.num_rows:
@@ -197,8 +196,7 @@ class FileWriter:
             return
         kept = keep_drives(sorted(drives, key=lambda drive: drive.drive_id), self._audit)
         self._result.vehicles |= kept.vehicles
-        self._result.drives |= {drive.drive_id for drive in kept.drives}
-        self._result.left_out += kept.left_out
+        self._result.left_out |= kept.left_out
         self._result.ticks += sum(drive.ticks.size for drive in kept.drives)
         if kept.drives:
             self._pass_on("logs", kept.drives, last=last)

@@ -1,0 +1,175 @@
+"""A forgotten drive stays away when its recording comes again under other names."""
+
+import gzip
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.ingest import Mapping
+from fleet_slip.ingest.landing import landing
+from fleet_slip.ingest.landing.ingest_job import ingest_file
+from fleet_slip.maintenance.forget import forget
+from fleet_slip.warehouse.audit import Audit, Forgettable
+from fleet_slip.warehouse.tables import Warehouse
+from tests.support.measured import SIGNALS, a_mapping, csv_text
+
+ROWS = 3000
+
+
+def recording(seed: int = 1) -> dict[str, Any]:
+    """A drive of 30 s with noise, as sensors have it, and a row for the quarantine."""
+    noise = np.random.default_rng(seed).normal(size=(2, ROWS)).cumsum(axis=1) / 20
+    ax = [f"{x:.3f}" for x in np.clip(noise[0], -9, 9)]
+    ax[100] = "broken"
+    beta = [f"{x:.3f}" for x in np.clip(noise[1], -9, 9)]
+    return {"t": [f"{i / 100:.2f}" for i in range(ROWS)], "ax": ax, "beta": beta}
+
+
+def write(folder: Path, columns: dict[str, Any], name: str = "monday.csv") -> Path:
+    file = folder / name
+    file.write_text(csv_text(columns))
+    return file
+
+
+@pytest.fixture
+def forgotten(warehouse: Warehouse, tmp_path: Path) -> Warehouse:
+    """A data root where the drive of `recording` was forgotten."""
+    ingest_file(warehouse, write(tmp_path, recording()), a_mapping())
+    (file,) = warehouse.logs.snapshot().files
+    (name,) = warehouse.logs.read_names(file.path)["drive_id"].used
+    assert forget(warehouse, Forgettable("drive", name), now=True).drives == 1
+    return warehouse
+
+
+def is_empty(warehouse: Warehouse) -> bool:
+    return not warehouse.logs.snapshot().rows and not warehouse.quarantine.snapshot().rows
+
+
+Copy = tuple[dict[str, Any], Mapping]
+
+
+def a_part() -> Copy:
+    return {name: values[700:1900] for name, values in recording().items()}, a_mapping()
+
+
+def inside_a_longer_one() -> Copy:
+    longer = {name: values * 2 for name, values in recording(7).items()}
+    longer = {name: [*values, *recording()[name]] for name, values in longer.items()}
+    return longer | {"t": [f"{i / 100:.2f}" for i in range(3 * ROWS)]}, a_mapping()
+
+
+def without_some_rows() -> Copy:
+    kept = [i for i in range(ROWS) if i % 300]
+    return {name: [values[i] for i in kept] for name, values in recording().items()}, a_mapping()
+
+
+def with_the_label_turned() -> Copy:
+    turned = [
+        value.removeprefix("-") if "-" in value else f"-{value}" for value in recording()["beta"]
+    ]
+    return recording() | {"beta": turned}, a_mapping()
+
+
+AGAIN: dict[str, Callable[[], Copy]] = {
+    "another mapping": lambda: (recording(), a_mapping(name="other")),
+    "another car": lambda: (recording(), a_mapping(drive={"vehicle_id": "pseudonym"})),
+    "another day": lambda: (recording(), a_mapping(drive={"day": "2020-01-01"})),
+    "another model": lambda: (recording(), a_mapping(drive={"vehicle_model": "coupe"})),
+    "fewer signals": lambda: (recording(), a_mapping(signals={"ax": SIGNALS["ax"]})),
+    "swapped signals": lambda: (recording(), a_mapping(signals={"ay": SIGNALS["ax"]})),
+    "a later clock": lambda: (
+        recording() | {"t": [f"{500 + i / 100:.2f}" for i in range(ROWS)]},
+        a_mapping(),
+    ),
+    "a part": a_part,
+    "inside a longer one": inside_a_longer_one,
+    "without some rows": without_some_rows,
+    "with the label turned": with_the_label_turned,
+}
+
+
+@pytest.mark.parametrize("change", AGAIN)
+def test_the_recording_does_not_land_again(
+    change: str, forgotten: Warehouse, tmp_path: Path
+) -> None:
+    columns, mapping = AGAIN[change]()
+    report = ingest_file(forgotten, write(tmp_path, columns, "tuesday.csv"), mapping)
+    assert (report.drives_forgotten, report.counts.drives) == (1, 0)
+    assert is_empty(forgotten)
+
+
+@pytest.mark.parametrize("more", [b"\n", b"\r\n", b"# end\n"])
+def test_nor_does_its_file_with_some_bytes_more(
+    more: bytes, forgotten: Warehouse, tmp_path: Path
+) -> None:
+    file = write(tmp_path, recording())
+    file.write_bytes(file.read_bytes() + more)
+    assert ingest_file(forgotten, file, a_mapping()).drives_forgotten == 1
+    packed = tmp_path / "packed.csv.gz"
+    packed.write_bytes(gzip.compress(file.read_bytes()))
+    assert ingest_file(forgotten, packed, a_mapping()).drives_forgotten == 1
+
+
+def test_a_car_that_stands_is_known_by_its_name_and_day(
+    warehouse: Warehouse, tmp_path: Path
+) -> None:
+    standing = recording() | {"ax": ["0"] * ROWS, "beta": ["0"] * ROWS}
+    ingest_file(warehouse, write(tmp_path, standing), a_mapping())
+    (file,) = warehouse.logs.snapshot().files
+    (name,) = warehouse.logs.read_names(file.path)["drive_id"].used
+    forget(warehouse, Forgettable("drive", name))
+    again = write(tmp_path, standing, "again.csv")
+    assert ingest_file(warehouse, again, a_mapping(name="other")).drives_forgotten == 1
+    other = a_mapping(drive={"vehicle_id": "other"})
+    assert ingest_file(warehouse, again, other).counts.drives == 1
+
+
+def test_other_recordings_of_the_car_land(forgotten: Warehouse, tmp_path: Path) -> None:
+    other = write(tmp_path, recording(2), "other.csv")
+    report = ingest_file(forgotten, other, a_mapping())
+    assert (report.drives_forgotten, report.counts.drives) == (0, 1)
+    again = write(tmp_path, recording(), "again.csv")
+    assert ingest_file(forgotten, again, a_mapping(name="b")).drives_forgotten == 1
+
+
+def test_a_forgotten_car_does_not_come_back_under_another_name(
+    warehouse: Warehouse, tmp_path: Path
+) -> None:
+    file = write(tmp_path, recording())
+    ingest_file(warehouse, file, a_mapping())
+    car = Forgettable("vehicle", "car")
+    forget(warehouse, car)
+    renamed = a_mapping(drive={"vehicle_id": "renamed"})
+    assert ingest_file(warehouse, file, renamed).drives_forgotten == 1
+    Audit(warehouse.root).allow(car)
+    again = a_mapping(name="again", drive={"vehicle_id": "renamed"})
+    assert ingest_file(warehouse, file, again).counts.drives == 1
+
+
+def test_a_recording_that_is_forgotten_while_it_lands_again_does_not(
+    warehouse: Warehouse, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ingest_file(warehouse, write(tmp_path, recording()), a_mapping())
+    (file,) = warehouse.logs.snapshot().files
+    (name,) = warehouse.logs.read_names(file.path)["drive_id"].used
+    commit = landing.Landing.commit
+
+    def overtaken(self: landing.Landing, table: Any) -> frozenset[str]:
+        monkeypatch.setattr(landing.Landing, "commit", commit)
+        forget(warehouse, Forgettable("drive", name), now=True)
+        return commit(self, table)
+
+    monkeypatch.setattr(landing.Landing, "commit", overtaken)
+    report = ingest_file(warehouse, write(tmp_path, recording()), a_mapping(name="other"))
+    assert report.drives_forgotten == 1
+    assert is_empty(warehouse)
+
+
+def test_the_root_of_an_earlier_version_has_no_recordings(tmp_path: Path) -> None:
+    audit = Audit(LocalFolder(tmp_path))
+    audit.begin(Forgettable("drive", "d"), 1, [])
+    assert audit.recordings() is None
