@@ -21,6 +21,8 @@ from fleet_slip.monitoring.night_report import NightReport, NightStep, State
 from fleet_slip.runs.log import step
 from fleet_slip.runs.nights import Beginning, Nights, hash_drive, without_drives
 from fleet_slip.selection.model_list import load_model_list
+from fleet_slip.warehouse.table_views import connect_tables
+from fleet_slip.warehouse.tables import Warehouse
 from fleet_slip.words import number_of
 
 if TYPE_CHECKING:
@@ -120,8 +122,12 @@ class Night:
 
     def _hindrance(self, name: str) -> str:
         """Return why a step cannot be done."""
-        if name != "ingest" and not self.fleet.warehouse.logs.snapshot().rows:
+        warehouse = self.fleet.warehouse
+        logs = warehouse.logs.snapshot().rows
+        if name != "ingest" and not (logs or warehouse.grams.snapshot().rows):
             return "No drive has landed yet."
+        if name == "verify" and not logs:
+            return "There is no log to compute Gram rows from again."
         undone = [one.name for one in self.steps if one.state in ("failed", "left out")]
         missing = [one for one in NEEDS.get(name, ()) if one in undone]
         return f"{missing[0]} was not done." if missing else ""
@@ -131,13 +137,9 @@ class Night:
         warehouse, champion = self.fleet.warehouse, None
         if self.fleet.root.exists():
             champion = self.fleet.registry().champion(self.training.name)
-        grams = warehouse.grams.snapshot()
-        drives: set[str] = set()
-        for file in grams.files:
-            drives.update(warehouse.grams.read(file.path, ["drive_id"])["drive_id"].to_pylist())
         return Beginning(
             champion=champion.reference if champion else None,
-            drives=len(drives),
+            drives=_count_drives(warehouse),
             rows=warehouse.logs.snapshot().rows,
             quarantined=warehouse.quarantine.snapshot().rows,
         )
@@ -162,7 +164,7 @@ class Night:
         try:
             find_logs([self.landing])
         except InputError:  # a night in which no car came home is no fault
-            never = not self.before.rows
+            never = not self.before.drives
             return ("attention" if never else "done"), "No log is in the folder."
         reports = self.fleet.ingest(
             self.landing, mapping, workers=self.workers, progress=self._shown("ingest")
@@ -252,6 +254,15 @@ class Night:
             f"{number_of(forgotten, 'drive')} before {report.before} forgotten, "
             f"{number_of(removed, 'old file')} removed."
         )
+
+
+def _count_drives(warehouse: Warehouse) -> int:
+    """Return the number of drives that have Gram rows."""
+    if not warehouse.grams.snapshot().rows:
+        return 0
+    query = "SELECT count(DISTINCT drive_id) FROM grams"
+    with connect_tables(warehouse, query) as database:
+        return int(database.sql(query).fetchall()[0][0])
 
 
 def _revoked(drives: Mapping[str, int]) -> str:

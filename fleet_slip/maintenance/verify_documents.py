@@ -58,7 +58,9 @@ def verify_models(
             trained = manifest.trained_on
             if manifest.imported_from is not None:  # the tables that made it are elsewhere
                 continue
-            made_of = {"logs": trained.logs_version, "grams": trained.grams_version}
+            made_of = {"grams": trained.grams_version}
+            if trained.drives_without_log != trained.drives:
+                made_of["logs"] = trained.logs_version
             for table, version in made_of.items():
                 latest = snapshots[table].version if table in snapshots else None
                 if latest is None or version > latest:

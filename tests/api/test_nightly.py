@@ -9,16 +9,21 @@ from datetime import date, timedelta
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import fleet_slip
 from fleet_slip.api.nightly import Night
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import UsageError
 from fleet_slip.models.gate import floor
 from fleet_slip.monitoring.night_page import render_night
 from fleet_slip.monitoring.night_report import NightReport
+from fleet_slip.regression.exact.gram import Gram
+from tests.support.cars import counts, drive
 from tests.support.commands import Finished, run_on, start_on
 from tests.support.landing import Landing
+from tests.support.messages import START_S, message_of
 from tests.support.once import made_once
 from tests.support.state import state
 
@@ -132,6 +137,32 @@ def test_a_night_brings_in_what_is_new_and_writes_its_summary(
     again = give(place, 3).as_text()
     assert "0 new rows" in again
     assert "smoke@3 is up to date" in again
+
+
+def test_a_fleet_that_sends_messages_alone_has_nights(place: Path, tmp_path: Path) -> None:
+    shutil.rmtree(place / "data")
+    shutil.rmtree(place / "landing")
+    (place / "landing").mkdir()
+    fleet = fleet_slip.open(place / "data")
+    rng = np.random.default_rng(2)
+    names = catalogue().gram_signals
+    for night in range(2):
+        content = b""
+        for car in range(12):
+            told = counts(drive(rng, gentleness=2.0))
+            matrix = np.column_stack([told[name].astype(np.int64) for name in names])
+            start_s = START_S + 86_400 * night
+            content += message_of(Gram.from_counts(names, matrix), f"VIN{car}", start_s)
+        (tmp_path / f"{night}").write_bytes(content)
+        fleet.receive(tmp_path / f"{night}")
+        report = give(place, night)
+        assert (report.exit_code, report.drives, report.champion) == (
+            0,
+            12 * (night + 1),
+            f"smoke@{night + 1}",
+        ), report.as_text()
+    assert "smoke@2 is up to date" in give(place, 2).as_text()
+    assert fleet.verify(full=True).findings == []
 
 
 class Killed(BaseException):
