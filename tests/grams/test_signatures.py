@@ -105,6 +105,28 @@ def test_a_signed_message_is_the_unsigned_one_again(
     assert (report.received, report.duplicates) == (0, 2)
 
 
+def test_a_signed_message_takes_the_place_of_an_unsigned_one(
+    fleet: fleet_slip.Fleet,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    keys: dict[str, tuple[bytes, str]],
+) -> None:
+    forged, true, same = message_of(gram_of(7), "VIN1"), message(1), message(2)
+    assert receive(fleet, tmp_path, forged + same + message(3)).received == 3
+    signed = [sign_messages(one, keys[f"VIN{car}"][0]) for car, one in ((1, true), (2, same))]
+    assert receive(fleet, tmp_path, b"".join(signed)).received == 0, "without keys nothing is sure"
+    list_keys(tmp_path, monkeypatch, *(f"{name},{keys[name][1]},,," for name in ("VIN1", "VIN2")))
+    report = receive(fleet, tmp_path, b"".join([*signed, signed[0]]))
+    assert (report.received, report.duplicates, report.refused) == (1, 2, {})
+    found = fleet.sql("SELECT vehicle_id, sums FROM grams ORDER BY ALL").fetchall()
+    assert found == [(f"VIN{car}", list(gram_of(10 * car).sums)) for car in (1, 2, 3)]
+    other = sign_messages(forged, keys["VIN1"][0])
+    assert dict(receive(fleet, tmp_path, other).refused) == {
+        "contradicts another message of its drive": 1
+    }
+    assert fleet.verify(full=True).damage == []
+
+
 def test_what_a_revoked_key_signed_since_a_day_is_left_out_and_named(
     fleet: fleet_slip.Fleet,
     tmp_path: Path,

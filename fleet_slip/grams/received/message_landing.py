@@ -5,14 +5,22 @@ from dataclasses import dataclass
 from itertools import chain
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
+from fleet_slip.arrays import BoolArray
 from fleet_slip.delta import Change, Unit
 from fleet_slip.grams.received.new_messages import NewMessages
-from fleet_slip.grams.received.received_rows import Refused
+from fleet_slip.grams.received.received_rows import Refused, is_received
 from fleet_slip.grams.received.received_table import received_table
-from fleet_slip.grams.rows.gram_files import files_to_rewrite, rows_to_keep, write_rows
-from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA, Warehouse
+from fleet_slip.grams.rows.gram_files import (
+    files_to_rewrite,
+    is_of_received,
+    rows_to_keep,
+    write_rows,
+)
+from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA, SIGNED, Warehouse
 
 ONE_AT_A_TIME = "receive"
 """Unit that every commit of received rows lands: two at once, which could bring the same message,
@@ -63,7 +71,16 @@ def land_rows(warehouse: Warehouse, files: Sequence[MessageFile], new: NewMessag
     """Commit the new rows of some files, and that these landed."""
     grams = new.grams
     replaced = files_to_rewrite(grams, frozenset()) if new.new else []
-    kept = rows_to_keep(grams, replaced, frozenset())
+    if len(new.superseded):
+        replaced += [
+            file
+            for file in filter(is_of_received, grams.files)
+            if file not in replaced and _is_superseded(grams.table.read(file.path), new).any()
+        ]
+    kept = (
+        rows.filter(pa.array(~_is_superseded(rows, new)))
+        for rows in rows_to_keep(grams, replaced, frozenset())
+    )
     mine = [
         received_table(rows, warehouse.grams.schema, [file.digest for file in files])
         for rows in new.new
@@ -77,3 +94,11 @@ def land_rows(warehouse: Warehouse, files: Sequence[MessageFile], new: NewMessag
             note={"job": "receive"},
         )
     )
+
+
+def _is_superseded(rows: pa.Table, new: NewMessages) -> BoolArray:
+    """Return which rows of `grams` give way to signed ones."""
+    out = pc.and_(is_received(rows), pc.is_in(rows["drive_id"].cast(pa.string()), new.superseded))
+    if SIGNED in rows.column_names:
+        out = pc.and_(out, rows[SIGNED].is_null())
+    return np.asarray(out.to_numpy(zero_copy_only=False), dtype=np.bool_)

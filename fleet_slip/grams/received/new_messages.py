@@ -18,7 +18,7 @@ from fleet_slip.grams.received.screening import Screened, screen
 from fleet_slip.grams.rows.gram_files import is_of_received
 from fleet_slip.grams.rows.gram_rows import by_signals, gram_table
 from fleet_slip.grams.rows.same_drives import content_keys
-from fleet_slip.warehouse.tables import Warehouse, gram_schema
+from fleet_slip.warehouse.tables import SIGNED, Warehouse, gram_schema
 
 CONTRADICTS = "contradicts another message of its drive"
 HAS_LOG = "has a drive whose log is here"
@@ -32,6 +32,7 @@ class NewMessages:
         grams: the snapshot.
         new: rows that it lacks, by their signals.
         refused: what goes to the quarantine.
+        superseded: drives whose unsigned rows go, since the key of their car signed others.
         duplicates, forgotten: the file of each row that it has, and that is of a car or a drive
             that was forgotten.
         screened: what of all that was forgotten, and which cars were found to be none of it.
@@ -40,15 +41,23 @@ class NewMessages:
     grams: Snapshot
     new: Sequence[ReceivedRows]
     refused: Sequence[Refused]
+    superseded: pa.StringArray
     duplicates: IntArray
     forgotten: IntArray
     screened: Screened
 
 
 def choose_new(
-    warehouse: Warehouse, rows: Sequence[ReceivedRows], refused: Sequence[Refused]
+    warehouse: Warehouse,
+    rows: Sequence[ReceivedRows],
+    refused: Sequence[Refused],
+    *,
+    signed: bool = False,
 ) -> NewMessages:
-    """Return what of some rows is new, and what contradicts what is there."""
+    """Return what of some rows is new, and what contradicts what is there.
+
+    Rows of which it was checked that they are `signed` take the place of unsigned ones.
+    """
     grams = warehouse.grams.snapshot()
     # Asked after the snapshot: who forgets a car from now on makes this commit a conflict.
     screened = screen(warehouse.root, rows, refused)
@@ -64,8 +73,10 @@ def choose_new(
     _mark_logged(grams, drives)
     duplicates: list[IntArray] = []
     new: list[ReceivedRows] = []
+    superseded = [pa.array([], pa.string())]
     for one in drives:
-        fresh, same, logged = one.compare()
+        fresh, same, logged, beaten = one.compare(signed=signed)
+        superseded.append(one.ids.filter(pa.array(beaten)))
         wrong += one.rows.refuse(logged, HAS_LOG)
         wrong += one.rows.refuse(~(fresh | same | logged), CONTRADICTS)
         duplicates.append(one.rows.file[same])
@@ -74,6 +85,7 @@ def choose_new(
         grams,
         new,
         wrong,
+        pa.concat_arrays(superseded),
         np.concatenate([*duplicates, np.empty(0, np.int64)]),
         np.array(forgotten, np.int64),
         screened,
@@ -91,6 +103,7 @@ class _Drives:
         first: of each drive, its first message.
         logged: of each drive, whether its log is here.
         known: of a drive, by its place, n, sums and products that the table has.
+        signed: of each drive, whether what the table has was signed.
     """
 
     rows: ReceivedRows
@@ -98,6 +111,7 @@ class _Drives:
     drive: IntArray
     first: IntArray
     logged: BoolArray
+    signed: BoolArray
     known: list[tuple[IntArray, IntArray, IntArray]] = field(default_factory=list)
 
     @classmethod
@@ -105,12 +119,14 @@ class _Drives:
         coded = rows.drive_ids.dictionary_encode()
         drive = coded.indices.to_numpy().astype(np.int64)
         _, first = np.unique(drive, return_index=True)
-        return cls(rows, coded.dictionary, drive, first, np.zeros(len(first), dtype=np.bool_))
+        no = np.zeros(len(first), dtype=np.bool_)
+        return cls(rows, coded.dictionary, drive, first, no, no.copy())
 
-    def compare(self) -> tuple[BoolArray, BoolArray, BoolArray]:
+    def compare(self, *, signed: bool) -> tuple[BoolArray, BoolArray, BoolArray, BoolArray]:
         """Return which messages are new, which are here already, and which have a log here.
 
-        What is none of these contradicts what is here, or a message before it.
+        What is none of these contradicts what is here, or a message before it. And return the
+        drives whose unsigned row here gives way to another one that is `signed`.
         """
         logged = self.logged[self.drive]
         there = np.zeros(len(self.ids), dtype=np.bool_)
@@ -123,13 +139,16 @@ class _Drives:
             its = at[self.drive[mine]]
             same[mine] = self._equal(mine, n[its], numbers[its])
             at[drives] = -1
+        beaten = there & ~self.signed & ~self.logged & ~same[self.first] & signed
+        there &= ~beaten
+        same &= ~beaten[self.drive]
         fresh = np.zeros(len(self.rows), dtype=np.bool_)
         fresh[self.first] = True
         fresh &= ~there[self.drive] & ~logged
         again = np.flatnonzero(~fresh & ~there[self.drive] & ~logged)
         before = self.first[self.drive[again]]
         same[again] = self._equal(again, self.rows.n[before], self.rows.numbers[before])
-        return fresh, same & ~logged, logged
+        return fresh, same & ~logged, logged, beaten
 
     def _equal(self, mine: IntArray, n: IntArray, numbers: IntArray) -> BoolArray:
         equal = (self.rows.numbers[mine] == numbers).all(axis=1)
@@ -148,10 +167,18 @@ def _look_up(grams: Snapshot, drives: Sequence[_Drives]) -> None:
         logged = rows.filter(pc.invert(came))["drive_id"].cast(pa.string()).unique()
         for one in drives:
             one.logged |= pc.is_in(one.ids, logged).to_numpy(zero_copy_only=False)
+            one.signed |= pc.is_in(one.ids, _signed(rows)).to_numpy(zero_copy_only=False)
         for batch in rows.filter(came).combine_chunks().to_batches():
             for signals, some, _ in by_signals(batch):
                 if mine := by_name.get(signals):
                     mine.known += _known(mine, signals, some)
+
+
+def _signed(rows: pa.Table) -> pa.Array:
+    """Return the drives of rows that were signed."""
+    if SIGNED not in rows.column_names:
+        return pa.array([], pa.string())
+    return rows.filter(rows[SIGNED].is_valid())["drive_id"].cast(pa.string()).unique()
 
 
 def _files_of_days(grams: Snapshot, drives: Sequence[_Drives]) -> list[TableFile]:

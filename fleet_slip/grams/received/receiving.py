@@ -129,7 +129,7 @@ def _receive_batch(warehouse: Warehouse, batch: dict[Path, bytes]) -> list[Recei
     rows, refused = sort_out(found, None if keys is None else partial(judge_signatures, keys=keys))
 
     def attempt() -> NewMessages:
-        new = choose_new(warehouse, rows, refused)
+        new = choose_new(warehouse, rows, refused, signed=keys is not None)
         land_refused(warehouse, files, new.refused)
         land_rows(warehouse, files, new)
         return new
