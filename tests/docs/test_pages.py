@@ -121,6 +121,13 @@ def test_pages_link_to_nothing_that_the_site_lacks() -> None:
     assert outside == []
 
 
+@pytest.mark.parametrize("page", sorted(DOCS.rglob("*.md")), ids=lambda page: page.name)
+def test_no_row_of_a_table_stands_apart(page: Path) -> None:
+    """After a blank line it would be text with bars."""
+    blocks = MarkdownIt("commonmark").enable("table").parse(page.read_text())
+    assert [one.content for one in blocks if one.content.startswith("| ")] == []
+
+
 def test_the_readme_is_short() -> None:
     assert len((HERE / "README.md").read_text().splitlines()) <= 120
 
