@@ -19,12 +19,12 @@ from pathlib import Path
 from typing import Any
 
 import fleet_slip
-from benchmarks.cortex_m import can_measure, measure_cortex_m
 from fleet_slip.export.c_names import c_prefix
 from fleet_slip.export.c_source import c_header, c_source
 from fleet_slip.export.compile import compile_program
 from fleet_slip.export.files import export_files
 from fleet_slip.models.model_version import ModelVersion
+from tests.support.cortex_m import can_measure, measure_cortex_m
 
 DRIVER = """
 #define _POSIX_C_SOURCE 199309L

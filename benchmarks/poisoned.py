@@ -1,9 +1,9 @@
 """What cars that lie do to a model, and what leaving out cars of unusual influence saves.
 
-    python -m benchmarks.poisoned [--root DATA] [--draws 30] [--share 0.01]
+    python -m benchmarks.poisoned [--root DATA] [--campaign fleet] [--draws 30] [--share 0.01]
 
-The cars are those of the campaign `fleet`, six days of which are simulated into the data root first
-if it is not there (a temporary one by default). In each draw two thirds of the cars train model 4
+The cars are those of a campaign, six days of which are simulated into the data root first if it is
+not there (a temporary one by default). In each draw two thirds of the cars train model 4
 of Table I, and a share of these lies about the label: it has a gain, an offset, or the
 other sign. The error is that on the other third, which is honest. "Left out" are the cars that
 `select --robust` leaves out.
@@ -13,9 +13,7 @@ import argparse
 import json
 import math
 import tempfile
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from fractions import Fraction
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 
@@ -25,18 +23,10 @@ import fleet_slip
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.grams.cohorts.cohort import load_cohort
 from fleet_slip.regression.exact.figures import error_sums
-from fleet_slip.regression.exact.gram import Gram, packed_position
-from fleet_slip.regression.exact.gram_table import GramTable
+from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import LinearModel, fit
-from fleet_slip.regression.inference.drive_moments import DriveMoments
-from fleet_slip.regression.inference.influential import find_influential
+from tests.support.lying_cars import INPUTS, LABEL, left_out, told
 
-INPUTS = (
-    *("ax", "ay", "yaw_rate", "steering_wheel"),
-    *("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr"),
-)
-LABEL = catalogue().label
-SIGNALS = (*INPUTS, LABEL)
 DAYS = 6
 TRAINING = 2 / 3
 LIES: dict[str, tuple[int, float]] = {
@@ -52,19 +42,20 @@ LIES: dict[str, tuple[int, float]] = {
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--root", type=Path)
+    parser.add_argument("--campaign", default="fleet")
     parser.add_argument("--draws", type=int, default=30)
     parser.add_argument("--share", type=float, default=0.01)
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        cars = grams_of_cars(given.root or Path(folder))
+        cars = grams_of_cars(given.root or Path(folder), given.campaign)
     for lie in LIES:
         print(json.dumps(measure(cars, lie, given.draws, given.share)), flush=True)
 
 
-def grams_of_cars(root: Path) -> list[Gram]:
+def grams_of_cars(root: Path, campaign: str) -> list[Gram]:
     """Return the Gram of each car, of the inputs and the label."""
     fleet = fleet_slip.open(root)
-    fleet.simulate("fleet", days=DAYS)
+    fleet.simulate(campaign, days=DAYS)
     fleet.gram()
     served = load_cohort(fleet.warehouse).serving(INPUTS)
     names, number = np.unique(served.drives["vehicle_id"].to_pylist(), return_inverse=True)
@@ -103,21 +94,6 @@ def measure(cars: Sequence[Gram], lie: str, draws: int, share: float) -> dict[st
     }
 
 
-def told(gram: Gram, gain: int, offset_rad: float) -> Gram:
-    """Return the Gram of the same rows with the label times a gain, plus an offset, exactly."""
-    counts = round(Fraction(str(offset_rad)) / catalogue()[LABEL].exact_scale)
-    y = len(gram.signals) - 1
-    sums, products = list(gram.sums), list(gram.products)
-    at: Callable[[int], int] = lambda i: packed_position(y, i)  # noqa: E731
-    for i in range(y):
-        products[at(i)] = gain * gram.products[at(i)] + counts * gram.sums[i]
-    products[at(y)] = (
-        gain**2 * gram.products[at(y)] + 2 * gain * counts * gram.sums[y] + counts**2 * gram.n
-    )
-    sums[y] = gain * gram.sums[y] + counts * gram.n
-    return replace(gram, sums=tuple(sums), products=tuple(products))
-
-
 def total(grams: Sequence[Gram]) -> Gram:
     return sum(grams[1:], grams[0])
 
@@ -131,19 +107,6 @@ def error_deg(model: LinearModel, gram: Gram) -> float:
     sums = error_sums(model, gram)
     square = float((sums.pp - 2 * sums.py + sums.yy) / sums.n)
     return math.degrees(math.sqrt(square) * float(catalogue()[LABEL].exact_scale))
-
-
-def left_out(cars: Sequence[Gram]) -> set[int]:
-    """Return the cars whose influence no honest car has."""
-    grams = [car.restrict(SIGNALS) for car in cars]
-    table = GramTable(
-        SIGNALS,
-        np.array([gram.n for gram in grams]),
-        np.array([gram.sums for gram in grams]),
-        np.array([gram.products for gram in grams]),
-    )
-    found = find_influential(DriveMoments.of(table), np.arange(len(cars)))
-    return {one.car for one in found}
 
 
 if __name__ == "__main__":

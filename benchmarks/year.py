@@ -26,11 +26,11 @@ import numpy as np
 
 import fleet_slip
 from benchmarks.documents import insert
-from benchmarks.receive import messages_of
 from benchmarks.usage import measured
 from fleet_slip.errors import AlarmError
 from fleet_slip.grams.rows.rollup import CELLS, DRIVES, VEHICLES
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.fleet_messages import messages_of
 
 FIRST_DAY = datetime(2024, 1, 1, 5, tzinfo=UTC)
 LATEST_START_S = 18 * 3600

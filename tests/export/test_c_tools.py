@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.cortex_m import measure_cortex_m, run_self_test
 from fleet_slip.export.costs import cost_on_board
 from fleet_slip.export.files import export_files
 from fleet_slip.models.model_version import ModelVersion
 from tests.export.compiled import STRICT
 from tests.export.models import MODELS, export_texts, model_of
+from tests.support.cortex_m import measure_cortex_m, run_self_test
 
 DEVIATIONS = {"misra-c2012-15.5", "misra-c2012-2.5", "misra-c2012-8.7"}
 """All are advisory: a feature returns where a value is missing, the header names the version, and

@@ -1,12 +1,10 @@
-"""The benchmark of cars that lie: its lies are exact, and it finds one that nobody could miss."""
+"""Cars that lie: their lies are exact, and one that nobody could miss is found."""
 
 import numpy as np
 
-from benchmarks.poisoned import INPUTS, LABEL, left_out, told
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.regression.exact.gram import Gram
-
-SIGNALS = (*INPUTS, LABEL)
+from tests.support.lying_cars import LABEL, SIGNALS, left_out, told
 
 
 def counts_of(car: int) -> np.ndarray:

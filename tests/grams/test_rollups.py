@@ -13,7 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import fleet_slip
-from benchmarks.receive import messages_of
 from fleet_slip.delta import Change
 from fleet_slip.errors import CohortError, FleetSlipError, StorageError
 from fleet_slip.files.local_folder import LocalFolder
@@ -33,6 +32,7 @@ from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.warehouse.condition import parse_condition
 from fleet_slip.warehouse.minimum_cohort import MINIMUM_VARIABLE
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.fleet_messages import messages_of
 from tests.support.growth_history import FIRST_DAY, SIGNALS, Drives, day_of, write_logs
 from tests.support.messages import START_S, gram_of, message_of
 

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.receive import messages_of
 from fleet_slip.files import object_files
 from fleet_slip.files.folder import Folder
 from fleet_slip.files.local_folder import LocalFolder
@@ -12,6 +11,7 @@ from fleet_slip.grams.cohorts.fold_sums import SummedCohort, sum_cohort
 from fleet_slip.grams.cohorts.folding import Folding
 from fleet_slip.grams.received.receiving import receive_files
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.fleet_messages import messages_of
 from tests.support.messages import START_S
 
 CARS = 1000
