@@ -1,6 +1,6 @@
 # `make run`  sets up .venv and runs the whole job on the default campaign into ./data.
 # `make test` adds what the checks need, and passes every check that needs Python alone.
-# `make test-all` installs outside programs, such as a browser, and passes the checks that need them.
+# `make test-all` installs outside programs, such as a browser, and passes the checks that need them or minutes.
 # `make report` does what `make run` does, then writes ./data/report/report.html.
 # `make report MODEL=gated` adds hard driving, slippery roads and a fleet before, and tells of the model with gates: ten minutes.
 # `make docs` builds the pages as a site, ./site/index.html; a warning is an error.

@@ -16,7 +16,6 @@ COMMANDS = (
     "gram_variants",
     "encoding --copies 1",
     "cluster",
-    "statistics",
     "observers",
     "reliability",
     "crash --kills 30",

@@ -1,14 +1,14 @@
 """What `fleet-slip monitor` says of days like those before, and of days on which something changed.
 
-    python -m benchmarks.drift [DAYS]
+    python -m benchmarks.drift [DAYS] [--drives 24]
 
-Simulates DAYS days (12) of the campaign `fleet` with 24 drives each, publishes a model, and then
-lands six more days three times over: as before, on worn tyres, and on wet roads. Draws each chart
-to drift_0.svg, drift_1.svg, drift_2.svg in the working directory.
+Simulates DAYS days (12) of the campaign `fleet` with so many drives each, publishes a model, and
+then lands six more days three times over: as before, on worn tyres, and on wet roads. Draws each
+chart to drift_0.svg, drift_1.svg, drift_2.svg in the working directory.
 """
 
+import argparse
 import shutil
-import sys
 import tempfile
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -32,19 +32,18 @@ NEW_DAYS = 6
 COHORT = "source = 'simulated'"
 
 
-def base(days: int) -> Campaign:
-    update = {"drives_per_day": 24, "number_of_days": days}
+def base(days: int, drives: int) -> Campaign:
+    update = {"drives_per_day": drives, "number_of_days": days}
     return load_campaign("fleet").model_copy(update=update)
 
 
-def later(name: str, days: int, update: Mapping[str, Any]) -> Campaign:
-    """Return a campaign of the days after, changed in some way."""
-    first = base(days)
+def later(name: str, first: Campaign, update: Mapping[str, Any]) -> Campaign:
+    """Return a campaign of the days after another one's, changed in some way."""
     content = first.model_dump()
     content |= {
         "name": f"fleet_{name}",
         "seed": first.seed + 1,
-        "first_day": first.first_day + timedelta(days=days),
+        "first_day": first.first_day + timedelta(days=first.number_of_days),
         "number_of_days": NEW_DAYS,
     }
     content["plan"] |= update.get("plan", {})
@@ -90,16 +89,20 @@ def tell(name: str, chart: Chart) -> None:
 
 
 def main() -> None:
-    days = int(sys.argv[1]) if len(sys.argv) > 1 else 12
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("days", type=int, nargs="?", default=12)
+    parser.add_argument("--drives", type=int, default=24, help="of a day")
+    given = parser.parse_args()
+    first = base(given.days, given.drives)
     with tempfile.TemporaryDirectory() as folder:
         trained = Path(folder) / "trained"
-        land(Warehouse(LocalFolder(trained)), base(days))
+        land(Warehouse(LocalFolder(trained)), first)
         train(Warehouse(LocalFolder(trained)))
         for number, (name, update) in enumerate(CHANGES.items()):
             root = Path(folder) / str(number)
             shutil.copytree(trained, root)
             warehouse = Warehouse(LocalFolder(root))
-            land(warehouse, later(f"later_{number}", days, update))
+            land(warehouse, later(f"later_{number}", first, update))
             version = Registry(LocalFolder(root / "models")).resolve("sideslip")
             chart = monitor(warehouse, version, COHORT)
             tell(name, chart)

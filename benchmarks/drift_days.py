@@ -1,14 +1,14 @@
 """How often `fleet-slip monitor` warns of nothing, and after how many days of a growing bias.
 
-    python -m benchmarks.drift_days ROOT
+    python -m benchmarks.drift_days ROOT [--drives 24] [--training 10] [--deals 30]
 
 Takes a warehouse with at least 480 simulated drives and their Gram rows. Its drives are dealt to
-days of 24 anew, again and again; ten days train, the others are judged. A bias of a sensor of all
+days of 24 anew, 30 times; ten days train, the others are judged. A bias of a sensor of all
 cars that grows from day to day is brought into the Gram rows themselves, which is exact: adding a
 constant to a signal changes sums and products by known amounts.
 """
 
-import sys
+import argparse
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from statistics import fmean, median
@@ -29,9 +29,6 @@ from fleet_slip.warehouse.tables import Warehouse
 WHEELS = ("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")
 SIGNALS = ("ax", "ay", "yaw_rate", "steering_wheel", *WHEELS)
 LABEL = "sideslip"
-TRAINING_DAYS = 10
-DRIVES_PER_DAY = 24
-DEALS = 30
 SEED = 20180418
 
 GROWING = {
@@ -44,15 +41,14 @@ GROWING = {
 }
 
 
-def deals(table: GramTable) -> Iterator[list[Gram]]:
-    """Yield the sums of days that the drives were dealt to."""
+def deals(table: GramTable, drives: int, times: int) -> Iterator[list[Gram]]:
+    """Yield the sums of days of so many drives that the drives were dealt to."""
     rng = np.random.default_rng(SEED)
-    days = len(table) // DRIVES_PER_DAY
-    for _ in range(DEALS):
+    days = len(table) // drives
+    for _ in range(times):
         numbers = np.full(len(table), days)
-        numbers[rng.permutation(len(table))[: days * DRIVES_PER_DAY]] = np.repeat(
-            np.arange(days), DRIVES_PER_DAY
-        )
+        dealt = rng.permutation(len(table))[: days * drives]
+        numbers[dealt] = np.repeat(np.arange(days), drives)
         yield list(table.totals(numbers, days + 1))[:days]
 
 
@@ -91,9 +87,16 @@ class Watch:
 
 
 def main() -> None:
-    warehouse = Warehouse(LocalFolder(Path(sys.argv[1])))
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("root", type=Path)
+    parser.add_argument("--drives", type=int, default=24, help="of a day")
+    parser.add_argument("--training", type=int, default=10, help="days that train")
+    parser.add_argument("--deals", type=int, default=30)
+    given = parser.parse_args()
+    warehouse = Warehouse(LocalFolder(given.root))
     table = load_cohort(warehouse, "source = 'simulated'").serving(SIGNALS).table
-    watched = [(Watch(days[:TRAINING_DAYS]), days[TRAINING_DAYS:]) for days in deals(table)]
+    dealt = deals(table, given.drives, given.deals)
+    watched = [(Watch(days[: given.training]), days[given.training :]) for days in dealt]
     warnings = [watch.warns(day) for watch, days in watched for day in days]
     print(f"{len(table)} drives; no drift: {len(warnings)} days", end=", ")
     print(f"{1000 * fmean(warnings):.1f} warnings per 1,000 days")

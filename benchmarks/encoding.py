@@ -1,9 +1,10 @@
 """How log files should be laid out: bytes, writing, a bare sum and the Gram query.
 
-    python -m benchmarks.encoding [--root DATA] [--copies 2] [--only row-group]
+    python -m benchmarks.encoding [--root DATA] [--campaign waterford] [--copies 2]
+        [--only row-group]
 
-Rows are those of the `waterford` campaign, which is simulated into the data root first if it is not
-there (a temporary one by default), copied under other names of drives. Each layout differs from
+Rows are those of the campaign, which is simulated into the data root first if it is not there (a
+temporary one by default), copied under other names of drives. Each layout differs from
 today's in one thing. All layouts are read in turn, in several rounds, and the best round counts;
 the Gram rows of all layouts of a kind are compared. Times are of one thread and in CPU time, so
 that other work on the machine disturbs them little.
@@ -23,12 +24,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from benchmarks.pipeline import SIGNALS, prepare
-from fleet_slip.catalogue.signals import catalogue
+from benchmarks.pipeline import SIGNALS, add_options, job_statement, prepare
 from fleet_slip.delta.encoding import ROW_GROUP_ROWS, WRITE_BATCH_ROWS
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.rows.aggregation import FILES_PER_QUERY
-from fleet_slip.grams.rows.statement import gram_statement
 from fleet_slip.warehouse.tables import Warehouse
 
 ROUNDS = 3
@@ -180,14 +179,13 @@ def write(layout: Layout, rows: pa.Table, folder: Path) -> Measured:
     return Measured(layout, files, sum(Path(path).stat().st_size for path in files), write_s)
 
 
-def read(measured: Measured) -> list[tuple[Any, ...]]:
+def read(measured: Measured, gram: str) -> list[tuple[Any, ...]]:
     """Time both queries once, keep the best times, and return the Gram rows but for their file."""
     database = duckdb.connect(config={"threads": 1})
     step = measured.layout.files_per_query
     batches = [measured.files[i : i + step] for i in range(0, len(measured.files), step)]
     source = "read_parquet(getvariable('log_files'), union_by_name => true)"
     sums = ", ".join(f"sum({name})" for name in SIGNALS)
-    gram = gram_statement(catalogue(), whole=True)
     bare_s, _ = _timed(database, batches, f"SELECT {sums} FROM {source}")
     gram_s, rows = _timed(database, batches, gram, {"feature_set": "signals"})
     measured.bare_s = min(bare_s, measured.bare_s)
@@ -209,13 +207,13 @@ def _timed(
     return time.process_time() - start, rows
 
 
-def compare(group: Sequence[Layout], rows: pa.Table, folder: Path) -> list[Measured]:
+def compare(group: Sequence[Layout], rows: pa.Table, folder: Path, gram: str) -> list[Measured]:
     """Measure some layouts in turn. Asserts that all give the same Gram rows."""
     measured = [write(layout, rows, folder / layout.name) for layout in group]
-    expected = read(measured[0])
+    expected = read(measured[0], gram)
     for _ in range(ROUNDS):
         for one in measured:
-            assert read(one) == expected, one.layout.name
+            assert read(one, gram) == expected, one.layout.name
     return measured
 
 
@@ -233,19 +231,20 @@ def print_table(name: str, measured: Sequence[Measured], rows: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--root", type=Path)
+    add_options(parser)
     parser.add_argument("--copies", type=int, default=2)
     parser.add_argument("--only", nargs="+")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         warehouse = Warehouse(LocalFolder(options.root or Path(folder) / "data"))
-        prepare(warehouse)
+        prepare(warehouse, options.campaign)
+        gram = job_statement(warehouse)
         rows = source_rows(warehouse, options.copies)
         print(f"{rows.num_rows:,} rows of {options.copies} copies", flush=True)
         for name, group in layouts(warehouse.logs.encoding.options()).items():
             if not options.only or name in options.only:
                 with tempfile.TemporaryDirectory(dir=folder) as inner:
-                    print_table(name, compare(group, rows, Path(inner)), rows.num_rows)
+                    print_table(name, compare(group, rows, Path(inner), gram), rows.num_rows)
 
 
 if __name__ == "__main__":

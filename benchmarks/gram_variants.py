@@ -1,9 +1,9 @@
 """Other ways to write the Gram query, beside the one in use.
 
-    python -m benchmarks.gram_variants [--root DATA] [--only packed]
+    python -m benchmarks.gram_variants [--root DATA] [--campaign waterford] [--only packed]
 
-On the `waterford` campaign, which is simulated into the data root first if it is not there (a
-temporary one by default). CPU time of one thread, the best of several rounds in which the variants
+On a campaign, which is simulated into the data root first if it is not there (a temporary one by
+default). CPU time of one thread, the best of several rounds in which the variants
 take turns, so that other work on the machine disturbs them little.
 """
 
@@ -15,10 +15,9 @@ from pathlib import Path
 
 import duckdb
 
-from benchmarks.pipeline import SIGNALS, prepare
-from fleet_slip.catalogue.signals import catalogue
+from benchmarks.pipeline import SIGNALS, add_options, job_statement, prepare
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.rows.statement import LOGS, gram_statement
+from fleet_slip.grams.rows.statement import LOGS
 from fleet_slip.warehouse.tables import Warehouse
 
 ROUNDS = 7
@@ -59,10 +58,9 @@ def lists() -> str:
     return f"SELECT drive_id, {inner} FROM ({by_drive(*columns)})"
 
 
-def variants() -> dict[str, str]:
+def variants(in_use: str) -> dict[str, str]:
     """Return the queries by what they do; the first is what they are measured against."""
     named = LOGS.replace("union_by_name", "filename => true, union_by_name")
-    whole = gram_statement(catalogue(), whole=True)
     integer = products("INTEGER")
     first_half = ", ".join(f"sum({a}::INTEGER * {b}::INTEGER)" for a, b in PAIRS[:33])
     return {
@@ -70,7 +68,7 @@ def variants() -> dict[str, str]:
         "the same sums by drive": by_drive(SUMS),
         "and 33 products": by_drive(SUMS, first_half),
         "and all 66 products": by_drive(SUMS, integer),
-        IN_USE: whole,
+        IN_USE: in_use,
         "a constant beside drive_id in GROUP BY": (
             f"SELECT drive_id, 0 AS absent, {SUMS}, {integer} FROM {LOGS} GROUP BY drive_id, absent"
         ),
@@ -110,12 +108,12 @@ def cpu_s(database: duckdb.DuckDBPyConnection, query: str) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--root", type=Path)
+    add_options(parser)
     parser.add_argument("--only", nargs="+", default=[], help="words in the names of variants")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         warehouse = Warehouse(LocalFolder(options.root or Path(folder)))
-        prepare(warehouse)
+        prepare(warehouse, options.campaign)
         logs = warehouse.logs.snapshot()
 
         def connect(setting: str = "threads = 1") -> duckdb.DuckDBPyConnection:
@@ -125,7 +123,7 @@ def main() -> None:
             return database
 
         usual = connect()
-        runs = {name: (usual, query) for name, query in variants().items()}
+        runs = {name: (usual, query) for name, query in variants(job_statement(warehouse)).items()}
         runs |= {f"SET {one}": (connect(one), runs[IN_USE][1]) for one in SETTINGS}
         first = next(iter(runs))
         chosen = [

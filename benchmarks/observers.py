@@ -1,11 +1,12 @@
 """Steps per second of the Kalman filter and its rivals, over drives on threads.
 
-    python -m benchmarks.observers
+    python -m benchmarks.observers [--rows 30000] [--drives 64]
 
 A step is one row of one drive through the whole estimator: for the Kalman filter the yaw rate
 filter, prediction, the update at every tenth row, and the angle.
 """
 
+import argparse
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -19,8 +20,6 @@ from fleet_slip.comparison.observers import ekf, kalman, luenberger, sliding_mod
 from fleet_slip.comparison.observers.signals import STEP_S, DriveSignals
 from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
 
-ROWS = 30_000
-DRIVES = 64
 REPEATS = 5
 
 ESTIMATORS: dict[str, Callable[..., Any]] = {
@@ -31,15 +30,15 @@ ESTIMATORS: dict[str, Callable[..., Any]] = {
 }
 
 
-def slalom(car: VehicleParameters, seed: int) -> DriveSignals:
+def slalom(car: VehicleParameters, rows: int, seed: int) -> DriveSignals:
     """Return a drive of noisy signals on a winding road."""
-    noise = np.random.default_rng(seed).standard_normal((9, ROWS))
-    time_s = np.arange(ROWS) * STEP_S
+    noise = np.random.default_rng(seed).standard_normal((9, rows))
+    time_s = np.arange(rows) * STEP_S
     yaw_rate = 0.2 * np.sin(0.3 * time_s)
     spin = 20.0 / car.tyre.rolling_radius_m + 0.02 * noise[:4]
     turn = yaw_rate * car.body.track_rear_m / 2 / car.tyre.rolling_radius_m
     steer = yaw_rate * car.body.wheelbase_m / 20.0
-    fix = np.where(np.arange(ROWS) % 10 == 0, 0.0, np.nan)
+    fix = np.where(np.arange(rows) % 10 == 0, 0.0, np.nan)
     return DriveSignals(
         ax_mps2=0.1 * noise[4],
         ay_mps2=20.0 * yaw_rate + 0.1 * noise[5],
@@ -69,10 +68,14 @@ def steps_per_second(
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rows", type=int, default=30_000, help="of a drive")
+    parser.add_argument("--drives", type=int, default=64)
+    given = parser.parse_args()
     car = load_vehicle("d_class_sedan")
-    drives = [slalom(car, seed) for seed in range(DRIVES)]
+    drives = [slalom(car, given.rows, seed) for seed in range(given.drives)]
     cores = cpu_count() or 1
-    print(f"{DRIVES} drives of {ROWS} rows; million steps/s, best of {REPEATS}")
+    print(f"{given.drives} drives of {given.rows} rows; million steps/s, best of {REPEATS}")
     for name, estimator in ESTIMATORS.items():
         estimate = partial(estimator, car=car)
         estimate(drives[0])  # compiles

@@ -63,9 +63,10 @@ def fleet_slip(threads: int) -> Fit:
     from fleet_slip.regression.exact.gram import Gram  # noqa: PLC0415
     from fleet_slip.regression.exact.least_squares import fit  # noqa: PLC0415
 
-    statement = gram_statement(catalogue(), whole=True)
-
     def run(paths: list[str]) -> Coefficients:
+        logged = pq.read_schema(paths[0]).names
+        absent = [name for name in catalogue().stored_columns if name not in logged]
+        statement = gram_statement(catalogue(), whole=True, absent=absent)
         database = duckdb.connect(config={"threads": threads})
         total = Gram.zero(catalogue().gram_signals)
         for first in range(0, len(paths), FILES_PER_QUERY):

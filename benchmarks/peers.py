@@ -1,10 +1,11 @@
 """Programs side by side: the coefficients of one model from the same log files.
 
     pip install --group peers -c constraints.txt
-    python -m benchmarks.peers [--root DATA] [--only spark lstsq] [--plot docs/images/peers.svg]
+    python -m benchmarks.peers [--root DATA] [--campaign waterford] [--only spark lstsq]
+        [--plot docs/images/peers.svg]
 
-The model is the last one of Table I, on the `waterford` campaign, which is simulated into the data
-root first if it is not there (a temporary one by default). Each program runs in a process of its
+The model is the last one of Table I, on a campaign, which is simulated into the data root
+first if it is not there (a temporary one by default). Each program runs in a process of its
 own: twice on two threads, of which the faster counts, and once more on one thread with the files in
 reverse order. Digits are of the worst coefficient, against the exact rational solution. A program
 that is not installed is skipped.
@@ -30,7 +31,7 @@ import pyarrow.parquet as pq
 from matplotlib.figure import Figure
 
 from benchmarks.peer_ways import COLUMNS, INPUTS, LABEL, WAYS, thread_variables
-from benchmarks.pipeline import prepare
+from benchmarks.pipeline import add_options, prepare
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.pages.style import PALETTE, STYLE
@@ -137,13 +138,13 @@ def draw(results: Sequence[Result], path: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--root", type=Path)
+    add_options(parser)
     parser.add_argument("--only", nargs="+", choices=list(WAYS), default=list(WAYS))
     parser.add_argument("--plot", type=Path)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         warehouse = Warehouse(LocalFolder(options.root or Path(folder)))
-        prepare(warehouse)
+        prepare(warehouse, options.campaign)
         logs = warehouse.logs.snapshot()
         exact = exact_model(logs.paths)
         print("| program | million rows/s | peak MiB | correct digits | same bits |")

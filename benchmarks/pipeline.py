@@ -1,13 +1,15 @@
 """How fast logs become Gram rows and models.
 
-    python -m benchmarks.pipeline [--root DATA] [--threads 2]
+    python -m benchmarks.pipeline [--root DATA] [--campaign waterford] [--threads 1 2]
+        [--gram-rows 50000]
 
-Runs on the `waterford` campaign, which is simulated into the data root first if it is not there
-(a temporary one by default). All figures are from one run; each time is the best of several.
+The campaign is simulated into the data root first if it is not there (a temporary one by default).
+All figures are from one run; each time is the best of several.
 """
 
 import argparse
 import json
+import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -17,11 +19,11 @@ from pathlib import Path
 from typing import Any
 
 import duckdb
-import pyarrow as pa
-import pyarrow.parquet as pq
 
+from benchmarks.search import repeat_drives
+from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.delta import Change
+from fleet_slip.delta import Change, absent_columns
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.cohorts.cohort import load_cohort
 from fleet_slip.grams.rows.gram_job import update_grams
@@ -52,9 +54,15 @@ def line(what: str, seconds: float, rows: int, remark: str = "") -> None:
     print(f"{what:44s} {seconds * 1e3:9.1f} ms {rows / seconds / 1e6:8.2f} Mrows/s  {remark}")
 
 
-def prepare(warehouse: Warehouse) -> None:
-    """Simulate the campaign and bring the Gram rows up to date."""
-    campaign = load_campaign("waterford")
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Let the user say where the rows are, and whose they are."""
+    parser.add_argument("--root", type=Path, help="default: a temporary folder")
+    parser.add_argument("--campaign", default="waterford")
+
+
+def prepare(warehouse: Warehouse, name: str) -> None:
+    """Simulate the campaign of a name and bring the Gram rows up to date."""
+    campaign = load_campaign(name)
     with ThreadPoolExecutor(2) as executor:
         simulate_campaign(warehouse, campaign, campaign.days(), executor)
     update_grams(warehouse)
@@ -63,6 +71,16 @@ def prepare(warehouse: Warehouse) -> None:
         f"{logs.rows:,} rows in {len(logs.files)} files: {logs.size_bytes / logs.rows:.2f} bytes a "
         "row, all columns included\n"
     )
+
+
+def absent_from(warehouse: Warehouse) -> tuple[str, ...]:
+    """Return the columns of the catalogue that no log file has."""
+    return absent_columns(warehouse.logs.snapshot().files, catalogue().stored_columns)
+
+
+def job_statement(warehouse: Warehouse) -> str:
+    """Return the statement with which the Gram job reads the logs."""
+    return gram_statement(catalogue(), whole=True, absent=absent_from(warehouse))
 
 
 def gram_query(warehouse: Warehouse, threads: int) -> None:
@@ -76,16 +94,18 @@ def gram_query(warehouse: Warehouse, threads: int) -> None:
     source = "read_parquet(getvariable('log_files'), union_by_name => true)"
     sums = ", ".join(f"sum({name})" for name in SIGNALS)
     bare = f"SELECT {sums} FROM {source}"
-    every = ", ".join(f"sum({name})" for name in ["tick", *catalogue().signals])
+    absent = absent_from(warehouse)
+    logged = ["tick", *(name for name in catalogue().signals if name not in absent)]
+    every = ", ".join(f"sum({name})" for name in logged)
     grouped = f"SELECT drive_id, {sums} FROM {source} GROUP BY drive_id"
-    gram = gram_statement(catalogue(), whole=True)
+    gram = job_statement(warehouse)
     bare_s = best(lambda: database.execute(bare).fetchall())
     every_s = best(lambda: database.execute(f"SELECT {every} FROM {source}").fetchall())
     grouped_s = best(lambda: database.execute(grouped).fetchall())
     gram_s = best(lambda: database.execute(gram, {"feature_set": "signals"}).fetchall())
     line(f"bare sum of {len(SIGNALS)} columns, {threads} thread(s)", bare_s, snapshot.rows)
     line("  the same sums by drive", grouped_s, snapshot.rows, f"{bare_s / grouped_s:.2f} of it")
-    line(f"  bare sum of all {len(catalogue().signals) + 1} columns", every_s, snapshot.rows)
+    line(f"  bare sum of all {len(logged)} columns", every_s, snapshot.rows)
     ratios = f"{bare_s / gram_s:.2f} of the bare sum of its columns, {every_s / gram_s:.2f} of all"
     line("  Gram query: 77 sums by drive", gram_s, snapshot.rows, ratios)
 
@@ -95,7 +115,7 @@ def operators(warehouse: Warehouse) -> None:
     snapshot = warehouse.logs.snapshot()
     database = duckdb.connect(config={"threads": 1})
     database.execute("SET VARIABLE log_files = $files", {"files": snapshot.paths})
-    explain = f"EXPLAIN (ANALYZE, FORMAT JSON) {gram_statement(catalogue(), whole=True)}"
+    explain = f"EXPLAIN (ANALYZE, FORMAT JSON) {job_statement(warehouse)}"
     profiles = []
     for _ in range(ROUNDS):
         answer = database.execute(explain, {"feature_set": "signals"}).fetchone()
@@ -145,21 +165,14 @@ def incremental(warehouse: Warehouse) -> None:
         line("  nothing new", best(lambda: update_grams(copy)), rows)
 
 
-def selection(warehouse: Warehouse, gram_rows: int = 50_000) -> None:
+def selection(warehouse: Warehouse, gram_rows: int) -> None:
     """Time a selection over many Gram rows, reading them included."""
-    paths = warehouse.grams.snapshot().paths
-    rows = pa.concat_tables([pq.read_table(path) for path in paths])
-    rows = rows.filter(pa.compute.equal(rows["feature_set"], "signals"))
-    repeats = -(-gram_rows // rows.num_rows)
-    many = pa.concat_tables([rows] * repeats).slice(0, gram_rows)
-    ids = pa.array([f"drive-{i}" for i in range(gram_rows)])
-    many = many.set_column(many.schema.get_field_index("drive_id"), "drive_id", ids)
     with tempfile.TemporaryDirectory() as folder:
-        copy = Warehouse(LocalFolder(Path(folder)))
-        action = copy.grams.write_file("many", many.cast(copy.grams.schema))
-        copy.grams.snapshot().commit(Change(add=[action]))
-        seconds = best(lambda: select(load_cohort(copy), MODELS.model, MODELS.folds))
-        refit = best(lambda: load_cohort(copy, "mass_kg > 0 AND day >= '2024-05-02'"))
+        root = Path(folder) / "data"
+        shutil.copytree(str(warehouse.root), root)
+        many = repeat_drives(root, gram_rows, PLAIN)
+        seconds = best(lambda: select(load_cohort(many), MODELS.model, MODELS.folds))
+        refit = best(lambda: load_cohort(many, "mass_kg > 0 AND day >= '2024-05-02'"))
     print(
         f"{'select: 5 models x 5 folds':44s} {seconds * 1e3:9.1f} ms  over {gram_rows:,} Gram "
         f"rows; a cohort of them read in {refit * 1e3:.0f} ms"
@@ -168,12 +181,13 @@ def selection(warehouse: Warehouse, gram_rows: int = 50_000) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--root", type=Path)
+    add_options(parser)
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--gram-rows", type=int, default=50_000, help="to select from")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         warehouse = Warehouse(LocalFolder(options.root or Path(folder)))
-        prepare(warehouse)
+        prepare(warehouse, options.campaign)
         for threads in options.threads:
             gram_query(warehouse, threads)
         print()
@@ -181,7 +195,7 @@ def main() -> None:
         print()
         incremental(warehouse)
         print()
-        selection(warehouse)
+        selection(warehouse, options.gram_rows)
 
 
 if __name__ == "__main__":

@@ -36,13 +36,13 @@ MODELS = load_model_list("estimator")
 AT_ONCE = 1000
 
 
-def repeat_drives(root: Path, drives: int) -> Warehouse:
-    """Give a root Gram rows of so many drives, by repeating those that it has."""
+def repeat_drives(root: Path, drives: int, feature_set: str) -> Warehouse:
+    """Give a root Gram rows of so many drives of a set, by repeating those that it has."""
     warehouse = Warehouse(LocalFolder(root))
     grams = warehouse.grams.snapshot()
-    identity = features().identity(MODELS.features or "")
+    identity = features().identity(feature_set)
     parts = [grams.table.read(file.path) for file in grams.files]
-    rows = pa.concat_tables(part.cast(grams.table.schema) for part in parts)
+    rows = pa.concat_tables(part.cast(grams.table.usual_schema) for part in parts)
     known = rows.filter(pc.equal(rows["feature_set"], identity))
     at = known.schema.get_field_index("drive_id")
 
@@ -74,7 +74,7 @@ def best_seconds(rounds: int, work: Callable[[], Any]) -> float:
 
 def measure(root: Path, drives: int, options: argparse.Namespace) -> dict[str, Any]:
     """Return the times for so many drives."""
-    warehouse = repeat_drives(root, drives)
+    warehouse = repeat_drives(root, drives, MODELS.features or "")
 
     def read() -> Any:
         return sum_cohort(warehouse, MODELS.folds, feature_set=MODELS.features or "")

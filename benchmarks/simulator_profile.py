@@ -35,7 +35,6 @@ from fleet_slip.vehicle.lanes.lane_drives import LaneDrive, simulate_blocks, sim
 from fleet_slip.warehouse.tables import Warehouse
 
 ROUNDS = 5
-DAY = date(2024, 6, 1)
 
 
 def best(function: Callable[[], Any], clock: Callable[[], float] = time.thread_time) -> float:
@@ -59,7 +58,7 @@ def stages(batch: Batch, warehouse: Warehouse) -> tuple[int, dict[str, float]]:
     lanes = [lane_drive(spec) for spec in batch.drives]
     logs = simulate_logs(batch.drives)
     rows = tabulate(batch, logs)
-    signals = list(catalogue().signals)
+    signals = [name for name in catalogue().signals if name in rows.schema.names]
     blocks = [
         (block.drive, {name: values.copy() for name, values in block.channels.items()})
         for block in simulate_blocks(lanes)
@@ -84,7 +83,9 @@ def stages(batch: Batch, warehouse: Warehouse) -> tuple[int, dict[str, float]]:
     distort_s = best(distort)
     others = [name for name in rows.schema.names if name not in signals]
     return len(rows), {
-        "plan a day: cars, roads, speeds": best(lambda: load_campaign(batch.campaign).batches(DAY)),
+        "plan a day: cars, roads, speeds": best(
+            lambda: load_campaign(batch.campaign).batches(batch.day)
+        ),
         "roads of the drives": best(lambda: [lane_drive(spec) for spec in batch.drives]),
         "kernel": best(lambda: drive(lanes)),
         "sensors: draw the noise": draw_s,
@@ -127,7 +128,8 @@ def compiled_assembly() -> str:
     fresh = numba.njit(nogil=True, error_model="numpy")(kernel.build_kernel("not kept"))
     usual, kernel.simulate = kernel.simulate, fresh
     try:
-        spec = load_campaign("fleet").batches(DAY)[0].drives[0]
+        fleet = load_campaign("fleet")
+        spec = fleet.batches(fleet.first_day)[0].drives[0]
         simulate_drives([lane_drive(replace(spec, laps=0.01))])
     finally:
         kernel.simulate = usual
@@ -158,7 +160,8 @@ def main() -> None:
     parser.add_argument("--campaign", default="fleet")
     parser.add_argument("--loop", type=Path, help="file for the assembly of the longest loop")
     arguments = parser.parse_args()
-    batch = load_campaign(arguments.campaign).batches(DAY)[0]
+    campaign = load_campaign(arguments.campaign)
+    batch = campaign.batches(campaign.first_day)[0]
     with tempfile.TemporaryDirectory() as folder:
         rows, seconds = stages(batch, Warehouse(LocalFolder(Path(folder))))
     print(f"{rows:,} rows of {len(batch.drives)} drives\n{'stage':34}{'ms':>8}{'ns a row':>10}")

@@ -2,10 +2,11 @@
 
     apt-get install weka                    # or unpack the package: dpkg-deb -x weka_*.deb FOLDER
     pip install --group peers -c constraints.txt        # py4j, which starts the JVM
-    python -m benchmarks.weka [--root DATA] [--rows 2000000] [--jar /usr/share/java/weka.jar]
+    python -m benchmarks.weka [--root DATA] [--campaign waterford] [--rows 2000000]
+        [--jar /usr/share/java/weka.jar]
 
-Rows are the first ones of the `waterford` campaign, which is simulated into the data root first if
-it is not there (a temporary one by default). WEKA reads them from an ARFF file of counts; its time
+Rows are the first ones of the campaign, which is simulated into the data root first if it is not
+there (a temporary one by default). WEKA reads them from an ARFF file of counts; its time
 is given with and without reading. Without the jar, or without py4j, nothing is measured.
 """
 
@@ -24,7 +25,7 @@ import pyarrow.parquet as pq
 
 from benchmarks.peer_ways import COLUMNS, INPUTS
 from benchmarks.peers import digits, exact_model, in_process
-from benchmarks.pipeline import prepare
+from benchmarks.pipeline import add_options, prepare
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.regression.exact.least_squares import LinearModel
 from fleet_slip.warehouse.tables import Warehouse
@@ -128,7 +129,7 @@ def measure(warehouse: Warehouse, jar: Path, count: int, folder: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--root", type=Path)
+    add_options(parser)
     parser.add_argument("--rows", type=int, default=2_000_000)
     parser.add_argument("--jar", type=Path, default=JAR)
     options = parser.parse_args()
@@ -138,7 +139,7 @@ def main() -> None:
         sys.exit("py4j is not installed. Run: pip install --group peers -c constraints.txt")
     with tempfile.TemporaryDirectory() as folder:
         warehouse = Warehouse(LocalFolder(options.root or Path(folder) / "data"))
-        prepare(warehouse)
+        prepare(warehouse, options.campaign)
         measure(warehouse, options.jar, options.rows, Path(folder))
 
 

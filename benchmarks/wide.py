@@ -1,10 +1,10 @@
 """Gram rows of sets with windows: the compiled kernel against the SQL that defines them.
 
-    python -m benchmarks.wide ROOT [--threads 2] [--rounds 3] [--sql-files 1]
+    python -m benchmarks.wide ROOT [--campaign waterford] [--threads 2] [--rounds 3] [--sql-files 1]
 
 For 12, 52, 100 and 200 columns of the logs below ROOT: whether both give the same bits, and how
 many rows a second each computes, Parquet reading included, and the kernel's processor time a row,
-which other load disturbs less. The kernel reads all files of the campaign `waterford`, SQL as many
+which other load disturbs less. The kernel reads all files of the campaign, SQL as many
 as are asked for, perhaps none. The best of some rounds; columns that are no windows are signals and
 the label.
 """
@@ -101,9 +101,14 @@ def stages(warehouse: Warehouse, file: TableFile, known: FeatureCatalogue) -> di
     return {"read_cpu_ns_row": round(read), "kernel_cpu_ns_row": round(computed)}
 
 
+def files_of(warehouse: Warehouse, campaign: str) -> list[TableFile]:
+    """Return the log files of a campaign."""
+    return [one for one in warehouse.logs.snapshot().files if f"{campaign}-" in one.path]
+
+
 def measure(warehouse: Warehouse, columns: int, options: Any) -> dict[str, Any]:
     """Return rates and whether the bits are the same, for so many columns."""
-    files = [f for f in warehouse.logs.snapshot().files if "waterford-" in f.path]
+    files = files_of(warehouse, options.campaign)
     few = files[: options.sql_files]
     known = catalogue_with(columns)
     # A copy keeps what was computed of the original.
@@ -144,13 +149,14 @@ def measure(warehouse: Warehouse, columns: int, options: Any) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("root")
+    parser.add_argument("--campaign", default="waterford")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--sql-files", type=int, default=1)
     parser.add_argument("--columns", type=int, nargs="*", default=COLUMNS)
     options = parser.parse_args()
     warehouse = Warehouse(data_root(options.root))
-    files = [f for f in warehouse.logs.snapshot().files if "waterford-" in f.path]
+    files = files_of(warehouse, options.campaign)
     plain, _ = best_rate(
         sum(file.rows for file in files),
         options.rounds,

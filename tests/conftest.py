@@ -22,14 +22,14 @@ settings.register_profile("fixed", settings.get_profile("search"), derandomize=T
 settings.load_profile("fixed")
 
 LEFT_OUT = pytest.StashKey[dict[str, int]]()
-"""How many tests were left out because of each tool."""
+"""How many tests were left out because of each tool, or of the minutes that they take."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--tools",
         action="store_true",
-        help="run the tests that need outside programs, and no others",
+        help="run the tests that need outside programs or minutes, and no others",
     )
 
 
@@ -38,12 +38,17 @@ def tools_of(item: pytest.Item) -> list[str]:
     return [name for marker in item.iter_markers("tools") for name in marker.args]
 
 
+def why_left_out(item: pytest.Item) -> list[str]:
+    """Return for what a test is left to `make test-all`; nothing if it is not."""
+    return [*tools_of(item), *(["minutes"] if item.get_closest_marker("long") else [])]
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     with_tools = config.getoption("--tools")
-    left = [item for item in items if bool(tools_of(item)) != with_tools]
-    items[:] = [item for item in items if bool(tools_of(item)) == with_tools]
+    left = [item for item in items if bool(why_left_out(item)) != with_tools]
+    items[:] = [item for item in items if bool(why_left_out(item)) == with_tools]
     config.hook.pytest_deselected(items=left)
-    names = [name for item in left for name in tools_of(item)]
+    names = [name for item in left for name in why_left_out(item)]
     config.stash[LEFT_OUT] = {name: names.count(name) for name in sorted(set(names))}
 
 

@@ -1,0 +1,153 @@
+"""Every benchmark runs, with tiny sizes, and every page that names one names one that is there."""
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.support.commands import done_on
+from tests.support.once import made_once
+
+HERE = Path(__file__).resolve().parents[2]
+BENCHMARKS = HERE / "benchmarks"
+DEADLINE_S = 600
+"""Each takes some seconds on an idle machine."""
+
+TINY = {
+    "billion": "--root {folder} --rows 3e4",
+    "checksums": "--campaign smoke --repeat 1",
+    "cluster": "--days 1 --workers 1",
+    "crash": "--kills 2 --commands gram",
+    "drift": "4 --drives 2",
+    "drift_days": "{root} --drives 1 --training 5 --deals 2",
+    "encoding": "--root {root} --campaign smoke --copies 1",
+    "features": "{root} 15",
+    "fleet": "{root} --no-rivals",
+    "flips": "--flips 1",
+    "fuzz": "--cases 10 --target config",
+    "gram_variants": "--root {root} --campaign smoke --only packed",
+    "growth": "--root {folder} --part runs --sizes 10 20",
+    "ingest": "--rows 2000,4000",
+    "ingest_clocks": "--rows 4000 --formats mdf",
+    "ingest_folder": "--files 3 --rows 100",
+    "interleave": "--schedules 2 --first gram --second simulate",
+    "label_delay": "{root} --drives 1",
+    "mutants": "--show --each 1 --folder files",
+    "nights": "{root} --nights 2 --output {folder}",
+    "observers": "--rows 500 --drives 2",
+    "on_board": "{root} smoke --seconds 0.01",
+    "on_paper": "",
+    "peers": "--root {root} --campaign smoke --only fleet_slip duckdb scikit-learn",
+    "pipeline": "--root {root} --campaign smoke --threads 1 --gram-rows 200",
+    "poisoned": "--root {root} --campaign smoke --draws 1",
+    "quality": "{root}",
+    "realism": "",
+    "receive": "--cars 3 --drives 1",
+    "refit": "{root} true",
+    "reliability": "--writers 2 --commits 2 --bits 2",
+    "search": "{root} --drives 10 --most 2 --rounds 1 --methods forward",
+    "simulator": "--seconds 0.01 --threads 1",
+    "simulator_profile": "--campaign smoke",
+    "soak": "--minutes 0.1",
+    "stability_control": "--record 2 --trials 1",
+    "start": "--rounds 1",
+    "statistics_figures": "{root} smoke",
+    "store_history": "--sizes 10",
+    "suggest": "",
+    "validation": "",
+    "wide": "{root} --campaign smoke --rounds 1 --columns 12",
+    "work_precision": "",
+    "year": "--cars 2 --days 10 --rows-days 1",
+}
+"""What makes each small. `{root}` is a data root, see `tiny_root`."""
+
+ELSEWHERE = {
+    "cluster_namespaces": "network namespaces, and the right to make them",
+    "fuzz.guided": "atheris",
+    "weka": "WEKA and a JVM",
+}
+"""What is not run here, and what it needs."""
+
+PARTS = {"peer_ways", "usage"}
+"""What benchmarks start as processes of their own."""
+
+
+@pytest.fixture(scope="session")
+def tiny_root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Path:
+    """A data root with a published model, and a day of many cars with what is known of them."""
+
+    def make(root: Path) -> None:
+        shutil.copytree(smoke_root, root)
+        done_on(root, "simulate", "fleet", "--days", "1")
+        for feature_set in ("signals", "calibration", "fleet"):
+            done_on(root, "gram", "--features", feature_set)
+
+    return made_once(tmp_path_factory, "benchmarks", make)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", TINY)
+def test_a_benchmark_runs_with_tiny_sizes(name: str, tiny_root: Path, tmp_path: Path) -> None:
+    root = shutil.copytree(tiny_root, tmp_path / "data")
+    given = shlex.split(TINY[name].format(root=root, folder=tmp_path / "folder"))
+    done = subprocess.run(
+        [sys.executable, "-m", f"benchmarks.{name}", *given],
+        cwd=tmp_path,  # what it writes stays here
+        env={**os.environ, "PYTHONPATH": str(HERE)},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=DEADLINE_S,
+    )
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+    assert done.stdout
+
+
+def programs() -> set[str]:
+    """Return the names under which `python -m benchmarks.NAME` starts something."""
+    modules = {
+        path.stem
+        for path in BENCHMARKS.glob("*.py")
+        if '__name__ == "__main__"' in path.read_text(encoding="utf-8")
+    }
+    return (modules | {"fuzz", "fuzz.guided"}) - PARTS
+
+
+def named_in(page: Path) -> set[str]:
+    """Return the benchmarks that a page tells to run."""
+    return set(re.findall(r"python -m benchmarks\.([\w.]*\w)", page.read_text(encoding="utf-8")))
+
+
+def test_every_benchmark_has_tiny_sizes_or_needs_what_is_not_here() -> None:
+    assert programs() == {*TINY, *ELSEWHERE}
+    assert not TINY.keys() & ELSEWHERE
+
+
+def test_every_command_of_the_measurements_is_one_of_them() -> None:
+    named = named_in(HERE / "docs/measured.md")
+    assert len(named) > 10
+    assert named <= {*TINY, *ELSEWHERE}
+
+
+def test_every_benchmark_is_named_by_a_page() -> None:
+    pages = [HERE / "CONTRIBUTING.md", *(HERE / "docs").rglob("*.md")]
+    assert set().union(*map(named_in, pages)) == programs()
+
+
+def test_make_bench_runs_what_is_there() -> None:
+    text = (BENCHMARKS / "__main__.py").read_text(encoding="utf-8")
+    commands = re.findall(r'^    "(\w+)[^"]*",$', text, re.M)
+    assert commands
+    assert set(commands) <= programs()
+
+
+def test_no_test_imports_a_benchmark() -> None:
+    """What both need lies in tests/support; a benchmark may take it from there."""
+    pattern = re.compile(r"^\s*(?:from|import) benchmarks\b", re.M)
+    tests = (HERE / "tests").rglob("*.py")
+    assert [str(path) for path in tests if pattern.search(path.read_text("utf-8"))] == []
