@@ -117,6 +117,6 @@ def _picture(chart: Chart) -> Picture:
         "control-chart",
         title,
         caption,
-        f"{title}. {caption}",
+        "Points over the days, beside their limits.",
         lambda size: control_chart(chart, size),
     )

@@ -15,13 +15,18 @@ class Picture:
     Attributes:
         key: name of its files, and of its place on the page.
         title: what it shows.
-        caption: what is to be seen, in numbers.
-        alternative: for those who cannot see it.
+        caption: what it tells, in numbers.
+        seen: what is drawn, for those who cannot see it.
         draw: makes it at a size.
     """
 
     key: str
     title: str
     caption: str
-    alternative: str
+    seen: str
     draw: Callable[[Size], Figure]
+
+    @property
+    def alternative(self) -> str:
+        """The text in place of the figure."""
+        return f"{self.title}. {self.seen} {self.caption}"

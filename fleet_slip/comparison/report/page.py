@@ -5,7 +5,6 @@ from collections.abc import Sequence
 
 from fleet_slip.comparison.report.claims.judging import Judged, Status, judge_claims
 from fleet_slip.comparison.report.findings.report_data import ReportData
-from fleet_slip.comparison.report.pictures.road_pictures import standings
 from fleet_slip.comparison.report.tables import further_tables, paper_tables
 from fleet_slip.pages.drawing import draw
 from fleet_slip.pages.picture import Picture
@@ -58,7 +57,7 @@ def _further(data: ReportData) -> list[ReportTable]:
     learned = further_tables.rivals(data)
     return [
         further_tables.scenarios(data),
-        standings(data),
+        further_tables.standings(data),
         *further_tables.fleets(data),
         *([learned] if learned else []),
     ]

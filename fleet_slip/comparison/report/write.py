@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from fleet_slip.comparison.report.findings.report_data import gather
 from fleet_slip.comparison.report.page import render
-from fleet_slip.comparison.report.pictures.all_pictures import draw_pictures
+from fleet_slip.comparison.report.pictures import draw_pictures
 from fleet_slip.files.folder import Folder
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.pages.drawing import png_file, svg_file

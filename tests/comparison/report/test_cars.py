@@ -19,7 +19,7 @@ from fleet_slip.comparison.report.findings.cars import (
 )
 from fleet_slip.comparison.report.findings.report_data import ReportData
 from fleet_slip.comparison.report.page import render
-from fleet_slip.comparison.report.pictures.all_pictures import draw_pictures
+from fleet_slip.comparison.report.pictures import draw_pictures
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.cohorts.cohort import Cohort, assign_folds
 from fleet_slip.grams.rows.gram_job import update_grams

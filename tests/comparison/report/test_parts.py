@@ -106,7 +106,7 @@ def test_a_drawing_on_the_page_takes_its_colours_from_the_page() -> None:
         assert "var(--model-4)" in svg
         assert not [tone.light for tone in PALETTE.values() if tone.light in svg]
         assert "<style" not in svg
-        assert 'aria-label="says &quot;x&quot; &amp; &lt;y>"' in svg
+        assert 'aria-label="title. says &quot;x&quot; &amp; &lt;y> caption"' in svg
     names = [set(re.findall(r'\bid="([^"]+)"', svg)) for svg in drawings.values()]
     assert names[0]
     assert not names[0] & names[1]

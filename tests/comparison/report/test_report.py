@@ -32,9 +32,10 @@ from fleet_slip.comparison.report.findings.memory import by_length, looks_back
 from fleet_slip.comparison.report.findings.report_data import ReportData
 from fleet_slip.comparison.report.findings.stretches import blocks_won, difference
 from fleet_slip.comparison.report.page import render
-from fleet_slip.comparison.report.pictures.all_pictures import draw_pictures
-from fleet_slip.comparison.report.pictures.road_pictures import road_pictures, standings
+from fleet_slip.comparison.report.pictures import draw_pictures
+from fleet_slip.comparison.report.pictures.further_pictures import road_pictures
 from fleet_slip.comparison.report.tables import paper_tables
+from fleet_slip.comparison.report.tables.further_tables import standings
 from fleet_slip.errors import DataError
 from fleet_slip.files.documents import Document
 from fleet_slip.files.local_folder import LocalFolder

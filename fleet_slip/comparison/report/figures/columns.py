@@ -8,12 +8,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.comparison.report.figures.labels import End, label_ends, tick_degrees
+from fleet_slip.comparison.report.figures.labels import End, error_axes, finish_errors
 from fleet_slip.comparison.report.findings.memory import Memory, Without
 from fleet_slip.pages.style import Size, colour
 from fleet_slip.pages.text import degrees
 
-HEIGHT_IN = 3.6
 BAR_IN = 0.2
 HEAD_IN = 0.34
 FOOT_IN = 0.4
@@ -47,16 +46,7 @@ def error_by_columns(lines: Sequence[Series], size: Size) -> Figure:
 
 def error_over(places: FloatArray, label: str, lines: Sequence[Series], size: Size) -> Figure:
     """Draw each line over some places, shape (places,), on a logarithmic scale."""
-    figure = Figure(figsize=(size.width_in, HEIGHT_IN))
-    room = 1.5 if size.wide else 1.05
-    axes = figure.add_axes(
-        (
-            0.5 / size.width_in,
-            0.45 / HEIGHT_IN,
-            1 - (0.5 + room) / size.width_in,
-            1 - 0.8 / HEIGHT_IN,
-        )
-    )
+    axes = error_axes(size)
     for line in lines:
         tone = colour(line.colour)
         axes.plot(
@@ -69,12 +59,9 @@ def error_over(places: FloatArray, label: str, lines: Sequence[Series], size: Si
         )
         if line.mark_deg is not None:
             axes.axhline(line.mark_deg, color=tone, linewidth=0.9, linestyle=(0, (5, 3)))
-    axes.set_yscale("log")
-    tick_degrees(axes)
-    axes.set_xlabel(label, labelpad=2)
-    axes.set_title("root mean square error", color=colour("muted"))
-    label_ends(axes, [End(float(o.rmse_deg[-1]), o.label, o.colour) for o in lines], size)
-    return figure
+    return finish_errors(
+        axes, label, [End(float(o.rmse_deg[-1]), o.label, o.colour) for o in lines], size
+    )
 
 
 def left_out(memory: Memory, size: Size) -> Figure:

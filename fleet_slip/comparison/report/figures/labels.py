@@ -2,15 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from fleet_slip.pages.style import POINTS_PER_INCH, Size, colour
 
 LINE_POINTS = 13.0
 """Height of a line of text."""
 
+HEIGHT_IN = 3.6
 TICKS_DEG = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10)
 
 
@@ -21,6 +24,26 @@ class End:
     value: float
     label: str
     colour: str
+
+
+def error_axes(
+    size: Size, height_in: float = HEIGHT_IN, room_in: tuple[float, float] = (1.5, 1.05)
+) -> Axes:
+    """Return axes for errors, with room for names at the right: on wide and on narrow pages."""
+    figure = Figure(figsize=(size.width_in, height_in))
+    room = room_in[0] if size.wide else room_in[1]
+    width = 1 - (0.5 + room) / size.width_in
+    return figure.add_axes((0.5 / size.width_in, 0.45 / height_in, width, 1 - 0.8 / height_in))
+
+
+def finish_errors(axes: Axes, label: str, ends: Sequence[End], size: Size) -> Figure:
+    """Make the errors' axis logarithmic, and name axes and lines; return the figure."""
+    axes.set_yscale("log")
+    tick_degrees(axes)
+    axes.set_xlabel(label, labelpad=2)
+    axes.set_title("root mean square error", color=colour("muted"))
+    label_ends(axes, ends, size)
+    return cast(Figure, axes.figure)
 
 
 def tick_degrees(axes: Axes) -> None:

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.comparison.evaluation.runs import EvaluatedScenario
-from fleet_slip.comparison.report.figures.labels import End, label_ends, tick_degrees
+from fleet_slip.comparison.report.figures.labels import End, error_axes, finish_errors
 from fleet_slip.comparison.report.figures.lines import smooth
 from fleet_slip.comparison.report.figures.series import Line
 from fleet_slip.pages.style import Size, colour
@@ -53,23 +53,13 @@ def error_by_acceleration(
     runs: Sequence[EvaluatedScenario], lines: Sequence[Line], trained_to_mps2: float, size: Size
 ) -> Figure:
     """Draw the error of each estimator over the lateral acceleration, on a logarithmic scale."""
-    figure = Figure(figsize=(size.width_in, HEIGHT_IN))
-    room = 1.35 if size.wide else 0.95
-    axes = figure.add_axes(
-        (
-            0.5 / size.width_in,
-            0.45 / HEIGHT_IN,
-            1 - (0.5 + room) / size.width_in,
-            1 - 0.8 / HEIGHT_IN,
-        )
-    )
+    axes = error_axes(size, HEIGHT_IN, (1.35, 0.95))
     ends, furthest = [], 0.0
     for line in lines:
         middle, error = error_by_bin(runs, line.estimator)
         axes.plot(middle, error, color=colour(line.colour), linewidth=1.6, marker="o", markersize=3)
         furthest = max(furthest, float(middle[-1]))
         ends.append(End(float(error[-1]), line.label, line.colour))
-    axes.set_yscale("log")
     axes.axvspan(0, trained_to_mps2, color=colour("model_4"), alpha=0.07, linewidth=0)
     axes.text(
         trained_to_mps2,
@@ -82,8 +72,4 @@ def error_by_acceleration(
         fontsize=8.5,
     )
     axes.set_xlim(0, furthest + BIN_MPS2 / 2)
-    tick_degrees(axes)
-    axes.set_xlabel("size of the lateral acceleration (m/s²)", labelpad=2)
-    axes.set_title("root mean square error", color=colour("muted"))
-    label_ends(axes, ends, size)
-    return figure
+    return finish_errors(axes, "size of the lateral acceleration (m/s²)", ends, size)

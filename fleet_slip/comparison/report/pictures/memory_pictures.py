@@ -38,7 +38,6 @@ def _by_columns(data: ReportData, memory: Memory) -> Picture:
         mark = filter_deg if name == "nominal" else None
         lines.append(Series(*LINES[name], errors, mark))
     found = memory.searched
-    title = "Error by number of columns"
     caption = (
         f"Models of 1 to {len(found.models)} columns that a search by {found.search.method} finds "
         f"among {found.inputs} inputs on the training drives alone; the test drives only judge. "
@@ -47,9 +46,9 @@ def _by_columns(data: ReportData, memory: Memory) -> Picture:
     )
     return Picture(
         "memory-columns",
-        title,
+        "Error by number of columns",
         caption,
-        f"{title}: a falling line for each of {listed([line.label for line in lines])}. {caption}",
+        f"A falling line for each of {listed([line.label for line in lines])}.",
         lambda size: error_by_columns(lines, size),
     )
 
@@ -72,7 +71,6 @@ def _smallest(memory: Memory, filter_deg: float | None) -> str:
 
 
 def _left_out(data: ReportData, memory: Memory) -> Picture:
-    title = "What each column and each window buys"
     dearest = memory.columns[0]
     caption = (
         f"Cross-validated RMSE of the columns of {data.version.reference} as they stand, "
@@ -83,9 +81,9 @@ def _left_out(data: ReportData, memory: Memory) -> Picture:
     )
     return Picture(
         "memory-left-out",
-        title,
+        "What each column and each window buys",
         caption,
-        f"{title}: bars. {caption}",
+        "Bars.",
         lambda size: left_out(memory, size),
     )
 
@@ -105,7 +103,6 @@ def _on_the_track(data: ReportData) -> Picture:
         Map(f"{published}, with memory", run, published),
     ]
     before, after = (run.results[one.estimator].whole.rmse_deg for one in maps)
-    title = "Where on the track memory helps"
     caption = (
         "The nominal drive, by the model of one instant and by the published one. Blue: the "
         "estimate is too far to the right; orange: too far to the left. Root mean square error "
@@ -113,9 +110,9 @@ def _on_the_track(data: ReportData) -> Picture:
     )
     return Picture(
         "memory-map",
-        title,
+        "Where on the track memory helps",
         caption,
-        f"{title}: two maps of the track, coloured by the error. {caption}",
+        "Two maps of the track, coloured by the error.",
         lambda size: error_map(maps, size, FINE_EDGES_DEG),
     )
 

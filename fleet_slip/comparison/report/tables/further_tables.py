@@ -1,10 +1,11 @@
 """Tables of what the evaluation found beyond the paper, of coefficients and of storage."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.comparison.evaluation.errors import ErrorFigures
+from fleet_slip.comparison.evaluation.ranking import LEAST_COVERAGE
 from fleet_slip.comparison.report.findings.coefficients import Coefficient, Coefficients
 from fleet_slip.comparison.report.findings.report_data import ReportData
 from fleet_slip.pages.table import Cell, ReportTable, table
@@ -98,6 +99,54 @@ def scenarios(data: ReportData) -> ReportTable:
             "the tuned ones; they know mass, geometry and tyres of the training car, the "
             "regression nothing but its drives."
         ),
+    )
+
+
+def compared(data: ReportData) -> list[str]:
+    """Return the estimators that stand beside each other: of Table I the paper's choice alone."""
+    left_out = set(data.evaluated.models.values()) - {data.choice}
+    return [name for name in data.evaluated.estimators if name not in left_out]
+
+
+def standings(data: ReportData) -> ReportTable:
+    """Return the RMSE of every estimator on every test drive, the smallest marked."""
+    evaluated, names = data.evaluated, compared(data)
+    rows: list[list[str | Cell]] = [
+        [scenario, *_standing([evaluated.figures(scenario, name) for name in names])]
+        for scenario in evaluated.scenarios
+    ]
+    return table(
+        "standings",
+        "Every estimator on every test drive: root mean square error in degrees",
+        ["test drive", *names],
+        rows,
+        note=f"Green: the smallest of the row. {won(data)}A percentage: the share of the drive "
+        "with an estimate; such do not compete.",
+    )
+
+
+def _standing(found: Sequence[ErrorFigures | None]) -> list[Cell]:
+    errors = [one.rmse_deg if one and one.coverage >= LEAST_COVERAGE else None for one in found]
+    least = min((error for error in errors if error is not None), default=None)
+    cells = []
+    for one, error in zip(found, errors, strict=True):
+        if error is None and one is not None and one.rmse_deg is not None:
+            cells.append(Cell(f"{number(one.rmse_deg)} ({percent(one.coverage)})"))
+        else:
+            best = error is not None and error == least
+            cells.append(Cell(number(error), "good" if best else ""))
+    return cells
+
+
+def won(data: ReportData) -> str:
+    """Tell how many drives the published model wins; nothing in evaluations without a ranking."""
+    found = data.evaluated.document.content.get("ranking")
+    if found is None:
+        return ""
+    return (
+        f"Among all without satellite navigation {found['estimator']} wins {found['won']} of "
+        f"{found['drives']} drives, and comes within {found['close_ratio']} times the winner in "
+        f"{found['close']} more. "
     )
 
 

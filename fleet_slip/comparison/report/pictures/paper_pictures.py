@@ -1,0 +1,160 @@
+"""The figures of the paper, in its order, with captions from the same data."""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+from fleet_slip.comparison.report.figures.series import Block, Line, side_slip
+from fleet_slip.comparison.report.figures.speed import KMH_PER_MPS, speed
+from fleet_slip.comparison.report.findings.report_data import DRAWN_FILTERS, ReportData
+from fleet_slip.pages.picture import Picture
+from fleet_slip.pages.text import degrees, listed, number
+
+FILTER_LABELS = {"kalman": "Kalman filter", "kalman_tuned": "Kalman filter, tuned"}
+
+
+class Drives(NamedTuple):
+    """A figure of the paper: the speed in one drive, or angles in some drives.
+
+    Attributes:
+        key, title: as of a `Picture`.
+        drives: title by scenario; the figure needs them all.
+        models: those of Table I that are drawn; none for the one that the paper settles on.
+        shaded: name of the section to mark.
+    """
+
+    key: str
+    title: str
+    drives: dict[str, str]
+    models: tuple[str, ...] = ()
+    shaded: str | None = None
+
+
+TEST_DRIVE = "side-slip angle on the test drive"
+FIGURES = (
+    Drives("figure-1a", f"Figure 1(a). {{}}: {TEST_DRIVE}", {"nominal": ""}, ("1", "2")),
+    Drives("figure-1b", f"Figure 1(b). {{}}: {TEST_DRIVE}", {"nominal": ""}, ("3", "4", "5")),
+    Drives("figure-2", "Figure 2. Speed during the test drive", {"nominal": ""}),
+    Drives(
+        "figure-3",
+        "Figure 3. Effect of increased noise",
+        {"nominal": "Initial noise", "noise_doubled": "Bias and noise doubled"},
+    ),
+    Drives(
+        "figure-4",
+        "Figure 4. Effect of the car's mass",
+        {"mass_1000": "Sprung mass 1000 kg", "mass_1740": "Sprung mass 1740 kg"},
+    ),
+    Drives(
+        "figure-5",
+        "Figure 5. Effect of the adhesion coefficient",
+        {"adhesion_0_7": "Adhesion 0.7", "adhesion_0_4": "Adhesion 0.4"},
+        shaded="unstable",
+    ),
+    Drives("figure-6", "Figure 6. Speed on the Melbourne circuit", {"melbourne": ""}),
+    Drives(
+        "figure-7",
+        "Figure 7. Side-slip angle on the Melbourne circuit",
+        {"melbourne": "Melbourne Grand Prix Circuit"},
+    ),
+)
+SPEEDS = ("figure-2", "figure-6")
+
+
+def paper_pictures(data: ReportData) -> Iterator[Picture]:
+    """Return the figures whose drives were evaluated, and whose models could be trained."""
+    for one in FIGURES:
+        if not all(name in data.runs for name in one.drives):
+            continue
+        if one.key in SPEEDS:
+            yield _speed(data, one)
+        elif not one.models:
+            yield _series(one.key, one.title, _blocks(data, one, (choice_line(data),)))
+        elif lines := tuple(model_line(data, n) for n in one.models if n in data.evaluated.models):
+            names = listed([line.label for line in lines])
+            blocks = _blocks(
+                data, one._replace(drives={"nominal": f"Nominal drive, {names}"}), lines
+            )
+            yield _series(one.key, one.title.format(names), blocks)
+    yield from _against_the_filter(data)
+
+
+def model_line(data: ReportData, number_in_table: str) -> Line:
+    """Return how a model of Table I is drawn."""
+    return Line(
+        data.evaluated.models[number_in_table],
+        f"Model {number_in_table}",
+        f"model_{number_in_table}",
+    )
+
+
+def choice_line(data: ReportData) -> Line:
+    """Return how the model that the paper settles on is drawn."""
+    return model_line(data, data.choice_number)
+
+
+def _blocks(data: ReportData, one: Drives, lines: tuple[Line, ...]) -> list[Block]:
+    return [
+        Block(title, data.runs[name], lines, shaded=one.shaded)
+        for name, title in one.drives.items()
+    ]
+
+
+def _against_the_filter(data: ReportData) -> Iterator[Picture]:
+    filters = [
+        Line(name, FILTER_LABELS[name], name)
+        for name in DRAWN_FILTERS
+        if name in data.evaluated.estimators
+    ]
+    if filters and "nominal" in data.runs:
+        drives = {"nominal": "Nominal drive", "gps_tunnel": "A tunnel of 20 s"}
+        lines, strips = (filters[0], choice_line(data)), tuple(filters[1:])
+        blocks = [
+            Block(title, data.runs[name], lines, strips, shaded="gps_outage")
+            for name, title in drives.items()
+            if name in data.runs
+        ]
+        yield _series("figure-8", "Figure 8. The Kalman filter and the regression", blocks)
+
+
+def _series(key: str, title: str, blocks: Sequence[Block]) -> Picture:
+    found = " ".join(sentence for block in blocks for sentence in _found(block, len(blocks) > 1))
+    seen = (
+        "Lines over time of the true angle and of the estimates, and beneath them the differences."
+    )
+    return Picture(key, title, found, seen, lambda size: side_slip(blocks, size))
+
+
+def _found(block: Block, named: bool) -> Iterator[str]:
+    errors = []
+    for line in block.all_strips:
+        figures = block.run.results[line.estimator].whole
+        errors.append(
+            f"{line.label} {degrees(figures.error_std_deg)} "
+            f"({degrees(figures.error_mean_deg, sign=True)})"
+        )
+    place = f"{block.title}: standard" if named else "Standard"
+    yield f"{place} deviation (mean) of the error: {', '.join(errors)}."
+    if block.shaded == "unstable":
+        yield _stability(block)
+
+
+def _stability(block: Block) -> str:
+    result = block.run.results[block.lines[0].estimator]
+    if "unstable" not in result.inside:
+        return "The car is stable throughout."
+    inside, outside = result.inside["unstable"], result.outside["unstable"]
+    return (
+        f"Where the car is unstable (shaded) it is {degrees(inside.error_std_deg)}, elsewhere "
+        f"{degrees(outside.error_std_deg)} with a correlation of {number(outside.correlation)}."
+    )
+
+
+def _speed(data: ReportData, one: Drives) -> Picture:
+    (drive,) = (data.runs[name].drive for name in one.drives)
+    kmh = drive.speed_mps * KMH_PER_MPS
+    caption = (
+        f"From {kmh.min():.0f} to {kmh.max():.0f} km/h in {drive.time_s[-1]:.0f} s, over "
+        f"{drive.scenario.track.length_m / 1000:.2f} km."
+    )
+    seen = "A line of speed over time."
+    return Picture(one.key, one.title, caption, seen, lambda size: speed(drive, size))
