@@ -240,8 +240,8 @@ class Definition(Config):
     def signals(self) -> tuple[str, ...]:
         """The logged signals in it."""
         own = parse(self.sql).inputs if self.sql else (self.of,)
-        beside = self.gate.by if self.gate else self.number.running if self.number else None
-        return tuple(dict.fromkeys((*own, *(beside.signals if beside else ()))))
+        beside = (self.gate and self.gate.by, self.number and self.number.running)
+        return tuple(dict.fromkeys((*own, *(n for one in beside if one for n in one.signals))))
 
     @property
     def ungated(self) -> "Definition":

@@ -29,24 +29,34 @@ static int32_t sign(int64_t value)
     return found;
 }
 """,
+    "min": """
+static int32_t smaller(int32_t one, int32_t other)
+{
+    return (one < other) ? one : other;
+}
+""",
+    "max": """
+static int32_t larger(int32_t one, int32_t other)
+{
+    return (one > other) ? one : other;
+}
+""",
     "nearest_64": """
-/* value * numerator / divisor to the nearest, halves away from zero, within limit. */
-static int32_t nearest_64(int64_t value, int64_t numerator, int64_t divisor, int32_t limit)
+/* value / divisor to the nearest, halves away from zero. */
+static int64_t nearest_64(int64_t value, int64_t divisor)
 {
     const int64_t size = (value < 0) ? -value : value;
-    const int64_t found = ((2 * size * numerator) + divisor) / (2 * divisor);
-    const int32_t kept = (found > (int64_t)limit) ? limit : (int32_t)found;
-    return (value < 0) ? -kept : kept;
+    const int64_t found = ((2 * size) + divisor) / (2 * divisor);
+    return (value < 0) ? -found : found;
 }
 """,
     "nearest_32": """
-/* The same for what fits into 32 bits: value * numerator / divisor, halves away from zero. */
-static int32_t nearest_32(int32_t value, uint32_t numerator, uint32_t divisor, int32_t limit)
+/* The same for what fits into 32 bits. */
+static int32_t nearest_32(int32_t value, uint32_t divisor)
 {
     const uint32_t size = (uint32_t)((value < 0) ? -value : value);
-    const uint32_t found = ((2U * size * numerator) + divisor) / (2U * divisor);
-    const int32_t kept = (found > (uint32_t)limit) ? limit : (int32_t)found;
-    return (value < 0) ? -kept : kept;
+    const uint32_t found = ((2U * size) + divisor) / (2U * divisor);
+    return (value < 0) ? -(int32_t)found : (int32_t)found;
 }
 """,
     "ago_16": """
@@ -116,23 +126,6 @@ static void gather(int64_t *sum, uint32_t *values, uint32_t most, int32_t value)
         *sum += value;
         *values += 1U;
     }
-}
-""",
-    "weight": """
-/* How far a gate is open, in parts of 1024; it stays open beyond its peak where high is MISSING. */
-static int32_t weight(int32_t at, int32_t low, int32_t peak, int32_t high)
-{
-    int32_t found = 1024;
-    if ((at == MISSING) || (at <= low)) {
-        found = 0;
-    } else if (at < peak) {
-        found = ((at - low) * 1024) / (peak - low);
-    } else if (high != MISSING) {
-        found = (at < high) ? (1024 - (((at - peak) * 1024) / (high - peak))) : 0;
-    } else {
-        /* open */
-    }
-    return found;
 }
 """,
     "floor_shift": """

@@ -1,14 +1,12 @@
 """A program in C99: a header and a source, in integers alone, without allocation or recursion."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
-from fleet_slip.catalogue.columns import LARGEST_FACT
-from fleet_slip.catalogue.signals import COUNT_MAX
-from fleet_slip.export.c_columns import ColumnWriter, missing_of, ring_width, sum_type, summed
 from fleet_slip.export.c_helpers import HELPERS
-from fleet_slip.export.c_names import c_prefix, field_names, literal, plain_text
+from fleet_slip.export.c_names import c_prefix, field_names, integer_type, literal, plain_text
 from fleet_slip.export.c_state import state_fields
-from fleet_slip.export.program import Numbered, Program
+from fleet_slip.export.c_steps import StepWriter, ring_width, sum_key
+from fleet_slip.export.program import Program
 from fleet_slip.models.model_version import ModelVersion
 
 INDENT = "    "
@@ -87,21 +85,15 @@ def _car(program: Program) -> list[str]:
 
 def c_source(version: ModelVersion, program: Program) -> str:
     """Return the source that goes with the header."""
-    prefix, writer = c_prefix(version), ColumnWriter(program)
-    features = writer.sources()
+    prefix, writer = c_prefix(version), StepWriter(program)
     start, step = _start(prefix, program, writer), _step(prefix, program, writer)
     helpers = [text.strip("\n") + "\n" for name, text in HELPERS.items() if writer.done[name]]
-    wide = any(isinstance(one, Numbered) for one in program.columns)
-    missing = "#define MISSING INT32_MIN\n" + (
-        f"#define MISSING_64 {literal(-(2**62))}\n" if wide else ""
-    )
     return "\n".join(
         [
             _preamble(version, program),
             f'#include "{prefix}.h"\n',
-            missing,
+            "#define MISSING INT32_MIN\n",
             *helpers,
-            "\n".join(features),
             start,
             step,
         ]
@@ -132,21 +124,21 @@ def _state(program: Program) -> list[str]:
     return [one.declared for one in state_fields(program)]
 
 
-def _start(prefix: str, program: Program, writer: ColumnWriter) -> str:
+def _start(prefix: str, program: Program, writer: StepWriter) -> str:
     fields, lines = field_names(program), []
-    for place, one in enumerate(program.sources):
-        if one.ticks:
-            empty = "INT16_MIN" if ring_width(one) == 16 else "MISSING"
+    for of, ticks in program.rings.items():
+        if ticks:
+            empty = "INT16_MIN" if ring_width(program, of) == 16 else "MISSING"
             lines += [
-                f"for (uint32_t i = 0U; i < {one.ticks}U; i++) {{",
-                f"{INDENT}state->ring_{place}[i] = {empty};",
+                f"for (uint32_t i = 0U; i < {ticks}U; i++) {{",
+                f"{INDENT}state->ring_{of}[i] = {empty};",
                 "}",
-                f"state->at_{place} = 0U;",
+                f"state->at_{of} = 0U;",
             ]
-    for key in summed(program):
+    for one in program.sums:
+        key = sum_key(*one)
         lines += [f"state->sum_{key} = 0;", f"state->values_{key} = 0U;"]
-    ranges = [(-LARGEST_FACT, LARGEST_FACT) if f.equals is None else (0, 1) for f in program.facts]
-    ranges += [(-COUNT_MAX, COUNT_MAX)] * len(program.numbers)
+    ranges = [*program.given["fact"], *program.given["number"]]
     for field, (least, most) in zip((*fields["facts"], *fields["numbers"]), ranges, strict=True):
         writer.done["within"] += 1
         lines.append(f"state->{field} = within(car->{field}, {literal(least)}, {most});")
@@ -172,57 +164,37 @@ def _tables(program: Program) -> list[str]:
     return lines
 
 
-def _step(prefix: str, program: Program, writer: ColumnWriter) -> str:
+def _step(prefix: str, program: Program, writer: StepWriter) -> str:
     body = "\n".join(INDENT + line for line in [*_tables(program), *step_lines(program, writer)])
     return f"{_step_line(prefix)}\n{{\n{body}\n}}\n"
 
 
-def step_lines(program: Program, writer: ColumnWriter) -> list[str]:
+def step_lines(program: Program, writer: StepWriter) -> list[str]:
     """Return the statements of a tick; the writer counts what they do."""
-    lines = [*writer.signals(), *writer.values(), *_slides(program, writer), *writer.columns()]
-    lines += [*_keeps(program, writer), *_dot(program, writer)]
+    places = [place for place, _ in program.angle.terms]
+    terms, valid = [writer.value(place) for place in places], writer.there(*places)
+    kept = {of: writer.kept(of) for of, ticks in program.rings.items() if ticks}
+    lines = [*writer.lines, *_keeps(program, writer, kept), *_dot(program, writer, terms, valid)]
     if not any("state->" in line for line in lines):
         lines.insert(-1, "(void)state;")
     return lines
 
 
-def _slides(program: Program, writer: ColumnWriter) -> list[str]:
-    """Return statements that bring the sums of windows to this tick."""
-    found = []
-    for key, (_, one) in summed(program).items():
-        if one.over == "running_mean":
-            continue
-        width = "32" if sum_type(one) == "int32_t" else "64"
-        writer.done[f"slide_{width}"] += 1
-        oldest = writer.ago(one.source, one.ticks)
-        sums = f"&state->sum_{key}, &state->values_{key}"
-        found.append(f"slide_{width}({sums}, {oldest}, source_{one.source});")
-    return found
-
-
-def _keeps(program: Program, writer: ColumnWriter) -> list[str]:
+def _keeps(program: Program, writer: StepWriter, kept: Mapping[int, str]) -> list[str]:
     """Return statements that write this tick into the rings."""
     found = []
-    for place, one in enumerate(program.sources):
-        if one.ticks:
-            width = ring_width(one)
-            writer.done[f"keep_{width}"] += 1
-            ring = f"state->ring_{place}, &state->at_{place}"
-            found.append(f"keep_{width}({ring}, {one.ticks}U, source_{place});")
+    for of, value in kept.items():
+        width = ring_width(program, of)
+        writer.done[f"keep_{width}"] += 1
+        ring = f"state->ring_{of}, &state->at_{of}, {program.rings[of]}U"
+        found.append(f"keep_{width}({ring}, {value});")
     return found
 
 
-def _dot(program: Program, writer: ColumnWriter) -> list[str]:
+def _dot(program: Program, writer: StepWriter, terms: Sequence[str], valid: str) -> list[str]:
     """Return statements that add up the angle, as `fleet_slip.export.fixed_point` proves."""
-    angle, places = program.angle, [place for place, _ in program.angle.terms]
-    wide = any(isinstance(program.columns[place], Numbered) for place in places)
-    kind, missing = ("int64_t", "MISSING_64") if wide else ("int32_t", "MISSING")
-    terms = [
-        f"(column_{place} == MISSING) ? MISSING_64 : column_{place}"
-        if wide and missing_of(program, place) == "MISSING"
-        else f"column_{place}"
-        for place in places
-    ]
+    angle = program.angle
+    kind = integer_type(max(writer.size(place) for place, _ in angle.terms))
     (high, low), *_ = angle.parts
     shift = angle.bits - angle.low_bits
     writer.done.update({"floor_shift": 2, "clip": 1, "term": len(terms)})
@@ -233,16 +205,12 @@ def _dot(program: Program, writer: ColumnWriter) -> list[str]:
         "};",
         f"int64_t high = {literal(high)};",
         f"int64_t low = {literal(low)};",
-        "bool valid = true;",
         f"for (uint32_t i = 0U; i < {len(terms)}U; i++) {{",
-        f"{INDENT}if (term[i] == {missing}) {{",
-        f"{INDENT * 2}valid = false;",
-        f"{INDENT}}} else {{",
-        f"{INDENT * 2}high += (int64_t)upper[i] * term[i];",
-        f"{INDENT * 2}low += (int64_t)lower[i] * term[i];",
-        f"{INDENT}}}",
+        f"{INDENT}high += (int64_t)upper[i] * term[i];",
+        f"{INDENT}low += (int64_t)lower[i] * term[i];",
         "}",
         f"high += floor_shift(low, {angle.low_bits}U) + {literal(2 ** (shift - 1))};",
+        f"const bool valid = {valid};",
         f"*angle = valid ? clip(floor_shift(high, {shift}U), {angle.limit}) : 0;",
         "return valid;",
     ]

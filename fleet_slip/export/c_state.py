@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-from fleet_slip.export.c_columns import ring_width, sum_type, summed
 from fleet_slip.export.c_names import field_names
+from fleet_slip.export.c_steps import ring_width, sum_key, sum_type
 from fleet_slip.export.program import Program
 
 
@@ -31,17 +31,18 @@ class Field:
 
 
 def state_fields(program: Program) -> list[Field]:
-    """Return the fields of the state: rings of sources, sums of windows, what the car knows."""
+    """Return the fields of the state: rings of steps, sums, what the car knows."""
     names, found = field_names(program), []
-    for place, one in enumerate(program.sources):
-        if one.ticks:
-            kind = f"int{ring_width(one)}_t"
+    for of, ticks in program.rings.items():
+        if ticks:
+            kind = f"int{ring_width(program, of)}_t"
             found += [
-                Field(kind, f"ring_{place}", one.ticks, array=True, comment=one.name),
-                Field("uint32_t", f"at_{place}"),
+                Field(kind, f"ring_{of}", ticks, array=True, comment=f"step {of}"),
+                Field("uint32_t", f"at_{of}"),
             ]
-    for key, (_, window) in summed(program).items():
-        found += [Field(sum_type(window), f"sum_{key}"), Field("uint32_t", f"values_{key}")]
+    for of, ticks, most in program.sums:
+        key, kind = sum_key(of, ticks, most), sum_type(program, of, most)
+        found += [Field(kind, f"sum_{key}"), Field("uint32_t", f"values_{key}")]
     found += [Field("int32_t", name) for name in (*names["facts"], *names["numbers"])]
     nothing = Field("uint8_t", "nothing", comment="this model looks back on nothing")
     return found or [nothing]

@@ -13,7 +13,8 @@ import pyarrow as pa
 
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.signals import COUNT_MAX
-from fleet_slip.export.program import UNKNOWN_CAR, Car, CarFact, Input, Program
+from fleet_slip.columns.lowering import CarFact
+from fleet_slip.export.program import UNKNOWN_CAR, Car, Input, Program
 from fleet_slip.grams.columns import DriveCounts
 from fleet_slip.grams.drive_rows import counts_of
 from fleet_slip.models.manifest import Manifest

@@ -11,10 +11,10 @@ from typing import Any
 from fleet_slip.canonical import canonical_json, sha256_of
 from fleet_slip.catalogue.columns import LARGEST_FACT
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
+from fleet_slip.columns.lowering import CarFact
 from fleet_slip.export.checks import Check
 from fleet_slip.export.costs import count_costs
-from fleet_slip.export.program import Angle, CarFact, Input, Program
-from fleet_slip.export.steps import steps_of
+from fleet_slip.export.program import Angle, Input, Program
 from fleet_slip.models.model_version import ModelVersion
 
 FORMAT = "fleet-slip estimator"
@@ -48,7 +48,6 @@ def document_of(
 
 def program_content(program: Program) -> dict[str, Any]:
     """Return the program alone."""
-    steps, terms = steps_of(program)
     return {
         "tick_s": str(float(SAMPLE_TIME_S)),
         "signals": [_signal(one) for one in program.signals],
@@ -57,8 +56,8 @@ def program_content(program: Program) -> dict[str, Any]:
             {"name": one.name, "unit": one.unit, "grain": f"{one.grain:f}"}
             for one in program.numbers
         ],
-        "steps": [list(step) for step in steps],
-        "angle": _angle(program.angle, terms),
+        "steps": [list(step) for step in program.steps],
+        "angle": _angle(program.angle),
     }
 
 
@@ -79,7 +78,7 @@ def _fact(one: CarFact) -> dict[str, Any]:
     return {"name": one.name, "largest": LARGEST_FACT}
 
 
-def _angle(angle: Angle, steps: Sequence[int]) -> dict[str, Any]:
+def _angle(angle: Angle) -> dict[str, Any]:
     return {
         "name": angle.name,
         "column": angle.column,
@@ -88,8 +87,7 @@ def _angle(angle: Angle, steps: Sequence[int]) -> dict[str, Any]:
         "bits": angle.bits,
         "intercept": str(angle.intercept),
         "terms": [
-            {"step": step, "coefficient": str(coefficient)}
-            for step, (_, coefficient) in zip(steps, angle.terms, strict=True)
+            {"step": step, "coefficient": str(coefficient)} for step, coefficient in angle.terms
         ],
         "error": f"{angle.error.numerator}/{angle.error.denominator}",
         "largest": angle.largest,

@@ -10,22 +10,12 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.catalogue.car_numbers import round_number
+from fleet_slip.columns.operations import operation_of, plain_of
 from fleet_slip.errors import InputError
 from fleet_slip.export import stepping as do
-from fleet_slip.export.c_columns import sum_key, summed
 from fleet_slip.export.compile import compile_program
-from fleet_slip.export.program import Car, Factor, Gated, Numbered, Program, Source, Window
+from fleet_slip.export.program import Car, Program
 from fleet_slip.models.manifest import Manifest
-
-_OPERATIONS = {
-    "+": do.ADD,
-    "-": do.SUBTRACT,
-    "*": do.MULTIPLY,
-    "//": do.DIVIDE,
-    "negative": do.NEGATIVE,
-    "abs": do.ABSOLUTE,
-    "sign": do.SIGN,
-}
 
 
 class Estimator:
@@ -45,7 +35,7 @@ class Estimator:
         self.columns = tuple(one.column for one in program.signals)
         self._name = manifest.name
         self._ticks = program.longest_ticks
-        self._begin, self._steps = layout.memory(), layout.steps()
+        self._begin, self._steps = layout.memory(), layout.rows()
         self._values = layout.values()
         self._intercept = manifest.intercept
         self._memory = self._begin.copy()
@@ -58,9 +48,8 @@ class Estimator:
         """Return the angle of the next tick in rad; None if there is none.
 
         A sample has the columns of `columns` in SI units, None where a value is missing, as one
-        that is not finite is; others are left alone. They are rounded to counts, half to even, and
-        clipped to their valid range, as the sensors do. The angles of a drive have the bits that
-        `predict` computes.
+        that is beyond its valid range is; others are left alone. They are rounded to counts, half
+        to even, as the sensors do. The angles of a drive have the bits that `predict` computes.
 
         Raises `InputError` if the sample lacks a column.
         """
@@ -118,29 +107,32 @@ def _fraction(value: Any) -> Fraction:
 
 
 class _Layout:
-    """Where everything of a program lies in memory, and the rows of its operations."""
+    """Where everything of a program lies in memory, and the rows of its steps.
+
+    The value of a step lies at its number.
+    """
 
     def __init__(self, program: Program, manifest: Manifest, car: Car) -> None:
         """Take a program and a car."""
         self._program, self._manifest = program, manifest
         self._begin: list[int] = []
-        signals = self._room(len(program.signals))
-        self._signals = {one.name: signals + i for i, one in enumerate(program.signals)}
-        self._facts = self._keep(car.fact_counts(program))
-        self._numbers = self._keep(car.number_counts(program))
-        self._sources = self._room(len(program.sources))
-        self._columns = self._room(len(program.columns))
-        self._sums = {key: self._keep((0, 0)) for key in summed(program)}
-        self._ats = self._keep((0,) * len(program.sources))
-        self._rings = [self._room(one.ticks) for one in program.sources]
-        self._rows = [row for part in self._parts() for row in part]
+        told = {"fact": car.fact_counts(program), "number": car.number_counts(program)}
+        for step in program.steps:
+            name, (first, *_) = operation_of(step), plain_of(step)
+            constant = first if name == "constant" else told[name][first] if name in told else None
+            self._keep((0 if name in ("sum", "values") else constant,))
+        self._rings = {
+            of: (self._keep((None,) * ticks), ticks, self._keep((0,)))
+            for of, ticks in program.rings.items()
+        }
+        self._rows = list(self._written())
 
     def memory(self) -> IntArray:
         """Return memory at the beginning of a drive."""
         return np.array(self._begin, dtype=np.int64)
 
-    def steps(self) -> IntArray:
-        """Return the rows of all operations, in order."""
+    def rows(self) -> IntArray:
+        """Return the rows of all steps, in order."""
         table = np.zeros((len(self._rows), do.ROW), dtype=np.int64)
         for number, row in enumerate(self._rows):
             table[number, : len(row)] = row
@@ -155,90 +147,39 @@ class _Layout:
         worth = [known[t.signal] if t.logged else float(t.scale) for t in terms]
         return np.array([np.nan] * len(signals) + scales + coefficients + worth)
 
-    def _room(self, size: int) -> int:
-        return self._keep((None,) * size)
-
     def _keep(self, values: Sequence[int | None]) -> int:
         place = len(self._begin)
         self._begin += [do.MISSING if one is None else one for one in values]
         return place
 
-    def _parts(self) -> Iterator[list[tuple[int, ...]]]:
-        signals = self._program.signals
-        yield [
-            (do.SIGNAL, self._signals[s.name], i, len(signals) + i, s.min_count, s.max_count)
-            for i, s in enumerate(signals)
-        ]
-        for place, one in enumerate(self._program.sources):
-            yield self._source(place, one)
-        yield [self._slide(key, one) for key, (_, one) in summed(self._program).items()]
-        for place in range(len(self._program.columns)):
-            yield [self._column(place)]
-        yield [
-            (do.KEEP, 0, self._sources + i, self._rings[i], one.ticks, 0, self._ats + i)
-            for i, one in enumerate(self._program.sources)
-            if one.ticks
-        ]
-        first, terms = 2 * len(signals), self._program.angle.terms
-        yield [
-            (do.TERM, 0, self._columns + place, first + i, first + len(terms) + i)
-            for i, (place, _) in enumerate(terms)
-        ]
+    def _written(self) -> Iterator[tuple[int, ...]]:
+        signals, terms = self._program.signals, self._program.angle.terms
+        slid: set[tuple[int, ...]] = set()
+        for place, step in enumerate(self._program.steps):
+            name, plain = operation_of(step), plain_of(step)
+            if name == "signal":
+                one = signals[plain[0]]
+                scale = len(signals) + plain[0]
+                yield (do.SIGNAL, place, plain[0], scale, one.min_count, one.max_count)
+            elif name == "ago":
+                yield (do.AGO, place, plain[0], *self._rings[plain[0]], plain[1])
+            elif name in ("sum", "values"):
+                if plain not in slid:
+                    yield self._slide(*plain)
+                slid.add(plain)
+            elif name not in ("constant", "fact", "number"):
+                yield (do.OPERATIONS[name], place, plain[0], plain[-1])
+        for of, ring in self._rings.items():
+            if ring[1]:
+                yield (do.KEEP, 0, of, *ring)
+        first = 2 * len(signals)
+        for i, (column, _) in enumerate(terms):
+            yield (do.TERM, 0, column, first + i, first + len(terms) + i)
 
-    def _source(self, place: int, one: Source) -> list[tuple[int, ...]]:
-        out = self._sources + place
-        if one.arithmetic is None:
-            return [(do.SOURCE, out, self._signals[one.name], -1, 0, one.limit)]
-        rows: list[tuple[int, ...]] = []
-        places: list[int] = []
-        for step in one.arithmetic.steps:
-            if step.name:
-                places.append(self._signals[step.name])
-            elif not step.function:
-                places.append(self._keep((step.value,)))
-            else:
-                places.append(self._room(1))
-                a, b = places[step.operands[0]], places[step.operands[-1]]
-                rows.append((_OPERATIONS[step.function], places[-1], a, b))
-        guard = -1 if one.arithmetic.guard is None else places[one.arithmetic.guard]
-        last = (do.SOURCE, out, places[-1], guard, one.arithmetic.at_least, one.limit)
-        return [*rows, last]
-
-    def _slide(self, key: str, one: Window) -> tuple[int, ...]:
-        source, sums = self._sources + one.source, self._sums[key]
-        if one.over == "running_mean":
-            return (do.GATHER, sums, source, one.most_values)
-        length = self._program.sources[one.source].ticks
-        at = self._ats + one.source
-        return (do.SLIDE, sums, source, self._rings[one.source], length, one.ticks, at)
-
-    def _column(self, place: int) -> tuple[int, ...]:
-        column, out = self._program.columns[place], self._columns + place
-        match column:
-            case Window():
-                return self._window(place, column, out)
-            case Factor():
-                ratio = (column.numerator, column.denominator, column.limit)
-                of, fact = self._columns + column.of, self._facts + column.fact
-                return (do.FACTOR, out, of, *ratio, fact, column.less)
-            case Gated():
-                high = do.MISSING if column.high is None else column.high
-                of, by = self._columns + column.of, self._columns + column.by
-                return (do.GATE, out, of, by, column.low, column.peak, high)
-            case Numbered():
-                running = -1 if column.running is None else self._columns + column.running
-                number = self._numbers + column.number
-                of = self._columns + column.of
-                return (do.NUMBER, out, of, running, column.alone, 0, number, column.less)
-
-    def _window(self, place: int, one: Window, out: int) -> tuple[int, ...]:
-        source = self._sources + one.source
-        ratio = (one.numerator, one.denominator, one.limit)
-        if one.over is None:
-            return (do.VALUE, out, source, *ratio)
-        if one.over == "lag":
-            length = self._program.sources[one.source].ticks
-            at = self._ats + one.source
-            return (do.LAG, out, self._rings[one.source], *ratio, length, at, one.ticks)
-        kind = do.SUM if one.over == "sum" else do.MEAN
-        return (kind, out, source, *ratio, self._sums[sum_key(place, one)])
+    def _slide(self, of: int, ticks: int, most: int) -> tuple[int, ...]:
+        """Return what brings a sum and its number of values to this tick."""
+        known = {step: place for place, step in enumerate(self._program.steps)}
+        both = [known.get((name, of, ticks, most)) for name in ("sum", "values")]
+        total, count = (self._keep((0,)) if one is None else one for one in both)
+        ring = self._rings[of] if ticks else (0, 0, 0)
+        return (do.SLIDE, total, of, *ring, ticks or most, count)

@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 from fleet_slip.errors import ConfigError, StorageError, UsageError
 from fleet_slip.export.checks import Check
 from fleet_slip.export.files import render
-from fleet_slip.export.program import Program, Window
+from fleet_slip.export.program import Program
 from fleet_slip.models.model_version import ModelVersion
 
 LOADER = "fleet_slip.export.mlflow_model"
@@ -145,7 +145,7 @@ def _columns(program: Program) -> dict[str, str]:
 def _signature(mlflow: Any, program: Program) -> Any:
     types = mlflow.types
     given = [types.ColSpec(kind, name) for name, kind in _columns(program).items()]
-    if any(isinstance(one, Window) and one.over for one in program.columns):
+    if program.rings:
         given += [
             types.ColSpec("string", "drive_id", required=False),
             types.ColSpec("long", "tick", required=False),

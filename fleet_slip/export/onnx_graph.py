@@ -11,7 +11,7 @@ A ring has the oldest value first. A missing value of a ring, an unknown fact or
 `UNKNOWN`, -2^31.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from typing import Any, Literal
 
@@ -19,12 +19,10 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper
 
-from fleet_slip.catalogue.arithmetic import Arithmetic
-from fleet_slip.catalogue.columns import LARGEST_FACT, WEIGHT
-from fleet_slip.catalogue.signals import COUNT_MAX, catalogue
-from fleet_slip.export.c_columns import sum_key, summed
-from fleet_slip.export.onnx_nodes import Nodes, Value
-from fleet_slip.export.program import Factor, Gated, Numbered, Program, Source, Window
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.columns.operations import GIVEN, operation_of, plain_of, size_of
+from fleet_slip.export.onnx_nodes import Nodes
+from fleet_slip.export.program import Program
 from fleet_slip.models.counts_model import counts_model
 from fleet_slip.models.model_version import ModelVersion
 
@@ -65,7 +63,7 @@ def error_bound(version: ModelVersion, program: Program, kind: FloatName) -> flo
     meets at most k + 1 additions: (1 + u)^(k + 4) - 1 times the sum of sizes (Higham 2002, 3.1).
     """
     intercept, *coefficients = _radians(version)
-    largest = [program.columns[place].largest for place, _ in program.angle.terms]
+    largest = [size_of(program.ranges[place]) for place, _ in program.angle.terms]
     size = abs(intercept) + sum(abs(g) * n for g, n in zip(coefficients, largest, strict=True))
     roundoff = Fraction(1, 2 ** FLOAT_BITS[kind])
     return float(size * ((1 + roundoff) ** (len(coefficients) + 4) - 1))
@@ -92,201 +90,168 @@ def _properties(version: ModelVersion, program: Program, kind: FloatName) -> dic
 
 
 class _Writer(Nodes):
-    """Writes the nodes of a program."""
+    """Writes the nodes of a program, of each step once: its value, and where it is there."""
 
     def __init__(self, program: Program, kind: FloatName) -> None:
         """Begin with no node."""
         super().__init__()
         self.program, self.kind = program, _KINDS[kind]
         self.dtype: Any = np.dtype(kind)
+        self._roots = program.roots
+        self._values: dict[int, str] = {}
+        self._present: dict[int, str] = {}
+        self._rings: dict[int, str] = {}
+        self._slid: dict[tuple[int, ...], tuple[str, str]] = {}
+        self._given: dict[str, str] = {}
 
     def write(self, exact: Sequence[Fraction]) -> None:
         """Write all; `exact` is the intercept and the coefficients in the unit of the angle."""
+        places = [place for place, _ in self.program.angle.terms]
+        self._declare_given()
+        values = [self._value(place) for place in places]
+        self._angle(values, self._there(*places), exact)
+
+    def _declare_given(self) -> None:
         program = self.program
-        signals = self._signals()
-        facts = self._told("facts", [LARGEST_FACT] * len(program.facts))
-        numbers = self._told("numbers", [COUNT_MAX] * len(program.numbers))
-        sources = [self._source(one, signals) for one in program.sources]
-        rings = [self._ring(place, one) for place, one in enumerate(sources)]
-        sums = {
-            key: self._sum(key, window, rings[window.source], sources[window.source])
-            for key, (_, window) in summed(program).items()
-        }
-        columns: list[Value] = []
-        for place, one in enumerate(program.columns):
-            match one:
-                case Window():
-                    columns.append(self._window(place, one, sources, rings, sums))
-                case Factor():
-                    columns.append(self._factor(one, columns[one.of], facts[one.fact]))
-                case Gated():
-                    columns.append(self._gated(one, columns[one.of], columns[one.by]))
-                case Numbered():
-                    running = None if one.running is None else columns[one.running]
-                    columns.append(
-                        self._numbered(one, columns[one.of], numbers[one.number], running)
-                    )
-        self._angle([columns[place] for place, _ in program.angle.terms], exact)
+        self._given["signal"] = self.declare("signals", len(program.signals), self.kind)
+        for name, told in (("fact", program.facts), ("number", program.numbers)):
+            if told:
+                self._given[name] = self.declare(f"{name}s", len(told))
 
-    def _signals(self) -> dict[str, Value]:
-        found = {}
-        given = self.declare("signals", len(self.program.signals), self.kind)
-        for place, one in enumerate(self.program.signals):
-            physical = self.part(given, place, place + 1)
-            scale = self.constant(float(one.scale), self.dtype)
-            count = self.do("Round", self.do("Div", physical, scale))
-            least, most = (self.constant(n, self.dtype) for n in (one.min_count, one.max_count))
-            inside = self.do("LessOrEqual", count, most)
-            inside = self.do("And", inside, self.do("GreaterOrEqual", count, least))
-            zero = self.constant(0.0, self.dtype)
-            safe = self.do("Where", inside, count, zero)
-            found[one.name] = Value(self.do("Cast", safe, to=TensorProto.INT64), inside)
-        return found
+    def _value(self, step: int) -> str:
+        """Return the value of a step: any of its range where it is missing."""
+        if step not in self._values:
+            name, plain = operation_of(self.program.steps[step]), plain_of(self.program.steps[step])
+            self._values[step] = self._computed(step, name, plain)
+        return self._values[step]
 
-    def _told(self, name: str, largest: Sequence[int]) -> list[Value]:
-        """Return what a car is told, unknown beyond the largest."""
-        if not largest:
-            return []
-        given = self.declare(name, len(largest))
-        found = []
-        for place, most in enumerate(largest):
-            value = self.part(given, place, place + 1)
-            known = self.do("LessOrEqual", self.do("Abs", value), most)
-            found.append(self.where(known, value))
-        return found
+    def _there(self, *steps: int) -> str:
+        """Return whether all of some steps are there."""
+        roots = dict.fromkeys(root for step in steps for root in self._roots[step])
+        first, *rest = [self._root(one) for one in roots] or [self.constant([[True]], np.bool_)]
+        for one in rest:
+            first = self.do("And", first, one)
+        return first
 
-    def _source(self, one: Source, signals: Mapping[str, Value]) -> Value:
-        if one.arithmetic is None:
-            return signals[one.name]
-        there = self.all_there([signals[name] for name in one.arithmetic.inputs])
-        value, there = self._feature(one.arithmetic, signals, there)
-        return self.where(there, self.clip(value, one.limit))
-
-    def _feature(
-        self, arithmetic: Arithmetic, signals: Mapping[str, Value], there: str
-    ) -> tuple[str, str]:
-        found: list[str] = []
-        for number, step in enumerate(arithmetic.steps):
-            operands = [found[i] for i in step.operands]
-            if step.name:
-                found.append(signals[step.name].value)
-            elif not step.function:
-                found.append(self.constant(step.value))
-            elif step.function == "//":
-                divisor = operands[1]
-                there = self.do("And", there, self.do("Greater", divisor, 0))
-                size = self.do("Div", self.do("Abs", operands[0]), self.do("Max", divisor, 1))
-                found.append(self.signed(operands[0], size))
-            elif step.function == "sign":
-                one_or_zero = self.do("Min", self.do("Abs", operands[0]), 1)
-                found.append(self.signed(operands[0], one_or_zero))
+    def _root(self, step: int) -> str:
+        """Return whether a step is there by itself."""
+        if step not in self._present:
+            name, plain = operation_of(self.program.steps[step]), plain_of(self.program.steps[step])
+            if name in ("//", "nearest"):
+                self._present[step] = self.do("Greater", self._value(plain[1]), 0)
+            elif name == "at_least":
+                both = (self._value(one) for one in plain)
+                self._present[step] = self.do("GreaterOrEqual", *both)
+            elif name == "else":
+                self._present[step] = self.do("Or", *(self._there(one) for one in plain))
             else:
-                found.append(self.do(_OPERATIONS[step.function], *operands))
-            if number == arithmetic.guard:
-                enough = self.do("GreaterOrEqual", found[-1], arithmetic.at_least)
-                there = self.do("And", there, enough)
-        return found[-1], there
+                self._value(step)
+        return self._present[step]
 
-    def _ring(self, place: int, now: Value) -> str:
-        """Return a ring with the value of this tick behind it; the empty text without one."""
-        ticks = self.program.sources[place].ticks
-        if not ticks:
-            return ""
-        ring = self.declare(f"ring_{place}", ticks)
-        kept = self.do("Where", now.there, now.value, UNKNOWN)
-        longer = self.do("Concat", ring, kept, axis=1)
-        last = [self.constant([one]) for one in (1, ticks + 1)]
-        self.do(
-            "Slice",
-            longer,
-            *last,
-            self.constant([1]),
-            out=self.declare_next(f"ring_{place}", ticks),
-        )
-        return longer
+    def _computed(self, step: int, name: str, plain: tuple[int, ...]) -> str:
+        if name in ("constant", "where", "at_least"):
+            return self.constant(plain[0]) if name == "constant" else self._value(plain[0])
+        if name in GIVEN:
+            return self._taken(step, name, plain[0])
+        if name == "ago":
+            length = self.program.rings[plain[0]]
+            past = self.part(self._ring(plain[0]), length - plain[1], length - plain[1] + 1)
+            there = self.do("Not", self.do("Equal", past, UNKNOWN))
+            return self._taken_where(step, there, past)
+        if name in ("sum", "values"):
+            return self._slide(*plain)[name == "values"]
+        values = [self._value(one) for one in plain]
+        if name == "else":
+            return self.do("Where", self._there(plain[0]), *values)
+        if name in ("//", "nearest") and self.program.ranges[plain[1]][0] <= 0:
+            values[1] = self.do("Max", values[1], 1)
+        return _OPERATIONS[name](self, *values)
 
-    def _sum(self, key: str, one: Window, ring: str, now: Value) -> tuple[str, str]:
+    def _taken(self, step: int, name: str, place: int) -> str:
+        """Write what is given, which is missing beyond its range: a signal is rounded to counts."""
+        given = self.part(self._given[name], place, place + 1)
+        kind: Any = np.int64
+        if name == "signal":
+            kind = self.dtype
+            scale = self.constant(float(self.program.signals[place].scale), kind)
+            given = self.do("Round", self.do("Div", given, scale))
+        least, most = (self.constant(n, kind) for n in self.program.given[name][place])
+        inside = self.do("LessOrEqual", given, most)
+        inside = self.do("And", inside, self.do("GreaterOrEqual", given, least))
+        return self._taken_where(step, inside, given, kind)
+
+    def _taken_where(self, step: int, there: str, given: str, kind: Any = np.int64) -> str:
+        self._present[step] = there
+        safe = self.do("Where", there, given, self.constant(0, kind))
+        return safe if kind is np.int64 else self.do("Cast", safe, to=TensorProto.INT64)
+
+    def _ring(self, of: int) -> str:
+        """Return a ring with the value of this tick behind it."""
+        if of not in self._rings:
+            ticks = self.program.rings[of]
+            ring = self.declare(f"ring_{of}", ticks)
+            kept = self.do("Where", self._there(of), self._value(of), UNKNOWN)
+            self._rings[of] = longer = self.do("Concat", ring, kept, axis=1)
+            ends = [self.constant([one]) for one in (1, ticks + 1, 1)]
+            self.do("Slice", longer, *ends, out=self.declare_next(f"ring_{of}", ticks))
+        return self._rings[of]
+
+    def _slide(self, *window: int) -> tuple[str, str]:
         """Return the sum and the number of the values of a window."""
-        if one.over == "running_mean":
-            total, count = self.declare(f"sum_{key}", 1), self.declare(f"values_{key}", 1)
-            takes = self.do("And", now.there, self.do("Less", count, one.most_values))
-            more = self.do("Where", takes, now.value, 0)
-            one_more = self.do("Cast", takes, to=TensorProto.INT64)
-            return (
-                self.do("Add", total, more, out=self.declare_next(total, 1)),
-                self.do("Add", count, one_more, out=self.declare_next(count, 1)),
-            )
-        length = self.program.sources[one.source].ticks + 1
-        values = self.part(ring, length - one.ticks, length)
+        if window not in self._slid:
+            of, ticks, most = window
+            self._slid[window] = self._last(of, ticks) if ticks else self._ever(of, most)
+        return self._slid[window]
+
+    def _ever(self, of: int, most: int) -> tuple[str, str]:
+        total, count = (self.declare(f"{one}_{of}_of_{most}", 1) for one in ("sum", "values"))
+        takes = self.do("And", self._there(of), self.do("Less", count, most))
+        more = self.do("Where", takes, self._value(of), 0)
+        one_more = self.do("Cast", takes, to=TensorProto.INT64)
+        return (
+            self.do("Add", total, more, out=self.declare_next(total, 1)),
+            self.do("Add", count, one_more, out=self.declare_next(count, 1)),
+        )
+
+    def _last(self, of: int, ticks: int) -> tuple[str, str]:
+        length = self.program.rings[of] + 1
+        values = self.part(self._ring(of), length - ticks, length)
         there = self.do("Not", self.do("Equal", values, UNKNOWN))
         axis = self.constant([1])
         total = self.do("ReduceSum", self.do("Where", there, values, 0), axis, keepdims=1)
         counted = self.do("Cast", there, to=TensorProto.INT64)
         return total, self.do("ReduceSum", counted, axis, keepdims=1)
 
-    def _window(
-        self,
-        place: int,
-        one: Window,
-        sources: Sequence[Value],
-        rings: Sequence[str],
-        sums: Mapping[str, tuple[str, str]],
-    ) -> Value:
-        now = sources[one.source]
-        total, divisor = now.value, self.constant(one.denominator)
-        if one.over == "lag":
-            at = self.program.sources[one.source].ticks - one.ticks
-            past = self.part(rings[one.source], at, at + 1)
-            now = self.where(self.do("Not", self.do("Equal", past, UNKNOWN)), past)
-            total = now.value
-        elif one.over is not None:
-            total, count = sums[sum_key(place, one)]
-            if one.over != "sum":
-                divisor = self.do("Mul", divisor, self.do("Max", count, 1))
-        quotient = self.nearest(total, one.numerator, divisor)
-        return self.where(now.there, self.clip(quotient, one.limit))
-
-    def _factor(self, one: Factor, of: Value, fact: Value) -> Value:
-        product = self.do("Mul", of.value, self.do("Sub", fact.value, one.less))
-        quotient = self.nearest(product, one.numerator, one.denominator)
-        return self.where(self.all_there([of, fact]), self.clip(quotient, one.limit))
-
-    def _gated(self, one: Gated, of: Value, by: Value) -> Value:
-        rises = self.do("Mul", self.do("Max", self.do("Sub", by.value, one.low), 0), WEIGHT)
-        weight = self.do("Min", self.do("Div", rises, one.peak - one.low), WEIGHT)
-        if one.high is not None:
-            beyond = self.do("Max", self.do("Sub", by.value, one.peak), 0)
-            falls = self.do("Div", self.do("Mul", beyond, WEIGHT), one.high - one.peak)
-            weight = self.do("Min", weight, self.do("Max", self.do("Sub", WEIGHT, falls), 0))
-        quotient = self.nearest(self.do("Mul", of.value, weight), 1, WEIGHT)
-        return self.where(self.all_there([of, by]), quotient)
-
-    def _numbered(self, one: Numbered, of: Value, number: Value, running: Value | None) -> Value:
-        stand_in, there = self.constant(0), of.there
-        if running is not None:
-            stand_in = running.value
-            either = self.do("Or", number.there, running.there)
-            there = self.do("And", there, either)
-        less = self.do("Sub", number.value, one.less)
-        factor = self.do("Where", number.there, less, stand_in)
-        value = factor if one.alone else self.do("Mul", of.value, factor)
-        return self.where(there, value)
-
-    def _angle(self, terms: Sequence[Value], exact: Sequence[Fraction]) -> None:
+    def _angle(self, terms: Sequence[str], there: str, exact: Sequence[Fraction]) -> None:
         intercept, *coefficients = (float(one) for one in exact)
-        counts = self.do("Concat", *(one.value for one in terms), axis=1)
+        counts = self.do("Concat", *terms, axis=1)
         weights = self.constant([[one] for one in coefficients], self.dtype)
         total = self.do("MatMul", self.do("Cast", counts, to=self.kind), weights)
         total = self.do("Add", total, self.constant(intercept, self.dtype))
         nothing = self.constant(np.nan, self.dtype)
-        self.do("Where", self.all_there(terms), total, nothing, out="angle")
+        self.do("Where", there, total, nothing, out="angle")
         self.outputs.insert(0, helper.make_tensor_value_info("angle", self.kind, ["cars", 1]))
 
 
-_OPERATIONS = {
-    "+": "Add",
-    "-": "Sub",
-    "*": "Mul",
-    "negative": "Neg",
-    "abs": "Abs",
+def _sign(graph: Nodes, a: str) -> str:
+    return graph.signed(a, graph.do("Min", graph.do("Abs", a), 1))
+
+
+def _node(name: str) -> Callable[..., str]:
+    return lambda graph, *operands: graph.do(name, *operands)
+
+
+_OPERATIONS: Mapping[str, Callable[..., str]] = {
+    "+": _node("Add"),
+    "-": _node("Sub"),
+    "*": _node("Mul"),
+    "min": _node("Min"),
+    "max": _node("Max"),
+    "negative": _node("Neg"),
+    "abs": _node("Abs"),
+    "sign": _sign,
+    "//": lambda graph, a, b: graph.signed(a, graph.do("Div", graph.do("Abs", a), b)),
+    "nearest": lambda graph, a, b: graph.nearest(a, b),
+    "clip": lambda graph, a, b: graph.do("Max", graph.do("Min", a, b), graph.do("Neg", b)),
 }
+"""What computes an operation of the values that it works on."""

@@ -1,19 +1,9 @@
 """Nodes of an ONNX graph: how they are written, and what several of them compute together."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from onnx import TensorProto, helper, numpy_helper
-
-
-@dataclass(frozen=True)
-class Value:
-    """Names of two tensors (cars, 1): an integer, which is 0 where missing, and if it is there."""
-
-    value: str
-    there: str
 
 
 class Nodes:
@@ -43,24 +33,9 @@ class Nodes:
             self.constants.append(numpy_helper.from_array(array, self._known[key]))
         return self._known[key]
 
-    def all_there(self, values: Sequence[Value]) -> str:
-        """Return whether all of these are there."""
-        there, *rest = dict.fromkeys(one.there for one in values)
-        for one in rest:
-            there = self.do("And", there, one)
-        return there
-
-    def where(self, there: str, value: str | int) -> Value:
-        """Return a value that is 0 where it is missing."""
-        return Value(self.do("Where", there, value, 0), there)
-
-    def clip(self, value: str, limit: int) -> str:
-        """Return a value within a limit."""
-        return self.do("Max", self.do("Min", value, limit), -limit)
-
-    def nearest(self, value: str, numerator: int, divisor: str | int) -> str:
-        """Return value * numerator / divisor to the nearest, halves away from zero."""
-        twice = self.do("Mul", self.do("Abs", value), 2 * numerator)
+    def nearest(self, value: str, divisor: str) -> str:
+        """Return a quotient to the nearest, halves away from zero."""
+        twice = self.do("Mul", self.do("Abs", value), 2)
         size = self.do("Div", self.do("Add", twice, divisor), self.do("Mul", divisor, 2))
         return self.signed(value, size)
 

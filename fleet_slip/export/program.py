@@ -1,32 +1,21 @@
 """A published estimator as an integer program: what a car computes at each tick, and nothing else.
 
-A program has four layers, each computed from those before it:
-
-* **Signals** are counts, or missing. A count beyond its signal's valid range is missing. A tick
-  that was not logged is one at which all signals are missing.
-* **Sources** are integer functions of the signals of one tick, clipped; missing where a signal in
-  them is missing, where their guard is too small, or where they would divide by what is not
-  positive.
-* **Columns** look back on sources, and are multiplied by what a car knows of itself.
-* **The angle** is a dot product of columns, and missing where one of them is.
-
-A quotient is rounded to the nearest integer, halves away from zero. These are the rules of
-`fleet_slip.catalogue.columns`, so that a program computes what the warehouse computes.
+* **Signals** are counts, or missing. A count beyond its signal's valid range is missing, and so is
+  what a car is told of itself. At a tick that was not logged, all signals are missing.
+* **Steps** are operations on whole numbers (`fleet_slip.columns.operations`).
+* **The angle** is a dot product of steps, and missing where one of them is.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
+from functools import cached_property
 
-from fleet_slip.catalogue.arithmetic import Arithmetic
-from fleet_slip.catalogue.columns import LARGEST_FACT, Over
-
-LARGEST_WORD = 2**63 - 1
-"""Largest size of anything that a program computes."""
-
-MOST_VALUES = 2**31 - 1
-"""Most values of a running mean: 248 days."""
+from fleet_slip.catalogue.columns import LARGEST_FACT
+from fleet_slip.catalogue.signals import COUNT_MAX
+from fleet_slip.columns.lowering import CarCount, CarFact
+from fleet_slip.columns.operations import Range, Step, plain_of, ranges_of, rings_of, roots_of
 
 
 @dataclass(frozen=True)
@@ -42,137 +31,8 @@ class Input:
 
 
 @dataclass(frozen=True)
-class CarFact:
-    """What a car knows of itself: a number, rounded; or, with `equals`, 1 if it is that, else 0."""
-
-    name: str
-    equals: str | None = None
-
-    @property
-    def field(self) -> str:
-        """Its name where programs have one name for each."""
-        if self.equals is None:
-            return self.name
-        return f"{self.name}_is_" + "".join(c if c.isalnum() else "_" for c in self.equals).lower()
-
-
-@dataclass(frozen=True)
-class CarNumber:
-    """What a car's own drives tell of it: a count of so many `grain`."""
-
-    name: str
-    unit: str
-    grain: Decimal
-
-
-@dataclass(frozen=True)
-class Source:
-    """An integer function of the signals of one tick.
-
-    Attributes:
-        name: of the signal or feature.
-        arithmetic: of the feature; None for a signal as it is.
-        limit: largest size of its count.
-        ticks: how far columns look back on it.
-    """
-
-    name: str
-    arithmetic: Arithmetic | None
-    limit: int
-    ticks: int = 0
-
-
-@dataclass(frozen=True)
-class Window:
-    """Looks back on a source; without `over`, the source's value now.
-
-    `count * numerator / denominator`, of a mean over as many values as there are, rounded once and
-    clipped to `limit`. `ticks` is 0 for all since the drive began.
-    """
-
-    source: int
-    over: Over | None
-    ticks: int
-    numerator: int
-    denominator: int
-    limit: int
-    source_limit: int
-
-    @property
-    def most_values(self) -> int:
-        """How many values are added up at most: a running mean stays as it is after so many.
-
-        So many that twice the sum times the numerator, and the divisor, fit into 64 bits.
-        """
-        if self.over != "running_mean":
-            return self.ticks
-        each = 2 * self.source_limit * self.numerator + self.denominator
-        return min(MOST_VALUES, LARGEST_WORD // each)
-
-    @property
-    def largest(self) -> int:
-        """Largest size of the count."""
-        return self.limit
-
-
-@dataclass(frozen=True)
-class Factor:
-    """A column times a fact less `less`, times the ratio; rounded, and clipped to `limit`.
-
-    Missing where the car does not know the fact: beyond `LARGEST_FACT` it does not.
-    """
-
-    of: int
-    fact: int
-    less: int
-    numerator: int
-    denominator: int
-    limit: int
-
-    @property
-    def largest(self) -> int:
-        """Largest size of the count."""
-        return self.limit
-
-
-@dataclass(frozen=True)
-class Gated:
-    """A column times the weight of a gate, over `WEIGHT`, rounded.
-
-    The weight is 0 up to `low`, `WEIGHT` at `peak`, and 0 again from `high`, rounded down on the
-    way up; without `high` it stays.
-    """
-
-    of: int
-    by: int
-    low: int
-    peak: int
-    high: int | None
-    largest: int
-
-
-@dataclass(frozen=True)
-class Numbered:
-    """A column times a number of the car less `less`; `alone`, the number where the column is.
-
-    Where the number is not known, the column `running` takes its place, `less` not taken from it;
-    where there is none, 0.
-    """
-
-    of: int
-    number: int
-    less: int
-    alone: bool
-    running: int | None
-    largest: int
-
-
-Column = Window | Factor | Gated | Numbered
-
-
-@dataclass(frozen=True)
 class Angle:
-    """The dot product: `(intercept + sum(coefficient * column)) / 2^bits`, in counts of `scale`.
+    """The dot product: `(intercept + sum(coefficient * step)) / 2^bits`, in counts of `scale`.
 
     Rounded to the nearest integer, halves up, and clipped to 32 bits. How far it is from the exact
     model is proven in `fleet_slip.export.fixed_point`.
@@ -183,7 +43,7 @@ class Angle:
         bits: of the fraction.
         low_bits: of the lower part of each coefficient, where two words hold it.
         intercept: over 2^bits.
-        terms: a column and its coefficient over 2^bits, for each term of the model.
+        terms: a step and its coefficient over 2^bits, for each term of the model.
         error: bound of the distance from the exact model, rounding included, in counts.
         largest: bound of the size before it is clipped, in counts.
         limit: to which it is clipped.
@@ -210,19 +70,55 @@ class Angle:
 
 @dataclass(frozen=True)
 class Program:
-    """A published estimator, complete. Columns refer to those before them by their place."""
+    """A published estimator, complete: steps, and what they are given."""
 
     signals: tuple[Input, ...]
     facts: tuple[CarFact, ...]
-    numbers: tuple[CarNumber, ...]
-    sources: tuple[Source, ...]
-    columns: tuple[Column, ...]
+    numbers: tuple[CarCount, ...]
+    steps: tuple[Step, ...]
     angle: Angle
+
+    @cached_property
+    def given(self) -> dict[str, list[Range]]:
+        """The valid ranges of signals, facts and numbers: what is beyond is missing."""
+        return given_ranges(self.signals, self.facts, self.numbers)
+
+    @cached_property
+    def ranges(self) -> list[Range]:
+        """The range of each step, zero included where it can be missing."""
+        return ranges_of(self.steps, self.given)
+
+    @cached_property
+    def roots(self) -> list[tuple[int, ...]]:
+        """For each step, the steps that must be there by themselves for it to be there."""
+        return roots_of(self.steps, self.ranges)
+
+    @cached_property
+    def rings(self) -> dict[int, int]:
+        """The steps that are looked back on, and how many ticks; 0 are all since the start."""
+        return rings_of(self.steps)
+
+    @property
+    def sums(self) -> list[tuple[int, ...]]:
+        """What is added up over time: a step, its ticks, and the most values."""
+        return list(dict.fromkeys(plain_of(s) for s in self.steps if s[0] in ("sum", "values")))
 
     @property
     def longest_ticks(self) -> int:
         """How far it looks back; a running mean looks back on all."""
-        return max(source.ticks for source in self.sources)
+        return max(self.rings.values(), default=0)
+
+
+def given_ranges(
+    signals: Sequence[Input], facts: Sequence[CarFact], numbers: Sequence[CarCount]
+) -> dict[str, list[Range]]:
+    """Return the valid ranges of signals, facts and numbers: what is beyond is missing."""
+    fact = (-LARGEST_FACT, LARGEST_FACT)
+    return {
+        "signal": [(one.min_count, one.max_count) for one in signals],
+        "fact": [fact if one.equals is None else (0, 1) for one in facts],
+        "number": [(-COUNT_MAX, COUNT_MAX)] * len(numbers),
+    }
 
 
 @dataclass(frozen=True)

@@ -1,20 +1,29 @@
-"""A program as one SELECT over rows in SI units: windows, and integers of 64 bits.
+"""A program as one SELECT over rows in SI units, in plain SQL that several engines take as it is.
 
-It is plain SQL, which DuckDB, SQLite and PostgreSQL take as it is. Where `/` of whole numbers is a
-division in floating point, it is exact too: what is divided is a multiple of the divisor, and the
-quotient far below 2^53.
+DuckDB, SQLite and PostgreSQL do. What is used more than once is a column of a layer of its own.
 """
 
-from collections.abc import Iterable
+from collections import Counter, defaultdict
 
-from fleet_slip.catalogue.columns import LARGEST_FACT, WEIGHT
+from fleet_slip.catalogue.columns import LARGEST_FACT
 from fleet_slip.catalogue.signals import COUNT_MAX
-from fleet_slip.export.c_columns import sum_key, summed
-from fleet_slip.export.program import CarFact, Factor, Gated, Numbered, Program, Source, Window
+from fleet_slip.columns.lowering import CarFact
+from fleet_slip.columns.operations import (
+    GIVEN,
+    OPERATIONS,
+    operands_of,
+    operation_of,
+    plain_of,
+)
+from fleet_slip.columns.sql_operations import PLAIN_SQL, sql_constant, sql_of
+from fleet_slip.export.program import Program
 from fleet_slip.models.model_version import ModelVersion
 
 ROWS = "log"
 """The table or view that the plain statement reads: `drive_id`, `tick`, and columns in SI units."""
+
+INLINE = ("+", "-", "*", "negative")
+"""What may stand within another step, where it is used once."""
 
 
 def sql_statement(version: ModelVersion, program: Program, rows: str = ROWS) -> str:
@@ -22,29 +31,12 @@ def sql_statement(version: ModelVersion, program: Program, rows: str = ROWS) -> 
 
     `angle` is null where there is none. Rows are the ticks of drives, in any order.
     """
-    angle = program.angle
-    layers = [
-        ("given", ["drive_id", "tick", *_given(program)]),
-        ("signals", _valid(program)),
-        ("sources", _sources(program)),
-        ("sources_clipped", _clipped("source_raw", "source", enumerate(_limits(program)))),
-        ("sums", _sums(program)),
-        ("quotients", _quotients(program)),
-        ("windows", _clipped("raw", "column", _of_windows(program))),
-        ("products", _products(program)),
-        ("factors", _clipped("raw", "column", _of_factors(program))),
-        ("weights", _weights(program)),
-        ("gated", _gated(program)),
-        ("numbered", _numbered(program)),
-        ("parts", _parts(program)),
-    ]
-    text, before = [], rows
-    for name, columns in layers:
-        if columns:
-            kept = [] if name == "given" else ["*"]
-            listed = ",\n        ".join([*kept, *columns])
-            text.append(f"{name} AS (\n    SELECT\n        {listed}\n    FROM {before}\n)")
-            before = name
+    angle, text, before = program.angle, [], rows
+    for number, columns in enumerate([*_given(program), *_Layers(program).written()]):
+        kept = ["*"] if number else ["drive_id", "tick"]
+        listed = ",\n        ".join([*kept, *columns])
+        text.append(f"layer_{number} AS (\n    SELECT\n        {listed}\n    FROM {before}\n)")
+        before = f"layer_{number}"
     layered = ",\n\n".join(text)
     return (
         f"{_comment(version, program)}\nWITH {layered},\n\n"
@@ -74,18 +66,25 @@ def _comment(version: ModelVersion, program: Program) -> str:
     )
 
 
-def _given(program: Program) -> list[str]:
-    """Return the counts of signals, and what the car knows, as whole numbers."""
-    signals = [
-        f"CAST(ROUND({one.column} / {one.scale:f}) AS BIGINT) AS {one.name}_in"
-        for one in program.signals
-    ]
+def _given(program: Program) -> list[list[str]]:
+    """Return layers that round what is given to counts, signals half to even; beyond is null."""
+    counts, rounded, valid = [], [], []
+    for place, one in enumerate(program.signals):
+        ratio = f"ratio_{place}"
+        counts.append(f"{one.column} / {one.scale:f} AS {ratio}")
+        half = f"CASE WHEN ABS({ratio} - ROUND({ratio})) = 0.5 THEN 2 * ROUND({ratio} / 2)"
+        rounded.append(f"{half} ELSE ROUND({ratio}) END AS rounded_{place}")
+        ends = (one.min_count, one.max_count)
+        valid.append(f"{_within(f'rounded_{place}', *ends)} AS signal_{place}")
+    for place, number in enumerate(program.numbers):
+        counts.append(f"ROUND({number.name} / {number.grain:f}) AS told_{place}")
+        valid.append(f"{_within(f'told_{place}', -COUNT_MAX, COUNT_MAX)} AS number_{place}")
     facts = [f"{_fact(one)} AS fact_{place}" for place, one in enumerate(program.facts)]
-    numbers = [
-        f"CAST(ROUND({one.name} / {one.grain:f}) AS BIGINT) AS number_{place}"
-        for place, one in enumerate(program.numbers)
-    ]
-    return [*signals, *facts, *numbers]
+    return [[*counts, *facts], rounded, valid]
+
+
+def _within(value: str, least: int, most: int) -> str:
+    return f"CASE WHEN {value} BETWEEN {least} AND {most} THEN CAST({value} AS BIGINT) END"
 
 
 def _fact(one: CarFact) -> str:
@@ -96,196 +95,80 @@ def _fact(one: CarFact) -> str:
     return f"CASE WHEN {is_it} THEN 1 WHEN {one.name} IS NOT NULL THEN 0 END"
 
 
-def _valid(program: Program) -> list[str]:
-    return [
-        f"CASE WHEN {one.name}_in BETWEEN {one.min_count} AND {one.max_count} "
-        f"THEN {one.name}_in END AS {one.name}_valid"
-        for one in program.signals
-    ]
+class _Layers:
+    """The layers of a program: each has columns made of those of the layers before."""
+
+    def __init__(self, program: Program) -> None:
+        """Take a program."""
+        self._program = program
+        self._layers: defaultdict[int, list[str]] = defaultdict(list)
+        self._uses = Counter(of for step in program.steps for of in operands_of(step))
+        self._texts: dict[int, tuple[str, int]] = {}
+
+    def written(self) -> list[list[str]]:
+        """Return the columns of each layer; the last has the parts of the angle."""
+        terms = [(*self._text(step), step) for step, _ in self._program.angle.terms]
+        last = max(layer for _, layer, _ in terms)
+        self._layers[last + 1] += _parts(self._program, [text for text, _, _ in terms])
+        return [self._layers[number] for number in sorted(self._layers)]
+
+    def _text(self, number: int) -> tuple[str, int]:
+        """Return a step in SQL, and the layer that has all columns in it."""
+        if number not in self._texts:
+            self._texts[number] = self._written(number)
+        return self._texts[number]
+
+    def _written(self, number: int) -> tuple[str, int]:
+        step = self._program.steps[number]
+        name, plain = operation_of(step), plain_of(step)
+        if name == "constant":
+            return sql_constant(plain[0]), 0
+        if name in GIVEN:
+            return f"{name}_{plain[0]}", 0
+        one = OPERATIONS[name]
+        own = plain[: one.steps]
+        inline = name in INLINE
+        parts = [self._text(i) if inline else self._column(i) for i in own]
+        text = sql_of(
+            name,
+            [part for part, _ in parts],
+            *plain[one.steps :],
+            divides_by=self._program.ranges[own[-1]][0],
+            table=PLAIN_SQL,
+        )
+        layer = max(layer for _, layer in parts)
+        if inline and self._uses[number] == 1:
+            return text, layer
+        return self._named(number, text, layer)
+
+    def _column(self, number: int) -> tuple[str, int]:
+        """Return a step as one word."""
+        text, layer = self._text(number)
+        if " " in text:
+            self._texts[number] = self._named(number, text, layer)
+        return self._texts[number]
+
+    def _named(self, number: int, text: str, layer: int) -> tuple[str, int]:
+        self._layers[layer + 1].append(f"{text} AS step_{number}")
+        return f"step_{number}", layer + 1
 
 
-def _limits(program: Program) -> list[int]:
-    return [one.limit for one in program.sources]
-
-
-def _sources(program: Program) -> list[str]:
-    return [f"{_source(one)} AS source_raw_{place}" for place, one in enumerate(program.sources)]
-
-
-def _source(one: Source) -> str:
-    if one.arithmetic is None:
-        return f"{one.name}_valid"
-    texts: list[str] = []
-    conditions = []
-    for number, step in enumerate(one.arithmetic.steps):
-        operands = [texts[i] for i in step.operands]
-        if step.name or not step.function:
-            texts.append(f"{step.name}_valid" if step.name else f"{step.value}")
-        else:
-            texts.append(_operation(step.function, operands))
-        if step.function == "//" and not operands[1].isdigit():
-            conditions.append(f"{operands[1]} > 0")
-        if number == one.arithmetic.guard:
-            conditions.insert(0, f"{texts[-1]} >= {one.arithmetic.at_least}")
-    if not conditions:
-        return texts[-1]
-    return f"CASE WHEN {' AND '.join(conditions)} THEN {texts[-1]} END"
-
-
-def _operation(function: str, operands: list[str]) -> str:
-    a, b = operands[0], operands[-1]
-    match function:
-        case "negative":
-            return f"(-{a})"
-        case "abs":
-            return f"ABS({a})"
-        case "sign":
-            return f"(CASE WHEN {a} > 0 THEN 1 WHEN {a} < 0 THEN -1 ELSE 0 * {a} END)"
-        case "//":
-            return divide(a, b)
-        case _:
-            return f"({a} {function} {b})"
-
-
-def divide(a: str, b: str) -> str:
-    """Return SQL of a / b, truncated; b is positive."""
-    return f"CAST(ROUND(({a} - {a} % {b}) / {b}) AS BIGINT)"
-
-
-def nearest(a: str, b: str) -> str:
-    """Return SQL of a / b to the nearest, halves away from zero; b is positive."""
-    size = divide(f"(2 * ABS({a}) + {b})", f"(2 * {b})")
-    return f"(CASE WHEN {a} < 0 THEN -{size} ELSE {size} END)"
-
-
-def _clipped(raw: str, name: str, limits: Iterable[tuple[int, int]]) -> list[str]:
-    return [
-        f"CASE WHEN {raw}_{place} > {limit} THEN {limit} "
-        f"WHEN {raw}_{place} < -{limit} THEN -{limit} ELSE {raw}_{place} END AS {name}_{place}"
-        for place, limit in limits
-    ]
-
-
-def _sums(program: Program) -> list[str]:
-    """Return sums and numbers of values of windows, and values of before."""
-    found = []
-    for key, (_, one) in summed(program).items():
-        back = f"{one.ticks - 1} PRECEDING" if one.ticks else "UNBOUNDED PRECEDING"
-        over = _over(f"RANGE BETWEEN {back} AND CURRENT ROW")
-        source = f"source_{one.source}"
-        found += [
-            f"CAST(SUM({source}) {over} AS BIGINT) AS sum_{key}",
-            f"COUNT({source}) {over} AS values_{key}",
-        ]
-    for place, column in enumerate(program.columns):
-        if isinstance(column, Window) and column.over == "lag":
-            over = _over(f"RANGE BETWEEN {column.ticks} PRECEDING AND {column.ticks} PRECEDING")
-            found.append(f"MAX(source_{column.source}) {over} AS past_{place}")
-    return found
-
-
-def _over(frame: str) -> str:
-    return f"OVER (PARTITION BY drive_id ORDER BY tick {frame})"
-
-
-def _quotients(program: Program) -> list[str]:
-    found = []
-    for place, one in enumerate(program.columns):
-        if not isinstance(one, Window):
-            continue
-        now = f"past_{place}" if one.over == "lag" else f"source_{one.source}"
-        total, divisor = now, f"{one.denominator}"
-        if one.over in ("mean", "sum", "running_mean"):
-            total = f"sum_{sum_key(place, one)}"
-        if one.over in ("mean", "running_mean"):
-            divisor = f"({divisor} * values_{sum_key(place, one)})"
-        quotient = nearest(f"({total} * {one.numerator})", divisor)
-        found.append(f"CASE WHEN {now} IS NOT NULL THEN {quotient} END AS raw_{place}")
-    return found
-
-
-def _of_windows(program: Program) -> list[tuple[int, int]]:
-    return [(i, one.limit) for i, one in enumerate(program.columns) if isinstance(one, Window)]
-
-
-def _of_factors(program: Program) -> list[tuple[int, int]]:
-    return [(i, one.limit) for i, one in enumerate(program.columns) if isinstance(one, Factor)]
-
-
-def _products(program: Program) -> list[str]:
-    found = []
-    for place, one in enumerate(program.columns):
-        if isinstance(one, Factor):
-            product = f"(column_{one.of} * (fact_{one.fact} - ({one.less})) * {one.numerator})"
-            found.append(f"{nearest(product, str(one.denominator))} AS raw_{place}")
-    return found
-
-
-def _weights(program: Program) -> list[str]:
-    found = []
-    for place, one in enumerate(program.columns):
-        if isinstance(one, Gated):
-            at = f"column_{one.by}"
-            rising = divide(f"(({at} - ({one.low})) * {WEIGHT})", str(one.peak - one.low))
-            cases = f"WHEN {at} <= {one.low} THEN 0 WHEN {at} < {one.peak} THEN {rising}"
-            if one.high is None:
-                cases += f" WHEN {at} IS NOT NULL THEN {WEIGHT}"
-            else:
-                falls = divide(f"(({at} - ({one.peak})) * {WEIGHT})", str(one.high - one.peak))
-                cases += f" WHEN {at} < {one.high} THEN {WEIGHT} - {falls}"
-                cases += f" WHEN {at} IS NOT NULL THEN 0"
-            found.append(f"CASE {cases} END AS weight_{place}")
-    return found
-
-
-def _gated(program: Program) -> list[str]:
-    return [
-        f"{nearest(f'(column_{one.of} * weight_{place})', str(WEIGHT))} AS column_{place}"
-        for place, one in enumerate(program.columns)
-        if isinstance(one, Gated)
-    ]
-
-
-def _numbered(program: Program) -> list[str]:
-    found = []
-    for place, one in enumerate(program.columns):
-        if isinstance(one, Numbered):
-            number = f"number_{one.number}"
-            stand_in = "0" if one.running is None else f"column_{one.running}"
-            known = (
-                f"(CASE WHEN {number} > {COUNT_MAX} THEN {COUNT_MAX} WHEN {number} < -{COUNT_MAX} "
-            )
-            known += f"THEN -{COUNT_MAX} ELSE {number} END - ({one.less}))"
-            factor = f"(CASE WHEN {number} IS NULL THEN {stand_in} ELSE {known} END)"
-            value = factor if one.alone else f"column_{one.of} * {factor}"
-            found.append(
-                f"CASE WHEN column_{one.of} IS NOT NULL THEN {value} END AS column_{place}"
-            )
-    return found
-
-
-def _parts(program: Program) -> list[str]:
+def _parts(program: Program, terms: list[str]) -> list[str]:
     """Return the sums of the upper and of the lower parts; see `fixed_point`."""
     (high, low), *parts = program.angle.parts
-    sums = []
-    for name, first, which in (("high", high, 0), ("low", low, 1)):
-        terms = " + ".join(
-            f"({part[which]}) * column_{place}"
-            for part, (place, _) in zip(parts, program.angle.terms, strict=True)
-        )
-        sums.append(f"{first} + {terms} AS {name}")
-    return sums
+    return [
+        f"{first} + "
+        + " + ".join(f"({part[which]}) * {t}" for part, t in zip(parts, terms, strict=True))
+        + f" AS {name}"
+        for name, first, which in (("high", high, 0), ("low", low, 1))
+    ]
 
 
 def _rounded(program: Program) -> str:
     angle = program.angle
     shift = angle.bits - angle.low_bits
     carried = f"(high + {_floor('low', angle.low_bits)} + {2 ** (shift - 1)})"
-    found = _floor(carried, shift)
-    return (
-        f"CASE WHEN {found} > {angle.limit} THEN {angle.limit} "
-        f"WHEN {found} < -{angle.limit} THEN -{angle.limit} ELSE {found} END"
-    )
+    return PLAIN_SQL["clip"].format(_floor(carried, shift), angle.limit)
 
 
 def _floor(value: str, bits: int) -> str:

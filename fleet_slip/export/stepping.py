@@ -1,58 +1,63 @@
-"""Runs a program for one tick, compiled: a row of whole numbers for each operation.
+"""Runs steps for one tick, compiled: a row of whole numbers for each.
 
-A row is an operation, the place in memory that it writes, and up to eight operands, which are
-places in memory or constants. Memory is int64; `MISSING` is a value that is not there.
+A row is an operation, the place in memory that it writes, and operands, which are places in memory
+or plain numbers. Memory is int64; `MISSING` is a value that is not there.
 """
 
 from typing import Any
 
 import numpy as np
 
-from fleet_slip.catalogue.columns import WEIGHT
 from fleet_slip.compiling import inner_loop, kernel
 
 MISSING = -(2**63)
 
-ADD, SUBTRACT, MULTIPLY, DIVIDE, NEGATIVE, ABSOLUTE, SIGN = 0, 1, 2, 3, 4, 5, 6
-SIGNAL, SOURCE, SLIDE, GATHER, KEEP = 10, 11, 12, 13, 14
-VALUE, LAG, SUM, MEAN, FACTOR, GATE, NUMBER, TERM = 20, 21, 22, 23, 24, 25, 26, 27
+OPERATIONS = {
+    name: number
+    for number, name in enumerate(
+        ("+", "-", "*", "//", "nearest", "min", "max", "negative", "abs", "sign", "clip",
+         "at_least", "where", "else", "signal", "ago", "slide", "keep", "term")
+    )
+}  # fmt: skip
+"""The operations of steps, and what a tick takes besides; `slide` is the sums and the values."""
 
-ROW = 9
+ADD, SUBTRACT, MULTIPLY, DIVIDE, NEAREST, LEAST, MOST = 0, 1, 2, 3, 4, 5, 6
+NEGATIVE, ABSOLUTE, SIGN, CLIP, AT_LEAST, WHERE, ELSE = 7, 8, 9, 10, 11, 12, 13
+SIGNAL, AGO, SLIDE, KEEP, TERM = 14, 15, 16, 17, 18
+
+ROW = 8
 """Whole numbers of an operation."""
 
 
 @kernel
-def run_tick(steps: Any, memory: Any, values: Any, intercept: float) -> Any:
+def run_tick(rows: Any, memory: Any, values: Any, intercept: float) -> Any:
     """Return the angle in rad of the next tick; NaN if there is none.
 
     `values` has the given physical values of the signals first, then constants.
     """
     estimate = intercept
-    for n in range(len(steps)):
-        operation, out, a, b = steps[n, 0], steps[n, 1], steps[n, 2], steps[n, 3]
-        c, d, e = steps[n, 4], steps[n, 5], steps[n, 6]
-        if operation <= SIGN:
+    for n in range(len(rows)):
+        operation, out, a, b = rows[n, 0], rows[n, 1], rows[n, 2], rows[n, 3]
+        if operation < ELSE:
             memory[out] = _calculate(operation, memory[a], memory[b])
+        elif operation == ELSE:
+            memory[out] = memory[b] if memory[a] == MISSING else memory[a]
         elif operation == SIGNAL:
-            memory[out] = _count(values[a], values[b], c, d)
+            memory[out] = _count(values[a], values[b], rows[n, 4], rows[n, 5])
         elif operation == TERM:
             column = memory[a]
-            term = np.nan if column == MISSING else column * values[c]
+            term = np.nan if column == MISSING else column * values[rows[n, 4]]
             estimate += values[b] * term
-        elif operation <= KEEP:
-            _remember(operation, memory, out, a, b, c, d, e)
-        elif operation <= MEAN:
-            memory[out] = _window(operation, memory, a, b, c, d, e, steps[n, 7], steps[n, 8])
         else:
-            memory[out] = _times(operation, memory, a, b, c, d, e, steps[n, 7])
+            _remember(operation, memory, out, a, b, rows[n, 4], rows[n, 5], rows[n, 6], rows[n, 7])
     return estimate
 
 
 @inner_loop
 def _calculate(operation: int, a: int, b: int) -> Any:
-    """Return what a step of a feature computes."""
+    """Return what a step computes of two values; of one, both are the same."""
     found = a
-    if MISSING in (a, b) or (operation == DIVIDE and b <= 0):
+    if MISSING in (a, b):
         found = MISSING
     elif operation == ADD:
         found = a + b
@@ -60,118 +65,65 @@ def _calculate(operation: int, a: int, b: int) -> Any:
         found = a - b
     elif operation == MULTIPLY:
         found = a * b
-    elif operation == DIVIDE:
-        found = a // b if a >= 0 else -(-a // b)
+    elif operation in (DIVIDE, NEAREST):
+        found = _quotient(a, b, operation == NEAREST)
+    elif operation == LEAST:
+        found = min(a, b)
+    elif operation == MOST:
+        found = max(a, b)
     elif operation == NEGATIVE:
         found = -a
     elif operation == ABSOLUTE:
         found = abs(a)
-    else:
+    elif operation == SIGN:
         found = (1 if a > 0 else 0) - (1 if a < 0 else 0)
+    elif operation == CLIP:
+        found = max(-b, min(a, b))
+    elif operation == AT_LEAST and a < b:
+        found = MISSING
     return found
 
 
 @inner_loop
-def _count(value: float, scale: float, least: int, most: int) -> Any:
-    """Return a physical value in counts, as the sensors round it: half to even, then clipped."""
-    if not np.isfinite(value):
+def _quotient(a: int, b: int, rounds: bool) -> Any:
+    if b <= 0:
         return MISSING
+    size = (2 * abs(a) + b) // (2 * b) if rounds else abs(a) // b
+    return -size if a < 0 else size
+
+
+@inner_loop
+def _count(value: float, scale: float, least: int, most: int) -> Any:
+    """Return a physical value in counts, as the sensors round it: half to even."""
     count = np.rint(value / scale)
-    return np.int64(min(max(count, np.float64(least)), np.float64(most)))
+    inside = np.float64(least) <= count <= np.float64(most)
+    return np.int64(count) if inside else MISSING
 
 
 @inner_loop
 def _remember(
-    operation: int, memory: Any, out: int, a: int, b: int, c: int, d: int, at: int
+    operation: int, memory: Any, out: int, a: int, b: int, c: int, d: int, e: int, f: int
 ) -> None:
-    """Write a source, bring a sum to this tick, or write a source into its ring."""
-    value = memory[a]
-    if operation == SOURCE:
-        if b >= 0 and memory[b] < c:
-            value = MISSING
-        memory[out] = value if value == MISSING else min(max(value, -d), d)
-    elif operation == SLIDE:
-        oldest = _ago(memory, b, c, memory[at], d)
-        if oldest != MISSING:
-            memory[out] -= oldest
-            memory[out + 1] -= 1
-        if value != MISSING:
-            memory[out] += value
-            memory[out + 1] += 1
-    elif operation == GATHER:
-        if value != MISSING and memory[out + 1] < b:
-            memory[out] += value
-            memory[out + 1] += 1
-    else:
-        place = memory[at]
-        memory[b + place] = value
-        memory[at] = 0 if place + 1 == c else place + 1
+    """Read or write a ring of `c` values at `b`, whose next place stands at `d`; or bring a sum
+    and its number of values, at `out` and `f`, to this tick."""
+    if operation == KEEP:
+        memory[b + memory[d]] = memory[a]
+        memory[d] = 0 if memory[d] + 1 == c else memory[d] + 1
+        return
+    if operation == AGO:
+        memory[out] = _ago(memory, b, c, memory[d], e)
+        return
+    oldest = _ago(memory, b, c, memory[d], e) if c else MISSING
+    if oldest != MISSING:
+        memory[out] -= oldest
+        memory[f] -= 1
+    # Without a ring, `e` is how many values are taken at most.
+    if memory[a] != MISSING and (c or memory[f] < e):
+        memory[out] += memory[a]
+        memory[f] += 1
 
 
 @inner_loop
 def _ago(memory: Any, ring: int, length: int, at: int, ticks: int) -> Any:
     place = at - ticks
     return memory[ring + (place if place >= 0 else place + length)]
-
-
-@inner_loop
-def _nearest(value: int, numerator: int, divisor: int, limit: int) -> Any:
-    """Return a quotient to the nearest, halves away from zero, clipped."""
-    size = min((2 * abs(value) * numerator + divisor) // (2 * divisor), limit)
-    return -size if value < 0 else size
-
-
-@inner_loop
-def _window(
-    operation: int,
-    memory: Any,
-    a: int,
-    numerator: int,
-    denominator: int,
-    limit: int,
-    b: int,
-    at: int,
-    ticks: int,
-) -> Any:
-    """Return what looks back on a source `a`, whose sum is at `b`; or on a ring `a`, so long."""
-    now = _ago(memory, a, b, memory[at], ticks) if operation == LAG else memory[a]
-    if now == MISSING:
-        return MISSING
-    total, divisor = now, denominator
-    if operation in (SUM, MEAN):
-        total = memory[b]
-    if operation == MEAN:
-        divisor *= memory[b + 1]
-    return _nearest(total, numerator, divisor, limit)
-
-
-@inner_loop
-def _times(operation: int, memory: Any, a: int, b: int, c: int, d: int, e: int, less: int) -> Any:
-    """Return a column `a` times a fact, a gate's weight or a number of the car."""
-    now = memory[a]
-    if operation == GATE:
-        by = memory[b]
-        missing = MISSING in (now, by)
-        return MISSING if missing else _nearest(now * _weight(by, c, d, e), 1, WEIGHT, 2**62)
-    known = memory[e]
-    if operation == FACTOR:
-        missing = MISSING in (now, known)
-        return MISSING if missing else _nearest(now * (known - less), b, c, d)
-    factor = known - less
-    if known == MISSING:
-        factor = memory[b] if b >= 0 else 0
-    if MISSING in (now, factor):
-        return MISSING
-    return factor if c else now * factor
-
-
-@inner_loop
-def _weight(at: int, low: int, peak: int, high: int) -> Any:
-    """Return how far a gate is open; `high` is missing where it stays open."""
-    if at <= low:
-        return 0
-    if at < peak:
-        return (at - low) * WEIGHT // (peak - low)
-    if high == MISSING:
-        return WEIGHT
-    return WEIGHT - (at - peak) * WEIGHT // (high - peak) if at < high else 0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip.export.c_columns import LARGEST_UNSIGNED
+from fleet_slip.export.c_steps import LARGEST_UNSIGNED
 from fleet_slip.export.checks import Sample, angles_by_kernel, angles_of_columns
 from fleet_slip.export.compile import compile_program
 from fleet_slip.export.program import Car, Program

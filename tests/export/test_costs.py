@@ -34,7 +34,7 @@ def test_windows_of_one_source_share_its_ring_buffer() -> None:
     assert two.memory_bytes == one.memory_bytes + 8
     # Of a window more: the oldest is found and leaves, the newest comes, a quotient, a term.
     assert two.additions - one.additions == 2 + 4 + 1 + 2
-    assert two.multiplications - one.multiplications == 2 + 2
+    assert two.multiplications - one.multiplications == 1 + 2 + 2  # the scales are 16 to one
     assert (one.divisions, two.divisions, two.divisions_64) == (1, 2, 0)
 
 
@@ -43,10 +43,11 @@ def test_a_feature_is_computed_once() -> None:
     alone = cost_on_board(model_of({"course": ONE}))
     both = cost_on_board(model_of({"course": ONE, "heavy_above": ONE}))
     heavy = cost_on_board(model_of({"heavy": ONE}))
-    gate = (1, 3, 1)  # product, differences and quotient of a weight
-    rounded = (2, 1, 1)
-    assert both.multiplications == alone.multiplications + heavy.multiplications + 1 + 2
-    assert both.divisions == alone.divisions + heavy.divisions + gate[2] + rounded[2]
+    gate = (1, 1)  # product and quotient of what rises
+    rounded = (2, 1)
+    gated = 1 + rounded[0] + gate[0]
+    assert both.multiplications == alone.multiplications + heavy.multiplications + gated
+    assert both.divisions == alone.divisions + heavy.divisions + gate[1] + rounded[1]
     assert (alone.divisions_64, both.divisions_64) == (1, 2)
 
 

@@ -8,11 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet_slip.catalogue.columns import Definition
+from fleet_slip.columns.lowering import most_values
 from fleet_slip.errors import QuestionError
 from fleet_slip.export.checks import angles_by_kernel, make_checks
 from fleet_slip.export.compile import compile_program
 from fleet_slip.export.document import program_content
-from fleet_slip.export.program import Car, Window
+from fleet_slip.export.program import Car
 from fleet_slip.models.manifest import Manifest
 from tests.export import plain
 from tests.export.models import DEFINITIONS, cars, drives, model_of, models
@@ -50,9 +51,9 @@ def test_every_kind_of_column_has_an_angle_in_the_checks() -> None:
 def test_what_several_columns_are_made_of_is_computed_once() -> None:
     third = Fraction(1, 3)
     program = compile_program(model_of(dict.fromkeys(("mean_3", "below", "mean_5", "ay"), third)))
-    assert [one.name for one in program.sources] == ["ay", "wheel_fl"]
-    assert [one.ticks for one in program.sources] == [5, 4]
-    assert len(program.columns) == 5
+    assert [one.name for one in program.signals] == ["ay", "wheel_fl"]
+    assert program.rings == {0: 5, 1: 4}
+    assert program.sums == [(0, 3, 3), (1, 4, 4), (0, 5, 5)]
 
 
 def test_steps_that_several_columns_are_made_of_stand_once() -> None:
@@ -81,10 +82,12 @@ def test_a_running_mean_takes_no_more_than_its_most_values() -> None:
 
 
 def test_a_running_mean_ends_before_its_sum_overflows() -> None:
-    widest = Window(0, "running_mean", 0, 2**14, 1, 2**19 - 1, 2**19 - 1)
-    twice = 2 * widest.source_limit * widest.numerator
-    assert (twice + 1) * widest.most_values < 2**63 <= (twice + 1) * (widest.most_values + 1)
-    assert widest.most_values > 2**28
+    widest = Definition(
+        of="fast", sql="ay", of_bits=20, over="running_mean", ratio=Fraction(2**14), bits=20
+    )
+    twice, most = 2 * (2**19 - 1) * 2**14, most_values(widest)
+    assert (twice + 1) * most < 2**63 <= (twice + 1) * (most + 1)
+    assert most > 2**28
 
 
 def test_a_feature_defined_in_two_ways_is_refused() -> None:

@@ -1,0 +1,1 @@
+"""One language for what a column is: operations on whole numbers, and what is lowered to them."""

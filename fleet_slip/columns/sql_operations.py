@@ -1,0 +1,65 @@
+"""What each operation is in SQL: plain SQL of many engines, and what DuckDB writes otherwise.
+
+Null is a missing value. Integers have 64 bits.
+"""
+
+from collections.abc import Mapping
+
+QUOTIENT = "CAST(ROUND(({0} - {0} % {1}) / {1}) AS BIGINT)"
+"""{0} / {1}, truncated. Where `/` of whole numbers is a division in floating point, it is exact
+too: what is divided is a multiple of the divisor, and the quotient far below 2^53."""
+
+_NEAREST = QUOTIENT.format("(2 * ABS({0}) + {1})", "(2 * {1})")
+
+PLAIN_SQL: Mapping[str, str] = {
+    "+": "({0} + {1})",
+    "-": "({0} - {1})",
+    "*": "({0} * {1})",
+    "//": QUOTIENT,
+    "nearest": f"(CASE WHEN {{0}} < 0 THEN -{_NEAREST} ELSE {_NEAREST} END)",
+    "min": "(CASE WHEN {0} <= {1} THEN {0} WHEN {1} < {0} THEN {1} END)",
+    "max": "(CASE WHEN {0} >= {1} THEN {0} WHEN {1} > {0} THEN {1} END)",
+    "negative": "(-{0})",
+    "abs": "ABS({0})",
+    "sign": "(CASE WHEN {0} > 0 THEN 1 WHEN {0} < 0 THEN -1 ELSE 0 * {0} END)",
+    "clip": "(CASE WHEN {0} > {1} THEN {1} WHEN {0} < -{1} THEN -{1} ELSE {0} END)",
+    "at_least": "(CASE WHEN {0} >= {1} THEN {0} END)",
+    "where": "(CASE WHEN {1} IS NOT NULL THEN {0} END)",
+    "else": "COALESCE({0}, {1})",
+    "ago": "MAX({0}) OVER ({drive} RANGE BETWEEN {1} PRECEDING AND {1} PRECEDING)",
+    "sum": "CAST(COALESCE(SUM({0}) OVER ({drive} {frame}), 0) AS BIGINT)",
+    "values": "COUNT({0}) OVER ({drive} {frame})",
+}
+
+DUCKDB_SQL: Mapping[str, str] = {
+    **PLAIN_SQL,
+    "//": "({0} // {1})",
+    "nearest": "((2 * {0} + sign({0}) * {1}) // (2 * {1}))",
+    "sign": "sign({0})",
+}
+
+DIVIDES = ("//", "nearest")
+
+
+def sql_constant(value: int) -> str:
+    """Return a constant; a negative one may stand behind a minus."""
+    return str(value) if value >= 0 else f"({value})"
+
+
+def sql_of(
+    operation: str, operands: list[str], *plain: int, divides_by: int, table: Mapping[str, str]
+) -> str:
+    """Return an operation in SQL, of its operands in SQL and its plain numbers.
+
+    `divides_by` is the least that the divisor can be.
+    """
+    frame = f"RANGE BETWEEN {plain[0] - 1} PRECEDING AND CURRENT ROW" if plain and plain[0] else ""
+    text = table[operation].format(
+        *operands,
+        *plain,
+        drive="PARTITION BY drive_id ORDER BY tick",
+        frame=frame or "RANGE BETWEEN UNBOUNDED PRECEDING AND CURRENT ROW",
+    )
+    if operation in DIVIDES and divides_by <= 0:
+        return f"(CASE WHEN {operands[1]} > 0 THEN {text} END)"
+    return text
