@@ -3,7 +3,7 @@
 from decimal import Decimal
 
 from fleet_slip.catalogue.arithmetic import parse
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalogue.signals import COUNT_MAX, catalogue
 from fleet_slip.columns.lowering import Lowering, plain_column
 from fleet_slip.columns.operations import ranges_of, size_of
 from fleet_slip.errors import DataError
@@ -66,7 +66,8 @@ def _inputs(manifest: Manifest) -> tuple[Input, ...]:
             raise DataError(f"the feature {term.signal} is of no signal. Publish the model again.")
         used |= {*term.inputs}
     return tuple(
-        Input(name, s.column, s.unit, s.scale, s.min_count, s.max_count)
+        # -32768 is a missing count on board, so that a cyclic signal lacks its half turn there.
+        Input(name, s.column, s.unit, s.scale, max(s.min_count, -COUNT_MAX), s.max_count)
         for name, s in catalogue().signals.items()
         if name in used
     )

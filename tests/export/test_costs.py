@@ -40,8 +40,8 @@ def test_windows_of_one_source_share_its_ring_buffer() -> None:
 
 def test_a_feature_is_computed_once() -> None:
     """Two looks at `change`: its arithmetic counts once, and needs a division of 64 bits."""
-    alone = cost_on_board(model_of({"course": ONE}))
-    both = cost_on_board(model_of({"course": ONE, "heavy_above": ONE}))
+    alone = cost_on_board(model_of({"change_mean": ONE}))
+    both = cost_on_board(model_of({"change_mean": ONE, "heavy_above": ONE}))
     heavy = cost_on_board(model_of({"heavy": ONE}))
     gate = (1, 1)  # product and quotient of what rises
     rounded = (2, 1)

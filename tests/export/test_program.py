@@ -91,7 +91,7 @@ def test_a_running_mean_ends_before_its_sum_overflows() -> None:
 
 
 def test_a_feature_defined_in_two_ways_is_refused() -> None:
-    manifest = model_of({"course": Fraction(1), "heavy": Fraction(1)})
+    manifest = model_of({"change_mean": Fraction(1), "heavy": Fraction(1)})
     other = Definition(of="change", sql="ay", of_bits=18, over="mean", ticks=2)
     term = manifest.terms[1].model_copy(update={"definition": other})
     with pytest.raises(QuestionError, match="two ways"):
