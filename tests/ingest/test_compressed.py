@@ -9,7 +9,7 @@ import pytest
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest import read_measured
-from fleet_slip.ingest.formats import csv_batches
+from fleet_slip.ingest.formats import budget
 from fleet_slip.ingest.formats.csv_batches import BLOCK_BYTES
 from tests.support.logs import without_names
 from tests.support.measured import a_mapping, csv_text, good_columns, read_text
@@ -64,9 +64,13 @@ def test_what_would_not_fit_into_memory_is_refused_while_it_unfolds(
     assert "a line is longer than" in failure(tmp_path, bomb)
 
 
-def test_lines_without_end_in_a_small_file_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@both
+def test_a_file_that_becomes_far_more_than_it_is_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compress: Compress
 ) -> None:
-    monkeypatch.setattr(csv_batches, "MOST_BYTES", 10_000)
-    bomb = gzip.compress(TEXT + b"1,1,1\n" * 100_000)
-    assert "unfolds to more than 200 times its size" in failure(tmp_path, bomb)
+    bomb = compress(TEXT + b"1,1,1\n" * 100_000)
+    monkeypatch.setattr(budget, "FREE_ROWS", 50_000)
+    assert "rows or more in" in failure(tmp_path, bomb)
+    monkeypatch.setattr(budget, "FREE_ROWS", 10**6)
+    monkeypatch.setattr(budget, "FREE_BYTES", 10_000)
+    assert "bytes unfold to" in failure(tmp_path, bomb)

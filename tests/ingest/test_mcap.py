@@ -14,6 +14,7 @@ from mcap_ros2.writer import Writer
 from fleet_slip.errors import InputError
 from fleet_slip.ingest import Mapping, read_measured
 from fleet_slip.ingest.formats import mcap_log, mcap_messages
+from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.source import OWN_TIME
 from tests.ingest.test_formats import AX, AX_COUNTS, BETA_DEG, START, TIME_S, require_the_drive
 from tests.support.measured import a_mapping
@@ -131,7 +132,7 @@ def test_a_field_with_a_text_far_down_is_one_of_texts(
     messages[0]["b"] = messages[0]["c"] = None
     messages[17] |= {"b": "late", "c": 5}
     file = write_json(tmp_path / "log.mcap", messages)
-    with mcap_log.open_mcap(file) as source:
+    with mcap_log.open_mcap(Budget.of(file)) as source:
         (base,) = source.bases(["imu.a", "imu.b", "imu.c"])
         found = pl.concat(base.read())
         assert base.count_rows() == found.height == 20

@@ -13,6 +13,7 @@ from fleet_slip.errors import InputError
 from fleet_slip.ingest import read_measured
 from fleet_slip.ingest.drives import checking, log_rows
 from fleet_slip.ingest.formats import csv_batches
+from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.parquet_batches import open_parquet
 from tests.support.logs import without_names
 from tests.support.measured import a_mapping, csv_text, good_columns, read_text, reasons, ticks
@@ -238,7 +239,7 @@ def test_a_time_beyond_the_calendar_is_no_time(
     table = pa.table({"time": column})
     file = tmp_path / "log.parquet"
     pq.write_table(table, file)
-    with open_parquet(file) as source:
+    with open_parquet(Budget.of(file)) as source:
         (batch,) = source.batches(["time"])
     assert [value is None for value in batch["time"]] == [True, False]
     assert capfd.readouterr().err == ""
@@ -249,7 +250,7 @@ def test_a_row_group_that_is_a_whole_file_is_not_in_memory_as_a_whole(tmp_path: 
     values = np.random.default_rng(0).random(rows)
     columns = pa.table({"ax": as_arrow(values)})
     pq.write_table(columns, tmp_path / "log.parquet", row_group_size=rows, use_dictionary=False)
-    with open_parquet(tmp_path / "log.parquet") as source:
+    with open_parquet(Budget.of(tmp_path / "log.parquet")) as source:
         before = pa.total_allocated_bytes()
         batches = source.batches(["ax"])
         next(batches)

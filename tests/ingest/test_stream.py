@@ -20,6 +20,7 @@ from fleet_slip.ingest.drives import read_ahead as read_ahead_module
 from fleet_slip.ingest.drives.drive_cutter import DriveCutter
 from fleet_slip.ingest.drives.read_ahead import AHEAD, map_ahead, read_ahead
 from fleet_slip.ingest.formats import csv_batches
+from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.csv_batches import PlainNumbers, open_csv
 from fleet_slip.ingest.formats.csv_format import CsvFormat
 from fleet_slip.ingest.landing import landing, writing
@@ -202,7 +203,7 @@ def test_plain_numbers_are_those_of_their_texts(
     form = CsvFormat(separator=";", decimal_comma=comma)
 
     def read(plain: PlainNumbers | None) -> pl.Series:
-        with open_csv(file, form, plain) as source:
+        with open_csv(Budget.of(file), form, plain) as source:
             return pl.concat(source.batches(["a"]))["a"]
 
     found = read(PlainNumbers(frozenset({"a"}), (-99.0, float("nan"))))

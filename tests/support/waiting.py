@@ -17,12 +17,16 @@ def until(condition: Callable[[], object], seconds: float = PATIENCE_S) -> None:
         time.sleep(0.02)
 
 
+class LateError(BaseException):
+    """Something hangs; not an `Exception`, which what hangs may catch."""
+
+
 @contextmanager
 def within(seconds: int = 60) -> Iterator[None]:
-    """Raise `AssertionError` in what hangs; of the main thread."""
+    """Raise `LateError` in what hangs; of the main thread."""
 
     def stop(*_: Any) -> None:
-        raise AssertionError(f"not done within {seconds} s")
+        raise LateError(f"not done within {seconds} s")
 
     before = signal.signal(signal.SIGALRM, stop)
     signal.alarm(seconds)

@@ -5,8 +5,9 @@ floats, dates or timestamps. CSV fields stay text, so that what is not a number 
 as it was written.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -15,6 +16,7 @@ import polars as pl
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.drives.spread_bases import PartBases, join_parts
 from fleet_slip.ingest.drives.time_bases import merge_bases
+from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.columns import shown
 from fleet_slip.ingest.formats.parquet_batches import BATCH_ROWS
 from fleet_slip.ingest.formats.reading import file_errors, open_source
@@ -36,7 +38,7 @@ def read_batches(log: Path, mapping: Mapping) -> Iterator[pl.DataFrame]:
     if time is None or (len(wanted) == 1 and not mapping.time.own_clock):
         for part in parts:
             with _open_part(part, mapping) as source:
-                yield from source.batches(next(iter(wanted.values())))
+                yield from Budget.of(part).metered(source.batches(next(iter(wanted.values()))))
     elif len(parts) == 1:
         with _open_part(log, mapping) as source:
             yield from _merged(_bases_of(source, log, mapping, wanted), mapping)
@@ -91,16 +93,22 @@ def _bases_of(
 ) -> list[Base]:
     """Return the time bases of a file that have one of the wanted columns."""
     if isinstance(source, ClockSource):
-        return [base for columns in wanted.values() for base in source.bases(columns)]
-    time = str(mapping.time.key)
-    return [
-        Base(
-            str(own),
-            partial(_count_rows, source, str(own), own == time),
-            partial(_read_with_times, source, part, columns, str(own), time),
-        )
-        for own, columns in wanted.items()
-    ]
+        bases = [base for columns in wanted.values() for base in source.bases(columns)]
+    else:
+        time = str(mapping.time.key)
+        bases = [
+            Base(
+                str(own),
+                partial(_count_rows, source, str(own), own == time),
+                partial(_read_with_times, source, part, columns, str(own), time),
+            )
+            for own, columns in wanted.items()
+        ]
+    return [replace(base, read=partial(_metered, part, base.read)) for base in bases]
+
+
+def _metered(part: Path, read: Callable[[], Iterator[pl.DataFrame]]) -> Iterator[pl.DataFrame]:
+    return Budget.of(part).metered(read())
 
 
 def _count_rows(source: Source, own: str, is_main: bool) -> int:

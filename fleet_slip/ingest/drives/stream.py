@@ -38,8 +38,8 @@ from fleet_slip.ingest.mapping.mapping import Mapping
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA
 from fleet_slip.words import number_of
 
-RATE_ROWS = 2**17
-"""The usual time between rows is that of the first ones of a file, so many at least."""
+RATE_ROWS, MOST_RATE_ROWS = 2**17, 2**21
+"""The usual time between rows is that of the first ones of a file, so many at least and at most."""
 FEWEST_STEPS = 1000
 MAX_DRIVES = 10_000
 """Short drives in one file. More means that time or the drive's column is not what is said."""
@@ -106,7 +106,8 @@ class MeasuredStream:
             early.append(block)
             while _reach(early) >= enough:
                 first = _trial(self.mapping, early, enough)
-                if first["part"].is_duplicated().sum() > FEWEST_STEPS:
+                has_steps = first["part"].is_duplicated().sum() > FEWEST_STEPS
+                if has_steps or enough >= MOST_RATE_ROWS:
                     return early, sample_intervals_s(first)
                 enough += RATE_ROWS
         return early, sample_intervals_s(_trial(self.mapping, early, _reach(early)))

@@ -14,7 +14,16 @@ from fleet_slip.arrays import FloatArray
 Bytes = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
 
+MOST_BYTES = 64
+"""Bytes of a frame of CAN FD."""
 _FLOATS = {16: np.float16, 32: np.float32, 64: np.float64}
+
+
+def is_possible(signal: Any) -> bool:
+    """Whether a frame can have a signal: at most 64 bits in 64 bytes, floats of their sizes."""
+    if not 0 <= signal.start < 8 * MOST_BYTES or not 1 <= signal.length <= 64:
+        return False
+    return needed_bytes(signal) <= MOST_BYTES and (not signal.is_float or signal.length in _FLOATS)
 
 
 def needed_bytes(signal: Any) -> int:

@@ -19,8 +19,16 @@ from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray
 from fleet_slip.errors import InputError
+from fleet_slip.ingest.formats.budget import Budget
+from fleet_slip.ingest.formats.can_blocks import require_bounded
 from fleet_slip.ingest.formats.can_bus import CanBus
-from fleet_slip.ingest.formats.can_decoding import is_sent, needed_bytes, physical, raw_numbers
+from fleet_slip.ingest.formats.can_decoding import (
+    is_possible,
+    is_sent,
+    needed_bytes,
+    physical,
+    raw_numbers,
+)
 from fleet_slip.ingest.formats.can_frames import CanFrames
 from fleet_slip.ingest.formats.columns import describe_missing, shown
 from fleet_slip.ingest.formats.source import OWN_TIME, Base, Channel, reading_with
@@ -29,6 +37,8 @@ from fleet_slip.ingest.formats.spool import Spool
 SUFFIXES = {".blf", ".asc", ".log", ".trc"}
 
 _MOST_NUMBERS = 100_000
+_ABSURD = re.compile(r"\d{7,}\s*\|\s*\d+\s*@|\|\s*\d{7,}\s*@|BO_\s+\d+\s+\S+\s*:\s*\d{7,}")
+"""Sizes in a DBC file of which cantools would make a format of so many characters."""
 _Key = tuple[int, bool]
 """Number of a message, and whether it is of 29 bits."""
 
@@ -38,10 +48,10 @@ class CanSource:
 
     has_clock = True
 
-    def __init__(self, file: Path, bus: CanBus, database: Any, spool: Spool) -> None:
-        """Take the trace's path, what the mapping says of it, the parsed database, and a spool."""
-        self._file, self._bus, self._database = file, bus, database
-        self._spool = spool
+    def __init__(self, bus: CanBus, database: Any, spool: Spool, budget: Budget) -> None:
+        """Take what the mapping says of the trace, the parsed database, and what it may become."""
+        self._file, self._bus, self._database = budget.file, bus, database
+        self._spool, self._budget = spool, budget
         self._messages = {message.name: message for message in database.messages}
         self._wanted: set[_Key] = set()
         self._numbers: set[_Key] = set()
@@ -63,7 +73,7 @@ class CanSource:
         for column in columns:
             name, _, signal = column.partition(".")
             of = self._messages[name].signals if name in self._messages else ()
-            found = {s.name: s for s in of}
+            found = {s.name: s for s in of if is_possible(s)}
             if signal not in found:
                 known = [f"{m}.{s.name}" for m, of in self._messages.items() for s in of.signals]
                 raise InputError(f"{shown(self._bus.database)}: {describe_missing(column, known)}")
@@ -162,9 +172,16 @@ class CanSource:
 
     def _read_trace(self) -> None:
         """Keep the frames of the wanted messages, and note the numbers of all."""
+        if self._file.suffix.lower() not in SUFFIXES:
+            raise InputError(
+                f"{shown(self._file)}: the suffix tells the format of a CAN trace: "
+                f"{', '.join(sorted(SUFFIXES))}. Name it as what it is."
+            )
+        require_bounded(self._budget)
         with reading_with(self._file, "can") as can, can.LogReader(self._file) as trace:
             self._require_whole(trace)
-            for frame in trace:
+            for number, frame in enumerate(trace):
+                self._budget.require_rows(number)
                 if frame.is_error_frame or frame.is_remote_frame:
                     continue
                 key = frame.arbitration_id, frame.is_extended_id
@@ -197,10 +214,10 @@ def _key(message: Any) -> _Key:
 
 
 @contextmanager
-def open_can_trace(file: Path, bus: CanBus) -> Iterator[CanSource]:
+def open_can_trace(bus: CanBus, budget: Budget) -> Iterator[CanSource]:
     """Open a CAN trace. Raises `InputError`, for a database that cannot be parsed too."""
     with closing(Spool()) as spool:
-        yield CanSource(file, bus, parse_database(bus), spool)
+        yield CanSource(bus, parse_database(bus), spool, budget)
 
 
 def parse_database(bus: CanBus) -> Any:
@@ -209,6 +226,11 @@ def parse_database(bus: CanBus) -> Any:
     What cantools says of a text that it cannot parse quotes a line of it; only the place is told.
     """
     database = Path(bus.database)
+    if _ABSURD.search(bus.text):
+        raise InputError(
+            f"{shown(database)}: a signal or a message of more than a million bits or bytes. Is "
+            "the file damaged?"
+        )
     with reading_with(database, "cantools") as cantools:
         try:
             return cantools.database.load_string(bus.text, bus.format, strict=False)

@@ -15,6 +15,7 @@ import pyarrow as pa
 from fleet_slip.arrays import is_finite
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.drives.read_ahead import map_ahead
+from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.columns import require_columns, shown
 from fleet_slip.ingest.formats.csv_format import CsvFormat
 from fleet_slip.ingest.formats.source import Channel
@@ -25,8 +26,6 @@ BLOCK_BYTES = 2**22
 MAX_LINE_BYTES = 2**20
 LINE_BLOCKS = 4
 """Blocks that one line may fill: more often a quote is not closed."""
-MOST_UNFOLDED, MOST_BYTES = 200, 2**30
-"""How many times its size a compressed file may become, beyond so many bytes: more is a bomb."""
 
 EXTRA_FIELDS = "\0extra fields"
 """Column of a CSV batch: what a line has after the header's last column, null if nothing."""
@@ -58,10 +57,15 @@ class PlainNumbers:
 class CsvSource:
     """A CSV file, or one that is compressed."""
 
-    file: Path
+    budget: Budget
     csv_format: CsvFormat
     numbers: PlainNumbers
     has_clock = False
+
+    @property
+    def file(self) -> Path:
+        """The file."""
+        return self.budget.file
 
     def channels(self) -> list[Channel]:
         """Return the columns of the header."""
@@ -96,7 +100,7 @@ class CsvSource:
             padding = self.csv_format.separator.encode() * len(names) + b"\n"
             blocks = _whole_lines(plain, self.file, padding)
             if plain is not stream:
-                blocks = _without_bomb(blocks, self.file)
+                blocks = _within(self.budget, blocks)
             yield from map_ahead(parse, blocks)
 
     def _parse(
@@ -121,10 +125,10 @@ class CsvSource:
 
 @contextmanager
 def open_csv(
-    file: Path, csv_format: CsvFormat, numbers: PlainNumbers | None = None
+    budget: Budget, csv_format: CsvFormat, numbers: PlainNumbers | None = None
 ) -> Iterator[CsvSource]:
     """Open a CSV file."""
-    yield CsvSource(file, csv_format, numbers or PlainNumbers())
+    yield CsvSource(budget, csv_format, numbers or PlainNumbers())
 
 
 def _decompressed(stream: BinaryIO) -> BinaryIO:
@@ -139,16 +143,14 @@ def _decompressed(stream: BinaryIO) -> BinaryIO:
     return stream
 
 
-def _without_bomb(blocks: Iterator[bytes], file: Path) -> Iterator[bytes]:
-    """Yield the blocks of a compressed file, as long as they are not absurdly many."""
-    unfolded = 0
+def _within(budget: Budget, blocks: Iterator[bytes]) -> Iterator[bytes]:
+    """Yield the blocks of a compressed file as long as they, and the lines in them, are few."""
+    unfolded = lines = 0
     for block in blocks:
         unfolded += len(block)
-        if unfolded > MOST_BYTES and unfolded > MOST_UNFOLDED * file.stat().st_size:
-            raise InputError(
-                f"{shown(file)}: it unfolds to more than {MOST_UNFOLDED} times its size, which no "
-                "log does. Unpack it and look at what is in it."
-            )
+        lines += block.count(b"\n") - 1  # the first is ours
+        budget.require_unfolded(unfolded)
+        budget.require_rows(lines)
         yield block
 
 

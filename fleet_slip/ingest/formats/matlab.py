@@ -3,16 +3,17 @@
 A column is the path of a vector, `Data.Vehicle.yawRate`, or one column of a matrix, `wheels(:,2)`.
 """
 
+import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 import polars as pl
 
 from fleet_slip.errors import InputError
+from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.columns import describe_missing, shown
 from fleet_slip.ingest.formats.matlab_elements import open_matrices
 from fleet_slip.ingest.formats.source import Channel, as_column, reading_with
@@ -47,9 +48,12 @@ class MatSource:
 
     has_clock = False
 
-    def __init__(self, file: Path, matrices: Mapping[str, _Matrix]) -> None:
-        """Take the file's path, and its matrices by path."""
-        self._file, self._matrices = file, matrices
+    def __init__(
+        self, matrices: Mapping[str, _Matrix], budget: Budget, links: Collection[str] = ()
+    ) -> None:
+        """Take its matrices by path, what may become of it, and names that are only links."""
+        self._file, self._budget = budget.file, budget
+        self._matrices, self._links = matrices, links
 
     def channels(self) -> list[Channel]:
         """Return all vectors, and the columns of matrices."""
@@ -72,6 +76,7 @@ class MatSource:
                     f"{shown(self._file)}: {name!r} has {length:,} values and {first!r} has "
                     f'{rows:,}. Give the signal the time that goes with it: time = "…".'
                 )
+        self._budget.require_rows(rows)
         for start in range(0, max(rows, 1), WINDOW_ROWS):
             end = min(start + WINDOW_ROWS, rows)
             yield pl.DataFrame(
@@ -94,6 +99,11 @@ class MatSource:
         matrix = self._matrices.get(found[1]) if found else None
         if found and matrix and 1 <= int(found[2]) <= _rows_columns(matrix.shape)[1]:
             return matrix, int(found[2]) - 1
+        if any(f"{name}.".startswith(f"{link}.") for link in self._links):
+            raise InputError(
+                f"{shown(self._file)}: {name!r} is a link, which is not followed. Map what it "
+                "links to."
+            )
         names = [channel.name for channel in self.channels()]
         raise InputError(f"{shown(self._file)}: {describe_missing(name, names)}")
 
@@ -120,23 +130,43 @@ def _rows_columns(shape: Sequence[int]) -> tuple[int, int]:
 
 
 @contextmanager
-def open_mat(file: Path) -> Iterator[MatSource]:
+def open_mat(budget: Budget) -> Iterator[MatSource]:
     """Open a MATLAB file of version 5 to 7. Raises `InputError`."""
-    with open_matrices(file) as matrices:
-        yield MatSource(file, {path: one for path, one in matrices.items() if one.shape})
+    with open_matrices(budget) as matrices:
+        yield MatSource({path: one for path, one in matrices.items() if one.shape}, budget)
 
 
 @contextmanager
-def open_mat73(file: Path) -> Iterator[MatSource]:
-    """Open a MATLAB file of version 7.3, or any HDF5 file. Raises `InputError`."""
+def open_mat73(budget: Budget) -> Iterator[MatSource]:
+    """Open a MATLAB file of version 7.3, or any HDF5 file. Raises `InputError`.
+
+    HDF5 can take the values of a dataset out of any other file. That is asked of each dataset
+    before anything else, its size among it: the library opens those files to tell it. Links are
+    not followed.
+    """
+    file = budget.file
     with reading_with(file, "h5py") as h5py, h5py.File(file, "r") as root:
         matrices: dict[str, _Dataset] = {}
+        links: list[str] = []
 
         def visit(path: str, item: Any) -> None:
-            if isinstance(item, h5py.Dataset) and not path.startswith("#refs#"):
-                kind = item.attrs.get("MATLAB_class", b"")
-                if item.shape and item.dtype.kind in "iufb" and kind != b"char":
-                    matrices[path.replace("/", ".")] = _Dataset(item)
+            if not isinstance(item, h5py.Dataset) or path.startswith("#refs#"):
+                return
+            layout = item.id.get_create_plist()
+            if layout.get_external_count() or layout.get_layout() == h5py.h5d.VIRTUAL:
+                raise InputError(
+                    f"{shown(file)}: the values of {path!r} are in other files. Export it again "
+                    "with all values in one file."
+                )
+            kind = item.attrs.get("MATLAB_class", b"")
+            if item.shape and item.dtype.kind in "iufb" and kind != b"char":
+                budget.require_rows(math.prod(item.chunks or ()))  # unfolded at once
+                matrices[path.replace("/", ".")] = _Dataset(item)
+
+        def note(path: str, link: Any) -> None:
+            if not isinstance(link, h5py.HardLink):
+                links.append(path.replace("/", "."))
 
         root.visititems(visit)
-        yield MatSource(file, matrices)
+        root.visititems_links(note)
+        yield MatSource(matrices, budget, links)

@@ -5,7 +5,6 @@ data stand in the tag itself. A matrix is made of elements again: flags, dimensi
 numbers or, of a struct, the names of its fields and their matrices (MAT-File Format, MathWorks).
 """
 
-import itertools
 import mmap
 import os
 import struct
@@ -14,12 +13,13 @@ import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from pathlib import Path
+from itertools import islice, pairwise
 from typing import IO, Any
 
 import numpy as np
 
 from fleet_slip.errors import InputError
+from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.columns import shown
 from fleet_slip.ingest.formats.spool import needing_room
 
@@ -34,8 +34,7 @@ _STRUCT, _TEXT, _NUMERIC = 2, 4, range(6, 16)
 """Classes of matrices."""
 _COMPLEX = 8
 _DEEPEST = 50
-_LARGEST, _LARGEST_OF_ALL = 2**31, 2**34
-"""Bytes of one element unfolded, and of all."""
+_MOST_MATRICES = 100_000
 _PIECE = 2**20
 
 Array = np.ndarray[Any, Any]
@@ -72,21 +71,26 @@ class _DamagedError(Exception):
 
 
 @contextmanager
-def open_matrices(file: Path) -> Iterator[dict[str, StoredMatrix]]:
+def open_matrices(budget: Budget) -> Iterator[dict[str, StoredMatrix]]:
     """Open a MATLAB 5 file: all matrices of numbers or text, by path. Raises `InputError`."""
+    file = budget.file
     with ExitStack() as opened:
         content = opened.enter_context(file.open("rb"))
         try:
-            found = dict(_find_matrices(content, opened))
+            found = list(islice(_find_matrices(content, opened, budget), _MOST_MATRICES + 1))
         except (_DamagedError, zlib.error, struct.error, RecursionError) as error:
             raise InputError(
                 f"{shown(file)}: it is truncated or damaged: {error}. Is it complete? Copy it "
                 "again."
             ) from None
-        yield found
+        if len(found) > _MOST_MATRICES:
+            raise InputError(f"{shown(file)}: more than {_MOST_MATRICES:,} matrices are not read.")
+        yield dict(found)
 
 
-def _find_matrices(content: IO[bytes], opened: ExitStack) -> Iterator[tuple[str, StoredMatrix]]:
+def _find_matrices(
+    content: IO[bytes], opened: ExitStack, budget: Budget
+) -> Iterator[tuple[str, StoredMatrix]]:
     """Yield the matrices of a file; compressed ones are unfolded into a file without a name."""
     content.seek(_BYTE_ORDER_AT)
     order = ">" if content.read(2) == b"MI" else "<"
@@ -98,7 +102,7 @@ def _find_matrices(content: IO[bytes], opened: ExitStack) -> Iterator[tuple[str,
         plain = _Part(content, elements, order)
         for kind, start, end in plain.walk(_HEADER, len(elements)):
             if kind == _COMPRESSED:
-                _unfold(elements, start, end, unfolded)
+                _unfold(elements, start, end, unfolded, budget)
                 places.append(unfolded.tell())
             else:
                 yield from plain.matrices(kind, start, end)
@@ -106,7 +110,7 @@ def _find_matrices(content: IO[bytes], opened: ExitStack) -> Iterator[tuple[str,
         unfolded.flush()
         with _mapped(unfolded) as elements:
             aside = _Part(unfolded, elements, order)
-            for begin, until in itertools.pairwise(places):
+            for begin, until in pairwise(places):
                 for kind, start, end in aside.walk(begin, until):
                     yield from aside.matrices(kind, start, end)
 
@@ -116,9 +120,9 @@ def _mapped(file: IO[bytes]) -> mmap.mmap:
     return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
 
 
-def _unfold(elements: mmap.mmap, start: int, end: int, sink: IO[bytes]) -> None:
+def _unfold(elements: mmap.mmap, start: int, end: int, sink: IO[bytes], budget: Budget) -> None:
     """Write what an element unfolds to."""
-    unpacking, begin = zlib.decompressobj(), sink.tell()
+    unpacking = zlib.decompressobj()
     for at in range(start, end, _PIECE):
         packed = elements[at : min(at + _PIECE, end)]
         while packed:
@@ -127,11 +131,7 @@ def _unfold(elements: mmap.mmap, start: int, end: int, sink: IO[bytes]) -> None:
                 sink.write(piece)
                 sink.flush()
             packed = unpacking.unconsumed_tail
-            if sink.tell() - begin > _LARGEST or sink.tell() > _LARGEST_OF_ALL:
-                raise _DamagedError(
-                    f"a compressed element of more than {_LARGEST:,} bytes, or all of them of more "
-                    f"than {_LARGEST_OF_ALL:,}"
-                )
+            budget.require_unfolded(sink.tell())
     sink.write(bytes(-sink.tell() % 8))
 
 

@@ -11,14 +11,15 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from pathlib import Path
 from typing import Any
 
 import polars as pl
 
 from fleet_slip.errors import InputError
+from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.columns import describe_missing, shown
 from fleet_slip.ingest.formats.mcap_messages import (
+    LARGEST_MESSAGE,
     Decode,
     decoder_of,
     field_of,
@@ -51,9 +52,9 @@ class McapSource:
 
     has_clock = True
 
-    def __init__(self, file: Path, spool: Spool) -> None:
-        """Take the file's path, and where decoded messages are kept."""
-        self._file, self._spool = file, spool
+    def __init__(self, budget: Budget, spool: Spool) -> None:
+        """Take the file and what it may become, and where decoded messages are kept."""
+        self._file, self._budget, self._spool = budget.file, budget, spool
         self._kept: dict[str, _Fields] = {}
         self._rows: dict[str, int] = {}
         self._numbers: set[str] = set()
@@ -107,6 +108,8 @@ class McapSource:
         with reading_with(self._file, "mcap"):
             for channel, decode, message in self._messages():
                 encodings.add(channel.message_encoding)
+                if len(message.data) > LARGEST_MESSAGE:
+                    continue
                 if decode is not None and channel.topic not in found:
                     found[channel.topic] = list(leaves_of(decode(message.data)))
         if not found:
@@ -121,9 +124,12 @@ class McapSource:
         """Yield all messages, in the file's order, with their channels and what decodes them."""
         schemas: dict[int, Any] = {}
         channels: dict[int, tuple[Any, Decode | None]] = {}
-        for record in read_records(self._file):
+        messages = 0
+        for record in read_records(self._budget):
             kind = type(record).__name__
             if kind == "Message":
+                messages += 1
+                self._budget.require_rows(messages)
                 yield *channels[record.channel_id], record
             elif kind == "Schema":
                 schemas[record.id] = record
@@ -146,6 +152,11 @@ class McapSource:
                 rows = coming.get(channel.topic)
                 if rows is None or decode is None:
                     continue
+                if len(message.data) > LARGEST_MESSAGE:
+                    raise InputError(
+                        f"{shown(self._file)}: a message of {channel.topic!r} has "
+                        f"{len(message.data):,} bytes; at most {LARGEST_MESSAGE:,} are decoded."
+                    )
                 found = decode(message.data)
                 rows.times_s.append(stamp_s(found, message.publish_time))
                 rows.values.append([field_of(found, name) for name in rows.fields.values()])
@@ -185,7 +196,7 @@ class McapSource:
 
 
 @contextmanager
-def open_mcap(file: Path) -> Iterator[McapSource]:
+def open_mcap(budget: Budget) -> Iterator[McapSource]:
     """Open an MCAP file. Raises `InputError`."""
     with closing(Spool()) as spool:
-        yield McapSource(file, spool)
+        yield McapSource(budget, spool)

@@ -10,26 +10,33 @@ from typing import Any
 import pyarrow as pa
 
 from fleet_slip.errors import InputError
+from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.columns import shown
 from fleet_slip.ingest.formats.source import reading_with
 
 _LARGEST_RECORD, _LARGEST_RATIO = 2**27, 1000
 """Bytes of a record or of a chunk unpacked, and how many times its size a chunk may become."""
+LARGEST_MESSAGE = 2**22
+"""Bytes of a message that is decoded: each may become an object of its own."""
 _MOST_ITEMS, _DEEPEST = 64, 20
 """Items of an array that are columns, and levels of messages in messages."""
 
 Decode = Callable[[bytes], Any]
 
 
-def read_records(path: Path) -> Iterator[Any]:
+def read_records(budget: Budget) -> Iterator[Any]:
     """Yield the records of a file; those in chunks come singly. Raises `InputError`."""
+    path, unfolded = budget.file, 0
     with reading_with(path, "mcap.stream_reader") as mcap, path.open("rb") as file:
         reader = mcap.StreamReader(
             file, emit_chunks=True, validate_crcs=True, record_size_limit=_LARGEST_RECORD
         )
         for record in reader.records:
             if type(record).__name__ == "Chunk":
-                yield from mcap.breakup_chunk(_unpacked(path, record), validate_crc=True)
+                chunk = _unpacked(path, record)
+                unfolded += chunk.uncompressed_size
+                budget.require_unfolded(unfolded)
+                yield from mcap.breakup_chunk(chunk, validate_crc=True)
             else:
                 yield record
 

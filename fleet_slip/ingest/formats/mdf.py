@@ -14,7 +14,9 @@ import polars as pl
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import InputError
+from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.columns import describe_missing, shown
+from fleet_slip.ingest.formats.mdf_links import require_tree
 from fleet_slip.ingest.formats.source import OWN_TIME, Base, Channel, as_column, reading_with
 
 MAGICS = (b"MDF     ", b"UnFinMF ")
@@ -32,9 +34,9 @@ class MdfSource:
 
     has_clock = True
 
-    def __init__(self, file: Path, mdf: Any) -> None:
-        """Take the file's path and what asammdf has opened."""
-        self._file, self._mdf = file, mdf
+    def __init__(self, mdf: Any, budget: Budget) -> None:
+        """Take what asammdf has opened, and what may become of it."""
+        self._file, self._mdf, self._budget = budget.file, mdf, budget
         start = mdf.start_time.timestamp()
         self._start_s = start if start > _EARLIEST_S else 0.0
 
@@ -187,6 +189,8 @@ class MdfSource:
                 f"of {size:,} bytes, and there are {whole:,}: it is truncated or damaged. Copy it "
                 "again."
             )
+        self._budget.require_unfolded(whole)
+        self._budget.require_rows(samples)
 
     def _find(self, name: str) -> tuple[int, int]:
         places = self._places(name)
@@ -216,20 +220,27 @@ class MdfSource:
 
 
 @contextmanager
-def open_mdf(file: Path) -> Iterator[MdfSource]:
-    """Open an MDF file. Raises `InputError`."""
+def open_mdf(budget: Budget) -> Iterator[MdfSource]:
+    """Open an MDF file. Raises `InputError`.
+
+    An attachment may be any other file, and so may the database by which asammdf would decode bus
+    logging at once: nothing is read of either.
+    """
+    file = budget.file
+    require_tree(file)
     # It leaves copies of unfinalised files behind, and more where it fails.
     with TemporaryDirectory(prefix="fleet-slip-", ignore_cleanup_errors=True) as folder:
         with reading_with(file, "asammdf") as asammdf:
             try:
-                mdf = asammdf.MDF(file, temporary_folder=folder)
+                mdf = asammdf.MDF(file, temporary_folder=folder, process_bus_logging=False)
             except Exception as error:
                 _close_half_made(error)
                 raise
         if getattr(mdf._mdf, "_delete_on_close", False):
             mdf._mdf.name.unlink()  # it stays open, and goes with the process however that ends
+        mdf._mdf.extract_attachment = lambda *_, **__: (b"", Path(), b"")
         try:
-            yield MdfSource(file, mdf)
+            yield MdfSource(mdf, budget)
         finally:
             mdf.close()
 

@@ -5,13 +5,13 @@ ASAM's associated standard names the channels: a group of frames has `CAN_DataFr
 
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.errors import InputError
+from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.can_bus import CanBus
 from fleet_slip.ingest.formats.can_decoding import Bytes
 from fleet_slip.ingest.formats.can_trace import CanSource, parse_database
@@ -29,10 +29,10 @@ class MdfBus(CanSource):
     """The CAN messages of an MDF file."""
 
     def __init__(
-        self, file: Path, bus: CanBus, database: Any, spool: Spool, mdf: MdfSource
+        self, bus: CanBus, database: Any, spool: Spool, budget: Budget, mdf: MdfSource
     ) -> None:
         """Take what a trace does, and the open file."""
-        super().__init__(file, bus, database, spool)
+        super().__init__(bus, database, spool, budget)
         self._mdf = mdf
 
     def _read_trace(self) -> None:
@@ -85,8 +85,8 @@ def _payloads(samples: NDArray[Any]) -> Bytes:
 
 
 @contextmanager
-def open_mdf_bus(file: Path, bus: CanBus) -> Iterator[MdfBus]:
+def open_mdf_bus(bus: CanBus, budget: Budget) -> Iterator[MdfBus]:
     """Open an MDF file for the CAN frames in it. Raises `InputError`."""
     database = parse_database(bus)
-    with closing(Spool()) as spool, open_mdf(file) as mdf:
-        yield MdfBus(file, bus, database, spool, mdf)
+    with closing(Spool()) as spool, open_mdf(budget) as mdf:
+        yield MdfBus(bus, database, spool, budget, mdf)

@@ -13,6 +13,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from fleet_slip.errors import InputError
+from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.columns import require_columns, shown
 from fleet_slip.ingest.formats.source import Channel
 
@@ -36,14 +37,16 @@ class ParquetSource:
 
     has_clock = False
 
-    def __init__(self, file: Path, stream: pa.NativeFile) -> None:
-        """Take the file's path and its bytes."""
-        _require_sane_footer(stream, file)
-        self._file, self._stream = file, stream
-        self._schema = pq.ParquetFile(stream).schema_arrow
+    def __init__(self, stream: pa.NativeFile, budget: Budget) -> None:
+        """Take the bytes of a file, and what it may become."""
+        _require_sane_footer(stream, budget.file)
+        self._file, self._stream = budget.file, stream
+        parquet = pq.ParquetFile(stream)
+        _require_within(budget, parquet.metadata)
+        self._schema = parquet.schema_arrow
         self._keys = {
             name: text
-            for name, text in partition_keys(file).items()
+            for name, text in partition_keys(budget.file).items()
             if name not in self._schema.names
         }
 
@@ -62,11 +65,11 @@ class ParquetSource:
 
 
 @contextmanager
-def open_parquet(file: Path) -> Iterator[ParquetSource]:
+def open_parquet(budget: Budget) -> Iterator[ParquetSource]:
     """Open a Parquet file. Raises `InputError`."""
     # Not Python's own file: each read of Arrow's threads would wait for the interpreter.
-    with pa.OSFile(os.fsencode(file), "rb") as stream:
-        yield ParquetSource(file, stream)
+    with pa.OSFile(os.fsencode(budget.file), "rb") as stream:
+        yield ParquetSource(stream, budget)
 
 
 def partition_keys(file: Path) -> dict[str, str]:
@@ -107,6 +110,18 @@ def _require_sane_footer(stream: pa.NativeFile, file: Path) -> None:
     if int.from_bytes(tail[:4], "little") > MAX_FOOTER_BYTES:
         raise InputError(
             f"{shown(file)}: its footer is too large. Write fewer columns or row groups."
+        )
+
+
+def _require_within(budget: Budget, metadata: pq.FileMetaData) -> None:
+    """Raise `InputError` for more rows or bytes than a file can have, or those of another file."""
+    groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
+    budget.require_rows(max(metadata.num_rows, sum(group.num_rows for group in groups)))
+    budget.require_unfolded(sum(group.total_byte_size for group in groups))
+    if any(group.num_columns and group.column(0).file_path for group in groups):
+        raise InputError(
+            f"{shown(budget.file)}: its values are in other files: it is the index of a dataset. "
+            "Give the files themselves."
         )
 
 

@@ -13,6 +13,8 @@ import polars as pl
 import pyarrow as pa
 
 from fleet_slip.errors import InputError
+from fleet_slip.ingest.formats.budget import Budget
+from fleet_slip.ingest.formats.can_blocks import BLF_MAGIC
 from fleet_slip.ingest.formats.can_bus import CanBus
 from fleet_slip.ingest.formats.can_trace import open_can_trace
 from fleet_slip.ingest.formats.columns import shown
@@ -31,7 +33,6 @@ from fleet_slip.ingest.formats.parquet_batches import PARQUET_MAGIC, open_parque
 from fleet_slip.ingest.formats.source import Source
 from fleet_slip.ingest.landing.log_files import parts_of
 
-BLF_MAGIC = b"LOGG"
 _ARCHIVES = {b"PK\x03\x04": "unzip", b"7z\xbc\xaf": "7z x", b"Rar!": "unrar x"}
 _BINARY = {
     (".parquet", ".pq"): "a Parquet file",
@@ -115,7 +116,12 @@ def log_digest(log: Path) -> "hashlib._Hash":
 
 @contextmanager
 def open_source(file: Path, formats: Formats) -> Iterator[Source]:
-    """Open a file, in the format that its first bytes tell. Raises `InputError`."""
+    """Open a file, in the format that its first bytes tell. Raises `InputError`.
+
+    Each format makes sure that the file stands for itself: that no value of it is to be fetched
+    from another file, or computed, and that it is not far more than its `Budget` once decoded.
+    """
+    budget = Budget.of(file)
     with file.open("rb") as stream:
         start = stream.read(HDF5_AT + len(HDF5_MAGIC))
     for magic, program in _ARCHIVES.items():
@@ -123,30 +129,32 @@ def open_source(file: Path, formats: Formats) -> Iterator[Source]:
             raise InputError(
                 f"{shown(file)}: it is an archive. Unpack it with {program} and give the files."
             )
-    with _opened(file, start, formats) as source:
+    with _opened(file, start, formats, budget) as source:
         yield source
 
 
-def _opened(file: Path, start: bytes, formats: Formats) -> AbstractContextManager[Source]:
+def _opened(
+    file: Path, start: bytes, formats: Formats, budget: Budget
+) -> AbstractContextManager[Source]:
     if start.startswith(MDF_MAGICS) and formats.can is not None:
-        return open_mdf_bus(file, formats.can)
+        return open_mdf_bus(formats.can, budget)
     for is_it, open_it in _FORMATS:
         if is_it(start):
-            return open_it(file)
+            return open_it(budget)
     if start[DUCKDB_AT:].startswith(DUCKDB_MAGIC):
-        return open_duckdb(file, _wanted(formats.duckdb, file, "duckdb", 'table = "…"', formats))
+        rows = _wanted(formats.duckdb, file, "duckdb", 'table = "…"', formats)
+        return open_duckdb(rows, budget)
     suffix = file.suffix.lower()
     if formats.can is not None or start.startswith(BLF_MAGIC) or suffix in {".blf", ".asc"}:
-        return open_can_trace(
-            file, _wanted(formats.can, file, "can", 'database = "….dbc"', formats)
-        )
+        bus = _wanted(formats.can, file, "can", 'database = "….dbc"', formats)
+        return open_can_trace(bus, budget)
     for suffixes, kind in _BINARY.items():
         if suffix in suffixes:
             raise InputError(
                 f"{shown(file)}: not {kind}, whatever its name says. Export it again, or name it "
                 "as what it is."
             )
-    return open_csv(file, formats.csv, formats.plain_numbers)
+    return open_csv(budget, formats.csv, formats.plain_numbers)
 
 
 def _wanted(told: Told | None, file: Path, table: str, key: str, formats: Formats) -> Told:
@@ -160,7 +168,7 @@ def _wanted(told: Told | None, file: Path, table: str, key: str, formats: Format
 
 
 _FORMATS: tuple[
-    tuple[Callable[[bytes], bool], Callable[[Path], AbstractContextManager[Source]]], ...
+    tuple[Callable[[bytes], bool], Callable[[Budget], AbstractContextManager[Source]]], ...
 ] = (
     (lambda start: start.startswith(PARQUET_MAGIC), open_parquet),
     (lambda start: start.startswith(MDF_MAGICS), open_mdf),

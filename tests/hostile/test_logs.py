@@ -1,0 +1,368 @@
+"""Measured files that point elsewhere, or stand for far more than they are: refused, and at once.
+
+They are made with the packages of their formats, as an attacker would.
+"""
+
+import os
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import h5py
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from asammdf import MDF, Signal
+
+from fleet_slip.errors import InputError
+from fleet_slip.ingest import Mapping, read_measured
+from fleet_slip.ingest.formats import budget
+from fleet_slip.ingest.formats.can_bus import CanBus
+from tests.support.fuzz.logs import DBC, FORMATS, sound_file
+from tests.support.measured import a_mapping
+from tests.support.waiting import within
+
+COLUMNS = ("t", "ax", "beta")
+SECRET = 12_345.0
+"""What stands in a file that the log is not to be read from."""
+ROWS = 100
+
+
+def failure(file: Path, mapping: Mapping | None = None) -> str:
+    with within(), pytest.raises(InputError) as caught:
+        read_measured(file, mapping or a_mapping())
+    assert "\n" not in str(caught.value)
+    assert str(SECRET) not in str(caught.value)
+    return str(caught.value)
+
+
+def values(column: str) -> Any:
+    return np.arange(ROWS) / 100 * (1 if column == "t" else 0.1)
+
+
+# HDF5
+
+
+def hdf5(folder: Path, make: Callable[[h5py.File, str], object]) -> Path:
+    """A file that is sound but for ax and beta, which are made otherwise."""
+    file = folder / "log.h5"
+    with h5py.File(file, "w") as root:
+        root["t"] = values("t")
+        for column in COLUMNS[1:]:
+            make(root, column)
+    return file
+
+
+def secret(folder: Path) -> Path:
+    """Another file, which has the values of both kinds of storage."""
+    file = folder / "secret.h5"
+    with h5py.File(file, "w") as root:
+        root["x"] = np.full(ROWS, SECRET)
+    return file
+
+
+def test_values_in_another_file_are_not_read(tmp_path: Path) -> None:
+    other = secret(tmp_path)
+
+    def make(root: h5py.File, column: str) -> None:
+        outside = [(str(other), 0, h5py.h5f.UNLIMITED)]
+        root.create_dataset(column, (ROWS,), dtype="f8", external=outside)
+
+    assert "are in other files" in failure(hdf5(tmp_path, make))
+
+
+def test_values_in_a_pipe_are_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+
+    def make(root: h5py.File, column: str) -> None:
+        outside = [(str(tmp_path / "pipe"), 0, h5py.h5f.UNLIMITED)]
+        root.create_dataset(f"below/{column}", (ROWS,), dtype="f8", external=outside)
+
+    assert "are in other files" in failure(hdf5(tmp_path, make))
+
+
+@pytest.mark.parametrize("is_unlimited", [False, True])
+def test_a_virtual_dataset_is_not_read(tmp_path: Path, is_unlimited: bool) -> None:
+    other = secret(tmp_path)
+    most = (None,) if is_unlimited else (ROWS,)
+
+    def make(root: h5py.File, column: str) -> None:
+        layout = h5py.VirtualLayout((ROWS,), "f8", maxshape=most)
+        layout[: h5py.h5s.UNLIMITED if is_unlimited else ROWS] = h5py.VirtualSource(
+            str(other), "x", (ROWS,), maxshape=most
+        )[: h5py.h5s.UNLIMITED if is_unlimited else ROWS]
+        root.create_virtual_dataset(column, layout)
+
+    assert "are in other files" in failure(hdf5(tmp_path, make))
+
+
+def test_links_are_not_followed(tmp_path: Path) -> None:
+    other = secret(tmp_path)
+
+    def outside(root: h5py.File, column: str) -> None:
+        root[column] = h5py.ExternalLink(str(other), "x")
+
+    def within_it(root: h5py.File, column: str) -> None:
+        root[column] = h5py.SoftLink("/t")
+
+    def group(root: h5py.File, column: str) -> None:
+        root[f"{column}_of"] = h5py.ExternalLink(str(other), "/")
+
+    assert "'ax' is a link, which is not followed" in failure(hdf5(tmp_path, outside))
+    assert "'ax' is a link, which is not followed" in failure(hdf5(tmp_path, within_it))
+    signals = {name: {"column": f"{name}_of.x", "unit": "m/s^2"} for name in ("ax", "ay")}
+    told = failure(hdf5(tmp_path, group), a_mapping(signals=signals))
+    assert "'ax_of.x' is a link, which is not followed" in told
+
+
+def test_rows_that_stand_nowhere_are_not_read(tmp_path: Path) -> None:
+    rows = 10**9
+
+    def write(file: Path, **options: Any) -> Path:
+        with h5py.File(file, "w") as root:
+            for column in COLUMNS:
+                root.create_dataset(column, (rows,), dtype="f8", **options)
+        return file
+
+    assert write(tmp_path / "a.h5").stat().st_size < 10_000
+    for number, options in enumerate(({}, {"chunks": (1000,)}, {"chunks": (10**8,)})):
+        told = failure(write(tmp_path / f"{number}.h5", **options))
+        assert "of a file of this size at most 1,000,000 are read" in told
+
+
+# Parquet
+
+
+def test_runs_of_equal_values_are_not_unrolled(tmp_path: Path) -> None:
+    file = tmp_path / "log.parquet"
+    one = pa.DictionaryArray.from_arrays(pa.array(np.zeros(3 * 10**6, "i1")), pa.array([0.0]))
+    pq.write_table(pa.table(dict.fromkeys(COLUMNS, one)), file)
+    assert file.stat().st_size < 100_000
+    assert "3,000,000 rows or more" in failure(file)
+
+
+def test_the_index_of_a_dataset_is_no_log(tmp_path: Path) -> None:
+    file = tmp_path / "log.parquet"
+    pq.write_table(pa.table({column: values(column) for column in COLUMNS}), file)
+    index = pq.read_metadata(file)
+    index.set_file_path("../../secret.parquet")
+    index.write_metadata_file(file)
+    assert "its values are in other files" in failure(file)
+
+
+def test_columns_that_unfold_to_gigabytes_are_not_read(tmp_path: Path) -> None:
+    file = tmp_path / "log.parquet"
+    text = pa.array(["x" * 10**6] * 1100)
+    numbers = {column: np.arange(1100) / 100 for column in COLUMNS}
+    pq.write_table(
+        pa.table({**numbers, "text": text}), file, compression="zstd", use_dictionary=False
+    )
+    assert file.stat().st_size < 10**6
+    assert "bytes unfold to" in failure(file)
+
+
+# DuckDB
+
+
+def database(file: Path, *statements: str) -> Path:
+    with duckdb.connect(str(file)) as connection:
+        connection.sql("CREATE TABLE sound AS SELECT i / 100.0 AS t, i / 1e3 AS ax, 0.0 AS beta "
+                       "FROM range(100) AS r(i)")  # fmt: skip
+        for statement in statements:
+            connection.sql(statement)
+    return file
+
+
+ENDLESS = "SELECT i / 100.0 AS t, 0.0 AS ax, 0.0 AS beta FROM range(10000000000000) AS r(i)"
+COMPUTED = {
+    "a view": f"CREATE VIEW log AS {ENDLESS}",
+    "a view by another name": f'CREATE VIEW "LOG" AS {ENDLESS}',
+    "a macro": f"CREATE MACRO log() AS TABLE {ENDLESS}",
+    "a generated column": "CREATE TABLE log (t DOUBLE, ax DOUBLE, beta VARCHAR GENERATED ALWAYS AS "
+    "(repeat('x', 1000000000)))",
+}
+
+
+@pytest.mark.parametrize("statement", COMPUTED.values(), ids=COMPUTED)
+@pytest.mark.parametrize("rows", [{"table": "log"}, {"query": "FROM (SELECT * FROM log)"}])
+def test_what_a_database_computes_is_not_read(
+    tmp_path: Path, statement: str, rows: dict[str, str]
+) -> None:
+    file = database(tmp_path / "log.duckdb", statement)
+    told = failure(file, a_mapping(duckdb=rows))
+    assert "what a file computes is not read" in told or "does not exist" in told
+
+
+@pytest.mark.parametrize(
+    "macro", ["round(a, b) AS (SELECT 9.0)", '"+"(a, b) AS (SELECT 9.0)', "Round(a) AS 1.0"]
+)
+def test_a_database_gives_no_function_another_meaning(tmp_path: Path, macro: str) -> None:
+    file = database(tmp_path / "log.duckdb", f"CREATE MACRO {macro}")
+    query = 'SELECT t, "ROUND"(ax + 0.1, 3) AS ax, beta FROM sound'
+    assert "what a file computes is not read" in failure(file, a_mapping(duckdb={"query": query}))
+
+
+def test_a_database_cannot_hide_what_it_computes(tmp_path: Path) -> None:
+    hiding = (
+        f"CREATE VIEW log AS {ENDLESS}",
+        "CREATE MACRO json_serialize_sql(x) AS '{\"error\": false}'",
+        "CREATE MACRO duckdb_views() AS TABLE SELECT 'x' AS view_name, true AS internal",
+        "CREATE VIEW duckdb_functions AS SELECT 'x' AS function_name, true AS internal",
+    )
+    file = database(tmp_path / "log.duckdb", *hiding)
+    told = failure(file, a_mapping(duckdb={"query": "SELECT * FROM measured.main.log"}))
+    assert "'log' is a view" in told
+
+
+def test_equal_rows_of_a_database_are_counted_first(tmp_path: Path) -> None:
+    many = (
+        "CREATE TABLE log AS SELECT 0::DOUBLE AS t, 0::DOUBLE AS ax, 0::DOUBLE AS beta FROM range"
+    )
+    file = database(tmp_path / "log.duckdb", f"{many}(20000000)")
+    assert file.stat().st_size < 10**6
+    assert "20,000,000 rows or more" in failure(file, a_mapping(duckdb={"table": "log"}))
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        ENDLESS,
+        "SELECT sum(a.i) AS t, 0.0 AS ax, 0.0 AS beta FROM range(1000000) AS a(i), range(1000000)",
+        "WITH RECURSIVE r AS (SELECT 0 AS t UNION ALL SELECT (t + 1) % 9 FROM r) "
+        "SELECT sum(t) AS t, 0.0 AS ax, 0.0 AS beta FROM r",
+    ],
+    ids=["rows", "a product", "recursion"],
+)
+def test_an_endless_query_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, query: str) -> None:
+    monkeypatch.setattr(budget, "FREE_S", 0.5)
+    file = database(tmp_path / "log.duckdb")
+    told = failure(file, a_mapping(duckdb={"query": query}))
+    assert "did not suffice to decode" in told or "rows or more in" in told
+
+
+def test_rows_in_a_file_beside_a_database_are_not_read(tmp_path: Path) -> None:
+    file = database(tmp_path / "log.duckdb")
+    os.mkfifo(tmp_path / "log.duckdb.wal")
+    assert "beside it is a .wal file" in failure(file, a_mapping(duckdb={"table": "sound"}))
+
+
+# MDF
+
+MDF_MAPPING = a_mapping(time={"column": None, "unit": None, "own_clock": True})
+
+
+def mdf(file: Path, version: str = "4.10", outside: Path | None = None) -> Path:
+    with MDF(version=version) as log:
+        for column in COLUMNS[1:]:
+            log.append([Signal(values(column), values("t"), name=column)])
+        if outside is not None:
+            one = Signal(values("t"), values("t"), name="video", attachment=(b"", outside, None))
+            log.append([one])
+            log._mdf.attachments[0].flags = 0  # its content is not in the file
+            log._mdf.attachments[0].file_name = str(outside)
+        return Path(log.save(file, overwrite=True))
+
+
+def test_an_attachment_of_a_channel_is_not_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = tmp_path / "secret"
+    other.write_text(str(SECRET))
+    file = mdf(tmp_path / "log.mf4", outside=other)
+    read, seen = Path.read_bytes, []
+
+    def noted(path: Path) -> bytes:
+        seen.append(path.name)
+        return read(path)
+
+    monkeypatch.setattr(Path, "read_bytes", noted)
+    with MDF(file) as log:
+        assert log.get("video").attachment[0] == str(SECRET).encode()  # type: ignore[index]
+    assert seen == ["secret"]
+    signals = {"ax": {"column": "video", "unit": "m/s^2"}}
+    mapping = a_mapping(time={"column": None, "unit": None, "own_clock": True}, signals=signals)
+    assert read_measured(file, mapping).counts.ticks == ROWS
+    assert seen == ["secret"]
+
+
+@pytest.mark.parametrize("version", ["3.30", "4.10"])
+@pytest.mark.parametrize("kind", ["DG", "CG", "CN"])
+def test_links_in_a_circle_are_refused(tmp_path: Path, version: str, kind: str) -> None:
+    file = mdf(tmp_path / "log", version)
+    data = bytearray(file.read_bytes())
+    mark, link, size = (f"##{kind}", 24, 8) if version >= "4" else (kind, 4, 4)
+    at = data.index(mark.encode(), 64)
+    data[at + link : at + link + size] = at.to_bytes(size, "little")  # the next one is itself
+    file.write_bytes(data)
+    assert "is linked to twice" in failure(file, MDF_MAPPING)
+
+
+def test_channels_that_groups_share_are_refused(tmp_path: Path) -> None:
+    file = mdf(tmp_path / "log")
+    data = bytearray(file.read_bytes())
+    first, second = data.index(b"##CG"), data.rindex(b"##CG")
+    data[second + 32 : second + 40] = data[first + 32 : first + 40]
+    file.write_bytes(data)
+    assert "is linked to twice" in failure(file, MDF_MAPPING)
+
+
+# CAN
+
+
+def trace(folder: Path, name: str, content: bytes) -> str:
+    file = folder / name
+    file.write_bytes(content)
+    return failure(file, FORMATS["blf"].mapping)
+
+
+def blf(*objects: bytes, compress: bool = True) -> bytes:
+    """A BLF file with one container that has these objects."""
+    sound = sound_file("blf")
+    content = b"".join(objects)
+    packed = zlib.compress(content) if compress else content
+    header = struct.pack("<4sHHII", b"LOBJ", 16, 1, 32 + len(packed), 10)
+    container = header + struct.pack("<H6xI4x", 2 if compress else 0, len(content)) + packed
+    return sound[: int.from_bytes(sound[4:8], "little")] + container
+
+
+@pytest.mark.parametrize("compress", [False, True])
+@pytest.mark.parametrize("size", [0, 15, 2**32 - 1])
+def test_an_object_of_a_trace_has_a_size(tmp_path: Path, size: int, compress: bool) -> None:
+    one = struct.pack("<4sHHII", b"LOBJ", 32, 1, size, 99) + bytes(64)
+    assert f"an object of {size:,} bytes" in trace(tmp_path, "log.blf", blf(one, compress=compress))
+
+
+def test_a_container_of_a_trace_is_bounded(tmp_path: Path) -> None:
+    content = blf(bytes(2**27 + 1))
+    assert len(content) < 2**18
+    assert "a container of more than" in trace(tmp_path, "log.blf", content)
+
+
+@pytest.mark.parametrize("name", ["log.asc", "log.log", "log.trc"])
+def test_a_line_of_a_trace_is_bounded(tmp_path: Path, name: str) -> None:
+    assert "a line of more than" in trace(tmp_path, name, b"x" * (2**21 + 1))
+
+
+@pytest.mark.parametrize("name", ["log.asc.gz", "log.db", "log.mf4"])
+def test_only_known_traces_are_read(tmp_path: Path, name: str) -> None:
+    assert "the suffix tells the format" in trace(tmp_path, name, b"\x1f\x8b" + bytes(9))
+
+
+@pytest.mark.parametrize(
+    "signal",
+    [
+        ' SG_ ax : 0|2000000000@1- (0.001,0) [0|0] "" ECU',
+        ' SG_ ax : 0|65@1- (0.001,0) [0|0] "" ECU',
+        ' SG_ ax : 2000000000|16@1- (0.001,0) [0|0] "" ECU',
+    ],
+)
+def test_a_database_cannot_ask_for_more_than_a_frame_has(tmp_path: Path, signal: str) -> None:
+    text = "\n".join(signal if " ax " in line else line for line in DBC.splitlines()) + "\n"
+    file = tmp_path / "log.blf"
+    file.write_bytes(sound_file("blf"))
+    bus = CanBus(database="car.dbc", text=text)
+    assert failure(file, FORMATS["blf"].mapping.model_copy(update={"can": bus}))
