@@ -6,7 +6,9 @@ from pathlib import Path
 import pytest
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.landing.ingest_job import ingest_file
+from fleet_slip.ingest import read_measured
+from fleet_slip.ingest.landing.ingest_job import ingest_file, ingest_files
+from fleet_slip.ingest.landing.log_files import StrayLink, find_logs
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.measured import a_mapping, csv_text, good_columns
 
@@ -46,3 +48,43 @@ def test_links_to_what_is_no_file_are_refused(
     with pytest.raises(InputError):
         ingest_file(warehouse, link, a_mapping())
     assert not (tmp_path / "data").exists()
+
+
+def test_a_link_out_of_a_folder_is_refused_and_holds_nothing_up(
+    warehouse: Warehouse, tmp_path: Path
+) -> None:
+    folder, other = tmp_path / "landing", tmp_path / "private"
+    folder.mkdir()
+    other.mkdir()
+    (folder / "a.csv").write_text(csv_text(good_columns()))
+    (other / "secret.csv").write_text(csv_text(good_columns(30)))
+    for name, target in {
+        "b.csv": other / "secret.csv",
+        "c.csv": Path("../private/secret.csv"),
+        "d.csv": folder / "b.csv",
+        "e.csv": Path("/dev/zero"),
+        "f.csv": folder / "a.csv",
+    }.items():
+        (folder / name).symlink_to(target)
+    (folder / "below").symlink_to(other)
+    reports = []
+    with pytest.raises(InputError, match=r"4 files cannot be used; all others are in.*b\.csv"):
+        reports += list(ingest_files(warehouse, find_logs([folder]), a_mapping()))
+    assert warehouse.logs.snapshot().rows == 20
+
+
+def test_a_pattern_does_not_lead_out_of_its_folder(tmp_path: Path) -> None:
+    folder, other = tmp_path / "landing", tmp_path / "private"
+    (folder / "sound").mkdir(parents=True)
+    other.mkdir()
+    for file in (folder / "sound" / "a.csv", other / "secret.csv"):
+        file.write_text(csv_text(good_columns()))
+    (folder / "below").symlink_to(other)
+    found = find_logs([f"{folder}/**/*.csv"])
+    strays = {str(file): isinstance(file, StrayLink) for file in found}
+    assert strays == {str(folder / "sound/a.csv"): False, str(folder / "below/secret.csv"): True}
+    (folder / "sound" / "b.csv").symlink_to(other / "secret.csv")
+    with pytest.raises(InputError, match=r"b\.csv: it is behind a link"):
+        read_measured(folder / "sound", a_mapping())
+    (tmp_path / "link").symlink_to(folder)  # a person's own link to a folder is followed
+    assert not isinstance(find_logs([tmp_path / "link" / "sound"])[0], StrayLink)

@@ -260,10 +260,11 @@ def mdf(file: Path, version: str = "4.10", outside: Path | None = None) -> Path:
         for column in COLUMNS[1:]:
             log.append([Signal(values(column), values("t"), name=column)])
         if outside is not None:
-            one = Signal(values("t"), values("t"), name="video", attachment=(b"", outside, None))
-            log.append([one])
-            log._mdf.attachments[0].flags = 0  # its content is not in the file
-            log._mdf.attachments[0].file_name = str(outside)
+            attached = (b"", outside, b"")
+            log.append([Signal(values("t"), values("t"), name="video", attachment=attached)])
+            attachments: Any = log._mdf
+            attachments.attachments[0].flags = 0  # its content is not in the file
+            attachments.attachments[0].file_name = str(outside)
         return Path(log.save(file, overwrite=True))
 
 

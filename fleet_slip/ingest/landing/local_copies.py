@@ -15,7 +15,7 @@ from typing import Self
 from fleet_slip.errors import FleetSlipError, InputError
 from fleet_slip.files.folder import StoredFile
 from fleet_slip.files.storage_errors import storage_errors
-from fleet_slip.ingest.landing.log_files import Log, StoredParts, stored_parts
+from fleet_slip.ingest.landing.log_files import Log, StoredParts, require_inside, stored_parts
 
 AT_ONCE = 16
 
@@ -61,6 +61,7 @@ class LocalCopies:
         `StorageError`.
         """
         if isinstance(log, Path):
+            require_inside(log)
             yield log
             return
         copy = self._copies[log].result()

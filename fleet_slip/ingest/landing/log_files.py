@@ -6,8 +6,9 @@ They are on this machine, or on an object store.
 import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from glob import glob
-from pathlib import Path
+from pathlib import Path, PosixPath
 from typing import TypeAlias
 
 from fleet_slip.errors import InputError, UsageError
@@ -30,6 +31,13 @@ class StoredParts:
     def __str__(self) -> str:
         """Return the URL."""
         return self.url
+
+
+class StrayLink(PosixPath):
+    """A file that was found in a folder, and is behind a link that leads out of it.
+
+    Who may put files into a folder must not choose which others of this machine are read.
+    """
 
 
 Log: TypeAlias = Path | StoredFile | StoredParts
@@ -73,7 +81,7 @@ def find_files(path: Path) -> list[Path]:
     inside = sorted(_logs_below(path))
     if not inside:
         raise InputError(f"{shown(path)}: {_NO_LOG}")
-    return inside
+    return _without_strays(inside, path)
 
 
 def names_several(place: Place) -> bool:
@@ -95,7 +103,19 @@ def is_pattern(place: Place) -> bool:
 
 def parts_of(log: Path) -> list[Path]:
     """Return the files that one log is in: itself, or those of its folder. Raises `InputError`."""
-    return find_files(log)
+    files = find_files(log)
+    for file in files:
+        require_inside(file)
+    return files
+
+
+def require_inside(file: Path) -> None:
+    """Raise `InputError` for a link that leads out of the folder in which it was found."""
+    if isinstance(file, StrayLink):
+        raise InputError(
+            f"{shown(file)}: it is behind a link that leads out of its folder, and not followed. "
+            "Give the file by its own path."
+        )
 
 
 def stored_parts(log: StoredFile | StoredParts) -> list[StoredFile]:
@@ -128,7 +148,20 @@ def _matching(pattern: Path) -> list[Path]:
     files = [path for path in map(Path, names) if path.is_file()]
     if not files:
         raise InputError(f"{shown(pattern)}: no file matches this pattern. Look at its folder.")
-    return files
+    plain = [part for part in pattern.parents if not any(c in str(part) for c in "*?[")]
+    return _without_strays(files, plain[0])
+
+
+def _without_strays(files: list[Path], folder: Path) -> list[Path]:
+    """Return files that were found below a folder, marked where they are in truth elsewhere."""
+    top = os.path.realpath(folder)
+    real = cache(os.path.realpath)
+
+    def is_inside(file: Path) -> bool:
+        place = os.path.realpath(file) if file.is_symlink() else f"{real(file.parent)}/"
+        return os.path.commonpath([top, place]) == top
+
+    return [file if is_inside(file) else StrayLink(file) for file in files]
 
 
 def _logs_below(folder: Path) -> Iterator[Path]:
