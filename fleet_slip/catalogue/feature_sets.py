@@ -11,6 +11,7 @@ from itertools import pairwise
 
 from pydantic import Field, model_validator
 
+from fleet_slip.catalogue.course_change import TURNED
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, Identifier, catalogue
 from fleet_slip.config import Config
 
@@ -60,6 +61,8 @@ class FeatureSet(Config):
     block_s: Decimal | None = Field(default=None, gt=0, le=100_000)
     row_folds: int | None = Field(default=None, ge=2, le=1000)
     lagged: bool = False
+    change_s: Decimal | None = Field(default=None, gt=0, le=10)
+    """Instead of the columns, what they change by in so much time, with the course as the label."""
 
     @model_validator(mode="after")
     def _consistent(self) -> "FeatureSet":
@@ -72,14 +75,25 @@ class FeatureSet(Config):
             raise ValueError("a set has regimes, block_s, row_folds or lagged, not several of them")
         if (self.windows or self.calibrated) and (self.row_folds or self.lagged):
             raise ValueError("a set with windows has no row_folds or lagged")
-        if self.block_s is not None and Fraction(self.block_s) % SAMPLE_TIME_S:
-            raise ValueError(f"block_s must be a multiple of {float(SAMPLE_TIME_S)}")
+        if self.change_ticks and (self.row_folds or self.lagged or self.regimes or self.block_s):
+            raise ValueError("a set with change_s does not divide rows")
+        if self.change_ticks and (not self.windows or self.calibrated):
+            raise ValueError("a set with change_s has windows, and no calibrated columns")
+        for name in ("block_s", "change_s"):
+            time_s = getattr(self, name)
+            if time_s is not None and Fraction(time_s) % SAMPLE_TIME_S:
+                raise ValueError(f"{name} must be a multiple of {float(SAMPLE_TIME_S)}")
         return self
 
     @property
     def block_ticks(self) -> int | None:
         """Number of ticks of a block of time; None where rows are not divided by time."""
         return None if self.block_s is None else int(Fraction(self.block_s) / SAMPLE_TIME_S)
+
+    @property
+    def change_ticks(self) -> int | None:
+        """Number of ticks over which columns change; None where they stand for themselves."""
+        return None if self.change_s is None else int(Fraction(self.change_s) / SAMPLE_TIME_S)
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -89,5 +103,6 @@ class FeatureSet(Config):
     @property
     def columns(self) -> tuple[str, ...]:
         """The columns of a Gram row, in its order; calibrated ones follow from it."""
-        now = (*self.signals, *self.features, *self.windows, catalogue().label)
+        turned = (TURNED,) if self.change_ticks else ()
+        now = (*self.signals, *self.features, *self.windows, *turned, catalogue().label)
         return lag_signals(now) if self.lagged else now

@@ -16,6 +16,7 @@ from pydantic import Field, ValidationError, model_validator
 from fleet_slip.canonical import canonical_json, sha256_of
 from fleet_slip.catalogue.column_sql import with_features, with_windows
 from fleet_slip.catalogue.columns import COUNT_BITS, Definition
+from fleet_slip.catalogue.course_change import TURNED, course_units
 from fleet_slip.catalogue.feature_sets import PLAIN, FeatureSet, Regime
 from fleet_slip.catalogue.gates import GateFamily, gated_columns
 from fleet_slip.catalogue.row_features import Feature
@@ -52,7 +53,7 @@ class FeatureCatalogue(Config):
         signals = catalogue()
         taken = {*signals.signals, *(s.column for s in signals.signals.values()), *signals.drive}
         columns: dict[str, Feature | TimeColumn] = {**self.features, **self.time_columns}
-        taken |= {"day", "tick", "clipped"}
+        taken |= {"day", "tick", "clipped", TURNED}
         names = [*columns, *(one.column for one in columns.values())]
         twice = sorted(name for name in names if name in taken or names.count(name) > 1)
         if twice:
@@ -186,6 +187,8 @@ class FeatureCatalogue(Config):
             content["extras"] = {name: str(catalogue()[name].scale) for name in extras}
         if one.block_ticks:
             content["block_ticks"] = one.block_ticks
+        if one.change_ticks:
+            content["change"] = {"ticks": one.change_ticks, **vars(course_units())}
         if one.windows:
             content["windows"] = {
                 w: self.time_columns[w].model_dump(mode="json", exclude={"description"})

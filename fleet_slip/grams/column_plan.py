@@ -6,6 +6,7 @@ from functools import cached_property, lru_cache
 
 from fleet_slip.catalogue.arithmetic import parse
 from fleet_slip.catalogue.columns import Definition, features_behind, limit_of
+from fleet_slip.catalogue.course_change import COURSE, YAW_RATE
 from fleet_slip.catalogue.features import FeatureCatalogue
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError
@@ -58,7 +59,7 @@ class ColumnPlan:
 
     @classmethod
     def of_set(cls, known: FeatureCatalogue, name: str) -> "ColumnPlan":
-        """Plan the columns of a feature set, the label last."""
+        """Plan the columns of a feature set, the label last; of changes, what makes it."""
         one = known.feature_set(name)
         divided_by = [known.regimes[regime].of for regime in one.regimes]
         features = {
@@ -66,7 +67,8 @@ class ColumnPlan:
             for f in (*one.features, *divided_by)
             if f in known.features
         }
-        return cls.of(one.columns, features, known.definitions(name), divided_by)
+        columns = (*one.inputs, COURSE, YAW_RATE) if one.change_ticks else one.columns
+        return cls.of(columns, features, known.definitions(name), divided_by)
 
     @property
     def signals(self) -> tuple[str, ...]:

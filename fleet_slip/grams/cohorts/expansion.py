@@ -20,6 +20,7 @@ from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import ALL_DRIVES
 from fleet_slip.grams.calibration.calibration import calibration_of
 from fleet_slip.grams.cohorts.reader import OpenedGrams
+from fleet_slip.grams.cohorts.sweeping import swept
 from fleet_slip.grams.rows.gram_rows import by_signals, gram_table
 from fleet_slip.regression.exact.gram import packed_position
 from fleet_slip.regression.exact.gram_table import GramTable
@@ -38,10 +39,12 @@ class Expansion:
     Attributes:
         columns: the column that each is made of, and its number.
         cars: the counts of the cars' numbers.
+        sweep: whether rows are of changes, which are swept of the gyroscope's bias and scale.
     """
 
     columns: Mapping[str, tuple[str, Number]]
     cars: CarCounts
+    sweep: bool = False
 
     def tables(
         self, batch: pa.RecordBatch | pa.Table
@@ -52,6 +55,10 @@ class Expansion:
         """
         for names, rows, here in by_signals(batch):
             table = gram_table(names, rows)
+            if self.sweep:
+                table = swept(table)
+                yield ",".join(table.signals), table, here
+                continue
             if not self.columns:
                 yield names, table, here
                 continue
@@ -130,7 +137,7 @@ def expansion_of(opened: OpenedGrams, feature_set: str) -> Expansion:
     known = features()
     names = known.feature_set(feature_set).calibrated
     if not names:
-        return Expansion({}, {})
+        return Expansion({}, {}, sweep=bool(known.feature_set(feature_set).change_ticks))
     columns = {}
     for name in names:
         number = known.time_columns[name].definition.number

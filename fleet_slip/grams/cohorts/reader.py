@@ -149,13 +149,14 @@ class GramReader:
                 f"{self._warehouse.root}: there are no Gram rows yet. "
                 f"Run: {'' if logs.rows else fill}fleet-slip gram."
             )
-        calibrated = bool(features().feature_set(feature_set).calibrated)
+        one = features().feature_set(feature_set)
+        calibrated, drive_by_drive = bool(one.calibrated), one.calibrated or one.change_ticks
         for name in (feature_set, *([CALIBRATION] if calibrated else [])):
             if name != PLAIN:
                 rows = partial(self._opened, grams, logs, name)
                 _require_complete(logs, grams, rows, name, condition)
         cells = NO_CELLS
-        if folding and not calibrated:
+        if folding and not drive_by_drive:
             identity, revoked = features().identity(feature_set), _revoked_cars()
             cells = self._rollups.cells(grams, logs, identity, condition, folding, revoked)
         opened = self._opened(grams, logs, feature_set, cells)

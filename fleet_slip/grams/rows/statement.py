@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from fleet_slip.catalogue.column_sql import over_windows, with_absent, with_features
+from fleet_slip.catalogue.course_change import with_changes
 from fleet_slip.catalogue.feature_sets import LAG, PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import COUNT_MAX, SignalCatalogue
@@ -53,6 +54,8 @@ def gram_statement(
         rows = with_features(logs, definitions, {n: feature.limit for n, feature in used.items()})
     if windows:
         rows = over_windows(rows if used else f"(SELECT *, 0 AS clipped FROM {logs})", windows)
+    if one.change_ticks:
+        rows = with_changes(rows, one.inputs, one.change_ticks)
     wide = windows or any(feature.limit > COUNT_MAX for feature in used.values())
     kind = "BIGINT" if wide else "INTEGER"
     parts = Parts.of_set(known, one)

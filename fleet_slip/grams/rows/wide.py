@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from fleet_slip.arrays import FloatArray, IntArray
+from fleet_slip.catalogue.feature_sets import FeatureSet
 from fleet_slip.catalogue.features import features
 from fleet_slip.delta import TableFile
 from fleet_slip.errors import DataError, StorageError
@@ -22,6 +23,7 @@ from fleet_slip.grams.column_plan import ColumnPlan
 from fleet_slip.grams.columns import DriveCounts, Workspace
 from fleet_slip.grams.drive_rows import LoggedDrive, read_drives
 from fleet_slip.grams.operations import BLOCK_ROWS
+from fleet_slip.grams.rows.course_sums import course_changes
 from fleet_slip.grams.rows.parts import UNKNOWN, Parts
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -35,9 +37,9 @@ def wide_grams(warehouse: Warehouse, files: Sequence[TableFile], feature_set: st
     Sorted by file and drive. Raises `DataError` for a drive that cannot be looked back on, and
     `StorageError` for one whose sums need more than 64 bits.
     """
-    plan = ColumnPlan.of_set(features(), feature_set)
-    workspace = Workspace(plan)
-    parts = Parts.of_set(features(), features().feature_set(feature_set))
+    one = features().feature_set(feature_set)
+    workspace = Workspace(ColumnPlan.of_set(features(), feature_set))
+    plan = workspace.plan
     identity = features().identity(feature_set)
     columns: dict[str, list[Any]] = {name: [] for name in warehouse.grams.usual_schema.names}
     # Files are shared out among threads; a BLAS with threads of its own would be in their way.
@@ -47,7 +49,7 @@ def wide_grams(warehouse: Warehouse, files: Sequence[TableFile], feature_set: st
                 _append_rows(
                     columns,
                     workspace,
-                    parts,
+                    one,
                     drive,
                     {"feature_set": identity, "file": file.path, "day": file.day},
                 )
@@ -57,19 +59,22 @@ def wide_grams(warehouse: Warehouse, files: Sequence[TableFile], feature_set: st
 def _append_rows(
     columns: dict[str, list[Any]],
     workspace: Workspace,
-    parts: Parts,
+    one: FeatureSet,
     drive: LoggedDrive,
     known: Mapping[str, Any],
 ) -> None:
-    plan = workspace.plan
+    parts = Parts.of_set(features(), one)
     where = f"{known['file']}: drive {drive.drive_id}"
     try:
-        found = drive_sums(workspace, parts, drive.counts)
+        if one.change_ticks:
+            found = change_sums(workspace, drive.counts, one.change_ticks)
+        else:
+            found = drive_sums(workspace, parts, drive.counts)
     except DataError as error:
         raise DataError(f"{where}: {error}") from None
     for absent, part in sorted(found, key=_last_if_unknown):
         sums = found[absent, part]
-        names = [name for i, name in enumerate(plan.names) if not absent >> i & 1]
+        names = [name for i, name in enumerate(one.columns) if not absent >> i & 1]
         lower = np.tril_indices(len(names))
         row = {
             **drive.metadata,
@@ -151,6 +156,27 @@ def drive_sums(workspace: Workspace, parts: Parts, counts: DriveCounts) -> dict[
         first += _add_by_kind(found, workspace, parts, counts.ticks, first)
     complete.add_totals(totals)
     return {kind: sums for kind, sums in found.items() if sums.n}
+
+
+def change_sums(workspace: Workspace, counts: DriveCounts, apart: int) -> dict[Kind, DriveSums]:
+    """Return the sums of the changes of a drive's columns, by which of them they lack.
+
+    Raises like `drive_sums`.
+    """
+    largest = 2 * max(workspace.plan.limits)
+    exact_rows = (_EXACT - 1) // largest**2
+    if len(counts.ticks) * largest**2 >= _INT64:
+        raise StorageError(f"the drive has {len(counts.ticks):,} rows: too many for 64-bit sums.")
+    workspace.load(counts)
+    changes = course_changes(workspace, counts.ticks, apart)
+    found: dict[Kind, DriveSums] = {}
+    for kind, rows in _kinds(changes.columns, None):
+        has = [i for i in range(len(changes.columns)) if not kind[0] >> i & 1]
+        sums = found.setdefault(kind, DriveSums(len(has)))
+        for first in range(0, len(rows), exact_rows):
+            some = rows[first : first + exact_rows]
+            sums.add(changes.columns[np.ix_(np.array(has), some)], changes.clipped[some])
+    return found
 
 
 def _add_by_kind(

@@ -1,0 +1,101 @@
+"""Sums of the changes from fix to fix of one drive, as `catalogue/course_change.py` says it in SQL.
+
+Only rows with a fix are kept, one in ten or fewer, so that the products cost less than those of all
+rows and a drive of any length fits into memory.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_slip.arrays import BoolArray, FloatArray, IntArray
+from fleet_slip.catalogue.course_change import COARSER, course_units
+from fleet_slip.catalogue.signals import HALF_TURN
+from fleet_slip.grams.columns import Workspace
+from fleet_slip.grams.operations import BLOCK_ROWS
+
+
+@dataclass(frozen=True)
+class Changes:
+    """The changes of a drive's columns between fixes that are so many ticks apart.
+
+    Attributes:
+        rows: each row that has a change, shape (changes,).
+        columns: shape (columns + 2, changes), NaN where missing; `TURNED` and the label come last.
+        clipped: how many columns of each row were clipped, shape (changes,).
+    """
+
+    rows: IntArray
+    columns: FloatArray
+    clipped: FloatArray
+
+
+def course_changes(workspace: Workspace, ticks: NDArray[Any], apart: int) -> Changes:
+    """Return the changes of the drive that is loaded.
+
+    The last two columns of the workspace's plan are the course and the yaw rate.
+    """
+    yaw_rate = np.empty(workspace.rows)
+    fixes: list[IntArray] = []
+    values: list[FloatArray] = []
+    clipped: list[FloatArray] = []
+    for first in range(0, workspace.rows, BLOCK_ROWS):
+        workspace.compute_block(first)
+        block, here = workspace.block(first)
+        yaw_rate[first : first + block.shape[1]] = block[-1]
+        fixed = np.flatnonzero(~np.isnan(block[-2]))
+        fixes.append(fixed + first)
+        values.append(block[:-1, fixed])
+        clipped.append(here[fixed])
+    at, counts = np.concatenate(fixes), np.concatenate(values, axis=1)
+    before, now = _pairs(ticks[at].astype(np.int64), apart)
+    turned, known = _twice_turned(ticks.astype(np.int64), yaw_rate, at[before], at[now])
+    change, sound = _change(counts[-1, now] - counts[-1, before], turned)
+    kept = known & sound
+    before, now = before[kept], now[kept]
+    columns = np.concatenate(
+        [
+            counts[:-1, now] - counts[:-1, before],
+            _rounded(turned[kept], COARSER)[None],
+            change[None, kept],
+        ]
+    )
+    return Changes(at[now], columns, np.concatenate(clipped)[now])
+
+
+def _pairs(ticks: IntArray, apart: int) -> tuple[IntArray, IntArray]:
+    """Return the numbers of fixes that are so many ticks apart: the earlier and the later."""
+    if not ticks.size:
+        return ticks, ticks
+    place = np.minimum(np.searchsorted(ticks, ticks - apart), ticks.size - 1)
+    later = np.flatnonzero(ticks[place] == ticks - apart)
+    return place[later], later
+
+
+def _twice_turned(
+    ticks: IntArray, yaw_rate: FloatArray, before: IntArray, now: IntArray
+) -> tuple[IntArray, BoolArray]:
+    """Return J between pairs of rows, and where no tick's yaw rate is missing in between."""
+    missing = np.isnan(yaw_rate)
+    counts = np.where(missing, 0.0, yaw_rate).astype(np.int64)
+    total, gaps = np.cumsum(counts), np.cumsum(missing)
+    turned = 2 * (total[now] - total[before]) - counts[now] + counts[before]
+    whole = ticks[now] - ticks[before] == now - before
+    return turned, whole & (gaps[now] == gaps[before]) & ~missing[before]
+
+
+def _change(course: FloatArray, turned: IntArray) -> tuple[IntArray, BoolArray]:
+    """Return the change of the side-slip angle in counts of the label, and where it is one."""
+    units = course_units()
+    left = units.turn * course.astype(np.int64) - 2 * HALF_TURN * turned
+    whole = 2 * HALF_TURN * units.turn
+    left -= whole * _rounded(left, whole)
+    return _rounded(left, units.divisor), np.abs(left) <= units.largest
+
+
+def _rounded(number: IntArray, divisor: int) -> IntArray:
+    """Return integers over another, to the nearest, halves away from zero."""
+    half: IntArray = (2 * np.abs(number) + divisor) // (2 * divisor)
+    return np.sign(number) * half

@@ -1,0 +1,128 @@
+"""Changes from fix to fix: kernel, SQL and plain integers agree, and tell the angle's change."""
+
+import math
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from fleet_slip.catalogue.course_change import LARGEST_RAD, TURNED, course_units
+from fleet_slip.catalogue.features import features
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.grams.column_plan import ColumnPlan
+from fleet_slip.grams.columns import Workspace
+from fleet_slip.grams.drive_rows import counts_of
+from fleet_slip.grams.rows.aggregation import aggregate, by_sql
+from fleet_slip.grams.rows.check import grams_of
+from fleet_slip.grams.rows.course_sums import course_changes
+from fleet_slip.grams.rows.wide import wide_grams
+from fleet_slip.warehouse.tables import Warehouse
+from tests.support.logs import land, log_rows, random_counts
+
+APART = 400
+LABEL = catalogue().label
+
+
+def hostile_drive(name: str, rows: int, seed: int, *, every: int = 10) -> pa.Table:
+    """A drive with fixes that fail, missing values, holes in time, and a course that goes round."""
+    rng = np.random.default_rng(seed)
+    counts: dict[str, Any] = random_counts(rng, rows)
+    for wheel in ("fl", "fr", "rl", "rr"):
+        counts[f"wheel_{wheel}"] = rng.integers(0, 12_000, rows).astype(np.int16)
+    counts["yaw_rate"] = rng.integers(-9000, 9000, rows).astype(np.int16)
+    lost = (np.arange(rows) % every != 0) | (rng.random(rows) < 0.1)
+    counts["course"] = pa.array(counts["course"], mask=lost)
+    counts["ay"] = pa.array(counts["ay"], mask=rng.random(rows) < 0.05)
+    counts["yaw_rate"] = pa.array(counts["yaw_rate"], mask=rng.random(rows) < 0.3 / rows)
+    counts[LABEL] = pa.nulls(rows, pa.int16())
+    table = log_rows(name, counts)
+    ticks = np.arange(rows) + np.where(np.arange(rows) > rows * 2 // 3, 300, 0)
+    at = table.schema.get_field_index("tick")
+    return table.set_column(at, "tick", pa.array(ticks.astype(np.int32)))
+
+
+def nearest(value: Fraction) -> int:
+    return int(math.copysign(math.floor(abs(value) + Fraction(1, 2)), value))
+
+
+def plain_changes(table: pa.Table) -> dict[int, tuple[int, int]]:
+    """Tick of each change, and its turned and label, in words of plain Python."""
+    rows = {row["tick"]: row for row in table.to_pylist()}
+    units, found = course_units(), {}
+    for tick, row in rows.items():
+        before = rows.get(tick - APART)
+        between = [rows.get(t, {}).get("yaw_rate") for t in range(tick - APART, tick + 1)]
+        if before is None or None in (row["course"], before["course"], *between):
+            continue
+        turned = between[0] + between[-1] + 2 * sum(between[1:-1])
+        angle = Fraction(row["course"] - before["course"], 65536) * units.turn - turned
+        angle -= units.turn * nearest(angle / units.turn)
+        if abs(angle) * Fraction(1, 2_000_000) <= LARGEST_RAD:
+            found[tick] = (nearest(Fraction(turned, 256)), nearest(angle / 200))
+    return found
+
+
+def test_the_changes_of_a_hostile_drive_are_those_of_plain_integers() -> None:
+    table = hostile_drive("a", 6000, 7)
+    plan = ColumnPlan.of_set(features(), "course")
+    workspace, counts = Workspace(plan), counts_of(table, plan, {})
+    workspace.load(counts)
+    found = course_changes(workspace, counts.ticks, APART)
+    expected = plain_changes(table)
+    assert len(expected) > 40
+    assert counts.ticks[found.rows].tolist() == list(expected)
+    assert list(zip(*found.columns[-2:].astype(int).tolist(), strict=True)) == list(
+        expected.values()
+    )
+
+
+def test_gram_rows_of_the_kernel_are_those_of_the_statement(warehouse: Warehouse) -> None:
+    land(warehouse, "one", hostile_drive("b", 4000, 1), hostile_drive("a", 300, 2))
+    land(warehouse, "two", hostile_drive("c", 9000, 3), hostile_drive("d", 2500, 4, every=1))
+    files = warehouse.logs.snapshot().files
+    kernel = wide_grams(warehouse, files, "course")
+    defined = by_sql(warehouse, files, "course").cast(kernel.schema)
+    assert set(kernel["drive_id"].to_pylist()) == {"b", "c", "d"}
+    assert {"ay", TURNED, LABEL} <= set(kernel["signals"][0].as_py().split(","))
+    assert grams_of(kernel) == grams_of(defined)
+    for name in kernel.column_names:
+        assert kernel[name].to_pylist() == defined[name].to_pylist(), name
+    assert aggregate(warehouse, files, feature_set="course").equals(kernel)
+
+
+def test_a_log_without_a_course_has_no_changes(warehouse: Warehouse) -> None:
+    table = hostile_drive("a", 1000, 1)
+    land(warehouse, "one", table.drop_columns(["course", "satellite_speed"]))
+    files = warehouse.logs.snapshot().files
+    assert wide_grams(warehouse, files, "course").num_rows == 0
+    assert by_sql(warehouse, files, "course").num_rows == 0
+
+
+def test_the_label_is_the_change_of_the_side_slip_angle() -> None:
+    """Round several turns, with the course's and the yaw rate's grain as the only errors."""
+    time = np.arange(5000) / 100
+    slip, r = 0.05 * np.sin(1.3 * time), 0.6 + 0.3 * np.sin(0.5 * time)
+    heading = 0.6 * time - 0.6 * np.cos(0.5 * time)
+    course = np.rint((heading + slip) * 65536 / (2 * np.pi)).astype(np.int64)
+    counts: dict[str, Any] = {name: np.zeros(5000, np.int16) for name in catalogue().inputs}
+    counts["course"] = pa.array(
+        ((course + 32768) % 65536 - 32768).astype(np.int16), mask=np.arange(5000) % 10 != 0
+    )
+    counts["yaw_rate"] = np.rint(r * 10_000).astype(np.int16)
+    plan = ColumnPlan.of_set(features(), "course")
+    workspace, loaded = Workspace(plan), counts_of(log_rows("a", counts), plan, {})
+    workspace.load(loaded)
+    found = course_changes(workspace, loaded.ticks, APART)
+    assert len(found.rows) == 460
+    changed = slip[found.rows] - slip[found.rows - APART]
+    assert np.abs(found.columns[-1] * 1e-4 - changed).max() < 3e-4
+    turned = heading[found.rows] - heading[found.rows - APART]
+    assert np.abs(found.columns[-2] * 1.28e-4 - turned).max() < 2e-4
+
+
+def test_a_turn_is_a_whole_number_of_integrated_counts() -> None:
+    units = course_units()
+    assert (units.turn, units.divisor) == (12_566_371, 13_107_200)
+    assert units.turn * 0.5e-6 == pytest.approx(2 * math.pi, rel=4e-8)
