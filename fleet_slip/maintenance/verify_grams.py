@@ -13,6 +13,7 @@ from fleet_slip.grams.received.signature_check import check_signed_rows
 from fleet_slip.grams.rows.check import (
     DriveGrams,
     differing_drives,
+    find_gram_files,
     grams_by_blocks,
     read_counts,
     stored_grams,
@@ -71,17 +72,22 @@ def verify_grams(
     _verify_unique(warehouse, sound.grams, report)
     _verify_each(warehouse, sound.grams, report)
     _verify_signatures(warehouse, sound.grams, report, full)
-    stored = stored_grams(warehouse, sound.grams)
-    covered = [file for file in sound.logs if file.path in stored]
+    where = find_gram_files(warehouse, sound.grams)
+    covered = [file for file in sound.logs if file.path in where]
     step = 1 if full else max(1, len(covered) // SAMPLE)
+    by_place: dict[tuple[str, ...], list[TableFile]] = {}
+    for file in covered[::step]:
+        by_place.setdefault(where[file.path], []).append(file)
     task = partial(_compute_grams, warehouse)
-    for file, computed in run_tasks(executor, task, covered[::step], _name_task):
-        for drive in differing_drives(stored[file.path], computed):
-            problem = f"the stored Gram row of drive {drive} is not that of its rows"
-            report.findings.append(Damage("gram", f"logs/{file.path}", problem))
-        report.log_files_recomputed += 1
+    for places, files in by_place.items():
+        stored = stored_grams(warehouse, files, places)
+        for file, computed in run_tasks(executor, task, files, _name_task):
+            for drive in differing_drives(stored[file.path], computed):
+                problem = f"the stored Gram row of drive {drive} is not that of its rows"
+                report.findings.append(Damage("gram", f"logs/{file.path}", problem))
+            report.log_files_recomputed += 1
     missing = len(sound.logs) - len(covered)
-    stale = stored.keys() - set(sound.active)
+    stale = where.keys() - set(sound.active)
     if missing or stale:
         problem = (
             f"no Gram rows of {number_of(missing, 'log file')}, Gram rows of {len(stale)} that "

@@ -1,7 +1,7 @@
 """Checks the Gram rows against two other ways to compute them, bit for bit."""
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -58,11 +58,12 @@ def check_grams(
     if not logs.files:
         raise DataError(f"{warehouse.root}: no logs yet. Run: fleet-slip simulate CAMPAIGN")
     chosen = _evenly(logs.files, count, begin)
-    stored = stored_grams(warehouse)
+    where = find_gram_files(warehouse, warehouse.grams.snapshot().files)
     drives = by_integers = rows = wide_drives = 0
     wide = _computed_wide_sets(warehouse)
     for file in chosen:
         from_sql = grams_of(aggregate(warehouse, [file]))
+        stored = stored_grams(warehouse, [file], where.get(file.path, ()))
         _compare(file, "the stored Gram rows", from_sql, stored.get(file.path, {}))
         counts = read_counts(warehouse, file)
         _compare(file, "float64 blocks", from_sql, grams_by_blocks(warehouse, counts))
@@ -101,7 +102,8 @@ def _check_wide(warehouse: Warehouse, file: TableFile, feature_set: str) -> int:
     A file that the set was not computed for has nothing to compare.
     """
     identity = features().identity(feature_set)
-    kept = grams_of_file(warehouse, file, identity)
+    grams = [gram_file.path for gram_file in warehouse.grams.snapshot().files]
+    kept = stored_grams(warehouse, [file], grams, identity).get(file.path)
     if not kept:
         return 0
     rows = by_sql(warehouse, [file], feature_set)
@@ -109,17 +111,6 @@ def _check_wide(warehouse: Warehouse, file: TableFile, feature_set: str) -> int:
     _compare(file, "the kernel", from_sql, grams_of(wide_grams(warehouse, [file], feature_set)))
     _compare(file, f"the stored Gram rows of {feature_set}", from_sql, kept)
     return len(rows["drive_id"].unique())
-
-
-def grams_of_file(warehouse: Warehouse, file: TableFile, identity: str) -> "DriveGrams":
-    """Return the stored Gram rows of a log file and a feature set, as its rows carry it."""
-    found: DriveGrams = {}
-    for gram_file in warehouse.grams.snapshot().files:
-        names = warehouse.grams.read(gram_file.path, ["feature_set", "file"])
-        here = pc.and_(pc.equal(names["feature_set"], identity), pc.equal(names["file"], file.path))
-        if pc.any(here).as_py():
-            found |= grams_of(warehouse.grams.read(gram_file.path).filter(here))
-    return found
 
 
 DriveGrams = dict[tuple[str, tuple[str, ...]], Gram]
@@ -150,21 +141,35 @@ def _in_one_order(grams: DriveGrams) -> DriveGrams:
     return {(drive, signals): gram.restrict(signals) for drive, signals, gram in ordered}
 
 
-def stored_grams(
-    warehouse: Warehouse, files: Sequence[TableFile] | None = None
-) -> dict[str, DriveGrams]:
-    """Return the stored Gram rows of the logged signals, by log file; of some files, or all.
+def find_gram_files(warehouse: Warehouse, grams: Iterable[TableFile]) -> dict[str, tuple[str, ...]]:
+    """Return the paths of the Gram files with rows of the logged signals of each log file."""
+    found: dict[str, tuple[str, ...]] = {}
+    for path in (gram_file.path for gram_file in grams):
+        rows = warehouse.grams.read(path, ["feature_set", "file"])
+        mine = pc.and_(pc.equal(rows["feature_set"], PLAIN), pc.invert(is_received(rows)))
+        for file in rows.filter(mine)["file"].unique().to_pylist():
+            found[file] = (*found.get(file, ()), path)
+    return found
 
-    Those that came without a log are left out.
-    """
-    by_file: dict[str, DriveGrams] = defaultdict(dict)
-    for gram_file in warehouse.grams.snapshot().files if files is None else files:
-        every = warehouse.grams.read(gram_file.path)
-        plain = pc.equal(every["feature_set"], PLAIN)
-        rows = every.filter(pc.and_(plain, pc.invert(is_received(every))))
-        for file in rows["file"].unique().to_pylist():
-            by_file[file] |= grams_of(rows.filter(pc.equal(rows["file"], file)))
-    return by_file
+
+def stored_grams(
+    warehouse: Warehouse,
+    files: Sequence[TableFile],
+    grams: Iterable[str],
+    identity: str = PLAIN,
+) -> dict[str, DriveGrams]:
+    """Return the Gram rows of some log files and a feature set in some Gram files, by log file."""
+    paths = pa.array([file.path for file in files], pa.string())
+    found: dict[str, DriveGrams] = defaultdict(dict)
+    for path in grams:
+        told = warehouse.grams.read(path, ["feature_set", "file"])
+        names = told["file"].cast(pa.string())
+        mine = pc.and_(pc.equal(told["feature_set"], identity), pc.is_in(names, paths))
+        if pc.any(mine).as_py():
+            rows = warehouse.grams.read(path).filter(mine)
+            for file in rows["file"].unique().to_pylist():
+                found[file] |= grams_of(rows.filter(pc.equal(rows["file"], file)))
+    return found
 
 
 def read_counts(warehouse: Warehouse, file: TableFile) -> pa.Table:

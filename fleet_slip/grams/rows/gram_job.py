@@ -74,12 +74,13 @@ def reconcile(
     identities = {name: features().identity(name) for name in (PLAIN, *features().sets)}
     used = [n for n, i in identities.items() if grams.landed(unit_name(i)) is not None]
     over_time = [name for name in used if features().feature_set(name).windows]
-    drives = {name: _drives_of(grams, identities[name]) for name in over_time}
+    drives = {name: _unique(grams, identities[name], "drive_id") for name in over_time}
     reports = []
     for name in used:
         among = None
         if name in drives:
-            among = _files_of(warehouse.grams.snapshot(), drives[name])
+            plain = warehouse.grams.snapshot()
+            among = set(_unique(plain, PLAIN, "file", drives[name]).to_pylist())
         if unreadable:
             active = {file.path for file in warehouse.logs.snapshot().files}
             among = (active if among is None else among).difference(unreadable)
@@ -87,26 +88,18 @@ def reconcile(
     return reports
 
 
-def _drives_of(grams: Snapshot, identity: str) -> set[str]:
-    """Return the drives that have Gram rows of a feature set."""
-    found: set[str] = set()
+def _unique(
+    grams: Snapshot, identity: str, column: str, drives: pa.Array | None = None
+) -> pa.Array:
+    """Return the values of a column in the Gram rows of a feature set, of some drives or all."""
+    found = [pa.array([], pa.string())]
     for file in grams.files:
-        rows = grams.table.read(file.path, ["feature_set", "drive_id"])
-        mine = rows.filter(pc.equal(rows["feature_set"], identity))
-        found.update(mine["drive_id"].unique().to_pylist())
-    return found
-
-
-def _files_of(grams: Snapshot, drives: Collection[str]) -> set[str]:
-    """Return the log files that have one of some drives, by the Gram rows of the plain set."""
-    found: set[str] = set()
-    for file in grams.files:
-        rows = grams.table.read(file.path, ["feature_set", "drive_id", "file"])
-        plain = rows.filter(pc.equal(rows["feature_set"], PLAIN)).select(["drive_id", "file"])
-        for row in plain.to_pylist():
-            if row["drive_id"] in drives:
-                found.add(row["file"])
-    return found
+        rows = grams.table.read(file.path, list({"feature_set", "drive_id", column}))
+        mine = pc.equal(rows["feature_set"], identity)
+        if drives is not None:
+            mine = pc.and_(mine, pc.is_in(rows["drive_id"].cast(pa.string()), drives))
+        found.append(rows.filter(mine)[column].cast(pa.string()).unique())
+    return pa.concat_arrays(found).unique()
 
 
 def unit_name(identity: str) -> str:
