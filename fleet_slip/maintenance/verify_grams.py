@@ -8,8 +8,7 @@ from functools import partial
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.delta import TableFile
 from fleet_slip.grams.received.car_keys import load_car_keys
-from fleet_slip.grams.received.received_check import find_unsound
-from fleet_slip.grams.received.signature_check import check_signed_rows
+from fleet_slip.grams.received.received_check import check_signed_rows, find_unsound
 from fleet_slip.grams.rows.check import (
     DriveGrams,
     differing_drives,

@@ -28,7 +28,7 @@ or metadata concerned, or `time`; `value` is what stood there, as text."""
 
 SIGNED = "signed"
 """Column of `grams` with what is kept of the signature of a message that a car sent; no view has
-it (`fleet_slip/grams/received/signed_rows.py`)."""
+it (`fleet_slip/grams/received.messages.py`)."""
 
 
 @dataclass(frozen=True)

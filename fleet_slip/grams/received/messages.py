@@ -67,6 +67,18 @@ Messages = NDArray[Any]
 """Messages of the same length: an array with the fields of `message_type`."""
 
 
+KEPT = np.dtype(
+    [
+        ("signature", "V64"),
+        ("definition", "<u8"),
+        ("mask", "<u4"),
+        ("place", "<u2"),
+        ("parts", "<u2"),
+    ]
+)
+"""What the column holds; a message that was not signed has no parts here."""
+
+
 @dataclass
 class Found:
     """What some bytes hold.
@@ -243,3 +255,12 @@ def without_signatures(messages: Messages) -> Messages:
     for name in kept:
         plain[name] = messages[name]
     return plain
+
+
+def keep_signatures(messages: Messages) -> Messages:
+    """Return what is kept of some messages: an array of `KEPT`."""
+    kept = np.zeros(len(messages), KEPT)
+    if "signature" in (messages.dtype.names or ()):
+        for name in KEPT.names or ():
+            kept[name] = messages[name]
+    return kept

@@ -18,11 +18,11 @@ from fleet_slip.grams.received.messages import (
     LONGEST_VEHICLE,
     Found,
     Messages,
+    keep_signatures,
     signals_definition,
     without_signatures,
 )
 from fleet_slip.grams.received.plausible import find_impossible
-from fleet_slip.grams.received.signed_rows import keep_signatures
 
 FIRST_START_S = 946_684_800
 """2000-01-01: a car's clock that says less has not been set."""
