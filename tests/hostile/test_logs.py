@@ -20,7 +20,7 @@ from asammdf import MDF, Signal
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest import Mapping, read_measured
-from fleet_slip.ingest.formats import budget
+from fleet_slip.ingest.formats import budget, mcap_log
 from fleet_slip.ingest.formats.can_bus import CanBus
 from tests.support.fuzz.logs import DBC, FORMATS, sound_file
 from tests.support.measured import a_mapping
@@ -311,6 +311,31 @@ def test_channels_that_groups_share_are_refused(tmp_path: Path) -> None:
     assert "is linked to twice" in failure(file, MDF_MAPPING)
 
 
+def conversion(parts: list[int]) -> bytes:
+    """A block that gives each value the text, or the conversion, that a link leads to."""
+    links = [0, 0, 0, 0, *parts]
+    sizes = (len(parts), len(parts) - 1)
+    body = struct.pack("<BBHHHdd", 7, 0, 0, *sizes, 0, 0) + bytes(8 * sizes[1])
+    head = struct.pack("<4sIQQ", b"##CC", 0, 24 + 8 * len(links) + len(body), len(links))
+    return head + struct.pack(f"<{len(links)}Q", *links) + body
+
+
+@pytest.mark.parametrize("is_circle", [False, True])
+def test_conversions_of_conversions_are_counted(tmp_path: Path, is_circle: bool) -> None:
+    file = mdf(tmp_path / "log")
+    data = bytearray(file.read_bytes())
+    data += bytes(-len(data) % 8)
+    last = 0
+    for _ in range(1 if is_circle else 40):
+        at = len(data)
+        data += conversion([at if is_circle else last] * 3)
+        last = at
+    link = data.rindex(b"##CN") + 24 + 4 * 8
+    data[link : link + 8] = last.to_bytes(8, "little")
+    file.write_bytes(data)
+    assert "is made of more than 10,000 conversions" in failure(file, MDF_MAPPING)
+
+
 # CAN
 
 
@@ -367,3 +392,13 @@ def test_a_database_cannot_ask_for_more_than_a_frame_has(tmp_path: Path, signal:
     file.write_bytes(sound_file("blf"))
     bus = CanBus(database="car.dbc", text=text)
     assert failure(file, FORMATS["blf"].mapping.model_copy(update={"can": bus}))
+
+
+# MCAP
+
+
+def test_a_message_is_decoded_up_to_a_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mcap_log, "LARGEST_MESSAGE", 10)
+    file = tmp_path / "log.mcap"
+    file.write_bytes(sound_file("mcap"))
+    assert "no message in it can be decoded" in failure(file, FORMATS["mcap"].mapping)
