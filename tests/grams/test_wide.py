@@ -38,7 +38,7 @@ DEFINITIONS = {
     "sum_4": Definition(of="ax", over="sum", ticks=4, ratio=Fraction(3, 2), bits=17),
     "lag_2": Definition(of="yaw_rate", over="lag", ticks=2),
     "ever": Definition(of="ay", over="running_mean", ratio=Fraction(16)),
-    "course": Definition(
+    "changing": Definition(
         of="change", sql=COURSE.sql, of_bits=18, over="mean", ticks=2, ratio=Fraction(5)
     ),
     "heavy": Definition(
