@@ -15,6 +15,8 @@ _CREDENTIALS = (
     "GOOGLE_APPLICATION_CREDENTIALS, or AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY"
 )
 
+_TIMEOUT = r"timed out|TimedOut|kind: Timeout"
+
 _MEANINGS: tuple[tuple[str, str], ...] = (
     (
         r"169\.254\.169\.254|computeMetadata|metadata\.google|Account must be specified|"
@@ -49,7 +51,11 @@ _MEANINGS: tuple[tuple[str, str], ...] = (
         "the store answers with errors, after several attempts. Run the same command again.",
     ),
     (
-        r"timed out|TimedOut|kind: Timeout",
+        r"InvalidPath",
+        "the name of an object there is no path: a part of it is empty, `.` or `..`. Rename it.",
+    ),
+    (
+        _TIMEOUT,
         "the store does not answer in time, after several attempts. Check the network, and run "
         "the same command again.",
     ),
@@ -67,10 +73,19 @@ def known_meaning(error: BaseException) -> str | None:
     return next((meaning for pattern, meaning in _MEANINGS if re.search(pattern, text)), None)
 
 
+def is_timeout(error: BaseException) -> bool:
+    """Whether a request was given up because an answer did not come in time."""
+    return re.search(_TIMEOUT, str(error)) is not None
+
+
 def meaning_of(error: BaseException) -> str:
     """Return what a failure of an object store means, in one line."""
     unknown = f"the store cannot be used ({type(error).__name__}). Run the same command again."
     return known_meaning(error) or unknown
+
+
+class NoSuchObjectError(StorageError):
+    """An object is not there, or is gone."""
 
 
 @contextlib.contextmanager
@@ -80,5 +95,7 @@ def object_errors(where: str) -> Iterator[None]:
 
     try:
         yield
+    except FileNotFoundError as error:
+        raise NoSuchObjectError(f"{where}: {meaning_of(error)}") from None
     except (BaseError, OSError, ValueError) as error:
         raise StorageError(f"{where}: {meaning_of(error)}") from None

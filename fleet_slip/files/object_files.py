@@ -15,6 +15,7 @@ import obstore
 
 from fleet_slip.files.checksums import checksum_in, require_content
 from fleet_slip.files.object_errors import object_errors
+from fleet_slip.files.object_transfer import fetch_parts
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -81,8 +82,7 @@ def _fetch(store: "ObjectStore", key: str, where: str) -> bytes:
     with _fetching:
         if where in _fetched:
             return _fetched[where]
-    with object_errors(where):
-        content = bytes(obstore.get(store, key).bytes())
+    content = b"".join(part for _, part in fetch_parts(store, key, where))
     require_content(key, content, where)
     with _fetching:
         _fetched[where] = content

@@ -25,6 +25,7 @@ from fleet_slip.files.folder import Content, StoredFile
 from fleet_slip.files.object_client import client, delta_options
 from fleet_slip.files.object_errors import object_errors
 from fleet_slip.files.object_files import LentFile, ObjectFilesystem, open_object
+from fleet_slip.files.object_transfer import fetch_parts
 
 if TYPE_CHECKING:
     from obstore.store import ObjectStore
@@ -101,9 +102,12 @@ class ObjectFolder:
 
     def read(self, path: str, longest: int | None = None) -> bytes:
         """Return the content of a file, or only its first bytes."""
-        with object_errors(f"{self}/{path}"):
+        where = f"{self}/{path}"
+        if longest is None:
+            return b"".join(part for _, part in fetch_parts(self._store, self._key(path), where))
+        with object_errors(where):
             answer = obstore.get(self._store, self._key(path))
-            if longest is not None and answer.meta["size"] > longest:
+            if answer.meta["size"] > longest:
                 return bytes(
                     obstore.get_range(self._store, self._key(path), start=0, length=longest)
                 )
@@ -232,7 +236,7 @@ class ObjectFolder:
         # and quotes when they are asked for it alone.
         return StoredFile(
             self,
-            meta["path"][len(self.prefix) :].lstrip("/"),
+            meta["path"].removeprefix(f"{self.prefix}/") if self.prefix else meta["path"],
             meta["size"],
             int(meta["last_modified"].timestamp()) * 10**9,
             (meta["e_tag"] or "").strip('"'),

@@ -1,21 +1,30 @@
 """Files that commands read from an object store: found by URL, and copied to be read."""
 
+import hashlib
 import re
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import obstore
 from fsspec.utils import glob_translate
+from obstore.exceptions import InvalidPathError
 
 from fleet_slip.errors import InputError
 from fleet_slip.files.folder import StoredFile
 from fleet_slip.files.object_client import client
-from fleet_slip.files.object_errors import object_errors
+from fleet_slip.files.object_errors import NoSuchObjectError, object_errors
 from fleet_slip.files.object_folder import ObjectFolder
+from fleet_slip.files.object_names import list_any_names
+from fleet_slip.files.object_transfer import fetch_parts
 from fleet_slip.files.storage_errors import storage_errors
 
-CHUNK_BYTES = 2**23
+ATTEMPTS = 3
+"""So often an object is fetched that does not arrive as the store says that it is."""
+
+_COMPARABLE = re.compile(r"[0-9a-f]{32}(-[1-9][0-9]{0,4})?")
+"""A tag that may be an MD5, or the MD5 of the MD5s of so many parts."""
+
+_PART_SIZES = (5, 8, 10, 15, 16, 25, 32, 50, 64, 100, 128, 256, 512)
+"""Sizes of a part that uploaders choose."""
 
 _URL = re.compile(r"(?P<bucket>(?:s3|gs|az)://[a-z0-9][a-z0-9._-]{1,62})(?:/+(?P<path>.*))?")
 
@@ -69,30 +78,81 @@ def is_pattern(text: str) -> bool:
 def copy_object(file: StoredFile, copy: Path) -> None:
     """Copy an object as a listing found it to a file, whose folder is made.
 
-    Raises `InputError` if another has taken its place since, and `StorageError`.
+    What arrives is compared with the store's checksum, if its tag is one. Raises `InputError` if
+    the object is gone, or another has taken its place since, or it does not arrive as it is
+    stored; and `StorageError`.
     """
-    folder = file.folder
-    assert isinstance(folder, ObjectFolder)  # noqa: S101 - where else?
-    with object_errors(str(file)):
-        answer = obstore.get(client(folder.bucket), file.path)
-        now = folder.found(answer.meta)
-    copied = 0
+    arrived = set[str]()
     with storage_errors(copy):
         copy.parent.mkdir(parents=True, exist_ok=True)
-        with copy.open("xb") as stream:
-            for chunk in _chunks(answer, str(file)):
-                copied += stream.write(chunk)
-    if (now.identity, copied) != (file.identity, file.size_bytes):
+    for _ in range(ATTEMPTS):
+        digest = _copy_once(file, copy)
+        # A tag that looks like a checksum may be none: then two transfers that agree must do.
+        if not _COMPARABLE.fullmatch(file.identity) or digest in arrived:
+            return
+        if digest == file.identity or _is_of_parts(copy, file.identity):
+            return
+        arrived.add(digest)
+    raise InputError(
+        f"{file}: it arrived {ATTEMPTS} times with other bytes than the store has. Run the same "
+        "command again, and have the network examined."
+    )
+
+
+def _copy_once(file: StoredFile, copy: Path) -> str:
+    """Copy an object; return the MD5 of what arrived, which is what stores tell."""
+    folder = file.folder
+    assert isinstance(folder, ObjectFolder)  # noqa: S101 - where else?
+    md5, copied = hashlib.md5(usedforsecurity=False), 0
+    try:
+        with storage_errors(copy), copy.open("wb") as stream:
+            for meta, part in fetch_parts(client(folder.bucket), file.path, str(file)):
+                if folder.found(meta).identity != file.identity:
+                    break
+                copied += stream.write(part)
+                md5.update(part)
+    except NoSuchObjectError as error:
+        raise InputError(str(error)) from None
+    if copied != file.size_bytes:
         raise InputError(f"{file}: it changed while it was read. Wait until it is complete.")
+    return md5.hexdigest()
 
 
-def _chunks(answer: Any, where: str) -> Iterator[memoryview]:
-    with object_errors(where):
-        for chunk in answer.stream(min_chunk_size=CHUNK_BYTES):
-            yield memoryview(chunk)
+def _is_of_parts(copy: Path, tag: str) -> bool:
+    """Whether the tag of an upload in N parts is that of a file: the MD5 of the parts' MD5s.
+
+    The size of a part is not told; it is tried as uploaders choose it, in whole MiB or MB.
+    """
+    stated, _, number = tag.partition("-")
+    size, parts = copy.stat().st_size, int(number or 0)
+    if not parts:
+        return False
+    for unit in (2**20, 10**6):
+        for length in {_rounded_up(size, parts * unit) * unit, *(n * unit for n in _PART_SIZES)}:
+            if _rounded_up(size, length) == parts and _md5_of_parts(copy, length) == stated:
+                return True
+    return False
+
+
+def _rounded_up(size: int, length: int) -> int:
+    return -(-size // length)
+
+
+def _md5_of_parts(copy: Path, length: int) -> str:
+    whole = hashlib.md5(usedforsecurity=False)
+    with copy.open("rb") as stream:
+        while part := stream.read(length):
+            whole.update(hashlib.md5(part, usedforsecurity=False).digest())
+    return whole.hexdigest()
 
 
 def _listed(bucket: ObjectFolder, path: str) -> list[StoredFile]:
-    with object_errors(f"{bucket}/{path}"):
-        pages = list(obstore.list(client(bucket.bucket), path or None))
+    where = f"{bucket}/{path}"
+    with object_errors(where):
+        try:
+            pages = list(obstore.list(client(bucket.bucket), path or None))
+        except InvalidPathError:
+            if not bucket.bucket.startswith("s3://"):
+                raise
+            return sorted(list_any_names(bucket, path), key=str)
     return sorted((bucket.found(meta) for page in pages for meta in page), key=str)

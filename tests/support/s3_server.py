@@ -41,6 +41,7 @@ class Faults:
         access_key: the one that is let in.
         flipping: one bit is flipped in some answers to GET whose path this pattern finds.
         flipped: share of those answers.
+        bytes_per_s: how fast answers to GET of objects come, if not at once.
         seen: requests that came, as METHOD PATH.
     """
 
@@ -50,6 +51,7 @@ class Faults:
     access_key: str = ACCESS_KEY
     flipping: str = r"(?!)"
     flipped: float = 1.0
+    bytes_per_s: float | None = None
     seen: list[str] = field(default_factory=list)
 
 
@@ -124,6 +126,8 @@ class Server:
         asked = method == "GET" and re.search(faults.flipping, environ["PATH_INFO"])
         if asked and self._rng.random() < faults.flipped:
             return [self._flip(b"".join(answer))]
+        if faults.bytes_per_s and method == "GET" and not environ["QUERY_STRING"]:
+            return _slowly(b"".join(answer), faults.bytes_per_s)
         return answer
 
     def _flip(self, content: bytes) -> bytes:
@@ -157,6 +161,14 @@ def _answer(start: StartResponse, status: str, code: str) -> Iterable[bytes]:
     body = f"<Error><Code>{code}</Code><AWSAccessKeyId>{ACCESS_KEY}</AWSAccessKeyId></Error>"
     start(status, [("Content-Type", "application/xml"), ("Content-Length", str(len(body)))])
     return [body.encode()]
+
+
+def _slowly(content: bytes, bytes_per_s: float) -> Iterator[bytes]:
+    """Yield an answer as a slow network brings it, twenty times in a second."""
+    step = max(1, int(bytes_per_s / 20))
+    for first in range(0, len(content), step):
+        time.sleep(1 / 20)
+        yield content[first : first + step]
 
 
 class _Quiet(WSGIRequestHandler):

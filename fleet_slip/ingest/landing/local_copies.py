@@ -7,7 +7,7 @@ the temporary folder (`TMPDIR`) while it is read.
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import TracebackType
 from typing import Self
@@ -77,9 +77,8 @@ def _copy(log: StoredFile | StoredParts, folder: Path) -> Path:
     from fleet_slip.files.object_inputs import copy_object, parse_url  # noqa: PLC0415 - an extra
 
     for part in stored_parts(log):
-        place = PurePosixPath(part.path)
-        if place.is_absolute() or ".." in place.parts:
-            raise InputError(f"{part}: its name leads out of the bucket. Give it another.")
+        if not {"", ".", ".."}.isdisjoint(part.path.split("/")):
+            raise InputError(f"{part}: its name is no path in the bucket. Give it another.")
         copy_object(part, folder / part.path)
     return folder / (log.path if isinstance(log, StoredFile) else parse_url(log.url)[1])
 

@@ -4,6 +4,7 @@ They are on this machine, or on an object store.
 """
 
 import os
+import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -123,6 +124,9 @@ def stored_parts(log: StoredFile | StoredParts) -> list[StoredFile]:
     return [log] if isinstance(log, StoredFile) else _stored(log.url)
 
 
+_HIDDEN = re.compile(r"/\.(?!\.?(/|$))")
+"""A part of a path that begins with a point, and is not `.` or `..`: those are told as faults."""
+
 _NO_LOG = f"no file in this folder has the suffix of a log: {', '.join(SUFFIXES)}."
 
 
@@ -132,7 +136,7 @@ def _stored(url: str) -> list[StoredFile]:
     if (one := find_object(url)) is not None:
         return [one]
     below = find_below(url)
-    seen = [file for file in below if "/." not in str(file) or "/." in url]
+    seen = [file for file in below if not _HIDDEN.search(str(file)) or "/." in url]
     if is_pattern(url):
         found, none = seen, "no object matches this pattern. Look at its folder."
     else:
