@@ -25,7 +25,7 @@ from fleet_slip.grams.rows.aggregation import compute_grams
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.models.publish import manifest_of
 from fleet_slip.models.score import score
-from fleet_slip.selection.answer import answer_request
+from fleet_slip.selection.answer_request import answer_request
 from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.job import simulate_campaign

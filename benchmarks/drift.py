@@ -22,7 +22,7 @@ from fleet_slip.models.publish import manifest_of, publish
 from fleet_slip.models.versions import Registry
 from fleet_slip.monitoring.chart import draw
 from fleet_slip.monitoring.monitor import Chart, monitor
-from fleet_slip.selection.answer import answer_request
+from fleet_slip.selection.answer_request import answer_request
 from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.simulation.campaign import Campaign, load_campaign
 from fleet_slip.simulation.job import simulate_campaign

@@ -17,7 +17,7 @@ import numpy as np
 
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohorts.cohort import load_cohort
+from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.monitoring.monitor import Limits
 from fleet_slip.monitoring.thresholds import thresholds
 from fleet_slip.regression.exact.figures import error_sums

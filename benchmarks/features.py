@@ -17,7 +17,7 @@ from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohorts.cohort import Cohort, load_cohort
+from fleet_slip.grams.cohorts.gram_cohort import Cohort, load_cohort
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.regression.exact.figures import Figures
 from fleet_slip.regression.exact.gram import Gram

@@ -25,11 +25,11 @@ from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.delta import Change, absent_columns
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohorts.cohort import load_cohort
+from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.grams.rows.statement import gram_statement
-from fleet_slip.selection.compare import select
 from fleet_slip.selection.model_list import load_model_list
+from fleet_slip.selection.select_models import select
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.job import simulate_campaign
 from fleet_slip.warehouse.tables import Warehouse

@@ -21,7 +21,7 @@ import numpy as np
 
 import fleet_slip
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.cohorts.cohort import load_cohort
+from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.regression.exact.figures import error_sums
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import LinearModel, fit

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from fleet_slip.catalogue.signals import COUNT_MAX, catalogue
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohorts.cohort import Cohort, load_cohort
+from fleet_slip.grams.cohorts.gram_cohort import Cohort, load_cohort
 from fleet_slip.monitoring.quality import QualityReport, examine
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.gram_table import GramTable

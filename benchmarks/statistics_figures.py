@@ -14,27 +14,27 @@ from matplotlib.figure import Figure
 from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohorts.cohort import load_cohort
+from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.regression.choice.criteria import CRITERIA, criterion_values
 from fleet_slip.regression.choice.nested import nested_fits
 from fleet_slip.regression.choice.nested_choice import (
     CROSS_VALIDATION,
     Rule,
-    Training,
+    TrainingFolds,
     cross_validate_nested,
     cross_validate_selection,
 )
-from fleet_slip.regression.choice.ranking import RANKINGS, rank
+from fleet_slip.regression.choice.signal_orders import RANKINGS, rank
 from fleet_slip.regression.choice.subsets import all_rss, best_subsets, pick_sizes, subset_sizes
 from fleet_slip.regression.exact.least_squares import correlation_matrix, fit
-from fleet_slip.regression.inference.drive_moments import DriveMoments, serving_drives
-from fleet_slip.regression.inference.evidence import Evidence
-from fleet_slip.regression.inference.resampling import (
+from fleet_slip.regression.inference.bootstrap import (
     bootstrap_correlations,
     held_out_products,
     percentile_interval,
     repeated_cross_validation,
 )
+from fleet_slip.regression.inference.drive_moments import DriveMoments, serving_drives
+from fleet_slip.regression.inference.evidence import Evidence
 from fleet_slip.regression.inference.standard_errors import infer_by_clusters, infer_classically
 from fleet_slip.regression.shrinkage.disturbance import disturb
 from fleet_slip.regression.validation.folds import CohortFolds, by_hash
@@ -47,7 +47,7 @@ NINE = tuple(name for name in SIGNALS.inputs if name != "steering_wheel")
 SCALES = {name: SIGNALS[name].exact_scale for name in SIGNALS.gram_signals}
 
 
-def load(root: str, campaign: str) -> tuple[Training, IntArray]:
+def load(root: str, campaign: str) -> tuple[TrainingFolds, IntArray]:
     cohort = load_cohort(Warehouse(LocalFolder(Path(root))), f"campaign = '{campaign}'")
     table, mask = serving_drives(cohort.tables, [*NINE, LABEL])
     ids = [
@@ -55,10 +55,10 @@ def load(root: str, campaign: str) -> tuple[Training, IntArray]:
     ]
     assignment = by_hash(ids, 5)
     folds = CohortFolds.of([table], assignment).serving(NINE, LABEL)
-    return Training(folds, DriveMoments.of(table), SCALES), assignment.fold
+    return TrainingFolds(folds, DriveMoments.of(table), SCALES), assignment.fold
 
 
-def evidence(training: Training) -> None:
+def evidence(training: TrainingFolds) -> None:
     total = training.folds.total
     order = rank("backward", total, NINE, LABEL)
     fits = nested_fits(total, order, LABEL)
@@ -90,7 +90,7 @@ def evidence(training: Training) -> None:
     save(figure, "contributions")
 
 
-def orders(training: Training, fold: IntArray) -> None:
+def orders(training: TrainingFolds, fold: IntArray) -> None:
     total = training.folds.total
     figure, axes = plt.subplots(figsize=(6.4, 3.4))
     for name in RANKINGS:
@@ -111,7 +111,7 @@ def orders(training: Training, fold: IntArray) -> None:
         print(f"  backward + {criterion}: {' '.join(honest.signals)}, r = {honest.correlation:.5f}")
 
 
-def subsets(training: Training) -> None:
+def subsets(training: TrainingFolds) -> None:
     total = training.folds.total
     results = best_subsets(total, NINE, LABEL)
     for result in results:
@@ -135,7 +135,7 @@ def subsets(training: Training) -> None:
     save(figure, "subsets")
 
 
-def uncertainty(training: Training, fold: IntArray) -> None:
+def uncertainty(training: TrainingFolds, fold: IntArray) -> None:
     folds = training.folds
     assert training.drives is not None
     models = [fit(folds.total - test, NINE, LABEL).model for test in folds.grams]

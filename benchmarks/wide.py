@@ -30,7 +30,7 @@ from fleet_slip.grams.columns import Workspace
 from fleet_slip.grams.drive_rows import read_drives
 from fleet_slip.grams.rows import aggregation, statement, wide
 from fleet_slip.grams.rows.aggregation import aggregate, by_sql
-from fleet_slip.grams.rows.parts import Parts
+from fleet_slip.grams.rows.drive_parts import Parts
 from fleet_slip.warehouse.tables import Warehouse
 
 COLUMNS = (12, 52, 100, 200)

@@ -9,8 +9,8 @@ from fleet_slip.warehouse.tables import Warehouse
 
 if TYPE_CHECKING:
     from fleet_slip.api.subject import Examined
-    from fleet_slip.grams.cohorts.cohort import Cohort
     from fleet_slip.grams.cohorts.folding import Folding, FoldKey
+    from fleet_slip.grams.cohorts.gram_cohort import Cohort
     from fleet_slip.models.model_version import ModelVersion
     from fleet_slip.regression.inference.drive_moments import ClusterUnit
     from fleet_slip.selection.diagnostics import Diagnosis
@@ -90,7 +90,7 @@ class FleetCohort(Rooted):
         Raises `UsageError` for options that do not go together or a list that is not valid, and
         `DataError` if no model can be fitted.
         """
-        from fleet_slip.selection.answer import answer_request
+        from fleet_slip.selection.answer_request import answer_request
         from fleet_slip.selection.request import SelectionRequest
 
         request = SelectionRequest(
@@ -216,7 +216,7 @@ class FleetCohort(Rooted):
 
         Raises `DataError` for a feature set without such regimes.
         """
-        from fleet_slip.selection.inputs import WHOLE_SET, inputs_of
+        from fleet_slip.selection.named_inputs import WHOLE_SET, inputs_of
         from fleet_slip.selection.regimes import compare_regimes
         from fleet_slip.selection.worth import parse_worth
 
@@ -241,7 +241,7 @@ class FleetCohort(Rooted):
         the feature set `features` separated by commas, by default all; with `naive` rows are
         independent evidence, else what `cluster` says, as in `select`.
         """
-        from fleet_slip.selection.inputs import WHOLE_SET, inputs_of
+        from fleet_slip.selection.named_inputs import WHOLE_SET, inputs_of
         from fleet_slip.selection.shrinkage import compare_shrinkage
 
         folding, cohort = _folding(by, folds), self._load(features)
@@ -249,7 +249,7 @@ class FleetCohort(Rooted):
         return compare_shrinkage(cohort, inputs, folding, naive=naive, cluster=cluster)
 
     def _load(self, feature_set: str, condition: str | None = None) -> "Cohort":
-        from fleet_slip.grams.cohorts.cohort import load_cohort
+        from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 
         return load_cohort(self.warehouse, condition or self.condition, feature_set)
 

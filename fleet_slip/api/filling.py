@@ -20,7 +20,7 @@ from fleet_slip.runs.log import step
 
 if TYPE_CHECKING:
     from fleet_slip.grams.received.receiving import ReceiveReport
-    from fleet_slip.grams.rows.check import CheckReport
+    from fleet_slip.grams.rows.check_grams import CheckReport
     from fleet_slip.grams.rows.gram_job import GramReport
     from fleet_slip.ingest.drafting.preview import Preview
     from fleet_slip.ingest.landing.ingest_job import IngestReport
@@ -236,7 +236,7 @@ class Filling(Rooted):
         Raises `StorageError` naming the first drive whose Gram rows differ, and `DataError` if
         there is nothing to check.
         """
-        from fleet_slip.grams.rows.check import check_grams
+        from fleet_slip.grams.rows.check_grams import check_grams
 
         return check_grams(self.warehouse, files, count_from_start(progress), begin)
 

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.errors import QuestionError, UsageError
-from fleet_slip.grams.cohorts.cohort import Cohort
+from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.versions import Registry
-from fleet_slip.selection.inputs import WHOLE_SET, inputs_of
+from fleet_slip.selection.named_inputs import WHOLE_SET, inputs_of
 
 
 @dataclass(frozen=True)

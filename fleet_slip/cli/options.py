@@ -10,7 +10,7 @@ import typer
 
 from fleet_slip.cli.completing import complete_config, complete_feature_set
 from fleet_slip.regression.choice.criteria import CRITERIA
-from fleet_slip.regression.choice.ranking import RANKINGS
+from fleet_slip.regression.choice.signal_orders import RANKINGS
 from fleet_slip.regression.choice.stepwise import METHODS
 from fleet_slip.regression.inference.drive_moments import ClusterUnit
 from fleet_slip.selection.model_list import DEFAULT_MOST

@@ -38,7 +38,7 @@ from fleet_slip.delta.sealing import NOTE, seal_note
 from fleet_slip.delta.table import ALL_STATISTICS
 from fleet_slip.errors import ConflictError, RefusedError, StorageError
 from fleet_slip.files.storage_errors import storage_errors
-from fleet_slip.grams.rows.ahead import land_ahead
+from fleet_slip.grams.rows.landing_before_logs import land_ahead
 from fleet_slip.maintenance.rewriting import read_kept_drives
 from fleet_slip.maintenance.unused_names import drop_unused_names
 from fleet_slip.progress import Progress, no_progress

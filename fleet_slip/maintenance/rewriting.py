@@ -18,7 +18,7 @@ from deltalake.transaction import AddAction
 from fleet_slip.arrays import IntArray
 from fleet_slip.delta import Change, Snapshot, Table, TableFile, Unit
 from fleet_slip.errors import FleetSlipError
-from fleet_slip.grams.rows.ahead import land_ahead
+from fleet_slip.grams.rows.landing_before_logs import land_ahead
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.tables import Warehouse
 

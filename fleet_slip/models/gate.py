@@ -38,7 +38,7 @@ from fleet_slip.regression.validation.crossval import (
 from fleet_slip.regression.validation.folds import Folds
 from fleet_slip.regression.validation.paired import compare_paired, compare_typical
 from fleet_slip.resources import config_file
-from fleet_slip.selection.compare import Selection
+from fleet_slip.selection.select_models import Selection
 from fleet_slip.words import number_of
 
 

@@ -23,8 +23,8 @@ from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.trained_drives import checksum_of_drives, pack_drives
 from fleet_slip.models.versions import Registry
 from fleet_slip.regression.validation.crossval import CrossValidation
-from fleet_slip.selection.compare import Selection
 from fleet_slip.selection.request import RequestedSelection
+from fleet_slip.selection.select_models import Selection
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from importlib.metadata import version as package_version
 
 from fleet_slip.catalogue.features import features
 from fleet_slip.models.manifest import Manifest
-from fleet_slip.selection.answer import checksum_of_list
+from fleet_slip.selection.answer_request import checksum_of_list
 from fleet_slip.selection.model_list import load_model_list
 from fleet_slip.warehouse.tables import Warehouse
 

@@ -13,8 +13,8 @@ from fleet_slip.arrays import BoolArray
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.grams.cohorts.cohort import Cohort, load_cohort, require_training
 from fleet_slip.grams.cohorts.empty_cohort import empty_cohort_error
+from fleet_slip.grams.cohorts.gram_cohort import Cohort, load_cohort, require_training
 from fleet_slip.grams.cohorts.reader import GramReader
 from fleet_slip.monitoring.moments import DriveBatches
 from fleet_slip.monitoring.peers import settle
@@ -75,7 +75,7 @@ def examine_drives(
 ) -> QualityReport:
     """Examine the drives that satisfy a condition, with one vehicle model's at a time in memory.
 
-    Raises like `fleet_slip.grams.cohorts.cohort.load_cohort`.
+    Raises like `fleet_slip.grams.cohorts.gram_cohort.load_cohort`.
     """
     drives = parse_condition(condition)
     with GramReader(warehouse) as reader:

@@ -4,8 +4,8 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
-from fleet_slip.grams.cohorts.cohort import Cohort
-from fleet_slip.grams.cohorts.training import clustered_moments
+from fleet_slip.grams.cohorts.gram_cohort import Cohort
+from fleet_slip.grams.cohorts.training_folds import clustered_moments
 from fleet_slip.regression.inference.influential import find_influential
 from fleet_slip.warehouse.condition import Condition, parse_condition
 

@@ -8,7 +8,7 @@ from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.errors import UsageError
 from fleet_slip.grams.cohorts.folding import FoldKey
 from fleet_slip.regression.inference.drive_moments import ClusterUnit
-from fleet_slip.selection.compare import Selection
+from fleet_slip.selection.select_models import Selection
 from fleet_slip.selection.worth import WORTH, parse_worth
 
 DEFAULT_MODELS = "table1"

@@ -8,9 +8,9 @@ import numpy as np
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.grams.cohorts.cohort import Cohort
 from fleet_slip.grams.cohorts.folding import ROW_FOLDS, Folding
-from fleet_slip.grams.cohorts.training import drive_folds, row_training
+from fleet_slip.grams.cohorts.gram_cohort import Cohort
+from fleet_slip.grams.cohorts.training_folds import drive_folds, row_training
 from fleet_slip.regression.choice.criteria import CRITERIA
 from fleet_slip.regression.choice.nested_choice import (
     CROSS_VALIDATION,

@@ -8,9 +8,9 @@ import numpy as np
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError
-from fleet_slip.grams.cohorts.cohort import Cohort
 from fleet_slip.grams.cohorts.folding import Folding
-from fleet_slip.grams.cohorts.training import drive_folds
+from fleet_slip.grams.cohorts.gram_cohort import Cohort
+from fleet_slip.grams.cohorts.training_folds import drive_folds
 from fleet_slip.regression.choice.lars import fit_lasso
 from fleet_slip.regression.choice.nested import nested_fits
 from fleet_slip.regression.choice.nested_choice import FEWEST_FOLDS

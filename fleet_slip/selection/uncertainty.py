@@ -3,17 +3,17 @@
 from dataclasses import dataclass
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.cohorts.cohort import Cohort
 from fleet_slip.grams.cohorts.folding import EACH, Folding
-from fleet_slip.grams.cohorts.training import drive_folds
-from fleet_slip.regression.inference.drive_moments import ClusterUnit, DriveMoments
-from fleet_slip.regression.inference.resampling import (
+from fleet_slip.grams.cohorts.gram_cohort import Cohort
+from fleet_slip.grams.cohorts.training_folds import drive_folds
+from fleet_slip.regression.inference.bootstrap import (
     Interval,
     bootstrap_correlations,
     held_out_products,
     percentile_interval,
     repeated_cross_validation,
 )
+from fleet_slip.regression.inference.drive_moments import ClusterUnit, DriveMoments
 from fleet_slip.regression.validation.crossval import CrossValidation, least_squares
 
 SEED = 1

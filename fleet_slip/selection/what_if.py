@@ -6,7 +6,7 @@ from typing import Any
 
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.errors import QuestionError
-from fleet_slip.grams.cohorts.cohort import Cohort
+from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.regression.exact.figures import Figures, error_sums
 from fleet_slip.regression.exact.least_squares import LinearModel
 from fleet_slip.regression.shrinkage.disturbance import disturb

@@ -20,7 +20,7 @@ from fleet_slip.catalogue.features import features, load_features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.delta import Change, Unit
 from fleet_slip.errors import ConfigError, DataError, QuestionError
-from fleet_slip.grams.cohorts.cohort import load_cohort
+from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.grams.column_plan import ColumnPlan
 from fleet_slip.grams.columns import DriveColumns, DriveCounts
 from fleet_slip.grams.row_code import RowColumn

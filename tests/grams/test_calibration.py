@@ -13,8 +13,8 @@ from fleet_slip.catalogue.car_numbers import CAR_NUMBERS
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.calibration.calibration import calibrate
-from fleet_slip.grams.calibration.car_evidence import Evidence
-from fleet_slip.grams.calibration.car_numbers import KINDS, course_shape, tell_numbers
+from fleet_slip.grams.calibration.car_evidence import CarEvidence
+from fleet_slip.grams.calibration.tell_numbers import KINDS, course_shape, tell_numbers
 from fleet_slip.grams.cohorts.drive_sums import collect_sums
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.maintenance.forget import forget
@@ -68,9 +68,9 @@ def gram_row(car: str, number: int, counts: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def evidence(rows: list[dict[str, Any]], size: int = 7) -> Evidence:
+def evidence(rows: list[dict[str, Any]], size: int = 7) -> CarEvidence:
     batches = [pa.RecordBatch.from_pylist(rows[i : i + size]) for i in range(0, len(rows), size)]
-    return Evidence(collect_sums(batches, KINDS))
+    return CarEvidence(collect_sums(batches, KINDS))
 
 
 @pytest.fixture(scope="module")

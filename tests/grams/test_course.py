@@ -15,7 +15,7 @@ from fleet_slip.grams.column_plan import ColumnPlan
 from fleet_slip.grams.columns import Workspace
 from fleet_slip.grams.drive_rows import counts_of
 from fleet_slip.grams.rows.aggregation import aggregate, by_sql
-from fleet_slip.grams.rows.check import grams_of
+from fleet_slip.grams.rows.check_grams import grams_of
 from fleet_slip.grams.rows.course_sums import course_changes
 from fleet_slip.grams.rows.wide import wide_grams
 from fleet_slip.warehouse.tables import Warehouse

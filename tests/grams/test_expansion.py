@@ -11,10 +11,10 @@ from fleet_slip.catalogue.car_numbers import CAR_NUMBERS
 from fleet_slip.catalogue.features import features
 from fleet_slip.errors import DataError, InputError, QuestionError
 from fleet_slip.grams.calibration.calibration import calibrate
-from fleet_slip.grams.cohorts.cohort import load_cohort
 from fleet_slip.grams.cohorts.expansion import expand
 from fleet_slip.grams.cohorts.fold_sums import sum_cohort
 from fleet_slip.grams.cohorts.folding import Folding
+from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.grams.column_plan import ColumnPlan
 from fleet_slip.grams.columns import DriveCounts
 from fleet_slip.grams.numbered_columns import NumberedColumns

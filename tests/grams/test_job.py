@@ -17,7 +17,7 @@ from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.rows import gram_files
 from fleet_slip.grams.rows.aggregation import aggregate
 from fleet_slip.grams.rows.backlog import find_backlog
-from fleet_slip.grams.rows.check import check_grams, grams_of
+from fleet_slip.grams.rows.check_grams import check_grams, grams_of
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.grams.rows.statement import gram_statement
 from fleet_slip.warehouse.tables import Warehouse

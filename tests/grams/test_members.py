@@ -3,7 +3,7 @@
 import numpy as np
 import pyarrow as pa
 
-from fleet_slip.grams.cohorts.cohort import load_cohort
+from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.grams.cohorts.members import Hashed, Members, hash_numbers
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.warehouse.tables import Warehouse

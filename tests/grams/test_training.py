@@ -5,7 +5,7 @@ import pytest
 
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.cohorts.folding import Folding, FoldKey
-from fleet_slip.grams.cohorts.training import drive_folds, row_training
+from fleet_slip.grams.cohorts.training_folds import drive_folds, row_training
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.inference.drive_moments import DriveMoments
 from tests.support.cohorts import INPUTS, LABEL, Driven, cohort_of, driven, rows_of

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 import fleet_slip
 from fleet_slip import Fleet
 from fleet_slip.catalogue.sources import LONGEST_PAUSE_S
-from fleet_slip.grams.cohorts.cohort import load_cohort
 from fleet_slip.grams.cohorts.fold_sums import sum_cohort
 from fleet_slip.grams.cohorts.folding import EACH, Folding
+from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.ingest import Mapping
 from fleet_slip.resources import read_sql
 from tests.support.measured import csv_text

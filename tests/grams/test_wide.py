@@ -21,7 +21,7 @@ from fleet_slip.grams.column_plan import ColumnPlan
 from fleet_slip.grams.columns import DriveColumns, DriveCounts
 from fleet_slip.grams.rows import statement
 from fleet_slip.grams.rows.aggregation import aggregate, by_sql
-from fleet_slip.grams.rows.check import grams_of
+from fleet_slip.grams.rows.check_grams import grams_of
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.grams.rows.statement import gram_statement
 from fleet_slip.grams.rows.wide import wide_grams

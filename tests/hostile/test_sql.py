@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from fleet_slip.errors import FleetSlipError, QuestionError, StorageError
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohorts.cohort import load_cohort
+from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.progress import no_progress
 from fleet_slip.views import connect

@@ -9,7 +9,7 @@ import pytest
 from fleet_slip.catalogue.features import column_query, features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohorts.cohort import load_cohort
+from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.ingest import load_mapping
 from fleet_slip.ingest.landing.ingest_job import ingest_file

@@ -17,7 +17,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.delta import Change
 from fleet_slip.errors import QuestionError, RefusedError, StorageError
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohorts.cohort import load_cohort
+from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.grams.rows import gram_job
 from fleet_slip.grams.rows.aggregation import compute_grams
 from fleet_slip.grams.rows.gram_job import update_grams

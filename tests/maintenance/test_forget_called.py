@@ -9,7 +9,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip import Fleet
-from fleet_slip.grams.cohorts.cohort import load_cohort
+from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.ingest import Mapping
 from fleet_slip.maintenance import forget_called
 from fleet_slip.maintenance.forget import ForgetReport, forget

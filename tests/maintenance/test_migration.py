@@ -17,7 +17,7 @@ from fleet_slip.delta import Change, Table
 from fleet_slip.delta.schema import compare_schemas
 from fleet_slip.errors import ConflictError, RefusedError
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.rows.check import check_grams
+from fleet_slip.grams.rows.check_grams import check_grams
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.maintenance.migration import migrate, rescale_counts
 from fleet_slip.resources import folder

@@ -15,7 +15,7 @@ import pytest
 import fleet_slip
 from fleet_slip.delta import Change, Snapshot
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohorts.cohort import load_cohort
+from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.grams.rows import gram_job
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.ingest.landing.ingest_job import ingest_file
@@ -29,7 +29,7 @@ from fleet_slip.maintenance.verify import verify
 from fleet_slip.models.publish import manifest_of, publish
 from fleet_slip.models.versions import Registry
 from fleet_slip.runs.log import recording
-from fleet_slip.selection.answer import answer_request
+from fleet_slip.selection.answer_request import answer_request
 from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.job import simulate_batches

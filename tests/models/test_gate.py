@@ -18,7 +18,7 @@ from fleet_slip.models.diff import compare_versions
 from fleet_slip.models.publish import Publication, manifest_of, publish
 from fleet_slip.models.versions import Registry
 from fleet_slip.resources import CONFIG_VARIABLE
-from fleet_slip.selection.answer import answer_request
+from fleet_slip.selection.answer_request import answer_request
 from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.warehouse.audit import Forgettable
 from fleet_slip.warehouse.tables import Warehouse

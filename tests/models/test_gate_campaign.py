@@ -15,7 +15,7 @@ from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.models.publish import Publication, manifest_of, publish
 from fleet_slip.models.versions import Registry
 from fleet_slip.resources import find_config
-from fleet_slip.selection.answer import answer_request
+from fleet_slip.selection.answer_request import answer_request
 from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.job import simulate_campaign

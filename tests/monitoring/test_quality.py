@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fleet_slip.errors import DataError
-from fleet_slip.grams.cohorts.cohort import load_cohort
+from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.monitoring.plausibility import Fault
 from fleet_slip.monitoring.quality import QualityReport, examine, examine_drives

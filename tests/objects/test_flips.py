@@ -9,9 +9,9 @@ import pytest
 from fleet_slip.errors import StorageError
 from fleet_slip.files import object_files
 from fleet_slip.files.folder import Folder
-from fleet_slip.grams.cohorts.cohort import load_cohort
 from fleet_slip.grams.cohorts.fold_sums import sum_cohort
 from fleet_slip.grams.cohorts.folding import Folding
+from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.maintenance.verify import verify
 from fleet_slip.models.score import score

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from fleet_slip.errors import DataError
 from fleet_slip.regression.choice.nested import nested_fits
 from fleet_slip.regression.exact.elimination import eliminate, inverse_matrix
+from fleet_slip.regression.exact.exact_roots import sqrt
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import (
     condition_number,
@@ -17,7 +18,6 @@ from fleet_slip.regression.exact.least_squares import (
     dependence,
     fit,
 )
-from fleet_slip.regression.exact.rounding import sqrt
 from tests.support.counts import dense_fit, gram_of, names, random_drives
 
 

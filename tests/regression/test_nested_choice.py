@@ -7,7 +7,7 @@ from fleet_slip.errors import QuestionError
 from fleet_slip.regression.choice.nested_choice import (
     CROSS_VALIDATION,
     Rule,
-    Training,
+    TrainingFolds,
     cross_validate_nested,
     cross_validate_selection,
     select_nested,
@@ -34,12 +34,12 @@ def sparse_drives(seed: int, drives: int = 40) -> list[np.ndarray]:
     return result
 
 
-def training_of(drives: list[np.ndarray], *, clustered: bool) -> tuple[Training, np.ndarray]:
+def training_of(drives: list[np.ndarray], *, clustered: bool) -> tuple[TrainingFolds, np.ndarray]:
     table = table_of([gram_of(counts) for counts in drives])
     assignment = by_value([i % 5 for i in range(len(drives))])
     folds = CohortFolds.of([table], assignment).serving(INPUTS, "y")
     moments = DriveMoments.of(table) if clustered else None
-    return Training(folds, moments, unit_scales(5)), assignment.fold
+    return TrainingFolds(folds, moments, unit_scales(5)), assignment.fold
 
 
 @pytest.mark.parametrize("ranking", ["forward", "backward", "t", "lars"])
@@ -77,7 +77,7 @@ def test_the_choice_is_made_again_inside_every_training_fold() -> None:
         rest = [drive for drive, f in zip(drives, fold, strict=True) if f != number]
         table = table_of([gram_of(counts) for counts in rest])
         folds = CohortFolds.of([table], by_value([i % 4 for i in range(16)]))
-        inner = Training(folds.serving(INPUTS, "y"), DriveMoments.of(table), unit_scales(5))
+        inner = TrainingFolds(folds.serving(INPUTS, "y"), DriveMoments.of(table), unit_scales(5))
         model = select_nested(inner, INPUTS, "y", rule).fit.model
         tests.append(error_sums(model, training.folds.grams[number]))
     pooled = sum(tests[1:], tests[0])
@@ -100,7 +100,7 @@ def test_inner_cross_validation_needs_folds() -> None:
     table = table_of([gram_of(counts) for counts in drives])
     assignment = by_value([0, 0, 0, 1, 1, 1])
     folds = CohortFolds.of([table], assignment).serving(INPUTS, "y")
-    training = Training(folds, None, unit_scales(5))
+    training = TrainingFolds(folds, None, unit_scales(5))
     with pytest.raises(QuestionError, match="at least three folds"):
         cross_validate_selection(
             "x", training, assignment.fold, INPUTS, "y", Rule("t", CROSS_VALIDATION)

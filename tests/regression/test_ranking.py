@@ -20,7 +20,7 @@ from fleet_slip.regression.choice.lars import (
 )
 from fleet_slip.regression.choice.leaps import best_by_leaps
 from fleet_slip.regression.choice.nested import nested_fits
-from fleet_slip.regression.choice.ranking import RANKINGS, rank, replacement_sets
+from fleet_slip.regression.choice.signal_orders import RANKINGS, rank, replacement_sets
 from fleet_slip.regression.choice.subsets import all_rss, best_subsets, candidates, signals_of
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import correlation_matrix, fit

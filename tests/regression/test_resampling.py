@@ -6,8 +6,7 @@ import pytest
 from fleet_slip.errors import DataError
 from fleet_slip.regression.exact.gram_table import GramTable
 from fleet_slip.regression.exact.least_squares import fit
-from fleet_slip.regression.inference.drive_moments import DriveMoments
-from fleet_slip.regression.inference.resampling import (
+from fleet_slip.regression.inference.bootstrap import (
     bootstrap_coefficients,
     bootstrap_correlations,
     held_out_products,
@@ -16,6 +15,7 @@ from fleet_slip.regression.inference.resampling import (
     solve,
     to_counts,
 )
+from fleet_slip.regression.inference.drive_moments import DriveMoments
 from fleet_slip.regression.inference.standard_errors import infer_by_clusters
 from fleet_slip.regression.validation.crossval import cross_validate, least_squares
 from fleet_slip.regression.validation.folds import CohortFolds, by_value

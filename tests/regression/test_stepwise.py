@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fleet_slip.errors import QuestionError
-from fleet_slip.regression.choice.ranking import rank, replacement_sets
+from fleet_slip.regression.choice.signal_orders import rank, replacement_sets
 from fleet_slip.regression.choice.stepwise import METHODS, stepwise_order
 from fleet_slip.regression.exact.gram import Gram
 

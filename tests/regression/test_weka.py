@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from fleet_slip.regression.choice.nested import nested_fits
-from fleet_slip.regression.choice.ranking import backward
+from fleet_slip.regression.choice.signal_orders import backward
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import LinearModel, fit
 from fleet_slip.regression.inference.evidence import Evidence

@@ -7,11 +7,11 @@ from sklearn.model_selection import LeaveOneGroupOut, cross_val_predict
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError
-from fleet_slip.grams.cohorts import cohort as cohorts
-from fleet_slip.grams.cohorts.cohort import assign_folds
+from fleet_slip.grams.cohorts import gram_cohort as cohorts
 from fleet_slip.grams.cohorts.folding import EACH, FoldCount, Folding
-from fleet_slip.selection.compare import select
+from fleet_slip.grams.cohorts.gram_cohort import assign_folds
 from fleet_slip.selection.model_list import CandidateModel
+from fleet_slip.selection.select_models import select
 from tests.support.cohorts import INPUTS, LABEL, cohort_of, driven
 
 MODEL = CandidateModel(name="all", signals=INPUTS)

@@ -13,8 +13,8 @@ from typing import Literal
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.regression.choice.ranking import backward
-from fleet_slip.regression.exact import rounding
+from fleet_slip.regression.choice.signal_orders import backward
+from fleet_slip.regression.exact import exact_roots
 from fleet_slip.regression.exact.figures import error_sums
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import LinearModel
@@ -172,6 +172,6 @@ def standardised_size(gram: Gram, model: LinearModel) -> dict[str, float]:
     """Return |b_j| s_j / s_y of each signal, s the standard deviations."""
     matrix = gram.restrict([*model.signals, model.label]).centred()
     return {
-        name: rounding.sqrt(b * b * matrix[i][i] / matrix[-1][-1])
+        name: exact_roots.sqrt(b * b * matrix[i][i] / matrix[-1][-1])
         for i, (name, b) in enumerate(zip(model.signals, model.coefficients, strict=True))
     }

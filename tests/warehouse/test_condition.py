@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohorts.cohort import load_cohort
 from fleet_slip.grams.cohorts.day_sums import sum_days
 from fleet_slip.grams.cohorts.fold_sums import sum_cohort
 from fleet_slip.grams.cohorts.folding import Folding
+from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.score import score_statement

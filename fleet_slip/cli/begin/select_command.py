@@ -20,9 +20,9 @@ from fleet_slip.regression.choice.nested_choice import (
 )
 from fleet_slip.regression.inference.evidence import Evidence
 from fleet_slip.regression.validation.crossval import CrossValidation
-from fleet_slip.selection.compare import Selection
 from fleet_slip.selection.request import RequestedSelection, SelectionRequest
 from fleet_slip.selection.search import SearchChoice
+from fleet_slip.selection.select_models import Selection
 from fleet_slip.selection.uncertainty import Uncertainty
 from fleet_slip.words import number_of
 

@@ -11,7 +11,7 @@ from fleet_slip.catalogue.sources import ALL_DRIVES
 from fleet_slip.cli.options import Cohort
 from fleet_slip.cli.output import Json, print_json, print_table, say
 from fleet_slip.grams.calibration.calibration import Calibration
-from fleet_slip.grams.calibration.car_evidence import Calibrated
+from fleet_slip.grams.calibration.car_evidence import CalibratedNumber
 from fleet_slip.words import number_of
 
 
@@ -45,7 +45,7 @@ def calibrate(
         _print_fleet(found)
 
 
-def _print_car(car: str, numbers: Mapping[NumberName, Calibrated]) -> None:
+def _print_car(car: str, numbers: Mapping[NumberName, CalibratedNumber]) -> None:
     print_table(
         f"{car}, by its own drives",
         ["number", "unit", "value", "+-", "drives", "count on board", "of"],

@@ -13,7 +13,7 @@ from fleet_slip.comparison.evaluation.ranking import Ranking, rank
 from fleet_slip.comparison.evaluation.results import document
 from fleet_slip.comparison.evaluation.runs import EvaluatedScenario, run_all
 from fleet_slip.comparison.evaluation.targets import Check, check_filter_targets, check_targets
-from fleet_slip.grams.cohorts.cohort import Cohort
+from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.simulation.scenario import Scenario, load_scenario

@@ -22,7 +22,7 @@ from fleet_slip.comparison.observers.tuning import tune
 from fleet_slip.config import Config
 from fleet_slip.errors import DataError
 from fleet_slip.files.documents import DocumentFolder
-from fleet_slip.grams.cohorts.cohort import Cohort
+from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.runs.log import LOGGER
 from fleet_slip.vehicle.parameters import VehicleParameters
 from fleet_slip.views import connect

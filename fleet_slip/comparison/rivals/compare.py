@@ -19,7 +19,7 @@ from fleet_slip.comparison.rivals.learners import LEARNERS, OF_WINDOWS
 from fleet_slip.comparison.rivals.sample import Sample, draw_sample
 from fleet_slip.comparison.rivals.tree_filter import BASE, GROUP, train_tree_filter
 from fleet_slip.grams.calibration.calibration import calibrate
-from fleet_slip.grams.cohorts.cohort import Cohort
+from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.regression.validation.folds import FoldAssignment
 from fleet_slip.selection.model_list import load_model_list

@@ -14,8 +14,8 @@ import pyarrow as pa
 from fleet_slip.catalogue.car_numbers import CALIBRATION, CAR_NUMBERS, NumberName
 from fleet_slip.catalogue.sources import ALL_DRIVES
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.grams.calibration.car_evidence import Calibrated, Convergence, Evidence
-from fleet_slip.grams.calibration.car_numbers import KINDS
+from fleet_slip.grams.calibration.car_evidence import CalibratedNumber, CarEvidence, Convergence
+from fleet_slip.grams.calibration.tell_numbers import KINDS
 from fleet_slip.grams.cohorts.drive_sums import collect_sums
 from fleet_slip.grams.cohorts.reader import GramReader, OpenedGrams, open_grams
 from fleet_slip.warehouse.condition import Condition, parse_condition
@@ -33,12 +33,12 @@ class Calibration:
         evidence: sums and variances that the numbers came from.
     """
 
-    cars: Mapping[str, Mapping[NumberName, Calibrated]]
+    cars: Mapping[str, Mapping[NumberName, CalibratedNumber]]
     logs_version: int
     grams_version: int
-    evidence: Evidence
+    evidence: CarEvidence
 
-    def car(self, vehicle_id: str) -> Mapping[NumberName, Calibrated]:
+    def car(self, vehicle_id: str) -> Mapping[NumberName, CalibratedNumber]:
         """Return the numbers of a car. Raises `QuestionError` if no drive is of it."""
         if vehicle_id not in self.cars:
             raise QuestionError(
@@ -93,7 +93,7 @@ def calibration_of(opened: OpenedGrams, condition: Condition) -> Calibration:
 
     `opened` are the Gram rows of the feature set `calibration`.
     """
-    evidence = Evidence(collect_sums(opened.batches(condition), KINDS))
+    evidence = CarEvidence(collect_sums(opened.batches(condition), KINDS))
     cars = {car: evidence.calibrated(car) for car in evidence.cars}
     return Calibration(cars, opened.logs_version, opened.grams_version, evidence)
 

@@ -14,13 +14,13 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.car_numbers import CAR_NUMBERS, NumberName
-from fleet_slip.grams.calibration.car_numbers import Telling, gradient_about, tell_numbers
+from fleet_slip.grams.calibration.tell_numbers import Telling, gradient_about, tell_numbers
 from fleet_slip.grams.cohorts.drive_sums import DriveSums
 from fleet_slip.regression.exact.plane import Influence, influence
 
 
 @dataclass(frozen=True)
-class Calibrated:
+class CalibratedNumber:
     """One number of one car.
 
     Attributes:
@@ -59,7 +59,7 @@ STEPS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 """Numbers of drives that a convergence is shown for."""
 
 
-class Evidence:
+class CarEvidence:
     """Sums of the drives of all cars, and the variance of residuals as drives differ."""
 
     def __init__(self, sums: Mapping[str, DriveSums]) -> None:
@@ -135,17 +135,17 @@ class Evidence:
             for name, variance in own.items()
         }
 
-    def calibrated(self, car: str) -> dict[NumberName, Calibrated]:
+    def calibrated(self, car: str) -> dict[NumberName, CalibratedNumber]:
         """Return the numbers of a car."""
         told, slices = self.told[car], self._slices(car)
         sure = self.uncertainties(told, slices)
-        found: dict[NumberName, Calibrated] = {}
+        found: dict[NumberName, CalibratedNumber] = {}
         for name in CAR_NUMBERS:
             if name in told:
                 at = slices[told[name].kind]
                 rows = int(self.sums[told[name].kind].table.n[at].sum())
                 count = CAR_NUMBERS[name].count(told[name].value)
-                found[name] = Calibrated(
+                found[name] = CalibratedNumber(
                     value=float(told[name].value),
                     count=count or 0,
                     uncertainty=_three_digits(sure[name]) if name in sure else None,

@@ -10,10 +10,10 @@ import pyarrow as pa
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.grams.cohorts.cohort import require_training
 from fleet_slip.grams.cohorts.empty_cohort import empty_cohort
 from fleet_slip.grams.cohorts.expansion import expansion_of
 from fleet_slip.grams.cohorts.folding import EACH, Folding
+from fleet_slip.grams.cohorts.gram_cohort import require_training
 from fleet_slip.grams.cohorts.members import Hashed, Members, add_hashed, hash_numbers
 from fleet_slip.grams.cohorts.reader import GramReader, open_grams
 from fleet_slip.grams.rows.gram_rows import gram_table
@@ -48,7 +48,7 @@ def sum_days(
 ) -> DailySums:
     """Add up, day by day, the Gram rows of the drives that have the label and all the inputs.
 
-    Raises like `fleet_slip.grams.cohorts.cohort.load_cohort`, and `DataError`
+    Raises like `fleet_slip.grams.cohorts.gram_cohort.load_cohort`, and `DataError`
     if no drive has them all.
     """
     signals = (*inputs, catalogue().label)

@@ -17,12 +17,6 @@ from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohorts.cells import Cells, dealt_folds
-from fleet_slip.grams.cohorts.cohort import (
-    assign_folds,
-    gram_condition,
-    require_divided,
-    require_training,
-)
 from fleet_slip.grams.cohorts.empty_cohort import empty_cohort
 from fleet_slip.grams.cohorts.expansion import Expansion, expansion_of
 from fleet_slip.grams.cohorts.folding import (
@@ -30,6 +24,12 @@ from fleet_slip.grams.cohorts.folding import (
     FoldCount,
     Folding,
     FoldKey,
+)
+from fleet_slip.grams.cohorts.gram_cohort import (
+    assign_folds,
+    gram_condition,
+    require_divided,
+    require_training,
 )
 from fleet_slip.grams.cohorts.members import (
     Hashed,
@@ -112,7 +112,7 @@ def sum_cohort(
 ) -> SummedCohort:
     """Add up the Gram rows of the drives that satisfy a condition, over each fold.
 
-    Raises like `fleet_slip.grams.cohorts.cohort.load_cohort`, and `DataError`
+    Raises like `fleet_slip.grams.cohorts.gram_cohort.load_cohort`, and `DataError`
     if there are not two folds.
     """
     condition = parse_condition(condition)

@@ -7,7 +7,7 @@ from fleet_slip.catalogue.course_change import with_changes
 from fleet_slip.catalogue.feature_sets import LAG, PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import COUNT_MAX, SignalCatalogue
-from fleet_slip.grams.rows.parts import Parts
+from fleet_slip.grams.rows.drive_parts import Parts
 from fleet_slip.resources import read_sql
 
 LOGS = "read_parquet(getvariable('log_files'), union_by_name => true, hive_partitioning => false)"

@@ -24,7 +24,7 @@ from fleet_slip.grams.columns import DriveCounts, Workspace
 from fleet_slip.grams.drive_rows import LoggedDrive, read_drives
 from fleet_slip.grams.operations import BLOCK_ROWS
 from fleet_slip.grams.rows.course_sums import course_changes
-from fleet_slip.grams.rows.parts import UNKNOWN, Parts
+from fleet_slip.grams.rows.drive_parts import UNKNOWN, Parts
 from fleet_slip.warehouse.tables import Warehouse
 
 _EXACT = 2**53
@@ -91,7 +91,7 @@ def _append_rows(
 
 
 @dataclass
-class DriveSums:
+class PartSums:
     """Sums of the rows of a drive, or of a part of it, that have the same columns."""
 
     size: int
@@ -129,7 +129,7 @@ def _last_if_unknown(kind: Kind) -> tuple[int, bool, int]:
     return absent, part == UNKNOWN, part
 
 
-def drive_sums(workspace: Workspace, parts: Parts, counts: DriveCounts) -> dict[Kind, DriveSums]:
+def drive_sums(workspace: Workspace, parts: Parts, counts: DriveCounts) -> dict[Kind, PartSums]:
     """Return the sums of a drive's rows, by which columns they lack and by part.
 
     Raises `DataError` for a drive that cannot be looked back on, and `StorageError` if sums of
@@ -141,7 +141,7 @@ def drive_sums(workspace: Workspace, parts: Parts, counts: DriveCounts) -> dict[
     if exact_rows < BLOCK_ROWS or total * largest**2 >= _INT64:
         raise StorageError(f"the drive has {total:,} rows: too many for 64-bit sums.")
     workspace.load(counts)
-    complete, totals = DriveSums(len(plan.names)), workspace.totals()
+    complete, totals = PartSums(len(plan.names)), workspace.totals()
     found = {(0, 0): complete}
     first = 0
     while first < total:
@@ -158,7 +158,7 @@ def drive_sums(workspace: Workspace, parts: Parts, counts: DriveCounts) -> dict[
     return {kind: sums for kind, sums in found.items() if sums.n}
 
 
-def change_sums(workspace: Workspace, counts: DriveCounts, apart: int) -> dict[Kind, DriveSums]:
+def change_sums(workspace: Workspace, counts: DriveCounts, apart: int) -> dict[Kind, PartSums]:
     """Return the sums of the changes of a drive's columns, by which of them they lack.
 
     Raises like `drive_sums`.
@@ -169,10 +169,10 @@ def change_sums(workspace: Workspace, counts: DriveCounts, apart: int) -> dict[K
         raise StorageError(f"the drive has {len(counts.ticks):,} rows: too many for 64-bit sums.")
     workspace.load(counts)
     changes = course_changes(workspace, counts.ticks, apart)
-    found: dict[Kind, DriveSums] = {}
+    found: dict[Kind, PartSums] = {}
     for kind, rows in _kinds(changes.columns, None):
         has = [i for i in range(len(changes.columns)) if not kind[0] >> i & 1]
-        sums = found.setdefault(kind, DriveSums(len(has)))
+        sums = found.setdefault(kind, PartSums(len(has)))
         for first in range(0, len(rows), exact_rows):
             some = rows[first : first + exact_rows]
             sums.add(changes.columns[np.ix_(np.array(has), some)], changes.clipped[some])
@@ -180,7 +180,7 @@ def change_sums(workspace: Workspace, counts: DriveCounts, apart: int) -> dict[K
 
 
 def _add_by_kind(
-    found: dict[Kind, DriveSums],
+    found: dict[Kind, PartSums],
     workspace: Workspace,
     parts: Parts,
     ticks: NDArray[Any],
@@ -193,7 +193,7 @@ def _add_by_kind(
     for (absent, part), rows in _kinds(block, numbers):
         has = [i for i in range(len(block)) if not absent >> i & 1]
         few = block[np.ix_(np.array(has, dtype=np.int64), rows)]
-        found.setdefault((absent, part), DriveSums(len(has))).add(few, clipped[rows])
+        found.setdefault((absent, part), PartSums(len(has))).add(few, clipped[rows])
     return len(clipped)
 
 

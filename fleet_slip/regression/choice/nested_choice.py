@@ -14,7 +14,7 @@ from fleet_slip.arrays import IntArray
 from fleet_slip.errors import QuestionError
 from fleet_slip.regression.choice.criteria import best_size, criterion_values
 from fleet_slip.regression.choice.nested import nested_fits
-from fleet_slip.regression.choice.ranking import rank
+from fleet_slip.regression.choice.signal_orders import rank
 from fleet_slip.regression.choice.winner import DEFAULT_WORTH, Worth, choose
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import Fit, Scales
@@ -107,7 +107,7 @@ class NestedDistances:
 
 
 @dataclass(frozen=True)
-class Training:
+class TrainingFolds:
     """The rows to choose on.
 
     Attributes:
@@ -144,7 +144,7 @@ class Training:
 
 
 def select_nested(
-    training: Training, inputs: Sequence[str], label: str, rule: Rule
+    training: TrainingFolds, inputs: Sequence[str], label: str, rule: Rule
 ) -> NestedChoice:
     """Rank the inputs, and choose one of the nested models.
 
@@ -164,7 +164,7 @@ def select_nested(
     return NestedChoice(order, size, fits[size], evidence, values)
 
 
-def measure_distances(training: Training, order: Sequence[str], label: str) -> NestedDistances:
+def measure_distances(training: TrainingFolds, order: Sequence[str], label: str) -> NestedDistances:
     """Return the distances of the nested models of an order as it is given.
 
     Raises `DataError` for dependent signals or a label without noise.
@@ -175,7 +175,7 @@ def measure_distances(training: Training, order: Sequence[str], label: str) -> N
 
 
 def cross_validate_nested(
-    training: Training, order: Sequence[str], label: str
+    training: TrainingFolds, order: Sequence[str], label: str
 ) -> list[CrossValidation]:
     """Cross-validate the k+1 nested models of a given order; model j is called "first j"."""
     return [
@@ -186,7 +186,7 @@ def cross_validate_nested(
 
 def cross_validate_selection(
     name: str,
-    training: Training,
+    training: TrainingFolds,
     fold: IntArray,
     inputs: Sequence[str],
     label: str,
@@ -206,7 +206,7 @@ def cross_validate_selection(
     return assemble(name, folds, tests, chosen, training.scales)
 
 
-def _without(training: Training, fold: IntArray, number: int) -> Training:
+def _without(training: TrainingFolds, fold: IntArray, number: int) -> TrainingFolds:
     if len(training.folds.grams) < FEWEST_FOLDS:
         raise QuestionError("choosing inside the training folds needs at least three folds.")
     drives = training.drives

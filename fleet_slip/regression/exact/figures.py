@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
-from fleet_slip.regression.exact import rounding
+from fleet_slip.regression.exact import exact_roots
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import LinearModel
 
@@ -63,11 +63,13 @@ class ErrorSums:
         square = self.signed_r_squared
         return Figures(
             rows=self.n,
-            correlation=math.copysign(rounding.sqrt(abs(square)), square),
-            rmse=rounding.sqrt(self.squared_error / self.n * unit**2),
+            correlation=math.copysign(exact_roots.sqrt(abs(square)), square),
+            rmse=exact_roots.sqrt(self.squared_error / self.n * unit**2),
             error_mean=float(bias * unit),
-            error_std=rounding.sqrt(spread / (self.n - 1) * unit**2) if self.n > 1 else 0.0,
-            relative_rmse=rounding.sqrt(self.squared_error / self.null) if self.null else math.inf,
+            error_std=exact_roots.sqrt(spread / (self.n - 1) * unit**2) if self.n > 1 else 0.0,
+            relative_rmse=exact_roots.sqrt(self.squared_error / self.null)
+            if self.null
+            else math.inf,
         )
 
 

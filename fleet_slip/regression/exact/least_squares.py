@@ -9,7 +9,7 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
-from fleet_slip.regression.exact import rounding
+from fleet_slip.regression.exact import exact_roots
 from fleet_slip.regression.exact.eigenvalues import symmetric_eigenvalues
 from fleet_slip.regression.exact.elimination import Elimination, eliminate
 from fleet_slip.regression.exact.gram import Gram
@@ -201,7 +201,7 @@ def correlation_matrix(gram: Gram) -> FloatArray:
     return np.array(
         [
             [
-                rounding.signed_ratio(Fraction(product), Fraction(squares[i] * squares[j]))
+                exact_roots.signed_ratio(Fraction(product), Fraction(squares[i] * squares[j]))
                 for j, product in enumerate(row)
             ]
             for i, row in enumerate(centred)

@@ -14,7 +14,7 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
-from fleet_slip.regression.exact import rounding, special
+from fleet_slip.regression.exact import exact_roots, special
 from fleet_slip.regression.exact.elimination import inverse_matrix
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import Fit, Scales, dependence, moments
@@ -102,7 +102,7 @@ def infer_classically(fitted: Fit, scales: Scales, variance: Fraction | None = N
     sigma2 = noise_variance(fitted) if variance is None else variance
     units = _units(fitted, scales)
     errors = [
-        rounding.sqrt(v * unit**2)
+        exact_roots.sqrt(v * unit**2)
         for v, unit in zip(classical_variances(fitted, sigma2), units, strict=True)
     ]
     return _inference(
@@ -213,5 +213,5 @@ def _inference(
         t = value / error if error else math.copysign(math.inf, value)
         p = special.student_t_two_sided(t, degrees)
         estimates.append(Estimate(name, value, error, t, p))
-    residual_std = rounding.sqrt(sigma2 * scales[fitted.model.label] ** 2)
+    residual_std = exact_roots.sqrt(sigma2 * scales[fitted.model.label] ** 2)
     return Inference(tuple(estimates), residual_std, degrees, kind)

@@ -8,7 +8,7 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
-from fleet_slip.regression.exact import rounding
+from fleet_slip.regression.exact import exact_roots
 from fleet_slip.regression.exact.elimination import Elimination, eliminate
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import LinearModel, dependence, fit_leading, moments
@@ -42,11 +42,11 @@ class OrthogonalResponses:
         if variance == 0:
             raise DataError(f"{label} has no noise around {', '.join(order)}: nothing to shrink.")
         n = part.n
-        a = [rounding.signed_ratio(Fraction(part.sums[-1]), n * variance)]
+        a = [exact_roots.signed_ratio(Fraction(part.sums[-1]), n * variance)]
         for t, row in enumerate(triangle.rows):
             # Row t of the Cholesky factor of n S is row / sqrt(minor_t minor_{t+1}).
             scale = n * variance * triangle.minors[t] * triangle.minors[t + 1]
-            a.append(rounding.signed_ratio(Fraction(row[-1]), scale))
+            a.append(exact_roots.signed_ratio(Fraction(row[-1]), scale))
         return cls(tuple(order), np.array(a), part, triangle)
 
     def model(self, shrunk: FloatArray) -> LinearModel:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.regression.choice.ranking import backward
+from fleet_slip.regression.choice.signal_orders import backward
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import LinearModel
 from fleet_slip.regression.exact.special import normal_density

@@ -6,7 +6,7 @@ from fractions import Fraction
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.regression.exact import rounding
+from fleet_slip.regression.exact import exact_roots
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import LinearModel
 
@@ -14,7 +14,7 @@ from fleet_slip.regression.exact.least_squares import LinearModel
 def lengths(gram: Gram) -> FloatArray:
     """Return the root of the centred sum of squares of each signal, sqrt(S_aa), in counts."""
     matrix = gram.centred()
-    return np.array([rounding.sqrt(Fraction(row[i], gram.n)) for i, row in enumerate(matrix)])
+    return np.array([exact_roots.sqrt(Fraction(row[i], gram.n)) for i, row in enumerate(matrix)])
 
 
 def from_standardised(

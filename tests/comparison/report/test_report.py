@@ -39,14 +39,14 @@ from fleet_slip.comparison.report.tables.further_tables import standings
 from fleet_slip.errors import DataError
 from fleet_slip.files.documents import Document
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohorts.cohort import load_cohort
+from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.pages.drawing import png_file, svg_file
 from fleet_slip.pages.style import DESK, PHONE
 from fleet_slip.pages.text import degrees, number
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.resources import config_names
-from fleet_slip.selection.compare import validate
 from fleet_slip.selection.model_list import CandidateModel
+from fleet_slip.selection.select_models import validate
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand

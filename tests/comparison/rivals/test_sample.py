@@ -11,7 +11,7 @@ from fleet_slip.comparison.rivals.inputs import Inputs, LearnedEstimate
 from fleet_slip.comparison.rivals.learner import Fitted
 from fleet_slip.comparison.rivals.sample import draw_sample
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohorts.cohort import load_cohort
+from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.grams.columns import DriveCounts
 from fleet_slip.models.versions import Registry
 from fleet_slip.views import connect

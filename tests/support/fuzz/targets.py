@@ -27,8 +27,8 @@ from fleet_slip.errors import FleetSlipError
 from fleet_slip.files.data_root import data_root
 from fleet_slip.files.documents import checksum
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohorts.cohort import load_cohort
 from fleet_slip.grams.cohorts.folding import FoldKey
+from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.ingest.landing.ingest_job import ingest_file
 from fleet_slip.ingest.mapping.mapping import Mapping, load_mapping
@@ -37,7 +37,7 @@ from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.score import score
 from fleet_slip.models.versions import Registry
 from fleet_slip.resources import find_config, folder
-from fleet_slip.selection.answer import answer_request
+from fleet_slip.selection.answer_request import answer_request
 from fleet_slip.selection.model_list import load_model_list
 from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.simulation.campaign import load_campaign

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.cohorts.cohort import Cohort
-from fleet_slip.grams.cohorts.training import clustered_moments
+from fleet_slip.grams.cohorts.gram_cohort import Cohort
+from fleet_slip.grams.cohorts.training_folds import clustered_moments
 from fleet_slip.regression.exact.least_squares import fit
 from fleet_slip.regression.inference.drive_moments import ClusterUnit
 from fleet_slip.regression.inference.standard_errors import (

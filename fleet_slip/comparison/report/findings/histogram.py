@@ -10,12 +10,12 @@ import pyarrow as pa
 
 from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.cohorts.cohort import assign_folds
 from fleet_slip.grams.cohorts.folding import FOLD_KEYS
+from fleet_slip.grams.cohorts.gram_cohort import assign_folds
 from fleet_slip.regression.exact.least_squares import LinearModel
 from fleet_slip.regression.validation.crossval import CrossValidation, least_squares
 from fleet_slip.resources import read_sql
-from fleet_slip.selection.compare import Selection
+from fleet_slip.selection.select_models import Selection
 from fleet_slip.views import connect
 from fleet_slip.warehouse.database import reading_files
 from fleet_slip.warehouse.tables import Warehouse

@@ -14,15 +14,15 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.comparison.evaluation.errors import error_figures
 from fleet_slip.comparison.evaluation.estimators import as_counts
 from fleet_slip.comparison.evaluation.runs import EvaluatedScenario
-from fleet_slip.grams.cohorts.cohort import Cohort
 from fleet_slip.grams.cohorts.folding import Folding
+from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.grams.column_plan import ColumnPlan
 from fleet_slip.grams.columns import DriveColumns
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.regression.validation.crossval import CrossValidation, cross_validate_inputs
 from fleet_slip.regression.validation.folds import CohortFolds
 from fleet_slip.selection.model_list import Search
-from fleet_slip.selection.stepwise import SearchedModels, search_models
+from fleet_slip.selection.searched_models import SearchedModels, search_models
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 
 DRIVES = ("nominal", "melbourne", "noise_doubled", "style_sporty")

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.cohorts.cohort import Cohort
+from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.regression.choice.nested import nested_fits
-from fleet_slip.regression.choice.ranking import RANKINGS, rank
+from fleet_slip.regression.choice.signal_orders import RANKINGS, rank
 from fleet_slip.regression.choice.subsets import best_subsets
 
 CLOSE = 0.001

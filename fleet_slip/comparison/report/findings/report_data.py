@@ -27,15 +27,15 @@ from fleet_slip.comparison.report.findings.kept_evaluation import Evaluated, lat
 from fleet_slip.comparison.report.findings.memory import Memory, looks_back, weigh_memory
 from fleet_slip.comparison.report.findings.ordering import Ordering, compare_orders
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.grams.cohorts.cohort import Cohort, load_cohort
 from fleet_slip.grams.cohorts.folding import BANDS, Folding
+from fleet_slip.grams.cohorts.gram_cohort import Cohort, load_cohort
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.regression.choice.nested_choice import NestedDistances
 from fleet_slip.regression.validation.crossval import CrossValidation
 from fleet_slip.resources import config_file
-from fleet_slip.selection.compare import Selection, select
 from fleet_slip.selection.model_list import load_model_list
 from fleet_slip.selection.search import try_distances
+from fleet_slip.selection.select_models import Selection, select
 from fleet_slip.simulation.scenario import Scenario, load_scenario, shipped_scenarios
 from fleet_slip.views import connect
 from fleet_slip.warehouse.database import reading_files

@@ -9,9 +9,9 @@ from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError
-from fleet_slip.grams.cohorts.cohort import Cohort, Served, assign_folds
 from fleet_slip.grams.cohorts.folding import FOLD_KEYS, PARTS, ROW_FOLDS, Folding
-from fleet_slip.regression.choice.nested_choice import Training
+from fleet_slip.grams.cohorts.gram_cohort import Cohort, Served, assign_folds
+from fleet_slip.regression.choice.nested_choice import TrainingFolds
 from fleet_slip.regression.inference.drive_moments import ClusterUnit, DriveMoments
 from fleet_slip.regression.validation.folds import CohortFolds, Folds
 
@@ -28,7 +28,7 @@ class DriveFolds:
 
     served: Served
     fold: IntArray
-    training: Training
+    training: TrainingFolds
 
     @property
     def moments(self) -> DriveMoments:
@@ -90,13 +90,13 @@ def drive_folds(
     )
     folds = CohortFolds.of([served.table], assignment).serving(inputs, catalogue().label)
     moments = None if naive else clustered_moments(served, cluster, intercept=intercept)
-    training = Training(folds, moments, input_scales(), intercept)
+    training = TrainingFolds(folds, moments, input_scales(), intercept)
     return DriveFolds(served, assignment.fold, training)
 
 
 def row_training(
     cohort: Cohort, inputs: Sequence[str], folding: Folding, *, intercept: bool = True
-) -> Training:
+) -> TrainingFolds:
     """Return folds of rows; rows then count as independent. Raises `DataError`."""
     folds: Folds = cohort.folds(folding.by, folding.count).serving(inputs, catalogue().label)
-    return Training(folds, None, input_scales(), intercept)
+    return TrainingFolds(folds, None, input_scales(), intercept)

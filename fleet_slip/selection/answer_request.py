@@ -7,14 +7,12 @@ from fleet_slip.canonical import canonical_json, sha256_of
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.errors import QuestionError, UsageError
-from fleet_slip.grams.cohorts.cohort import Cohort, load_cohort
 from fleet_slip.grams.cohorts.fold_sums import SummedCohort, sum_cohort
 from fleet_slip.grams.cohorts.folding import EACH, ROW_FOLDS, Folding, make_folding
+from fleet_slip.grams.cohorts.gram_cohort import Cohort, load_cohort
 from fleet_slip.regression.choice.nested_choice import Rule
 from fleet_slip.regression.choice.stepwise import METHODS
-from fleet_slip.selection.compare import Selection, select
 from fleet_slip.selection.influential_cars import influential_cars, without_vehicles
-from fleet_slip.selection.inputs import WHOLE_SET, inputs_of, require_inputs
 from fleet_slip.selection.model_list import (
     CandidateModel,
     ModelList,
@@ -22,6 +20,7 @@ from fleet_slip.selection.model_list import (
     load_model_list,
     nested_candidates,
 )
+from fleet_slip.selection.named_inputs import WHOLE_SET, inputs_of, require_inputs
 from fleet_slip.selection.request import DEFAULT_MODELS, RequestedSelection, SelectionRequest
 from fleet_slip.selection.search import (
     require_criterion,
@@ -29,6 +28,7 @@ from fleet_slip.selection.search import (
     select_subsets,
     try_distances,
 )
+from fleet_slip.selection.select_models import Selection, select
 from fleet_slip.selection.uncertainty import estimate_uncertainty
 from fleet_slip.selection.worth import WORTH, parse_worth
 from fleet_slip.warehouse.tables import Warehouse

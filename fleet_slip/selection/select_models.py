@@ -9,16 +9,16 @@ from typing_extensions import TypeVar
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.grams.cohorts.cohort import Cohort
 from fleet_slip.grams.cohorts.fold_sums import SummedCohort
 from fleet_slip.grams.cohorts.folding import ROW_FOLDS, Folding
+from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.regression.choice.nested_choice import NestedDistances
 from fleet_slip.regression.choice.winner import DEFAULT_WORTH, Winner, Worth
 from fleet_slip.regression.validation.crossval import CrossValidation, cross_validate_inputs
 from fleet_slip.regression.validation.folds import CohortFolds
 from fleet_slip.selection.model_list import CandidateModel, Search
 from fleet_slip.selection.search import SearchChoice
-from fleet_slip.selection.stepwise import SearchedModels, choose_by, search_models
+from fleet_slip.selection.searched_models import SearchedModels, choose_by, search_models
 from fleet_slip.selection.uncertainty import Uncertainty
 
 AnyCohort = TypeVar("AnyCohort", bound=Cohort | SummedCohort, default=Cohort)

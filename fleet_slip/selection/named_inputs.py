@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 from fleet_slip.catalogue.features import features
 from fleet_slip.errors import QuestionError, UsageError
-from fleet_slip.grams.cohorts.cohort import Cohort
 from fleet_slip.grams.cohorts.fold_sums import SummedCohort
+from fleet_slip.grams.cohorts.gram_cohort import Cohort
 
 WHOLE_SET = "catalogue"
 """As an order of signals: all inputs of the feature set, in its order."""
