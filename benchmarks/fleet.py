@@ -33,7 +33,6 @@ from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.comparison.observers import ekf
 from fleet_slip.comparison.observers.signals import DriveSignals, read_drive
 from fleet_slip.comparison.rivals.compare import all_signals, cross_validate_learner
-from fleet_slip.comparison.rivals.inputs import Inputs
 from fleet_slip.comparison.rivals.learner import one_thread
 from fleet_slip.comparison.rivals.learners import ANFIS, PERCEPTRON, TREES
 from fleet_slip.comparison.rivals.sample import draw_sample
@@ -48,6 +47,7 @@ from fleet_slip.simulation.campaign import DriveSpec, load_campaign
 from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.inputs_today import inputs_today
 
 FOLDS = 10
 SET = "fleet"
@@ -176,7 +176,7 @@ def errors_of_learners(
     """Yield the same of networks, trees and neuro-fuzzy rules, on a sample of rows."""
     loaded = load_cohort(warehouse, cohort)
     sets = {name: models()[name] for name in LEARNED}
-    every = Inputs.of_catalogue(tuple(dict.fromkeys(name for one in sets.values() for name in one)))
+    every = inputs_today(tuple(dict.fromkeys(name for one in sets.values() for name in one)))
     sample = draw_sample(warehouse, loaded, every, numbers=found.counts())
     drives = loaded.drives.select(["trip", "vehicle_id"]).to_pylist()
     car_of = {one["trip"]: one["vehicle_id"] for one in drives}

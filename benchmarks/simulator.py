@@ -20,14 +20,10 @@ from fleet_slip.simulation.speed_profile import SpeedLimits, speed_profile
 from fleet_slip.simulation.track import load_track
 from fleet_slip.vehicle.driver import SAMPLE_S
 from fleet_slip.vehicle.highway import FourWheelVehicle
-from fleet_slip.vehicle.lanes.lane_drives import (
-    STEPS_PER_SAMPLE,
-    LaneDrive,
-    simulate_blocks,
-    simulate_drives,
-)
+from fleet_slip.vehicle.lanes.lane_drives import STEPS_PER_SAMPLE, LaneDrive, simulate_blocks
 from fleet_slip.vehicle.lanes.road import Road
 from fleet_slip.vehicle.parameters import load_vehicle
+from tests.support.whole_drives import simulate_drives
 
 ROUNDS = 5
 DRIVES = 32

@@ -31,8 +31,9 @@ from fleet_slip.simulation.campaign import Batch, load_campaign
 from fleet_slip.simulation.drives import lane_drive, simulate_logs, tabulate
 from fleet_slip.simulation.sensors import Recorder
 from fleet_slip.vehicle.lanes import kernel
-from fleet_slip.vehicle.lanes.lane_drives import LaneDrive, simulate_blocks, simulate_drives
+from fleet_slip.vehicle.lanes.lane_drives import LaneDrive, simulate_blocks
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.whole_drives import simulate_drives
 
 ROUNDS = 5
 

@@ -21,7 +21,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.vehicle.driver import handling
 from fleet_slip.vehicle.imperfections import PERFECT, CarImperfections
-from fleet_slip.vehicle.lanes.lane_drives import LaneDrive, Truth, simulate_drives
+from fleet_slip.vehicle.lanes.lane_drives import LaneDrive
 from fleet_slip.vehicle.lanes.road import Road
 from fleet_slip.vehicle.parameters import (
     GRAVITY_MPS2,
@@ -30,6 +30,7 @@ from fleet_slip.vehicle.parameters import (
 )
 from tests.support.linear_bicycle import LinearBicycle
 from tests.support.open_loop import Response, steer
+from tests.support.whole_drives import Truth, simulate_drives
 
 CARS = {"compact": "compact_hatchback", "sedan": "d_class_sedan", "SUV": "suv"}
 RADIUS_M = 100.0

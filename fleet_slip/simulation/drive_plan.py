@@ -4,14 +4,20 @@ import hashlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field, FiniteFloat, model_validator
+from pydantic import BeforeValidator, Field, FiniteFloat
 
 from fleet_slip.config import Config
 from fleet_slip.errors import ConfigError
-from fleet_slip.simulation.imperfections import NONE, ImperfectionRanges, Imperfections
+from fleet_slip.simulation.imperfections import (
+    NONE,
+    ImperfectionRanges,
+    Imperfections,
+    NotNegative,
+    Range,
+)
 from fleet_slip.simulation.manoeuvres import Manoeuvre
 from fleet_slip.simulation.sensors import Sensors
 from fleet_slip.simulation.speed_profile import SpeedLimits
@@ -38,7 +44,6 @@ def load_by_name(load: Callable[[str], object]) -> BeforeValidator:
 NamedTrack = Annotated[Track, load_by_name(load_track)]
 NamedVehicle = Annotated[VehicleParameters, load_by_name(load_vehicle)]
 Positive = Annotated[FiniteFloat, Field(gt=0)]
-NotNegative = Annotated[FiniteFloat, Field(ge=0)]
 NotEmpty = Field(min_length=1)
 
 
@@ -49,21 +54,11 @@ def random_generator(seed: int, *identity: str) -> np.random.Generator:
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, *words])))
 
 
-class Uniform(Config):
+class Uniform(Range):
     """A uniform distribution over positive numbers."""
 
     min: Positive
     max: Positive
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        if self.min > self.max:
-            raise ValueError(f"min {self.min} is above max {self.max}")
-        return self
-
-    def draw(self, generator: np.random.Generator) -> float:
-        """Draw one number."""
-        return float(generator.uniform(self.min, self.max))
 
 
 @dataclass(frozen=True)

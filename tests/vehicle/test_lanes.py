@@ -13,10 +13,11 @@ from fleet_slip.simulation.speed_profile import SpeedLimits, speed_profile
 from fleet_slip.simulation.track import load_track
 from fleet_slip.vehicle.lanes import kernel
 from fleet_slip.vehicle.lanes.lane_blocks import BLOCK, CHANNELS
-from fleet_slip.vehicle.lanes.lane_drives import LaneDrive, Truth, simulate_blocks, simulate_drives
+from fleet_slip.vehicle.lanes.lane_drives import LaneDrive, simulate_blocks
 from fleet_slip.vehicle.lanes.road import Road
 from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
 from tests.support.rolling import SEDAN
+from tests.support.whole_drives import Truth, simulate_drives
 
 MASSES_KG = (1000.0, 1320.0, 1740.0)
 TRACKS = ("waterford_hills", "melbourne")

@@ -2,10 +2,11 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
-from typing import Any, Protocol
+from dataclasses import dataclass, field
+from typing import Any
 
 from fleet_slip.comparison.evaluation.comparison import FleetComparison, compare_fleets
+from fleet_slip.comparison.evaluation.errors import ErrorFigures
 from fleet_slip.comparison.evaluation.estimators import Estimate, TrainedModels, train_models
 from fleet_slip.comparison.evaluation.filters import Bank, FilterEstimate, filter_bank
 from fleet_slip.comparison.evaluation.gps_noise import GpsSweep, sweep_gps_noise
@@ -20,22 +21,47 @@ from fleet_slip.simulation.scenario import Scenario, load_scenario
 from fleet_slip.warehouse.tables import Warehouse
 
 
-class Rival(Protocol):
-    """What an evaluation asks of a learned rival; `fleet_slip.comparison.rivals` has them."""
+@dataclass(frozen=True)
+class Rival:
+    """A rival that was trained, with what it reaches and costs.
 
-    @property
-    def name(self) -> str:
-        """Name among the estimators."""
+    Attributes:
+        name: among the estimators.
+        learner: what was fitted, in words.
+        estimate: fitted to the whole sample, what estimates side-slip in rad of a drive; NaN where
+            an input is null.
+        signals: its inputs.
+        cross_validated: figures on drives that it was not fitted on, pooled over the folds.
+        rows: rows of the sample.
+        training_s: time to fit the whole sample.
+        size_bytes: what a car would have to carry.
+        one_estimate_us: time of one estimate by itself, as on board; the median of many.
+        each_of_many_us: time of each of many estimates at once.
+        told: what a document says of it besides.
+    """
 
-    @property
-    def estimate(self) -> Estimate:
-        """What estimates side-slip in rad of a drive; NaN where an input is null."""
+    name: str
+    learner: str
+    estimate: Estimate
+    signals: tuple[str, ...]
+    cross_validated: ErrorFigures
+    rows: int
+    training_s: float
+    size_bytes: int
+    one_estimate_us: float
+    each_of_many_us: float
+    told: Mapping[str, Any] = field(default_factory=dict)
 
-    def description(self) -> Mapping[str, Any]:
+    def description(self) -> dict[str, Any]:
         """Return what a document says of it as an estimator."""
+        return {"kind": "rival", "group": "rivals", "signals": list(self.signals), **self.told}
 
     def as_dict(self) -> dict[str, Any]:
         """Return what a document says of its accuracy and cost."""
+        left_out = ("estimate", "told", "cross_validated", "signals")
+        plain = {name: value for name, value in vars(self).items() if name not in left_out}
+        figures = self.cross_validated.as_dict()
+        return {**plain, "signals": list(self.signals), "cross_validated": figures}
 
 
 TrainRivals = Callable[[Warehouse, Cohort, Manifest, Bank], Sequence[Rival]]

@@ -3,8 +3,6 @@
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -17,7 +15,7 @@ from fleet_slip.comparison.rivals.inputs import Inputs, LearnedEstimate
 from fleet_slip.comparison.rivals.learner import Fitted, Learner, one_thread
 from fleet_slip.comparison.rivals.learners import LEARNERS, OF_WINDOWS
 from fleet_slip.comparison.rivals.sample import Sample, draw_sample
-from fleet_slip.comparison.rivals.tree_filter import BASE, GROUP, train_tree_filter
+from fleet_slip.comparison.rivals.tree_filter import BASE, train_tree_filter
 from fleet_slip.grams.calibration.calibration import calibrate
 from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.models.manifest import Manifest
@@ -37,49 +35,6 @@ def all_signals() -> tuple[str, ...]:
     """Return the signals of model 4 of Table I, which the paper settles on."""
     models = load_model_list(TABLE_ONE).model
     return next(model.signals for model in models if model.name == "4")
-
-
-@dataclass(frozen=True)
-class TrainedRival:
-    """One learner on one set of inputs.
-
-    Attributes:
-        name: learner, and number of signals or `windows`.
-        learner: what was fitted.
-        estimate: fit to the whole sample, as an estimator of a drive.
-        cross_validated: figures on drives that it was not fitted on, pooled over the folds.
-        rows: rows of the sample.
-        training_s: time to fit the whole sample.
-        one_estimate_us: time of one estimate by itself, as on board; the median of many.
-        each_of_many_us: time of each of many estimates at once.
-    """
-
-    name: str
-    learner: Learner
-    estimate: LearnedEstimate
-    cross_validated: ErrorFigures
-    rows: int
-    training_s: float
-    one_estimate_us: float
-    each_of_many_us: float
-
-    def description(self) -> dict[str, Any]:
-        """Return what a JSON document says of it as an estimator."""
-        return {"kind": "rival", "group": GROUP, "signals": list(self.estimate.inputs.names)}
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return what a JSON document says of its accuracy and cost."""
-        return {
-            "name": self.name,
-            "learner": self.learner.description,
-            "signals": list(self.estimate.inputs.names),
-            "rows": self.rows,
-            "cross_validated": self.cross_validated.as_dict(),
-            "training_s": self.training_s,
-            "size_bytes": self.estimate.fitted.size_bytes,
-            "one_estimate_us": self.one_estimate_us,
-            "each_of_many_us": self.each_of_many_us,
-        }
 
 
 def train_rivals(
@@ -109,20 +64,22 @@ def train_rivals(
         return (*learned, train_tree_filter(bank.estimators[BASE], drives, executor))
 
 
-def train(learner: Learner, sample: Sample, inputs: Inputs, suffix: str) -> TrainedRival:
+def train(learner: Learner, sample: Sample, inputs: Inputs, suffix: str) -> Rival:
     """Fit and cross-validate one learner, and measure it."""
     values = sample.of(inputs.names)
     started = time.perf_counter()
     fitted = learner.fit(values, sample.sideslip_rad, sample.trip)
     training_s = time.perf_counter() - started
     one_us, each_us = time_estimates(fitted, values)
-    return TrainedRival(
+    return Rival(
         name=f"{learner.name}_{suffix}",
-        learner=learner,
+        learner=learner.description,
         estimate=LearnedEstimate(inputs, fitted),
+        signals=inputs.names,
         cross_validated=cross_validate_learner(learner, values, sample, sample.folds(FOLDS)),
         rows=len(values),
         training_s=training_s,
+        size_bytes=fitted.size_bytes,
         one_estimate_us=one_us,
         each_of_many_us=each_us,
     )

@@ -10,7 +10,6 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.arithmetic import parse
 from fleet_slip.catalogue.columns import Definition
-from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.comparison.evaluation.estimators import Signals, as_counts
 from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive
@@ -39,22 +38,6 @@ class Inputs:
     def of_signals(cls, names: Sequence[str]) -> "Inputs":
         """Return logged signals as inputs."""
         return cls({name: float(catalogue()[name].scale) for name in names})
-
-    @classmethod
-    def of_catalogue(cls, names: Sequence[str]) -> "Inputs":
-        """Return signals, features and columns over time as they are defined today."""
-        known, scales = features(), input_scales()
-        rows = {
-            name: RowColumn(name, parse(one.sql), one.limit)
-            for name, one in known.features.items()
-            if name in names
-        }
-        over_time = {
-            name: known.time_columns[name].definition
-            for name in names
-            if name in known.time_columns
-        }
-        return cls({name: float(scales[name]) for name in names}, rows, over_time)
 
     @classmethod
     def of_model(cls, manifest: Manifest, signals: Sequence[str]) -> "Inputs":

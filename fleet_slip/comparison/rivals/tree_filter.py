@@ -17,8 +17,9 @@ import numpy as np
 from pydantic import Field, FiniteFloat
 
 from fleet_slip.arrays import FloatArray, IntArray
-from fleet_slip.comparison.evaluation.errors import ErrorFigures, error_figures
+from fleet_slip.comparison.evaluation.errors import error_figures
 from fleet_slip.comparison.evaluation.estimators import Signals
+from fleet_slip.comparison.evaluation.evaluate import Rival
 from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive
 from fleet_slip.comparison.evaluation.filters import FilterEstimate, seen
 from fleet_slip.comparison.observers import ekf
@@ -31,7 +32,6 @@ from fleet_slip.config import Config
 from fleet_slip.vehicle.parameters import VehicleParameters
 
 NAME = "ekf_tree"
-GROUP = "rivals"
 BASE = "ekf_class_tuned"
 """The filter whose noise the tree changes."""
 
@@ -140,53 +140,9 @@ def fit_tree_filter(
     return replace(start, noise=found.parameters)
 
 
-@dataclass(frozen=True)
-class TreeRival:
-    """The filter with its tree as a rival that was trained.
-
-    Attributes:
-        estimate: fitted to all training drives.
-        cross_validated: figures on each training drive, by a tree that has not seen it.
-        rows: rows of the training drives.
-        training_s: time to fit.
-        one_estimate_us: time of one step.
-    """
-
-    estimate: TreeFilter
-    cross_validated: ErrorFigures
-    rows: int
-    training_s: float
-    one_estimate_us: float
-    name: str = NAME
-
-    def description(self) -> dict[str, Any]:
-        """Return what a JSON document says of it as an estimator."""
-        return {
-            "kind": "rival",
-            "group": GROUP,
-            "signals": list(SIGNALS),
-            "told": "class",
-            "factors": self.estimate.noise.model_dump(),
-        }
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return what a JSON document says of its accuracy and cost."""
-        return {
-            "name": self.name,
-            "learner": f"Kalman filter with a decision tree of {LEAVES} leaves",
-            "signals": list(SIGNALS),
-            "rows": self.rows,
-            "cross_validated": self.cross_validated.as_dict(),
-            "training_s": self.training_s,
-            "size_bytes": self.estimate.size_bytes,
-            "one_estimate_us": self.one_estimate_us,
-            "each_of_many_us": self.one_estimate_us,
-        }
-
-
 def train_tree_filter(
     base: FilterEstimate, drives: Sequence[LabelledDrive], executor: Executor
-) -> TreeRival:
+) -> Rival:
     """Fit the filter with a tree to drives, and to all but each of them; measure it."""
     started = time.perf_counter()
     fitted = fit_tree_filter(base, drives, executor)
@@ -199,7 +155,19 @@ def train_tree_filter(
     estimates = [_held_out(base, drives, number, executor) for number in range(len(drives))]
     truth = np.concatenate([drive.sideslip_rad for drive in drives])
     figures = error_figures(np.concatenate(estimates), truth, np.isfinite(truth))
-    return TreeRival(fitted, figures, rows, training_s, step_s * 1e6)
+    return Rival(
+        name=NAME,
+        learner=f"Kalman filter with a decision tree of {LEAVES} leaves",
+        estimate=fitted,
+        signals=SIGNALS,
+        cross_validated=figures,
+        rows=rows,
+        training_s=training_s,
+        size_bytes=fitted.size_bytes,
+        one_estimate_us=step_s * 1e6,
+        each_of_many_us=step_s * 1e6,
+        told={"told": "class", "factors": fitted.noise.model_dump()},
+    )
 
 
 def _held_out(

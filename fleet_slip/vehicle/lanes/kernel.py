@@ -23,9 +23,6 @@ from fleet_slip.vehicle.driver import (
     Handling,
     decide,
 )
-from fleet_slip.vehicle.dynamics import derivative
-from fleet_slip.vehicle.integration import SECOND_ORDER, Slopes, advance
-from fleet_slip.vehicle.lanes.imperfect_kernel import integrate_imperfect, look_around
 from fleet_slip.vehicle.lanes.lane_blocks import (
     BLOCK,
     at,
@@ -42,18 +39,16 @@ from fleet_slip.vehicle.lanes.lane_memory import (
     HANDLING,
     LAP,
     NOBODY,
-    ORDER,
     PATH,
     POSE,
-    POSE_SLOPES,
-    SLOPES,
     STATE,
     TICK,
 )
+from fleet_slip.vehicle.lanes.movement import build_integrate, look_around
 from fleet_slip.vehicle.lanes.route import place
 from fleet_slip.vehicle.lanes.rows import LANES, read, write
 from fleet_slip.vehicle.parameters import Constants
-from fleet_slip.vehicle.pose import Path, Pose, PoseSlopes, advance_pose, pose_slopes
+from fleet_slip.vehicle.pose import Path, Pose
 from fleet_slip.vehicle.state import Controls, State
 
 AFTER_LOSS = 500
@@ -100,31 +95,6 @@ def _decide(memory: Any) -> None:
         h = read(memory, HANDLING, lane, Handling)
         c = read(memory, CAR, lane, Constants)
         write(memory, CONTROLS, lane, decide(x, pose, path, before, h, c))
-
-
-@equation
-def _integrate(memory: Any, step_s: float, first_step: bool) -> None:
-    """Move all cars on by one step; keep the specific force at the first step of a sample."""
-    for lane in range(LANES):
-        x = read(memory, STATE, lane, State)
-        u = read(memory, CONTROLS, lane, Controls)
-        c = read(memory, CAR, lane, Constants)
-        pose = read(memory, POSE, lane, Pose)
-        path = read(memory, PATH, lane, Path)
-        order = memory[ORDER * LANES + lane]
-        d = derivative(x, u, c)
-        slopes_before = read(memory, SLOPES, lane, Slopes)
-        after, slopes = advance(x, d, slopes_before, c, step_s, order)
-        pose_before = read(memory, POSE_SLOPES, lane, PoseSlopes)
-        travel = pose_slopes(x, pose, path)
-        ax = d.ax if first_step else memory[FORCE * LANES + lane]
-        ay = d.ay if first_step else memory[(FORCE + 1) * LANES + lane]
-        write(memory, STATE, lane, after)
-        write(memory, SLOPES, lane, slopes)
-        write(memory, POSE, lane, advance_pose(pose, travel, pose_before, step_s, order))
-        write(memory, POSE_SLOPES, lane, travel)
-        write(memory, FORCE, lane, (ax, ay))
-        memory[ORDER * LANES + lane] = SECOND_ORDER
 
 
 @equation
@@ -203,6 +173,8 @@ def build_kernel(sources: str, imperfect: bool = False) -> Callable[..., None]:
     compiled code on disk: a change of any module compiles it again.
     """
 
+    integrate = build_integrate(imperfect)
+
     def simulate(
         routes: Any,
         cars: Any,
@@ -229,10 +201,7 @@ def build_kernel(sources: str, imperfect: bool = False) -> Callable[..., None]:
                 look_around(memory, book, routes, surfaces, truth)
             _decide(memory)
             for step in range(steps):
-                if imperfect:
-                    integrate_imperfect(memory, SAMPLE_S / steps, step == 0)
-                else:
-                    _integrate(memory, SAMPLE_S / steps, step == 0)
+                integrate(memory, SAMPLE_S / steps, step == 0)
             complete = _move_on(memory, book, routes, truth, ended)
         _finish(truth, book, ended, cars, imperfect)
 

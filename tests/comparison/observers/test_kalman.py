@@ -19,11 +19,19 @@ from fleet_slip.comparison.observers.kalman import (
     predict,
     update,
 )
-from fleet_slip.comparison.observers.outages import TUNNEL_S, tunnel
 from fleet_slip.comparison.observers.signals import STEP_S, DriveSignals
 from fleet_slip.errors import DataError
 from fleet_slip.vehicle.parameters import load_vehicle
-from tests.support.drives import GPS_EVERY, mirrored, noisy, rolling_drive, slalom, without_fixes
+from tests.support.drives import (
+    GPS_EVERY,
+    TUNNEL_S,
+    mirrored,
+    noisy,
+    rolling_drive,
+    slalom,
+    tunnel,
+    without_fixes,
+)
 
 CAR = load_vehicle("d_class_sedan")
 H = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0]])

@@ -16,6 +16,7 @@ from fleet_slip.grams.columns import DriveCounts
 from fleet_slip.models.versions import Registry
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.inputs_today import inputs_today
 
 WINDOWS = ("ay_mean_16", "course_sum_16")
 SIGNALS = ("ay", "yaw_rate")
@@ -23,7 +24,7 @@ SIGNALS = ("ay", "yaw_rate")
 
 def inputs() -> Inputs:
     """Return two signals and two windows."""
-    return Inputs.of_catalogue((*SIGNALS, *WINDOWS))
+    return inputs_today((*SIGNALS, *WINDOWS))
 
 
 @pytest.fixture
@@ -82,7 +83,7 @@ def test_a_rival_sees_on_a_drive_what_it_was_trained_on(
 def test_a_sample_has_the_numbers_that_a_cars_drives_tell(warehouse: Warehouse) -> None:
     cohort = load_cohort(warehouse, "campaign = 'smoke'")
     (car,) = set(cohort.drives["vehicle_id"].to_pylist())
-    offset = Inputs.of_catalogue(("ay_offset_alone",))
+    offset = inputs_today(("ay_offset_alone",))
     told = draw_sample(warehouse, cohort, offset, rows=500, numbers={car: {"ay_offset": 37}})
     number = features().time_columns["ay_offset_alone"].definition.number
     assert number is not None
@@ -107,7 +108,7 @@ def test_of_a_gated_model_a_rival_sees_columns_and_what_opens_the_gates(smoke_ro
     generator = np.random.default_rng(6)
     counts = {name: generator.integers(2000, 6000, 40) for name in catalogue().inputs}
     drive = DriveCounts(np.arange(40), counts)
-    alone = Inputs.of_catalogue(("rear_ay_mean_16", "steering_excess_mean_32"))
+    alone = inputs_today(("rear_ay_mean_16", "steering_excess_mean_32"))
     expected = alone.columns.compute(drive)
     assert (np.ptp(expected, axis=1) > 0).all()
     np.testing.assert_array_equal(found.columns.compute(drive)[2:], expected)

@@ -1,8 +1,10 @@
-"""The stages of the lane kernel that cars with imperfections have of their own."""
+"""The physics of the lane kernel: what is around all cars, and how they move on by a step."""
 
+from collections.abc import Callable
 from typing import Any
 
 from fleet_slip.compiling import equation
+from fleet_slip.vehicle.dynamics import derivative
 from fleet_slip.vehicle.imperfect_dynamics import (
     Around,
     Give,
@@ -77,34 +79,44 @@ def look_around(memory: Any, book: Any, routes: Any, surfaces: Any, truth: Any) 
             truth[further_at(lane, 2, sample)] = x.ay_lag
 
 
-@equation
-def integrate_imperfect(memory: Any, step_s: float, first_step: bool) -> None:
-    """Move all cars on by one step; keep the specific force at the first step of a sample."""
-    for lane in range(LANES):
-        x = read(memory, STATE, lane, State)
-        u = read(memory, CONTROLS, lane, Controls)
-        c = read(memory, CAR, lane, Constants)
-        t = read(memory, TRAITS, lane, Traits)
-        pose = read(memory, POSE, lane, Pose)
-        path = read(memory, PATH, lane, Path)
-        around = read(memory, AROUND, lane, Around)
-        give = read(memory, GIVE, lane, Give)
-        order = memory[ORDER * LANES + lane]
-        d, give_rates = imperfect_derivative(x, u, give, around, c, t)
-        after, slopes = advance(x, d, read(memory, SLOPES, lane, Slopes), c, step_s, order)
-        give_before = read(memory, GIVE_SLOPES, lane, GiveRates)
-        followed = advance_give(
-            give, give_rates, give_before, after.steering_wheel, t, step_s, order
-        )
-        pose_before = read(memory, POSE_SLOPES, lane, PoseSlopes)
-        travel = pose_slopes(x, pose, path)
-        ax = d.ax if first_step else memory[FORCE * LANES + lane]
-        ay = d.ay if first_step else memory[(FORCE + 1) * LANES + lane]
-        write(memory, STATE, lane, after)
-        write(memory, SLOPES, lane, slopes)
-        write(memory, GIVE, lane, followed)
-        write(memory, GIVE_SLOPES, lane, give_rates)
-        write(memory, POSE, lane, advance_pose(pose, travel, pose_before, step_s, order))
-        write(memory, POSE_SLOPES, lane, travel)
-        write(memory, FORCE, lane, (ax, ay))
-        memory[ORDER * LANES + lane] = SECOND_ORDER
+def build_integrate(imperfect: bool) -> Callable[[Any, float, bool], None]:
+    """Compile a step of all cars: of those of the textbook, or of those with imperfections."""
+
+    @equation
+    def integrate(memory: Any, step_s: float, first_step: bool) -> None:
+        """Move all cars on; keep the specific force at the first step of a sample."""
+        for lane in range(LANES):
+            x = read(memory, STATE, lane, State)
+            u = read(memory, CONTROLS, lane, Controls)
+            c = read(memory, CAR, lane, Constants)
+            pose = read(memory, POSE, lane, Pose)
+            path = read(memory, PATH, lane, Path)
+            order = memory[ORDER * LANES + lane]
+            if imperfect:
+                t = read(memory, TRAITS, lane, Traits)
+                around = read(memory, AROUND, lane, Around)
+                give = read(memory, GIVE, lane, Give)
+                d, give_rates = imperfect_derivative(x, u, give, around, c, t)
+            else:
+                d = derivative(x, u, c)
+            after, slopes = advance(x, d, read(memory, SLOPES, lane, Slopes), c, step_s, order)
+            if imperfect:
+                before = read(memory, GIVE_SLOPES, lane, GiveRates)
+                followed = advance_give(
+                    give, give_rates, before, after.steering_wheel, t, step_s, order
+                )
+            pose_before = read(memory, POSE_SLOPES, lane, PoseSlopes)
+            travel = pose_slopes(x, pose, path)
+            ax = d.ax if first_step else memory[FORCE * LANES + lane]
+            ay = d.ay if first_step else memory[(FORCE + 1) * LANES + lane]
+            write(memory, STATE, lane, after)
+            write(memory, SLOPES, lane, slopes)
+            if imperfect:
+                write(memory, GIVE, lane, followed)
+                write(memory, GIVE_SLOPES, lane, give_rates)
+            write(memory, POSE, lane, advance_pose(pose, travel, pose_before, step_s, order))
+            write(memory, POSE_SLOPES, lane, travel)
+            write(memory, FORCE, lane, (ax, ay))
+            memory[ORDER * LANES + lane] = SECOND_ORDER
+
+    return integrate
