@@ -10,7 +10,7 @@ that is made again from its source takes its place without a commit.
 """
 
 from fleet_slip.delta.change import Change, Unit, rows_in
-from fleet_slip.delta.conflicts import retry_conflicts
+from fleet_slip.delta.conflicts import on_newest, retry_conflicts
 from fleet_slip.delta.encoding import Encoded, Encoding
 from fleet_slip.delta.files import TableFile, absent_columns
 from fleet_slip.delta.snapshot import Snapshot
@@ -28,6 +28,7 @@ __all__ = [
     "absent_columns",
     "checksum_in",
     "checksum_of",
+    "on_newest",
     "retry_conflicts",
     "rows_in",
 ]

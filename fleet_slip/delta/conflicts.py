@@ -3,16 +3,21 @@
 import random
 import re
 import time
-from collections.abc import Callable
-from typing import TypeVar
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, TypeVar
 
 from deltalake.exceptions import CommitFailedError
 
-from fleet_slip.errors import ConflictError
+from fleet_slip.errors import ConflictError, StorageError
+
+if TYPE_CHECKING:
+    from fleet_slip.delta.table import Table
 
 ATTEMPTS = 12
 FIRST_WAIT_S = 0.02
 LONGEST_WAIT_S = 5.0
+LOOKS = 8
+"""So often tables are looked at again that do not rest."""
 
 _CONFLICT = re.compile(
     r"concurrent|changed since last commit|existing table version|already exists|"
@@ -27,6 +32,40 @@ Result = TypeVar("Result")
 def is_conflict(error: CommitFailedError) -> bool:
     """Whether a commit failed because another one was faster."""
     return _CONFLICT.search(str(error)) is not None
+
+
+def on_newest(
+    tables: Sequence["Table"],
+    look: Callable[[], Result],
+    is_damage: Callable[[Result], bool] = lambda _: False,
+) -> Result:
+    """Look at tables, and again if what is found may be of files that a newer version removed.
+
+    A job that compacts or forgets takes files away that a reader has just been told of: damage, or
+    a `StorageError`, is told only if the tables rested meanwhile, or never rest.
+    """
+    for _ in range(LOOKS):
+        before = _versions(tables)
+        try:
+            found = look()
+            if not is_damage(found) or _versions(tables) == before:
+                return found
+        except StorageError:
+            if _versions(tables) == before:
+                raise
+    return look()
+
+
+def _versions(tables: Sequence["Table"]) -> list[int | None]:
+    """Return the versions of tables; None for one whose log cannot be read."""
+    found: list[int | None] = []
+    for table in tables:
+        try:
+            delta = table.open_delta()
+        except StorageError:
+            delta = None
+        found.append(None if delta is None else delta.version())
+    return found
 
 
 def retry_conflicts(attempt: Callable[[], Result]) -> Result:

@@ -9,9 +9,10 @@ and drives with the record of what was forgotten.
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
+from functools import partial
 
 from fleet_slip.catalogue.feature_sets import PLAIN
-from fleet_slip.delta import Snapshot, Table, TableFile
+from fleet_slip.delta import Snapshot, Table, TableFile, on_newest
 from fleet_slip.delta.checkpoints import FOLDER as CHECKSUMS
 from fleet_slip.delta.checkpoints import checkpoint_faults, unsealed_checkpoints
 from fleet_slip.delta.commit_check import find_commit_faults
@@ -40,10 +41,18 @@ def verify(
     """Verify a data root; `full` computes the Gram rows of all log files again.
 
     Files are read by the workers of an executor, if there is one, else by threads. `progress`
-    counts bytes.
+    counts bytes. Where damage is found while other jobs change the tables, it is looked for again:
+    they take files away.
     """
-    report = Verification()
     warehouse.require()
+    look = partial(_verify, warehouse, full, progress, executor)
+    return on_newest(warehouse.tables, look, lambda report: bool(report.damage))
+
+
+def _verify(
+    warehouse: Warehouse, full: bool, progress: Progress, executor: Executor | None
+) -> Verification:
+    report = Verification()
     snapshots = _open_tables(warehouse, report)
     read = {table: verify_files(s, report, progress, executor) for table, s in snapshots.items()}
     logs, grams = ([one.file for one in read.get(table, [])] for table in ("logs", "grams"))

@@ -3,6 +3,7 @@
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -12,7 +13,7 @@ import pyarrow.compute as pc
 
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
-from fleet_slip.delta import TableFile
+from fleet_slip.delta import TableFile, on_newest
 from fleet_slip.errors import DataError, StorageError
 from fleet_slip.grams.received.received_rows import is_received
 from fleet_slip.grams.rows.aggregation import aggregate, by_sql
@@ -54,6 +55,11 @@ def check_grams(
     turn. Raises `StorageError` naming the first drive whose Grams differ, and `DataError` if there
     is nothing to check.
     """
+    look = partial(_check, warehouse, count, progress, begin)
+    return on_newest((warehouse.logs, warehouse.grams), look)
+
+
+def _check(warehouse: Warehouse, count: int, progress: Progress, begin: int) -> CheckReport:
     logs = warehouse.logs.snapshot()
     if not logs.files:
         raise DataError(f"{warehouse.root}: no logs yet. Run: fleet-slip simulate CAMPAIGN")
