@@ -31,7 +31,7 @@ from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.comparison.observers import ekf
-from fleet_slip.comparison.observers.signals import DriveSignals, read_drive
+from fleet_slip.comparison.observers.drive_signals import DriveSignals, read_drive
 from fleet_slip.comparison.rivals.compare import all_signals, cross_validate_learner
 from fleet_slip.comparison.rivals.learner import one_thread
 from fleet_slip.comparison.rivals.learners import ANFIS, PERCEPTRON, TREES

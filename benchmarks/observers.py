@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.comparison.observers import ekf, kalman, luenberger, sliding_mode
-from fleet_slip.comparison.observers.signals import STEP_S, DriveSignals
+from fleet_slip.comparison.observers.drive_signals import STEP_S, DriveSignals
 from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
 
 REPEATS = 5

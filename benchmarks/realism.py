@@ -31,7 +31,7 @@ from fleet_slip.comparison.evaluation.estimators import (
     published_estimate,
 )
 from fleet_slip.comparison.observers import ekf, kalman
-from fleet_slip.comparison.observers.signals import DriveSignals, LabelledDrive
+from fleet_slip.comparison.observers.drive_signals import DriveSignals, LabelledDrive
 from fleet_slip.comparison.observers.tuning import tune
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import fit

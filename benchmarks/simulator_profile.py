@@ -30,7 +30,7 @@ from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.simulation.campaign import Batch, load_campaign
 from fleet_slip.simulation.drives import lane_drive, simulate_logs, tabulate
 from fleet_slip.simulation.sensors import Recorder
-from fleet_slip.vehicle.lanes import kernel
+from fleet_slip.vehicle.lanes import lane_kernel
 from fleet_slip.vehicle.lanes.lane_drives import LaneDrive, simulate_blocks
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.whole_drives import simulate_drives
@@ -126,14 +126,14 @@ def loops(assembly: str) -> list[list[str]]:
 
 def compiled_assembly() -> str:
     """Return the kernel's assembly on this machine."""
-    fresh = numba.njit(nogil=True, error_model="numpy")(kernel.build_kernel("not kept"))
-    usual, kernel.simulate = kernel.simulate, fresh
+    fresh = numba.njit(nogil=True, error_model="numpy")(lane_kernel.build_kernel("not kept"))
+    usual, lane_kernel.simulate = lane_kernel.simulate, fresh
     try:
         fleet = load_campaign("fleet")
         spec = fleet.batches(fleet.first_day)[0].drives[0]
         simulate_drives([lane_drive(replace(spec, laps=0.01))])
     finally:
-        kernel.simulate = usual
+        lane_kernel.simulate = usual
     (assembly,) = fresh.inspect_asm().values()
     return str(assembly)
 

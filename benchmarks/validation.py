@@ -19,8 +19,8 @@ from matplotlib import pyplot as plt
 from benchmarks.documents import insert
 from fleet_slip.arrays import FloatArray
 from fleet_slip.simulation.scenario import load_scenario
+from fleet_slip.vehicle.car_imperfections import PERFECT, CarImperfections
 from fleet_slip.vehicle.driver import handling
-from fleet_slip.vehicle.imperfections import PERFECT, CarImperfections
 from fleet_slip.vehicle.lanes.lane_drives import LaneDrive
 from fleet_slip.vehicle.lanes.road import Road
 from fleet_slip.vehicle.parameters import (

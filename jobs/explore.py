@@ -18,7 +18,7 @@ def _():
     from matplotlib.figure import Figure
 
     import fleet_slip
-    from fleet_slip.comparison.watch.frames import drive_frames
+    from fleet_slip.comparison.watch.drive_frames import drive_frames
     from fleet_slip.errors import FleetSlipError
     from fleet_slip.monitoring.control_chart import control_chart
     from fleet_slip.pages.style import DESK, STYLE, colour

@@ -184,8 +184,8 @@ class Serving(Rooted):
         scenario that was changed since its drive was simulated, and what `model` raises.
         """
         from fleet_slip.comparison.evaluation.evaluate import evaluate
-        from fleet_slip.comparison.evaluation.results import keep
-        from fleet_slip.comparison.evaluation.runs import simulate_scenarios
+        from fleet_slip.comparison.evaluation.evaluation_document import keep
+        from fleet_slip.comparison.evaluation.scenario_runs import simulate_scenarios
         from fleet_slip.files.documents import Document
         from fleet_slip.simulation.scenario import load_scenario, shipped_scenarios
 
@@ -239,12 +239,12 @@ class Serving(Rooted):
         drive, `ExtraError` without the extra `watch`, and what `model` raises.
         """
         with needed("watch", "a page or a film of a drive"):
-            from fleet_slip.comparison.watch.film import write_film
-            from fleet_slip.comparison.watch.frames import (
+            from fleet_slip.comparison.watch.drive_frames import (
                 drive_frames,
                 is_scenario,
                 scenario_frames,
             )
+            from fleet_slip.comparison.watch.film import write_film
             from fleet_slip.comparison.watch.watch_page import write_page
 
         writers = {".html": write_page, ".mp4": write_film, ".gif": write_film}

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
 from fleet_slip.config import Config
-from fleet_slip.vehicle.imperfections import CarImperfections
+from fleet_slip.vehicle.car_imperfections import CarImperfections
 
 NotNegative = Annotated[FiniteFloat, Field(ge=0)]
 Latency = Annotated[FiniteFloat, Field(ge=0, le=1)]

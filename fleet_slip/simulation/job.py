@@ -19,7 +19,7 @@ from fleet_slip.delta import Change, Snapshot, retry_conflicts
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.simulation.campaign import Batch, Campaign, DriveSpec
 from fleet_slip.simulation.drives import simulate_batch
-from fleet_slip.simulation.units import (
+from fleet_slip.simulation.landed_batches import (
     changed_campaign,
     day_units,
     file_name,

@@ -9,8 +9,8 @@ import math
 from typing import NamedTuple
 
 from fleet_slip.compiling import equation
+from fleet_slip.vehicle.car_imperfections import Traits
 from fleet_slip.vehicle.dynamics import Derivative, driven_body, rates_of
-from fleet_slip.vehicle.imperfections import Traits
 from fleet_slip.vehicle.integration import extrapolate
 from fleet_slip.vehicle.parameters import Constants
 from fleet_slip.vehicle.state import Controls, State

@@ -8,8 +8,9 @@ from types import ModuleType
 
 import pytest
 
+import fleet_slip.vehicle.tyre
 from fleet_slip import kept_code
-from fleet_slip.vehicle.lanes import kernel as lanes
+from fleet_slip.vehicle.lanes import lane_kernel as lanes
 
 SOURCE = """
 from fleet_slip.compiling import kernel
@@ -114,10 +115,15 @@ def test_a_full_disk_keeps_nothing_and_fails_nothing(
 def test_a_change_of_any_source_changes_the_key_of_the_kept_code(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("kernel.py", "tyre.py"):
-        (tmp_path / name).write_text("one")
-    monkeypatch.setattr(lanes, "__file__", str(tmp_path / "kernel.py"))
+    """The equations stand in the folder above the kernel's."""
+    folder = tmp_path / "vehicle" / "lanes"
+    folder.mkdir(parents=True)
+    kernel, tyre = folder / "lane_kernel.py", folder.parent / "tyre.py"
+    for file in (kernel, tyre):
+        file.write_text("one")
+    assert Path(lanes.__file__).parents[1] == Path(fleet_slip.vehicle.tyre.__file__).parent
+    monkeypatch.setattr(lanes, "__file__", str(kernel))
     before = lanes._source_digest()
     assert lanes._source_digest() == before
-    (tmp_path / "tyre.py").write_text("other")
+    tyre.write_text("other")
     assert lanes._source_digest() != before

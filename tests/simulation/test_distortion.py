@@ -9,7 +9,7 @@ from fleet_slip.simulation.imperfections import Imperfections, SensorImperfectio
 from fleet_slip.simulation.lags import Delay, LowPass
 from fleet_slip.simulation.pulses import Pulses
 from fleet_slip.simulation.wander import Wander
-from fleet_slip.vehicle.imperfections import CarImperfections
+from fleet_slip.vehicle.car_imperfections import CarImperfections
 from fleet_slip.vehicle.lanes.lane_blocks import CHANNELS, IMPERFECT_CHANNELS
 
 TICKS = 3000

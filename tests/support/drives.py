@@ -7,7 +7,7 @@ import numpy as np
 
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.comparison.observers.signals import STEP_S, DriveSignals, LabelledDrive
+from fleet_slip.comparison.observers.drive_signals import STEP_S, DriveSignals, LabelledDrive
 from fleet_slip.comparison.observers.single_track import SingleTrack
 from fleet_slip.simulation.campaign import Batch, load_campaign
 from fleet_slip.simulation.drives import simulate_batch

@@ -6,6 +6,7 @@ import numba
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
+from fleet_slip.vehicle.car_imperfections import CarImperfections, traits
 from fleet_slip.vehicle.driver import SAMPLE_S, SPEED_GAIN_1PS
 from fleet_slip.vehicle.imperfect_dynamics import (
     Around,
@@ -14,7 +15,6 @@ from fleet_slip.vehicle.imperfect_dynamics import (
     advance_give,
     imperfect_derivative,
 )
-from fleet_slip.vehicle.imperfections import CarImperfections, traits
 from fleet_slip.vehicle.integration import FIRST_ORDER, SECOND_ORDER, STEP_S, Slopes, advance
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2, VehicleParameters, constants
 from fleet_slip.vehicle.state import Controls, State

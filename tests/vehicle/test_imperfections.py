@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from fleet_slip.vehicle.car_imperfections import PERFECT, CarImperfections, traits
 from fleet_slip.vehicle.driver import SAMPLE_S, handling
 from fleet_slip.vehicle.dynamics import derivative
 from fleet_slip.vehicle.imperfect_dynamics import (
@@ -12,7 +13,6 @@ from fleet_slip.vehicle.imperfect_dynamics import (
     advance_give,
     imperfect_derivative,
 )
-from fleet_slip.vehicle.imperfections import PERFECT, CarImperfections, traits
 from fleet_slip.vehicle.integration import SECOND_ORDER
 from fleet_slip.vehicle.lanes.lane_drives import LaneDrive, simulate_blocks
 from fleet_slip.vehicle.lanes.road import Road, Surface

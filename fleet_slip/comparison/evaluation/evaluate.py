@@ -5,15 +5,19 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from typing import Any
 
-from fleet_slip.comparison.evaluation.comparison import FleetComparison, compare_fleets
-from fleet_slip.comparison.evaluation.errors import ErrorFigures
+from fleet_slip.comparison.evaluation.error_figures import ErrorFigures
 from fleet_slip.comparison.evaluation.estimators import Estimate, TrainedModels, train_models
+from fleet_slip.comparison.evaluation.evaluation_document import document
 from fleet_slip.comparison.evaluation.filters import Bank, FilterEstimate, filter_bank
+from fleet_slip.comparison.evaluation.fleet_comparison import FleetComparison, compare_fleets
 from fleet_slip.comparison.evaluation.gps_noise import GpsSweep, sweep_gps_noise
 from fleet_slip.comparison.evaluation.ranking import Ranking, rank
-from fleet_slip.comparison.evaluation.results import document
-from fleet_slip.comparison.evaluation.runs import EvaluatedScenario, run_all
-from fleet_slip.comparison.evaluation.targets import Check, check_filter_targets, check_targets
+from fleet_slip.comparison.evaluation.scenario_runs import EvaluatedScenario, run_all
+from fleet_slip.comparison.evaluation.targets import (
+    TargetCheck,
+    check_filter_targets,
+    check_targets,
+)
 from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.model_version import ModelVersion
@@ -99,7 +103,7 @@ class Evaluation:
 
     competitors: Competitors
     runs: tuple[EvaluatedScenario, ...]
-    checks: tuple[Check, ...]
+    checks: tuple[TargetCheck, ...]
     comparisons: tuple[FleetComparison, ...]
     ranking: Ranking
     gps_noise: GpsSweep | None

@@ -17,7 +17,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.comparison.evaluation.estimators import Signals
 from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive
 from fleet_slip.comparison.observers import ekf, kalman, luenberger, sliding_mode
-from fleet_slip.comparison.observers.signals import DriveSignals, LabelledDrive, read_drive
+from fleet_slip.comparison.observers.drive_signals import DriveSignals, LabelledDrive, read_drive
 from fleet_slip.comparison.observers.tuning import tune
 from fleet_slip.config import Config
 from fleet_slip.errors import DataError

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.comparison.evaluation.errors import ErrorFigures
+from fleet_slip.comparison.evaluation.error_figures import ErrorFigures
 from fleet_slip.comparison.evaluation.estimators import LinearEstimate
-from fleet_slip.comparison.evaluation.runs import GPS_OUTAGE_S, EvaluatedScenario
+from fleet_slip.comparison.evaluation.scenario_runs import GPS_OUTAGE_S, EvaluatedScenario
 from fleet_slip.comparison.evaluation.stability import find_stretches, rear_compliance
 from fleet_slip.simulation.sensors import Sensors
 
@@ -93,7 +93,7 @@ NOISE = "noise_doubled"
 
 
 @dataclass(frozen=True)
-class Check:
+class TargetCheck:
     """One requirement on one estimator: `found` against `limit`.
 
     Both are NaN where there are no estimates. `explanation` is empty where it is reached.
@@ -119,8 +119,8 @@ def check_targets(
     runs: Sequence[EvaluatedScenario],
     models: Mapping[str, str],
     estimators: Mapping[str, LinearEstimate],
-) -> tuple[Check, ...]:
-    """Check the models of Table I, given the name of each one's estimator.
+) -> tuple[TargetCheck, ...]:
+    """TargetCheck the models of Table I, given the name of each one's estimator.
 
     A requirement whose scenario is not among the runs is left out, and all without the nominal one.
     """
@@ -143,7 +143,7 @@ def _check(
     run: EvaluatedScenario,
     name: str,
     estimators: Mapping[str, LinearEstimate],
-) -> Check:
+) -> TargetCheck:
     found = requirement.found(nominal.results[name].whole, stable(run, name))
     limit = requirement.limit
     reached = found >= limit if requirement.least else found <= limit
@@ -151,7 +151,9 @@ def _check(
     if not reached:
         noisy = run.scenario.name == NOISE
         explanation = _noise(estimators[name], nominal, run) if noisy else _compliance(run, nominal)
-    return Check(requirement.text, run.scenario.name, name, found, limit, reached, explanation)
+    return TargetCheck(
+        requirement.text, run.scenario.name, name, found, limit, reached, explanation
+    )
 
 
 FILTER_SCENARIOS = ("nominal", "gps_clear", "gps_urban", "gps_tunnel")
@@ -161,8 +163,8 @@ THE_PAPERS_CHOICE = "4"
 
 def check_filter_targets(
     runs: Sequence[EvaluatedScenario], models: Mapping[str, str]
-) -> tuple[Check, ...]:
-    """Check that the regression has a smaller error than the paper's Kalman filter has.
+) -> tuple[TargetCheck, ...]:
+    """TargetCheck that the regression has a smaller error than the paper's Kalman filter has.
 
     As it is and tuned; over the drive, and while satellite navigation is out in the tunnel.
     """
@@ -179,7 +181,7 @@ def check_filter_targets(
     )
 
 
-def _check_filters(run: EvaluatedScenario, name: str, rival: str) -> Iterator[Check]:
+def _check_filters(run: EvaluatedScenario, name: str, rival: str) -> Iterator[TargetCheck]:
     ours, theirs = run.results[name], run.results[rival]
     parts = [("error std", ours.whole, theirs.whole, _CORRECTED)]
     if "gps_outage" in ours.inside:
@@ -188,7 +190,7 @@ def _check_filters(run: EvaluatedScenario, name: str, rival: str) -> Iterator[Ch
     for figure, our, their, why in parts:
         found, limit = _number(our.error_std_deg), _number(their.error_std_deg)
         reached = found < limit
-        yield Check(
+        yield TargetCheck(
             f"{run.scenario.name}: {figure} below that of {rival}, deg",
             run.scenario.name,
             name,

@@ -10,7 +10,7 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.comparison.observers.signals import STEP_S
+from fleet_slip.comparison.observers.drive_signals import STEP_S
 from fleet_slip.comparison.observers.single_track import SLOWEST_MPS
 from fleet_slip.compiling import kernel
 from fleet_slip.vehicle.parameters import VehicleParameters, constants

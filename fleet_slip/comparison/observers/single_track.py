@@ -16,7 +16,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.comparison.observers.signals import DriveSignals, hold_last
+from fleet_slip.comparison.observers.drive_signals import DriveSignals, hold_last
 from fleet_slip.comparison.observers.wheel_speeds import undriven_axle
 from fleet_slip.vehicle.parameters import VehicleParameters, constants
 from fleet_slip.vehicle.tyre import cornering_stiffness

@@ -9,7 +9,7 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.comparison.observers.signals import DriveSignals, LabelledDrive
+from fleet_slip.comparison.observers.drive_signals import DriveSignals, LabelledDrive
 from fleet_slip.config import Config
 from fleet_slip.errors import DataError
 from fleet_slip.vehicle.parameters import VehicleParameters

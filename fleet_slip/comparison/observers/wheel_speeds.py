@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.comparison.observers.signals import DriveSignals
+from fleet_slip.comparison.observers.drive_signals import DriveSignals
 from fleet_slip.vehicle.parameters import VehicleParameters
 
 

@@ -7,8 +7,8 @@ from fleet_slip.comparison.report.claims.judging import Judged, Status, judge_cl
 from fleet_slip.comparison.report.findings.report_data import ReportData
 from fleet_slip.comparison.report.tables import further_tables, paper_tables
 from fleet_slip.pages.drawing import draw
+from fleet_slip.pages.page_table import ReportTable, Tile
 from fleet_slip.pages.picture import Picture
-from fleet_slip.pages.table import ReportTable, Tile
 from fleet_slip.pages.templating import fill_in
 from fleet_slip.pages.text import count, degrees, size
 from fleet_slip.words import number_of

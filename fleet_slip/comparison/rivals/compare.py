@@ -7,14 +7,14 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.comparison.evaluation.errors import ErrorFigures, error_figures
+from fleet_slip.comparison.evaluation.error_figures import ErrorFigures, error_figures
 from fleet_slip.comparison.evaluation.estimators import TABLE_ONE
 from fleet_slip.comparison.evaluation.evaluate import Rival
 from fleet_slip.comparison.evaluation.filters import Bank, read_labelled
 from fleet_slip.comparison.rivals.inputs import Inputs, LearnedEstimate
 from fleet_slip.comparison.rivals.learner import Fitted, Learner, one_thread
 from fleet_slip.comparison.rivals.learners import LEARNERS, OF_WINDOWS
-from fleet_slip.comparison.rivals.sample import Sample, draw_sample
+from fleet_slip.comparison.rivals.sample import RowSample, draw_sample
 from fleet_slip.comparison.rivals.tree_filter import BASE, train_tree_filter
 from fleet_slip.grams.calibration.calibration import calibrate
 from fleet_slip.grams.cohorts.gram_cohort import Cohort
@@ -64,7 +64,7 @@ def train_rivals(
         return (*learned, train_tree_filter(bank.estimators[BASE], drives, executor))
 
 
-def train(learner: Learner, sample: Sample, inputs: Inputs, suffix: str) -> Rival:
+def train(learner: Learner, sample: RowSample, inputs: Inputs, suffix: str) -> Rival:
     """Fit and cross-validate one learner, and measure it."""
     values = sample.of(inputs.names)
     started = time.perf_counter()
@@ -95,7 +95,7 @@ def time_estimates(fitted: Fitted, values: FloatArray) -> tuple[float, float]:
 
 
 def cross_validate_learner(
-    learner: Learner, inputs: FloatArray, sample: Sample, folds: FoldAssignment
+    learner: Learner, inputs: FloatArray, sample: RowSample, folds: FoldAssignment
 ) -> ErrorFigures:
     """Return the figures on rows that each fold's fit has not seen."""
     estimates = np.full(len(inputs), np.nan)

@@ -21,7 +21,7 @@ SAMPLE_ROWS = 60_000
 
 
 @dataclass(frozen=True)
-class Sample:
+class RowSample:
     """Rows evenly spaced in time over all drives.
 
     Attributes:
@@ -51,7 +51,7 @@ def draw_sample(
     inputs: Inputs,
     rows: int = SAMPLE_ROWS,
     numbers: CarCounts | None = None,
-) -> Sample:
+) -> RowSample:
     """Draw about so many rows of a cohort that have all inputs and the label.
 
     The columns are those of the cohort's Gram rows, computed over whole drives by the same code;
@@ -80,4 +80,4 @@ def draw_sample(
     order = np.argsort(np.array(names), kind="stable")
     found = np.concatenate(parts)[order]
     trip = np.array([trips[names[at]] for at in order])
-    return Sample(inputs.names, found[:, :-1], found[:, -1], trip)
+    return RowSample(inputs.names, found[:, :-1], found[:, -1], trip)

@@ -10,7 +10,7 @@ from matplotlib.animation import FFMpegWriter, PillowWriter
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
-from fleet_slip.comparison.watch.frames import FRAMES_PER_S, Frames
+from fleet_slip.comparison.watch.drive_frames import FRAMES_PER_S, DriveFrames
 from fleet_slip.extras import needed
 from fleet_slip.files.storage_errors import storage_errors
 from fleet_slip.pages.style import STYLE, colour
@@ -23,7 +23,7 @@ CAR_M = np.array([(2.1, 0.9), (2.1, -0.9), (-2.3, -0.9), (-2.3, 0.9)])
 ARROWS = (("truth", 9.0), ("model_4", 8.0))
 
 
-def write_film(frames: Frames, file: Path) -> None:
+def write_film(frames: DriveFrames, file: Path) -> None:
     """Write the film of a drive; the suffix says the format.
 
     Raises `ExtraError` for an MP4 without the extra `watch`, and `StorageError`.
@@ -49,7 +49,7 @@ def _encoder() -> str:
     return str(get_ffmpeg_exe())
 
 
-def _stage(frames: Frames) -> tuple[Figure, Callable[[int], None]]:
+def _stage(frames: DriveFrames) -> tuple[Figure, Callable[[int], None]]:
     """Return a figure, and what moves everything in it to a frame."""
     figure = Figure(figsize=(10, 5.6), layout="constrained")
     above, angles = figure.subplots(2, height_ratios=[2.2, 1])

@@ -8,17 +8,17 @@ import numpy as np
 from markupsafe import Markup
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.comparison.watch.frames import WHEELS, Frames
+from fleet_slip.comparison.watch.drive_frames import WHEELS, DriveFrames
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.pages.templating import fill_in
 
 
-def write_page(frames: Frames, file: Path) -> None:
+def write_page(frames: DriveFrames, file: Path) -> None:
     """Write the page as a whole, or not at all. Raises `StorageError`."""
     LocalFolder(file.parent).put(file.name, render_watch(frames).encode("utf-8"))
 
 
-def render_watch(frames: Frames) -> str:
+def render_watch(frames: DriveFrames) -> str:
     """Return the page."""
     text = json.dumps(_data(frames), separators=(",", ":"), allow_nan=False)
     # Within a script element only this could end it.
@@ -26,7 +26,7 @@ def render_watch(frames: Frames) -> str:
     return fill_in("watch.html.j2", frames=frames, data=data)
 
 
-def _data(frames: Frames) -> dict[str, Any]:
+def _data(frames: DriveFrames) -> dict[str, Any]:
     wheels = np.array([frames.wheel_rad_s[name] for name in WHEELS])
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = wheels.mean(axis=0)

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import ConfigError
+from fleet_slip.vehicle.car_imperfections import PERFECT, CarImperfections, traits
 from fleet_slip.vehicle.driver import SAMPLE_S, handling
-from fleet_slip.vehicle.imperfections import PERFECT, CarImperfections, traits
 from fleet_slip.vehicle.integration import STEP_S
-from fleet_slip.vehicle.lanes import kernel, lane_memory
+from fleet_slip.vehicle.lanes import lane_kernel, lane_memory
 from fleet_slip.vehicle.lanes.lane_blocks import BLOCK, CHANNELS, IMPERFECT_CHANNELS, empty_blocks
 from fleet_slip.vehicle.lanes.lane_memory import DRIVE, FIRST, NOBODY
 from fleet_slip.vehicle.lanes.road import (
@@ -75,8 +75,8 @@ def simulate_blocks(
     """Yield what happens in each drive, sampled at 100 Hz from its start, block by block.
 
     The blocks of a drive come in order, those of different drives in any. A drive ends after its
-    laps, at the end of an open road, `kernel.AFTER_LOSS` samples after the driver lost the car, or
-    when it takes `PATIENCE` times as long as planned. The bits of a drive depend on nothing but the
+    laps, at the end of an open road, `AFTER_LOSS` samples after the driver lost the car, or when
+    it takes `PATIENCE` times as long as planned. The bits of a drive depend on nothing but the
     drive: not on the others, their number or order, the thread or the machine. Releases the GIL.
     The memory does not depend on the number and the length of the drives: at most 63 MB.
 
@@ -99,7 +99,7 @@ def _simulate_alike(
     """Yield the blocks of drives that are all with imperfections, or all without."""
     if not drives:
         return
-    simulate = kernel.simulate_imperfect if imperfect else kernel.simulate
+    simulate = lane_kernel.simulate_imperfect if imperfect else lane_kernel.simulate
     routes, roads = _routes(drives)
     surfaces = _surfaces(drives) if imperfect else np.zeros((0, len(Surface._fields)))
     cars = np.array([_car(drive) for drive in drives])
@@ -110,15 +110,15 @@ def _simulate_alike(
     while True:
         for lane in np.flatnonzero(book[DRIVE] == NOBODY)[: len(waiting)]:
             drive = waiting.pop()
-            speed_mps = roads[routes["first"][drive], kernel.SPEED]
+            speed_mps = roads[routes["first"][drive], lane_kernel.SPEED]
             lane_memory.begin(memory, book, lane, drive, cars[drive], speed_mps)
         if (book[DRIVE] == NOBODY).all():
             return
         simulate(routes, cars, roads, surfaces, steps_per_sample, memory, book, truth, ended)
         for lane, (drive, tick, _, first) in enumerate(book.T.tolist()):
-            last = drive != NOBODY and ended[drive, kernel.SAMPLES] != NOBODY
+            last = drive != NOBODY and ended[drive, lane_kernel.SAMPLES] != NOBODY
             if last or tick - first == BLOCK:
-                lost = int(ended[drive, kernel.LOST])
+                lost = int(ended[drive, lane_kernel.LOST])
                 channels = dict(zip(CHANNELS, usual[lane, :, : tick - first], strict=True))
                 if imperfect:
                     more = further[lane, :, : tick - first]

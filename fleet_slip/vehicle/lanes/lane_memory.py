@@ -3,9 +3,9 @@
 import numpy as np
 
 from fleet_slip.arrays import FloatArray, IntArray
+from fleet_slip.vehicle.car_imperfections import Traits
 from fleet_slip.vehicle.driver import Handling
 from fleet_slip.vehicle.imperfect_dynamics import Around, Give, GiveRates
-from fleet_slip.vehicle.imperfections import Traits
 from fleet_slip.vehicle.integration import Slopes
 from fleet_slip.vehicle.lanes.rows import LANES
 from fleet_slip.vehicle.parameters import Constants

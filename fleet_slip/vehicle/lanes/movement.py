@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 from fleet_slip.compiling import equation
+from fleet_slip.vehicle.car_imperfections import Traits
 from fleet_slip.vehicle.dynamics import derivative
 from fleet_slip.vehicle.imperfect_dynamics import (
     Around,
@@ -14,7 +15,6 @@ from fleet_slip.vehicle.imperfect_dynamics import (
     rack_tangent,
     wheel_tangent,
 )
-from fleet_slip.vehicle.imperfections import Traits
 from fleet_slip.vehicle.integration import SECOND_ORDER, Slopes, advance
 from fleet_slip.vehicle.lanes.lane_blocks import at, further_at
 from fleet_slip.vehicle.lanes.lane_memory import (

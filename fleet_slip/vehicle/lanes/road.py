@@ -7,7 +7,7 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import ConfigError
-from fleet_slip.vehicle.lanes.kernel import LOST_SPEED_MPS
+from fleet_slip.vehicle.lanes.lane_kernel import LOST_SPEED_MPS
 
 FARTHEST_VIEW_M = 20.0
 """How far beyond a lap's end a driver may look."""

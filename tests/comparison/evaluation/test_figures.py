@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from fleet_slip.comparison.evaluation.errors import error_figures
+from fleet_slip.comparison.evaluation.error_figures import error_figures
 from fleet_slip.comparison.evaluation.estimators import LinearEstimate
 from fleet_slip.comparison.evaluation.evaluated_drives import apply_failure
 from fleet_slip.comparison.evaluation.stability import join, peak_slip

@@ -14,7 +14,7 @@ from fleet_slip.comparison.evaluation.gps_noise import (
     rmse_deg,
     sweep_gps_noise,
 )
-from fleet_slip.comparison.evaluation.runs import evaluate_drive
+from fleet_slip.comparison.evaluation.scenario_runs import evaluate_drive
 from fleet_slip.comparison.observers import kalman
 from fleet_slip.simulation.scenario import load_scenario
 from tests.support.drives import noisy, slalom

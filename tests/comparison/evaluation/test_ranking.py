@@ -12,7 +12,7 @@ from fleet_slip.cli.accuracy.evaluation_tables import print_ranking
 from fleet_slip.comparison.evaluation.estimators import Signals
 from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive, visible_signals
 from fleet_slip.comparison.evaluation.ranking import Ranking, rank
-from fleet_slip.comparison.evaluation.runs import EvaluatedScenario, evaluate_drive
+from fleet_slip.comparison.evaluation.scenario_runs import EvaluatedScenario, evaluate_drive
 from fleet_slip.simulation.scenario import load_scenario
 
 ROWS = 1000

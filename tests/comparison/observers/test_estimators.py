@@ -10,7 +10,7 @@ import pytest
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.comparison.observers import ekf, kalman, luenberger, sliding_mode
-from fleet_slip.comparison.observers.signals import LabelledDrive
+from fleet_slip.comparison.observers.drive_signals import LabelledDrive
 from fleet_slip.errors import DataError
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.support.drives import mirrored, noisy, rolling_drive, simulated_drive, slalom

@@ -12,6 +12,7 @@ from scipy import stats
 from fleet_slip.arrays import FloatArray
 from fleet_slip.comparison.observers import kalman
 from fleet_slip.comparison.observers.belief import Belief, belief_of
+from fleet_slip.comparison.observers.drive_signals import STEP_S, DriveSignals
 from fleet_slip.comparison.observers.kalman import (
     FilterNoise,
     covariances,
@@ -19,7 +20,6 @@ from fleet_slip.comparison.observers.kalman import (
     predict,
     update,
 )
-from fleet_slip.comparison.observers.signals import STEP_S, DriveSignals
 from fleet_slip.errors import DataError
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.support.drives import (

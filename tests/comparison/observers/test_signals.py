@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fleet_slip.comparison.observers.angle import sideslip_angle
-from fleet_slip.comparison.observers.signals import DriveSignals, hold_last, read_drive
+from fleet_slip.comparison.observers.drive_signals import DriveSignals, hold_last, read_drive
 from fleet_slip.errors import DataError, QuestionError
 
 

@@ -11,8 +11,8 @@ from pydantic import ValidationError
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.comparison.observers import luenberger, sliding_mode
+from fleet_slip.comparison.observers.drive_signals import STEP_S, DriveSignals
 from fleet_slip.comparison.observers.luenberger import ObserverPoles
-from fleet_slip.comparison.observers.signals import STEP_S, DriveSignals
 from fleet_slip.comparison.observers.single_track import SingleTrack, state_space
 from fleet_slip.comparison.observers.sliding_mode import SlidingGains
 from fleet_slip.vehicle.parameters import load_vehicle

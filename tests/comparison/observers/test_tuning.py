@@ -9,8 +9,8 @@ from pydantic import Field
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.comparison.observers import ekf, kalman, luenberger, sliding_mode
+from fleet_slip.comparison.observers.drive_signals import DriveSignals, LabelledDrive
 from fleet_slip.comparison.observers.kalman import FilterNoise
-from fleet_slip.comparison.observers.signals import DriveSignals, LabelledDrive
 from fleet_slip.comparison.observers.tuning import rmse_rad, tune
 from fleet_slip.config import Config
 from fleet_slip.errors import DataError

@@ -14,7 +14,7 @@ import pytest
 from pypdfium2 import PdfDocument
 
 import fleet_slip
-from fleet_slip.comparison.watch.frames import drive_frames
+from fleet_slip.comparison.watch.drive_frames import drive_frames
 from fleet_slip.comparison.watch.watch_page import render_watch
 from fleet_slip.monitoring.night_page import render_night
 from tests.support.landing import Landing

@@ -9,7 +9,7 @@ import pytest
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.features import input_scales
-from fleet_slip.comparison.report.findings.cars import (
+from fleet_slip.comparison.report.findings.own_numbers import (
     FEWEST_CARS,
     FOLDS,
     Cars,

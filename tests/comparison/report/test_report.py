@@ -15,8 +15,8 @@ import pytest
 from jinja2 import meta
 
 from fleet_slip.catalogue.features import features, input_scales
+from fleet_slip.comparison.evaluation.evaluation_document import keep
 from fleet_slip.comparison.evaluation.ranking import LEAST_COVERAGE
-from fleet_slip.comparison.evaluation.results import keep
 from fleet_slip.comparison.report.claims.facts import NAMES, Facts
 from fleet_slip.comparison.report.claims.judging import (
     CLAIMS,

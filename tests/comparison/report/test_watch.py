@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 import fleet_slip
-from fleet_slip.comparison.watch.frames import FRAMES_PER_S, Frames, drive_frames
+from fleet_slip.comparison.watch.drive_frames import FRAMES_PER_S, DriveFrames, drive_frames
 from fleet_slip.comparison.watch.watch_page import render_watch
 from fleet_slip.errors import ExtraError, QuestionError, UsageError
 from tests.support.commands import run
@@ -23,7 +23,7 @@ DRIVE = "smoke-2024-05-01-0000"
 
 
 @pytest.fixture(scope="module")
-def frames(smoke_root: Path) -> Frames:
+def frames(smoke_root: Path) -> DriveFrames:
     fleet = fleet_slip.open(smoke_root)
     return drive_frames(fleet.warehouse, DRIVE, fleet.model("smoke"))
 
@@ -34,7 +34,7 @@ def data_of(page: str) -> Any:
     return json.loads(found[1])
 
 
-def test_frames_are_those_of_the_log(frames: Frames, smoke_root: Path) -> None:
+def test_frames_are_those_of_the_log(frames: DriveFrames, smoke_root: Path) -> None:
     fleet = fleet_slip.open(smoke_root)
     log = fleet.sql(
         f"SELECT time_s, sideslip_rad FROM log WHERE drive_id = '{DRIVE}' ORDER BY time_s"
@@ -46,7 +46,7 @@ def test_frames_are_those_of_the_log(frames: Frames, smoke_root: Path) -> None:
     assert np.nanstd(frames.estimate_deg - frames.sideslip_deg) < 0.2
 
 
-def test_the_car_moves_as_fast_as_it_drives_and_where_it_goes(frames: Frames) -> None:
+def test_the_car_moves_as_fast_as_it_drives_and_where_it_goes(frames: DriveFrames) -> None:
     vx, vy = np.gradient(frames.x_m, frames.time_s), np.gradient(frames.y_m, frames.time_s)
     inner = slice(15, -15)  # at the ends of a drive places are smoothed from one side
     assert np.hypot(vx, vy)[inner] == pytest.approx(frames.speed_mps[inner], abs=1.0)
@@ -57,7 +57,7 @@ def test_the_car_moves_as_fast_as_it_drives_and_where_it_goes(frames: Frames) ->
     assert off.max() < 3.0
 
 
-def test_the_page_holds_the_drive_and_asks_for_nothing(frames: Frames) -> None:
+def test_the_page_holds_the_drive_and_asks_for_nothing(frames: DriveFrames) -> None:
     page = render_watch(frames)
     data = data_of(page)
     assert len(data["t"]) == len(data["beta"]) == len(data["wheels"][0]) == len(frames.time_s)
@@ -65,7 +65,7 @@ def test_the_page_holds_the_drive_and_asks_for_nothing(frames: Frames) -> None:
     assert not re.findall(r'(?:src|href)="(?!data:)', page)
 
 
-def test_hostile_names_and_missing_signals_do_not_break_the_page(frames: Frames) -> None:
+def test_hostile_names_and_missing_signals_do_not_break_the_page(frames: DriveFrames) -> None:
     nothing = np.full(len(frames.time_s), np.nan)
     hostile = replace(
         frames,
@@ -80,7 +80,7 @@ def test_hostile_names_and_missing_signals_do_not_break_the_page(frames: Frames)
     assert set(data_of(page)["estimate"]) == {None}
 
 
-def test_a_part_is_a_part(frames: Frames) -> None:
+def test_a_part_is_a_part(frames: DriveFrames) -> None:
     part = frames.part(5.0, 6.0)
     assert (part.time_s[0], part.time_s[-1]) == (pytest.approx(5.0), pytest.approx(6.0))
     assert len(part.gates) == len(frames.gates)

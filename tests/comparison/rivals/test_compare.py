@@ -21,16 +21,16 @@ from fleet_slip.comparison.rivals.networks import (
     fit_perceptron,
     kernel_mean,
 )
-from fleet_slip.comparison.rivals.sample import Sample
+from fleet_slip.comparison.rivals.sample import RowSample
 from fleet_slip.regression.validation.folds import by_hash
 
 
-def sample(rows: int = 1200, drives: int = 12) -> Sample:
+def sample(rows: int = 1200, drives: int = 12) -> RowSample:
     generator = np.random.default_rng(3)
     inputs = generator.standard_normal((rows, len(all_signals())))
     label = 0.02 * np.tanh(inputs[:, 1]) - 0.01 * inputs[:, 2]
     names = np.array([f"drive-{i % drives}" for i in range(rows)])
-    return Sample(all_signals(), inputs, label, names)
+    return RowSample(all_signals(), inputs, label, names)
 
 
 def two_drives(rows: int) -> Names:

@@ -9,7 +9,7 @@ import pytest
 
 from fleet_slip.comparison.evaluation.filters import FILTERS, FilterEstimate
 from fleet_slip.comparison.observers import ekf
-from fleet_slip.comparison.observers.signals import LabelledDrive
+from fleet_slip.comparison.observers.drive_signals import LabelledDrive
 from fleet_slip.comparison.rivals.tree_filter import (
     LeafNoise,
     fit_tree_filter,

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from fleet_slip.comparison.evaluation.errors import ErrorFigures
+from fleet_slip.comparison.evaluation.error_figures import ErrorFigures
 from fleet_slip.comparison.report.findings.report_data import DRAWN_FILTERS, ReportData
 from fleet_slip.comparison.report.findings.stretches import BLOCK_S, blocks_won, difference
 from fleet_slip.comparison.report.tables.paper_tables import PAPER_TABLE_TWO

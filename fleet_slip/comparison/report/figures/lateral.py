@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.comparison.evaluation.runs import EvaluatedScenario
+from fleet_slip.comparison.evaluation.scenario_runs import EvaluatedScenario
 from fleet_slip.comparison.report.figures.labels import End, error_axes, finish_errors
 from fleet_slip.comparison.report.figures.lines import smooth
 from fleet_slip.comparison.report.figures.series import Line

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.comparison.evaluation.runs import EvaluatedScenario
+from fleet_slip.comparison.evaluation.scenario_runs import EvaluatedScenario
 from fleet_slip.comparison.evaluation.stability import find_stretches
 from fleet_slip.comparison.report.figures.lines import band
 from fleet_slip.pages.style import Size, colour
@@ -36,7 +36,7 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Block:
+class DriveBlock:
     """One drive in a figure.
 
     Attributes:
@@ -64,7 +64,7 @@ class Block:
         return HEAD_IN + ANGLE_IN + len(self.all_strips) * (STRIP_IN + GAP_IN) + FOOT_IN
 
 
-def side_slip(blocks: Sequence[Block], size: Size) -> Figure:
+def side_slip(blocks: Sequence[DriveBlock], size: Size) -> Figure:
     """Draw the blocks one above another."""
     height = sum(block.height_in for block in blocks)
     figure = Figure(figsize=(size.width_in, height))
@@ -75,7 +75,7 @@ def side_slip(blocks: Sequence[Block], size: Size) -> Figure:
     return figure
 
 
-def _draw(figure: Figure, block: Block, top_in: float, reach: float, size: Size) -> None:
+def _draw(figure: Figure, block: DriveBlock, top_in: float, reach: float, size: Size) -> None:
     angle, *strips = _panels(figure, block, top_in)
     time_s = block.run.drive.time_s
     truth_deg = np.degrees(block.run.drive.sideslip_rad)
@@ -100,7 +100,7 @@ def _draw(figure: Figure, block: Block, top_in: float, reach: float, size: Size)
     last.set_xlabel("time (s)", labelpad=2)
 
 
-def _panels(figure: Figure, block: Block, top_in: float) -> Iterator[Axes]:
+def _panels(figure: Figure, block: DriveBlock, top_in: float) -> Iterator[Axes]:
     width, height = figure.get_size_inches()
     across = (LEFT_IN / width, 1 - (LEFT_IN + RIGHT_IN) / width)
     bottom = top_in - HEAD_IN - ANGLE_IN
@@ -110,7 +110,7 @@ def _panels(figure: Figure, block: Block, top_in: float) -> Iterator[Axes]:
         yield figure.add_axes((across[0], bottom / height, across[1], STRIP_IN / height))
 
 
-def _estimate_deg(block: Block, line: Line) -> FloatArray:
+def _estimate_deg(block: DriveBlock, line: Line) -> FloatArray:
     drive = block.run.drive
     estimate: FloatArray = np.where(
         drive.evaluated, np.degrees(block.run.estimates[line.estimator]), np.nan
@@ -125,14 +125,14 @@ def _plot(axes: Axes, x: FloatArray, y: FloatArray, line: Line, size: Size) -> N
     axes.plot(series.x, series.mean, color=tone, linewidth=1.0)
 
 
-def _reaches(blocks: Sequence[Block]) -> list[float]:
+def _reaches(blocks: Sequence[DriveBlock]) -> list[float]:
     """Return the half-height of each block's strips: the same for all where that can be read."""
     reaches = [_reach(block) for block in blocks]
     comparable = max(reaches) <= COMPARABLE * min(reaches)
     return [max(reaches)] * len(reaches) if comparable else reaches
 
 
-def _reach(block: Block) -> float:
+def _reach(block: DriveBlock) -> float:
     """Return a round number that is larger than all differences of a block, in deg."""
     truth = np.degrees(block.run.drive.sideslip_rad)
     sizes = [np.abs(_estimate_deg(block, line) - truth) for line in block.all_strips]
@@ -140,7 +140,7 @@ def _reach(block: Block) -> float:
     return next(reach for reach in REACHES_DEG if largest < reach)
 
 
-def _shade(axes: Axes, block: Block) -> None:
+def _shade(axes: Axes, block: DriveBlock) -> None:
     for section in block.run.sections:
         if section.name == block.shaded:
             name = "unstable" if section.name == "unstable" else "outage"
@@ -150,7 +150,7 @@ def _shade(axes: Axes, block: Block) -> None:
                 )
 
 
-def _legend(figure: Figure, axes: Axes, block: Block, top_in: float) -> None:
+def _legend(figure: Figure, axes: Axes, block: DriveBlock, top_in: float) -> None:
     """Write the title, and beneath it the name of each line in its colour."""
     width, height = figure.get_size_inches()
     figure.text(LEFT_IN / width, (top_in - 0.05) / height, block.title, fontweight="bold", va="top")
@@ -173,7 +173,7 @@ def _legend(figure: Figure, axes: Axes, block: Block, top_in: float) -> None:
     axes.margins(y=0.06)
 
 
-def _caption(axes: Axes, block: Block, line: Line, size: Size) -> None:
+def _caption(axes: Axes, block: DriveBlock, line: Line, size: Size) -> None:
     figures = block.run.results[line.estimator].whole
     text = f"{line.label} \N{MINUS SIGN} true"
     if figures.error_std_deg is not None and figures.error_mean_deg is not None:

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
 
-from fleet_slip.comparison.evaluation.errors import ErrorFigures
-from fleet_slip.comparison.evaluation.results import evaluations_of
+from fleet_slip.comparison.evaluation.error_figures import ErrorFigures
+from fleet_slip.comparison.evaluation.evaluation_document import evaluations_of
 from fleet_slip.errors import DataError
 from fleet_slip.files.documents import Document
 from fleet_slip.models.model_version import ModelVersion

@@ -11,9 +11,9 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.comparison.evaluation.errors import error_figures
+from fleet_slip.comparison.evaluation.error_figures import error_figures
 from fleet_slip.comparison.evaluation.estimators import as_counts
-from fleet_slip.comparison.evaluation.runs import EvaluatedScenario
+from fleet_slip.comparison.evaluation.scenario_runs import EvaluatedScenario
 from fleet_slip.grams.cohorts.folding import Folding
 from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.grams.column_plan import ColumnPlan

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.comparison.evaluation.runs import EvaluatedScenario
+from fleet_slip.comparison.evaluation.scenario_runs import EvaluatedScenario
 from fleet_slip.regression.exact.special import student_t_two_sided
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.comparison.evaluation.ranking import LEAST_COVERAGE
-from fleet_slip.comparison.report.figures.cars import car_by_car
-from fleet_slip.comparison.report.figures.columns import Series, error_over
+from fleet_slip.comparison.report.figures.car_by_car import car_by_car
+from fleet_slip.comparison.report.figures.column_errors import Series, error_over
 from fleet_slip.comparison.report.figures.density import density
-from fleet_slip.comparison.report.figures.gates import angle_and_gates
+from fleet_slip.comparison.report.figures.gate_strips import angle_and_gates
 from fleet_slip.comparison.report.figures.lateral import error_by_acceleration
 from fleet_slip.comparison.report.figures.series import Line
 from fleet_slip.comparison.report.figures.standings import Named, points_by_drive

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from fleet_slip.comparison.report.figures.columns import Series, error_by_columns, left_out
+from fleet_slip.comparison.report.figures.column_errors import Series, error_by_columns, left_out
 from fleet_slip.comparison.report.figures.track_map import FINE_EDGES_DEG, Map, error_map
 from fleet_slip.comparison.report.findings.memory import Memory, Without
 from fleet_slip.comparison.report.findings.report_data import ReportData

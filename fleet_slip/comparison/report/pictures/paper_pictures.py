@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from fleet_slip.comparison.report.figures.series import Block, Line, side_slip
+from fleet_slip.comparison.report.figures.series import DriveBlock, Line, side_slip
 from fleet_slip.comparison.report.figures.speed import KMH_PER_MPS, speed
 from fleet_slip.comparison.report.findings.report_data import DRAWN_FILTERS, ReportData
 from fleet_slip.pages.picture import Picture
@@ -92,9 +92,9 @@ def choice_line(data: ReportData) -> Line:
     return model_line(data, data.choice_number)
 
 
-def _blocks(data: ReportData, one: Drives, lines: tuple[Line, ...]) -> list[Block]:
+def _blocks(data: ReportData, one: Drives, lines: tuple[Line, ...]) -> list[DriveBlock]:
     return [
-        Block(title, data.runs[name], lines, shaded=one.shaded)
+        DriveBlock(title, data.runs[name], lines, shaded=one.shaded)
         for name, title in one.drives.items()
     ]
 
@@ -109,14 +109,14 @@ def _against_the_filter(data: ReportData) -> Iterator[Picture]:
         drives = {"nominal": "Nominal drive", "gps_tunnel": "A tunnel of 20 s"}
         lines, strips = (filters[0], choice_line(data)), tuple(filters[1:])
         blocks = [
-            Block(title, data.runs[name], lines, strips, shaded="gps_outage")
+            DriveBlock(title, data.runs[name], lines, strips, shaded="gps_outage")
             for name, title in drives.items()
             if name in data.runs
         ]
         yield _series("figure-8", "Figure 8. The Kalman filter and the regression", blocks)
 
 
-def _series(key: str, title: str, blocks: Sequence[Block]) -> Picture:
+def _series(key: str, title: str, blocks: Sequence[DriveBlock]) -> Picture:
     found = " ".join(sentence for block in blocks for sentence in _found(block, len(blocks) > 1))
     seen = (
         "Lines over time of the true angle and of the estimates, and beneath them the differences."
@@ -124,7 +124,7 @@ def _series(key: str, title: str, blocks: Sequence[Block]) -> Picture:
     return Picture(key, title, found, seen, lambda size: side_slip(blocks, size))
 
 
-def _found(block: Block, named: bool) -> Iterator[str]:
+def _found(block: DriveBlock, named: bool) -> Iterator[str]:
     errors = []
     for line in block.all_strips:
         figures = block.run.results[line.estimator].whole
@@ -138,7 +138,7 @@ def _found(block: Block, named: bool) -> Iterator[str]:
         yield _stability(block)
 
 
-def _stability(block: Block) -> str:
+def _stability(block: DriveBlock) -> str:
     result = block.run.results[block.lines[0].estimator]
     if "unstable" not in result.inside:
         return "The car is stable throughout."

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.comparison.evaluation.runs import EvaluatedScenario
+from fleet_slip.comparison.evaluation.scenario_runs import EvaluatedScenario
 from fleet_slip.comparison.evaluation.stability import find_stretches
 from fleet_slip.comparison.report.figures.lines import band
 from fleet_slip.comparison.report.figures.series import Line

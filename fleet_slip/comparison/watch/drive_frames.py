@@ -10,7 +10,7 @@ import pyarrow as pa
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.comparison.evaluation.evaluated_drives import load_drives
-from fleet_slip.comparison.evaluation.runs import simulate_scenarios
+from fleet_slip.comparison.evaluation.scenario_runs import simulate_scenarios
 from fleet_slip.comparison.report.findings.gate_openings import gates_on
 from fleet_slip.errors import DataError, QuestionError, UsageError
 from fleet_slip.models.model_version import ModelVersion
@@ -28,7 +28,7 @@ FACTS = ("vehicle_model", "mass_kg")
 
 
 @dataclass(frozen=True)
-class Frames:
+class DriveFrames:
     """A drive at 25 frames a second; arrays have shape (frames,).
 
     Attributes:
@@ -56,7 +56,7 @@ class Frames:
     gates: Mapping[str, FloatArray]
     track: tuple[FloatArray, FloatArray]
 
-    def part(self, from_s: float, until_s: float | None) -> "Frames":
+    def part(self, from_s: float, until_s: float | None) -> "DriveFrames":
         """Return the frames of a part of the drive. Raises `UsageError` if it has none."""
         wanted = self.time_s >= from_s
         if until_s is not None:
@@ -82,7 +82,7 @@ def is_scenario(what: str) -> bool:
 
 def scenario_frames(
     warehouse: Warehouse, name: str, version: ModelVersion, executor: Any
-) -> Frames:
+) -> DriveFrames:
     """Return the frames of a test drive, which is simulated if it is not in the logs.
 
     Raises `ConfigError` for an unknown scenario.
@@ -103,7 +103,7 @@ def scenario_frames(
     return _frames(title, columns, facts, drive.time_s, version)
 
 
-def drive_frames(warehouse: Warehouse, drive_id: str, version: ModelVersion) -> Frames:
+def drive_frames(warehouse: Warehouse, drive_id: str, version: ModelVersion) -> DriveFrames:
     """Return the frames of a drive of the logs. Raises `QuestionError` if there is none."""
     names = [one.column for one in catalogue().signals.values()]
     query = f"SELECT time_s, track, vehicle_model, mass_kg, {', '.join(names)} FROM log"
@@ -132,13 +132,13 @@ def _frames(
     facts: Mapping[str, Any],
     time_s: FloatArray,
     version: ModelVersion,
-) -> Frames:
+) -> DriveFrames:
     seen = np.flatnonzero(np.diff(np.floor((time_s - time_s[0]) * FRAMES_PER_S + 1e-6), prepend=-1))
     estimate = version.predict(_as_table(columns, facts, time_s))
     vx, vy = _velocity(columns)
     x, y, heading, track = _places(columns, facts, time_s, vx, vy)
     gates = gates_on(version.manifest, columns, facts)
-    return Frames(
+    return DriveFrames(
         title=title,
         model=version.reference,
         time_s=time_s[seen],

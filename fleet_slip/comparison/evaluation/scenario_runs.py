@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.comparison.evaluation.errors import ErrorFigures, error_figures
+from fleet_slip.comparison.evaluation.error_figures import ErrorFigures, error_figures
 from fleet_slip.comparison.evaluation.estimators import Estimate
 from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive, load_drives
 from fleet_slip.comparison.evaluation.stability import CRITERION, find_unstable

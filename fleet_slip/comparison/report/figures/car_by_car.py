@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from fleet_slip.comparison.report.figures.labels import End, error_axes, finish_errors
-from fleet_slip.comparison.report.findings.cars import Cars
+from fleet_slip.comparison.report.findings.own_numbers import Cars
 from fleet_slip.pages.style import Size, colour
 
 BEFORE, AFTER = "kalman", "model_3"

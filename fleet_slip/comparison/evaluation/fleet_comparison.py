@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from fleet_slip.comparison.evaluation.estimators import TrainedModels
-from fleet_slip.comparison.evaluation.runs import EvaluatedScenario
+from fleet_slip.comparison.evaluation.scenario_runs import EvaluatedScenario
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive
-from fleet_slip.comparison.evaluation.runs import EvaluatedScenario, Result, Section
+from fleet_slip.comparison.evaluation.scenario_runs import EvaluatedScenario, Result, Section
 from fleet_slip.comparison.evaluation.stability import find_stretches, rear_compliance
 from fleet_slip.files.documents import Document, DocumentFolder, checksum
 from fleet_slip.warehouse.tables import Warehouse

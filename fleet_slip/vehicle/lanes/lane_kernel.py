@@ -211,7 +211,8 @@ def build_kernel(sources: str, imperfect: bool = False) -> Callable[..., None]:
 def _source_digest() -> str:
     """Return a digest of all sources concerned, so that a change of any recompiles the kernel."""
     digest = hashlib.sha256()
-    for file in [*sorted(FilePath(__file__).parent.glob("*.py")), FilePath(compiling.__file__)]:
+    vehicle = FilePath(__file__).parents[1]
+    for file in [*sorted(vehicle.rglob("*.py")), FilePath(compiling.__file__)]:
         digest.update(file.read_bytes())
     return digest.hexdigest()
 
