@@ -5,8 +5,8 @@ import pytest
 
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.grams.cohorts.fold_assignment import assign_folds
 from fleet_slip.grams.cohorts.folding import Folding
-from fleet_slip.grams.cohorts.gram_cohort import assign_folds
 from fleet_slip.regression.validation.crossval import cross_validate_inputs
 from fleet_slip.selection.shrinkage import PACE, PENALTIES, Shrunk, compare_shrinkage
 from tests.support.cohorts import INPUTS, LABEL, Driven, cohort_of, driven, rows_of

@@ -4,7 +4,7 @@ Comparing given models needs no single drive, only the Gram of each fold. So any
 rows is added up in the memory of one batch; and of a file whose rollup serves, no row is read.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,24 +13,20 @@ import pyarrow.compute as pc
 
 from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.feature_sets import PLAIN
-from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohorts.cells import Cells, dealt_folds
+from fleet_slip.grams.cohorts.cohort_origin import CohortOrigin
 from fleet_slip.grams.cohorts.empty_cohort import empty_cohort
 from fleet_slip.grams.cohorts.expansion import Expansion, expansion_of
+from fleet_slip.grams.cohorts.fold_assignment import assign_folds, require_divided
 from fleet_slip.grams.cohorts.folding import (
     FOLD_KEYS,
     FoldCount,
     Folding,
     FoldKey,
 )
-from fleet_slip.grams.cohorts.gram_cohort import (
-    assign_folds,
-    gram_condition,
-    require_divided,
-    require_training,
-)
+from fleet_slip.grams.cohorts.gram_cohort import require_training
 from fleet_slip.grams.cohorts.members import (
     Hashed,
     Hashes,
@@ -39,7 +35,6 @@ from fleet_slip.grams.cohorts.members import (
     hash_numbers,
     received_among,
 )
-from fleet_slip.grams.cohorts.outweighing import Outweighing
 from fleet_slip.grams.cohorts.reader import GramReader, OpenedGrams, open_grams
 from fleet_slip.grams.rows.gram_rows import by_signals, gram_table
 from fleet_slip.regression.exact.gram import Gram
@@ -49,45 +44,29 @@ from fleet_slip.warehouse.condition import Condition, asking, parse_condition
 from fleet_slip.warehouse.tables import Warehouse
 
 
-@dataclass(frozen=True)
-class SummedCohort:
+@dataclass(frozen=True, kw_only=True)
+class SummedCohort(CohortOrigin):
     """What a selection from given models needs of a cohort.
 
     Attributes:
-        condition: which drives, by the columns of the view `drives`.
         folding: how the cohort was divided.
         sums: the Gram of each fold.
         rows, drive_count: number of rows of the logs, and of drives, behind the cohort.
-        logs_version, grams_version: versions of the Delta tables that were read.
         members: which drives and cars the Gram rows are of.
         source: where they were read, and can be read again over other folds.
-        feature_set: which Gram rows were read.
-        left_out: drives of the condition that have no such Gram rows: their cars sent no log.
-        revoked: how many drives of a car are left out, since a revoked key signed them.
-        outweighing: which are, since their cars would outweigh the others with them.
     """
 
-    condition: Condition
     folding: Folding
     sums: CohortFolds
     rows: int
     drive_count: int
-    logs_version: int
-    grams_version: int
     members: Members
     source: Warehouse | GramReader
-    feature_set: str = PLAIN
-    left_out: int = 0
-    revoked: Mapping[str, int] = field(default_factory=dict)
-    outweighing: tuple[Outweighing, ...] = ()
 
     @property
     def inputs(self) -> tuple[str, ...]:
         """Signals and features that any of the drives has, in the order of the feature set."""
-        found = {name for grams in self.sums.tables for name in grams[0].signals}
-        return tuple(
-            name for name in features().feature_set(self.feature_set).inputs if name in found
-        )
+        return self.inputs_among(name for grams in self.sums.tables for name in grams[0].signals)
 
     def folds(self, by: FoldKey, count: FoldCount) -> CohortFolds:
         """Return the folds; for others than the cohort was read over, its Gram rows as of now.
@@ -98,10 +77,6 @@ class SummedCohort:
             return self.sums
         folding = Folding(by=by, count=count)
         return sum_cohort(self.source, folding, self.condition, self.feature_set).sums
-
-    def gram_condition(self, inputs: Sequence[str]) -> str:
-        """Return the SQL condition on the view `grams` of the rows that a model is made of."""
-        return gram_condition(self.condition, self.feature_set, inputs, self.outweighing)
 
 
 def sum_cohort(
@@ -126,7 +101,7 @@ def sum_cohort(
         for batch in opened.batches(condition):
             require_training(batch["source"].unique().to_pylist(), condition)
             sums.add(batch)
-        left_out, revoked = opened.count_left_out(condition), opened.revoked(condition)
+        origin = opened.origin(condition)
         if not sums.tables:
             raise empty_cohort(warehouse, condition, feature_set)
     members = sums.members
@@ -134,19 +109,13 @@ def sum_cohort(
         of = f"the cohort {condition.text!r} with the signals {signals}"
         members.require_vehicles([signals], of)
     return SummedCohort(
-        condition=condition,
+        **vars(origin),
         folding=folding,
         sums=sums.of_folds(members),
         rows=sum(gram.n for grams in sums.tables.values() for gram in grams),
         drive_count=members.count_drives(members.drives),
-        logs_version=opened.logs_version,
-        grams_version=opened.grams_version,
         members=members,
         source=warehouse,
-        feature_set=feature_set,
-        left_out=left_out,
-        revoked=revoked,
-        outweighing=opened.outweighing,
     )
 
 

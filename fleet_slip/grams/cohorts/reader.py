@@ -17,6 +17,7 @@ from fleet_slip.catalogue.sources import ALL_DRIVES, LONGEST_PAUSE_S, TRAINING_D
 from fleet_slip.delta import Snapshot
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohorts.cells import NO_CELLS, Cells, RollupReader
+from fleet_slip.grams.cohorts.cohort_origin import CohortOrigin
 from fleet_slip.grams.cohorts.folding import Folding
 from fleet_slip.grams.cohorts.outweighing import Outweighing, find_outweighing
 from fleet_slip.grams.received.car_keys import load_car_keys
@@ -72,6 +73,18 @@ class OpenedGrams:
         statement = read_sql("jobs", "count_revoked.sql").format(condition=sql)
         with asking(self.database, condition):
             return dict(self.database.execute(statement).fetchall())
+
+    def origin(self, condition: Condition) -> CohortOrigin:
+        """Return which Gram rows a cohort of a condition is of."""
+        return CohortOrigin(
+            condition=condition,
+            logs_version=self.logs_version,
+            grams_version=self.grams_version,
+            feature_set=features().name_of(self.identity),
+            left_out=self.count_left_out(condition),
+            revoked=self.revoked(condition),
+            outweighing=self.outweighing,
+        )
 
     def batches(self, condition: Condition) -> Iterator[pa.RecordBatch]:
         """Yield the Gram rows of a cohort in any order, with what their fold is told from."""

@@ -21,7 +21,8 @@ from fleet_slip.comparison.report.findings.report_data import ReportData
 from fleet_slip.comparison.report.page import render
 from fleet_slip.comparison.report.pictures import draw_pictures
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohorts.gram_cohort import Cohort, assign_folds
+from fleet_slip.grams.cohorts.fold_assignment import assign_folds
+from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.pages.style import DESK, PHONE
 from fleet_slip.regression.exact.gram import Gram
@@ -57,7 +58,10 @@ def cohort(rows: dict[str, list[FloatArray]]) -> Cohort:
     )
     ids = [str(number) for number in range(len(drives))]
     about = pa.table({"drive_id": ids, "vehicle_id": [car for car, _ in drives]})
-    return Cohort(parse_condition("true"), (table,), about, 1, 1)
+    condition = parse_condition("true")
+    return Cohort(
+        condition=condition, tables=(table,), drives=about, logs_version=1, grams_version=1
+    )
 
 
 def test_each_car_is_judged_by_a_line_through_the_cars_of_other_folds() -> None:
