@@ -32,8 +32,6 @@ from fleet_slip.regression.validation.folds import Folds
 PENALTIES = tuple(float(10.0**exponent) for exponent in np.arange(-6, 0.01, 0.5))
 """Penalties on the correlation matrix that ridge and lasso choose from."""
 
-PACE = ("james-stein", "pace2", "pace4", "pace6", "eb")
-
 
 @dataclass(frozen=True)
 class Shrunk:
@@ -77,9 +75,8 @@ def compare_shrinkage(
         "lasso": lambda penalty: lambda gram: fit_lasso(gram, inputs, label, penalty),
     }
     found += [_penalised(name, folds, make, scales) for name, make in penalised.items()]
-    for name in PACE:
-        estimator = _by_effect(ESTIMATORS[name], effect)
-        procedure = _shrinking(inputs, label, estimator)
+    for name, estimator in ESTIMATORS.items():
+        procedure = _shrinking(inputs, label, _by_effect(estimator, effect))
         found.append(Shrunk(cross_validate(name, folds, procedure, scales)))
     return tuple(found)
 

@@ -158,9 +158,9 @@ def test_estimators_shrink_and_keep_signs(a: np.ndarray) -> None:
         shrunk = estimator(a)
         assert shrunk.shape == a.shape
         assert np.isfinite(shrunk).all(), name
-        if name in {"pace2", "pace4", "nested", "subset"}:
+        if name in {"pace2", "pace4"}:
             assert ((shrunk == a) | (shrunk == 0)).all()
-        if name in {"james-stein", "posterior-mean", "pace6"}:
+        if name in {"james-stein", "pace6"}:
             assert (shrunk * a >= 0).all()
 
 
@@ -172,17 +172,13 @@ def test_shrinkage_lowers_the_loss_when_most_effects_are_small() -> None:
         a = truth + rng.normal(size=60)
         for name, estimator in ESTIMATORS.items():
             loss[name] += float(np.sum((estimator(a) - truth) ** 2)) / 30
-    assert loss["ols"] == pytest.approx(60, rel=0.15)
-    for name in set(ESTIMATORS) - {"ols"}:
-        assert loss[name] < 0.7 * loss["ols"], (name, loss)
-    # Both estimate the same mixture: over 150 such draws they differ by -0.3 +- 0.3.
-    assert loss["posterior-mean"] == pytest.approx(loss["pace6"], rel=0.1)
+    assert max(loss.values()) < 0.7 * 60, loss  # 60: what least squares loses on average
 
 
 def test_pace_needs_no_row_and_names_its_mistakes() -> None:
     gram = gram_of(np.concatenate(random_drives(9, inputs=6)))
     inputs = names(6)[:-1]
-    found = shrink(gram, inputs, "y", ESTIMATORS["ols"])
+    found = shrink(gram, inputs, "y", lambda a: a)
     assert found.weights == pytest.approx(fit(gram, inputs, "y").model.weights)
     exact = Gram.from_counts(("x1", "y"), np.array([[1, 2], [2, 4], [3, 6], [5, 10]]))
     with pytest.raises(DataError, match="no noise"):

@@ -7,8 +7,9 @@ from fleet_slip.catalogue.features import input_scales
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.cohorts.fold_assignment import assign_folds
 from fleet_slip.grams.cohorts.folding import Folding
+from fleet_slip.regression.shrinkage.pace import ESTIMATORS
 from fleet_slip.regression.validation.crossval import cross_validate_inputs
-from fleet_slip.selection.shrinkage import PACE, PENALTIES, Shrunk, compare_shrinkage
+from fleet_slip.selection.shrinkage import PENALTIES, Shrunk, compare_shrinkage
 from tests.support.cohorts import INPUTS, LABEL, Driven, cohort_of, driven, rows_of
 
 FIVE = Folding(by="drive", count=5)
@@ -30,7 +31,7 @@ def collinear(drives: int, rows: int, noise: float) -> list[Driven]:
 
 def test_every_method_is_named_once_and_only_two_have_a_penalty() -> None:
     found = compared(driven(1, (0.1, 0.4, 0.9, 0.2)))
-    assert list(found) == ["least squares", "ridge", "lasso", *PACE]
+    assert list(found) == ["least squares", "ridge", "lasso", *ESTIMATORS]
     assert [name for name, one in found.items() if one.penalty is not None] == ["ridge", "lasso"]
     assert {one.cross_validation.pooled.rows for one in found.values()} == {12 * 80}
     assert found["ridge"].as_dict()["penalty"] == found["ridge"].penalty

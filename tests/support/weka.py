@@ -18,13 +18,19 @@ from fleet_slip.regression.exact import exact_roots
 from fleet_slip.regression.exact.figures import error_sums
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import LinearModel
-from fleet_slip.regression.shrinkage.mixture import ChiSquareKernel, Mixture, fit_mixture
+from fleet_slip.regression.shrinkage.mixture import (
+    ChiSquareKernel,
+    Mixture,
+    NormalKernel,
+    fit_mixture,
+    posterior,
+    signed_density,
+)
 from fleet_slip.regression.shrinkage.orthogonal import OrthogonalResponses
 from fleet_slip.regression.shrinkage.pace import (
     Estimator,
     empirical_bayes,
     half_contributions,
-    normal_contributions,
     pace5,
 )
 from fleet_slip.regression.shrinkage.ridge import fit_penalised
@@ -143,8 +149,16 @@ def _pace4(a: FloatArray) -> FloatArray:
     return np.where(positive & (a**2 > NEGLIGIBLE_SQUARE), a, 0.0)
 
 
+def _normal_contributions(a: FloatArray) -> FloatArray:
+    """Return E[2 a a* - a^2 | a] under a normal mixture."""
+    mixture = fit_mixture(a, NormalKernel())
+    return np.array(
+        [float(posterior(mixture, x, signed_density) @ (2 * x * mixture.points - x * x)) for x in a]
+    )
+
+
 def _nested(a: FloatArray) -> FloatArray:
-    kept = _leading(a, normal_contributions(a))
+    kept = _leading(a, _normal_contributions(a))
     return np.where(np.abs(kept) <= NEGLIGIBLE, 0.0, kept)
 
 

@@ -84,16 +84,6 @@ def _correlation(n: Any, p: Any, pp: Any, py: Any, y: Any, yy: Any) -> Any:
     return (py - p * y / n) / np.sqrt((pp - p * p / n) * (yy - y * y / n))
 
 
-def bootstrap_coefficients(drives: DriveMoments, replicates: int, seed: int) -> FloatArray:
-    """Return refitted coefficients of resampled clusters, in counts, shape (replicates, k+1).
-
-    The columns are the intercept and the inputs of the moments. Raises `DataError` for fewer
-    than two drives, and where a draw leaves signals dependent.
-    """
-    totals = drives.matrix(_resampled_totals(drives.clusters.packed, replicates, seed))
-    return to_counts(drives, solve(totals))
-
-
 def solve(totals: FloatArray, *, intercept: bool = True) -> FloatArray:
     """Solve for (constant, inputs) in each matrix of moments with the label last.
 
@@ -108,15 +98,6 @@ def solve(totals: FloatArray, *, intercept: bool = True) -> FloatArray:
         raise DataError(
             "a resampled cohort cannot be fitted: too few drives have these signals."
         ) from None
-
-
-def to_counts(drives: DriveMoments, solutions: FloatArray) -> FloatArray:
-    """Turn standardised (constant, coefficients), shape (..., k+1), into those of counts."""
-    unit, spread = drives.spread[-1], drives.spread[:-1]
-    slopes = solutions[..., 1:] * unit / spread
-    centre = np.array(drives.centre, dtype=np.float64)
-    level = solutions[..., :1] * unit + centre[-1] - slopes @ centre[:-1, None]
-    return np.concatenate([level, slopes], axis=-1)
 
 
 @dataclass(frozen=True)

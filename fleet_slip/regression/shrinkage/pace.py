@@ -3,8 +3,8 @@
 The effects A_j of an order are samples from a mixture; the mixing distribution G, estimated from
 all of them, says how much each one is worth. Names follow Wang: pace1 truncates the nested
 sequence, pace3 selects dimensions, pace5 shrinks, by a chi-square mixture that is known; pace2,
-pace4 and pace6 do the same by the one that is estimated from the very effects. nested, subset and
-eb are the latter with normal mixtures of signed effects.
+pace4 and pace6 do the same by the one that is estimated from the very effects. eb shrinks by a
+normal mixture of signed effects.
 """
 
 from collections.abc import Callable, Sequence
@@ -86,39 +86,12 @@ def pace6(a: FloatArray) -> FloatArray:
     return pace5(a, estimate_mixture(a))
 
 
-def posterior_mean(a: FloatArray) -> FloatArray:
-    """Shrink to the posterior mean of the signed a*: the least expected squared loss.
-
-    sign(a) int m [phi(a-m) - phi(a+m)] dG / int [phi(a-m) + phi(a+m)] dG.
-    """
-    mixture = estimate_mixture(a)
-    m = np.sqrt(mixture.points)
-    result: list[float] = []
-    for x in np.abs(a):
-        if x > _CERTAIN:
-            result.append(float(x))
-            continue
-        up, down = normal_density(x - m), normal_density(x + m)
-        result.append(float(mixture.weights @ (m * (up - down)) / (mixture.weights @ (up + down))))
-    return np.asarray(np.sign(a) * np.array(result))
-
-
 def empirical_bayes(a: FloatArray) -> FloatArray:
     """Shrink to the posterior mean under a normal mixture (eb)."""
     mixture = fit_mixture(a, NormalKernel())
     mean = np.array([float(posterior(mixture, x, signed_density) @ mixture.points) for x in a])
     mean = np.where(np.abs(a) > _CERTAIN, a, mean)
     return np.where(np.abs(mean) <= _NEGLIGIBLE, 0.0, mean)
-
-
-def nested(a: FloatArray) -> FloatArray:
-    """Keep the leading dimensions with the largest sum of E[2 a a* - a^2 | a]."""
-    return _leading(a, normal_contributions(a))
-
-
-def subset(a: FloatArray) -> FloatArray:
-    """Keep the dimensions with E[2 a a* - a^2 | a] > 0."""
-    return np.where(normal_contributions(a) > 0, a, 0.0)
 
 
 def _leading(a: FloatArray, contributions: FloatArray) -> FloatArray:
@@ -136,14 +109,6 @@ def posterior_root(mixture: Mixture, size: float) -> FloatArray:
     """Return the posterior of a chi-square mixture's points given |a|."""
     root = Mixture(np.sqrt(mixture.points), mixture.weights)
     return posterior(root, size, folded_density)
-
-
-def normal_contributions(a: FloatArray) -> FloatArray:
-    """Return E[2 a a* - a^2 | a] under a normal mixture."""
-    mixture = fit_mixture(a, NormalKernel())
-    return np.array(
-        [float(posterior(mixture, x, signed_density) @ (2 * x * mixture.points - x * x)) for x in a]
-    )
 
 
 def _contributions(a: FloatArray, mixture: Mixture) -> FloatArray:
@@ -167,13 +132,9 @@ def half_contributions(
 
 
 ESTIMATORS: dict[str, Estimator] = {
-    "ols": lambda a: a,
     "james-stein": james_stein,
     "pace2": pace2,
     "pace4": pace4,
     "pace6": pace6,
-    "posterior-mean": posterior_mean,
     "eb": empirical_bayes,
-    "nested": nested,
-    "subset": subset,
 }
