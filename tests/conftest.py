@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, settings
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import Finished, RunCommand, done_on, run_on
-from tests.support.once import made_once
+from tests.support.once import made_once, require_unchanged
 
 os.environ["FLEET_SLIP_LOG"] = "text"  # a test reads what a person would
 
@@ -56,6 +56,10 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     missing = [name for name in tools_of(item) if shutil.which(name) is None]
     if missing:
         pytest.skip(f"{', '.join(missing)} is not here: tests/tools/install {' '.join(missing)}")
+
+
+def pytest_runtest_teardown(item: pytest.Item) -> None:
+    require_unchanged(getattr(item, "funcargs", {}).values())
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:

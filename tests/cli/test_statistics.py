@@ -57,6 +57,12 @@ def every_set(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Pat
     return made_once(tmp_path_factory, "every-set", make)
 
 
+@pytest.fixture
+def own_set(every_set: Path, tmp_path: Path) -> Path:
+    """A copy of it, to publish in."""
+    return shutil.copytree(every_set, tmp_path / "copy")
+
+
 def test_all_sets_are_up_to_date(run_command: RunCommand, every_set: Path) -> None:
     reports = run_command("gram", "--features", "all", "--json", root=every_set).json
     assert [report["files_read"] for report in reports] == [0] * len(reports)
@@ -129,22 +135,22 @@ def test_folds_of_rows_are_labelled_as_leaking(run_command: RunCommand, every_se
 
 
 def test_a_published_model_with_features_explains_and_evaluates_them(
-    run_command: RunCommand, every_set: Path
+    run_command: RunCommand, own_set: Path
 ) -> None:
     nested = ("--nested", "ay,steer_fl,curvature,speed_squared")
     arguments = ("--features", "motion", *nested, "--rank", "declared", "--criterion", "cp")
-    done = run_command("publish", "curved", *arguments, "--json", root=every_set)
+    done = run_command("publish", "curved", *arguments, "--json", root=own_set)
     assert done.exit_code == 0, done.stderr
-    shown = run_command("show", "curved", "--json", root=every_set).json
+    shown = run_command("show", "curved", "--json", root=own_set).json
     terms = {term["signal"]: term for term in shown["terms"]}
     assert terms["curvature"]["sql"] == features().features["curvature"].sql
     assert (terms["curvature"]["unit"], terms["ay"]["sql"]) == ("rad/m", "")
     assert shown["trained_on"]["feature_set"] == features().identity("motion")
-    assert "CASE WHEN" in run_command("show", "curved", root=every_set).stdout
-    score = run_command("score", "curved", "--json", root=every_set).json
+    assert "CASE WHEN" in run_command("show", "curved", root=own_set).stdout
+    score = run_command("score", "curved", "--json", root=own_set).json
     assert score["rows"] == shown["trained_on"]["rows"]
     assert abs(score["error_mean_deg"]) < 1e-9  # an OLS fit has no mean error on its own rows
-    with fleet_slip.connect(every_set) as database:
+    with fleet_slip.connect(own_set) as database:
         rows = database.sql("FROM log_counts").to_arrow_table()
     computed = duckdb.connect()
     computed.register("log_counts", rows)
@@ -155,7 +161,7 @@ def test_a_published_model_with_features_explains_and_evaluates_them(
     weights = np.array([term["coefficient"] for term in terms.values()])
     error = matrix[:, :-1] @ (scales * weights) + shown["intercept"] - matrix[:, -1] * 1e-4
     assert score["rmse_deg"] == pytest.approx(math.degrees(math.sqrt(np.mean(error**2))), rel=1e-9)
-    again = run_command("publish", "curved", *arguments, "--json", root=every_set).json
+    again = run_command("publish", "curved", *arguments, "--json", root=own_set).json
     assert not again["new"]
 
 
@@ -181,7 +187,7 @@ def test_diagnose_shows_both_kinds_of_errors_and_the_serial_correlation(
 
 
 def test_what_if_agrees_with_a_campaign_of_doubled_noise(
-    run_command: RunCommand, every_set: Path, tmp_path: Path
+    run_command: RunCommand, own_set: Path, tmp_path: Path
 ) -> None:
     text = find_config("campaigns", "smoke").read_text()
     stds = ("acceleration_std_mps2", "yaw_rate_std_rad_s", "wheel_speed_std_rad_s")
@@ -193,15 +199,15 @@ def test_what_if_agrees_with_a_campaign_of_doubled_noise(
     noisy = tmp_path / "noisy"
     done_on(noisy, "simulate", str(tmp_path / "noisy.toml"))
     nested = ("--nested", ",".join(NOISE), "--rank", "declared", "--criterion", "aic", "--naive")
-    run_command("publish", "doubled", *nested, root=every_set)
-    shown = run_command("show", "doubled", "--json", root=every_set).json
+    run_command("publish", "doubled", *nested, root=own_set)
+    shown = run_command("show", "doubled", "--json", root=own_set).json
     used = [term["signal"] for term in shown["terms"]]
     # Noise of twice the standard deviation is what there is, plus noise of sqrt(3) times it.
     options = [
         word for name in used for word in ("--noise", f"{name}={NOISE[name] * math.sqrt(3)}")
     ]
-    predicted = run_command("what-if", "doubled", *options, "--json", root=every_set).json
-    (noisy / "models").symlink_to(every_set / "models")
+    predicted = run_command("what-if", "doubled", *options, "--json", root=own_set).json
+    (noisy / "models").symlink_to(own_set / "models")
     simulated = run_command("score", "doubled", "--json", root=noisy).json
     assert predicted["after"]["rmse_deg"] > 1.2 * predicted["before"]["rmse_deg"]
     assert predicted["after"]["rmse_deg"] == pytest.approx(simulated["rmse_deg"], rel=0.01)
@@ -209,7 +215,7 @@ def test_what_if_agrees_with_a_campaign_of_doubled_noise(
     assert predicted["refitted_after"]["rmse_deg"] < predicted["after"]["rmse_deg"]
     # A bias of d in one signal moves the mean error by its coefficient times d.
     weight = next(term["coefficient"] for term in shown["terms"] if term["signal"] == "ay")
-    biased = run_command("what-if", "doubled", "--bias", "ay=0.5", "--json", root=every_set).json
+    biased = run_command("what-if", "doubled", "--bias", "ay=0.5", "--json", root=own_set).json
     moved = biased["after"]["error_mean_deg"] - biased["before"]["error_mean_deg"]
     assert moved == pytest.approx(math.degrees(weight * 0.5), rel=1e-9)
 
@@ -379,10 +385,9 @@ def test_nested_models_have_their_distances_from_the_null_one_on(
 
 
 def test_a_model_through_the_origin_is_published_as_one(
-    run_command: RunCommand, every_set: Path, tmp_path: Path
+    run_command: RunCommand, own_set: Path, tmp_path: Path
 ) -> None:
-    root = tmp_path / "copy"
-    shutil.copytree(every_set, root)
+    root = own_set
     chosen = ("--model", "ay,yaw_rate,steering_wheel")
     usual = run_command("select", *chosen, "--json", root=root).json
     selected = run_command("select", *chosen, "--no-intercept", "--json", root=root).json

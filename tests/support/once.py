@@ -2,14 +2,15 @@
 
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import pytest
 
 from fleet_slip.files.local_folder import LocalFolder
 
-_made: set[Path] = set()
+_made: dict[Path, frozenset[Path]] = {}
+"""What is committed and published in each."""
 
 
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
@@ -22,7 +23,7 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
             shutil.rmtree(begun, ignore_errors=True)  # of a process that was killed
             make(begun)
             begun.rename(made)
-    _made.add(made)
+    _made.setdefault(made, _landed(made))
     return made
 
 
@@ -32,3 +33,16 @@ def require_no_failed_run(root: object) -> None:
         for file in Path(str(root), "runs").glob("*.jsonl"):
             failed = '"outcome":"failed"' in file.read_text(encoding="utf-8")
             assert not failed, f"a command failed in {root}, which other tests use. Copy it first."
+
+
+def require_unchanged(roots: Iterable[object]) -> None:
+    """Fail if anything was committed or published in a data root that is made once."""
+    for root in roots:
+        if isinstance(root, Path) and root in _made:
+            before, _made[root] = _made[root], _landed(root)  # told once
+            new = _made[root] - before
+            assert not new, f"{min(new)} is new, and other tests use {root}. Copy it first."
+
+
+def _landed(root: Path) -> frozenset[Path]:
+    return frozenset([*root.glob("*/_delta_log/*.json"), *root.glob("models/**/*.json")])
