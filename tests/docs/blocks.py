@@ -4,7 +4,8 @@
   `…` stands for any text, and a command without such lines may print anything.
 - `bash`, `python` and `sql` run as they are.
 - A block with a title, such as ```` ```toml title="mapping.toml" ````, becomes a file of that name.
-- A block below `<!-- not run: reason -->` is not run.
+- A block below `<!-- not run: reason -->` is not run; one below `<!-- long: reason -->` is run by
+  `make test-all`.
 - Blocks in the languages of `SHOWN` are for reading.
 """
 
@@ -31,7 +32,7 @@ DEADLINE_S = 120
 
 _FENCES = RawFencedCodeBlockLexer(re.compile(r"(?P<language>\S*)(?P<options>[^\n]*)$\n", re.M))
 _TITLE = re.compile(r'\s*title="(?P<title>[\w.-]+)"\s*')
-_MARK = re.compile(r"<!-- not run: \S.* -->\n\Z")
+_MARK = re.compile(r"<!-- (not run|long): \S.* -->\n\Z")
 _run_python = PythonEvaluator()
 
 
@@ -43,7 +44,7 @@ class Block:
     language: str
     options: str
     source: str
-    marked: bool
+    mark: str
     example: Example
 
     @property
@@ -59,8 +60,8 @@ class Block:
             return f"unknown options {self.options.strip()!r}"
         if self.language not in RUN | SHOWN:
             return f"{self.language or 'no language'}: use one of {sorted(RUN | SHOWN)}"
-        if self.marked and self.language not in RUN:
-            return "marked as not run, but blocks of its language never are"
+        if self.mark and self.language not in RUN:
+            return f"marked as {self.mark}, but blocks of its language never are"
         return None
 
 
@@ -76,27 +77,27 @@ def _regions(document: Document) -> Iterator[Region]:
 
 
 def _block(example: Example) -> Block:
-    before = example.document.text[: example.start]
+    found = _MARK.search(example.document.text[: example.start])
     lexemes = example.region.lexemes
     return Block(
         example.line,
         lexemes["language"],
         lexemes["options"],
         str(lexemes["source"]),
-        _MARK.search(before) is not None,
+        found[1] if found else "",
         example,
     )
 
 
-def run(block: Block, known: dict[str, str]) -> None:
-    """Run a block in the working directory.
+def run(block: Block, known: dict[str, str], *, long: bool = False) -> None:
+    """Run a block in the working directory, a long one if it is asked for.
 
     `known` are the outputs of commands that were run before the page was opened.
     """
     assert block.fault is None, block.fault
     if block.title:
         Path(block.title).write_text(block.source, encoding="utf-8")
-    elif block.marked or block.language in SHOWN:
+    elif block.language in SHOWN or (block.mark and not (long and block.mark == "long")):
         return
     elif block.language == "python":
         block.example.evaluate()

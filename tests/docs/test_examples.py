@@ -1,5 +1,6 @@
 """What README and pages tell the reader to type is run, on the data that `make run` makes."""
 
+import os
 import shutil
 import sys
 from pathlib import Path
@@ -41,10 +42,33 @@ def as_typed(patch: pytest.MonkeyPatch, folder: Path) -> None:
 def test_the_code_of_a_page_runs(
     page: str, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shutil.copytree(made / "data", tmp_path / "data")
-    as_typed(monkeypatch, tmp_path)
+    run_page(page, made, tmp_path, monkeypatch, long=False)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "page", [page for page, found in CODE.items() if any(one.mark == "long" for one in found)]
+)
+def test_all_code_of_a_page_runs(
+    page: str, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_page(page, made, tmp_path, monkeypatch, long=True)
+
+
+def run_page(page: str, made: Path, folder: Path, patch: pytest.MonkeyPatch, *, long: bool) -> None:
+    # Nothing changes a file of a table in place, so that 30 MB need not be copied for each page.
+    shutil.copytree(made / "data", folder / "data", copy_function=link_tables)
+    as_typed(patch, folder)
     for block in CODE[page]:
-        run(block, {"make run": (made / "printed").read_text(encoding="utf-8")})
+        run(block, {"make run": (made / "printed").read_text(encoding="utf-8")}, long=long)
+
+
+def link_tables(file: str, copy: str) -> None:
+    """Link a file of a table, and copy any other."""
+    if file.endswith(".parquet"):
+        os.link(file, copy)
+    else:
+        shutil.copy2(file, copy)
 
 
 @pytest.mark.parametrize("page", CODE)
@@ -73,14 +97,19 @@ def test_what_fails_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     page.write_text(
         "```console\n$ exit 3\n```\n\n```console\n$ echo 1\n2\n```\n\n"
         "```console\n$ fleet-slip show nothing\n```\n\n```python\nassert False\n```\n\n"
-        "```bash\nfalse\ntrue\n```\n\n<!-- not run: fails -->\n```bash\nfalse\n```\n"
+        "```bash\nfalse\ntrue\n```\n\n<!-- not run: fails -->\n```bash\nfalse\n```\n\n"
+        "<!-- long: fails late -->\n```bash\nfalse\n```\n"
     )
-    *failing, marked = blocks(page)
+    *failing, marked, long = blocks(page)
     assert len(failing) == 5
     for block in failing:
         with pytest.raises(AssertionError):
             run(block, {})
-    run(marked, {})
+    for block in (marked, long):
+        run(block, {})
+    run(marked, {}, long=True)
+    with pytest.raises(AssertionError):
+        run(long, {}, long=True)
 
 
 @pytest.mark.parametrize(
