@@ -274,6 +274,7 @@ def test_two_runs_at_once_do_the_job_once(tmp_path: Path, smoke_root: Path) -> N
     assert len(list((tmp_path / "data" / "models" / "smoke" / "versions").glob("*.json"))) == 1
 
 
+@pytest.mark.long
 def test_simulations_and_gram_jobs_at_once_lose_and_double_nothing(
     tmp_path: Path, smoke_root: Path
 ) -> None:

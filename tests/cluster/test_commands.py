@@ -93,7 +93,7 @@ def test_every_command_gives_the_same_bits_as_on_one_machine(
     assert damaged.name in found.stdout + found.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_killed_command_is_finished_by_the_next(
     dask: DaskProcesses, run_command: RunCommand, tmp_path: Path
 ) -> None:

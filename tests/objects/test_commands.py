@@ -112,7 +112,7 @@ def test_a_car_is_forgotten_and_its_files_are_gone(copied: Folder) -> None:
     assert command_on(root, "verify", "--full").exit_code == 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_processes_at_once_lose_and_double_nothing(
     server: Server, by_module: None, local: Folder
 ) -> None:

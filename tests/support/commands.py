@@ -36,10 +36,10 @@ class Finished:
 RunCommand = Callable[..., Finished]
 
 
-def run(words: Words, **options: Any) -> Finished:
+def run(words: Words, *, patience_s: float = PATIENCE_S, **options: Any) -> Finished:
     """Run a program to its end; `TimeoutExpired` if it has none."""
     done = subprocess.run(
-        words, capture_output=True, text=True, check=False, timeout=PATIENCE_S, **options
+        words, capture_output=True, text=True, check=False, timeout=patience_s, **options
     )
     return Finished(done.returncode, done.stdout, done.stderr)
 

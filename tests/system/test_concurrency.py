@@ -20,7 +20,7 @@ signals.sideslip = { column = "beta", unit = "deg" }
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_writers_lose_nothing_and_readers_see_whole_commits_in_order() -> None:
     said = concurrency(writers=3, commits=5, patience_s=PATIENCE_S)
     assert "nothing lost or doubled" in said
@@ -42,7 +42,7 @@ def contents(run_command: RunCommand, root: Path) -> list[Any]:
     return [run_command("sql", query, "--json", root=root).json for query in queries]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_commands_at_once_leave_what_they_leave_one_after_the_other(
     run_command: RunCommand, tmp_path: Path
 ) -> None:
