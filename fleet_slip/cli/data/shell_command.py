@@ -11,8 +11,8 @@ from pathlib import Path
 import typer
 
 from fleet_slip.api.session import Session
-from fleet_slip.cli.output import print_text, say
 from fleet_slip.cli.begin.sql_command import Form, answer
+from fleet_slip.cli.output import print_text, say
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.warehouse.database import limit_memory
 
