@@ -1,4 +1,4 @@
-"""Selects as it was asked for: which Gram rows are read, and what is done with them."""
+"""Answers a request: reads the Gram rows it needs, and selects among models."""
 
 from dataclasses import replace
 from typing import Any
@@ -84,7 +84,7 @@ def _answer_without(
     model_list: ModelList | None,
     feature_set: str,
 ) -> RequestedSelection:
-    """Select without the cars of unusual influence on a model of all inputs that are compared."""
+    """Select without the cars whose influence on a model of all compared inputs is unusual."""
     cohort = load_cohort(warehouse, request.cohort, feature_set)
     inputs = inputs_of(cohort, request.nested or WHOLE_SET)
     if model_list and model_list.model and not (request.nested or request.search):

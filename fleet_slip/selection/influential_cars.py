@@ -24,7 +24,7 @@ def influential_cars(cohort: Cohort, inputs: Sequence[str]) -> dict[str, float]:
 
 
 def without_vehicles(condition: Condition, vehicles: Collection[str]) -> Condition:
-    """Return a condition on drives that is not true of those of some cars."""
+    """Return a condition on drives that leaves out some cars."""
     if not vehicles:
         return condition
     quoted = ", ".join("'" + name.replace("'", "''") + "'" for name in sorted(vehicles))

@@ -1,4 +1,4 @@
-"""Inputs as they are asked for: in one text, separated by commas, or all of them."""
+"""Inputs as users name them: separated by commas, or all at once."""
 
 from collections.abc import Sequence
 

@@ -110,7 +110,7 @@ class RegimeComparison:
 
 
 def regime_names(cohort: Cohort, over: Sequence[str]) -> list[str]:
-    """Return the regime of each Gram row, by some of the regimes that its set divides by.
+    """Return the regime of each Gram row, by some of the regimes that divide its feature set.
 
     Raises `QuestionError` if the set does not divide by one of them.
     """

@@ -99,7 +99,7 @@ def calibration_of(opened: OpenedGrams, condition: Condition) -> Calibration:
 
 
 def calibration_table(opened: OpenedGrams) -> pa.Table:
-    """Return the numbers as the table `calibration` that SQL sees, one row a car and number.
+    """Return the table `calibration` that SQL sees: a row for each car and number.
 
     Of the Gram rows that there are: none are required.
     """

@@ -72,7 +72,7 @@ class CarEvidence:
         self.variances = self._variances()
 
     def _slices(self, car: str, first: int = 0, last: int | None = None) -> dict[str, slice]:
-        """Return where the drives of a car are, from the `first` to before the `last`, by kind."""
+        """Return where the drives `first` to `last` of a car stand, by kind."""
         found = {}
         for kind, one in self.sums.items():
             if car in one.cars:

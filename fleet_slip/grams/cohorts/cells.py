@@ -153,7 +153,7 @@ class RollupReader:
 
 
 def _has_any(rollup: Rollup, vehicles: Hashes) -> bool:
-    """Whether a rollup has a row of one of some cars."""
+    """Whether a rollup has a row of any of the given cars."""
     return bool(len(vehicles) and np.isin(vehicles, rollup.vehicles()).any())
 
 

@@ -1,4 +1,4 @@
-"""Which Gram rows a cohort is of."""
+"""Which Gram rows a cohort is made of."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,7 +12,7 @@ from fleet_slip.warehouse.condition import Condition
 
 @dataclass(frozen=True, kw_only=True)
 class CohortOrigin:
-    """Which Gram rows a cohort is of, and which drives of its condition it leaves out.
+    """Which Gram rows a cohort is made of, and which drives it leaves out.
 
     Attributes:
         condition: which drives, by the columns of the view `drives`.

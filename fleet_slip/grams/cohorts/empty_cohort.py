@@ -1,4 +1,4 @@
-"""What is said of a cohort without a drive."""
+"""The error for a cohort without drives."""
 
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohorts.reader import GramReader, OpenedGrams, open_grams
@@ -10,13 +10,13 @@ from fleet_slip.words import number_of
 def empty_cohort(
     source: Warehouse | GramReader, condition: Condition, feature_set: str
 ) -> DataError:
-    """Return the error that no drive satisfies a condition, or none that has a log."""
+    """Return the error that tells why a condition leaves no drive, from all Gram rows."""
     with open_grams(source, feature_set, condition) as opened:  # all of them: it says what there is
         return empty_cohort_error(opened, condition)
 
 
 def empty_cohort_error(opened: OpenedGrams, condition: Condition) -> DataError:
-    """Return the error that no drive satisfies a condition, or none that has a log or counts."""
+    """Return the error that tells why a condition leaves no drive."""
     if revoked := opened.revoked(condition):
         drives = number_of(sum(revoked.values()), "drive")
         return DataError(

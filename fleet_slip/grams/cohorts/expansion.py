@@ -1,4 +1,4 @@
-"""Calibrated columns of Gram rows: what follows from the rows and a number of each car, exactly.
+"""Calibrated columns of Gram rows, computed exactly from the rows and the numbers of each car.
 
 A column that is another times a number which is the same in all rows of a drive has sums that are
 that number times the other's, and products that are the product of both numbers times theirs. So
@@ -75,7 +75,7 @@ class Expansion:
                 yield ",".join(expanded.signals), expanded, mask
 
     def _expand(self, table: GramTable, ids: list[str]) -> GramTable:
-        """Return the table with the columns whose numbers all of its rows' cars have."""
+        """Return the table with the columns whose numbers are known for all of its cars."""
         known = self.cars.get(ids[0]) or {}
         added = {
             name: (of, number)

@@ -69,7 +69,7 @@ class SummedCohort(CohortOrigin):
         return self.inputs_among(name for grams in self.sums.tables for name in grams[0].signals)
 
     def folds(self, by: FoldKey, count: FoldCount) -> CohortFolds:
-        """Return the folds; for others than the cohort was read over, its Gram rows as of now.
+        """Return the folds; any division other than its own reads the Gram rows again.
 
         Raises what `sum_cohort` raises.
         """
@@ -229,7 +229,7 @@ class _Sums:
         return Members(self.drives, self.vehicles, self.received)
 
     def of_folds(self, members: Members) -> CohortFolds:
-        """Return the folds that a drive fell into. Raises `DataError` if it is one only."""
+        """Return the folds that have drives. Raises `DataError` if only one has."""
         names, order = self.known.names, sorted(self.tables)
         used = [
             fold

@@ -41,7 +41,7 @@ FoldCount: TypeAlias = Annotated[int, Field(ge=2, le=1000)] | Literal["each"]
 
 
 class Folding(Config):
-    """By what a cohort is divided, and into how many folds."""
+    """What divides a cohort, and into how many folds."""
 
     by: FoldKey = "drive"
     count: FoldCount = 5

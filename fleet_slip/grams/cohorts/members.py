@@ -91,7 +91,7 @@ class Members:
 
 
 def add_hashed(known: dict[str, Hashed], signals: str, more: Hashed | None) -> None:
-    """Add drives or cars of Gram rows of some signals, none of which is there, to the others."""
+    """Add drives or cars that are new to those with the same signals."""
     if more is not None:
         known[signals] = known[signals] + more if signals in known else more
 

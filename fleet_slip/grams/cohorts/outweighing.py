@@ -1,4 +1,4 @@
-"""Which drives are left out of training, since their car would outweigh the others with them.
+"""Which drives training leaves out, so that no car outweighs the others.
 
 A car that sends Gram rows says itself how many rows they are of. So that none decides alone what is
 true, each counts with `MOST_CARS` times the rows of the mean car at most, these bounded likewise:
@@ -37,7 +37,7 @@ LEAST_CARS = 10
 
 @dataclass(frozen=True)
 class Outweighing:
-    """The drives of a car that are left out: of so many rows and more, counted by their names.
+    """The drives of one car that are left out: its longest.
 
     Attributes:
         vehicle_id: the car.
@@ -60,7 +60,7 @@ class Outweighing:
 
 
 def find_outweighing(opened: "OpenedGrams", condition: Condition) -> tuple[Outweighing, ...] | None:
-    """Return what is left out of a cohort; None if the rows of each car must tell, not rollups."""
+    """Return what a cohort leaves out; None if rollups cannot tell, so that rows must be read."""
     with asking(opened.database, condition):
         text = opened.statement("rows_of_cars.sql", condition)
         cars = opened.database.sql(text).to_arrow_table()

@@ -38,7 +38,7 @@ BATCH_NUMBERS = 2**20
 
 @dataclass(frozen=True)
 class OpenedGrams:
-    """A connection to the Gram rows of a feature set, and what stood in the warehouse then.
+    """A connection to the Gram rows of a feature set, and the table versions behind it.
 
     Instead of the rows of some files it has their `cells`. Statements leave out what is
     `outweighing`.
@@ -52,7 +52,7 @@ class OpenedGrams:
     outweighing: tuple[Outweighing, ...] = ()
 
     def statement(self, name: str, condition: Condition, **values: str) -> str:
-        """Return a statement of `jobs/` for a condition, but for what is not to count."""
+        """Return a statement from `jobs/` for a condition, without the rows that must not count."""
         keys = load_car_keys()
         without = [key.condition for key in keys.revoked()] if keys else []
         without += [one.condition for one in self.outweighing]
@@ -75,7 +75,7 @@ class OpenedGrams:
             return dict(self.database.execute(statement).fetchall())
 
     def origin(self, condition: Condition) -> CohortOrigin:
-        """Return which Gram rows a cohort of a condition is of."""
+        """Return which Gram rows a cohort is made of."""
         return CohortOrigin(
             condition=condition,
             logs_version=self.logs_version,
@@ -87,7 +87,7 @@ class OpenedGrams:
         )
 
     def batches(self, condition: Condition) -> Iterator[pa.RecordBatch]:
-        """Yield the Gram rows of a cohort in any order, with what their fold is told from."""
+        """Yield the Gram rows of a cohort, in any order, with the columns that tell their fold."""
         statement = self.statement("cohort_sums.sql", condition)
         with asking(self.database, condition):
             yield from self.database.sql(statement).to_arrow_reader(self._batch_rows)
@@ -145,7 +145,7 @@ class GramReader:
         *,
         training: bool = False,
     ) -> OpenedGrams:
-        """Return the Gram rows of a feature set, until the next call.
+        """Return the Gram rows of a feature set; they are valid until the next call.
 
         For a cohort's sums over folds, cells stand in for the rows of files that have rollups. For
         `training` what outweighs the others is left out (`fleet_slip.grams.cohorts.outweighing`).

@@ -36,7 +36,7 @@ class MessageFile:
 
     @property
     def unit(self) -> Unit:
-        """The unit."""
+        """The unit of work under which the file lands, once."""
         return Unit(f"receive/{self.digest}", 1)
 
 
@@ -68,7 +68,7 @@ def land_refused(
 
 
 def land_rows(warehouse: Warehouse, files: Sequence[MessageFile], new: NewMessages) -> None:
-    """Commit the new rows of some files, and that these landed."""
+    """Commit the new rows of some files, and mark these files as landed."""
     grams = new.grams
     replaced = files_to_rewrite(grams, frozenset()) if new.new else []
     if len(new.superseded):

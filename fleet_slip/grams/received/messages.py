@@ -81,7 +81,7 @@ KEPT = np.dtype(
 
 @dataclass
 class Found:
-    """What some bytes hold.
+    """The messages that a file holds.
 
     Attributes:
         runs: messages whose checksum is right, of one length and one behind the other: the number
@@ -168,7 +168,7 @@ def read_messages(content: bytes) -> Found:
 
 
 def _over_budget(found: Found) -> str:
-    """Return why nothing more is read of a file, if it is so."""
+    """Return why the rest of a file is not read; an empty text if it is."""
     if len(found.refused) >= MOST_REFUSED:
         return NO_FILE
     return TOO_MANY if found.count >= MOST_MESSAGES else ""
@@ -177,7 +177,7 @@ def _over_budget(found: Found) -> str:
 def _continued(
     found: Found, messages: Messages, content: bytes, at: int
 ) -> tuple[int, Messages] | None:
-    """Take back the last run if messages go on with it; return both as one."""
+    """Return messages as one with the run before them, which is taken back, if they continue it."""
     if not found.runs:
         return None
     first, before = found.runs[-1]
@@ -200,7 +200,7 @@ def _types() -> dict[tuple[int, int], tuple[int, np.dtype[Any]]]:
 
 
 def _read_run(content: bytes, at: int, most: int) -> Messages:
-    """Return messages from a place on that are as long as the first; none if it is none."""
+    """Return the messages from a place on that are as long as the first, if it is one."""
     layout, size = (int.from_bytes(content[at + i : at + i + 2], "little") for i in (4, 6))
     if (layout, size) not in _types():
         return np.empty(0, message_type(0))

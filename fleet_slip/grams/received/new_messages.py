@@ -26,7 +26,7 @@ HAS_LOG = "has a drive whose log is here"
 
 @dataclass(frozen=True)
 class NewMessages:
-    """What of some files lands on a snapshot of the Gram rows.
+    """What lands of some files, given a snapshot of the Gram rows.
 
     Attributes:
         grams: the snapshot.
@@ -94,7 +94,7 @@ def choose_new(
 
 @dataclass
 class _Drives:
-    """Messages of the same signals by their drives, and what the table has of these.
+    """Messages of the same signals by drive, and what the table already has of each drive.
 
     Attributes:
         rows: the messages.
@@ -157,7 +157,7 @@ class _Drives:
 
 
 def _look_up(grams: Snapshot, drives: Sequence[_Drives]) -> None:
-    """Tell messages by their drives what a snapshot of the Gram rows has of these."""
+    """Note for each drive what a snapshot of the Gram rows already has."""
     if not drives:
         return
     by_name = {signals_of(one.rows.mask): one for one in drives}
@@ -194,7 +194,7 @@ def _files_of_days(grams: Snapshot, drives: Sequence[_Drives]) -> list[TableFile
 
 
 def _mark_logged(grams: Snapshot, drives: Sequence[_Drives]) -> None:
-    """Tell messages whose car has a log of the same day with the very same Gram row."""
+    """Note the drives whose car has a log of the same day with the very same Gram row."""
     if not drives:
         return
     cars = pa.concat_arrays([one.rows.vehicle_ids for one in drives]).unique()
@@ -211,7 +211,7 @@ def _mark_logged(grams: Snapshot, drives: Sequence[_Drives]) -> None:
 def _known(
     one: _Drives, signals: str, rows: pa.RecordBatch
 ) -> Iterator[tuple[IntArray, IntArray, IntArray]]:
-    """Yield the places of drives, and n and numbers that the table has of them."""
+    """Yield where drives stand, and their n and numbers in the table."""
     places = pc.index_in(rows["drive_id"].cast(pa.string()), one.ids)
     if places.null_count == len(places):
         return

@@ -26,7 +26,7 @@ OTHER_ROW = "has a signature that is of no message of it"
 
 
 def find_unsound(rows: pa.Table) -> Iterator[tuple[str, str]]:
-    """Yield drives of received rows of the table `grams` that cannot be, and why.
+    """Yield the drives whose received Gram rows cannot be true, and why.
 
     Each is examined as it was when it came, and its name must tell its car and its day.
     """

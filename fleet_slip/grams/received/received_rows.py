@@ -71,11 +71,11 @@ class ReceivedRows:
     kept: Messages
 
     def __len__(self) -> int:
-        """Return how many messages they are."""
+        """Return the number of messages."""
         return len(self.messages)
 
     def take(self, rows: BoolArray | IntArray) -> "ReceivedRows":
-        """Return some of them; them, if a mask has them all."""
+        """Return some of the messages; these themselves if a mask has them all."""
         if rows.dtype == np.bool_ and rows.all():
             return self
         return ReceivedRows(*(one[rows] for one in self._arrays))
@@ -135,7 +135,7 @@ class ReceivedRows:
         return pa.array(days.astype(np.int32)).cast(pa.date32())
 
     def refuse(self, rows: BoolArray | IntArray, reason: str) -> Iterator[Refused]:
-        """Yield some of them as refused."""
+        """Yield some of the messages as refused, for a reason."""
         some = self.take(rows)
         columns = (some.file, some.number, some.drive_ids, some.vehicle_ids)
         for file, number, drive, vehicle in zip(*(c.tolist() for c in columns), strict=True):
@@ -160,7 +160,7 @@ Judge = Callable[["ReceivedRows"], Iterable[str | None]]
 def sort_out(
     found: Iterable[tuple[int, Found]], judge: Judge | None = None
 ) -> tuple[list[ReceivedRows], list[Refused]]:
-    """Return what may land of the messages of some files, by their signals, and what may not."""
+    """Divide the messages of files into those that may land, by their signals, and others."""
     refused: list[Refused] = []
     runs: dict[int, list[ReceivedRows]] = {}
     for file, one in found:
@@ -222,7 +222,7 @@ def _without_name(run: ReceivedRows) -> tuple[ReceivedRows, list[Refused]]:
 
 
 def _believed(rows: ReceivedRows, why: Iterable[str | None]) -> tuple[ReceivedRows, list[Refused]]:
-    """Divide messages by whether there is a reason against each."""
+    """Divide messages into those that nothing speaks against, and the refused ones."""
     reasons = np.array(list(why), dtype=object)
     refused: list[Refused] = []
     for reason in sorted({reason for reason in reasons if reason}):

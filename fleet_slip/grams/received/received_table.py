@@ -61,7 +61,7 @@ def _signed_column(kept: Messages) -> pa.Array:
 
 
 def messages_again(signals: str, rows: pa.RecordBatch) -> tuple[Messages, BoolArray]:
-    """Return the signed messages that rows of the same signals came as, but for their checksums.
+    """Rebuild the signed messages behind rows of the same signals, without their checksums.
 
     And which of them the column fits: where it does not, it was not this row's.
     """

@@ -95,7 +95,7 @@ def receive_files(
 
 
 def find_messages(given: Iterable[Path]) -> list[Path]:
-    """Return files, and those in folders at any depth, in the order of their names.
+    """Return the given files and all files in the given folders, at any depth, sorted by name.
 
     Raises `InputError` for what is neither, and for a folder without files.
     """
@@ -143,7 +143,7 @@ def _receive_batch(warehouse: Warehouse, batch: dict[Path, bytes]) -> list[Recei
 
 
 def _tell(reports: Sequence[ReceiveReport], new: NewMessages) -> None:
-    """Tell the report of each file what of it landed."""
+    """Count in the report of each file what landed of it."""
     for one in new.refused:
         reports[one.file].refused[one.reason] += 1
     for rows in new.new:

@@ -26,7 +26,7 @@ SECONDS_A_NAME = 0.02
 
 @dataclass(frozen=True)
 class Screened:
-    """What of some messages was forgotten.
+    """Which of some messages are of what was forgotten.
 
     Attributes:
         barred: cars and drives.
@@ -59,7 +59,7 @@ class Screened:
 
 
 def screen(root: Folder, rows: Sequence[ReceivedRows], refused: Sequence[Refused]) -> Screened:
-    """Return what of some messages was forgotten, and which of their cars are cleared of it."""
+    """Return which messages are of forgotten cars or drives, and which cars are cleared."""
     audit = Audit(root)
     asked = audit.begun()
     if not asked:

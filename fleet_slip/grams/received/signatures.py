@@ -41,7 +41,7 @@ FORGED = "is not signed by the key of its car"
 
 
 def sign_messages(content: bytes, private_key: bytes) -> bytes:
-    """Return messages that stand one behind the other, each signed.
+    """Sign each of the messages that stand one behind the other.
 
     `private_key` is Ed25519 in PEM, as `fleet-slip keygen` makes it. Raises `InputError` for what
     is no sound message or is signed already, and for what is no such key; `ExtraError` if the extra
@@ -74,7 +74,7 @@ def sign_messages(content: bytes, private_key: bytes) -> bytes:
 
 
 def judge_signatures(rows: ReceivedRows, keys: CarKeys) -> list[str | None]:
-    """Return why each message is not to be believed; None where the key of its car signed it."""
+    """Return why each message is refused; None where the key of its car signed it."""
     layout = int(rows.messages["layout"][0])
     cars, days = rows.vehicle_ids.to_pylist(), rows.days.to_pylist()
     known = [keys.of(car, day) for car, day in zip(cars, days, strict=True)]

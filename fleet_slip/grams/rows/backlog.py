@@ -57,7 +57,7 @@ def _has_log(file: str) -> bool:
 
 
 def _about_to_land(logs: Snapshot, paths: Collection[str]) -> set[str]:
-    """Return the log files among some that a job has written just now and not committed yet.
+    """Return the log files that a job has just written and not yet committed.
 
     Their Gram rows land first, so that readers see a file and its Gram rows at the same moment.
     """

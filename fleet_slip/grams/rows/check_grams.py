@@ -86,13 +86,13 @@ def _check(warehouse: Warehouse, count: int, progress: Progress, begin: int) -> 
 
 
 def _evenly(files: Sequence[TableFile], count: int, begin: int) -> list[TableFile]:
-    """Return some of the files, evenly chosen, from the one of the number `begin` on."""
+    """Return evenly chosen files, counted from the number `begin` on."""
     many = len(files)
     return [files[(begin + i * many // count) % many] for i in range(min(count, many))]
 
 
 def _computed_wide_sets(warehouse: Warehouse) -> tuple[str, ...]:
-    """Return the feature sets with windows that Gram rows were computed of."""
+    """Return the feature sets with windows for which there are Gram rows."""
     known, grams = features(), warehouse.grams.snapshot()
     return tuple(
         name
@@ -124,7 +124,7 @@ DriveGrams = dict[tuple[str, tuple[str, ...]], Gram]
 
 
 def grams_of(rows: pa.Table) -> DriveGrams:
-    """Return rows of the table `grams` as Grams; a part of a drive goes by the names of both."""
+    """Return rows of the table `grams` as Grams, by the names of drive and part."""
     found = {}
     for row in rows.select(["drive_id", "part", "signals", "n", "sums", "products"]).to_pylist():
         signals = tuple(row["signals"].split(",")) if row["signals"] else ()

@@ -1,4 +1,4 @@
-"""What divides a drive's rows into several Gram rows: in SQL, and the same of arrays.
+"""What divides the rows of a drive into several Gram rows, in SQL and for arrays.
 
 Bands of a signal or feature, blocks of time, or folds of single rows.
 """

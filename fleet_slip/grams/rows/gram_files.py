@@ -73,7 +73,7 @@ def _only(rows: pa.Table, some: pa.ChunkedArray) -> pa.Table:
 
 
 def is_of_received(file: TableFile) -> bool:
-    """Whether a Gram file is of rows that cars sent."""
+    """Whether a Gram file holds rows that cars sent."""
     return file.path.startswith(RECEIVED_NAME)
 
 

@@ -153,7 +153,7 @@ def read_rollup(table: Table, path: str) -> Rollup | None:
 
 
 def is_rollup_of(rollup: Rollup, rows: pa.Table) -> bool:
-    """Whether a rollup is what the rows of its file come to."""
+    """Whether a rollup is the sum of the rows of its file."""
     parts = make_rollup(rows, rollup.by)
     if not parts:
         return False
@@ -195,7 +195,7 @@ def _cells_of(rows: pa.Table, columns: Collection[str]) -> tuple[list[str], IntA
 
 
 def _codes(column: pa.ChunkedArray) -> IntArray:
-    """Return a number for each value, of which two are the same only if their bits are."""
+    """Return a number for each value; equal numbers mean equal bits."""
     values = column.combine_chunks()
     if pa.types.is_floating(values.type):
         values = values.view(pa.int64())

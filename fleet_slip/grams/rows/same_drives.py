@@ -1,4 +1,4 @@
-"""Which received Gram rows are of drives whose logs are here: these count, and the others go.
+"""Which received Gram rows are of drives whose logs are here: the logs count, the rows go.
 
 A drive is the same if it has the same name; or the same car, day and signals, and exactly the same
 n, sums and products: what a car counts is, bit for bit, what its log comes to.
@@ -24,7 +24,7 @@ from fleet_slip.grams.rows.gram_files import is_of_received
 
 @dataclass
 class LoggedDrives:
-    """Drives of logs, by their names and by what their Gram rows are."""
+    """Drives with logs, by their names and by the content of their Gram rows."""
 
     names: set[str] = field(default_factory=set)
     contents: set[bytes] = field(default_factory=set)
@@ -79,7 +79,7 @@ def has_received(grams: Snapshot) -> bool:
 
 
 def content_keys(rows: pa.Table) -> Iterator[bytes]:
-    """Yield what tells whether Gram rows of the logged signals are of the same drive, row by row.
+    """Yield a key for each Gram row of the logged signals; equal keys mean the same drive.
 
     Rows of other feature sets have keys that none of these has.
     """
