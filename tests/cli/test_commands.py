@@ -81,7 +81,15 @@ def test_select_reports_the_models_in_the_list_s_order(
         assert model["correlation"] > 0.85
         assert model["rmse_deg"] >= model["error_std_deg"] * 0.99 > 0
         assert set(model["coefficients"]) == set(model["signals"])
-    assert report["winner"] in {"1", "2", "3", "4", "5"}
+    # The best is model 5, by 0.002° better than model 2: that is not worth its further signals.
+    assert min(report["models"], key=lambda model: model["rmse_deg"])["name"] == "5"
+    for worth, winner in (
+        ((), "2"),
+        (("--worth", "0.000001deg"), "5"),
+        (("--worth", "0.1deg"), "1"),
+    ):
+        asked = run_command("select", *worth, "--json", root=smoke_root).json
+        assert asked["winner"] == winner
     table = run_command("select", "--nested", "ay,yaw_rate,steering_wheel", root=smoke_root).stdout
     assert "first 3" in table
     assert "winner: " in table

@@ -239,13 +239,26 @@ def test_regimes_compare_one_model_with_one_for_each(
     assert gain == pytest.approx(
         report["pooled"]["rmse_deg"] - report["split"]["rmse_deg"], rel=1e-6
     )
-    real = gain > report["rmse_gain_standard_error_deg"]
-    assert report["winner"] == ("split" if real and gain >= 0.005 else "pooled")
     assert report["worth"] == "0.005 deg"
     asked = run_command(*arguments, "--worth", "2%", "--json", root=every_set).json
     assert asked["worth"] == "2 % of the best"
     assert run_command(*arguments, "--worth", "much", root=every_set).exit_code == 2
     assert "Choose" in run_command(*arguments, root=every_set).stdout
+
+
+@pytest.mark.parametrize(
+    ("signals", "worth", "winner"),
+    [
+        ("ay", "0.005deg", "split"),  # slip per lateral acceleration is another at each speed
+        ("ay", "10deg", "pooled"),  # more than it gains
+        ("ay,steer_fl,yaw_rate", "0.005deg", "pooled"),  # it loses
+    ],
+)
+def test_regimes_are_split_where_that_gains_what_it_is_worth(
+    run_command: RunCommand, every_set: Path, signals: str, worth: str, winner: str
+) -> None:
+    asked = ("regimes", "--over", "speed", "--signals", signals, "--worth", worth, "--json")
+    assert run_command(*asked, root=every_set).json["winner"] == winner
 
 
 def test_shrinkage_is_compared_with_least_squares(run_command: RunCommand, every_set: Path) -> None:
