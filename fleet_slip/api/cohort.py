@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from fleet_slip.regression.inference.drive_moments import ClusterUnit
     from fleet_slip.selection.diagnostics import Diagnosis
     from fleet_slip.selection.regimes import RegimeComparison
-    from fleet_slip.selection.request import RequestedSelection
+    from fleet_slip.selection.request import Label, RequestedSelection
     from fleet_slip.selection.shrinkage import Shrunk
     from fleet_slip.selection.what_if import WhatIf
 
@@ -45,6 +45,7 @@ class FleetCohort(Rooted):
         model: str | None = None,
         nested: str | None = None,
         features: str | None = None,
+        label: "Label | None" = None,
         by: "FoldKey | None" = None,
         folds: int | str | None = None,
         rank: str | None = None,
@@ -70,6 +71,8 @@ class FleetCohort(Rooted):
             nested: an order of inputs, separated by commas, or `catalogue` for all inputs; adds the
                 nested models of its first 1, 2 ... inputs.
             features: a feature set; by default what the list says, else the logged signals.
+            label: `course` to learn without a reference sensor, from changes of the course; the
+                feature set and the list are then those called `course` unless others are named.
             by: what a fold is made of; by default what the list says. By `row` leaks.
             folds: how many folds, or `each`: every drive, or whatever folds are made of, is one.
             rank: ranks the inputs of `nested` first, such as `backward`.
@@ -99,6 +102,7 @@ class FleetCohort(Rooted):
             model=model,
             nested=nested,
             features=features,
+            label=label,
             by=by,
             folds=folds,
             rank=rank,

@@ -10,6 +10,7 @@ from fleet_slip.api.calls import Workers, open_workers, record_call
 from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.filling import Filling
 from fleet_slip.api.tending import Tending
+from fleet_slip.catalogue.car_numbers import CALIBRATION
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.models.manifest import require_model_name
@@ -114,6 +115,7 @@ class Fleet(Filling, Tending):
         """
         from fleet_slip.api.retraining import Training
         from fleet_slip.api.run_report import RunReport
+        from fleet_slip.catalogue.features import features
         from fleet_slip.selection.model_list import load_model_list
         from fleet_slip.selection.worth import parse_worth
         from fleet_slip.simulation.campaign import load_campaign
@@ -142,6 +144,9 @@ class Fleet(Filling, Tending):
                         workers=executor,
                         progress=_of_step(progress, f"gram {feature_set}"),
                     )
+                if features().feature_set(feature_set).change_ticks:
+                    # What the intercept follows from.
+                    self.gram(CALIBRATION, cohort=condition, workers=executor)
             refusal, selection = "", None
             training = Training(model_name, condition, models, worth, sign_key)
             publication = training.made_already(self)

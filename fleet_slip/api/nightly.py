@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING
 
 from fleet_slip.api.calls import ShowProgress, Workers
 from fleet_slip.api.retraining import Training
+from fleet_slip.catalogue.car_numbers import CALIBRATION
 from fleet_slip.catalogue.feature_sets import PLAIN
+from fleet_slip.catalogue.features import features
 from fleet_slip.errors import DataError, FleetSlipError, InputError
 from fleet_slip.ingest.landing.log_files import Place, find_logs, is_url
 from fleet_slip.ingest.mapping.mapping import load_mapping
@@ -180,7 +182,9 @@ class Night:
         return "done", told
 
     def _gram(self) -> Told:
-        for name in dict.fromkeys((PLAIN, load_model_list(self.training.models).features)):
+        wanted = load_model_list(self.training.models).features
+        changes = features().feature_set(wanted).change_ticks  # whose intercept is calibrated
+        for name in dict.fromkeys((PLAIN, wanted, *([CALIBRATION] if changes else []))):
             self.fleet.gram(
                 name,
                 cohort=None if name == PLAIN else self.training.cohort,

@@ -81,11 +81,11 @@ class Serving(Rooted):
         Raises `RefusedError` for a worse winner, `UsageError` for a name that no model may have,
         `ConfigError` for a key that cannot be used, and what `FleetCohort.select` raises.
         """
-        from fleet_slip.models.publish import manifest_of, publish
+        from fleet_slip.models.publish import manifest_of, publish, with_straight_intercept
 
         require_model_name(name)
         selection = choice.select() if isinstance(choice, FleetCohort) else choice
-        manifest = manifest_of(selection, name)
+        manifest = with_straight_intercept(self.warehouse, manifest_of(selection, name))
         registry = self.registry(sign_key)
         return publish(registry, manifest, selection, force=force, candidate=candidate)
 

@@ -42,6 +42,11 @@ SELECTION: dict[str, Any] = {
         "--features NAME. Default: what the list says, else the logged signals.",
         autocompletion=complete_feature_set,
     ),
+    "label": typer.Option(
+        help="course: learn without a reference sensor, from changes of the course over ground. "
+        "Feature set and model list are then those called course, unless others are named.",
+        show_default=False,
+    ),
     "by": typer.Option(
         help="What a fold is made of. Default: what the list says. By row is WEKA's way and leaks."
     ),

@@ -140,16 +140,17 @@ def compare(selection: Selection[Any], incumbents: Sequence[ModelVersion]) -> Co
     groups = selection.cohort.folds(by, GROUPS).serving(signals, label, sparse=True)
     procedure = least_squares(inputs, label, intercept=selection.intercept)
     challenger = cross_validate(selection.winner.model.name, groups, procedure, input_scales())
-    others = tuple(_as_it_is(version, groups) for version in incumbents)
+    feature_set = selection.cohort.feature_set
+    others = tuple(_as_it_is(version, groups, feature_set) for version in incumbents)
     worth = Worth(math.radians(floor().worth_deg))
     shortfalls = tuple(compare_paired(challenger, other, worth) for other in others)
     typical = tuple(compare_typical(challenger, other, worth) for other in others)
     return Comparison(by, challenger, others, shortfalls, typical if by == "vehicle" else ())
 
 
-def _as_it_is(version: ModelVersion, folds: Folds) -> CrossValidation:
+def _as_it_is(version: ModelVersion, folds: Folds, feature_set: str) -> CrossValidation:
     """Return the figures of a published model over folds, none of which it is fitted to again."""
-    model = counts_model(version.manifest)
+    model = counts_model(version.manifest, feature_set)
     tests = [error_sums(model, test) for test in folds.grams]
     return assemble(version.reference, folds, tests, model, input_scales())
 

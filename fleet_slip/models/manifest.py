@@ -189,6 +189,20 @@ class TrainedOn(Config):
         return content
 
 
+class LearnedFrom(Config):
+    """What stood for a label: changes of the course over so many seconds.
+
+    The intercept is that of `cars`, where they go straight, with its uncertainty and the standard
+    deviation between them.
+    """
+
+    label: Literal["course"]
+    change_s: Annotated[FiniteFloat, Field(gt=0)]
+    cars: Count
+    intercept_uncertainty_deg: FiniteFloat
+    intercept_spread_deg: FiniteFloat
+
+
 class SelectedBy(Config):
     """Why this model: the list it came from, its name there, and the rule that chose it."""
 
@@ -224,6 +238,8 @@ class Manifest(Config):
     trained_on: TrainedOn
     selected_by: SelectedBy
     package_version: str
+    learned_from: Annotated[LearnedFrom | None, Field(exclude_if=lambda one: one is None)] = None
+    """None where it was a reference sensor."""
     imported_from: Annotated[
         ImportedFrom | None, Field(exclude_if=lambda origin: origin is None)
     ] = None

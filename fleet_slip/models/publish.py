@@ -1,6 +1,7 @@
 """From a selection's winner to a published model version, unless the champion is better."""
 
 import functools
+import math
 from dataclasses import dataclass
 from fractions import Fraction
 from importlib.metadata import version as package_version
@@ -13,6 +14,7 @@ from fleet_slip.models.aliases import CANDIDATE, CHAMPION, AliasMove
 from fleet_slip.models.gate import compare, faults
 from fleet_slip.models.manifest import (
     CrossValidated,
+    LearnedFrom,
     Manifest,
     ModelLabel,
     ModelTerm,
@@ -20,11 +22,14 @@ from fleet_slip.models.manifest import (
     TrainedOn,
 )
 from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.models.straight_on import straight_on
 from fleet_slip.models.trained_drives import checksum_of_drives, pack_drives
 from fleet_slip.models.versions import Registry
 from fleet_slip.regression.validation.crossval import CrossValidation
 from fleet_slip.selection.request import RequestedSelection
 from fleet_slip.selection.select_models import Selection
+from fleet_slip.warehouse.condition import parse_condition
+from fleet_slip.warehouse.tables import Warehouse
 
 
 @dataclass(frozen=True)
@@ -87,6 +92,28 @@ def manifest_of(selection: RequestedSelection, name: str) -> Manifest:
         ),
         package_version=package_version("fleet-slip"),
     )
+
+
+def with_straight_intercept(warehouse: Warehouse, manifest: Manifest) -> Manifest:
+    """Return a manifest with the intercept that changes do not tell, if changes taught its model.
+
+    Raises `DataError` if the cars do not tell their sensors' offsets.
+    """
+    name = features().name_of(manifest.trained_on.feature_set)
+    change_s = features().feature_set(name).change_s
+    if change_s is None:
+        return manifest
+    found = straight_on(warehouse, parse_condition(manifest.trained_on.cohort), manifest)
+    learned = LearnedFrom(
+        label="course",
+        change_s=float(change_s),
+        cars=found.cars,
+        intercept_uncertainty_deg=math.degrees(found.uncertainty),
+        intercept_spread_deg=math.degrees(found.spread),
+    )
+    told = 0.0 if manifest.through_origin else found.intercept
+    own = {"intercept": told, "intercept_exact": Fraction(told)}
+    return manifest.model_copy(update={**own, "learned_from": learned})
 
 
 def _term(name: str, coefficient: Fraction) -> ModelTerm:

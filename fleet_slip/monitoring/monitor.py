@@ -134,7 +134,7 @@ def monitor(
             f"{condition.text!r}, too few to tell what is usual. {limits.min_training_days} "
             "days are needed. Choose another cohort, or a later first new day."
         )
-    models = _models(manifest, grams, training)
+    models = _models(manifest, feature_set, grams, training)
     found = [
         _day(day, gram, count, model, known)
         for day, gram, count, model, known in zip(
@@ -158,12 +158,12 @@ def monitor(
 
 
 def _models(
-    manifest: Manifest, grams: Sequence[Gram], training: Sequence[bool]
+    manifest: Manifest, feature_set: str, grams: Sequence[Gram], training: Sequence[bool]
 ) -> list[LinearModel]:
     """Return the model that predicts each day: of a training day, the one made without it."""
     own = [gram for gram, known in zip(grams, training, strict=True) if known]
     total = sum(own[1:], own[0])
-    champion = counts_model(manifest)
+    champion = counts_model(manifest, feature_set)
     refit = least_squares(champion.signals, champion.label, intercept=not manifest.through_origin)
     return [
         refit(total - gram) if known else champion

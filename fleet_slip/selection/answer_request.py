@@ -21,7 +21,12 @@ from fleet_slip.selection.model_list import (
     nested_candidates,
 )
 from fleet_slip.selection.named_inputs import WHOLE_SET, inputs_of, require_inputs
-from fleet_slip.selection.request import DEFAULT_MODELS, RequestedSelection, SelectionRequest
+from fleet_slip.selection.request import (
+    COURSE,
+    DEFAULT_MODELS,
+    RequestedSelection,
+    SelectionRequest,
+)
 from fleet_slip.selection.search import (
     require_criterion,
     select_ranked,
@@ -41,7 +46,8 @@ def answer_request(warehouse: Warehouse, request: SelectionRequest) -> Requested
     """Select as asked. Raises `UsageError` for options that do not go together."""
     request.check()
     named = request.nested or request.ordered or request.search
-    name = request.models or (None if named else DEFAULT_MODELS)
+    usual = COURSE if request.label == COURSE else DEFAULT_MODELS
+    name = request.models or (None if named else usual)
     model_list = _given(request) or (load_model_list(name) if name else None)
     folds = _folding(request, model_list)
     feature_set = _feature_set(request, model_list)
@@ -100,7 +106,7 @@ def _given(request: SelectionRequest) -> ModelList | None:
     """Return the one model that was asked for, if there is one, as a list."""
     if request.model is None:
         return None
-    feature_set = request.features or PLAIN
+    feature_set = request.features or (COURSE if request.label == COURSE else PLAIN)
     signals = require_inputs(request.model.split(","), feature_set)
     model = CandidateModel(name=GIVEN, signals=signals)
     return ModelList(description="One model", features=feature_set, model=(model,))
@@ -115,7 +121,14 @@ def _folding(request: SelectionRequest, model_list: ModelList | None) -> Folding
 
 
 def _feature_set(request: SelectionRequest, model_list: ModelList | None) -> str:
-    named = request.features or (model_list.features if model_list else PLAIN)
+    usual = COURSE if request.label == COURSE else PLAIN
+    named = request.features or (model_list.features if model_list else usual)
+    if request.label == COURSE and not features().feature_set(named).change_ticks:
+        known = ", ".join(name for name, one in features().sets.items() if one.change_ticks)
+        raise QuestionError(
+            f"the feature set {named} has no changes of the course. Feature sets that have: "
+            f"{known}."
+        )
     if request.by == ROW_FOLDS and named == PLAIN:
         return next(name for name, one in features().sets.items() if one.row_folds)
     return named
@@ -148,7 +161,7 @@ def _compare_listed(
         model=(*listed, *nested),
         search=search,
     )
-    usual = GIVEN if request.model else DEFAULT_MODELS
+    usual = GIVEN if request.model else request.label or DEFAULT_MODELS
     name = request.models or (usual if listed else None)
     label = "+".join(filter(None, [name, f"nested:{request.nested}" if nested else None]))
     selection = select(
@@ -182,6 +195,9 @@ def _search_of(request: SelectionRequest, model_list: ModelList | None) -> Searc
         if request.search not in METHODS:
             raise QuestionError(f"unknown search {request.search!r}. Known: {', '.join(METHODS)}.")
         asked = {"method": request.search, **({"most": request.most} if request.most else {})}
+        if request.label == COURSE:
+            # The noise of the course hides in the error what a column is worth to the angle.
+            asked["rule"] = "best"
         return Search.model_validate(asked)
     return model_list.search if model_list else None
 

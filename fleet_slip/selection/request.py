@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.errors import UsageError
@@ -12,6 +12,12 @@ from fleet_slip.selection.select_models import Selection
 from fleet_slip.selection.worth import WORTH, parse_worth
 
 DEFAULT_MODELS = "table1"
+
+Label = Literal["course"]
+"""What may stand for the label of a reference sensor."""
+
+COURSE: Label = "course"
+"""Also the name of the feature set, and of the model list, that are taken for it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,6 +30,7 @@ class SelectionRequest:
         model: inputs of the one model to take, separated by commas, instead of a list.
         nested: order of inputs, separated by commas, or `catalogue`; adds its nested models.
         features: name of the feature set; by default what the list says, or what the folds need.
+        label: `course` to learn from changes of the course, by a feature set of them.
         by, folds: how to fold; by default what the list says.
         rank, criterion: rank the inputs of `nested` first; choose by a criterion.
         all_subsets: choose among the best subsets of `nested` instead of an order's.
@@ -41,6 +48,7 @@ class SelectionRequest:
     model: str | None = None
     nested: str | None = None
     features: str | None = None
+    label: Label | None = None
     by: FoldKey | None = None
     folds: int | str | None = None
     rank: str | None = None

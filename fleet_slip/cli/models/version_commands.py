@@ -13,7 +13,7 @@ from fleet_slip.cli.recorded import record_run
 from fleet_slip.errors import UsageError
 from fleet_slip.export.costs import costs_content, describe_costs
 from fleet_slip.models.aliases import CHAMPION
-from fleet_slip.models.manifest import ImportedFrom, ModelTerm
+from fleet_slip.models.manifest import ImportedFrom, LearnedFrom, ModelTerm
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.words import number_of
 
@@ -155,6 +155,17 @@ def _origin(origin: ImportedFrom) -> str:
     return f"from {origin.reference} of another data root, sha256 {origin.sha256}"
 
 
+def _teacher(learned: LearnedFrom) -> str:
+    """Say what stood for a label, and where the intercept is from."""
+    return (
+        f"changes of the {learned.label} over {learned.change_s:g} s: the figures are of changes. "
+        f"Intercept where {number_of(learned.cars, 'car')} "
+        f"{'goes' if learned.cars == 1 else 'go'} straight, uncertain by "
+        f"{learned.intercept_uncertainty_deg:.3f} deg, between cars "
+        f"{learned.intercept_spread_deg:.3f} deg"
+    )
+
+
 def _print_version(version: ModelVersion) -> None:
     manifest = version.manifest
     figures, trained = manifest.cross_validation, manifest.trained_on
@@ -223,6 +234,7 @@ def _print_version(version: ModelVersion) -> None:
                 f"model {manifest.selected_by.model} of {manifest.selected_by.model_list}",
             ],
             ["why", manifest.selected_by.reason],
+            *([["learned from", _teacher(one)]] if (one := manifest.learned_from) else []),
             *([["imported", _origin(origin)]] if (origin := manifest.imported_from) else []),
             ["sha256", version.sha256],
         ],

@@ -1,0 +1,103 @@
+"""A model of the side-slip angle from logs without a label: as good as one that had it, nearly."""
+
+import math
+import shutil
+from pathlib import Path
+
+import pytest
+
+import fleet_slip
+from fleet_slip.api.fleet import Fleet
+from fleet_slip.errors import DataError, QuestionError, RefusedError
+from fleet_slip.models.manifest import Manifest
+
+CAMPAIGN = """
+name = "received"
+description = "Short drives with receivers"
+base = "smoke"
+laps = 1
+
+[[receivers.types]]
+rate_hz = 10
+velocity_std_mps = 0.03
+time_between_outages_s = 60.0
+outage_duration_s = 5.0
+"""
+COLUMNS = "steering_mean_16,ay_mean_16,ay_square_mean_8,yaw_rate_speed_mean_8"
+
+
+@pytest.fixture(scope="module")
+def uncalibrated(tmp_path_factory: pytest.TempPathFactory) -> Fleet:
+    folder = tmp_path_factory.mktemp("course")
+    file = folder / "received.toml"
+    file.write_text(CAMPAIGN)
+    made = fleet_slip.open(folder / "data")
+    made.simulate(str(file))
+    for name in ("signals", "course"):
+        made.gram(name)
+    return made
+
+
+@pytest.fixture
+def fleet(uncalibrated: Fleet, tmp_path: Path) -> Fleet:
+    made = fleet_slip.open(shutil.copytree(str(uncalibrated.root), tmp_path / "data"))
+    made.gram("calibration")
+    return made
+
+
+def without_label(fleet: Fleet) -> Manifest:
+    selection = fleet.cohort("true").select(label="course", model=COLUMNS)
+    return fleet.publish("freed", selection).version.manifest
+
+
+def test_the_intercept_needs_the_calibration(uncalibrated: Fleet) -> None:
+    selection = uncalibrated.cohort("true").select(label="course", model=COLUMNS)
+    with pytest.raises(DataError, match="fleet-slip gram --features calibration"):
+        uncalibrated.publish("too_early", selection)
+
+
+def test_a_model_without_a_label_is_one_of_the_angle(fleet: Fleet) -> None:
+    manifest = without_label(fleet)
+    assert manifest.signals == tuple(COLUMNS.split(","))
+    learned = manifest.learned_from
+    assert learned is not None and (learned.label, learned.change_s, learned.cars) == (
+        "course",
+        4.0,
+        1,
+    )
+    assert 0 < learned.intercept_uncertainty_deg < 0.1
+    score = fleet.score("freed")
+    assert score.correlation is not None and score.correlation > 0.995
+    # The label's noise, 0.0286 deg, is in it.
+    assert score.error_std_deg < 0.06 and abs(score.error_mean_deg) < 0.06
+    assert manifest.intercept != 0 and manifest.cross_validation.error_mean_deg == 0
+
+
+def test_the_same_again_is_nothing_new_and_the_gate_compares_changes(fleet: Fleet) -> None:
+    first = without_label(fleet)
+    assert without_label(fleet) == first
+    fewer = fleet.cohort("true").select(label="course", model="ay_mean_16")
+    with pytest.raises(RefusedError, match="worse than the champion"):
+        fleet.publish("freed", fewer)
+
+
+def test_columns_are_searched_for(fleet: Fleet) -> None:
+    selection = fleet.cohort("true").select(label="course")
+    found = selection.searched
+    assert found is not None and len(selection.winner.model.signals) <= 6
+    assert math.isclose(selection.winner.model.pooled.error_mean_deg, 0, abs_tol=1e-9)
+    assert selection.model_list == "course"
+
+
+def test_a_set_without_changes_has_no_course(fleet: Fleet) -> None:
+    with pytest.raises(QuestionError, match="Feature sets that have: course"):
+        fleet.cohort("true").select(label="course", features="windows", model="ay_mean_16")
+
+
+def test_a_fleet_without_receivers_is_told_so(tmp_path: Path) -> None:
+    plain = fleet_slip.open(tmp_path / "data")
+    plain.simulate("smoke", days=1)
+    plain.gram()
+    plain.gram("course")
+    with pytest.raises(DataError):
+        plain.cohort("true").select(label="course", model=COLUMNS)
