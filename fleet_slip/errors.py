@@ -1,5 +1,31 @@
 """Every error that a user can meet, each with its exit code. The CLI maps them in one place."""
 
+import re
+
+HIDDEN = "***"
+
+_URL, _WHOLE_URL = re.compile(r"://([^\s'\"]+)"), re.compile(r"(?s)://(.+)")
+_SECRET = re.compile(
+    r"(?i)([?&][\w.-]*(?:key|token|secret|passw|sig|credential)[\w.-]*=)[^&\s'\"]+"
+)
+
+
+def hide_passwords(text: str, *, whole: bool = False) -> str:
+    """Return text without what identifies a user in URLs: before the last @, and in the query.
+
+    With `whole`, a URL goes on to the end of the text, whatever is in it.
+    """
+    if "://" not in text:
+        return text
+    url = _WHOLE_URL if whole else _URL
+    return _SECRET.sub(rf"\1{HIDDEN}", url.sub(_without_user, text))
+
+
+def _without_user(found: re.Match[str]) -> str:
+    user, at, rest = found[1].rpartition("@")  # a password may have @ and / in it
+    secret = at and (":" in user or "/" not in user)
+    return f"://{HIDDEN}@{rest}" if secret else found[0]
+
 
 def printable(text: str) -> str:
     """Return text on one line, as it can be shown on a terminal or in a log.
@@ -19,7 +45,7 @@ class FleetSlipError(Exception):
 
     def __init__(self, message: str) -> None:
         """Take a message; names in it may be hostile."""
-        super().__init__(printable(message))
+        super().__init__(printable(hide_passwords(message)))
 
 
 class UsageError(FleetSlipError):
@@ -104,3 +130,7 @@ class ExtraError(FleetSlipError):
     """A package that only some commands need is not installed."""
 
     exit_code = 13
+
+
+class QueryGoesOnError(KeyboardInterrupt):
+    """Ctrl-C was pressed in the middle of what DuckDB cannot stop: it goes on in a thread."""

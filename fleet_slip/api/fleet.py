@@ -60,9 +60,9 @@ class Fleet(Filling, Tending):
         """
         from fleet_slip.api.session import Session, query_of_many
         from fleet_slip.views import connect
-        from fleet_slip.warehouse.minimum_cohort import VIEWS_WITHOUT_CARS, minimum_vehicles
+        from fleet_slip.warehouse.minimum_cohort import VIEWS_WITHOUT_CARS, tells_single_cars
 
-        if minimum_vehicles():
+        if not tells_single_cars():
             return Session(connect(self.root, query=" ".join(VIEWS_WITHOUT_CARS)), query_of_many)
         return Session(connect(self.root, threads=threads, query=query))
 
@@ -71,12 +71,10 @@ class Fleet(Filling, Tending):
 
         Only for SQL that you trust: it can overwrite the warehouse. Else like `session`.
         """
-        from fleet_slip.api.session import Session, any_statement, cohort_error
+        from fleet_slip.api.session import Session, any_statement, require_many_cars
         from fleet_slip.views import connect_unlocked
-        from fleet_slip.warehouse.minimum_cohort import minimum_vehicles
 
-        if minimum_vehicles():
-            raise cohort_error()
+        require_many_cars()
         return Session(connect_unlocked(self.root, query), any_statement)
 
     def cohort(self, condition: str = TRAINING_DRIVES) -> FleetCohort:

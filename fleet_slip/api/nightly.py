@@ -23,6 +23,7 @@ from fleet_slip.monitoring.night_report import NightReport, NightStep, State
 from fleet_slip.runs.log import step
 from fleet_slip.runs.nights import Beginning, Nights, hash_drive, without_drives
 from fleet_slip.selection.model_list import load_model_list
+from fleet_slip.warehouse.minimum_cohort import UNNAMED, tells_single_cars
 from fleet_slip.warehouse.table_views import connect_tables
 from fleet_slip.warehouse.tables import Warehouse
 from fleet_slip.words import number_of
@@ -175,7 +176,8 @@ class Night:
         told = f"{number_of(rows, 'new row')}."
         alike = {name for one in reports for names in one.look_alikes for name in names}
         if alike:
-            return "attention", f"{told} Names that look the same: {', '.join(sorted(alike))}."
+            names = f": {', '.join(sorted(alike))}" if tells_single_cars() else ""
+            return "attention", f"{told} Names that look the same{names}."
         if wrong := {str(found): one.file for one in reports for found in one.suspicions}:
             found, file = next(iter(wrong.items()))
             return "attention", f"{told} {file}: looks wrong: {found}"
@@ -217,6 +219,8 @@ class Night:
             return "left out", str(error)
         new = [day for day in self.chart.days if not day.training]
         left_out = _revoked(self.chart.drives_revoked)
+        if untold := self.chart.days_untold:
+            left_out = f" {number_of(untold, 'day')} of too few cars left out.{left_out}"
         if drives := self.chart.drives_left_out:
             left_out = f" {number_of(drives, 'drive')} without a log left out.{left_out}"
         told = f"{champion} on {number_of(len(new), 'new day')}: "
@@ -273,5 +277,6 @@ def _revoked(drives: Mapping[str, int]) -> str:
     """Return the sentence on drives that do not count, since a revoked key signed them."""
     if not drives:
         return ""
-    many, cars = number_of(sum(drives.values()), "drive"), number_of(len(drives), "car")
+    many = number_of(sum(drives.values()), "drive")
+    cars = number_of(len(drives), "car") if tells_single_cars() else UNNAMED
     return f" {many} of {cars} left out: a key of theirs was revoked."

@@ -208,9 +208,13 @@ class Serving(Rooted):
         """Write one page that lays our figures beside the paper's, from the latest evaluation.
 
         `output` is a folder, by default `report` in the data root. Raises `DataError` if the model
-        has not been evaluated, or not on today's data, and what `model` raises.
+        has not been evaluated, or not on today's data, `CohortError` where a minimum cohort is
+        asked for, and what `model` raises.
         """
         from fleet_slip.files.local_folder import LocalFolder
+        from fleet_slip.warehouse.minimum_cohort import require_single_cars
+
+        require_single_cars("the report", "Ask evaluate, of drives that are simulated.")
 
         with needed("report", "the report"):
             from fleet_slip.comparison.report.write import write_report

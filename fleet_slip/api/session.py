@@ -8,10 +8,14 @@ from typing import Self, TypeVar
 import duckdb
 import pyarrow as pa
 
-from fleet_slip.errors import CohortError, QuestionError
+from fleet_slip.errors import QueryGoesOnError, QuestionError
 from fleet_slip.views import VIEWS, add_calibration
-from fleet_slip.warehouse.database import database_errors, interruptible, reading_files
-from fleet_slip.warehouse.minimum_cohort import MINIMUM_VARIABLE, VIEWS_WITHOUT_CARS
+from fleet_slip.warehouse.database import (
+    database_errors,
+    interruptible,
+    reading_files,
+)
+from fleet_slip.warehouse.minimum_cohort import VIEWS_WITHOUT_CARS, require_single_cars
 from fleet_slip.warehouse.read_only_sql import one_query
 from fleet_slip.warehouse.table_views import views_in
 
@@ -53,8 +57,8 @@ class Session:
     def compute(self, query: str, work: Callable[[duckdb.DuckDBPyRelation], Result]) -> Result:
         """Do work with the answer to a query, and return what it returns.
 
-        Ctrl-C ends it in the middle of the query. Raises `StorageError` if a file that was read is
-        not what its checksum says.
+        Ctrl-C ends it within a second, in the middle of the query. Raises `StorageError` if a file
+        that was read is not what its checksum says.
         """
 
         def answer() -> Result:
@@ -77,8 +81,9 @@ class Session:
         error: BaseException | None,
         traceback: types.TracebackType | None,
     ) -> None:
-        """Close the connection."""
-        self.close()
+        """Close the connection, unless a query goes on that could not be stopped."""
+        if not isinstance(error, QueryGoesOnError):
+            self.close()
 
 
 def any_statement(_database: duckdb.DuckDBPyConnection, text: str) -> str:
@@ -89,13 +94,11 @@ def any_statement(_database: duckdb.DuckDBPyConnection, text: str) -> str:
 def query_of_many(database: duckdb.DuckDBPyConnection, text: str) -> str:
     """Return a query that names no view of single cars. Raises `CohortError`."""
     if views_in(text, VIEWS - set(VIEWS_WITHOUT_CARS) - {"dictionary"}):
-        raise cohort_error()
+        require_many_cars()
     return one_query(database, text)
 
 
-def cohort_error() -> CohortError:
-    """Return the error that a query could tell of single cars."""
-    return CohortError(
-        f"SQL can tell of single cars, and ${MINIMUM_VARIABLE} is set: only the views "
-        f"{' and '.join(VIEWS_WITHOUT_CARS)} are there. Ask select, which counts the cars."
-    )
+def require_many_cars() -> None:
+    """Raise `CohortError` if SQL may not tell of single cars."""
+    there = " and ".join(VIEWS_WITHOUT_CARS)
+    require_single_cars("SQL", f"Ask the views {there}, or select, which counts the cars.")

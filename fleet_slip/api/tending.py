@@ -81,10 +81,12 @@ class Tending(Serving):
         of a car, with a label or without. `cohort` is an SQL condition on the view `drives`. Reads
         the Gram rows of the feature set `calibration` only. Raises `DataError` if they have not
         been computed or no drive satisfies the condition, and `QuestionError` for one that is no
-        condition.
+        condition; `CohortError` where a minimum cohort is asked for.
         """
         from fleet_slip.grams.calibration.calibration import calibrate
+        from fleet_slip.warehouse.minimum_cohort import require_single_cars
 
+        require_single_cars("a calibration", "Unset it to calibrate cars.")
         return calibrate(self.warehouse, cohort)
 
     def monitor(

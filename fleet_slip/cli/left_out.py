@@ -1,13 +1,10 @@
 """Says which drives of a cohort what was computed leaves out."""
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 from fleet_slip.cli.output import say
+from fleet_slip.warehouse.minimum_cohort import MINIMUM_VARIABLE
 from fleet_slip.words import number_of
-
-if TYPE_CHECKING:
-    from fleet_slip.grams.cohorts.outweighing import Outweighing
 
 
 def say_without_log(drives: int, feature_set: str) -> None:
@@ -25,8 +22,17 @@ def say_revoked(drives: Mapping[str, int]) -> None:
         say(f"{number_of(many, 'drive')} of {car} left out: a key of it was revoked.")
 
 
-def say_outweighing(outweighing: "Sequence[Outweighing]") -> None:
+def say_outweighing(drives: Mapping[str, int]) -> None:
     """Say how many drives of each car do not count, since it would outweigh the others."""
-    for one in outweighing:
-        drives = f"{number_of(one.drives, 'drive')} of {one.vehicle_id}"
-        say(f"{drives} left out: with them it would outweigh the others.")
+    for car, many in drives.items():
+        drives_of = f"{number_of(many, 'drive')} of {car}"
+        say(f"{drives_of} left out: with them it would outweigh the others.")
+
+
+def say_untold(many: int, what: str) -> None:
+    """Say how many days, or sets of signals, too few cars have for a minimum cohort."""
+    if many:
+        say(
+            f"{number_of(many, what)} left out: fewer cars have them than "
+            f"${MINIMUM_VARIABLE} asks for."
+        )

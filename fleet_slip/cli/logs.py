@@ -12,7 +12,7 @@ from typing import Any
 
 from rich.console import Console
 
-from fleet_slip.errors import printable
+from fleet_slip.errors import hide_passwords, printable
 from fleet_slip.runs.log import LOGGER, current_run_id
 
 LOG_VARIABLE = "FLEET_SLIP_LOG"
@@ -65,7 +65,7 @@ class PeopleHandler(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """Print a remark."""
         if not hasattr(record, "event"):
-            text, console = printable(record.getMessage()), stderr()
+            text, console = printable(hide_passwords(record.getMessage())), stderr()
             shown = wrapped(text, console.width) if console.is_terminal else text
             console.print(shown, markup=False)
 
@@ -89,7 +89,7 @@ def json_line(record: logging.LogRecord) -> str:
     if hasattr(record, "event"):
         content |= {"event": record.event, **record.__dict__.get("fields", {})}
     else:
-        content |= {"event": "message", "message": record.getMessage()}
+        content |= {"event": "message", "message": hide_passwords(record.getMessage())}
     return json.dumps(content, default=str)
 
 

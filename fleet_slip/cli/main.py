@@ -13,7 +13,7 @@ from fleet_slip.cli.commands import MARKUP, CommandGroup
 from fleet_slip.cli.logs import LOG_VARIABLE, LogFormat, configure_logs
 from fleet_slip.cli.output import say
 from fleet_slip.cli.streams import Streams
-from fleet_slip.errors import FleetSlipError, StorageError
+from fleet_slip.errors import FleetSlipError, QueryGoesOnError, StorageError
 from fleet_slip.files.data_root import ROOT_VARIABLE
 from fleet_slip.limits import require_limits
 from fleet_slip.resources import CONFIG_VARIABLE, own_configs
@@ -113,16 +113,28 @@ def _exit_code_of_app() -> int:
     except MemoryError as error:
         say(f"error: out of memory: {error}. Ask for less at once, or give it more.", logging.ERROR)
         return StorageError.exit_code
-    except KeyboardInterrupt:
-        say(
-            "interrupted: what was committed is kept, and nothing is half written. Give the same "
-            "command again to go on.",
-            logging.WARNING,
-        )
-        return INTERRUPTED
+    except KeyboardInterrupt as error:
+        return _end_interrupted(error)
     except SystemExit as ended:
+        if ended.code == INTERRUPTED:  # typer makes it of a KeyboardInterrupt
+            return _end_interrupted(ended)
         return ended.code if isinstance(ended.code, int) else 0
     return 0
+
+
+def _end_interrupted(error: BaseException | None) -> int:
+    """Say that Ctrl-C was pressed; end the process at once if a query cannot be stopped."""
+    say(
+        "interrupted: what was committed is kept, and nothing is half written. Give the same "
+        "command again to go on.",
+        logging.WARNING,
+    )
+    while error is not None:
+        if isinstance(error, QueryGoesOnError):
+            sys.stdout.flush()
+            os._exit(INTERRUPTED)  # the usual end would wait for the query
+        error = error.__cause__ or error.__context__
+    return INTERRUPTED
 
 
 def _choose_code_folder() -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.files.data_root import data_root
+from fleet_slip.warehouse.minimum_cohort import tells_single_cars
 
 
 def next_steps(fleet: Fleet, campaign: str, model: str) -> list[str]:
@@ -44,6 +45,8 @@ def _root_option(fleet: Fleet) -> str:
 
 def _faster_half(fleet: Fleet, campaign: str) -> str | None:
     """Return a condition that about half of the campaign's drives satisfy; None if none is told."""
+    if not tells_single_cars():
+        return None
     medians = fleet.sql("SELECT campaign, median(speed_factor) FROM drives GROUP BY ALL").fetchall()
     speed = dict(medians).get(campaign)
     return None if speed is None else f"speed_factor > {speed:.2f}"

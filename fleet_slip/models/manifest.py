@@ -8,7 +8,7 @@ import math
 import re
 from decimal import Decimal
 from fractions import Fraction
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
     AfterValidator,
@@ -68,6 +68,11 @@ Scale = Annotated[Decimal, Field(ge=Decimal("1e-12"), le=Decimal("1e12"), allow_
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 Count = Annotated[int, Field(ge=0, lt=2**63)]
+
+NotNegative = Annotated[FiniteFloat, Field(ge=0)]
+
+Correlation = Annotated[FiniteFloat, Field(ge=-1 - 1e-9, le=1 + 1e-9)]
+"""A little more than there can be: rounding may take it there."""
 
 
 def _require_rounded(value: float, exact: Fraction) -> None:
@@ -154,12 +159,18 @@ class CrossValidated(Config):
 
     folds_by: str
     folds: Count
-    correlation: FiniteFloat
-    correlation_standard_error: FiniteFloat
-    rmse_deg: FiniteFloat
+    correlation: Correlation
+    correlation_standard_error: NotNegative
+    rmse_deg: NotNegative
     error_mean_deg: FiniteFloat
-    error_std_deg: FiniteFloat
-    condition_number: FiniteFloat
+    error_std_deg: NotNegative
+    condition_number: NotNegative
+
+    @model_validator(mode="after")
+    def _can_be(self) -> Self:
+        if abs(self.error_mean_deg) > self.rmse_deg * (1 + 1e-9) + 1e-12:
+            raise ValueError("says that the mean of the error is larger than its RMSE")
+        return self
 
 
 class TrainedOn(Config):
@@ -179,6 +190,12 @@ class TrainedOn(Config):
     logs_version: Count
     grams_version: Count
     drives_sha256: Sha256 | None = None
+
+    @model_validator(mode="after")
+    def _can_be(self) -> Self:
+        if not max(self.vehicles or 0, self.drives_without_log or 0) <= self.drives <= self.rows:
+            raise ValueError("says that there are more cars than drives, or more drives than rows")
+        return self
 
     @model_serializer(mode="wrap")
     def _without_nothing(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:

@@ -9,8 +9,9 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.column_sql import with_windows
+from fleet_slip.catalogue.columns import limit_of
 from fleet_slip.catalogue.features import input_scales
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
+from fleet_slip.catalogue.signals import COUNT_MAX, SAMPLE_TIME_S, catalogue
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.calibration.calibration import calibrate
 from fleet_slip.grams.cohorts.expansion import CarCounts
@@ -19,7 +20,18 @@ from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predictor import Predictor
 from fleet_slip.resources import read_sql
 from fleet_slip.runs.log import log_event
-from fleet_slip.warehouse.condition import Condition, asking, parse_condition, row_columns
+from fleet_slip.warehouse.condition import (
+    Condition,
+    asking,
+    drive_columns,
+    parse_condition,
+    row_columns,
+)
+from fleet_slip.warehouse.minimum_cohort import (
+    require_single_cars,
+    require_vehicles,
+    tells_single_cars,
+)
 from fleet_slip.warehouse.table_views import connect_tables
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -60,14 +72,35 @@ def score_statement(manifest: Manifest, condition: str | Condition) -> str:
             "on rows does not have. They are in the view calibration. Score it by fleet-slip score."
         )
     terms = [f"{term.coefficient!r} * {term.column}" for term in manifest.terms]
-    columns = [term.column for term in manifest.terms] + [manifest.label.column]
     return read_sql("jobs", "score.sql").format(
         estimate="\n        + ".join([repr(manifest.intercept), *terms]),
         label=manifest.label.column,
-        rows=_rows(manifest),
-        complete=" AND ".join(f"{column} IS NOT NULL" for column in columns),
-        condition=parse_condition(condition, row_columns()).sql,
+        step_rad=repr(_step_rad(manifest)),
+        **_scored_rows(manifest, parse_condition(condition, row_columns())),
     )
+
+
+def _scored_rows(manifest: Manifest, condition: Condition) -> dict[str, str]:
+    """Return what says in SQL which rows are scored."""
+    columns = [term.column for term in manifest.terms] + [manifest.label.column]
+    return {
+        "rows": _rows(manifest),
+        "complete": " AND ".join(f"{column} IS NOT NULL" for column in columns),
+        "condition": condition.sql,
+    }
+
+
+def _step_rad(manifest: Manifest) -> float:
+    """Return the power of two in which angles are counted to be added up exactly.
+
+    No angle has more than 2^45 steps: so the squares of their differences have at most 92 bits, and
+    2^34 rows of them fit into HUGEINT.
+    """
+    largest = abs(manifest.intercept) + float(manifest.label.scale) * COUNT_MAX
+    for term in manifest.terms:
+        limit = limit_of(term.definition.bits) if term.definition else COUNT_MAX + 1
+        largest += abs(term.coefficient) * float(term.scale) * limit
+    return 2.0 ** (math.frexp(largest)[1] - 45)
 
 
 def _rows(manifest: Manifest) -> str:
@@ -101,9 +134,10 @@ def score(warehouse: Warehouse, manifest: Manifest, condition: str | Condition) 
     """Score a model on the rows of `log` that satisfy a condition.
 
     Raises like `score_statement`, and `DataError` if no such row has the model's signals. A model
-    with columns over time is scored drive by drive, in the order of time.
+    with columns over time is scored drive by drive, in the order of time. Where a minimum cohort is
+    asked for, whole drives are scored: `CohortError` for a condition on rows, or for too few cars.
     """
-    condition = parse_condition(condition, row_columns())
+    condition = cohort_of_rows(condition)
     manifest.require_same_counts()
     found = (
         _score_over_time(warehouse, manifest, condition)
@@ -118,9 +152,27 @@ def score(warehouse: Warehouse, manifest: Manifest, condition: str | Condition) 
     return found
 
 
+def cohort_of_rows(condition: str | Condition) -> Condition:
+    """Return the condition of a cohort of rows: on the columns of the view `log`.
+
+    Raises `QuestionError` if it is none, and `CohortError` where a minimum cohort is asked for and
+    it parts the rows of a drive: then twenty cars with a row each would tell of another's row.
+    """
+    if isinstance(condition, Condition):
+        return condition
+    found = parse_condition(condition, row_columns())
+    if parts := sorted(found.columns - set(drive_columns())):
+        require_single_cars(f"a condition on {', '.join(parts)}", "Score whole drives.")
+    return found
+
+
 def _score_by_sql(warehouse: Warehouse, manifest: Manifest, condition: Condition) -> Score | None:
     statement = score_statement(manifest, condition)
+    cars = read_sql("jobs", "score_cars.sql").format(**_scored_rows(manifest, condition))
     with connect_tables(warehouse, statement) as database, asking(database, condition):
+        if not tells_single_cars():
+            [(found,)] = database.execute(cars).fetchall()
+            require_vehicles(found, f"the cohort {condition.text!r}")
         result = database.execute(statement)
         names = [column[0] for column in result.description or ()]
         row = result.fetchone()
@@ -146,6 +198,7 @@ def _score_over_time(
     )
     estimates: list[FloatArray] = []
     truths: list[FloatArray] = []
+    scored_cars: set[str] = set()
     unit = float(input_scales()[label])
     with (
         connect_tables(warehouse, text) as database,
@@ -161,6 +214,9 @@ def _score_over_time(
             given = chosen & np.isfinite(estimate) & np.isfinite(truth)
             estimates.append(estimate[given])
             truths.append(truth[given])
+            if given.any():
+                scored_cars.add(rows["vehicle_id"][0].as_py())
+    require_vehicles(len(scored_cars), f"the cohort {condition.text!r}")
     if not sum(map(len, truths)):
         return None
     return _figures(np.concatenate(estimates), np.concatenate(truths))

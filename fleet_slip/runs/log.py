@@ -23,7 +23,7 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 from typing import Any
 
-from fleet_slip.errors import StorageError
+from fleet_slip.errors import HIDDEN, StorageError, hide_passwords
 from fleet_slip.files.folder import Folder
 from fleet_slip.runs.anchors import newest_documents
 from fleet_slip.runs.processes import process_began
@@ -43,8 +43,8 @@ _NAMES = re.compile(r"(?i)\b(?:vehicle_id|drive_id|drive_name|source_file|trip_i
 _DATA_FILE = re.compile(
     r"(?is).*(\.(?:csv|parquet|mf4|mdf|dat|mat|blf|asc|log|trc|mcap|duckdb|ddb)(?:\.\w+)?)"
 )
-_URL_CREDENTIALS = re.compile(r"(?<=://)[^/@\s]+(?=@)")
-HIDDEN = "***"
+_ADDRESS = re.compile(r"(--?[\w-]+=)?[^\s:/@=]+:\S*@([^\s@]+)")
+"""Of a user with a password, without a scheme."""
 
 _current: ContextVar["Run | None"] = ContextVar("run", default=None)
 
@@ -118,7 +118,8 @@ class Run:
         }
 
     def _told(self, error: BaseException) -> str:
-        return _without(str(error), self.arguments, publishable(self.arguments))[:ERROR_MAX]
+        told = _without(str(error), self.arguments, publishable(self.arguments))
+        return hide_passwords(told)[:ERROR_MAX]
 
 
 def current_run_id() -> str | None:
@@ -177,14 +178,16 @@ def publishable(arguments: Sequence[str]) -> list[str]:
     """Return command line arguments without what the history must not keep.
 
     That is the value of an option whose name speaks of a key, token, secret or password, the user
-    part of a URL, and what may name a person's car, since the history outlives what is forgotten:
-    the values of --vehicle, --drive, --drive-name and --source-file, conditions on such columns,
-    and the names of data files.
+    part of a URL and the like in its query, and what may name a person's car, since the history
+    outlives what is forgotten: the values of --vehicle, --drive, --drive-name and --source-file,
+    conditions on such columns, and the names of data files.
     """
     kept: list[str] = []
     hide_next = False
     for argument in arguments:
-        text = _URL_CREDENTIALS.sub(HIDDEN, argument.encode(errors="replace").decode())
+        text = hide_passwords(argument.encode(errors="replace").decode(), whole=True)
+        if "://" not in text and (address := _ADDRESS.fullmatch(text)):
+            text = f"{address[1] or ''}{HIDDEN}@{address[2]}"
         if _NAMES.search(text):
             text = HIDDEN
         option, equals, _ = text.partition("=")

@@ -34,6 +34,7 @@ from fleet_slip.regression.inference.standard_errors import (
     variance_inflation,
 )
 from fleet_slip.regression.shrinkage.ridge import fit_errors_in_variables
+from fleet_slip.warehouse.minimum_cohort import tells_single_cars
 from fleet_slip.words import number_of
 
 
@@ -221,8 +222,9 @@ def _compare(
     inputs, label = fitted.model.signals, fitted.model.label
     shared = {*here.drives["drive_id"].to_pylist()} & {*there.drives["drive_id"].to_pylist()}
     if shared:
+        such = f", such as {min(shared)}" if tells_single_cars() else ""
         raise QuestionError(
-            f"the two cohorts share {number_of(len(shared), 'drive')}, such as {min(shared)}: a "
+            f"the two cohorts share {number_of(len(shared), 'drive')}{such}: a "
             f"comparison needs different drives. Add to the cohort: AND NOT ({condition})"
         )
     intercept = fitted.has_intercept

@@ -4,10 +4,15 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
+from fleet_slip.canonical import sha256_of
 from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.grams.cohorts.training_folds import clustered_moments
 from fleet_slip.regression.inference.influential import find_influential
 from fleet_slip.warehouse.condition import Condition, parse_condition
+from fleet_slip.warehouse.minimum_cohort import tells_single_cars
+
+HASH_CHARACTERS = 16
+"""Of the SHA-256 of a car's name."""
 
 
 def influential_cars(cohort: Cohort, inputs: Sequence[str]) -> dict[str, float]:
@@ -24,9 +29,16 @@ def influential_cars(cohort: Cohort, inputs: Sequence[str]) -> dict[str, float]:
 
 
 def without_vehicles(condition: Condition, vehicles: Collection[str]) -> Condition:
-    """Return a condition on drives that leaves out some cars."""
+    """Return a condition on drives that leaves out some cars.
+
+    It names them, or their hashes where a minimum cohort is asked for, since versions keep it.
+    """
     if not vehicles:
         return condition
-    quoted = ", ".join("'" + name.replace("'", "''") + "'" for name in sorted(vehicles))
-    others = f"(vehicle_id IS NULL OR vehicle_id NOT IN ({quoted}))"
+    tell, names = "vehicle_id", sorted(vehicles)
+    if not tells_single_cars():
+        tell = f"left(sha256(vehicle_id), {HASH_CHARACTERS})"
+        names = sorted(sha256_of(name)[:HASH_CHARACTERS] for name in vehicles)
+    quoted = ", ".join("'" + name.replace("'", "''") + "'" for name in names)
+    others = f"(vehicle_id IS NULL OR {tell} NOT IN ({quoted}))"
     return parse_condition(f"{condition.sql} AND {others}")

@@ -10,6 +10,7 @@ from fleet_slip.grams.cohorts.folding import FoldKey
 from fleet_slip.regression.inference.drive_moments import ClusterUnit
 from fleet_slip.selection.select_models import Selection
 from fleet_slip.selection.worth import WORTH, parse_worth
+from fleet_slip.warehouse.minimum_cohort import tells_single_cars
 
 DEFAULT_MODELS = "table1"
 
@@ -121,7 +122,8 @@ class RequestedSelection(Selection[Any]):
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `select --json` prints."""
-        return {**super().as_dict(), "vehicles_left_out": dict(self.left_out)}
+        named = dict(self.left_out) if tells_single_cars() else {}
+        return {**super().as_dict(), "vehicles_left_out": named}
 
     @classmethod
     def of(

@@ -28,6 +28,7 @@ from fleet_slip.regression.choice.winner import Winner, choose
 from fleet_slip.regression.inference.drive_moments import ClusterUnit
 from fleet_slip.regression.inference.evidence import Evidence
 from fleet_slip.regression.validation.crossval import CrossValidation
+from fleet_slip.selection.told_figures import told_figures
 
 ALL_SUBSETS = "all-subsets"
 """Instead of a ranking: the best subset of every size."""
@@ -68,7 +69,7 @@ class SearchChoice:
             document["subsets"] = [result.as_dict() for result in self.subsets]
             document["picks"] = self.picks
         if self.honest is not None:
-            document["honest"] = self.honest.as_dict()
+            document["honest"] = told_figures(self.honest)
         return document
 
 

@@ -12,6 +12,7 @@ from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.cohorts.fold_sums import SummedCohort
 from fleet_slip.grams.cohorts.folding import ROW_FOLDS, Folding
 from fleet_slip.grams.cohorts.gram_cohort import Cohort
+from fleet_slip.grams.cohorts.outweighing import drives_by_car
 from fleet_slip.regression.choice.nested_choice import NestedDistances
 from fleet_slip.regression.choice.winner import DEFAULT_WORTH, Winner, Worth
 from fleet_slip.regression.validation.crossval import CrossValidation, cross_validate_inputs
@@ -19,7 +20,9 @@ from fleet_slip.regression.validation.folds import CohortFolds
 from fleet_slip.selection.model_list import CandidateModel, Search
 from fleet_slip.selection.search import SearchChoice
 from fleet_slip.selection.searched_models import SearchedModels, choose_by, search_models
+from fleet_slip.selection.told_figures import told_figures
 from fleet_slip.selection.uncertainty import Uncertainty
+from fleet_slip.warehouse.minimum_cohort import tells_single_cars
 
 AnyCohort = TypeVar("AnyCohort", bound=Cohort | SummedCohort, default=Cohort)
 
@@ -53,13 +56,16 @@ class Selection(Generic[AnyCohort]):
     distances: NestedDistances | str | None = None
     intercept: bool = True
 
+    def _gram_rows(self, model: CrossValidation) -> dict[str, str]:
+        """Return which Gram rows a model is made of, for SQL; it may name cars."""
+        if not tells_single_cars():
+            return {}
+        return {"gram_rows": self.cohort.gram_condition(model.signals)}
+
     def as_dict(self) -> dict[str, Any]:
         """Return what `select --json` prints."""
         document: dict[str, Any] = {
-            "models": [
-                {**model.as_dict(), "gram_rows": self.cohort.gram_condition(model.signals)}
-                for model in self.models
-            ],
+            "models": [{**told_figures(model), **self._gram_rows(model)} for model in self.models],
             "winner": self.winner.model.name,
             "reason": self.winner.reason,
             "cohort": self.cohort.condition.text,
@@ -69,7 +75,8 @@ class Selection(Generic[AnyCohort]):
             "drives_without_log": self.cohort.members.count_received,
             "drives_left_out": self.cohort.left_out,
             "drives_revoked": dict(self.cohort.revoked),
-            "drives_outweighing": {one.vehicle_id: one.drives for one in self.cohort.outweighing},
+            "drives_outweighing": drives_by_car(self.cohort.outweighing),
+            "signal_sets_untold": self.cohort.untold,
             "intercept": self.intercept,
             "folds": {
                 "by": self.folds.by,

@@ -28,6 +28,7 @@ from fleet_slip.regression.validation.crossval import (
     least_squares,
 )
 from fleet_slip.regression.validation.folds import Folds
+from fleet_slip.selection.told_figures import told_figures
 
 PENALTIES = tuple(float(10.0**exponent) for exponent in np.arange(-6, 0.01, 0.5))
 """Penalties on the correlation matrix that ridge and lasso choose from."""
@@ -42,7 +43,7 @@ class Shrunk:
 
     def as_dict(self) -> dict[str, Any]:
         """Return what a JSON document needs."""
-        return {**self.cross_validation.as_dict(), "penalty": self.penalty}
+        return {**told_figures(self.cross_validation), "penalty": self.penalty}
 
 
 def compare_shrinkage(

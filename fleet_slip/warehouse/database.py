@@ -6,12 +6,12 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, wait
 from typing import TypeVar
 
 import duckdb
 
-from fleet_slip.errors import FleetSlipError, QuestionError, StorageError
+from fleet_slip.errors import FleetSlipError, QueryGoesOnError, QuestionError, StorageError
 from fleet_slip.files.checksums import check_local_files
 from fleet_slip.files.folder import Folder
 from fleet_slip.limits import memory_bytes
@@ -21,6 +21,9 @@ SPILL_LIMIT = "20GB"
 
 LOOK_S = 0.1
 """How often a waiting query looks whether Ctrl-C was pressed."""
+
+STUCK_S = 0.7
+"""So long after a Ctrl-C a query may take to stop."""
 
 Result = TypeVar("Result")
 
@@ -69,32 +72,37 @@ def interruptible(database: duckdb.DuckDBPyConnection, work: Callable[[], Result
 
     DuckDB asks whether to stop between tasks only, and a recursive query is one task. It forgets an
     interruption that comes before the query begins, so that it is told again until the work ends.
+    It never stops in the middle of a function: then `QueryGoesOnError` is raised after `STUCK_S`,
+    while the work goes on, in a thread that the end of the process does not wait for.
     """
-    under_way, stopped = threading.Event(), threading.Event()
+    answer: Future[Result] = Future()
+    stopped = threading.Event()
 
-    def unless_stopped() -> Result:
-        under_way.set()
+    def unless_stopped() -> None:
         try:
-            if stopped.is_set():
-                raise KeyboardInterrupt
-            return work()
-        finally:
-            under_way.clear()
+            if not stopped.is_set():
+                answer.set_result(work())
+            else:
+                answer.cancel()
+        except BaseException as error:
+            answer.set_exception(error)
 
-    with ThreadPoolExecutor(1) as pool:
-        try:
-            answer = pool.submit(unless_stopped)
-            # Where a library has set a handler that restarts system calls, a signal ends no wait.
-            while not wait([answer], LOOK_S).done:
-                pass
-        except KeyboardInterrupt:
-            stopped.set()
-            while under_way.is_set():
-                with contextlib.suppress(KeyboardInterrupt):
-                    database.interrupt()
-                    time.sleep(LOOK_S)
-            raise
-        return answer.result()
+    threading.Thread(target=unless_stopped, daemon=True).start()
+    try:
+        # Where a library has set a handler that restarts system calls, a signal ends no wait.
+        while not wait([answer], LOOK_S).done:
+            pass
+    except KeyboardInterrupt:
+        stopped.set()
+        until = time.monotonic() + STUCK_S
+        while not answer.done():
+            if time.monotonic() > until:
+                raise QueryGoesOnError from None
+            with contextlib.suppress(KeyboardInterrupt):
+                database.interrupt()
+                time.sleep(LOOK_S)
+        raise
+    return answer.result()
 
 
 _INTERRUPTED = "Query interrupted"

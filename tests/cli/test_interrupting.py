@@ -1,6 +1,11 @@
 """Ctrl-C in long work: what is said, and that the same command does the rest."""
 
+import os
 import shutil
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -70,3 +75,44 @@ def test_a_gram_job_that_was_interrupted_goes_on(smoke_root: Path, tmp_path: Pat
     done, total = seen[-1]
     assert 0 < done <= total
     assert 0 < fleet.gram("motion", workers=1).rows_read <= total
+
+
+BEGUN = "the query has begun"
+SAYS_SO = f"""
+import sys
+from fleet_slip.api.session import Session
+from fleet_slip.cli.main import main
+
+ask = Session.sql
+def sql(self, query):
+    print({BEGUN!r}, file=sys.stderr, flush=True)
+    return ask(self, query)
+Session.sql = sql
+main()
+"""
+"""The command line, which says when it asks a query."""
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        "SELECT length(bitstring('1', 2000000000))",
+        "SELECT sum(length(repeat('a', 100000000 + i::INT))) FROM range(50) t(i)",
+        "SELECT regexp_replace(repeat('ab', 100000000), '(a|b)*c', 'x')",
+    ],
+)
+def test_a_query_that_cannot_be_stopped_ends_with_the_process(smoke_root: Path, query: str) -> None:
+    words = [sys.executable, "-c", SAYS_SO, "--root", str(smoke_root), "sql", query]
+    with subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stderr is not None
+        assert BEGUN in process.stderr.readline()
+        time.sleep(0.5)
+        asked = time.monotonic()
+        os.kill(process.pid, signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    assert time.monotonic() - asked < 10  # a second on an idle machine
+    assert (process.returncode, out) == (130, "")
+    assert "interrupted: what was committed is kept" in err
+    assert "Traceback" not in err

@@ -1,14 +1,19 @@
 """The rule of a minimum cohort: no answer of fewer cars; and masks that cancel in exact sums."""
 
+import re
 import shutil
+from datetime import date
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import fleet_slip
 from fleet_slip.errors import CohortError, ConfigError, QuestionError
+from fleet_slip.monitoring.plausibility import Fault
+from fleet_slip.monitoring.quality import QualityReport, SensorFault
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.warehouse.minimum_cohort import MINIMUM_VARIABLE
 from tests.support.messages import START_S, gram_of, message_of
@@ -44,11 +49,17 @@ def test_an_answer_of_fewer_cars_is_refused(
         lambda: few.select(model="ax,ay"),
         lambda: few.select(nested="ax,ay", rank="backward"),
         lambda: few.diagnose(signals="ax,ay"),
-        lambda: fleet.cohort().select(model="ax,ay"),  # two cars have other signals
     ):
         with pytest.raises(CohortError, match="fewer than 5 cars"):
             ask()
     assert fleet.cohort(FULL).select(model="ax,ay").cohort.drive_count == 10
+    everybody = fleet.cohort().select(model="ax,ay").as_dict()
+    assert everybody["signal_sets_untold"] == 1  # two cars have other signals
+    full = fleet.cohort(FULL).select(model="ax,ay").as_dict()
+    assert everybody["models"][0]["rmse_deg"] == full["models"][0]["rmse_deg"]
+    assert (everybody["drives"], everybody["rows"]) == (full["drives"], full["rows"]) == (10, 5000)
+    ranked = fleet.cohort().select(nested="ax,ay", rank="backward")
+    assert (ranked.cohort.drive_count, ranked.cohort.untold) == (10, 1)
     monkeypatch.setenv(MINIMUM_VARIABLE, "6")
     with pytest.raises(CohortError, match="fewer than 6 cars"):
         fleet.cohort(FULL).select(model="ax,ay")
@@ -62,6 +73,70 @@ def test_a_day_of_fewer_cars_is_not_monitored(
     monkeypatch.setenv(MINIMUM_VARIABLE, "6")
     with pytest.raises(CohortError, match="on 2024-05-01"):
         fleet.monitor("cars")
+
+
+def test_folds_of_single_cars_are_not_told(
+    fleet: fleet_slip.Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def asked() -> list[dict[str, Any]]:
+        compared = fleet.cohort(FULL).select(model="ax,ay", by="vehicle", folds="each")
+        ranked = fleet.cohort(FULL).select(nested="ax,ay", rank="backward", by="vehicle")
+        (kept, *_) = fleet.cohort(FULL).shrink("ax,ay", by="vehicle", folds="each")
+        return [compared.as_dict(), ranked.as_dict(), kept.as_dict()]
+
+    assert all("VIN" in str(one) for one in asked())
+    monkeypatch.setenv(MINIMUM_VARIABLE, "5")
+    for one in asked():
+        assert not re.search(r"VIN\d", str(one).replace(FULL, "")), one
+    pooled = [asked()[0]["models"][0][name] for name in ("rmse_deg", "correlation")]
+    monkeypatch.delenv(MINIMUM_VARIABLE)
+    full = fleet.cohort(FULL).select(model="ax,ay", by="vehicle", folds="each").as_dict()
+    assert [full["models"][0][name] for name in ("rmse_deg", "correlation")] == pooled
+
+
+def test_one_odd_message_is_in_nobodys_way(
+    fleet: fleet_slip.Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "odd").write_bytes(message_of(gram_of(1).restrict(["sideslip"]), "VIN9", START_S))
+    fleet.receive(tmp_path / "odd")
+    monkeypatch.setenv(MINIMUM_VARIABLE, "5")
+    fleet.publish("cars", fleet.cohort().select(model="ax,ay"), force=True)
+    trained = fleet.model("cars").manifest.trained_on
+    assert (trained.drives, trained.vehicles) == (10, 5)
+    assert fleet.quality().as_dict()["findings"] == []
+    assert fleet.cohort().diagnose("cars").drives == 10
+
+
+def test_a_day_of_few_cars_is_left_out_of_the_chart(
+    fleet: fleet_slip.Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cars_of_day = {2: 5, 3: 5, 4: 4, 5: 5}
+    late = [
+        message_of(gram_of(10 * day + i), f"VIN{i}", START_S + 86_400 * day)
+        for day, cars in cars_of_day.items()
+        for i in range(cars)
+    ]
+    (tmp_path / "late").write_bytes(b"".join(late))
+    fleet.receive(tmp_path / "late")
+    fleet.publish("cars", fleet.cohort(FULL).select(model="ax,ay"), force=True)
+    since = date(2024, 5, 6)
+    assert [one.drives for one in fleet.monitor("cars", since=since).days] == [5, 5, 5, 5, 4, 5]
+    monkeypatch.setenv(MINIMUM_VARIABLE, "5")
+    chart = fleet.monitor("cars", since=since)
+    assert [one.drives for one in chart.days] == [5, 5, 5, 5, 5]
+    assert chart.days_untold == 1
+
+
+def test_faults_are_told_without_the_drives(monkeypatch: pytest.MonkeyPatch) -> None:
+    faults = [
+        SensorFault(f"drive{i}", f"VIN{i}", date(2024, 5, 1), Fault("biased", ("ay",), f"{i} m/s2"))
+        for i in range(2)
+    ]
+    report = QualityReport(9, 9, tuple(faults), {})
+    assert len(report.as_dict()["findings"]) == 2
+    monkeypatch.setenv(MINIMUM_VARIABLE, "5")
+    found = report.as_dict()["findings"]
+    assert found == [{"kind": "biased", "signals": ["ay"], "drives": 2}]
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,9 @@ def forge(registry: Registry, kind: str, **changes: Any) -> None:
     file = path_of(registry.folder) / NAME / kind / "1.json"
     document = json.loads(file.read_text())
     term = changes.pop("term", {})
-    document["content"] |= changes
+    for key, value in changes.items():
+        part = document["content"].get(key)
+        document["content"][key] = part | value if isinstance(part, dict) else value
     if term:
         document["content"]["terms"][0] |= term
     document["sha256"] = checksum(document["content"])
@@ -65,6 +67,18 @@ def forge(registry: Registry, kind: str, **changes: Any) -> None:
         {"unknown": 1},
         {"trained_on": {"cohort": "true", "drives": 2**70, "rows": 1}},
         {"trained_on": {"cohort": "true", "drives": -1, "rows": 1}},
+        {"cross_validation": {"rmse_deg": -1}},
+        {"cross_validation": {"correlation": 2}},
+        {"cross_validation": {"correlation": -1.01}},
+        {"cross_validation": {"correlation": "nan"}},
+        {"cross_validation": {"rmse_deg": "inf"}},
+        {"cross_validation": {"error_std_deg": -0.1}},
+        {"cross_validation": {"correlation_standard_error": -0.1}},
+        {"cross_validation": {"condition_number": -1}},
+        {"cross_validation": {"error_mean_deg": -1e9}},
+        {"trained_on": {"vehicles": 10**6}},
+        {"trained_on": {"drives_without_log": 10**6}},
+        {"trained_on": {"rows": 0}},
     ],
 )
 def test_a_forged_manifest_is_refused(registry: Registry, changes: dict[str, Any]) -> None:

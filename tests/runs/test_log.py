@@ -10,10 +10,9 @@ from typing import Any
 import pytest
 
 import fleet_slip
-from fleet_slip.errors import InputError
+from fleet_slip.errors import HIDDEN, InputError, StorageError
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.runs.log import (
-    HIDDEN,
     current_run_id,
     publishable,
     recording,
@@ -116,6 +115,22 @@ def test_secrets_and_names_of_cars_are_not_kept() -> None:
     assert publishable(
         ["publish", "--signing-key", "hunter2", "--api-token=abc", "s3://me:pw@bucket/x", "--force"]
     ) == ["publish", "--signing-key", "***", "--api-token=***", "s3://***@bucket/x", "--force"]
+    for url in (
+        "tcp://u:PW@h:1",
+        "tcp://u:P/W@h:1",
+        "tcp://u:P@W@h:1",
+        "TCP://u:P W@h:1",
+        "u:PW@h:1",
+    ):
+        hidden = url.partition("//")[0] + "//***@h:1" if "//" in url else "***@h:1"
+        assert publishable(["--cluster", url]) == ["--cluster", hidden]
+        assert publishable([f"--cluster={url}"]) == [f"--cluster={hidden}"]
+    assert publishable(["https://h/p?a=1&X-Amz-Signature=PW"]) == [
+        "https://h/p?a=1&X-Amz-Signature=***"
+    ]
+    assert publishable(["s3://bucket/a@b", "day >= '2024-05-01'"]) == [
+        *("s3://bucket/a@b", "day >= '2024-05-01'")
+    ]
     assert publishable(["forget", "--vehicle", "WVW1", "--drive=d", "a/WVW1.csv.gz"]) == [
         "forget",
         "--vehicle",
@@ -123,6 +138,7 @@ def test_secrets_and_names_of_cars_are_not_kept() -> None:
         "--drive=***",
         "***.csv.gz",
     ]
+    assert "PW" not in str(StorageError("no answer of tcp://u:P/W@h:1 in 30 s").args)
     assert publishable(["bad \udcff name"]) == ["bad ? name"]
 
 

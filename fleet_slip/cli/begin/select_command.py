@@ -9,10 +9,16 @@ import typer
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.cli.left_out import say_outweighing, say_revoked, say_without_log
+from fleet_slip.cli.left_out import (
+    say_outweighing,
+    say_revoked,
+    say_untold,
+    say_without_log,
+)
 from fleet_slip.cli.options import selection_options
 from fleet_slip.cli.output import Json, print_json, print_table, say, stdout
 from fleet_slip.grams.cohorts.folding import BANDS, PARTS, ROW_FOLDS
+from fleet_slip.grams.cohorts.outweighing import drives_by_car
 from fleet_slip.regression.choice.nested_choice import (
     CROSS_VALIDATION,
     NestedChoice,
@@ -24,6 +30,7 @@ from fleet_slip.selection.request import RequestedSelection, SelectionRequest
 from fleet_slip.selection.search import SearchChoice
 from fleet_slip.selection.select_models import Selection
 from fleet_slip.selection.uncertainty import Uncertainty
+from fleet_slip.warehouse.minimum_cohort import tells_single_cars
 from fleet_slip.words import number_of
 
 MANY_SIGNALS = 30
@@ -87,7 +94,7 @@ def print_selection(selection: Selection[Any]) -> None:
             f"learned from changes of the course over {change_s} s: the figures are of changes, "
             "with the noise of two fixes in them, and not of the angle."
         )
-    if selection.folds.by in (PARTS, BANDS):
+    if selection.folds.by in (PARTS, BANDS) and tells_single_cars():
         _print_folds(selection.winner.model)
     if selection.folds.by == ROW_FOLDS:
         say(
@@ -113,10 +120,15 @@ def _say_left_out(selection: Selection[Any]) -> None:
         say(f"{number_of(without_log, 'drive')} of these without a log: their cars sent Gram rows.")
     say_without_log(selection.cohort.left_out, selection.cohort.feature_set)
     say_revoked(selection.cohort.revoked)
-    say_outweighing(selection.cohort.outweighing)
-    if isinstance(selection, RequestedSelection):
-        for car, times in selection.left_out.items():
-            say(f"{car} left out: its influence on the model is {times:.0f} times the median one.")
+    say_outweighing(drives_by_car(selection.cohort.outweighing))
+    say_untold(selection.cohort.untold, "signal set")
+    if not isinstance(selection, RequestedSelection):
+        return
+    if selection.left_out and not tells_single_cars():
+        say(f"{number_of(len(selection.left_out), 'car')} of unusual influence left out.")
+        return
+    for car, times in selection.left_out.items():
+        say(f"{car} left out: its influence on the model is {times:.0f} times the median one.")
 
 
 def _print_folds(model: CrossValidation) -> None:

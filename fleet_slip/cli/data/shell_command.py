@@ -13,7 +13,7 @@ import typer
 from fleet_slip.api.session import Session
 from fleet_slip.cli.begin.sql_command import Form, answer
 from fleet_slip.cli.output import print_text, say
-from fleet_slip.errors import FleetSlipError
+from fleet_slip.errors import FleetSlipError, QueryGoesOnError
 from fleet_slip.warehouse.database import limit_memory
 
 HISTORY_LINES = 1000
@@ -41,6 +41,8 @@ def shell(context: typer.Context) -> None:
                     return
             except FleetSlipError as error:
                 say(f"error: {error}", logging.ERROR)
+            except QueryGoesOnError:
+                raise
             except KeyboardInterrupt:
                 say("interrupted")
 

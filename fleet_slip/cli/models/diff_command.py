@@ -8,6 +8,7 @@ from fleet_slip.cli.models.version_commands import Reference
 from fleet_slip.cli.output import Json, print_json, print_table, say
 from fleet_slip.models.diff import Difference
 from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.models.score import cohort_of_rows
 from fleet_slip.models.score import score as score_rows
 from fleet_slip.warehouse.condition import parse_condition, row_columns
 from fleet_slip.warehouse.tables import Warehouse
@@ -59,7 +60,7 @@ def score_against(
     """Print the figures of two versions on the rows that have the signals of both."""
     needed = {*one.manifest.columns, *other.manifest.columns}
     complete = " AND ".join(f"{name} IS NOT NULL" for name in sorted(needed))
-    both = parse_condition(cohort, row_columns()) & parse_condition(complete, row_columns())
+    both = cohort_of_rows(cohort) & parse_condition(complete, row_columns())
     first, second = (
         score_rows(warehouse, version.manifest, both).as_dict() for version in (one, other)
     )

@@ -8,7 +8,7 @@ import typer
 
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli.begin.run_command import DEFAULT_CAMPAIGN
-from fleet_slip.cli.left_out import say_revoked, say_without_log
+from fleet_slip.cli.left_out import say_revoked, say_untold, say_without_log
 from fleet_slip.cli.models.version_commands import Reference
 from fleet_slip.cli.output import Json, print_json, print_table, say
 from fleet_slip.cli.progress import progress
@@ -16,6 +16,7 @@ from fleet_slip.cli.recorded import record_run
 from fleet_slip.errors import AlarmError, UsageError
 from fleet_slip.monitoring.monitor import Chart
 from fleet_slip.monitoring.quality import QualityReport
+from fleet_slip.warehouse.minimum_cohort import tells_single_cars
 from fleet_slip.words import number_of
 
 
@@ -53,6 +54,10 @@ def _print_quality(found: QualityReport) -> None:
     if not found.findings:
         order = "all are in order" if found.drives else "none is long enough"
         typer.echo(f"{examined}: {order}")
+        return
+    if not tells_single_cars():
+        rows = [[kind, signals, f"{many:,}"] for (kind, signals), many in found.by_fault().items()]
+        print_table(examined, ["fault", "signals", "drives"], rows, left=2)
         return
     print_table(
         examined,
@@ -108,6 +113,7 @@ def monitor(
         _print_chart(chart)
         say_without_log(chart.drives_left_out, chart.feature_set)
         say_revoked(chart.drives_revoked)
+        say_untold(chart.days_untold, "day")
     if chart.alarms:
         days = ", ".join(f"{day.day} ({' and '.join(day.alarms)})" for day in chart.alarms)
         raise AlarmError(f"the error of {chart.model} is beyond its limits on {days}")

@@ -18,6 +18,7 @@ from fleet_slip.resources import config_names
 from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.simulation.track import load_track
 from fleet_slip.views import connect
+from fleet_slip.warehouse.minimum_cohort import require_single_cars
 from fleet_slip.warehouse.tables import Warehouse
 
 FRAMES_PER_S = 25
@@ -104,7 +105,11 @@ def scenario_frames(
 
 
 def drive_frames(warehouse: Warehouse, drive_id: str, version: ModelVersion) -> DriveFrames:
-    """Return the frames of a drive of the logs. Raises `QuestionError` if there is none."""
+    """Return the frames of a drive of the logs.
+
+    Raises `QuestionError` if there is none, and `CohortError` where a minimum cohort is asked for.
+    """
+    require_single_cars("a drive of the logs", "Watch a scenario, which is simulated.")
     names = [one.column for one in catalogue().signals.values()]
     query = f"SELECT time_s, track, vehicle_model, mass_kg, {', '.join(names)} FROM log"
     with connect(warehouse.root, query=query) as database:

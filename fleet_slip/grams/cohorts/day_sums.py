@@ -1,7 +1,7 @@
 """The sums of a cohort over each day, from rollups, and from Gram rows read batch by batch."""
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import date
 
@@ -21,6 +21,7 @@ from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.gram_table import GramTable
 from fleet_slip.regression.inference.drive_moments import missing_signals_error
 from fleet_slip.warehouse.condition import Condition, parse_condition
+from fleet_slip.warehouse.minimum_cohort import require_vehicles
 from fleet_slip.warehouse.tables import Warehouse
 
 
@@ -31,6 +32,8 @@ class DailySums:
     Attributes:
         left_out: drives of the condition that have no such Gram rows: their cars sent no log.
         revoked: how many drives of a car are left out, since a revoked key signed them.
+        untold: days that are left out, since fewer cars drove with the signals than the minimum
+            cohort asks for.
     """
 
     days: tuple[date, ...]
@@ -38,6 +41,7 @@ class DailySums:
     drives: tuple[int, ...]
     left_out: int
     revoked: Mapping[str, int]
+    untold: int
 
 
 def sum_days(
@@ -52,7 +56,7 @@ def sum_days(
     if no drive has them all.
     """
     signals = (*inputs, catalogue().label)
-    days: dict[date, _Day] = defaultdict(lambda: _Day(Gram.zero(signals)))
+    days: dict[date, _Day] = defaultdict(_Day)
     found = False
     condition = parse_condition(condition)
     with open_grams(source, feature_set, condition, Folding(by="day", count=EACH)) as opened:
@@ -80,32 +84,42 @@ def sum_days(
             raise empty_cohort(source, condition, feature_set)
     if not days:
         raise missing_signals_error(signals)
-    order = sorted(days)
-    members = [Members(days[day].drives, days[day].vehicles) for day in order]
-    for day, known in zip(order, members, strict=True):
-        known.require_vehicles(known.vehicles, f"the cohort {condition.text!r} on {day}")
+    told = {day: kinds for day in sorted(days) if (kinds := days[day].members.told())}
+    if not told:
+        require_vehicles(0, f"the cohort {condition.text!r}, on {min(days)} or any other day,")
     return DailySums(
-        tuple(order),
-        tuple(days[day].gram for day in order),
-        tuple(known.count_drives(known.drives) for known in members),
+        tuple(told),
+        tuple(days[day].total(kinds) for day, kinds in told.items()),
+        tuple(days[day].members.count_drives(kinds) for day, kinds in told.items()),
         left_out,
         revoked,
+        len(days) - len(told),
     )
 
 
 @dataclass
 class _Day:
-    """What a day comes to: its Gram, and its drives and cars by their signals."""
+    """What a day comes to: its Grams, drives and cars by the signals of the Gram rows."""
 
-    gram: Gram
+    grams: dict[str, Gram] = field(default_factory=dict)
     drives: dict[str, Hashed] = field(default_factory=dict)
     vehicles: dict[str, Hashed] = field(default_factory=dict)
 
     def add(self, names: str, gram: Gram, drives: Hashed, vehicles: Hashed) -> None:
         """Add Gram rows of the same signals."""
-        self.gram += gram
+        self.grams[names] = self.grams[names] + gram if names in self.grams else gram
         add_hashed(self.drives, names, drives)
         add_hashed(self.vehicles, names, vehicles)
+
+    @property
+    def members(self) -> Members:
+        """The drives and cars of the day."""
+        return Members(self.drives, self.vehicles)
+
+    def total(self, kinds: Collection[str]) -> Gram:
+        """Return the sum of the Grams of some sets of signals."""
+        first, *others = (self.grams[names] for names in sorted(kinds))
+        return sum(others, first)
 
 
 def _add_rows(days: dict[date, _Day], names: str, table: GramTable, rows: pa.RecordBatch) -> None:

@@ -7,6 +7,7 @@ from fleet_slip.catalogue.features import features
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.cohorts.folding import BANDS, EACH, PARTS, ROW_FOLDS, FoldCount
 from fleet_slip.regression.validation.folds import FoldAssignment, by_band, by_hash, by_value
+from fleet_slip.warehouse.minimum_cohort import tells_single_cars
 
 MOST_FOLDS = 10_000
 """Each fold is an exact fit of every model."""
@@ -42,8 +43,13 @@ def _require_row_folds(feature_set: str, count: FoldCount) -> None:
 def assign_folds(values: Sequence[Any], by: str, count: FoldCount) -> FoldAssignment:
     """Assign Gram rows to folds by the values of a fold key.
 
-    Raises `DataError` if there are not two folds, or too many.
+    Folds are not called after drives and cars where a minimum cohort is asked for. Raises
+    `DataError` if there are not two folds, or too many.
     """
+    of_their_own = len({*values}) <= (MOST_FOLDS if count == EACH else count)
+    if by in ("drive", "vehicle") and of_their_own and not tells_single_cars():
+        place = {name: i for i, name in enumerate(sorted({*values} - {None}), 1)}
+        values = [place.get(name) for name in values]
     if count == EACH:
         if (number := len(set(values))) > MOST_FOLDS:
             raise DataError(

@@ -4,7 +4,7 @@ Comparing given models needs no single drive, only the Gram of each fold. So any
 rows is added up in the memory of one batch; and of a file whose rollup serves, no row is read.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -41,6 +41,7 @@ from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.gram_table import GramTable
 from fleet_slip.regression.validation.folds import CohortFolds
 from fleet_slip.warehouse.condition import Condition, asking, parse_condition
+from fleet_slip.warehouse.minimum_cohort import require_vehicles
 from fleet_slip.warehouse.tables import Warehouse
 
 
@@ -104,12 +105,13 @@ def sum_cohort(
         origin = opened.origin(condition)
         if not sums.tables:
             raise empty_cohort(warehouse, condition, feature_set)
+    found, told = len(sums.tables), sums.members.told()
+    if not told:
+        require_vehicles(0, f"the cohort {condition.text!r}, with any one set of signals,")
+    sums.keep(told)
     members = sums.members
-    for signals in members.vehicles:
-        of = f"the cohort {condition.text!r} with the signals {signals}"
-        members.require_vehicles([signals], of)
     return SummedCohort(
-        **vars(origin),
+        **{**vars(origin), "untold": found - len(told)},
         folding=folding,
         sums=sums.of_folds(members),
         rows=sum(gram.n for grams in sums.tables.values() for gram in grams),
@@ -222,6 +224,12 @@ class _Sums:
         self.tables[signals] = (
             [a + b for a, b in zip(before, totals, strict=True)] if before else totals
         )
+
+    def keep(self, kinds: Collection[str]) -> None:
+        """Drop all but some sets of signals."""
+        for sums in (self.tables, self.drives, self.vehicles, self.received):
+            for signals in sums.keys() - kinds:
+                del sums[signals]
 
     @property
     def members(self) -> Members:

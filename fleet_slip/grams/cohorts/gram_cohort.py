@@ -30,7 +30,7 @@ from fleet_slip.regression.validation.folds import (
     CohortFolds,
 )
 from fleet_slip.warehouse.condition import Condition, asking, parse_condition
-from fleet_slip.warehouse.minimum_cohort import minimum_vehicles, require_vehicles
+from fleet_slip.warehouse.minimum_cohort import has_enough, require_vehicles
 from fleet_slip.warehouse.tables import Warehouse
 
 
@@ -149,10 +149,13 @@ def load_cohort(
 ) -> Cohort:
     """Read the Gram rows of the drives that satisfy a condition.
 
-    For `training` what outweighs the others is not among them. Raises `QuestionError` if the
-    condition is not one SQL expression on the columns of `drives`, `DataError` if no drive
-    satisfies it or the feature set has not been computed for all logs, and `RefusedError` if a
-    drive of an evaluation scenario satisfies it.
+    For `training` what outweighs the others is not among them, nor, where a minimum cohort is asked
+    for, are the rows of sets of signals that few cars have: raises `CohortError` if none is left.
+    Who asks for all rows counts the cars.
+
+    Raises `QuestionError` if the condition is not one SQL expression on the columns of `drives`,
+    `DataError` if no drive satisfies it or the feature set has not been computed for all logs, and
+    `RefusedError` if a drive of an evaluation scenario satisfies it.
     """
     condition = parse_condition(condition)
     with open_grams(warehouse, feature_set, condition, training=training) as opened:
@@ -166,14 +169,17 @@ def load_cohort(
     require_training(rows["source"].unique().to_pylist(), condition)
     parts = list(expansion.tables(rows))
     # Rows whose calibrated columns are not the same are apart now: their metadata follows them.
-    order = np.concatenate([np.flatnonzero(here) for _, _, here in parts])
-    if minimum_vehicles():
-        for names, _, here in parts:
-            cars = rows["vehicle_id"].filter(pa.array(here)).unique()
-            require_vehicles(len(cars), f"the cohort {condition.text!r} with the signals {names}")
+    told = [
+        one
+        for one in parts
+        if not training or has_enough(len(rows["vehicle_id"].filter(pa.array(one[2])).unique()))
+    ]
+    if not told:
+        require_vehicles(0, f"the cohort {condition.text!r}, with any one set of signals,")
+    order = np.concatenate([np.flatnonzero(here) for _, _, here in told])
     return Cohort(
-        **vars(origin),
-        tables=tuple(table for _, table, _ in parts),
+        **{**vars(origin), "untold": len(parts) - len(told)},
+        tables=tuple(table for _, table, _ in told),
         drives=rows.drop_columns(["sums", "products"]).take(order),
     )
 

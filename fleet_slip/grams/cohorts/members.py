@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray
 from fleet_slip.catalogue.sources import RECEIVED
-from fleet_slip.warehouse.minimum_cohort import minimum_vehicles, require_vehicles
+from fleet_slip.warehouse.minimum_cohort import minimum_vehicles
 
 Hashes = NDArray[np.uint64]
 """Hashes of drives or cars, `hash_number`: what tells one from others, in 8 bytes."""
@@ -80,14 +80,18 @@ class Members:
         """Return the number of cars that have all of some signals."""
         return _count(self.vehicles, _kinds_with(self.vehicles, signals))
 
-    def require_vehicles(self, kinds: Collection[str], of: str) -> None:
-        """Raise `CohortError` if too few cars have one of some sets of signals.
+    def told(self) -> frozenset[str]:
+        """Return the sets of signals that enough cars have for figures of them to be told.
 
-        See `fleet_slip.warehouse.minimum_cohort`.
+        See `fleet_slip.warehouse.minimum_cohort`. Each is counted alone: models of other inputs are
+        of other sets, and their difference would tell of a set that few cars have.
         """
-        least = minimum_vehicles()
-        if least is not None and all(self.vehicles[kind].least < least for kind in kinds):
-            require_vehicles(_count(self.vehicles, frozenset(kinds)), of)
+        least = minimum_vehicles() or 0
+        return frozenset(
+            names
+            for names, cars in self.vehicles.items()
+            if cars.least >= least or _count(self.vehicles, frozenset({names})) >= least
+        )
 
 
 def add_hashed(known: dict[str, Hashed], signals: str, more: Hashed | None) -> None:

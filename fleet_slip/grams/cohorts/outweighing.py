@@ -24,6 +24,7 @@ from fleet_slip.grams.cohorts.cells import Cells
 from fleet_slip.grams.cohorts.members import hash_numbers
 from fleet_slip.grams.rows.rollup import BUCKETS
 from fleet_slip.warehouse.condition import Condition, asking
+from fleet_slip.warehouse.minimum_cohort import UNNAMED, tells_single_cars
 
 if TYPE_CHECKING:
     from fleet_slip.grams.cohorts.reader import OpenedGrams
@@ -123,6 +124,13 @@ def _rows_of_groups(cars: pa.Table, cells: Cells) -> IntArray:
 
 def _has_heavy_group(rows: IntArray) -> bool:
     return bool(rows.max() > MOST_GROUPS * np.sort(rows)[BUCKETS // 2])
+
+
+def drives_by_car(outweighing: Sequence[Outweighing]) -> dict[str, int]:
+    """Return how many drives of each car are left out; of all together, if none may be named."""
+    if outweighing and not tells_single_cars():
+        return {UNNAMED: sum(one.drives for one in outweighing)}
+    return {one.vehicle_id: one.drives for one in outweighing}
 
 
 def _literal(text: str) -> str:

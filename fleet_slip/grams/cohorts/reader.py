@@ -26,6 +26,7 @@ from fleet_slip.grams.rows.same_drives import has_received
 from fleet_slip.regression.exact.gram import packed_size
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.condition import Condition, asking
+from fleet_slip.warehouse.minimum_cohort import UNNAMED, tells_single_cars
 from fleet_slip.warehouse.table_views import gram_snapshots, lock, open_tables
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -64,7 +65,10 @@ class OpenedGrams:
         return read_sql("jobs", name).format(**values)
 
     def revoked(self, condition: Condition) -> dict[str, int]:
-        """Return how many drives of each car a cohort lacks, since a key of it was revoked."""
+        """Return how many drives of each car a cohort lacks, since a key of it was revoked.
+
+        All together under `UNNAMED`, where a minimum cohort is asked for.
+        """
         keys = load_car_keys()
         some = [key.condition for key in keys.revoked()] if keys else []
         if not some:
@@ -72,7 +76,8 @@ class OpenedGrams:
         sql = f"{condition.sql} AND ({' OR '.join(some)})"
         statement = read_sql("jobs", "count_revoked.sql").format(condition=sql)
         with asking(self.database, condition):
-            return dict(self.database.execute(statement).fetchall())
+            found: dict[str, int] = dict(self.database.execute(statement).fetchall())
+        return found if tells_single_cars() or not found else {UNNAMED: sum(found.values())}
 
     def origin(self, condition: Condition) -> CohortOrigin:
         """Return which Gram rows a cohort is made of."""
