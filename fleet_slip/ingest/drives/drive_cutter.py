@@ -15,6 +15,18 @@ LONGEST_DRIVE_S = 2**19 * STEP_S
 """A stretch that lasts longer, some 87 minutes, is cut, so that a drive fits into memory."""
 
 
+_GROUP = np.dtype(
+    [
+        ("last", "f8"),  # time of the last row
+        ("kept", "f8"),  # of the last one that is not isolated
+        ("latest", "f8"),  # the latest time of the stretch
+        ("start", "f8"),  # its first time
+        ("part", "i8"),  # number of the open part
+        ("piece", "i8"),  # which part of the stretch that is
+    ]
+)
+_UNSEEN = np.array((np.nan, np.nan, np.nan, np.nan, -1, -1), dtype=_GROUP)
+
 MOST_STRETCHES = 16
 """Irregular steps in a block at which it is taken apart; with more it is cut as a whole."""
 
@@ -47,10 +59,8 @@ class DriveCutter:
         self._longest_s = longest_s
         self._waiting: pl.DataFrame | None = None
         self._parts = 0
-        # By group: times of the last row, the last that is not isolated, the latest, and the
-        # stretch's first; the number of the part, and which of its stretch it is.
-        self._last, self._kept, self._latest, self._start = (np.empty(0) for _ in range(4))
-        self._part, self._piece = (np.empty(0, dtype=np.int64) for _ in range(2))
+        self._state = np.empty(0, dtype=_GROUP)
+        """What was seen of each group so far."""
         self.ended: list[int] = []
         """Parts that the last block ended, in an order that does not depend on blocks."""
 
@@ -77,18 +87,19 @@ class DriveCutter:
         if not stretch.is_steady or self._waiting is not None:
             return self._cut(rows, last=last)
         group, time = int(rows["group"][0]), rows["time"].to_numpy()
-        if group >= self._last.size or np.isnan(self._last[group]):
+        if group >= self._state.size or np.isnan(self._state[group]["last"]):
             if time.size < 2 or time[-1] - time[0] >= self._longest_s:
                 return self._cut(rows, last=last)
             self._grow(rows)
-            self._start[group], self._part[group], self._piece[group] = time[0], self._parts, 0
+            self._state[group] = (np.nan, np.nan, np.nan, time[0], self._parts, 0)
             self._parts += 1
             return self._with_part(rows, group, time[-1])
-        if self._part[group] < 0:
+        seen = self._state[group]
+        if seen["part"] < 0:
             return self._cut(rows, last=last)
-        near = all(abs(time[0] - at[group]) <= self._gap_s for at in (self._last, self._kept))
-        piece = (time[-1] - self._start[group]) // self._longest_s
-        if not near or time[0] <= self._latest[group] or piece != self._piece[group]:
+        near = all(abs(time[0] - seen[at]) <= self._gap_s for at in ("last", "kept"))
+        piece = (time[-1] - seen["start"]) // self._longest_s
+        if not near or time[0] <= seen["latest"] or piece != seen["piece"]:
             return self._cut(rows, last=last)
         return self._with_part(rows, group, time[-1])
 
@@ -96,8 +107,9 @@ class DriveCutter:
         self, rows: pl.DataFrame, group: int, last_s: float
     ) -> tuple[pl.DataFrame, pl.DataFrame]:
         """Return rows that are all of their group's open part."""
-        self._last[group] = self._kept[group] = self._latest[group] = last_s
-        part = pl.lit(int(self._part[group]), pl.Int64)
+        for at in ("last", "kept", "latest"):
+            self._state[at][group] = last_s
+        part = pl.lit(int(self._state["part"][group]), pl.Int64)
         return rows.with_columns(part.alias("part")), no_rows()
 
     def _cut(self, rows: pl.DataFrame, *, last: bool) -> tuple[pl.DataFrame, pl.DataFrame]:
@@ -135,15 +147,9 @@ class DriveCutter:
 
     def _grow(self, rows: pl.DataFrame) -> None:
         """Make room for groups that were not there before."""
-        groups = int(rows["group"][-1]) + 1
-        more = groups - self._last.size
+        more = int(rows["group"][-1]) + 1 - self._state.size
         if more > 0:
-            for name in ("_last", "_kept", "_latest", "_start"):
-                grown = np.concatenate([getattr(self, name), np.full(more, np.nan)])
-                setattr(self, name, grown)
-            for name in ("_part", "_piece"):
-                grown = np.concatenate([getattr(self, name), np.full(more, -1, dtype=np.int64)])
-                setattr(self, name, grown)
+            self._state = np.concatenate([self._state, np.full(more, _UNSEEN, dtype=_GROUP)])
 
     def _isolated(
         self, rows: pl.DataFrame, *, last: bool
@@ -155,7 +161,7 @@ class DriveCutter:
         group, time = rows["group"].to_numpy(), rows["time"].to_numpy()
         first, end = _ends(group)
         before = np.concatenate([[np.nan], time[:-1]])
-        before[first] = self._last[group[first]]
+        before[first] = self._state["last"][group[first]]
         far = ~(np.abs(time - before) <= self._gap_s)
         far_next = np.concatenate([far[1:], [True]])
         far_next[end] = True
@@ -164,7 +170,7 @@ class DriveCutter:
         if not last:
             waiting[end] = alone[end]
             alone[end] = False
-        self._last[group[end]] = np.where(waiting[end], before[end], time[end])
+        self._state["last"][group[end]] = np.where(waiting[end], before[end], time[end])
         # Of several time bases only times tell what comes first.
         number = time if "base" in rows.columns else rows["row"].to_numpy().astype(np.float64)
         known_at = np.concatenate([number[1:], [np.inf]])
@@ -178,43 +184,41 @@ class DriveCutter:
 
         Ended parts are told in the order in which it becomes known that they have ended.
         """
-        group, time = rows["group"].to_numpy(), rows["time"].to_numpy()
+        group, time, seen = rows["group"].to_numpy(), rows["time"].to_numpy(), self._state
         first, end = _ends(group)
+        is_first = _mask(first, time.size)
         before = np.concatenate([[np.nan], time[:-1]])
-        before[first] = self._kept[group[first]]
+        before[first] = seen["kept"][group[first]]
         begins = ~(np.abs(time - before) <= self._gap_s)
-        before[first] = self._latest[group[first]]
+        before[first] = seen["latest"][group[first]]
         before[begins] = np.nan
         latest = time
         if not (begins | (time > before)).all():
-            latest, before = _latest(time, before, begins | _mask(first, time.size))
-        heads = np.flatnonzero(begins | _mask(first, time.size))
-        start_of = np.where(begins[heads], time[heads], self._start[group[heads]])
-        lengths = np.diff(np.append(heads, time.size))
-        start = np.repeat(start_of, lengths)
+            latest, before = _latest(time, before, begins | is_first)
+        heads = np.flatnonzero(begins | is_first)
+        start_of = np.where(begins[heads], time[heads], seen["start"][group[heads]])
+        start = np.repeat(start_of, np.diff(np.append(heads, time.size)))
         piece = ((latest - start) // self._longest_s).astype(np.int64)
         piece_before = np.concatenate([[-1], piece[:-1]])
-        piece_before[first] = self._piece[group[first]]
+        piece_before[first] = seen["piece"][group[first]]
         begins |= piece != piece_before
-        heads = np.flatnonzero(begins | _mask(first, time.size))
-        fresh = begins[heads]
-        part_of = np.where(fresh, self._parts + np.cumsum(fresh) - 1, self._part[group[heads]])
+        heads = np.flatnonzero(begins | is_first)
+        fresh, open_part = begins[heads], seen["part"][group[heads]]
+        part_of = np.where(fresh, self._parts + np.cumsum(fresh) - 1, open_part)
         self._parts += int(fresh.sum())
-        before_head = np.concatenate([[-1], part_of[:-1]])
-        is_first = _mask(first, time.size)[heads]
-        before_head[is_first] = self._part[group[heads[is_first]]]
+        before_head = np.where(is_first[heads], open_part, np.concatenate([[-1], part_of[:-1]]))
         over = fresh & (before_head >= 0)
         order = np.lexsort((group[heads[over]], known_at[heads[over]]))
         self.ended += before_head[over][order].tolist()
         parts = np.repeat(part_of, np.diff(np.append(heads, time.size)))
-        self._kept[group[end]], self._latest[group[end]] = time[end], latest[end]
-        self._start[group[end]], self._part[group[end]] = start[end], parts[end]
-        self._piece[group[end]] = piece[end]
+        now = {"kept": time, "latest": latest, "start": start, "part": parts, "piece": piece}
+        for name, values in now.items():
+            seen[name][group[end]] = values[end]
         return rows.with_columns(pl.Series("part", parts)), before
 
     def open_parts(self) -> list[int]:
         """Return the parts that no block has ended, by group."""
-        return [int(part) for part in self._part if part >= 0]
+        return [int(part) for part in self._state["part"] if part >= 0]
 
 
 def sample_interval_s(rows: pl.DataFrame) -> float | None:
