@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pyarrow as pa
 
-from fleet_slip.ingest.drives.measured_drives import log_table
 from fleet_slip.ingest.drives.stream import open_measured
 from fleet_slip.ingest.drives.totals import IngestCounts
+from fleet_slip.ingest.landing.log_table import log_table
 from fleet_slip.ingest.mapping.mapping import Mapping
 
 

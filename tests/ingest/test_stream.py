@@ -23,7 +23,7 @@ from fleet_slip.ingest.formats import csv_batches
 from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.csv_batches import PlainNumbers, open_csv
 from fleet_slip.ingest.formats.csv_format import CsvFormat
-from fleet_slip.ingest.landing import landing, writing
+from fleet_slip.ingest.landing import data_files, landing
 from fleet_slip.ingest.landing.ingest_job import ingest_file
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.measured import a_mapping, csv_text, good_columns, read_columns, ticks
@@ -113,7 +113,7 @@ def test_the_usual_rate_does_not_depend_on_blocks(
 def test_what_lands_does_not_depend_on_the_size_of_data_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: int, files: int
 ) -> None:
-    monkeypatch.setattr(writing, "FILE_ROWS", limit)
+    monkeypatch.setattr(data_files, "FILE_ROWS", limit)
     columns = good_columns(90)
     columns["t"] = [f"{i / 100 + 5 * (i // 30):.2f}" for i in range(90)]
     columns["ax"][3] = columns["ax"][70] = "x"
@@ -143,10 +143,10 @@ def test_the_bits_that_land_depend_on_neither_threads_nor_blocks(
     columns["t"] = [f"{i / 100 + 5 * (i // 30):.2f}" for i in range(120)]
     columns["ax"][70] = "broken"
     (tmp_path / "log.csv").write_text(csv_text(columns))
-    monkeypatch.setattr(writing, "FILE_ROWS", 50)
+    monkeypatch.setattr(data_files, "FILE_ROWS", 50)
     expected = _land_in(tmp_path / "as it is", tmp_path / "log.csv")
     monkeypatch.setattr(read_ahead_module, "WORKERS", threads)
-    monkeypatch.setattr(writing, "WRITERS", threads)
+    monkeypatch.setattr(data_files, "WRITERS", threads)
     monkeypatch.setattr(landing, "WRITERS", threads)
     monkeypatch.setattr(csv_batches, "BLOCK_BYTES", block_bytes)
     assert _land_in(tmp_path / "otherwise", tmp_path / "log.csv") == expected
@@ -164,7 +164,7 @@ def _land_in(root: Path, file: Path) -> list[str]:
 def test_nothing_is_left_of_a_file_that_fails_at_its_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(writing, "FILE_ROWS", 1)
+    monkeypatch.setattr(data_files, "FILE_ROWS", 1)
     monkeypatch.setattr(csv_batches, "BLOCK_BYTES", 100)
     columns = good_columns(90)
     columns["t"] = [f"{i / 100 + 5 * (i // 30):.2f}" for i in range(90)]

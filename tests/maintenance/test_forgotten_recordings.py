@@ -10,7 +10,7 @@ import pytest
 
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.ingest import Mapping
-from fleet_slip.ingest.landing import landing
+from fleet_slip.ingest.landing import ingest_job, landing
 from fleet_slip.ingest.landing.ingest_job import ingest_file
 from fleet_slip.maintenance.forget import forget
 from fleet_slip.warehouse.audit import Audit, Forgettable
@@ -156,14 +156,13 @@ def test_a_recording_that_is_forgotten_while_it_lands_again_does_not(
     ingest_file(warehouse, write(tmp_path, recording()), a_mapping())
     (file,) = warehouse.logs.snapshot().files
     (name,) = warehouse.logs.read_names(file.path)["drive_id"].used
-    commit = landing.Landing.commit
+    land = landing.land_batch
 
-    def overtaken(self: landing.Landing, table: Any) -> frozenset[str]:
-        monkeypatch.setattr(landing.Landing, "commit", commit)
+    def overtaken(*written: Any) -> Any:
         forget(warehouse, Forgettable("drive", name), now=True)
-        return commit(self, table)
+        return land(*written)
 
-    monkeypatch.setattr(landing.Landing, "commit", overtaken)
+    monkeypatch.setattr(ingest_job, "land_batch", overtaken)
     report = ingest_file(warehouse, write(tmp_path, recording()), a_mapping(name="other"))
     assert report.drives_forgotten == 1
     assert is_empty(warehouse)

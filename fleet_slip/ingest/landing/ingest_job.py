@@ -12,17 +12,12 @@ from fleet_slip.errors import InputError
 from fleet_slip.files.folder import StoredFile
 from fleet_slip.ingest.drafting.suspicion import Suspicion
 from fleet_slip.ingest.drives.totals import IngestCounts
+from fleet_slip.ingest.landing.data_files import unit_of
 from fleet_slip.ingest.landing.folders import KnownFiles
-from fleet_slip.ingest.landing.landing import (
-    AskedFile,
-    FileOutcome,
-    Landing,
-    WrittenBatch,
-    unit_of,
-    write_batch,
-)
+from fleet_slip.ingest.landing.landing import AskedFile, WrittenBatch, land_batch, write_batch
 from fleet_slip.ingest.landing.log_files import Log, StoredParts
 from fleet_slip.ingest.landing.look_alikes import find_vehicles_like
+from fleet_slip.ingest.landing.writing import FileOutcome
 from fleet_slip.ingest.mapping.mapping import Mapping
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.tables import Warehouse
@@ -108,10 +103,8 @@ def ingest_files(
         failures += written.failures
         # Not the file's name: it may name a car, and the Delta log outlives what is forgotten.
         note = {"job": "ingest", "mapping": mapping.name, "digest": written.digest}
-        landing = Landing(warehouse, partial(write, batch), written, note)
-        landing.commit("quarantine")
-        new = landing.commit("logs")
-        for outcome in landing.written.outcomes:
+        landed, new = land_batch(warehouse, written, partial(write, batch), note)
+        for outcome in landed.outcomes:
             yield _report(warehouse, outcome, new)
             new -= {unit_of(outcome.digest).name}  # the same content in another file is not new
             if known is not None:

@@ -3,32 +3,25 @@
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
-from hashlib import sha256
-from typing import Any
 
-from deltalake.transaction import AddAction
-
-from fleet_slip.delta import Change, Snapshot, Table, Unit, retry_conflicts
+from fleet_slip.delta import Change, Table, retry_conflicts
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.drafting.preview import signals_of
-from fleet_slip.ingest.drafting.suspicion import Suspicion, find_suspicions
+from fleet_slip.ingest.drafting.suspicion import find_suspicions
 from fleet_slip.ingest.drives.measured_drives import MeasuredDrive
-from fleet_slip.ingest.drives.stream import MeasuredStream, open_measured
-from fleet_slip.ingest.drives.totals import IngestCounts
+from fleet_slip.ingest.drives.stream import open_measured
 from fleet_slip.ingest.formats.columns import shown
-from fleet_slip.ingest.landing.local_copies import LocalCopies
-from fleet_slip.ingest.landing.log_files import Log
-from fleet_slip.ingest.landing.writing import (
-    FILE_ROWS,
+from fleet_slip.ingest.landing.data_files import (
     WRITERS,
     DataFiles,
-    FileWriter,
-    Rows,
+    Part,
     TableName,
-    WrittenFile,
-    as_table,
+    digest_of,
+    unit_of,
 )
+from fleet_slip.ingest.landing.local_copies import LocalCopies
+from fleet_slip.ingest.landing.log_files import Log
+from fleet_slip.ingest.landing.writing import FileOutcome, FileWriter
 from fleet_slip.ingest.mapping.mapping import Mapping
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.audit import Audit
@@ -44,45 +37,18 @@ class AskedFile:
 
 
 @dataclass(frozen=True)
-class FileOutcome:
-    """What one file became: its drives, those left out as forgotten, and whether it had landed."""
-
-    file: Log
-    digest: str
-    counts: IngestCounts
-    look_alikes: tuple[tuple[str, ...], ...]
-    vehicles: frozenset[str] = frozenset()
-    left_out: int = 0
-    suspicions: tuple[Suspicion, ...] = ()
-
-
-@dataclass(frozen=True)
-class Part:
-    """Data files of one table that are not committed yet, and the units that land with them."""
-
-    units: tuple[Unit, ...] = ()
-    files: tuple[AddAction, ...] = ()
-
-
-@dataclass(frozen=True)
 class WrittenBatch:
     """What a batch of files became; `forgotten` are the entries that its drives were judged by."""
 
     outcomes: tuple[FileOutcome, ...]
     failures: tuple[InputError, ...]
     forgotten: frozenset[int]
-    quarantine: Part = Part()
-    logs: Part = Part()
+    parts: dict[TableName, Part]
 
     @property
     def digest(self) -> str:
         """Digest of what landed first time, of all files together."""
-        return _digest([outcome.digest for outcome in self.outcomes])
-
-
-def unit_of(digest: str) -> Unit:
-    """Return the unit of work that a file's content is."""
-    return Unit(f"ingest/{digest}", 1)
+        return digest_of([outcome.digest for outcome in self.outcomes])
 
 
 def write_batch(
@@ -101,87 +67,78 @@ def write_batch(
     longest: tuple[int, MeasuredDrive] | None = None
     outcomes: list[FileOutcome] = []
     failures: list[InputError] = []
-    tables: tuple[tuple[TableName, Table, bool], ...] = (
-        ("quarantine", warehouse.quarantine, False),
-        ("logs", warehouse.logs, True),
-    )
-    landed = {name: table.snapshot().landed_among(len(files)) for name, table, _ in tables}
+    landed = {n: t.snapshot().landed_among(len(files)) for n, t in _tables(warehouse).items()}
     copies = LocalCopies(asked.file for asked in files)
     with copies, ThreadPoolExecutor(WRITERS) as threads:
-        parts: dict[TableName, _PartInTheMaking] = {
-            name: _PartInTheMaking(DataFiles(table, threads, by_day=by_day), mapping)
-            for name, table, by_day in tables
+        tables = {
+            name: DataFiles(table, mapping, threads, landed[name])
+            for name, table in _tables(warehouse).items()
         }
         for asked in files:
             try:
-                with copies.of(asked.file) as file, open_measured(file, mapping) as stream:
+                with (
+                    FileWriter(tables, Audit(warehouse.root), progress) as writer,
+                    copies.of(asked.file) as file,
+                    open_measured(file, mapping) as stream,
+                ):
                     _require_not_grown(asked, stream.digest, landed["logs"], mapping)
-                    missing = [
-                        name
-                        for name, part in parts.items()
-                        if not part.has(stream.digest)
-                        and not landed[name](unit_of(stream.digest).name)
-                    ]
-                    missing = missing if "logs" in missing else []
-                    written = FileWriter(warehouse, stream, missing, threads, progress).write()
+                    writer.read(stream)
             except InputError as error:
                 failures.append(error)
                 continue
-            outcomes.append(_outcome(asked.file, stream, written, new="logs" in missing))
-            drive = written.longest if missing else None
+            drive = writer.longest if writer.is_new else None
             if drive and (longest is None or drive.ticks.size > longest[1].ticks.size):
-                longest = len(outcomes) - 1, drive
-            for name in missing:
-                parts[name].add(stream.digest, written.rest.get(name, ()), written.files[name])
-        for part in parts.values():
-            part.write_rest()
+                longest = len(outcomes), drive
+            outcomes.append(writer.outcome(asked.file))
+        for rows in tables.values():
+            rows.write_waiting()
         if longest is not None:
             number, drive = longest
-            found = tuple(find_suspicions(signals_of(drive)))
-            found = (*outcomes[number].suspicions, *found)
+            found = (*outcomes[number].suspicions, *find_suspicions(signals_of(drive)))
             outcomes[number] = replace(outcomes[number], suspicions=found)
-        done = {name: part.finish() for name, part in parts.items()}
-    return WrittenBatch(
-        tuple(outcomes), tuple(failures), forgotten, done["quarantine"], done["logs"]
-    )
+        parts = {name: rows.finish() for name, rows in tables.items()}
+    return WrittenBatch(tuple(outcomes), tuple(failures), forgotten, parts)
 
 
-class _PartInTheMaking:
-    """The rows of small files, which are written together, and data files of large ones."""
+def land_batch(
+    warehouse: Warehouse,
+    written: WrittenBatch,
+    write: Callable[[], WrittenBatch],
+    note: dict[str, str],
+) -> tuple[WrittenBatch, frozenset[str]]:
+    """Commit what was written of a batch; return it, and the units that are now in the logs.
 
-    def __init__(self, together: DataFiles, mapping: Mapping) -> None:
-        self._together, self._mapping = together, mapping
-        self._rest: dict[str, Rows] = {}
-        self._number_of_rows = 0
-        self._digests: list[str] = []
-        self._files: list[AddAction] = []
+    Where something was forgotten, or landed by another process, since it was written, `write`
+    writes it again. Each table's files are one commit, with a note: refused rows, then drives.
+    """
+    tables = _tables(warehouse)
 
-    def has(self, digest: str) -> bool:
-        return digest in self._digests
+    def commit(name: TableName) -> frozenset[str]:
+        nonlocal written
+        snapshot = tables[name].snapshot()
+        # Asked after the snapshot: who forgets a car from now on makes this commit a conflict.
+        audit = Audit(warehouse.root)
+        landed = snapshot.landed_among(len(written.parts[name].units))
+        while audit.begun() != written.forgotten or any(
+            landed(unit.name) for unit in written.parts[name].units
+        ):
+            for other, table in tables.items():
+                table.discard(written.parts[other].files)
+            written = write()
+            snapshot = tables[name].snapshot()
+            landed = snapshot.landed_among(len(written.parts[name].units))
+        part = written.parts[name]
+        if part.files:
+            snapshot.commit(Change(add=part.files, units=part.units, note=note))
+        return frozenset(unit.name for unit in part.units) if part.files else frozenset()
 
-    def add(self, digest: str, rest: Rows, files: tuple[AddAction, ...]) -> None:
-        if rest:
-            self._rest[digest] = rest
-            self._number_of_rows += sum(one.num_rows for one in rest)
-        if rest or files:
-            self._digests.append(digest)
-        self._files += files
-        if self._number_of_rows >= FILE_ROWS:
-            self.write_rest()
+    retry_conflicts(lambda: commit("quarantine"))
+    new = retry_conflicts(lambda: commit("logs"))
+    return written, new
 
-    def finish(self) -> Part:
-        units = tuple(map(unit_of, sorted(self._digests)))
-        return Part(units, (*self._files, *self._together.files()))
 
-    def write_rest(self) -> None:
-        """Write the rows of files in the order of their digests: so drives are in that of names."""
-        if not self._rest:
-            return
-        digests = sorted(self._rest)
-        rows: Any = [one for digest in digests for one in self._rest[digest]]
-        name = f"measured-{_digest(digests)[:24]}"
-        self._together.write(name, partial(as_table, rows, self._mapping))
-        self._rest, self._number_of_rows = {}, 0
+def _tables(warehouse: Warehouse) -> dict[TableName, Table]:
+    return {"quarantine": warehouse.quarantine, "logs": warehouse.logs}
 
 
 def _require_not_grown(
@@ -196,67 +153,3 @@ def _require_not_grown(
         f"twice. Forget the old ones, {mapping.name}-{earlier[:12]}-1 and those that follow, with "
         "fleet-slip forget --drive; or give the changed file another name."
     )
-
-
-def _outcome(file: Log, stream: MeasuredStream, written: WrittenFile, *, new: bool) -> FileOutcome:
-    counts = stream.counts()
-    outcome = FileOutcome(file, stream.digest, counts, stream.look_alikes())
-    if not new:
-        return outcome
-    return replace(
-        outcome,
-        vehicles=frozenset(written.vehicles),
-        left_out=len(written.left_out),
-        suspicions=stream.suspicions(),
-        counts=replace(counts, drives=counts.drives - len(written.left_out), ticks=written.ticks),
-    )
-
-
-def _digest(digests: list[str]) -> str:
-    return digests[0] if len(digests) == 1 else sha256("".join(digests).encode()).hexdigest()
-
-
-class Landing:
-    """Commits what was written of a batch, without what was forgotten until then."""
-
-    def __init__(
-        self,
-        warehouse: Warehouse,
-        write: Callable[[], WrittenBatch],
-        written: WrittenBatch,
-        note: dict[str, str],
-    ) -> None:
-        """Take what was written, what writes it again, and what the commit notes."""
-        self._warehouse, self._write, self._note = warehouse, write, note
-        self.written = written
-
-    def commit(self, name: TableName) -> frozenset[str]:
-        """Commit a table's files as one; return the units that landed now."""
-        return retry_conflicts(lambda: self._attempt(name))
-
-    def _attempt(self, name: TableName) -> frozenset[str]:
-        table = self._table(name)
-        snapshot = table.snapshot()
-        # Asked after the snapshot: who forgets a car from now on makes this commit a conflict.
-        audit = Audit(self._warehouse.root)
-        while audit.begun() != self.written.forgotten or self._has_landed(snapshot, name):
-            self._warehouse.quarantine.discard(self.written.quarantine.files)
-            self._warehouse.logs.discard(self.written.logs.files)
-            self.written = self._write()
-            snapshot = table.snapshot()
-        part = self._part(name)
-        if not part.files:
-            return frozenset()
-        snapshot.commit(Change(add=part.files, units=part.units, note=self._note))
-        return frozenset(unit.name for unit in part.units)
-
-    def _has_landed(self, snapshot: Snapshot, name: TableName) -> bool:
-        units = self._part(name).units
-        landed = snapshot.landed_among(len(units))
-        return any(landed(unit.name) for unit in units)
-
-    def _table(self, name: TableName) -> Table:
-        return self._warehouse.logs if name == "logs" else self._warehouse.quarantine
-
-    def _part(self, name: TableName) -> Part:
-        return self.written.logs if name == "logs" else self.written.quarantine

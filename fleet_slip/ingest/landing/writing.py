@@ -1,82 +1,161 @@
-"""Writes what a measured file becomes to data files of bounded size. Nothing is committed."""
+"""Reads a measured file piece by piece, and passes on what may land to data files."""
 
 import os
-from collections.abc import Callable, Collection, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
-from functools import partial
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from itertools import count
 from tempfile import TemporaryFile
-from typing import IO, Any, Literal, TypeAlias
+from typing import IO, Self
 
 import polars as pl
 import pyarrow as pa
-import pyarrow.compute as pc
-from deltalake.transaction import AddAction
 
-from fleet_slip.delta import Table
-from fleet_slip.ingest.drives.measured_drives import MeasuredDrive, log_table
+from fleet_slip.ingest.drafting.suspicion import Suspicion
+from fleet_slip.ingest.drives.measured_drives import MeasuredDrive
 from fleet_slip.ingest.drives.stream import MeasuredStream
+from fleet_slip.ingest.drives.totals import IngestCounts
+from fleet_slip.ingest.landing import data_files
+from fleet_slip.ingest.landing.data_files import DataFiles, Rows, TableName, Writing
 from fleet_slip.ingest.landing.expected_rows import expected_rows
 from fleet_slip.ingest.landing.forgotten import keep_drives, keep_refused
-from fleet_slip.ingest.mapping.mapping import Mapping
+from fleet_slip.ingest.landing.log_files import Log
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.audit import Audit
-from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA, Warehouse
-
-FILE_ROWS = 2**18
-"""A data file is written as soon as it has so many rows; its last drive may make it larger."""
-
-WRITERS = 2
-"""Data files that are written at once: encoding them is the longest part of an ingest."""
-
-TableName: TypeAlias = Literal["quarantine", "logs"]
-Rows: TypeAlias = Sequence[MeasuredDrive] | Sequence[pa.Table]
-"""Drives for the logs, or refused rows for the quarantine."""
+from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA
 
 
-class DataFiles:
-    """Rows of one table on their way to data files, one file a day, written by threads."""
+@dataclass(frozen=True)
+class FileOutcome:
+    """What one file became: its drives, those left out as forgotten, and whether it had landed."""
 
-    def __init__(self, table: Table, threads: ThreadPoolExecutor, *, by_day: bool) -> None:
-        """Take the table and the threads that write."""
-        self._table, self._threads, self._by_day = table, threads, by_day
-        self._written: list[Future[list[AddAction]]] = []
+    file: Log
+    digest: str
+    counts: IngestCounts
+    look_alikes: tuple[tuple[str, ...], ...]
+    vehicles: frozenset[str] = frozenset()
+    left_out: int = 0
+    suspicions: tuple[Suspicion, ...] = ()
 
-    def write(self, name: str, rows: Callable[[], pa.Table]) -> None:
-        """Write rows, made when it is their turn, while the caller goes on.
 
-        At most `WRITERS` files of a table are on their way.
+class FileWriter:
+    """Writes one measured file, those tables of it that have not landed.
+
+    When it is left, what it wrote is to land with its batch; after an error nothing of it is there.
+
+    Attributes:
+        is_new: whether its drives have not landed.
+        longest: the drive with the most ticks, if there is one.
+    """
+
+    def __init__(
+        self,
+        tables: Mapping[TableName, DataFiles],
+        audit: Audit,
+        progress: Progress = no_progress,
+    ) -> None:
+        """Take the data files of its batch, and what was forgotten.
+
+        `progress` counts rows of the file, if it is known about how many it has.
         """
-        if len(self._written) >= WRITERS:
-            self._written[-WRITERS].result()
-        self._written.append(self._threads.submit(self._write, name, rows))
+        self._tables, self._audit, self._progress = tables, audit, progress
+        self._begun: dict[TableName, list[Writing]] = {name: [] for name in tables}
+        self._rest: dict[TableName, Rows] = {}
+        self._names = count(1)
+        self._ticks = 0
+        self._vehicles: set[str] = set()
+        self._left_out: set[str] = set()
+        self.is_new = False
+        self.longest: MeasuredDrive | None = None
 
-    def files(self) -> tuple[AddAction, ...]:
-        """Return the files, all written."""
-        return tuple(file for future in self._written for file in future.result())
+    def __enter__(self) -> Self:
+        """Return it."""
+        return self
 
-    def discard(self) -> None:
-        """Delete all that was written."""
-        written = [future for future in self._written if future.exception() is None]
-        self._table.discard(file for future in written for file in future.result())
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Pass on what was written, or delete it."""
+        for name, files in self._tables.items():
+            if kind is None:
+                files.take(self._stream.digest, self._begun[name], self._rest.get(name, ()))
+            else:
+                files.discard(self._begun[name])
 
-    def _write(self, name: str, make: Callable[[], pa.Table]) -> list[AddAction]:
-        rows = make()
-        parts = _by_day(rows) if self._by_day else {None: rows}
-        encoded = {day: self._table.encode(part) for day, part in parts.items()}
-        del rows, parts  # a disk may take its time
-        return [self._table.put(name, content, day) for day, content in encoded.items()]
+    def outcome(self, file: Log) -> FileOutcome:
+        """Return what the file became, by the name that a person knows it by."""
+        counts = self._stream.counts()
+        outcome = FileOutcome(file, self._stream.digest, counts, self._stream.look_alikes())
+        if not self.is_new:
+            return outcome
+        drives = counts.drives - len(self._left_out)
+        return replace(
+            outcome,
+            counts=replace(counts, drives=drives, ticks=self._ticks),
+            vehicles=frozenset(self._vehicles),
+            left_out=len(self._left_out),
+            suspicions=self._stream.suspicions(),
+        )
+
+    def read(self, stream: MeasuredStream) -> None:
+        """Read an open file, and write all but its last rows. Raises `InputError`."""
+        self._stream, digest = stream, stream.digest
+        self.is_new = self._tables["logs"].lacks(digest)
+        self._lacking = {
+            n for n, files in self._tables.items() if self.is_new and files.lacks(digest)
+        }
+        refused = _RefusedRows(self._stream)
+        waiting: list[MeasuredDrive] = []
+        told = self._progress is not no_progress
+        expected, read = expected_rows(self._stream.file) if told else 0, 0
+        for piece in self._stream.pieces():
+            rows = self._stream.checker.rows
+            if expected:
+                self._progress(rows - read, max(expected, rows))
+            read = rows
+            refused.add(piece.refused)
+            for drive in piece.drives:
+                waiting.append(drive)
+                if self.longest is None or drive.ticks.size > self.longest.ticks.size:
+                    self.longest = drive
+                if sum(one.ticks.size for one in waiting) >= data_files.FILE_ROWS:
+                    self._pass_on_drives(waiting, last=False)
+                    waiting = []
+        self._pass_on_drives(waiting, last=True)
+        tables = refused.tables()
+        table = next(tables, None)
+        while table is not None:
+            kept, vehicles = keep_refused(table, self._audit, self._left_out)
+            self._vehicles |= vehicles
+            table = next(tables, None)
+            if kept.num_rows:
+                self._pass_on("quarantine", [kept], last=table is None)
+
+    def _pass_on_drives(self, drives: list[MeasuredDrive], *, last: bool) -> None:
+        """Pass on the rows of drives that may land."""
+        if not drives:
+            return
+        kept = keep_drives(sorted(drives, key=lambda drive: drive.drive_id), self._audit)
+        self._vehicles |= kept.vehicles
+        self._left_out |= kept.left_out
+        self._ticks += sum(drive.ticks.size for drive in kept.drives)
+        if kept.drives:
+            self._pass_on("logs", kept.drives, last=last)
+
+    def _pass_on(self, name: TableName, rows: Rows, *, last: bool) -> None:
+        if name not in self._lacking:
+            return
+        if last:
+            self._rest[name] = rows
+        else:
+            file = f"measured-{self._stream.digest[:24]}-{next(self._names)}"
+            self._begun[name].append(self._tables[name].write(file, rows))
 
 
-class RefusedRows:
+class _RefusedRows:
     """Rows for the quarantine until the end of their file; of many, most are in a temporary file.
 
     Only then is it known whether a drive that they are of was forgotten.
     """
 
     def __init__(self, stream: MeasuredStream) -> None:
-        """Take the file that the rows are of."""
         self._stream = stream
         self._rows: list[pl.DataFrame] = []
         self._number = 0
@@ -88,7 +167,7 @@ class RefusedRows:
             return
         self._rows.append(rows)
         self._number += rows.height
-        if self._number >= FILE_ROWS:
+        if self._number >= data_files.FILE_ROWS:
             self._spilled = self._spilled or TemporaryFile()  # noqa: SIM115 - closed with this
             with pa.ipc.new_stream(self._spilled, QUARANTINE_SCHEMA) as sink:
                 sink.write_table(self._stream.quarantine_table(self._rows))
@@ -104,125 +183,3 @@ class RefusedRows:
                     yield pa.ipc.open_stream(file).read_all()
         if self._number:
             yield self._stream.quarantine_table(self._rows)
-
-
-@dataclass
-class WrittenFile:
-    """What a measured file became.
-
-    Attributes:
-        rest: rows that wait for those of other files: those of a small file, or the last.
-        vehicles: whose rows they are.
-        left_out: drives that were forgotten.
-        longest: the drive with the most ticks.
-    """
-
-    rest: dict[TableName, Rows] = field(default_factory=dict)
-    files: dict[TableName, tuple[AddAction, ...]] = field(default_factory=dict)
-    vehicles: set[str] = field(default_factory=set)
-    left_out: set[str] = field(default_factory=set)
-    ticks: int = 0
-    longest: MeasuredDrive | None = None
-
-
-class FileWriter:
-    """Writes one measured file, those tables of it that have not landed."""
-
-    def __init__(
-        self,
-        warehouse: Warehouse,
-        stream: MeasuredStream,
-        missing: Collection[TableName],
-        threads: ThreadPoolExecutor,
-        progress: Progress = no_progress,
-    ) -> None:
-        """Take an open file, the tables that miss it, and the threads that write.
-
-        `progress` counts rows of the file, if it is known about how many it has.
-        """
-        self._progress = progress
-        self._stream, self._missing = stream, missing
-        self._audit = Audit(warehouse.root)
-        self._large: dict[TableName, DataFiles] = {
-            "quarantine": DataFiles(warehouse.quarantine, threads, by_day=False),
-            "logs": DataFiles(warehouse.logs, threads, by_day=True),
-        }
-        self._names = count(1)
-        self._result = WrittenFile()
-
-    def write(self) -> WrittenFile:
-        """Read the file, and write all but its last rows. Raises `InputError`; nothing is left."""
-        try:
-            self._read()
-        except BaseException:
-            for files in self._large.values():
-                files.discard()
-            raise
-        self._result.files = {name: files.files() for name, files in self._large.items()}
-        return self._result
-
-    def _read(self) -> None:
-        refused = RefusedRows(self._stream)
-        waiting: list[MeasuredDrive] = []
-        told = self._progress is not no_progress
-        expected, read = expected_rows(self._stream.file) if told else 0, 0
-        for piece in self._stream.pieces():
-            rows = self._stream.checker.rows
-            if expected:
-                self._progress(rows - read, max(expected, rows))
-            read = rows
-            refused.add(piece.refused)
-            for drive in piece.drives:
-                waiting.append(drive)
-                longest = self._result.longest
-                if longest is None or drive.ticks.size > longest.ticks.size:
-                    self._result.longest = drive
-                if sum(one.ticks.size for one in waiting) >= FILE_ROWS:
-                    self._pass_on_drives(waiting, last=False)
-                    waiting = []
-        self._pass_on_drives(waiting, last=True)
-        tables = refused.tables()
-        table = next(tables, None)
-        while table is not None:
-            kept, vehicles = keep_refused(table, self._audit, self._result.left_out)
-            self._result.vehicles |= vehicles
-            table = next(tables, None)
-            if kept.num_rows:
-                self._pass_on("quarantine", [kept], last=table is None)
-
-    def _pass_on_drives(self, drives: list[MeasuredDrive], *, last: bool) -> None:
-        """Pass on the rows of drives that may land."""
-        if not drives:
-            return
-        kept = keep_drives(sorted(drives, key=lambda drive: drive.drive_id), self._audit)
-        self._result.vehicles |= kept.vehicles
-        self._result.left_out |= kept.left_out
-        self._result.ticks += sum(drive.ticks.size for drive in kept.drives)
-        if kept.drives:
-            self._pass_on("logs", kept.drives, last=last)
-
-    def _pass_on(self, name: TableName, rows: Rows, *, last: bool) -> None:
-        if name not in self._missing:
-            return
-        if last:
-            self._result.rest[name] = rows
-        else:
-            self._large[name].write(
-                f"measured-{self._stream.digest[:24]}-{next(self._names)}",
-                partial(as_table, rows, self._stream.mapping),
-            )
-
-
-def as_table(rows: Rows, mapping: Mapping) -> pa.Table:
-    """Return rows in one table."""
-    tables = [one for one in rows if isinstance(one, pa.Table)]
-    if tables:
-        return pa.concat_tables(tables).unify_dictionaries()
-    return log_table([one for one in rows if isinstance(one, MeasuredDrive)], mapping)
-
-
-def _by_day(rows: pa.Table) -> dict[Any, pa.Table]:
-    days = rows["day"].unique().to_pylist()
-    if len(days) == 1:
-        return {days[0]: rows}
-    return {day: rows.filter(pc.equal(rows["day"], pa.scalar(day, pa.date32()))) for day in days}
