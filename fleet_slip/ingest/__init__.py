@@ -2,12 +2,9 @@
 
 from fleet_slip.ingest.drives.totals import IngestCounts
 from fleet_slip.ingest.mapping.mapping import Mapping, load_mapping
-from fleet_slip.ingest.measured import MeasuredLog, read_measured
 
 __all__ = [
     "IngestCounts",
     "Mapping",
-    "MeasuredLog",
     "load_mapping",
-    "read_measured",
 ]

@@ -11,12 +11,18 @@ import pytest
 from asammdf import MDF, Signal
 
 from fleet_slip.errors import InputError, UsageError
-from fleet_slip.ingest import read_measured
 from fleet_slip.ingest.drafting.preview import preview_log
 from fleet_slip.ingest.drives import stream
 from fleet_slip.ingest.formats.reading import log_digest
 from tests.ingest.test_formats import AX, BETA_DEG, START, TIME_S, mdf_mapping, require_the_drive
-from tests.support.measured import a_mapping, csv_text, good_columns, read_columns, ticks
+from tests.support.measured import (
+    a_mapping,
+    csv_text,
+    good_columns,
+    read_columns,
+    read_measured,
+    ticks,
+)
 from tests.support.reported import call
 
 MAPPING = """name = "test"

@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet_slip.errors import ConfigError, InputError
-from fleet_slip.ingest import MeasuredLog, load_mapping, read_measured
+from fleet_slip.ingest import load_mapping
 from fleet_slip.ingest.formats import can_frames
 from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.can_bus import CanBus, read_can_database
@@ -27,7 +27,7 @@ from fleet_slip.ingest.formats.can_frames import CanFrames
 from fleet_slip.ingest.formats.can_trace import open_can_trace
 from fleet_slip.ingest.formats.spool import Spool
 from tests.support.logs import without_names
-from tests.support.measured import ticks
+from tests.support.measured import MeasuredLog, read_measured, ticks
 
 START_S = datetime(2024, 5, 31, 12, tzinfo=UTC).timestamp()
 TIME_S = np.arange(50) / 100

@@ -8,11 +8,10 @@ import pyarrow as pa
 import pytest
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import read_measured
 from fleet_slip.ingest.formats import budget
 from fleet_slip.ingest.formats.csv_batches import BLOCK_BYTES
 from tests.support.logs import without_names
-from tests.support.measured import a_mapping, csv_text, good_columns, read_text
+from tests.support.measured import a_mapping, csv_text, good_columns, read_measured, read_text
 
 TEXT = csv_text(good_columns(200)).encode()
 

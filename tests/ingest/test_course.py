@@ -10,9 +10,8 @@ import pytest
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from fleet_slip.ingest import MeasuredLog
 from fleet_slip.ingest.drafting.suspicion import find_suspicions
-from tests.support.measured import a_mapping, physical, read_columns
+from tests.support.measured import MeasuredLog, a_mapping, physical, read_columns
 from tests.support.reported import call
 
 ROWS = 3000

@@ -11,9 +11,10 @@ import pytest
 from asammdf import MDF, Signal
 
 from fleet_slip.errors import InputError, UsageError
-from fleet_slip.ingest import load_mapping, read_measured
+from fleet_slip.ingest import load_mapping
 from fleet_slip.ingest.drafting.guessing import parts_of
 from fleet_slip.ingest.drafting.suspicion import RADIUS_M, WHEELS
+from tests.support.measured import read_measured
 from tests.support.reported import call
 from tests.support.suggested import LOGS, wrong_guesses
 from tests.support.suggested import suggest as suggest_of

@@ -5,9 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleet_slip.ingest import read_measured
 from tests.support.fuzz.logs import AX, FORMATS, ROWS, sound_file
-from tests.support.measured import physical, ticks
+from tests.support.measured import physical, read_measured, ticks
 
 
 @pytest.mark.parametrize("name", FORMATS)

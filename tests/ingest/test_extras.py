@@ -11,14 +11,13 @@ from fleet_slip.catalogue.signals import CATALOGUE_VARIABLE, catalogue
 from fleet_slip.errors import RefusedError
 from fleet_slip.grams.rows.aggregation import by_sql
 from fleet_slip.grams.rows.gram_job import update_grams
-from fleet_slip.ingest.landing.ingest_job import ingest_file
 from fleet_slip.maintenance.compaction import compact
 from fleet_slip.maintenance.migration import migrate
 from fleet_slip.maintenance.verify import verify
 from fleet_slip.resources import CONFIG_VARIABLE, folder
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
-from tests.support.measured import a_mapping, csv_text, physical, read_columns, ticks
+from tests.support.measured import a_mapping, csv_text, ingest_file, physical, read_columns, ticks
 
 ROWS = 300
 PLAIN = {"ax": {"column": "ax", "unit": "m/s^2"}, "sideslip": {"column": "beta", "unit": "deg"}}

@@ -19,12 +19,12 @@ import scipy.sparse
 from asammdf import MDF, Signal
 
 from fleet_slip.errors import ExtraError, InputError
-from fleet_slip.ingest import Mapping, MeasuredLog, read_measured
+from fleet_slip.ingest import Mapping
 from fleet_slip.ingest.drafting.preview import preview_log
 from fleet_slip.ingest.formats import budget, matlab, mdf
 from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.source import reading_with
-from tests.support.measured import a_mapping, ticks
+from tests.support.measured import MeasuredLog, a_mapping, read_measured, ticks
 
 START = datetime(2024, 5, 31, 12, tzinfo=UTC)
 TIME_S = np.arange(100) / 100

@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import FleetSlipError
-from fleet_slip.ingest import MeasuredLog, read_measured
 from tests.support.logs import schema_without
-from tests.support.measured import a_mapping, csv_text, good_columns
+from tests.support.measured import MeasuredLog, a_mapping, csv_text, good_columns, read_measured
 
 CASES = settings(
     max_examples=100,

@@ -18,7 +18,6 @@ INGEST = """
 import sys
 from pathlib import Path
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.ingest.landing.ingest_job import ingest_file
 from fleet_slip.ingest.mapping.mapping import Mapping
 from fleet_slip.warehouse.tables import Warehouse
 root, log, mapping = sys.argv[1:]

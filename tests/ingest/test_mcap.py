@@ -12,12 +12,12 @@ from mcap.writer import Writer as PlainWriter
 from mcap_ros2.writer import Writer
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import Mapping, read_measured
+from fleet_slip.ingest import Mapping
 from fleet_slip.ingest.formats import mcap_log, mcap_messages
 from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.source import OWN_TIME
 from tests.ingest.test_formats import AX, AX_COUNTS, BETA_DEG, START, TIME_S, require_the_drive
-from tests.support.measured import a_mapping
+from tests.support.measured import a_mapping, read_measured
 from tests.support.reported import call
 from tests.support.ros2 import HEADER
 

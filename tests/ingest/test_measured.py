@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import load_mapping, read_measured
+from fleet_slip.ingest import load_mapping
 from fleet_slip.ingest.drives import checking, stream
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA
 from tests.support.logs import schema_without, without_names
@@ -23,6 +23,7 @@ from tests.support.measured import (
     good_columns,
     physical,
     read_columns,
+    read_measured,
     read_text,
     reasons,
     ticks,

@@ -12,13 +12,12 @@ from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.ingest import load_mapping
-from fleet_slip.ingest.landing.ingest_job import ingest_file
 from fleet_slip.regression.exact.least_squares import fit
 from fleet_slip.regression.inference.standard_errors import infer_classically
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand
-from tests.support.measured import csv_text
+from tests.support.measured import csv_text, ingest_file
 from tests.support.reported import call
 
 COEFFICIENTS = {"ax": 2e-4, "ay": -3e-3, "yaw_rate": 0.08, "steer_fl": 0.15, "steer_fr": 0.1}

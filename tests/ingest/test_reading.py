@@ -10,13 +10,20 @@ import pytest
 
 from fleet_slip.catalogue.counts import as_arrow
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import read_measured
 from fleet_slip.ingest.drives import checking, log_rows
 from fleet_slip.ingest.formats import csv_batches
 from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.parquet_batches import open_parquet
 from tests.support.logs import without_names
-from tests.support.measured import a_mapping, csv_text, good_columns, read_text, reasons, ticks
+from tests.support.measured import (
+    a_mapping,
+    csv_text,
+    good_columns,
+    read_measured,
+    read_text,
+    reasons,
+    ticks,
+)
 
 GOOD = csv_text(good_columns())
 

@@ -10,8 +10,7 @@ import pytest
 from pydantic import ValidationError
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import read_measured
-from tests.support.measured import a_mapping, good_columns, read_columns, ticks
+from tests.support.measured import a_mapping, good_columns, read_columns, read_measured, ticks
 
 
 def columns() -> dict[str, Any]:

@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 
 from fleet_slip.errors import InputError
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.ingest import read_measured
 from fleet_slip.ingest.drives import drive_cutter, open_drives, stream
 from fleet_slip.ingest.drives import read_ahead as read_ahead_module
 from fleet_slip.ingest.drives.drive_cutter import DriveCutter
@@ -24,9 +23,16 @@ from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.csv_batches import PlainNumbers, open_csv
 from fleet_slip.ingest.formats.csv_format import CsvFormat
 from fleet_slip.ingest.landing import data_files, landing
-from fleet_slip.ingest.landing.ingest_job import ingest_file
 from fleet_slip.warehouse.tables import Warehouse
-from tests.support.measured import a_mapping, csv_text, good_columns, read_columns, ticks
+from tests.support.measured import (
+    a_mapping,
+    csv_text,
+    good_columns,
+    ingest_file,
+    read_columns,
+    read_measured,
+    ticks,
+)
 
 times = st.lists(
     st.tuples(

@@ -21,7 +21,6 @@ from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.grams.rows import gram_job
 from fleet_slip.grams.rows.aggregation import compute_grams
 from fleet_slip.grams.rows.gram_job import update_grams
-from fleet_slip.ingest.landing.ingest_job import ingest_file
 from fleet_slip.maintenance.compaction import compact
 from fleet_slip.maintenance.find_drives import Located, drives_by_file, locate
 from fleet_slip.maintenance.forget import forget
@@ -32,7 +31,7 @@ from fleet_slip.warehouse.audit import Audit, Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand
 from tests.support.logs import land, log_rows, random_counts
-from tests.support.measured import a_mapping, csv_text, good_columns
+from tests.support.measured import a_mapping, csv_text, good_columns, ingest_file
 
 CARS = ("alfa", "beta", "gamma")
 

@@ -11,11 +11,10 @@ import pytest
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.ingest import Mapping
 from fleet_slip.ingest.landing import ingest_job, landing
-from fleet_slip.ingest.landing.ingest_job import ingest_file
 from fleet_slip.maintenance.forget import forget
 from fleet_slip.warehouse.audit import Audit, Forgettable
 from fleet_slip.warehouse.tables import Warehouse
-from tests.support.measured import SIGNALS, a_mapping, csv_text
+from tests.support.measured import SIGNALS, a_mapping, csv_text, ingest_file
 
 ROWS = 3000
 

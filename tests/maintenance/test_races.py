@@ -18,7 +18,6 @@ from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.grams.rows import gram_job
 from fleet_slip.grams.rows.gram_job import update_grams
-from fleet_slip.ingest.landing.ingest_job import ingest_file
 from fleet_slip.maintenance import compaction
 from fleet_slip.maintenance.compaction import compact
 from fleet_slip.maintenance.forget import forget
@@ -38,7 +37,7 @@ from fleet_slip.warehouse.tables import Warehouse
 from tests.maintenance.test_forget import CARS, drive, fill, mentions
 from tests.support.commands import RunCommand, run
 from tests.support.logs import land, path_of
-from tests.support.measured import a_mapping, csv_text, good_columns
+from tests.support.measured import a_mapping, csv_text, good_columns, ingest_file
 
 BETA = Forgettable("vehicle", "beta")
 

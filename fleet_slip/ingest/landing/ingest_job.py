@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any, TypeAlias
 
 from fleet_slip.compute.tasks import run_tasks
@@ -62,16 +61,6 @@ class IngestReport:
             "look_alikes": self.look_alikes,
             "suspicions": [vars(one) for one in self.suspicions],
         }
-
-
-def ingest_file(warehouse: Warehouse, file: Path, mapping: Mapping) -> IngestReport:
-    """Read a measured log and commit its drives, and its quarantined rows before them.
-
-    Raises `InputError` or `ConfigError` for a file or mapping that is not usable; then nothing is
-    written.
-    """
-    (report,) = ingest_files(warehouse, [file], mapping)
-    return report
 
 
 def ingest_files(

@@ -30,7 +30,6 @@ from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.cohorts.folding import FoldKey
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.grams.rows.gram_job import update_grams
-from fleet_slip.ingest.landing.ingest_job import ingest_file
 from fleet_slip.ingest.mapping.mapping import Mapping, load_mapping
 from fleet_slip.maintenance.retention import load_retention
 from fleet_slip.models.manifest import require_model_name
@@ -50,6 +49,7 @@ from fleet_slip.warehouse.tables import Warehouse
 from tests.support.fuzz.files import MAPPINGS, csv_file, parquet_file
 from tests.support.fuzz.logs import damaged_file
 from tests.support.fuzz.mutate import WORDS, mutate_bytes, mutate_tree, to_json, to_toml
+from tests.support.measured import ingest_file
 
 Target = Callable[[random.Random, Path], None]
 """Takes the source of all choices, and an empty folder: all that may be written is below it."""
