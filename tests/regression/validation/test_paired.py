@@ -60,11 +60,11 @@ def test_rows_of_a_group_are_not_taken_for_independent() -> None:
 def test_the_error_in_the_median_group_is_the_spread_of_many_repetitions() -> None:
     rng = np.random.default_rng(5)
     made = []
-    for _ in range(200):
-        groups = draw(rng, 40)
+    for _ in range(80):
+        groups = draw(rng, 20)
         made.append(compare_typical(predict((2, 0), groups), predict((2, 1), groups), Worth(0.0)))
     spread = np.std([one.rmse for one in made])
-    assert np.mean([one.standard_error for one in made]) == pytest.approx(spread, rel=0.2)
+    assert np.mean([one.standard_error for one in made]) == pytest.approx(spread, rel=0.25)
 
 
 def test_groups_that_lie_do_not_decide_whatever_their_rows() -> None:
