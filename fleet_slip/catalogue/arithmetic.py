@@ -57,6 +57,16 @@ class Arithmetic:
         """Whether it needs int64: not every integer in it is below 2^53, as binary64 has them."""
         return self.largest >= _EXACT
 
+    def is_positive(self, number: int) -> bool:
+        """Whether a step is above zero wherever the expression has a value."""
+        step = self.steps[number]
+        if step.function in ("+", "*"):
+            return all(map(self.is_positive, step.operands)) or self._guards(number)
+        return (not step.function and step.value > 0) or self._guards(number)
+
+    def _guards(self, number: int) -> bool:
+        return number == self.guard and self.at_least > 0
+
 
 @cache
 def parse(sql: str) -> Arithmetic:

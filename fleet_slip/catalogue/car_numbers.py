@@ -1,7 +1,7 @@
 """What a car's own drives tell of it without a label: its numbers, by name.
 
 Each is a physical value; models and boards use it as an integer count of its grain, rounded to the
-nearest, halves away from zero, and clipped to 16 bits.
+nearest, halves away from zero. A number that 16 bits cannot count is not known.
 """
 
 import math
@@ -42,10 +42,12 @@ class CarNumber(Config):
         return None if value is None else round_number(value, Fraction(self.grain))
 
 
-def round_number(value: Fraction, grain: Fraction) -> int:
-    """Return a value in counts: rounded to the nearest, halves away from zero, and clipped."""
+def round_number(value: Fraction, grain: Fraction) -> int | None:
+    """Return a value in counts, to the nearest, halves away from zero; None beyond 16 bits."""
     size = math.floor(abs(value) / grain + Fraction(1, 2))
-    return min(size, COUNT_MAX) * (-1 if value < 0 else 1)
+    if size > COUNT_MAX:
+        return None
+    return -size if value < 0 else size
 
 
 CAR_NUMBERS: dict[NumberName, CarNumber] = {

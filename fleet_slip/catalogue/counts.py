@@ -8,10 +8,20 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.catalogue.signals import Signal
+from fleet_slip.catalogue.signals import COUNT_MAX, Signal
 
 BLOCK = 2**14
 """Values that are rounded at once: what is made on the way stays in the processor's cache."""
+
+
+def valid_values(values: FloatArray, signal: Signal) -> FloatArray:
+    """Return values in SI units, NaN where the count is beyond the signal's valid range.
+
+    -32768 is beyond it: on board, that count is a missing one.
+    """
+    counts = np.rint(values / float(signal.scale))
+    beyond = (counts < max(signal.min_count, -COUNT_MAX)) | (counts > signal.max_count)
+    return np.where(beyond, np.nan, values) if beyond.any() else values
 
 
 def round_to_counts(values: FloatArray, signal: Signal) -> pa.Array:

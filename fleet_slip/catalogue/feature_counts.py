@@ -6,7 +6,6 @@ import numpy as np
 
 from fleet_slip.arrays import BoolArray, IntArray
 from fleet_slip.catalogue.arithmetic import Arithmetic
-from fleet_slip.errors import DataError
 
 
 def feature_counts(
@@ -15,9 +14,9 @@ def feature_counts(
     """Return the counts of a feature, clipped to ±limit, and where it has a value, (rows,) each.
 
     `counts` are int64 and have the signals in it; `present` is where none of them is missing. There
-    is no value below the guard. Raises `DataError` where a row with a value divides by zero.
+    is no value below the guard, nor where the divisor is not positive.
     """
-    there, divides = present.copy(), np.ones_like(present)
+    there = present.copy()
     found: list[IntArray] = []
     for number, step in enumerate(arithmetic.steps):
         if step.name:
@@ -27,19 +26,17 @@ def feature_counts(
         else:
             operands = [found[i] for i in step.operands]
             if step.function == "//":
-                divides &= operands[1] != 0
+                there &= operands[1] > 0
             found.append(_OPERATIONS[step.function](*operands))
         if number == arithmetic.guard:
             there &= found[-1] >= arithmetic.at_least
-    if (there & ~divides).any():
-        raise DataError("a feature divides by zero.")
     return np.broadcast_to(np.clip(found[-1], -limit, limit), present.shape), there
 
 
 def _divided(a: IntArray, b: IntArray) -> IntArray:
-    """Return a / b truncated towards zero; anything where b is 0."""
-    size = np.abs(a) // np.maximum(np.abs(b), 1)
-    return np.where((a < 0) == (b < 0), size, -size)
+    """Return a / b truncated towards zero; anything where b is not positive."""
+    size = np.abs(a) // np.maximum(b, 1)
+    return np.where(a < 0, -size, size)
 
 
 _OPERATIONS: Mapping[str, Callable[..., IntArray]] = {

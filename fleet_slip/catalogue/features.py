@@ -14,7 +14,6 @@ from typing import TypeVar
 from pydantic import Field, ValidationError, model_validator
 
 from fleet_slip.canonical import canonical_json, sha256_of
-from fleet_slip.catalogue.column_sql import with_features, with_windows
 from fleet_slip.catalogue.columns import COUNT_BITS, Definition
 from fleet_slip.catalogue.course_change import TURNED, course_units
 from fleet_slip.catalogue.feature_sets import PLAIN, FeatureSet, Regime
@@ -275,28 +274,6 @@ def features() -> FeatureCatalogue:
     if str(chosen) == str(shipped):
         return load_features(shipped)
     return load_features_over(shipped, chosen)
-
-
-def column_query(known: FeatureCatalogue, name: str) -> str:
-    """Return the query over the view `log_counts` that computes a feature or column over time.
-
-    Raises `QuestionError` for what is neither.
-    """
-    definition = known.definition(name)
-    if definition is not None and definition.number is not None:
-        raise QuestionError(
-            f"{name} is {known.calibrated[name].of} times {definition.number.name} of each car, in "
-            "counts: see fleet-slip features --sql of the one, and the view calibration."
-        )
-    if definition is not None:
-        rows = with_windows("log_counts", {}, {name: definition})
-    elif name in known.features:
-        rows = with_features("log_counts", {name: known.features[name].sql})
-    else:
-        raise QuestionError(
-            f"no feature, window or factor is called {name!r}. See: fleet-slip features"
-        )
-    return f"SELECT drive_id, tick, {name}\nFROM {rows}\nORDER BY drive_id, tick"
 
 
 @cache

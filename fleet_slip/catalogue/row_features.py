@@ -6,10 +6,12 @@ from functools import cached_property
 
 from pydantic import Field, model_validator
 
+from fleet_slip.catalogue.arithmetic import parse
 from fleet_slip.catalogue.columns import COUNT_BITS, Bits, limit_of
-from fleet_slip.catalogue.feature_sql import integer_sql, names_in
+from fleet_slip.catalogue.feature_sql import integer_sql, names_in, require_integer_sql
 from fleet_slip.catalogue.signals import Identifier, SIUnit, catalogue
 from fleet_slip.config import Config
+from fleet_slip.errors import QuestionError
 
 
 class Feature(Config):
@@ -31,7 +33,13 @@ class Feature(Config):
             raise ValueError("at_least is for a divisor that varies, which must have it")
         if self._divisor_is_number and int(self.divided_by or 0) == 0:
             raise ValueError("divided_by is zero")
-        _ = self.sql
+        try:
+            # What a manifest takes, and every target computes: see `columns/lowering.py`.
+            arithmetic = parse(require_integer_sql(self.sql))
+        except QuestionError as error:
+            raise ValueError(str(error)) from None
+        if not arithmetic.inputs:
+            raise ValueError("it is of no signal")
         return self
 
     @cached_property

@@ -162,10 +162,10 @@ class Lowering:
 
     def _gated(self, ungated: Definition, gate: Gate) -> int:
         of, by = self.column(ungated), self.column(gate.by)
-        times = self.do("*", of, self._weight(by, gate))
+        times = self.do("*", of, self.weight(by, gate))
         return self.nearest(times, 1, self.constant(WEIGHT))
 
-    def _weight(self, by: int, gate: Gate) -> int:
+    def weight(self, by: int, gate: Gate) -> int:
         """Return the weight of a gate: what rises, or what falls where that is less."""
         full, none = self.constant(WEIGHT), self.constant(0)
         rises = self._ramp(by, gate.low, gate.peak)

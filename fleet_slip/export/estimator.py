@@ -92,9 +92,10 @@ def _known(manifest: Manifest, program: Program, given: Mapping[str, Any]) -> Ca
             f"{', '.join(sorted(used)) or 'nothing'}."
         )
     counts = {
-        name: round_number(_fraction(given[name]), _fraction(str(one.grain)))
+        name: count
         for name, one in numbers.items()
         if given.get(name) is not None
+        and (count := round_number(_fraction(given[name]), _fraction(str(one.grain)))) is not None
     }
     return Car({name: value for name, value in given.items() if name not in numbers}, counts)
 

@@ -48,8 +48,8 @@ def compute(  # noqa: PLR0912 - one loop for each operation
     numerator: float,
     divisor: float,
     limit: float,
-) -> Any:
-    """Do an operation that writes binary64; return whether it divides by what is not positive.
+) -> None:
+    """Do an operation that writes binary64.
 
     `places` are where what is written and read begins: out, a, b and c. The first rows of the
     memory count what is clipped.
@@ -57,7 +57,6 @@ def compute(  # noqa: PLR0912 - one loop for each operation
     at, of_a, of_b, of_c = places
     out, a = memory[at : at + size], memory[of_a : of_a + size]
     b, c = memory[of_b : of_b + size], memory[of_c : of_c + size]
-    bad = 0
     if operation == COPY:
         for i in range(size):
             out[i] = a[i]
@@ -81,11 +80,9 @@ def compute(  # noqa: PLR0912 - one loop for each operation
             out[i] = 1.0 if a[i] > 0.0 else (-1.0 if a[i] < 0.0 else a[i])
     elif operation == DIVIDE:
         for i in range(size):
-            bad += 1 if b[i] + c[i] <= 0.0 else 0
             out[i] = np.trunc(a[i] / b[i])
     elif operation == NEAREST:
         for i in range(size):
-            bad += 1 if b[i] + c[i] <= 0.0 else 0
             out[i] = nearest(a[i], 1.0, b[i])
     elif operation == FILL:
         for i in range(size):
@@ -98,13 +95,13 @@ def compute(  # noqa: PLR0912 - one loop for each operation
         for i in range(size):
             out[i] = 0.0 if a[i] >= numerator else np.nan
     elif operation == CLIP:
+        outside = 0
         for i in range(size):
-            bad += 1 if abs(a[i]) > limit else 0
+            outside += 1 if abs(a[i]) > limit else 0
             out[i] = clip(a[i], limit)
-        if bad:
+        if outside:
             for i in range(size):
                 memory[i] += 1.0 if abs(a[i]) > limit else 0.0
-        bad = 0
     elif operation == WEIGH:
         for i in range(size):
             out[i] = nearest(a[i], weight(b[i], numerator, divisor, limit), WEIGHT)
@@ -119,19 +116,17 @@ def compute(  # noqa: PLR0912 - one loop for each operation
             for i in range(size):
                 value = nearest(a[i] * factor, numerator, divisor)
                 memory[i] += 1.0 if abs(value) > limit else 0.0
-    return bad > 0
 
 
 @inner_loop
 def compute_integers(  # noqa: PLR0912 - one loop for each operation
     operation: int, memory: Any, places: Any, size: int, number: int
-) -> Any:
-    """Do an operation that writes int64; return whether it divides by what is not positive."""
+) -> None:
+    """Do an operation that writes int64."""
     at, of_a, of_b, of_c = places
     whole = memory.view(np.int64)
     out, a, b = whole[at : at + size], whole[of_a : of_a + size], whole[of_b : of_b + size]
     valid = memory[of_c : of_c + size]
-    bad = 0
     if operation == TO_INTEGERS:
         for i in range(size):
             out[i] = np.int64(valid[i] if valid[i] == valid[i] else 0.0)
@@ -159,7 +154,5 @@ def compute_integers(  # noqa: PLR0912 - one loop for each operation
     else:
         rounds = operation == NEAREST_INTEGERS
         for i in range(size):
-            bad += 1 if b[i] <= 0 and valid[i] == 0.0 else 0
             divisor = max(b[i], 1)
             out[i] = nearest_integer(a[i], divisor) if rounds else truncated(a[i], divisor)
-    return bad > 0

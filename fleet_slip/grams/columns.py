@@ -1,7 +1,7 @@
 """From the counts of one drive to the integer columns of a feature set, sample by sample.
 
 This is the one path to the columns of models with windows: Gram rows, scores, evaluations and
-predictions all come through it. It computes what the SQL of `fleet_slip.catalogue.column_sql` says.
+predictions all come through it. It computes what the SQL of `fleet_slip.columns.column_sql` says.
 """
 
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.columns import limit_of
 from fleet_slip.errors import DataError
 from fleet_slip.grams.column_plan import ColumnPlan
-from fleet_slip.grams.kernel import BAD_DIVISOR, GAPS, LACKING, run
+from fleet_slip.grams.kernel import GAPS, run
 from fleet_slip.grams.operations import BLOCK_ROWS, Region
 from fleet_slip.grams.program import padded
 
@@ -144,10 +144,7 @@ class Workspace:
             self._products,
             totals,
         )
-        following, became, rows, clipped = found
-        if became == BAD_DIVISOR:
-            raise DataError("a feature divides by a count that is not positive.")
-        return Added(following, became == LACKING, rows, clipped)
+        return Added(*found)
 
     def _part(self, region: Region, number: int, size: int) -> FloatArray:
         begin, stride = self._regions[region]
@@ -202,10 +199,7 @@ class DriveColumns:
         self.clipped = np.zeros(len(drive.ticks))
 
     def compute(self) -> FloatArray:
-        """Return all columns, shape (columns, rows), NaN where missing; count what was clipped.
-
-        Raises `DataError` if a feature divides by a count that is not positive.
-        """
+        """Return all columns, shape (columns, rows), NaN where missing; count what was clipped."""
         out = np.empty((len(self._workspace.plan.names), len(self.clipped)))
         for first in range(0, len(self.clipped), BLOCK_ROWS):
             self._workspace.compute_block(first)

@@ -30,9 +30,6 @@ from fleet_slip.grams.operations import (
 )
 from fleet_slip.grams.rows.product_sums import add_products, add_sums
 
-COMPLETE, LACKING, BAD_DIVISOR = 0, 1, 2
-"""What became of a block."""
-
 GAPS, FOUND = 0, 1
 """Rows of `flags`: whether a sum has had gaps, and whether a kind's begins were found."""
 
@@ -63,24 +60,23 @@ def run(
     and kinds of windows. `ticks` is where the ticks of the drive's
     `rows` begin, `place` where the columns do, so many with a stride.
 
-    Returns the first row that is not done, what became of the last block, how many rows were
-    added, and how often a column of theirs was clipped.
+    Returns the first row that is not done, whether the block there lacks a value, how many rows
+    were added, and how often a column of theirs was clipped.
     """
     added, clipped, waiting = 0, 0.0, 0
-    became = COMPLETE
-    while first < rows and became == COMPLETE:
+    lacks = False
+    while first < rows:
         size = min(BLOCK_ROWS, rows - first)
         memory[:size] = 0.0
         for number in range(len(steps)):
-            if _do(steps[number], ratios[number], memory, flags, rows, ticks, first, size):
-                became = BAD_DIVISOR
-        if became != COMPLETE or exact_rows == 0:
+            _do(steps[number], ratios[number], memory, flags, rows, ticks, first, size)
+        if exact_rows == 0:
             break
         if waiting + size > exact_rows:
             _move_to_integers(products, totals)
             waiting = 0
         if add_sums(memory, place, stride, size, columns, products):
-            became = LACKING
+            lacks = True
             break
         add_products(memory, place, stride, size, products)
         for count in memory[:size]:
@@ -89,22 +85,22 @@ def run(
         added += size
         first += size
     _move_to_integers(products, totals)
-    return first, became, added, int(clipped)
+    return first, lacks, added, int(clipped)
 
 
 @inner_loop
 def _do(
     step: Any, ratio: Any, memory: Any, flags: Any, rows: int, ticks: int, first: int, size: int
-) -> Any:
-    """Do a step for some rows; return whether it divides by what is not positive."""
+) -> None:
+    """Do a step for some rows."""
     operation, slot, kind = step[OPERATION], step[SLOT], step[KIND]
     out = step[OUT] + step[MOVES + OUT] * first
     a, b = step[A] + step[MOVES + A] * first, step[B] + step[MOVES + B] * first
     c, d = step[C] + step[MOVES + C] * first, step[D] + step[MOVES + D] * first
     if operation >= TO_INTEGERS:
-        return compute_integers(operation, memory, (out, a, b, c), size, step[NUMBER])
-    if operation < ADD_UP:
-        return compute(
+        compute_integers(operation, memory, (out, a, b, c), size, step[NUMBER])
+    elif operation < ADD_UP:
+        compute(
             operation,
             memory,
             (out, a, b, c),
@@ -113,7 +109,7 @@ def _do(
             ratio[FIXED],
             ratio[LIMIT],
         )
-    if operation == ADD_UP:
+    elif operation == ADD_UP:
         flags[GAPS, slot] = add_up(memory, a, b, c, first, size, flags[GAPS, slot])
     elif operation == KEEP:
         for i in range(size):
@@ -127,7 +123,6 @@ def _do(
         else:
             places, gaps = (out, b, d, c, a), flags[GAPS, slot]
             divide_sums(memory, places, first, size, step[TICKS], ratio, gaps)
-    return False
 
 
 @inner_loop

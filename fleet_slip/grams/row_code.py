@@ -73,6 +73,7 @@ class _Expression:
         self._code, self._arithmetic = code, arithmetic
         self._integers = arithmetic.needs_integers
         self._known: dict[int, Value | _Constant] = {}
+        self._divisors: list[int] = []
         self._guarded: int | None = None
         if arithmetic.guard is not None:
             self._guarded = self._guard(arithmetic.guard)
@@ -85,8 +86,8 @@ class _Expression:
         result = self._written(self._value(len(self._arithmetic.steps) - 1))
         if self._integers:
             return self._code.add(Operation(op.TO_BINARY64, result, c=self._valid()))
-        if self._guarded is not None:
-            return self._code.add(Operation(op.ADD, result, self._guarded))
+        if self._guarded is not None or self._divisors:
+            return self._code.add(Operation(op.ADD, result, self._valid()))
         return result
 
     def _value(self, number: int) -> Value | _Constant:
@@ -115,12 +116,14 @@ class _Expression:
         return self._code.add(Operation(operation, a, b))
 
     def _quotient(self, step: Step) -> int:
+        divides = step.operands[-1]
         rounded = self._rounded_quotient(step)
         if rounded is not None:
-            return self._divided(op.NEAREST_INTEGERS if self._integers else op.NEAREST, *rounded)
+            operation = op.NEAREST_INTEGERS if self._integers else op.NEAREST
+            return self._divided(operation, divides, *rounded)
         dividend, divisor = (self._value(operand) for operand in step.operands)
         operation = op.DIVIDE_INTEGERS if self._integers else op.DIVIDE
-        return self._divided(operation, dividend, divisor)
+        return self._divided(operation, divides, dividend, divisor)
 
     def _rounded_quotient(self, step: Step) -> tuple[Value | _Constant, Value | _Constant] | None:
         """Return c and d of (2 * c + sign(c) * d) // (2 * d), as features round; None of others."""
@@ -139,15 +142,18 @@ class _Expression:
                 return self._value(c), self._value(d)
         return None
 
-    def _divided(self, operation: int, a: Value | _Constant, b: Value | _Constant) -> int:
+    def _divided(
+        self, operation: int, divides: int, a: Value | _Constant, b: Value | _Constant
+    ) -> int:
         if isinstance(b, _Constant):
             if b.value <= 0:
                 raise QuestionError("a feature divides by a number that is not positive.")
             if operation == op.NEAREST:
                 ratio = (1.0, float(b.value), 0.0, inf)
                 return self._code.add(Operation(op.SCALE, self._written(a), ratio=ratio))
-        operands = (self._written(a), self._written(b))
-        return self._code.add(Operation(operation, *operands, self._valid()))
+        elif not self._arithmetic.is_positive(divides):
+            self._divisors.append(self._at_least(self._written(b), 1))
+        return self._code.add(Operation(operation, self._written(a), self._written(b)))
 
     def _multiplied(self, a: Value | _Constant, factor: int) -> int:
         if self._integers:
@@ -167,17 +173,23 @@ class _Expression:
 
     def _guard(self, number: int) -> int:
         """Return what is 0 where the guard is large enough and nothing is missing, else NaN."""
-        guard, least = self._written(self._value(number)), self._arithmetic.at_least
+        return self._at_least(self._written(self._value(number)), self._arithmetic.at_least)
+
+    def _at_least(self, value: Value, least: int) -> int:
+        """Return what is 0 where a value is large enough and nothing is missing, else NaN."""
         if self._integers:  # the sign of a difference is exact however it is rounded
             smallest = self._written(_Constant(least))
-            excess = self._code.add(Operation(op.SUBTRACT_INTEGERS, guard, smallest))
-            guard = self._code.add(Operation(op.TO_BINARY64, excess, c=self._given()))
+            excess = self._code.add(Operation(op.SUBTRACT_INTEGERS, value, smallest))
+            value = self._code.add(Operation(op.TO_BINARY64, excess, c=self._given()))
             least = 0
-        return self._code.add(Operation(op.GUARD, guard, ratio=(float(least), 1.0, 0.0, inf)))
+        return self._code.add(Operation(op.GUARD, value, ratio=(float(least), 1.0, 0.0, inf)))
 
     def _valid(self) -> int:
         """Return what is 0 where the row has a value, else NaN."""
-        return self._given() if self._guarded is None else self._guarded
+        valid = self._given() if self._guarded is None else self._guarded
+        for one in self._divisors:
+            valid = self._code.add(Operation(op.ADD, valid, one))
+        return valid
 
     def _given(self) -> int:
         """Return what is 0 where no signal is missing, else NaN."""

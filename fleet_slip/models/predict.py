@@ -1,7 +1,8 @@
 """A published model on a data frame: side-slip angles from columns in SI units.
 
 The angle is `intercept + sum(coefficient * signal)`, added up from left to right as `score` does in
-SQL, so that both give the same bits. A feature is a function of counts: the signals that it is
+SQL, so that both give the same bits. What is beyond its valid range is missing, and so is the angle
+then. A feature is a function of counts: the signals that it is
 made of are rounded to counts as the sensors round them, and its arithmetic is that which stands in
 the manifest. A model with columns over time looks back within a drive: by `drive_id` and `tick` or
 `time_s` of the frame; a frame without them is one drive with a row for each tick.
@@ -18,7 +19,7 @@ import pyarrow.compute as pc
 from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.catalogue.arithmetic import parse
 from fleet_slip.catalogue.car_numbers import round_number
-from fleet_slip.catalogue.counts import round_to_counts
+from fleet_slip.catalogue.counts import round_to_counts, valid_values
 from fleet_slip.catalogue.feature_counts import feature_counts
 from fleet_slip.catalogue.signals import COUNT_MAX, SAMPLE_TIME_S, catalogue
 from fleet_slip.errors import DataError, InputError
@@ -35,6 +36,9 @@ def predict(manifest: Manifest, frame: Any, predictor: Predictor | None = None) 
     """
     opened = open_frame(frame)
     columns = opened.numbers(manifest.columns, f"the model {manifest.name}")
+    for signal in catalogue().signals.values():
+        if signal.column in columns:
+            columns[signal.column] = valid_values(columns[signal.column], signal)
     if manifest.definitions:
         angle = _over_time(manifest, opened, columns, predictor or Predictor.of(manifest))
         return opened.wrap(pa.array(angle, from_pandas=True), manifest.label.column)
@@ -72,9 +76,10 @@ def _over_time(
         for at in _rows_of_each_drive(frame, len(ticks)):
             first = at.start if isinstance(at, slice) else at[0]
             own = {
-                name: round_number(Fraction(float(values[first])), grain)
+                name: count
                 for name, (values, grain) in numbers.items()
-                if not np.isnan(values[first])
+                if np.isfinite(values[first])
+                and (count := round_number(Fraction(float(values[first])), grain)) is not None
             }
             known = {name: values[first].as_py() for name, values in facts.items()}
             angle[at] = predictor(rows.part(at, known, own), workspace)

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.column_sql import with_windows
 from fleet_slip.catalogue.columns import limit_of
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import COUNT_MAX, SAMPLE_TIME_S, catalogue
+from fleet_slip.columns.column_sql import with_windows
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.calibration.calibration import calibrate
 from fleet_slip.grams.cohorts.expansion import CarCounts

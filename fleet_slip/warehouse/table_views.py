@@ -7,8 +7,8 @@ from typing import Any
 import duckdb
 import pyarrow as pa
 
-from fleet_slip.catalogue.column_sql import with_absent
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, SignalCatalogue, catalogue
+from fleet_slip.columns.column_sql import with_absent
 from fleet_slip.delta import Snapshot, absent_columns
 from fleet_slip.errors import ConflictError
 from fleet_slip.resources import read_sql

@@ -14,10 +14,10 @@ import pytest
 
 from fleet_slip.catalogue import features as features_module
 from fleet_slip.catalogue.arithmetic import parse
-from fleet_slip.catalogue.column_sql import with_features
 from fleet_slip.catalogue.feature_sets import lag_signals
 from fleet_slip.catalogue.features import features, load_features
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.columns.column_sql import with_features
 from fleet_slip.delta import Change, Unit
 from fleet_slip.errors import ConfigError, DataError, QuestionError
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
@@ -184,6 +184,10 @@ def test_every_feature_is_its_physical_definition_rounded_and_clipped() -> None:
         ('counts = "ay * abs(ay)"', 'counts = "ay * vx"', "vx: not an input signal"),
         ('counts = "ay * abs(ay)"', 'counts = "ay / 2.5"', "not integer arithmetic"),
         ('counts = "ay * abs(ay)"', 'counts = "ay) FROM x; DROP TABLE y; --"', "not an input"),
+        ('counts = "ay * abs(ay)"', 'counts = "ay ** 2"', "not integer arithmetic"),
+        ('counts = "ay * abs(ay)"', 'counts = "ay -- 3"', "not integer arithmetic"),
+        ('counts = "ay * abs(ay)"', 'counts = "5"', "is of no signal"),
+        ('counts = "ay * abs(ay)"', 'counts = "ay*ay*ay*ay*ay"', "more than 64 bits"),
         ("at_least = 120000\n", "", "at_least is for a divisor that varies"),
         ('column = "speed_mps"', 'column = "ay_mps2"', "names must differ"),
         ('divided_by = "50000"', 'divided_by = "0"', "divided_by is zero"),

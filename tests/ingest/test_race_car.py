@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleet_slip.catalogue.features import column_query, features
+from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.columns.column_sql import column_query
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.grams.rows.gram_job import update_grams

@@ -145,9 +145,11 @@ class CarEvidence:
                 at = slices[told[name].kind]
                 rows = int(self.sums[told[name].kind].table.n[at].sum())
                 count = CAR_NUMBERS[name].count(told[name].value)
+                if count is None:
+                    continue
                 found[name] = CalibratedNumber(
                     value=float(told[name].value),
-                    count=count or 0,
+                    count=count,
                     uncertainty=_three_digits(sure[name]) if name in sure else None,
                     drives=at.stop - at.start,
                     rows=rows,

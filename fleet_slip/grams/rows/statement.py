@@ -2,11 +2,11 @@
 
 from collections.abc import Sequence
 
-from fleet_slip.catalogue.column_sql import over_windows, with_absent, with_features
 from fleet_slip.catalogue.course_change import with_changes
 from fleet_slip.catalogue.feature_sets import LAG, PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import COUNT_MAX, SignalCatalogue
+from fleet_slip.columns.column_sql import over_windows, with_absent, with_features
 from fleet_slip.grams.rows.drive_parts import Parts
 from fleet_slip.resources import read_sql
 

@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.catalogue.column_sql import with_windows
 from fleet_slip.catalogue.columns import WEIGHT, Definition, Fact, Gate, limit_of
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.columns.column_sql import with_windows
 from fleet_slip.errors import DataError
 from fleet_slip.grams.column_plan import ColumnPlan
 from fleet_slip.grams.columns import DriveColumns, DriveCounts

@@ -7,8 +7,14 @@ them over the view `log_counts`.
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
 
+from fleet_slip.catalogue.arithmetic import parse
 from fleet_slip.catalogue.columns import WEIGHT, Definition, Gate, features_behind, limit_of
+from fleet_slip.catalogue.features import FeatureCatalogue
 from fleet_slip.catalogue.signals import COUNT_MAX, catalogue
+from fleet_slip.columns.lowering import Lowering
+from fleet_slip.columns.operations import operation_of, plain_of
+from fleet_slip.columns.sql_operations import DUCKDB_SQL, sql_constant, sql_of
+from fleet_slip.errors import QuestionError
 
 _SEPARATOR = ",\n            "
 
@@ -19,16 +25,29 @@ def rounded_sql(value: str, ratio: Fraction, divisor: str = "1") -> str:
     below = f"{ratio.denominator} * {divisor}" if divisor != "1" else f"{ratio.denominator}"
     if below == "1":
         return product
-    return f"(2 * {product} + sign({value}) * {below}) // (2 * {below})"
+    return DUCKDB_SQL["nearest"].format(f"({product})", f"({below})")
 
 
 def clipped_sql(name: str, limit: int = COUNT_MAX) -> str:
     """Return the SQL of an integer column clipped to the range of counts; null stays null."""
     kind = "SMALLINT" if limit == COUNT_MAX else "INTEGER"
-    return (
-        f"CASE WHEN {name} > {limit} THEN {limit} "
-        f"WHEN {name} < -{limit} THEN -{limit} ELSE {name} END::{kind}"
-    )
+    return f"{DUCKDB_SQL['clip'].format(name, limit)}::{kind}"
+
+
+def feature_sql(sql: str) -> str:
+    """Return what DuckDB computes for the declared SQL of a feature: the same, taken apart."""
+    arithmetic = parse(sql)
+    texts: list[str] = []
+    for step in arithmetic.steps:
+        if step.name or not step.function:
+            texts.append(f"{step.name}::BIGINT" if step.name else sql_constant(step.value))
+            continue
+        operands = [texts[one] for one in step.operands]
+        positive = int(arithmetic.is_positive(step.operands[-1]))
+        texts.append(sql_of(step.function, operands, divides_by=positive, table=DUCKDB_SQL))
+    if arithmetic.guard is None:
+        return texts[-1]
+    return f"CASE WHEN {texts[arithmetic.guard]} >= {arithmetic.at_least} THEN {texts[-1]} END"
 
 
 def with_absent(rows: str, absent: Sequence[str]) -> str:
@@ -48,7 +67,8 @@ def with_features(
     those that are not int16. The column `clipped` says how many of the features of a row were out
     of range.
     """
-    return _layer(rows, definitions, limits or {}) if definitions else rows
+    computed = {name: feature_sql(sql) for name, sql in definitions.items()}
+    return _layer(rows, computed, limits or {}) if definitions else rows
 
 
 def with_windows(
@@ -114,17 +134,17 @@ def _gated(rows: str, definitions: Mapping[str, Definition]) -> str:
 
 def weight_sql(by: str, gate: Gate) -> str:
     """Return the SQL of a gate's weight, given the name of the column that opens and closes it."""
-    rises, at = gate.peak - gate.low, f"{by}::BIGINT"
-    rising = f"WHEN {at} < {gate.peak} THEN (({at} - ({gate.low})) * {WEIGHT}) // {rises}"
-    if gate.high is None:
-        return (
-            f"CASE WHEN {at} <= {gate.low} THEN 0 {rising} WHEN {by} IS NOT NULL THEN {WEIGHT} END"
-        )
-    falling = f"{WEIGHT} - (({at} - ({gate.peak})) * {WEIGHT}) // {gate.high - gate.peak}"
-    return (
-        f"CASE WHEN {at} <= {gate.low} THEN 0 {rising} "
-        f"WHEN {at} < {gate.high} THEN {falling} WHEN {by} IS NOT NULL THEN 0 END"
-    )
+    lowered = Lowering({})
+    texts = {lowered.do("signal", 0): f"{by}::BIGINT"}
+    weight = lowered.weight(0, gate)
+    for number, step in enumerate(lowered.steps):
+        name, plain = operation_of(step), plain_of(step)
+        if name == "constant":
+            texts[number] = sql_constant(plain[0])
+        elif number not in texts:
+            operands = [texts[one] for one in plain]
+            texts[number] = sql_of(name, operands, divides_by=1, table=DUCKDB_SQL)
+    return texts[weight]
 
 
 def _over_windows(rows: str, definitions: Mapping[str, Definition]) -> str:
@@ -204,3 +224,25 @@ def _layer(
             FROM {rows}{clause}
         )
     )"""
+
+
+def column_query(known: FeatureCatalogue, name: str) -> str:
+    """Return the query over the view `log_counts` that computes a feature or column over time.
+
+    Raises `QuestionError` for what is neither.
+    """
+    definition = known.definition(name)
+    if definition is not None and definition.number is not None:
+        raise QuestionError(
+            f"{name} is {known.calibrated[name].of} times {definition.number.name} of each car, in "
+            "counts: see fleet-slip features --sql of the one, and the view calibration."
+        )
+    if definition is not None:
+        rows = with_windows("log_counts", {}, {name: definition})
+    elif name in known.features:
+        rows = with_features("log_counts", {name: known.features[name].sql})
+    else:
+        raise QuestionError(
+            f"no feature, window or factor is called {name!r}. See: fleet-slip features"
+        )
+    return f"SELECT drive_id, tick, {name}\nFROM {rows}\nORDER BY drive_id, tick"
