@@ -62,7 +62,8 @@ def write_program(manifest: Manifest) -> Program:
 def _inputs(manifest: Manifest) -> tuple[Input, ...]:
     used: set[str] = set()
     for term in manifest.terms:
-        if term.sql and not parse(term.sql).inputs:
+        parts = term.definition.parts if term.definition else (term,)
+        if any(part.sql and not parse(part.sql).inputs for part in parts):
             raise DataError(f"the feature {term.signal} is of no signal. Publish the model again.")
         used |= {*term.inputs}
     return tuple(

@@ -28,7 +28,7 @@ from fleet_slip.models.model_version import ModelVersion
 from tests.export import plain
 from tests.export.compiled import compile_c, needs_cc
 from tests.export.models import MODELS, model_of
-from tests.export.test_sql import by_duckdb, by_sqlite
+from tests.export.sql_rows import by_duckdb, by_sqlite
 
 LONGEST = "n" + "_" * 39 + "1"
 TEXTS = ("a-b", "a.b", "a_b_2", "A_B", "-" * 60, "." * 60)

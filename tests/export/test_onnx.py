@@ -1,63 +1,22 @@
 """Exported ONNX graphs, run by onnxruntime: the exact model within the stated error."""
 
-from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import onnx
-import onnxruntime
 import pytest
 
 import fleet_slip
 from fleet_slip.errors import ConfigError
-from fleet_slip.export.checks import Sample, drive_counts
+from fleet_slip.export.checks import drive_counts
 from fleet_slip.export.compile import compile_program
 from fleet_slip.export.files import export_files
-from fleet_slip.export.onnx_graph import UNKNOWN, FloatName, error_bound
-from fleet_slip.export.program import Car, Program
+from fleet_slip.export.onnx_graph import FloatName, error_bound
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.predictor import Predictor
 from tests.export.models import CARS, MODELS, hostile_drive, model_of
-
-
-def open_session(version: ModelVersion, kind: str) -> onnxruntime.InferenceSession:
-    content = export_files(version, None, "onnx")[f"sideslip_{version.manifest.name}_{kind}.onnx"]
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-
-
-def run_drives(
-    session: onnxruntime.InferenceSession, program: Program, cars: Sequence[Car], drives: Any
-) -> Any:
-    """Drive cars side by side, shape (cars, ticks, signals) with NaN; return (cars, ticks)."""
-    told = {
-        "facts": [car.fact_counts(program) for car in cars],
-        "numbers": [car.number_counts(program) for car in cars],
-    }
-    given: dict[str, Any] = {}
-    for one in session.get_inputs():
-        if one.name in told:
-            values = [[UNKNOWN if n is None else n for n in row] for row in told[one.name]]
-            given[one.name] = np.array(values, np.int64)
-        elif one.name != "signals":
-            empty = UNKNOWN if one.name.startswith("ring") else 0
-            given[one.name] = np.full((len(cars), one.shape[1]), empty, np.int64)
-    names = [one.name for one in session.get_outputs()]
-    angles = []
-    for tick in range(drives.shape[1]):
-        computed = session.run(None, {**given, "signals": drives[:, tick]})
-        found = dict(zip(names, computed, strict=True))
-        angles.append(found.pop("angle")[:, 0])
-        given |= {name.removesuffix("_next"): value for name, value in found.items()}
-    return np.array(angles).T
-
-
-def in_si(program: Program, samples: Sequence[Sample], dtype: str) -> Any:
-    counts = np.array([[np.nan if n is None else n for n in row] for row in samples], float)
-    return (counts * [float(one.scale) for one in program.signals]).astype(dtype)
+from tests.export.onnx_drives import in_si, open_session, run_drives
 
 
 @pytest.mark.parametrize("kind", ["float32", "float64"])

@@ -1,0 +1,334 @@
+"""Random columns mean the same everywhere: ends of ranges and beyond, holes, halves, any divisor.
+
+The plain interpreter, which has the exported document and nothing of the package, is the judge.
+"""
+
+from collections.abc import Sequence
+from decimal import Decimal
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+from zlib import crc32
+
+import duckdb
+import numpy as np
+import polars as pl
+from hypothesis import HealthCheck, Phase, assume, given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from fleet_slip.catalogue.car_numbers import NumberName
+from fleet_slip.catalogue.columns import Definition, Fact, Gate, Number, Over
+from fleet_slip.catalogue.row_features import Feature
+from fleet_slip.columns.column_sql import with_windows
+from fleet_slip.export.checks import Sample, angles_by_kernel, angles_of_columns
+from fleet_slip.export.compile import compile_program
+from fleet_slip.export.document import program_content
+from fleet_slip.export.estimator import Estimator
+from fleet_slip.export.program import Car, Program
+from fleet_slip.models.manifest import Manifest, ModelTerm
+from fleet_slip.models.model_version import ModelVersion
+from tests.export import plain
+from tests.export.compiled import build_driver, drive, needs_cc
+from tests.export.models import cars, export_texts
+from tests.export.onnx_drives import open_session, run_drives
+from tests.export.sql_rows import by_duckdb, by_sqlite
+from tests.support.manifests import manifest
+
+SIGNALS = ("ay", "yaw_rate", "wheel_fl")
+NUMBERS: dict[NumberName, str] = {"yaw_rate_offset": "0.00000625", "speed_ratio": "0.0005"}
+
+
+def expressions(*, declared: bool) -> st.SearchStrategy[str]:
+    """Arithmetic on counts: as features.toml declares it, or with any divisor, as manifests may."""
+    leaf = st.sampled_from([*SIGNALS, "3", "1000"])
+
+    def larger(inner: st.SearchStrategy[str]) -> st.SearchStrategy[str]:
+        pair = st.tuples(inner, st.sampled_from("+-*"), inner).map(lambda x: f"({' '.join(x)})")
+        one = st.tuples(st.sampled_from(["abs", "sign", "-"]), inner).map(
+            lambda x: f"{x[0]}({x[1]})"
+        )
+        divisor = st.sampled_from(["2", "7", "40000"]) if declared else inner
+        return pair | one | st.tuples(inner, divisor).map(lambda x: f"({x[0]} // ({x[1]}))")
+
+    found = st.recursive(leaf, larger, max_leaves=6)
+    return found.map(
+        lambda text: text.replace("(2)", "2").replace("(7)", "7").replace("(40000)", "40000")
+    )
+
+
+@st.composite
+def features(draw: st.DrawFn) -> str:
+    """The SQL of a feature, perhaps guarded."""
+    text = draw(expressions(declared=False))
+    least = draw(st.sampled_from([None, None, 0, 1, 5000]))
+    return (
+        text
+        if least is None
+        else f"CASE WHEN {draw(st.sampled_from(SIGNALS))} >= {least} THEN {text} END"
+    )
+
+
+RATIO = st.sampled_from([Fraction(1), Fraction(16), Fraction(1, 7), Fraction(3, 2)])
+BITS = st.sampled_from([16, 18, 20])
+
+
+@st.composite
+def definitions(draw: st.DrawFn) -> Definition:
+    """A column of any kind: window, factor, gate, number."""
+    found = draw(windows())
+    kind = draw(st.sampled_from(["window", "window", "fact", "gate", "number"]))
+    update: dict[str, Any] = {}
+    if kind == "fact":
+        update["fact"] = draw(st.sampled_from([
+            Fact(name="mass_kg", less=1320, ratio=Fraction(1, 100)),
+            Fact(name="vehicle_model", equals="suv"),
+        ]))  # fmt: skip
+    if kind == "gate":
+        low, rises, falls = draw(st.tuples(st.integers(-9000, 9000), *[st.integers(1, 3000)] * 2))
+        high = draw(st.sampled_from([None, low + rises + falls]))
+        update["gate"] = Gate(by=draw(windows()), low=low, peak=low + rises, high=high)
+    if kind == "number":
+        name = draw(st.sampled_from([*NUMBERS]))
+        running = Definition(of="yaw_rate", over="running_mean", ratio=Fraction(16))
+        running_or_none = draw(st.sampled_from([None, running]))
+        less = 0 if running_or_none else draw(st.sampled_from([0, 2000]))
+        alone = draw(st.booleans())
+        grain = Decimal(NUMBERS[name])
+        update["number"] = Number(
+            name=name, grain=grain, less=less, alone=alone, running=running_or_none
+        )
+    return found.model_copy(update=update)
+
+
+@st.composite
+def windows(draw: st.DrawFn) -> Definition:
+    """What looks back on a signal or a feature, or is it now."""
+    sql = draw(st.one_of(st.just(""), features()))
+    over: Over | None = draw(st.sampled_from([None, "mean", "sum", "lag", "running_mean"]))
+    ticks = draw(st.integers(1, 4)) if over in {"mean", "sum", "lag"} else 0
+    row: dict[str, Any] = {"of": draw(st.sampled_from(SIGNALS))}
+    if sql:
+        row = {"of": f"f_{crc32(sql.encode())}", "sql": sql, "of_bits": draw(BITS)}
+    try:
+        return Definition(**row, over=over, ticks=ticks, ratio=draw(RATIO), bits=draw(BITS))
+    except ValidationError:  # it could need more than 64 bits
+        assume(False)
+        raise
+
+
+@st.composite
+def models(draw: st.DrawFn) -> Manifest:
+    """A model of one to three columns."""
+    columns = draw(st.lists(definitions(), min_size=1, max_size=3))
+    terms = tuple(
+        ModelTerm(
+            signal=f"c{place}", column=f"c{place}", unit="1", scale=Decimal("0.001"),
+            definition=one, coefficient=float(value), coefficient_exact=value,
+        )
+        for place, one in enumerate(columns)
+        for value in [Fraction(draw(st.integers(-99, 99)), 10**6)]
+    )  # fmt: skip
+    return manifest(name="any").model_copy(update={"terms": terms})
+
+
+def compiled(one: Manifest) -> Program:
+    """The program; what divides by a constant that is not positive is no example."""
+    try:
+        return compile_program(one)
+    except Exception as error:
+        assume("divides by a number" not in str(error) and "of no signal" not in str(error))
+        assume("two ways" not in str(error))
+        raise
+
+
+COUNT = st.one_of(
+    st.sampled_from([0, 0, 1, -1, 3, -30001, -30000, 30000, 30001, -32000, 32000, 32767]),
+    st.integers(-2000, 2000),
+    st.none(),
+)
+
+
+def drives(program: Program) -> st.SearchStrategy[list[list[float]]]:
+    """Ticks in SI units, NaN where missing: counts, and what lies half way between two."""
+    between = st.sampled_from([0.0, 0.0, 0.5, -0.5, 0.25])
+    value = st.tuples(COUNT, between).map(lambda x: np.nan if x[0] is None else x[0] + x[1])
+    row = st.one_of(
+        st.tuples(*[value] * len(program.signals)), st.just((np.nan,) * len(program.signals))
+    )
+    scales = [float(one.scale) for one in program.signals]
+    ticks = st.lists(row, min_size=1, max_size=9)
+    return ticks.map(lambda rows: [[x * s for x, s in zip(r, scales, strict=True)] for r in rows])
+
+
+def counts_of(program: Program, values: Sequence[Sequence[float]]) -> list[Sample]:
+    """The counts that sensors make of them: to the nearest, halves to even; 16 bits hold them."""
+    scales = [float(one.scale) for one in program.signals]
+    rows = [[x / scale for x, scale in zip(row, scales, strict=True)] for row in values]
+    return [tuple(round(x) if abs(x) <= 32767 else None for x in row) for row in rows]
+
+
+def judged(program: Program, car: Car, samples: Sequence[Sample]) -> list[int | None]:
+    """The angles by the plain interpreter."""
+    told = list(car.fact_counts(program)), list(car.number_counts(program))
+    return plain.angles(program_content(program), *told, samples)
+
+
+def by_warehouse(one: Manifest, program: Program, car: Car, samples: Sequence[Sample]) -> Any:
+    """The angles by the SQL of the warehouse, on counts within their ranges."""
+    ends = [(signal.min_count, signal.max_count) for signal in program.signals]
+    rows = [
+        [
+            n if n is not None and low <= n <= high else None
+            for n, (low, high) in zip(s, ends, strict=True)
+        ]
+        for s in samples
+    ]
+    names = [signal.name for signal in program.signals]
+    log = pl.DataFrame(rows, dict.fromkeys(names, pl.Int16), orient="row").with_columns(
+        pl.lit("d").alias("drive_id"), pl.int_range(pl.len()).alias("tick"),
+        pl.lit(car.facts.get("mass_kg"), pl.Float64).alias("mass_kg"),
+        pl.lit(car.facts.get("vehicle_model"), pl.String).alias("vehicle_model"),
+    )  # fmt: skip
+    with duckdb.connect() as database:
+        database.register("log_counts", log.to_arrow())
+        rows_sql = with_windows("log_counts", {}, one.definitions)
+        found = database.sql(f"SELECT * FROM {rows_sql} ORDER BY tick").to_arrow_table()
+    columns = np.array(
+        [[np.nan if n is None else n for n in found[name].to_pylist()] for name in one.definitions],
+        dtype=np.float64,
+    )
+    return angles_of_columns(program, columns)
+
+
+def in_counts(program: Program, angles: Sequence[float | None]) -> list[int | None]:
+    """Angles in rad as the program's counts."""
+    scale = float(program.angle.scale)
+    return [None if x is None or np.isnan(x) else int(np.floor(x / scale + 0.5)) for x in angles]
+
+
+def close(found: Sequence[int | None], expected: Sequence[int | None]) -> bool:
+    """Whether angles are the same, but for what rounding in binary64 may do at a half."""
+    return all(
+        (a is None) == (b is None) and (a is None or b is None or abs(a - b) <= 1)
+        for a, b in zip(found, expected, strict=True)
+    )
+
+
+def known(program: Program, car: Car) -> dict[str, Any]:
+    """What a car knows, numbers in SI units."""
+    facts = {one.name: car.facts[one.name] for one in program.facts}
+    told = {
+        n.name: Decimal(car.numbers[n.name]) * n.grain
+        for n in program.numbers
+        if n.name in car.numbers
+    }
+    return {**facts, **told}
+
+
+@settings(
+    max_examples=25,
+    phases=[Phase.generate],
+    suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow],
+)
+@given(models(), cars(), st.data())
+def test_kernel_warehouse_and_estimator_are_what_the_interpreter_says(
+    one: Manifest, car: Car, data: st.DataObject
+) -> None:
+    program = compiled(one)
+    values = data.draw(drives(program))
+    samples = counts_of(program, values)
+    expected = judged(program, car, samples)
+    assert angles_by_kernel(one, program, car, samples) == expected
+    if not program.numbers:
+        assert by_warehouse(one, program, car, samples) == expected
+    estimator = Estimator(one, known(program, car))
+    rows = [dict(zip(estimator.columns, row, strict=True)) for row in values]
+    stepped = [estimator.step(row) for row in rows]
+    assert close(in_counts(program, stepped), expected)
+    told = {name: [value] * len(rows) for name, value in known(program, car).items()}
+    missing = {n.name: [np.nan] * len(rows) for n in program.numbers}
+    frame = {c: [row[c] for row in rows] for c in estimator.columns} | missing | told
+    predicted = ModelVersion(1, one, "0" * 64).predict(frame).tolist()
+    assert [None if np.isnan(x) else x for x in predicted] == stepped
+
+
+@needs_cc
+@settings(
+    max_examples=5,
+    phases=[Phase.generate],
+    deadline=None,
+    suppress_health_check=[
+        HealthCheck.filter_too_much,
+        HealthCheck.too_slow,
+        HealthCheck.function_scoped_fixture,
+    ],
+)
+@given(one=models(), car=cars(), data=st.data())
+def test_exports_are_what_the_interpreter_says(
+    one: Manifest, car: Car, data: st.DataObject, tmp_path: Path
+) -> None:
+    program, version = compiled(one), ModelVersion(1, one, "0" * 64)
+    values = data.draw(st.lists(drives(program), min_size=3, max_size=3))
+    samples = [counts_of(program, each) for each in values]
+    expected = [judged(program, car, each) for each in samples]
+    driver = build_driver(tmp_path, version, program)
+    assert [drive(driver, program, car, each) for each in samples] == expected
+    log = log_of(program, car, values)
+    there = {(str(d), t): angle for d, each in enumerate(expected) for t, angle in enumerate(each)}
+    statement = export_texts(version, None, "sql")["sideslip_any.sql"]
+    assert by_duckdb(statement, log) == there
+    assert by_sqlite(statement, log) == there
+    session = open_session(version, "float64")
+    for each, angles in zip(values, expected, strict=True):
+        found = run_drives(session, program, [car], np.array([each]))[0]
+        assert close(in_counts(program, found.tolist()), angles)
+
+
+def log_of(program: Program, car: Car, values: Sequence[Sequence[Sequence[float]]]) -> pl.DataFrame:
+    """Drives in SI units, null where missing, with what the car knows."""
+    names = [one.column for one in program.signals]
+    parts = [
+        pl.DataFrame(each, dict.fromkeys(names, pl.Float64), orient="row").with_columns(
+            pl.lit(str(place)).alias("drive_id"), pl.int_range(pl.len()).alias("tick")
+        )
+        for place, each in enumerate(values)
+    ]
+    told = {n.name: known(program, car).get(n.name) for n in program.numbers}
+    return (
+        pl.concat(parts)
+        .fill_nan(None)
+        .with_columns(
+            pl.lit(car.facts.get("mass_kg"), pl.Float64).alias("mass_kg"),
+            pl.lit(car.facts.get("vehicle_model"), pl.String).alias("vehicle_model"),
+            *(
+                pl.lit(None if x is None else float(x), pl.Float64).alias(n)
+                for n, x in told.items()
+            ),
+        )
+    )
+
+
+@settings(max_examples=100, suppress_health_check=[HealthCheck.filter_too_much])
+@given(
+    st.one_of(expressions(declared=True), st.text("ay*/-+() 0123", max_size=12)), st.integers(0, 9)
+)
+def test_a_feature_that_can_be_defined_can_be_exported(text: str, divisor: int) -> None:
+    try:
+        one = Feature(
+            counts=text, divided_by=str(divisor) if divisor else None, scale=Decimal(1), unit="1",
+            column="any_feature", description="any",
+        )  # fmt: skip
+    except ValidationError:
+        return
+    value = Fraction(1, 10**6)
+    term = ModelTerm(
+        signal="any_feature", column="any_feature", unit="1", scale=Decimal(1), sql=one.sql,
+        coefficient=float(value), coefficient_exact=value,
+    )  # fmt: skip
+    made = manifest(name="any").model_copy(update={"terms": (term,)})
+    program = compile_program(made)
+    samples: list[Sample] = [(n,) * len(program.signals) for n in (None, -3, 0, 7, 30000)]
+    assert angles_by_kernel(made, program, Car({}, {}), samples) == judged(
+        program, Car({}, {}), samples
+    )
