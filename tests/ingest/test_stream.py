@@ -20,8 +20,7 @@ from fleet_slip.ingest.drives.drive_cutter import DriveCutter
 from fleet_slip.ingest.drives.read_ahead import AHEAD, map_ahead, read_ahead
 from fleet_slip.ingest.formats import csv_batches
 from fleet_slip.ingest.formats.budget import Budget
-from fleet_slip.ingest.formats.csv_batches import PlainNumbers, open_csv
-from fleet_slip.ingest.formats.csv_format import CsvFormat
+from fleet_slip.ingest.formats.csv_batches import CsvFormat, PlainNumbers, open_csv
 from fleet_slip.ingest.landing import data_files, landing
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.measured import (

@@ -73,7 +73,7 @@ def preview_log(log: Log, mapping: Mapping) -> Preview:
 
 
 def signals_of(drive: MeasuredDrive) -> dict[str, FloatArray]:
-    """Return the signals of a drive's begin in SI units, NaN where there is no value."""
+    """Return the signals of the beginning of a drive in SI units, NaN where there is no value."""
     ticks = drive.ticks - drive.ticks[0]
     kept = ticks < MOST_TICKS
     signals = {}

@@ -13,8 +13,7 @@ import polars as pl
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.can_bus import CanBus
-from fleet_slip.ingest.formats.csv_batches import PlainNumbers
-from fleet_slip.ingest.formats.csv_format import CsvFormat
+from fleet_slip.ingest.formats.csv_batches import CsvFormat, PlainNumbers
 from fleet_slip.ingest.formats.duckdb_table import DuckdbRows
 from fleet_slip.ingest.formats.reading import file_errors, open_source, require_unchanged_file
 from fleet_slip.ingest.formats.source import OWN_TIME, Channel, Source

@@ -7,12 +7,12 @@ import numpy as np
 import polars as pl
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
-from fleet_slip.ingest.drives.quarantine import describe_refused, join_refused, no_rows
+from fleet_slip.ingest.drives.checking import describe_refused, join_refused, no_rows
 from fleet_slip.ingest.drives.resampling import STEP_S, TIME_EPSILON_S
 from fleet_slip.ingest.mapping.mapping import TimeBase
 
 LONGEST_DRIVE_S = 2**19 * STEP_S
-"""A stretch that lasts longer, some 87 minutes, is cut, so that a drive fits into memory."""
+"""A longer stretch is cut after this time, some 87 minutes, so that a drive fits into memory."""
 
 
 _GROUP = np.dtype(
@@ -28,7 +28,7 @@ _GROUP = np.dtype(
 _UNSEEN = np.array((np.nan, np.nan, np.nan, np.nan, -1, -1), dtype=_GROUP)
 
 MOST_STRETCHES = 16
-"""Irregular steps in a block at which it is taken apart; with more it is cut as a whole."""
+"""Irregular steps up to which a block is taken apart at them; with more it is cut as a whole."""
 
 
 class _Stretch(NamedTuple):

@@ -13,7 +13,7 @@ from fleet_slip.arrays import FloatArray
 MAX_OPEN_ROWS = 20_000_000
 """Rows of drives that have not ended: 55 hours at 100 Hz of drives that alternate row by row."""
 MOST_RUNS = 8
-"""Runs of one part in a block that are told apart one by one."""
+"""Runs of rows of one part, in a block, up to which they are sliced one by one."""
 
 
 @dataclass(frozen=True)

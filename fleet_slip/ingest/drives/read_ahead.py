@@ -18,7 +18,7 @@ WORKERS = 2
 def read_ahead(items: Iterator[Item], ahead: int = AHEAD) -> Generator[Item, None, None]:
     """Yield items, in their order, while a thread takes the next; errors come in their place.
 
-    No two are taken at once. Who closes it waits for the item that is being taken. A single item,
+    No two are taken at once. Closing it waits for the item that is being taken. A single item,
     as most small files have, needs no thread.
     """
     first = _take(items)

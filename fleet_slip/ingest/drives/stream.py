@@ -16,7 +16,13 @@ import pyarrow as pa
 from fleet_slip.canonical import canonical_ascii
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.drafting.suspicion import Suspicion, find_refusals
-from fleet_slip.ingest.drives.checking import Block, RowChecker
+from fleet_slip.ingest.drives.checking import (
+    Block,
+    RowChecker,
+    describe_refused,
+    join_refused,
+    no_rows,
+)
 from fleet_slip.ingest.drives.drive_cutter import (
     LONGEST_DRIVE_S,
     DriveCutter,
@@ -24,7 +30,6 @@ from fleet_slip.ingest.drives.drive_cutter import (
 )
 from fleet_slip.ingest.drives.measured_drives import MeasuredDrive, drive_id, to_ticks
 from fleet_slip.ingest.drives.open_drives import MAX_OPEN_ROWS, DriveRows, OpenDrives
-from fleet_slip.ingest.drives.quarantine import describe_refused, join_refused, no_rows
 from fleet_slip.ingest.drives.read_ahead import read_ahead
 from fleet_slip.ingest.drives.resampling import STEP_S, TIME_EPSILON_S
 from fleet_slip.ingest.drives.totals import IngestCounts, Totals
@@ -39,13 +44,13 @@ from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA
 from fleet_slip.words import number_of
 
 RATE_ROWS, MOST_RATE_ROWS = 2**17, 2**21
-"""The usual time between rows is that of the first ones of a file, so many at least and at most."""
+"""The fewest and the most first rows of a file whose median step is the usual time between rows."""
 FEWEST_STEPS = 1000
 MAX_DRIVES = 10_000
-"""Short drives in one file. More means that time or the drive's column is not what is said."""
+"""Short drives in one file. With more, time or the drive's column is not what the mapping says."""
 SHORT_ROWS = 1000
 MAX_TICKS = 40_000_000
-"""Length of all drives of one file together, in ticks, where rows are few for it."""
+"""Ticks of all drives of one file together, where it has few rows for so many."""
 MOST_TICKS_A_ROW = 1000
 
 

@@ -19,9 +19,9 @@ HELD = "\0held "
 ROW = "\0row"
 """Column with the row's number, from 1: those of the first base come first, then the next."""
 _RIGHT = "\0right"
-"""Column with the last right time of the base up to each row, which has the row's place."""
+"""Column with the last right time of the base up to each row: where the row stands among others."""
 WINDOW_ROWS = 2**16
-"""About so many rows of all bases together are in a window."""
+"""A window has about this many rows of all bases together."""
 
 
 def merge_bases(

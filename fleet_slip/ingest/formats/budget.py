@@ -19,7 +19,7 @@ from fleet_slip.ingest.formats.columns import shown
 FREE_ROWS, ROWS_PER_BYTE = 10**6, 4
 """Rows that any file may have, and rows for each of its bytes if those are more."""
 FREE_BYTES, BYTES_PER_BYTE = 2**30, 200
-"""The same of what it unfolds to."""
+"""The same for the bytes that it unfolds to."""
 FREE_S, BYTES_PER_S = 60.0, 10**5
 """Seconds in which any file must be decoded, and a speed that no format falls below."""
 
@@ -78,7 +78,7 @@ class Budget:
         )
 
     def metered(self, batches: Iterator[pl.DataFrame]) -> Iterator[pl.DataFrame]:
-        """Yield batches as long as rows and seconds last; what the caller does takes no time."""
+        """Yield batches while rows and seconds last; the caller's own time does not count."""
         rows, seconds = 0, 0.0
         while True:
             began = time.monotonic()

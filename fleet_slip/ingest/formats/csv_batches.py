@@ -11,13 +11,14 @@ from typing import BinaryIO
 import numpy as np
 import polars as pl
 import pyarrow as pa
+from pydantic import field_validator, model_validator
 
 from fleet_slip.arrays import is_finite
+from fleet_slip.config import Config
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.drives.read_ahead import map_ahead
 from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.columns import require_columns, shown
-from fleet_slip.ingest.formats.csv_format import CsvFormat
 from fleet_slip.ingest.formats.source import Channel
 
 BLOCK_BYTES = 2**22
@@ -25,7 +26,7 @@ BLOCK_BYTES = 2**22
 
 MAX_LINE_BYTES = 2**20
 LINE_BLOCKS = 4
-"""Blocks that one line may fill: more often a quote is not closed."""
+"""Blocks that one line may fill. Where it fills more, usually a quote was not closed."""
 
 EXTRA_FIELDS = "\0extra fields"
 """Column of a CSV batch: what a line has after the header's last column, null if nothing."""
@@ -35,12 +36,32 @@ COMPRESSED = {b"\x1f\x8b": "gzip", b"\x28\xb5\x2f\xfd": "zstd"}
 """What compressed files begin with."""
 
 
+class CsvFormat(Config):
+    """How a CSV file is written. It is always UTF-8, with or without a byte order mark."""
+
+    separator: str = ","
+    decimal_comma: bool = False
+
+    @field_validator("separator")
+    @classmethod
+    def _one_character(cls, separator: str) -> str:
+        if len(separator) != 1 or not separator.isascii() or separator in '"\r\n\0':
+            raise ValueError("must be one ASCII character such as ',', ';' or a tab")
+        return separator
+
+    @model_validator(mode="after")
+    def _unambiguous(self) -> "CsvFormat":
+        if self.decimal_comma and self.separator == ",":
+            raise ValueError("with decimal_comma the separator cannot be ',': set it, often ';'")
+        return self
+
+
 @dataclass(frozen=True)
 class PlainNumbers:
-    """Columns that are nothing but numbers wherever they are used, and numbers that are none.
+    """Columns that are used only as numbers, and numbers that mean "no value".
 
-    They are parsed as numbers at once, three times as fast as by way of text. Where that is not
-    what the texts say (one is empty, is no number, or means "no value"), text it is.
+    They are parsed as numbers at once, three times as fast as by way of text. A column in which a
+    text is empty, is not a number or means "no value" is read as text.
     """
 
     columns: frozenset[str] = frozenset()

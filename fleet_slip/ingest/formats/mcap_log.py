@@ -90,7 +90,7 @@ class McapSource:
     def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
         """Yield the rows of each topic that has one of the columns, topic by topic.
 
-        Who asks for columns topic by topic does not make the file be read again for each.
+        If columns are asked for topic by topic, the file is not read again for each.
         """
         if not self._kept:
             self._keep({t: {f"{t}.{name}": name for name in of} for t, of in self._topics.items()})

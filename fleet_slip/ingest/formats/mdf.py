@@ -26,7 +26,7 @@ WINDOW_RECORDS = 2**17
 """Records that are read at once. asammdf takes four times as long for a whole group."""
 _TIME_SYNC = 1
 _EARLIEST_S = 10**8
-"""A start before 1973 is none: loggers without a clock write 0."""
+"""Loggers without a clock write 0: a start before 1973 is not a date."""
 
 
 class MdfSource:

@@ -21,7 +21,7 @@ from fleet_slip.ingest.formats.spool import Spool
 
 _FRAME = "CAN_DataFrame."
 _EXTENDED = 1 << 31
-"""Bit of an identifier that marks one of 29 bits, where there is no channel for it."""
+"""Bit that marks an identifier of 29 bits, where no channel of its own does."""
 _IDENTIFIER = (1 << 29) - 1
 
 

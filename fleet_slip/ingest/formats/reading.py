@@ -18,8 +18,7 @@ from fleet_slip.ingest.formats.can_blocks import BLF_MAGIC
 from fleet_slip.ingest.formats.can_bus import CanBus
 from fleet_slip.ingest.formats.can_trace import open_can_trace
 from fleet_slip.ingest.formats.columns import shown
-from fleet_slip.ingest.formats.csv_batches import PlainNumbers, open_csv
-from fleet_slip.ingest.formats.csv_format import CsvFormat
+from fleet_slip.ingest.formats.csv_batches import CsvFormat, PlainNumbers, open_csv
 from fleet_slip.ingest.formats.duckdb_table import MAGIC as DUCKDB_MAGIC
 from fleet_slip.ingest.formats.duckdb_table import MAGIC_AT as DUCKDB_AT
 from fleet_slip.ingest.formats.duckdb_table import DuckdbRows, open_duckdb

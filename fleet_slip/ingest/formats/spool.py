@@ -1,4 +1,4 @@
-"""Keeps aside what comes in one order and is read in another, in a temporary file if it is much.
+"""Keeps what comes in one order and is read in another, in a temporary file if it is large.
 
 The file has no name: it is gone with the process, however that ends.
 """
@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from fleet_slip.errors import InputError
 
 IN_MEMORY_BYTES = 2**24
-"""As long as there is no more, there is no file."""
+"""Up to this size all is in memory, and there is no file."""
 
 
 @contextmanager

@@ -37,7 +37,7 @@ class StoredParts:
 class StrayLink(PosixPath):
     """A file that was found in a folder, and is behind a link that leads out of it.
 
-    Who may put files into a folder must not choose which others of this machine are read.
+    Whoever may put files into a folder must not choose which others of this machine are read.
     """
 
 
@@ -51,8 +51,8 @@ Place: TypeAlias = Path | str
 def find_logs(given: Iterable[Place]) -> list[Log]:
     """Return files as they are given, and those in folders that have the suffix of a log, sorted.
 
-    A path that is none may be a pattern, `2024-*/*.mf4`, for who gives it in quotes. Hidden files
-    and folders are passed over. Raises `InputError` for a folder or a pattern without any.
+    What is not a path may be a pattern such as `2024-*/*.mf4`, given in quotes. Hidden files and
+    folders are passed over. Raises `InputError` for a folder or a pattern without any.
     """
     found: list[Log] = []
     for place in given:
@@ -64,7 +64,7 @@ def find_logs(given: Iterable[Place]) -> list[Log]:
 
 
 def find_whole_logs(given: Iterable[Place]) -> list[Log]:
-    """Return folders as logs whose files are their parts. Raises `UsageError` for what is none."""
+    """Return folders, each as one log in several files. Raises `UsageError` for anything else."""
     found: list[Log] = []
     for place in given:
         if not is_url(place) and not Path(place).is_dir():

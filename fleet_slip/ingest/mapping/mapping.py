@@ -20,8 +20,7 @@ from fleet_slip.config import Config, load_config
 from fleet_slip.errors import ConfigError
 from fleet_slip.ingest.formats.can_bus import CanBus, read_can_database
 from fleet_slip.ingest.formats.columns import describe_unknown
-from fleet_slip.ingest.formats.csv_batches import PlainNumbers
-from fleet_slip.ingest.formats.csv_format import CsvFormat
+from fleet_slip.ingest.formats.csv_batches import CsvFormat, PlainNumbers
 from fleet_slip.ingest.formats.duckdb_table import DuckdbRows
 from fleet_slip.ingest.formats.source import OWN_TIME
 from fleet_slip.ingest.mapping.condition_text import text_conditions
