@@ -23,14 +23,14 @@ from fleet_slip.catalogue.feature_sets import PLAIN, FeatureSet
 from fleet_slip.catalogue.features import FeatureCatalogue, features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.windows import Window
+from fleet_slip.columns.blocks.column_plan import ColumnPlan
+from fleet_slip.columns.blocks.drive_columns import Workspace
 from fleet_slip.delta import TableFile
 from fleet_slip.files.data_root import data_root
-from fleet_slip.grams.column_plan import ColumnPlan
-from fleet_slip.grams.columns import Workspace
-from fleet_slip.grams.drive_rows import read_drives
 from fleet_slip.grams.rows import aggregation, statement, wide
 from fleet_slip.grams.rows.aggregation import aggregate, by_sql
 from fleet_slip.grams.rows.drive_parts import Parts
+from fleet_slip.grams.rows.drive_rows import read_drives
 from fleet_slip.warehouse.tables import Warehouse
 
 COLUMNS = (12, 52, 100, 200)

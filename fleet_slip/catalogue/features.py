@@ -14,8 +14,8 @@ from typing import TypeVar
 from pydantic import Field, ValidationError, model_validator
 
 from fleet_slip.canonical import canonical_json, sha256_of
-from fleet_slip.catalogue.columns import COUNT_BITS, Definition
 from fleet_slip.catalogue.course_change import TURNED, course_units
+from fleet_slip.catalogue.definitions import COUNT_BITS, Definition
 from fleet_slip.catalogue.feature_sets import PLAIN, FeatureSet, Regime
 from fleet_slip.catalogue.gates import GateFamily, gated_columns
 from fleet_slip.catalogue.row_features import Feature

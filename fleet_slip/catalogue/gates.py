@@ -7,7 +7,7 @@ from itertools import pairwise
 
 from pydantic import Field, model_validator
 
-from fleet_slip.catalogue.columns import Gate
+from fleet_slip.catalogue.definitions import Gate
 from fleet_slip.catalogue.signals import Identifier
 from fleet_slip.catalogue.windows import TimeColumn
 from fleet_slip.config import Config

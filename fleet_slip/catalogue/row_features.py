@@ -7,7 +7,7 @@ from functools import cached_property
 from pydantic import Field, model_validator
 
 from fleet_slip.catalogue.arithmetic import parse
-from fleet_slip.catalogue.columns import COUNT_BITS, Bits, limit_of
+from fleet_slip.catalogue.definitions import COUNT_BITS, Bits, limit_of
 from fleet_slip.catalogue.feature_sql import integer_sql, names_in, require_integer_sql
 from fleet_slip.catalogue.signals import Identifier, SIUnit, catalogue
 from fleet_slip.config import Config

@@ -6,7 +6,7 @@ from fractions import Fraction
 from pydantic import Field, model_validator
 
 from fleet_slip.catalogue.car_numbers import CAR_NUMBERS, NumberName, Unit
-from fleet_slip.catalogue.columns import (
+from fleet_slip.catalogue.definitions import (
     LONGEST_TICKS,
     Bits,
     Definition,

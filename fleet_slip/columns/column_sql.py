@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from fractions import Fraction
 
 from fleet_slip.catalogue.arithmetic import parse
-from fleet_slip.catalogue.columns import WEIGHT, Definition, Gate, features_behind, limit_of
+from fleet_slip.catalogue.definitions import WEIGHT, Definition, Gate, features_behind, limit_of
 from fleet_slip.catalogue.features import FeatureCatalogue
 from fleet_slip.catalogue.signals import COUNT_MAX, catalogue
 from fleet_slip.columns.lowering import Lowering

@@ -11,7 +11,7 @@ from typing import TypeVar
 
 from fleet_slip.catalogue.arithmetic import parse
 from fleet_slip.catalogue.car_numbers import CAR_NUMBERS
-from fleet_slip.catalogue.columns import (
+from fleet_slip.catalogue.definitions import (
     COUNT_BITS,
     WEIGHT,
     Definition,

@@ -13,10 +13,10 @@ import pyarrow as pa
 
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.signals import COUNT_MAX
+from fleet_slip.columns.blocks.drive_columns import DriveCounts
 from fleet_slip.columns.lowering import CarFact
 from fleet_slip.export.program import UNKNOWN_CAR, Car, Input, Program
-from fleet_slip.grams.columns import DriveCounts
-from fleet_slip.grams.drive_rows import counts_of
+from fleet_slip.grams.rows.drive_rows import counts_of
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predictor import Predictor
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fleet_slip.canonical import canonical_json, sha256_of
-from fleet_slip.catalogue.columns import LARGEST_FACT
+from fleet_slip.catalogue.definitions import LARGEST_FACT
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 from fleet_slip.columns.lowering import CarFact
 from fleet_slip.export.checks import Check

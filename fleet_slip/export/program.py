@@ -12,7 +12,7 @@ from decimal import Decimal
 from fractions import Fraction
 from functools import cached_property
 
-from fleet_slip.catalogue.columns import LARGEST_FACT
+from fleet_slip.catalogue.definitions import LARGEST_FACT
 from fleet_slip.catalogue.signals import COUNT_MAX
 from fleet_slip.columns.lowering import CarCount, CarFact
 from fleet_slip.columns.operations import Range, Step, plain_of, ranges_of, rings_of, roots_of

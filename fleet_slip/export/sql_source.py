@@ -5,7 +5,7 @@ DuckDB, SQLite and PostgreSQL do. What is used more than once is a column of a l
 
 from collections import Counter, defaultdict
 
-from fleet_slip.catalogue.columns import LARGEST_FACT
+from fleet_slip.catalogue.definitions import LARGEST_FACT
 from fleet_slip.catalogue.signals import COUNT_MAX
 from fleet_slip.columns.lowering import CarFact
 from fleet_slip.columns.operations import (

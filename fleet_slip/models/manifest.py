@@ -21,7 +21,7 @@ from pydantic import (
     model_validator,
 )
 
-from fleet_slip.catalogue.columns import Definition
+from fleet_slip.catalogue.definitions import Definition
 from fleet_slip.catalogue.feature_sql import names_in, require_integer_sql
 from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN, Identifier, catalogue
 from fleet_slip.config import Config

@@ -10,12 +10,12 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.arithmetic import parse
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.columns.blocks.block_operations import BLOCK_ROWS
+from fleet_slip.columns.blocks.column_plan import ColumnPlan
+from fleet_slip.columns.blocks.drive_columns import DriveCounts, Workspace
+from fleet_slip.columns.blocks.numbered_columns import NumberedColumns
+from fleet_slip.columns.blocks.row_code import RowColumn
 from fleet_slip.compiling import kernel
-from fleet_slip.grams.column_plan import ColumnPlan
-from fleet_slip.grams.columns import DriveCounts, Workspace
-from fleet_slip.grams.numbered_columns import NumberedColumns
-from fleet_slip.grams.operations import BLOCK_ROWS
-from fleet_slip.grams.row_code import RowColumn
 from fleet_slip.models.manifest import Manifest
 
 KEPT_ROWS = 2**16

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.columns import limit_of
+from fleet_slip.catalogue.definitions import limit_of
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import COUNT_MAX, SAMPLE_TIME_S, catalogue
 from fleet_slip.columns.column_sql import with_windows
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.calibration.calibration import calibrate
 from fleet_slip.grams.cohorts.expansion import CarCounts
-from fleet_slip.grams.drive_rows import counts_of, drives_of_stream
+from fleet_slip.grams.rows.drive_rows import counts_of, drives_of_stream
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predictor import Predictor
 from fleet_slip.resources import read_sql

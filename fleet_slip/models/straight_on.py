@@ -15,11 +15,11 @@ import numpy as np
 
 from fleet_slip.catalogue.car_numbers import NumberName
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.columns.blocks.drive_columns import DriveCounts
 from fleet_slip.errors import DataError
 from fleet_slip.grams.calibration.calibration import calibrate
 from fleet_slip.grams.calibration.car_evidence import CalibratedNumber
 from fleet_slip.grams.cohorts.gram_cohort import Cohort, load_cohort
-from fleet_slip.grams.columns import DriveCounts
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predictor import Predictor
 from fleet_slip.regression.exact.gram import Gram

@@ -17,13 +17,13 @@ from fleet_slip.catalogue.arithmetic import parse
 from fleet_slip.catalogue.feature_sets import lag_signals
 from fleet_slip.catalogue.features import features, load_features
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.columns.blocks.column_plan import ColumnPlan
+from fleet_slip.columns.blocks.drive_columns import DriveColumns, DriveCounts
+from fleet_slip.columns.blocks.row_code import RowColumn
 from fleet_slip.columns.column_sql import with_features
 from fleet_slip.delta import Change, Unit
 from fleet_slip.errors import ConfigError, DataError, QuestionError
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
-from fleet_slip.grams.column_plan import ColumnPlan
-from fleet_slip.grams.columns import DriveColumns, DriveCounts
-from fleet_slip.grams.row_code import RowColumn
 from fleet_slip.grams.rows import aggregation, gram_job
 from fleet_slip.grams.rows import statement as gram_statement
 from fleet_slip.grams.rows.gram_job import update_grams

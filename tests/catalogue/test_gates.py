@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.catalogue.columns import WEIGHT, Definition, Gate
+from fleet_slip.catalogue.definitions import WEIGHT, Definition, Gate
 from fleet_slip.catalogue.features import features, load_features_over
+from fleet_slip.columns.blocks.quotients import weight
 from fleet_slip.columns.column_sql import weight_sql
 from fleet_slip.errors import ConfigError
-from fleet_slip.grams.rounding import weight
 from fleet_slip.resources import folder
 from fleet_slip.selection.model_list import load_model_list
 

@@ -7,7 +7,7 @@ from fractions import Fraction
 import numpy as np
 from hypothesis import strategies as st
 
-from fleet_slip.catalogue.columns import Definition, Fact, Gate, Number
+from fleet_slip.catalogue.definitions import Definition, Fact, Gate, Number
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.export.checks import Sample

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import fleet_slip
+from fleet_slip.columns.blocks.drive_columns import DriveCounts
 from fleet_slip.export.c_steps import LARGEST_UNSIGNED
 from fleet_slip.export.checks import Sample, angles_by_kernel, angles_of_columns
 from fleet_slip.export.compile import compile_program
 from fleet_slip.export.program import Car, Program
-from fleet_slip.grams.columns import DriveCounts
-from fleet_slip.grams.drive_rows import read_drives
+from fleet_slip.grams.rows.drive_rows import read_drives
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.predictor import Predictor
 from tests.export.compiled import SANITIZED, build_driver, can_sanitize, compile_c, drive, needs_cc

@@ -18,7 +18,7 @@ import polars as pl
 import pytest
 from cantools.database.can.database import Database
 
-from fleet_slip.catalogue.columns import Definition, Fact
+from fleet_slip.catalogue.definitions import Definition, Fact
 from fleet_slip.errors import InputError
 from fleet_slip.export import fmu
 from fleet_slip.export.c_names import different

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from fleet_slip.catalogue.car_numbers import NumberName
-from fleet_slip.catalogue.columns import Definition, Fact, Gate, Number, Over
+from fleet_slip.catalogue.definitions import Definition, Fact, Gate, Number, Over
 from fleet_slip.catalogue.row_features import Feature
 from fleet_slip.columns.column_sql import with_windows
 from fleet_slip.export.checks import Sample, angles_by_kernel, angles_of_columns

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.catalogue.columns import Definition
+from fleet_slip.catalogue.definitions import Definition
 from fleet_slip.columns.lowering import most_values
 from fleet_slip.errors import QuestionError
 from fleet_slip.export.checks import angles_by_kernel, make_checks

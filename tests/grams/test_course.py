@@ -11,12 +11,12 @@ import pytest
 from fleet_slip.catalogue.course_change import LARGEST_RAD, TURNED, course_units
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.column_plan import ColumnPlan
-from fleet_slip.grams.columns import Workspace
-from fleet_slip.grams.drive_rows import counts_of
+from fleet_slip.columns.blocks.column_plan import ColumnPlan
+from fleet_slip.columns.blocks.drive_columns import Workspace
 from fleet_slip.grams.rows.aggregation import aggregate, by_sql
 from fleet_slip.grams.rows.check_grams import grams_of
 from fleet_slip.grams.rows.course_sums import course_changes
+from fleet_slip.grams.rows.drive_rows import counts_of
 from fleet_slip.grams.rows.wide import wide_grams
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import land, log_rows, random_counts

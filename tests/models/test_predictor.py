@@ -8,8 +8,8 @@ import polars as pl
 import pyarrow as pa
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.columns import DriveCounts, Workspace
-from fleet_slip.grams.operations import BLOCK_ROWS
+from fleet_slip.columns.blocks.block_operations import BLOCK_ROWS
+from fleet_slip.columns.blocks.drive_columns import DriveCounts, Workspace
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.predictor import Predictor
 from tests.export.models import MODELS, model_of

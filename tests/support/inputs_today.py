@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 from fleet_slip.catalogue.arithmetic import parse
 from fleet_slip.catalogue.features import features, input_scales
+from fleet_slip.columns.blocks.row_code import RowColumn
 from fleet_slip.comparison.rivals.inputs import Inputs
-from fleet_slip.grams.row_code import RowColumn
 
 
 def inputs_today(names: Sequence[str]) -> Inputs:

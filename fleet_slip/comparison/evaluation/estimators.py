@@ -8,9 +8,9 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.columns.blocks.drive_columns import DriveCounts
 from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
-from fleet_slip.grams.columns import DriveCounts
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.predictor import Predictor

@@ -9,14 +9,14 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.arithmetic import parse
-from fleet_slip.catalogue.columns import Definition
+from fleet_slip.catalogue.definitions import Definition
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.columns.blocks.drive_columns import DriveCounts
+from fleet_slip.columns.blocks.numbered_columns import NumberedColumns
+from fleet_slip.columns.blocks.row_code import RowColumn
 from fleet_slip.comparison.evaluation.estimators import Signals, as_counts
 from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive
 from fleet_slip.comparison.rivals.learner import Fitted, one_thread
-from fleet_slip.grams.columns import DriveCounts
-from fleet_slip.grams.numbered_columns import NumberedColumns
-from fleet_slip.grams.row_code import RowColumn
 from fleet_slip.models.manifest import Manifest
 
 

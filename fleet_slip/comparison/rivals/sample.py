@@ -13,7 +13,7 @@ from fleet_slip.grams.cohorts.expansion import CarCounts
 from fleet_slip.grams.cohorts.fold_assignment import assign_folds
 from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.grams.cohorts.reader import cohort_files
-from fleet_slip.grams.drive_rows import read_drives
+from fleet_slip.grams.rows.drive_rows import read_drives
 from fleet_slip.regression.validation.folds import FoldAssignment
 from fleet_slip.warehouse.tables import Warehouse
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray
 from fleet_slip.catalogue.car_numbers import CALIBRATION
-from fleet_slip.catalogue.columns import Number
+from fleet_slip.catalogue.definitions import Number
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import ALL_DRIVES
 from fleet_slip.grams.calibration.calibration import calibration_of

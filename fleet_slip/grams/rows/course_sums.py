@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.catalogue.course_change import COARSER, course_units
 from fleet_slip.catalogue.signals import HALF_TURN
-from fleet_slip.grams.columns import Workspace
-from fleet_slip.grams.operations import BLOCK_ROWS
+from fleet_slip.columns.blocks.block_operations import BLOCK_ROWS
+from fleet_slip.columns.blocks.drive_columns import Workspace
 
 
 @dataclass(frozen=True)

@@ -17,14 +17,14 @@ from threadpoolctl import threadpool_limits
 from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.catalogue.feature_sets import FeatureSet
 from fleet_slip.catalogue.features import features
+from fleet_slip.columns.blocks.block_operations import BLOCK_ROWS
+from fleet_slip.columns.blocks.column_plan import ColumnPlan
+from fleet_slip.columns.blocks.drive_columns import DriveCounts, Workspace
 from fleet_slip.delta import TableFile
 from fleet_slip.errors import DataError, StorageError
-from fleet_slip.grams.column_plan import ColumnPlan
-from fleet_slip.grams.columns import DriveCounts, Workspace
-from fleet_slip.grams.drive_rows import LoggedDrive, read_drives
-from fleet_slip.grams.operations import BLOCK_ROWS
 from fleet_slip.grams.rows.course_sums import course_changes
 from fleet_slip.grams.rows.drive_parts import UNKNOWN, Parts
+from fleet_slip.grams.rows.drive_rows import LoggedDrive, read_drives
 from fleet_slip.warehouse.tables import Warehouse
 
 _EXACT = 2**53

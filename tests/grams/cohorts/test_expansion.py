@@ -9,15 +9,15 @@ import pytest
 import fleet_slip
 from fleet_slip.catalogue.car_numbers import CAR_NUMBERS
 from fleet_slip.catalogue.features import features
+from fleet_slip.columns.blocks.column_plan import ColumnPlan
+from fleet_slip.columns.blocks.drive_columns import DriveCounts
+from fleet_slip.columns.blocks.numbered_columns import NumberedColumns
 from fleet_slip.errors import DataError, InputError, QuestionError
 from fleet_slip.grams.calibration.calibration import calibrate
 from fleet_slip.grams.cohorts.expansion import expand
 from fleet_slip.grams.cohorts.fold_sums import sum_cohort
 from fleet_slip.grams.cohorts.folding import Folding
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
-from fleet_slip.grams.column_plan import ColumnPlan
-from fleet_slip.grams.columns import DriveCounts
-from fleet_slip.grams.numbered_columns import NumberedColumns
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.models.predict import predict
 from fleet_slip.models.score import score, score_statement

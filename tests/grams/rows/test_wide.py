@@ -12,13 +12,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.catalogue.columns import WEIGHT, Definition, Fact, Gate, limit_of
+from fleet_slip.catalogue.definitions import WEIGHT, Definition, Fact, Gate, limit_of
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.columns.blocks.column_plan import ColumnPlan
+from fleet_slip.columns.blocks.drive_columns import DriveColumns, DriveCounts
 from fleet_slip.columns.column_sql import with_windows
 from fleet_slip.errors import DataError
-from fleet_slip.grams.column_plan import ColumnPlan
-from fleet_slip.grams.columns import DriveColumns, DriveCounts
 from fleet_slip.grams.rows import statement
 from fleet_slip.grams.rows.aggregation import aggregate, by_sql
 from fleet_slip.grams.rows.check_grams import grams_of

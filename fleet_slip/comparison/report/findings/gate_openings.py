@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.columns import Definition
+from fleet_slip.catalogue.definitions import Definition
+from fleet_slip.columns.blocks.column_plan import ColumnPlan
+from fleet_slip.columns.blocks.drive_columns import DriveColumns
 from fleet_slip.comparison.evaluation.estimators import as_counts
 from fleet_slip.comparison.evaluation.scenario_runs import EvaluatedScenario
-from fleet_slip.grams.column_plan import ColumnPlan
-from fleet_slip.grams.columns import DriveColumns
 from fleet_slip.models.manifest import Manifest
 
 

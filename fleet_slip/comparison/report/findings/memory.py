@@ -11,13 +11,13 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.columns.blocks.column_plan import ColumnPlan
+from fleet_slip.columns.blocks.drive_columns import DriveColumns
 from fleet_slip.comparison.evaluation.error_figures import error_figures
 from fleet_slip.comparison.evaluation.estimators import as_counts
 from fleet_slip.comparison.evaluation.scenario_runs import EvaluatedScenario
 from fleet_slip.grams.cohorts.folding import Folding
 from fleet_slip.grams.cohorts.gram_cohort import Cohort
-from fleet_slip.grams.column_plan import ColumnPlan
-from fleet_slip.grams.columns import DriveColumns
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.regression.validation.crossval import CrossValidation, cross_validate_inputs
 from fleet_slip.regression.validation.folds import CohortFolds

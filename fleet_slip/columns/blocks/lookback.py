@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from fleet_slip.columns.blocks.block_operations import EACH, FIXED, LIMIT, NUMERATOR
+from fleet_slip.columns.blocks.quotients import clip, nearest
 from fleet_slip.compiling import inner_loop
-from fleet_slip.grams.operations import EACH, FIXED, LIMIT, NUMERATOR
-from fleet_slip.grams.rounding import clip, nearest
 
 
 @inner_loop

@@ -5,14 +5,14 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 from fleet_slip.catalogue.arithmetic import parse
-from fleet_slip.catalogue.columns import Definition, features_behind, limit_of
 from fleet_slip.catalogue.course_change import COURSE, YAW_RATE
+from fleet_slip.catalogue.definitions import Definition, features_behind, limit_of
 from fleet_slip.catalogue.features import FeatureCatalogue
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.columns.blocks.block_program import BlockProgram
+from fleet_slip.columns.blocks.compile_plan import compile_plan
+from fleet_slip.columns.blocks.row_code import RowColumn
 from fleet_slip.errors import DataError
-from fleet_slip.grams.compile_plan import compile_plan
-from fleet_slip.grams.program import Program
-from fleet_slip.grams.row_code import RowColumn
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class ColumnPlan:
         )
 
     @cached_property
-    def program(self) -> Program:
+    def program(self) -> BlockProgram:
         """The program that computes the columns; equal plans have the same.
 
         Raises `QuestionError` for a feature that divides by a number that is not positive.
@@ -108,5 +108,5 @@ def _program(
     rows: tuple[tuple[str, RowColumn], ...],
     windows: tuple[tuple[str, Definition], ...],
     also: tuple[str, ...],
-) -> Program:
+) -> BlockProgram:
     return compile_plan(names, dict(rows), dict(windows), also)

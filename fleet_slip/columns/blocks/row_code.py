@@ -7,9 +7,9 @@ from operator import add, mul, sub
 
 from fleet_slip.catalogue.arithmetic import Arithmetic, Step
 from fleet_slip.catalogue.signals import COUNT_MAX
+from fleet_slip.columns.blocks import block_operations as op
+from fleet_slip.columns.blocks.block_program import Code, Value, VectorOperation
 from fleet_slip.errors import QuestionError
-from fleet_slip.grams import operations as op
-from fleet_slip.grams.program import Code, Operation, Value
 
 _BINARY64 = {
     "+": op.ADD,
@@ -57,7 +57,7 @@ def add_row_column(code: Code, row: RowColumn) -> Value:
     if row.arithmetic is None:
         return code.signal(row.name)
     result = _Expression(code, row.arithmetic).result()
-    return code.add_anew(Operation(op.CLIP, result, ratio=(0.0, 1.0, 0.0, float(row.limit))))
+    return code.add_anew(VectorOperation(op.CLIP, result, ratio=(0.0, 1.0, 0.0, float(row.limit))))
 
 
 @dataclass(frozen=True)
@@ -85,9 +85,9 @@ class _Expression:
         """
         result = self._written(self._value(len(self._arithmetic.steps) - 1))
         if self._integers:
-            return self._code.add(Operation(op.TO_BINARY64, result, c=self._valid()))
+            return self._code.add(VectorOperation(op.TO_BINARY64, result, c=self._valid()))
         if self._guarded is not None or self._divisors:
-            return self._code.add(Operation(op.ADD, result, self._valid()))
+            return self._code.add(VectorOperation(op.ADD, result, self._valid()))
         return result
 
     def _value(self, number: int) -> Value | _Constant:
@@ -99,7 +99,11 @@ class _Expression:
     def _computed(self, step: Step) -> Value | _Constant:
         if step.name:
             counts = self._code.signal(step.name)
-            return self._code.add(Operation(op.TO_INTEGERS, c=counts)) if self._integers else counts
+            return (
+                self._code.add(VectorOperation(op.TO_INTEGERS, c=counts))
+                if self._integers
+                else counts
+            )
         if not step.function:
             return _Constant(step.value)
         if step.function == "//":
@@ -113,7 +117,7 @@ class _Expression:
             return self._multiplied(factor, constants[0] if constants else -1)
         operation = (_INTEGERS if self._integers else _BINARY64)[step.function]
         a, b = (self._written(one) for one in (operands * 2)[:2])
-        return self._code.add(Operation(operation, a, b))
+        return self._code.add(VectorOperation(operation, a, b))
 
     def _quotient(self, step: Step) -> int:
         divides = step.operands[-1]
@@ -150,17 +154,17 @@ class _Expression:
                 raise QuestionError("a feature divides by a number that is not positive.")
             if operation == op.NEAREST:
                 ratio = (1.0, float(b.value), 0.0, inf)
-                return self._code.add(Operation(op.SCALE, self._written(a), ratio=ratio))
+                return self._code.add(VectorOperation(op.SCALE, self._written(a), ratio=ratio))
         elif not self._arithmetic.is_positive(divides):
             self._divisors.append(self._at_least(self._written(b), 1))
-        return self._code.add(Operation(operation, self._written(a), self._written(b)))
+        return self._code.add(VectorOperation(operation, self._written(a), self._written(b)))
 
     def _multiplied(self, a: Value | _Constant, factor: int) -> int:
         if self._integers:
-            by = Operation(op.MULTIPLY_INTEGERS_BY, self._written(a), number=factor)
+            by = VectorOperation(op.MULTIPLY_INTEGERS_BY, self._written(a), number=factor)
         else:
             ratio = (float(factor), 1.0, 0.0, inf)
-            by = Operation(op.MULTIPLY_BY, self._written(a), ratio=ratio)
+            by = VectorOperation(op.MULTIPLY_BY, self._written(a), ratio=ratio)
         return self._code.add(by)
 
     def _written(self, one: Value | _Constant) -> Value:
@@ -168,8 +172,8 @@ class _Expression:
         if not isinstance(one, _Constant):
             return one
         if self._integers:
-            return self._code.add(Operation(op.FILL_INTEGERS, number=one.value))
-        return self._code.add(Operation(op.FILL, ratio=(float(one.value), 1.0, 0.0, inf)))
+            return self._code.add(VectorOperation(op.FILL_INTEGERS, number=one.value))
+        return self._code.add(VectorOperation(op.FILL, ratio=(float(one.value), 1.0, 0.0, inf)))
 
     def _guard(self, number: int) -> int:
         """Return what is 0 where the guard is large enough and nothing is missing, else NaN."""
@@ -179,16 +183,16 @@ class _Expression:
         """Return what is 0 where a value is large enough and nothing is missing, else NaN."""
         if self._integers:  # the sign of a difference is exact however it is rounded
             smallest = self._written(_Constant(least))
-            excess = self._code.add(Operation(op.SUBTRACT_INTEGERS, value, smallest))
-            value = self._code.add(Operation(op.TO_BINARY64, excess, c=self._given()))
+            excess = self._code.add(VectorOperation(op.SUBTRACT_INTEGERS, value, smallest))
+            value = self._code.add(VectorOperation(op.TO_BINARY64, excess, c=self._given()))
             least = 0
-        return self._code.add(Operation(op.GUARD, value, ratio=(float(least), 1.0, 0.0, inf)))
+        return self._code.add(VectorOperation(op.GUARD, value, ratio=(float(least), 1.0, 0.0, inf)))
 
     def _valid(self) -> int:
         """Return what is 0 where the row has a value, else NaN."""
         valid = self._given() if self._guarded is None else self._guarded
         for one in self._divisors:
-            valid = self._code.add(Operation(op.ADD, valid, one))
+            valid = self._code.add(VectorOperation(op.ADD, valid, one))
         return valid
 
     def _given(self) -> int:
@@ -196,7 +200,9 @@ class _Expression:
         total: Value | None = None
         for name in self._arithmetic.inputs:
             counts = self._code.signal(name)
-            total = counts if total is None else self._code.add(Operation(op.ADD, total, counts))
+            total = (
+                counts if total is None else self._code.add(VectorOperation(op.ADD, total, counts))
+            )
         if total is None:
-            return self._code.add(Operation(op.FILL))
-        return self._code.add(Operation(op.GUARD, total, ratio=(-inf, 1.0, 0.0, inf)))
+            return self._code.add(VectorOperation(op.FILL))
+        return self._code.add(VectorOperation(op.GUARD, total, ratio=(-inf, 1.0, 0.0, inf)))

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.columns import Fact
-from fleet_slip.grams.operations import ADD_UP, BLOCK_ROWS, COPY, KEEP, TILE, Region
+from fleet_slip.catalogue.definitions import Fact
+from fleet_slip.columns.blocks.block_operations import ADD_UP, BLOCK_ROWS, COPY, KEEP, TILE, Region
 
 Place = tuple[Region, int]
 """A part of the memory, and its number there."""
@@ -25,7 +25,7 @@ for all of them."""
 
 
 @dataclass(frozen=True)
-class Operation:
+class VectorOperation:
     """One operation; `operations` says what it reads and does."""
 
     operation: int
@@ -56,21 +56,21 @@ class Code:
         kinds: windows of different lengths in ticks.
     """
 
-    operations: list[Operation] = field(default_factory=list)
+    operations: list[VectorOperation] = field(default_factory=list)
     signals: dict[str, int] = field(default_factory=dict)
     facts: dict[Fact, int] = field(default_factory=dict)
     summed: dict[Value, int] = field(default_factory=dict)
     kept: dict[Value, int] = field(default_factory=dict)
     kinds: dict[int, int] = field(default_factory=dict)
-    _known: dict[Operation, int] = field(default_factory=dict)
+    _known: dict[VectorOperation, int] = field(default_factory=dict)
 
-    def add(self, one: Operation) -> int:
+    def add(self, one: VectorOperation) -> int:
         """Add an operation if there is no equal one; return its number."""
         if one not in self._known:
             self._known[one] = self.add_anew(one)
         return self._known[one]
 
-    def add_anew(self, one: Operation) -> int:
+    def add_anew(self, one: VectorOperation) -> int:
         """Add an operation that counts what it clips, for each column that it does so."""
         self.operations.append(one)
         return len(self.operations) - 1
@@ -79,15 +79,16 @@ class Code:
         """Return where the counts of a signal are."""
         return (Region.SIGNAL, self.signals.setdefault(name, len(self.signals)))
 
-    def assemble(self, results: Sequence[Value], also: Sequence[Value] = ()) -> "Program":
+    def assemble(self, results: Sequence[Value], also: Sequence[Value] = ()) -> "BlockProgram":
         """Return the program that leaves some results in the first registers, in their order.
 
         Those of `also` come after them and what pads them to whole tiles.
         """
         columns = [
-            one if isinstance(one, int) else self.add_anew(Operation(COPY, one)) for one in results
+            one if isinstance(one, int) else self.add_anew(VectorOperation(COPY, one))
+            for one in results
         ]
-        beside = [self.add_anew(Operation(COPY, one)) for one in also]
+        beside = [self.add_anew(VectorOperation(COPY, one)) for one in also]
         registers = {value: register for register, value in enumerate(columns)}
         registers |= {value: padded(len(columns)) + i for i, value in enumerate(beside)}
         last = {read: number for number, one in enumerate(self.operations) for read in one.reads}
@@ -105,7 +106,7 @@ class Code:
             + [(Region.REGISTER, registers[r]) if isinstance(r, int) else r for r in one.reads]
             for number, one in enumerate(self.operations)
         ]
-        return Program(self, np.array(places, dtype=np.int64), len(columns), count)
+        return BlockProgram(self, np.array(places, dtype=np.int64), len(columns), count)
 
 
 def padded(columns: int) -> int:
@@ -114,7 +115,7 @@ def padded(columns: int) -> int:
 
 
 @dataclass(frozen=True)
-class Program:
+class BlockProgram:
     """Operations with places for what they read and write.
 
     Attributes:

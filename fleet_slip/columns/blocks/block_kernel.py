@@ -4,10 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from fleet_slip.compiling import inner_loop, kernel
-from fleet_slip.grams.block_arithmetic import compute, compute_integers
-from fleet_slip.grams.lookback import add_up, divide_sums, find_begins, values_ago
-from fleet_slip.grams.operations import (
+from fleet_slip.columns.blocks.block_arithmetic import compute, compute_integers
+from fleet_slip.columns.blocks.block_operations import (
     ADD_UP,
     AGO,
     BLOCK_ROWS,
@@ -28,7 +26,9 @@ from fleet_slip.grams.operations import (
     C,
     D,
 )
-from fleet_slip.grams.rows.product_sums import add_products, add_sums
+from fleet_slip.columns.blocks.lookback import add_up, divide_sums, find_begins, values_ago
+from fleet_slip.columns.blocks.product_sums import add_products, add_sums
+from fleet_slip.compiling import inner_loop, kernel
 
 GAPS, FOUND = 0, 1
 """Rows of `flags`: whether a sum has had gaps, and whether a kind's begins were found."""

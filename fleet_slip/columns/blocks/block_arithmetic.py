@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from fleet_slip.catalogue.columns import WEIGHT
-from fleet_slip.compiling import inner_loop
-from fleet_slip.grams.operations import (
+from fleet_slip.catalogue.definitions import WEIGHT
+from fleet_slip.columns.blocks.block_operations import (
     ABSOLUTE,
     ABSOLUTE_INTEGERS,
     ADD,
@@ -36,7 +35,8 @@ from fleet_slip.grams.operations import (
     TO_INTEGERS,
     WEIGH,
 )
-from fleet_slip.grams.rounding import clip, nearest, nearest_integer, truncated, weight
+from fleet_slip.columns.blocks.quotients import clip, nearest, nearest_integer, truncated, weight
+from fleet_slip.compiling import inner_loop
 
 
 @inner_loop

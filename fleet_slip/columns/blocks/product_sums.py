@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from fleet_slip.columns.blocks.block_operations import TILE
 from fleet_slip.compiling import exact_loop, inner_loop
-from fleet_slip.grams.operations import TILE
 
 
 @inner_loop

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from fleet_slip.catalogue.columns import WEIGHT
+from fleet_slip.catalogue.definitions import WEIGHT
 from fleet_slip.compiling import equation
 
 

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.catalogue.columns import limit_of
+from fleet_slip.catalogue.definitions import limit_of
+from fleet_slip.columns.blocks.block_kernel import GAPS, run
+from fleet_slip.columns.blocks.block_operations import BLOCK_ROWS, Region
+from fleet_slip.columns.blocks.block_program import padded
+from fleet_slip.columns.blocks.column_plan import ColumnPlan
 from fleet_slip.errors import DataError
-from fleet_slip.grams.column_plan import ColumnPlan
-from fleet_slip.grams.kernel import GAPS, run
-from fleet_slip.grams.operations import BLOCK_ROWS, Region
-from fleet_slip.grams.program import padded
 
 _EXACT = 2**53
 _COUNTS = np.iinfo(np.int16)

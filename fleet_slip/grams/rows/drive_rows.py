@@ -9,9 +9,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from fleet_slip.columns.blocks.column_plan import ColumnPlan
+from fleet_slip.columns.blocks.drive_columns import DriveCounts
 from fleet_slip.delta import TableFile
-from fleet_slip.grams.column_plan import ColumnPlan
-from fleet_slip.grams.columns import DriveCounts
 from fleet_slip.warehouse.tables import Warehouse
 
 

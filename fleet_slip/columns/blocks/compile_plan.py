@@ -4,10 +4,19 @@ from collections.abc import Mapping, Sequence
 from math import inf
 from typing import TypeVar
 
-from fleet_slip.catalogue.columns import Definition, limit_of
-from fleet_slip.grams.operations import ADD_UP, AGO, FACT, KEEP, QUOTIENT, SCALE, WEIGH, Region
-from fleet_slip.grams.program import Code, Operation, Program, Value
-from fleet_slip.grams.row_code import RowColumn, add_row_column
+from fleet_slip.catalogue.definitions import Definition, limit_of
+from fleet_slip.columns.blocks.block_operations import (
+    ADD_UP,
+    AGO,
+    FACT,
+    KEEP,
+    QUOTIENT,
+    SCALE,
+    WEIGH,
+    Region,
+)
+from fleet_slip.columns.blocks.block_program import BlockProgram, Code, Value, VectorOperation
+from fleet_slip.columns.blocks.row_code import RowColumn, add_row_column
 
 
 def compile_plan(
@@ -15,7 +24,7 @@ def compile_plan(
     rows: Mapping[str, RowColumn],
     windows: Mapping[str, Definition],
     also: Sequence[str] = (),
-) -> Program:
+) -> BlockProgram:
     """Return the program of columns: of `rows`, and of `windows` that look back on one of `rows`.
 
     `also` are those of `rows` that it leaves beside the columns. Raises `QuestionError` for
@@ -38,7 +47,9 @@ def compile_plan(
     for window, (part, gate) in gates.items():
         high = inf if gate.high is None else float(gate.high)
         knots = (float(gate.low), float(gate.peak), 0.0, high)
-        found[window] = code.add_anew(Operation(WEIGH, parts[part], parts[gate.by], ratio=knots))
+        found[window] = code.add_anew(
+            VectorOperation(WEIGH, parts[part], parts[gate.by], ratio=knots)
+        )
     return code.assemble([found[name] for name in names], [values[name] for name in also])
 
 
@@ -48,9 +59,11 @@ def _add_window(code: Code, one: Definition, value: Value) -> int:
     limit = float(limit_of(one.bits))
     scale = (numerator, denominator, 0.0, limit)
     if one.over is None:
-        found = code.add_anew(Operation(SCALE, value, ratio=scale))
+        found = code.add_anew(VectorOperation(SCALE, value, ratio=scale))
     elif one.over == "lag":
-        found = code.add_anew(Operation(SCALE, _value_ago(code, one.ticks, value), ratio=scale))
+        found = code.add_anew(
+            VectorOperation(SCALE, _value_ago(code, one.ticks, value), ratio=scale)
+        )
     else:
         ratio = scale if one.over == "sum" else (numerator, 0.0, denominator, limit)
         found = _quotient(code, one.ticks, value, ratio)
@@ -58,7 +71,7 @@ def _add_window(code: Code, one: Definition, value: Value) -> int:
         return found
     fact, times = _number(code.facts, one.fact), one.fact.ratio
     scale = (float(times.numerator), float(times.denominator), 0.0, limit)
-    return code.add_anew(Operation(FACT, found, (Region.FACT, fact), ratio=scale))
+    return code.add_anew(VectorOperation(FACT, found, (Region.FACT, fact), ratio=scale))
 
 
 def _quotient(
@@ -66,10 +79,10 @@ def _quotient(
 ) -> int:
     slot, kind = _number(code.summed, value), _number(code.kinds, ticks)
     sums, counts = (Region.SUM, slot), (Region.COUNT, slot)
-    code.add(Operation(ADD_UP, value, sums, counts, slot=slot))
+    code.add(VectorOperation(ADD_UP, value, sums, counts, slot=slot))
     begins = (Region.BEGIN, kind)
     return code.add_anew(
-        Operation(
+        VectorOperation(
             QUOTIENT, value, sums, begins, counts, slot=slot, kind=kind, ticks=ticks, ratio=ratio
         )
     )
@@ -78,9 +91,9 @@ def _quotient(
 def _value_ago(code: Code, ticks: int, value: Value) -> int:
     """Add what reads the value so many ticks ago: its window begins there, one tick longer."""
     slot, kind = _number(code.kept, value), _number(code.kinds, ticks + 1)
-    code.add(Operation(KEEP, value, (Region.VALUE, slot)))
+    code.add(VectorOperation(KEEP, value, (Region.VALUE, slot)))
     begins = (Region.BEGIN, kind)
-    return code.add(Operation(AGO, (Region.VALUE, slot), c=begins, kind=kind, ticks=ticks))
+    return code.add(VectorOperation(AGO, (Region.VALUE, slot), c=begins, kind=kind, ticks=ticks))
 
 
 Key = TypeVar("Key")

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.columns import Definition, Number
-from fleet_slip.grams.column_plan import ColumnPlan
-from fleet_slip.grams.columns import DriveColumns, DriveCounts
-from fleet_slip.grams.row_code import RowColumn
+from fleet_slip.catalogue.definitions import Definition, Number
+from fleet_slip.columns.blocks.column_plan import ColumnPlan
+from fleet_slip.columns.blocks.drive_columns import DriveColumns, DriveCounts
+from fleet_slip.columns.blocks.row_code import RowColumn
 
 _OF, _RUNNING = "_of_number", "_for_number"
 """What the names of the columns end in that a calibrated column is made of."""
