@@ -1,7 +1,7 @@
 """A night with real cars: what is new comes in, is examined, and trains the model again."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from datetime import date
@@ -30,6 +30,7 @@ from fleet_slip.words import number_of
 
 if TYPE_CHECKING:
     from fleet_slip.api.fleet import Fleet, ShowStep
+    from fleet_slip.grams.cohorts.outweighing import Outweighing
     from fleet_slip.monitoring.monitor import Chart
     from fleet_slip.monitoring.quality import SensorFault
 
@@ -241,7 +242,8 @@ class Night:
             )
         if publication is None:
             publication = self.fleet.publish(name, selection, candidate=True, sign_key=key)
-        told = f"{publication.version.reference}: {publication.reason}"
+        left_out = _outweighing(selection.cohort.outweighing)
+        told = f"{publication.version.reference}: {publication.reason}{left_out}"
         return "attention" if refusal else "done", told
 
     def _verify(self) -> Told:
@@ -271,6 +273,14 @@ def _count_drives(warehouse: Warehouse) -> int:
     query = "SELECT count(DISTINCT drive_id) FROM grams"
     with connect_tables(warehouse, query) as database:
         return int(database.sql(query).fetchall()[0][0])
+
+
+def _outweighing(cars: "Sequence[Outweighing]") -> str:
+    """Return the sentence on drives that did not train, since their car would outweigh others."""
+    if not cars:
+        return ""
+    drives = number_of(sum(one.drives for one in cars), "drive")
+    return f" {drives} of {number_of(len(cars), 'car')} left out: they would outweigh the others."
 
 
 def _revoked(drives: Mapping[str, int]) -> str:

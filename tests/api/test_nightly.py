@@ -151,16 +151,21 @@ def test_a_fleet_that_sends_messages_alone_has_nights(place: Path, tmp_path: Pat
         for car in range(12):
             told = counts(drive(rng, gentleness=2.0))
             matrix = np.column_stack([told[name].astype(np.int64) for name in names])
-            start_s = START_S + 86_400 * night
-            content += message_of(Gram.from_counts(names, matrix), f"VIN{car}", start_s)
+            gram = Gram.from_counts(names, matrix)
+            content += message_of(gram, f"VIN{car}", START_S + 86_400 * night)
+        if night == 1:
+            sums, products = ([2000 * n for n in some] for some in (gram.sums, gram.products))
+            long = Gram(names, 2000 * gram.n, tuple(sums), tuple(products))
+            content += message_of(long, "LONG", START_S + 86_400 * night)
         (tmp_path / f"{night}").write_bytes(content)
         fleet.receive(tmp_path / f"{night}")
         report = give(place, night)
         assert (report.exit_code, report.drives, report.champion) == (
             0,
-            12 * (night + 1),
+            12 + 13 * night,
             f"smoke@{night + 1}",
         ), report.as_text()
+    assert "1 drive of 1 car left out: they would outweigh the others." in report.as_text()
     assert "smoke@2 is up to date" in give(place, 2).as_text()
     assert fleet.verify(full=True).findings == []
 
