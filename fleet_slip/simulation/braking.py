@@ -10,14 +10,11 @@ from fleet_slip.vehicle.integration import SECOND_ORDER, Slopes, advance
 from fleet_slip.vehicle.parameters import Constants
 from fleet_slip.vehicle.state import Controls, State
 from fleet_slip.vehicle.wheels import (
-    SLOWEST_DRIVE_MPS,
     Acceleration,
-    Loads,
-    WheelForces,
-    WheelRates,
     ackermann,
+    braked_spins,
     build_wheel_forces,
-    spin_rate,
+    driver_brakes,
     transferred_loads,
 )
 
@@ -44,30 +41,14 @@ _forces = build_wheel_forces(True, True)
 
 
 @equation
-def braked_spins(
-    x: State, force: WheelForces, load: Loads, brakes: Brakes, c: Constants
-) -> WheelRates:
-    """Return the rates of the wheels as `driven_spins` does, each with a brake of its own."""
-    strongest = c.power_per_mass / max(abs(x.vx), SLOWEST_DRIVE_MPS)
-    drive = c.mass * min(max(x.traction, 0.0), strongest)
-    brake = c.mass * max(-x.traction, 0.0)
-    drive_f, drive_r = c.drive_front * drive, c.drive_rear * drive
-    brake_f, brake_r = c.brake_front * brake, c.brake_rear * brake
-    return WheelRates(
-        spin_rate(force.fl, x.wheel_fl, load.fl, drive_f, brake_f + brakes.fl, c),
-        spin_rate(force.fr, x.wheel_fr, load.fr, drive_f, brake_f + brakes.fr, c),
-        spin_rate(force.rl, x.wheel_rl, load.rl, drive_r, brake_r + brakes.rl, c),
-        spin_rate(force.rr, x.wheel_rr, load.rr, drive_r, brake_r + brakes.rr, c),
-    )
-
-
-@equation
 def braked_derivative(x: State, u: Controls, brakes: Brakes, c: Constants) -> Derivative:
     """Return the rates of a car with all extensions and a brake at each wheel."""
     load = transferred_loads(x, c)
     force = _forces(x, ackermann(x, u, c), load, c)
     motion: Acceleration = driven_body(x, u, force, c)
-    return rates_of(x, u, motion, braked_spins(x, force, load, brakes, c), c)
+    front, rear = driver_brakes(x, c)
+    each = (front + brakes.fl, front + brakes.fr, rear + brakes.rl, rear + brakes.rr)
+    return rates_of(x, u, motion, braked_spins(x, force, load, each, c), c)
 
 
 @numba.njit(error_model="numpy", nogil=True, cache=False)

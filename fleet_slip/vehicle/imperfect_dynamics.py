@@ -5,7 +5,6 @@ point elsewhere, tyres lag, and weight and wind act along the road. Sources:
 `docs/imperfections.md`.
 """
 
-import math
 from typing import NamedTuple
 
 from fleet_slip.compiling import equation
@@ -21,6 +20,7 @@ from fleet_slip.vehicle.wheels import (
     Loads,
     WheelForce,
     WheelForces,
+    direction_of,
     driven_spins,
     in_car_frame,
     transferred_loads,
@@ -88,12 +88,6 @@ def rack_tangent(give: Give, c: Constants, t: Traits) -> float:
 
 
 @equation
-def _unit(along: float, across: float) -> Direction:
-    inverse = 1.0 / math.sqrt(along * along + across * across)
-    return Direction(along * inverse, across * inverse)
-
-
-@equation
 def _imperfect_wheel(
     vx: float,
     vy: float,
@@ -127,9 +121,9 @@ def _wheels(
     """Return the forces of the wheels and the rates of what follows them."""
     tangent = rack_tangent(give, c, t)
     bend = c.ackermann * tangent
-    left = _unit(*wheel_tangent(tangent, 1.0 - bend, -t.toe))
-    right = _unit(*wheel_tangent(tangent, 1.0 + bend, t.toe))
-    rear_left, rear_right = _unit(1.0, t.rear_left), _unit(1.0, t.rear_right)
+    left = direction_of(*wheel_tangent(tangent, 1.0 - bend, -t.toe))
+    right = direction_of(*wheel_tangent(tangent, 1.0 + bend, t.toe))
+    rear_left, rear_right = direction_of(1.0, t.rear_left), direction_of(1.0, t.rear_right)
     front, rear = x.vy + c.front * x.yaw_rate, x.vy - c.rear * x.yaw_rate
     turn_f, turn_r = c.half_track_front * x.yaw_rate, c.half_track_rear * x.yaw_rate
     peak_f, peak_r = around.stiffness * c.stiffness_front, around.stiffness * c.stiffness_rear

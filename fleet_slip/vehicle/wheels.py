@@ -96,7 +96,7 @@ AHEAD = Direction(1.0, 0.0)
 
 
 @equation
-def _direction(along: float, across: float) -> Direction:
+def direction_of(along: float, across: float) -> Direction:
     """Return the direction of a vector with `along` > 0."""
     inverse = 1.0 / math.sqrt(along * along + across * across)
     return Direction(along * inverse, across * inverse)
@@ -112,13 +112,13 @@ def ackermann(x: State, _u: Controls, c: Constants) -> tuple[Direction, Directio
     """
     tangent = c.steer_per_wheel * x.steering_wheel
     nearer = c.ackermann * tangent
-    return _direction(1.0 - nearer, tangent), _direction(1.0 + nearer, tangent)
+    return direction_of(1.0 - nearer, tangent), direction_of(1.0 + nearer, tangent)
 
 
 @equation
 def parallel(_x: State, u: Controls, c: Constants) -> tuple[Direction, Direction]:
     """Return one direction for both front wheels, without the lag of the steering."""
-    direction = _direction(1.0, c.steer_per_wheel * u.steering_wheel)
+    direction = direction_of(1.0, c.steer_per_wheel * u.steering_wheel)
     return direction, direction
 
 
@@ -263,21 +263,35 @@ def spin_rate(
 
 
 @equation
+def driver_brakes(x: State, c: Constants) -> tuple[float, float]:
+    """Return the brake force that the driver asks of a front and of a rear wheel, in N."""
+    brake = c.mass * max(-x.traction, 0.0)
+    return c.brake_front * brake, c.brake_rear * brake
+
+
+@equation
+def braked_spins(
+    x: State, force: WheelForces, load: Loads, brakes: tuple[float, ...], c: Constants
+) -> WheelRates:
+    """Return the rates of the wheels under the drivetrain's torque and a brake force of each."""
+    strongest = c.power_per_mass / max(abs(x.vx), SLOWEST_DRIVE_MPS)
+    drive = c.mass * min(max(x.traction, 0.0), strongest)
+    drive_f, drive_r = c.drive_front * drive, c.drive_rear * drive
+    return WheelRates(
+        spin_rate(force.fl, x.wheel_fl, load.fl, drive_f, brakes[0], c),
+        spin_rate(force.fr, x.wheel_fr, load.fr, drive_f, brakes[1], c),
+        spin_rate(force.rl, x.wheel_rl, load.rl, drive_r, brakes[2], c),
+        spin_rate(force.rr, x.wheel_rr, load.rr, drive_r, brakes[3], c),
+    )
+
+
+@equation
 def driven_spins(
     x: State, force: WheelForces, load: Loads, _motion: Acceleration, c: Constants
 ) -> WheelRates:
-    """Return the rates of the wheels under the torques of drivetrain and brakes."""
-    strongest = c.power_per_mass / max(abs(x.vx), SLOWEST_DRIVE_MPS)
-    drive = c.mass * min(max(x.traction, 0.0), strongest)
-    brake = c.mass * max(-x.traction, 0.0)
-    drive_f, drive_r = c.drive_front * drive, c.drive_rear * drive
-    brake_f, brake_r = c.brake_front * brake, c.brake_rear * brake
-    return WheelRates(
-        spin_rate(force.fl, x.wheel_fl, load.fl, drive_f, brake_f, c),
-        spin_rate(force.fr, x.wheel_fr, load.fr, drive_f, brake_f, c),
-        spin_rate(force.rl, x.wheel_rl, load.rl, drive_r, brake_r, c),
-        spin_rate(force.rr, x.wheel_rr, load.rr, drive_r, brake_r, c),
-    )
+    """Return the rates of the wheels under the torques of drivetrain and driver."""
+    front, rear = driver_brakes(x, c)
+    return braked_spins(x, force, load, (front, front, rear, rear), c)
 
 
 @equation

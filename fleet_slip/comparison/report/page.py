@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Sequence
 
+from fleet_slip.comparison.evaluation.targets import PAPER_TABLE_TWO
 from fleet_slip.comparison.report.claims.judging import Judged, Status, judge_claims
 from fleet_slip.comparison.report.findings.report_data import ReportData
 from fleet_slip.comparison.report.tables import further_tables, paper_tables
@@ -85,7 +86,7 @@ def _tiles(data: ReportData, claims: Sequence[Judged]) -> list[Tile]:
     nominal = data.evaluated.figures("nominal", data.choice)
     if nominal is not None and nominal.error_std_deg is not None:
         number = data.choice_number
-        paper = paper_tables.PAPER_TABLE_TWO[number][1]
+        paper = PAPER_TABLE_TWO[number][1]
         tiles.append(
             Tile(
                 degrees(nominal.error_std_deg),

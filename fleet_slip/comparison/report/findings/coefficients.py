@@ -12,6 +12,7 @@ from fleet_slip.regression.exact.least_squares import fit
 from fleet_slip.regression.inference.drive_moments import ClusterUnit
 from fleet_slip.regression.inference.standard_errors import (
     INTERCEPT,
+    Estimate,
     infer_by_clusters,
     infer_classically,
     variance_inflation,
@@ -23,24 +24,17 @@ class Coefficient:
     """One row of a coefficient table.
 
     Attributes:
-        name: signal, or "intercept".
+        estimate: of a signal or the intercept, with drives, or cars, as the independent pieces of
+            evidence.
         unit: of the value.
-        value: coefficient.
-        cluster_error: standard error with drives, or cars, as the independent pieces of evidence.
         row_error: standard error as if every row were independent.
-        t: value / cluster_error.
-        p: two-sided probability of a larger |t| if the true coefficient were zero.
         share_deg: degrees of estimate for one standard deviation of the signal; None of a constant.
         inflation: variance inflation factor; None of the intercept.
     """
 
-    name: str
+    estimate: Estimate
     unit: str
-    value: float
-    cluster_error: float
     row_error: float
-    t: float
-    p: float
     share_deg: float | None
     inflation: float | None
 
@@ -79,17 +73,6 @@ def coefficient_table(
         if not constant:
             deviation = spread[estimate.name] * float(scales[estimate.name])
             share = math.degrees(estimate.value * deviation)
-        rows.append(
-            Coefficient(
-                name=estimate.name,
-                unit=unit,
-                value=estimate.value,
-                cluster_error=estimate.standard_error,
-                row_error=other.standard_error,
-                t=estimate.t,
-                p=estimate.p,
-                share_deg=share,
-                inflation=inflation.get(estimate.name),
-            )
-        )
+        found = inflation.get(estimate.name)
+        rows.append(Coefficient(estimate, unit, other.standard_error, share, found))
     return Coefficients(model, tuple(rows), len(moments), moments.unit, served.table.total().n)

@@ -40,13 +40,14 @@ def coefficient_tables(data: ReportData) -> Iterator[ReportTable]:
 
 
 def _coefficient(row: Coefficient) -> list[str]:
+    one = row.estimate
     return [
-        row.name,
+        one.name,
         row.unit.replace("^2", "²"),
-        scientific(row.value, 3),
-        scientific(row.cluster_error),
-        number(row.t, 1),
-        scientific(row.p, 0) if row.p >= 1e-99 else "< 10⁻⁹⁹",
+        scientific(one.value, 3),
+        scientific(one.standard_error),
+        number(one.t, 1),
+        scientific(one.p, 0) if one.p >= 1e-99 else "< 10⁻⁹⁹",
         scientific(row.row_error),
         degrees(row.share_deg, 2, sign=True),
         number(row.inflation, 0),

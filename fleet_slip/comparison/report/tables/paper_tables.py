@@ -3,22 +3,13 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from fleet_slip.comparison.evaluation.targets import FILTER_SCENARIOS
+from fleet_slip.comparison.evaluation.targets import FILTER_SCENARIOS, PAPER_TABLE_TWO
 from fleet_slip.comparison.report.findings.report_data import ReportData
 from fleet_slip.pages.page_table import Cell, ReportTable, table
 from fleet_slip.pages.text import count, degrees, number
 
 PAPER_TABLE_ONE = {"1": 0.9013, "2": 0.9534, "3": 0.9796, "4": 0.9911, "5": 0.9911}
 """Cross-validated correlations, Table I."""
-
-PAPER_TABLE_TWO = {
-    "1": (0.0135, 0.3018),
-    "2": (-0.0146, 0.1754),
-    "3": (-0.0209, 0.1556),
-    "4": (-0.0060, 0.1549),
-    "5": (-0.0079, 0.1505),
-}
-"""Mean and standard deviation of the error in deg, Table II."""
 
 
 def table_one(data: ReportData) -> ReportTable:
