@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.commands import COMMAND, run
+from tests.support.commands import COMMAND, run_prepared
 
 
 def complete(root: Path, *words: str) -> list[str]:
@@ -15,7 +15,7 @@ def complete(root: Path, *words: str) -> list[str]:
         "COMP_WORDS": " ".join(typed),
         "COMP_CWORD": str(len(typed) - 1),
     }
-    done = run([COMMAND], env={**os.environ, **asked})
+    done = run_prepared([COMMAND], env={**os.environ, **asked})
     assert done.stderr == ""
     return done.stdout.split()
 
@@ -26,8 +26,8 @@ def complete(root: Path, *words: str) -> list[str]:
         (["sh"], ["show", "shell", "shrink"]),
         (["show", "sm"], ["smoke"]),
         (["show", "smoke@"], ["smoke@champion", "smoke@1"]),
-        (["simulate", "water"], ["waterford"]),
-        (["run", "--campaign", "prov"], ["proving_ground"]),
+        (["simulate", "water"], ["waterford", "waterford_course"]),
+        (["run", "--campaign", "prov"], ["proving_ground", "proving_ground_course"]),
         (["select", "--models", "tab"], ["table1"]),
         (["gram", "--features", "win"], ["windows"]),
         (["evaluate", "--scenario", "mass_1"], ["mass_1000", "mass_1740"]),

@@ -30,7 +30,10 @@ import fleet_slip
 from fleet_slip.cli.main import main as fleet_slip_main
 from fleet_slip.ingest.mapping.units import require_unit
 
-READ_LATE = ("AWS_", "FLEET_SLIP_", "XDG_CACHE_HOME", "CACHE_DIRECTORY", "TMPDIR")
+READ_LATE = (
+    *("AWS_", "FLEET_SLIP_", "XDG_CACHE_HOME", "CACHE_DIRECTORY", "TMPDIR"),
+    *("_FLEET_SLIP_COMPLETE", "COMP_"),
+)
 """How variables begin that nothing reads while importing."""
 
 LATE = ("pandas", "matplotlib.figure")
