@@ -5,7 +5,7 @@ from pathlib import Path
 
 import duckdb
 
-from fleet_slip.catalogue.car_numbers import CALIBRATION
+from fleet_slip.catalogue.car_numbers import CALIBRATION, DELAY
 from fleet_slip.catalogue.features import features
 from fleet_slip.files.data_root import data_root
 from fleet_slip.files.folder import Folder
@@ -101,8 +101,10 @@ def _calibrate(database: duckdb.DuckDBPyConnection) -> None:
     from fleet_slip.grams.calibration.calibration import calibration_table  # noqa: PLC0415
     from fleet_slip.grams.cohorts.reader import OpenedGrams  # noqa: PLC0415
 
-    opened = OpenedGrams(database, features().identity(CALIBRATION), 0, 0)
-    add_table(database, CALIBRATION, calibration_table(opened))
+    numbers, delays = (
+        OpenedGrams(database, features().identity(name), 0, 0) for name in (CALIBRATION, DELAY)
+    )
+    add_table(database, CALIBRATION, calibration_table(numbers, delays))
 
 
 def needed_views(query: str) -> frozenset[str]:

@@ -10,7 +10,7 @@ from fleet_slip.api.calls import Workers, open_workers, record_call
 from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.filling import Filling
 from fleet_slip.api.tending import Tending
-from fleet_slip.catalogue.car_numbers import CALIBRATION
+from fleet_slip.catalogue.car_numbers import CALIBRATION, DELAY
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.models.manifest import require_model_name
@@ -143,8 +143,9 @@ class Fleet(Filling, Tending):
                         progress=_of_step(progress, f"gram {feature_set}"),
                     )
                 if features().feature_set(feature_set).change_ticks:
-                    # What the intercept follows from.
-                    self.gram(CALIBRATION, cohort=condition, workers=executor)
+                    # What the intercept follows from, and whether the course came in time.
+                    for name_of_set in (CALIBRATION, DELAY):
+                        self.gram(name_of_set, cohort=condition, workers=executor)
             refusal, selection = "", None
             training = Training(model_name, condition, models, worth, sign_key)
             publication = training.made_already(self)

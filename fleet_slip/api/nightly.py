@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from fleet_slip.api.calls import ShowProgress, Workers
 from fleet_slip.api.retraining import Training
-from fleet_slip.catalogue.car_numbers import CALIBRATION
+from fleet_slip.catalogue.car_numbers import CALIBRATION, DELAY
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.errors import DataError, FleetSlipError, InputError
@@ -186,8 +186,9 @@ class Night:
 
     def _gram(self) -> Told:
         wanted = load_model_list(self.training.models).features
-        changes = features().feature_set(wanted).change_ticks  # whose intercept is calibrated
-        for name in dict.fromkeys((PLAIN, wanted, *([CALIBRATION] if changes else []))):
+        changes = features().feature_set(wanted).change_ticks
+        beside = (CALIBRATION, DELAY) if changes else ()  # for the intercept, and the course's time
+        for name in dict.fromkeys((PLAIN, wanted, *beside)):
             self.fleet.gram(
                 name,
                 cohort=None if name == PLAIN else self.training.cohort,

@@ -15,6 +15,9 @@ from fleet_slip.config import Config
 CALIBRATION = "calibration"
 """The feature set whose Gram rows tell the numbers."""
 
+DELAY = "delay"
+"""The feature set whose Gram rows tell how late a satellite receiver is."""
+
 NumberName = Literal[
     "yaw_rate_offset",
     "yaw_rate_offset_by_wheels",

@@ -41,7 +41,8 @@ def uncalibrated(tmp_path_factory: pytest.TempPathFactory) -> Fleet:
 @pytest.fixture
 def fleet(uncalibrated: Fleet, tmp_path: Path) -> Fleet:
     made = fleet_slip.open(shutil.copytree(str(uncalibrated.root), tmp_path / "data"))
-    made.gram("calibration")
+    for name in ("calibration", "delay"):
+        made.gram(name)
     return made
 
 

@@ -12,9 +12,11 @@ from typing import Any
 import pyarrow as pa
 
 from fleet_slip.catalogue.car_numbers import CALIBRATION, CAR_NUMBERS, NumberName
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 from fleet_slip.catalogue.sources import ALL_DRIVES
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.calibration.car_evidence import CalibratedNumber, CarEvidence, Convergence
+from fleet_slip.grams.calibration.receiver_delay import RECEIVER_DELAY, receiver_delays
 from fleet_slip.grams.calibration.tell_numbers import KINDS
 from fleet_slip.grams.cohorts.drive_sums import collect_sums
 from fleet_slip.grams.cohorts.reader import GramReader, OpenedGrams, open_grams
@@ -98,11 +100,24 @@ def calibration_of(opened: OpenedGrams, condition: Condition) -> Calibration:
     return Calibration(cars, opened.logs_version, opened.grams_version, evidence)
 
 
-def calibration_table(opened: OpenedGrams) -> pa.Table:
+def calibration_table(opened: OpenedGrams, of_delay: OpenedGrams) -> pa.Table:
     """Return the table `calibration` that SQL sees: a row for each car and number.
 
-    Of the Gram rows that there are: none are required.
+    Of the Gram rows that there are: none are required. `of_delay` are those of the set `delay`,
+    which tell how late satellite receivers are.
     """
+    grain = float(SAMPLE_TIME_S)
+    delays = [
+        {
+            "vehicle_id": car,
+            "number": RECEIVER_DELAY,
+            **vars(one),
+            "unit": "s",
+            "count": round(one.value / grain),
+            "grain": grain,
+        }
+        for car, one in receiver_delays(of_delay, parse_condition(ALL_DRIVES)).items()
+    ]
     found = calibration_of(opened, parse_condition(ALL_DRIVES))
     rows = [
         {
@@ -115,7 +130,7 @@ def calibration_table(opened: OpenedGrams) -> pa.Table:
         for car, numbers in found.cars.items()
         for name, one in numbers.items()
     ]
-    return pa.Table.from_pylist(rows, schema=TABLE)
+    return pa.Table.from_pylist([*rows, *delays], schema=TABLE)
 
 
 def calibrate(

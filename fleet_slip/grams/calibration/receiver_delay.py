@@ -1,0 +1,125 @@
+"""How late the satellite receiver of each car is, from Gram rows: its speed against acceleration.
+
+A receiver's speed is as late as its course. The change of speed over half a second is the integral
+of the longitudinal acceleration, whatever wheels do, and so are the changes of both over half a
+second more, in which an offset of the accelerometer is no more. The lag of the integral with the
+smallest sum of squares, by a parabola through its neighbours, is the delay. An integral that is k
+ticks late is that of the last 50 + k ticks less that of the last k, so that Gram rows have what all
+lags need. What the lag would be without each drive in turn tells how sure it is (jackknife).
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from fleet_slip.arrays import FloatArray
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S
+from fleet_slip.grams.cohorts.reader import OpenedGrams
+from fleet_slip.grams.cohorts.sweeping import swept
+from fleet_slip.grams.rows.gram_rows import by_signals, gram_table
+from fleet_slip.regression.exact.gram import packed_positions
+from fleet_slip.warehouse.condition import Condition
+
+RECEIVER_DELAY = "receiver_delay"
+"""What the view `calibration` calls it."""
+
+SPAN, STEP, STEPS = 50, 5, 8
+"""Ticks of the integral, between two lags, and how many lags there are beside none."""
+SPEEDS = ("satellite_speed", f"satellite_speed_late_{SPAN}")
+FEWEST_DRIVES = 3
+"""Of fewer the uncertainty is not told."""
+
+
+@dataclass(frozen=True)
+class ReceiverDelay:
+    """The delay of one car's receiver behind its accelerometer.
+
+    Attributes:
+        value: s.
+        uncertainty: standard error, s; None of few drives.
+        drives, rows: what tells it.
+    """
+
+    value: float
+    uncertainty: float | None
+    drives: int
+    rows: int
+
+
+def _columns() -> tuple[str, ...]:
+    """Return the columns of the Gram rows: both speeds, then the sums of the acceleration."""
+    lags = range(STEP, STEP * STEPS + 1, STEP)
+    ticks = (*lags, SPAN, *(SPAN + lag for lag in lags))
+    return (*SPEEDS, *(f"ax_sum_{n}" for n in ticks))
+
+
+def _weights() -> FloatArray:
+    """Return what the change of speed, and its integrals that are late, are of the columns."""
+    weights = np.zeros((2 + STEPS, len(_columns())))
+    weights[0, :2] = 1, -1
+    for late in range(STEPS + 1):
+        weights[1 + late, 2 + STEPS + late] = 1
+        if late:
+            weights[1 + late, 1 + late] = -1
+    return weights
+
+
+def receiver_delays(opened: OpenedGrams, condition: Condition) -> dict[str, ReceiverDelay]:
+    """Return the delay of each car of a cohort whose Gram rows tell it.
+
+    `opened` are the Gram rows of the feature set `delay`.
+    """
+    columns, weights = _columns(), _weights()
+    square = np.array(packed_positions(tuple(range(len(columns)))))
+    lower = np.tril_indices(len(columns))
+    products: dict[str, dict[str, FloatArray]] = {}
+    rows: dict[str, int] = {}
+    for batch in opened.batches(condition):
+        for names, some, _ in by_signals(batch.filter(batch["vehicle_id"].is_valid())):
+            if not set(columns) <= set(names.split(",")):
+                continue
+            table = swept(gram_table(names, some)).restrict(columns)
+            cars, drives = (some[name].to_pylist() for name in ("vehicle_id", "drive_id"))
+            for i, (car, drive) in enumerate(zip(cars, drives, strict=True)):
+                full = np.zeros((len(columns), len(columns)))
+                full[lower] = table.products[i][square]
+                full += np.tril(full, -1).T
+                own = products.setdefault(car, {})
+                own[drive] = own.get(drive, 0.0) + weights @ full @ weights.T
+                rows[car] = rows.get(car, 0) + int(table.n[i])
+    found = {
+        car: _delay(np.array([own[drive] for drive in sorted(own)]), rows[car])
+        for car, own in sorted(products.items())
+    }
+    return {car: one for car, one in found.items() if one is not None}
+
+
+def _delay(products: FloatArray, rows: int) -> ReceiverDelay | None:
+    """Return the delay that a car's drives tell, shape (drives, 2 + STEPS, 2 + STEPS)."""
+    drives, total = len(products), products.sum(axis=0)
+    lag = _best_lag(total)
+    if lag is None:
+        return None
+    without = [found for one in products if (found := _best_lag(total - one)) is not None]
+    uncertainty = None
+    if len(without) == drives >= FEWEST_DRIVES:
+        mean = math.fsum(without) / drives
+        square = math.fsum((one - mean) ** 2 for one in without)
+        uncertainty = math.sqrt(square * (drives - 1) / drives) * float(SAMPLE_TIME_S)
+    return ReceiverDelay(lag * float(SAMPLE_TIME_S), uncertainty, drives, rows)
+
+
+def _best_lag(products: FloatArray) -> float | None:
+    """Return the lag in ticks that explains most of the speed's changes; None without any."""
+    sizes = np.diag(products)[1:]
+    if not (sizes > 0).all():
+        return None
+    explained = products[0, 1:] ** 2 / sizes
+    middle = min(max(int(np.argmax(explained)), 1), STEPS - 1)
+    before, here, after = explained[middle - 1 : middle + 2]
+    bend = 2 * here - before - after
+    if bend <= 0:
+        return None
+    # A sum of ticks is the integral up to half a tick after the last one.
+    return STEP * (middle + 0.5 * float(after - before) / float(bend)) - 0.5
