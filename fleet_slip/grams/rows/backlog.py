@@ -7,10 +7,8 @@ import pyarrow.compute as pc
 
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.sources import RECEIVED_FILES
-from fleet_slip.delta import (
-    Snapshot,
-    TableFile,
-)
+from fleet_slip.delta import Snapshot, TableFile
+from fleet_slip.errors import ConflictError
 
 BEING_WRITTEN_HOURS = 1.0
 """A file that no commit ever knew and that is younger may belong to a job that is running."""
@@ -69,3 +67,13 @@ def _about_to_land(logs: Snapshot, paths: Collection[str]) -> set[str]:
         if file.path in paths and file.age_hours < BEING_WRITTEN_HOURS
     }
     return written - logs.removed() if written else set()
+
+
+def require_active(logs: Snapshot, files: Collection[TableFile]) -> None:
+    """Raise `ConflictError` if the logs have lost a file whose Gram rows are landing."""
+    lost = {file.path for file in files} - {file.path for file in logs.files}
+    if lost:
+        raise ConflictError(
+            f"{logs.table.folder}: other processes keep removing files, such as {min(lost)}. Run "
+            "the same command again."
+        )

@@ -15,9 +15,9 @@ import pyarrow.compute as pc
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.delta import Change, Snapshot, TableFile, Unit, retry_conflicts
-from fleet_slip.errors import ConflictError, StorageError
+from fleet_slip.errors import StorageError
 from fleet_slip.grams.rows.aggregation import compute_grams
-from fleet_slip.grams.rows.backlog import Backlog, find_backlog
+from fleet_slip.grams.rows.backlog import Backlog, find_backlog, require_active
 from fleet_slip.grams.rows.gram_files import files_to_rewrite, rows_to_keep, write_rows
 from fleet_slip.grams.rows.same_drives import LoggedDrives, has_received
 from fleet_slip.progress import Progress, no_progress
@@ -147,7 +147,9 @@ def _update_once(
                 },
             )
         )
-        _require_active(logs, backlog.missing)
+        # Who removed a file may have found no Gram row of its drives, and so have changed none; the
+        # next attempt drops those that landed.
+        require_active(logs.renewed(), backlog.missing)
         after = warehouse.grams.snapshot()
         version, gram_rows = after.version, after.rows
         dropped = merged.logged.found
@@ -191,17 +193,3 @@ class _Merged:
         self.replaced += [file for file in self.grams.files if file.path in paths]
         for rows in rows_to_keep(self.grams, self.replaced, self.stale):
             yield self.logged.without_received(rows) if looked_for else rows
-
-
-def _require_active(logs: Snapshot, files: Iterable[TableFile]) -> None:
-    """Raise `ConflictError` if the logs have lost a file whose Gram rows have just landed.
-
-    Who removed it may have found no Gram row of its drives, and so have changed none. The next
-    attempt drops those that landed.
-    """
-    lost = {file.path for file in files} - {file.path for file in logs.renewed().files}
-    if lost:
-        raise ConflictError(
-            f"{logs.table.folder}: other processes keep removing files, such as {min(lost)}. Run "
-            "the same command again."
-        )

@@ -13,9 +13,8 @@ from deltalake.transaction import AddAction
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.delta import Change, Snapshot, TableFile, Unit
-from fleet_slip.errors import ConflictError
 from fleet_slip.grams.rows.aggregation import aggregate
-from fleet_slip.grams.rows.backlog import named_files
+from fleet_slip.grams.rows.backlog import named_files, require_active
 from fleet_slip.grams.rows.gram_files import write_rows
 from fleet_slip.grams.rows.gram_job import unit_name
 from fleet_slip.warehouse.tables import Warehouse
@@ -40,7 +39,7 @@ def land_ahead(
         # The logs are looked at last. Whoever removes a file from them fences the Gram rows after
         # it: a commit of Gram rows that has not seen the file go is in conflict.
         logs = Snapshot(warehouse.logs, warehouse.logs.open_delta())  # in whatever scales
-        _require_active(logs, replaced)
+        require_active(logs, replaced)
         rows = aggregate(warehouse, missing, feature_set=name)
         grams.commit_or_discard(
             Change(
@@ -48,15 +47,6 @@ def land_ahead(
                 units=[Unit(unit_name(identity), logs.version or 0)],
                 note={"job": "gram", "feature_set": identity, "logs_version": logs.version},
             )
-        )
-
-
-def _require_active(logs: Snapshot, files: Collection[TableFile]) -> None:
-    lost = {file.path for file in files} - {file.path for file in logs.files}
-    if lost:
-        raise ConflictError(
-            f"{logs.table.folder}: another process has removed {min(lost)}. Run the same command "
-            "again."
         )
 
 
