@@ -2,6 +2,21 @@
 
 import re
 
+INTERRUPTED = 130
+"""Exit code after Ctrl-C."""
+
+_LACK = re.compile(
+    r"failed to map segment|cannot allocate memory|can't start new thread|bad allocation|"
+    r"realloc of size|malloc of size",
+    re.IGNORECASE,
+)
+
+
+def is_lack_of_memory(error: BaseException) -> bool:
+    """Whether an error is a want of memory, as Python, the loader and libraries tell it."""
+    return isinstance(error, MemoryError) or _LACK.search(str(error)) is not None
+
+
 HIDDEN = "***"
 
 _URL, _WHOLE_URL = re.compile(r"://([^\s'\"]+)"), re.compile(r"(?s)://(.+)")

@@ -15,6 +15,10 @@ LIBRARIES_BYTES = 3 * 2**30
 """Address space that the libraries reserve, nearly all of it never used."""
 THREAD_BYTES = 2**28
 """The same for each processor: stacks and heaps of the threads that the libraries start."""
+DATA_BYTES = 2**30
+"""Memory of its own, as `ulimit -d` counts it, that the libraries need to start and to end well."""
+DATA_THREAD_BYTES = 2**26
+"""The same for each processor."""
 OPEN_FILES = 64
 
 
@@ -24,7 +28,15 @@ def memory_bytes() -> int:
     address_space, _ = resource.getrlimit(resource.RLIMIT_AS)
     if address_space != resource.RLIM_INFINITY:
         allowed.append(max(address_space - LIBRARIES_BYTES, THREAD_BYTES))
+    _, data = resource.getrlimit(resource.RLIMIT_DATA)  # the soft one may be our own
+    if data != resource.RLIM_INFINITY:
+        allowed.append(max(data - DATA_BYTES // 2, THREAD_BYTES))
     return min(allowed)
+
+
+def data_needed() -> int:
+    """Return the least limit of data (`ulimit -d`) that the libraries survive."""
+    return DATA_BYTES + DATA_THREAD_BYTES * len(os.sched_getaffinity(0))
 
 
 def require_limits() -> None:
@@ -41,6 +53,14 @@ def require_limits() -> None:
             f"{needed // 2**20:,} MiB, most of it reserved and never used. Raise the limit: "
             f"ulimit -v {needed // 2**10}. To limit memory itself use a control group, such as "
             "systemd's MemoryMax=."
+        )
+    data, _ = resource.getrlimit(resource.RLIMIT_DATA)
+    if data != resource.RLIM_INFINITY and data < data_needed():
+        raise StorageError(
+            f"this process may have {data // 2**20:,} MiB of data and needs "
+            f"{data_needed() // 2**20:,} MiB: with less its libraries end it without a word. "
+            f"Raise the limit: ulimit -d {data_needed() // 2**10}. To limit memory itself use a "
+            "control group, such as systemd's MemoryMax=."
         )
     files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     if files != resource.RLIM_INFINITY and files < OPEN_FILES:

@@ -15,8 +15,6 @@ from rich.console import Console
 from fleet_slip.errors import hide_passwords, printable
 from fleet_slip.runs.log import LOGGER, current_run_id
 
-LOG_VARIABLE = "FLEET_SLIP_LOG"
-
 
 class LogFormat(StrEnum):
     """How remarks are written: `auto` is text on a terminal and JSON elsewhere."""

@@ -1,148 +1,26 @@
-"""The `fleet-slip` command: its options, its commands and its exit codes."""
+"""The program `fleet-slip`. It looks whether it can run here before anything large is imported."""
 
-import logging
-import os
+import signal
 import sys
-from pathlib import Path
-from typing import Annotated
 
-import typer
-
-import fleet_slip
-from fleet_slip.cli.commands import MARKUP, CommandGroup
-from fleet_slip.cli.logs import LOG_VARIABLE, LogFormat, configure_logs
-from fleet_slip.cli.output import say
-from fleet_slip.cli.streams import Streams
-from fleet_slip.errors import FleetSlipError, QueryGoesOnError, StorageError
-from fleet_slip.files.data_root import ROOT_VARIABLE
+from fleet_slip.cli.leaving import leave, tell
+from fleet_slip.errors import FleetSlipError, StorageError, is_lack_of_memory
 from fleet_slip.limits import require_limits
-from fleet_slip.resources import CONFIG_VARIABLE, own_configs
-
-INTERRUPTED = 130
-
-app = typer.Typer(
-    cls=CommandGroup,
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=MARKUP,
-    context_settings={"help_option_names": ["-h", "--help"]},
-    epilog=(
-        "Exit codes: 0 done, 1 a bug, 2 wrong usage, 3 a config file, 4 input data, 5 the data "
-        "cannot answer, 6 storage, 7 refused, 8 a conflict with another process, 9 damage "
-        "found, 10 something calls for attention, 11 a cluster, 12 not all done yet, 13 a "
-        "package of an extra is missing, 130 interrupted."
-    ),
-)
-
-
-def _print_version(wanted: bool) -> None:
-    if wanted:
-        from importlib.metadata import version  # noqa: PLC0415 - every start would wait for it
-
-        typer.echo(f"fleet-slip {version('fleet-slip')}")
-        raise typer.Exit
-
-
-@app.callback()
-def options(
-    context: typer.Context,
-    root: Annotated[
-        str | None,
-        typer.Option(
-            help="Data root: a folder, or the URL of an object store such as s3://BUCKET/PATH. "
-            f"Default: ${ROOT_VARIABLE}, else ./data.",
-            show_default=False,
-        ),
-    ] = None,
-    log: Annotated[
-        LogFormat,
-        typer.Option(
-            envvar=LOG_VARIABLE,
-            help="Remarks on stderr: text, json (one object a line), or auto: text on a terminal, "
-            "json elsewhere.",
-        ),
-    ] = LogFormat.AUTO,
-    config: Annotated[
-        str | None,
-        typer.Option(
-            help="A folder of configs laid over the shipped ones (docs/configuration.md). "
-            f"Default: ${CONFIG_VARIABLE}.",
-            show_default=False,
-        ),
-    ] = None,
-    _version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print it.")
-    ] = False,
-) -> None:
-    """Side-slip angle estimation from fleet logs.
-
-    Logs of many cars become exact Gram matrices; from these every model, cohort and fold follows
-    without reading a row again; the winner becomes a numbered model version.
-
-    Start with: **fleet-slip run --campaign smoke**
-    """
-    configure_logs(log)
-    if config is not None:
-        os.environ[CONFIG_VARIABLE] = str(Path(config).absolute())
-    own_configs()
-    require_limits()
-    context.obj = fleet_slip.open(root)
 
 
 def main() -> None:
-    """Run the command line; an expected error becomes one line on stderr and its exit code."""
-    streams = Streams()
-    configure_logs(LogFormat.AUTO)
-    _choose_code_folder()
-    exit_code = _exit_code_of_app()
-    if reason := streams.unprinted():
-        say(
-            f"error: standard output: {reason}. What was asked for is done, not all printed.",
-            logging.ERROR,
-        )
-        exit_code = exit_code or StorageError.exit_code
-    sys.exit(exit_code)
-
-
-def _exit_code_of_app() -> int:
+    """Run the command line, and end with its exit code."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, leave)
     try:
-        app()
+        require_limits()
+        from fleet_slip.cli.app import run_app  # noqa: PLC0415 - see above
     except FleetSlipError as error:
-        say(f"error: {error}", logging.ERROR)
-        return error.exit_code
-    except MemoryError as error:
-        say(f"error: out of memory: {error}. Ask for less at once, or give it more.", logging.ERROR)
-        return StorageError.exit_code
-    except KeyboardInterrupt as error:
-        return _end_interrupted(error)
-    except SystemExit as ended:
-        if ended.code == INTERRUPTED:  # typer makes it of a KeyboardInterrupt
-            return _end_interrupted(ended)
-        return ended.code if isinstance(ended.code, int) else 0
-    return 0
-
-
-def _end_interrupted(error: BaseException | None) -> int:
-    """Say that Ctrl-C was pressed; end the process at once if a query cannot be stopped."""
-    say(
-        "interrupted: what was committed is kept, and nothing is half written. Give the same "
-        "command again to go on.",
-        logging.WARNING,
-    )
-    while error is not None:
-        if isinstance(error, QueryGoesOnError):
-            sys.stdout.flush()
-            os._exit(INTERRUPTED)  # the usual end would wait for the query
-        error = error.__cause__ or error.__context__
-    return INTERRUPTED
-
-
-def _choose_code_folder() -> None:
-    """Keep compiled code, and what matplotlib knows of fonts, in the cache folder of a service.
-
-    systemd makes it; a service has no home.
-    """
-    folder = os.environ.get("CACHE_DIRECTORY", "").partition(":")[0]
-    if folder:
-        os.environ.setdefault("NUMBA_CACHE_DIR", folder)
-        os.environ.setdefault("MPLCONFIGDIR", folder)
+        tell(f"error: {error}", "error")
+        sys.exit(error.exit_code)
+    except (ImportError, OSError, MemoryError) as error:
+        if not is_lack_of_memory(error):
+            raise
+        tell("error: out of memory before anything was done. Give it more.", "error")
+        sys.exit(StorageError.exit_code)
+    sys.exit(run_app())

@@ -14,7 +14,7 @@ import duckdb
 from fleet_slip.errors import FleetSlipError, QueryGoesOnError, QuestionError, StorageError
 from fleet_slip.files.checksums import check_local_files
 from fleet_slip.files.folder import Folder
-from fleet_slip.limits import memory_bytes
+from fleet_slip.limits import data_needed, memory_bytes
 
 SPILL_LIMIT = "20GB"
 """Largest size of what one connection may write to disk for a query beyond its memory."""
@@ -61,7 +61,7 @@ def limit_memory() -> None:
 
     DuckDB keeps to its own limit for what it buffers, not for one value: a list of 2e9 numbers.
     """
-    limit = memory_bytes() // 4 * 3
+    limit = max(memory_bytes() // 4 * 3, data_needed())
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)
     if hard == resource.RLIM_INFINITY or limit < hard:
         resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))

@@ -1,6 +1,7 @@
 """Ctrl-C in long work: what is said, and that the same command does the rest."""
 
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -11,9 +12,10 @@ from pathlib import Path
 import pytest
 
 import fleet_slip
-from fleet_slip.cli import main
+from fleet_slip.cli import app as program
 from fleet_slip.cli.progress import progress, progress_of_steps
 from fleet_slip.runs.log import LOGGER
+from tests.support.commands import run
 
 
 @pytest.fixture
@@ -54,10 +56,60 @@ def test_the_command_ends_with_130_and_may_be_given_again(
     def interrupted() -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(main, "app", interrupted)
-    assert main._exit_code_of_app() == main.INTERRUPTED == 130
+    monkeypatch.setattr(program, "app", interrupted)
+    assert program._exit_code_of_app() == 130
     (remark,) = said
     assert remark.endswith("Give the same command again to go on.")
+
+
+INTERRUPTED_AT_IMPORT = """
+import os, signal, sys
+
+class Interrupting:
+    def find_spec(self, name, path=None, target=None):
+        if name == MODULE:
+            sys.meta_path.remove(self)
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Interrupting())
+from fleet_slip.cli.main import main
+main()
+"""
+
+
+@pytest.mark.parametrize("module", ["typer", "rich.console", "fleet_slip.cli.app", "numpy"])
+def test_an_interrupt_while_modules_are_imported_is_one_line(module: str, tmp_path: Path) -> None:
+    program = INTERRUPTED_AT_IMPORT.replace("MODULE", repr(module))
+    done = run([sys.executable, "-c", program, "--root", str(tmp_path / "data"), "status"])
+    assert done.exit_code == 130
+    assert "interrupted: " in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (MemoryError(), True),
+        (ImportError("x.so: failed to map segment from shared object"), True),
+        (OSError(12, "Cannot allocate memory"), True),
+        (RuntimeError("can't start new thread"), True),
+        (RuntimeError("a bug"), False),
+        (ImportError("No module named x"), False),
+    ],
+)
+def test_a_want_of_memory_is_told_with_an_amount_and_a_bug_is_not_hidden(
+    error: Exception, told: bool, monkeypatch: pytest.MonkeyPatch, said: list[str]
+) -> None:
+    def fail() -> None:
+        raise error
+
+    monkeypatch.setattr(program, "app", fail)
+    if told:
+        assert program._exit_code_of_app() == 6
+        assert re.search(r"out of memory: this process may have [\d,]+ MiB", said[0])
+    else:
+        with pytest.raises(type(error)):
+            program._exit_code_of_app()
 
 
 def test_a_gram_job_that_was_interrupted_goes_on(smoke_root: Path, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 import fleet_slip
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
-from fleet_slip.cli.main import app
+from fleet_slip.cli.app import app
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.resources import find_config
 from tests.support.commands import Finished, RunCommand, done_on

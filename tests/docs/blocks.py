@@ -23,7 +23,7 @@ from sybil.evaluators.python import PythonEvaluator
 from sybil.parsers.markdown.lexers import RawFencedCodeBlockLexer
 
 import fleet_slip
-from fleet_slip.cli.main import app
+from fleet_slip.cli.app import app
 from fleet_slip.errors import FleetSlipError
 
 RUN = frozenset({"console", "bash", "python", "sql"})

@@ -13,6 +13,9 @@ from tests.support.commands import COMMAND, Finished, run
 ENOUGH_KIB = (limits.LIBRARIES_BYTES + limits.THREAD_BYTES * len(os.sched_getaffinity(0))) // 2**10
 
 
+ENOUGH_DATA_KIB = limits.data_needed() // 2**10
+
+
 def run_limited(root: Path, limit: str) -> Finished:
     command = f"ulimit {limit} && exec {COMMAND} --root {root} run --campaign smoke --days 1"
     return run(["bash", "-c", command])
@@ -24,6 +27,8 @@ def run_limited(root: Path, limit: str) -> Finished:
         ("-v 1500000", f"ulimit -v {ENOUGH_KIB}"),
         ("-v 1000000", f"ulimit -v {ENOUGH_KIB}"),
         (f"-v {ENOUGH_KIB - 1}", f"ulimit -v {ENOUGH_KIB}"),
+        ("-d 250000", f"ulimit -d {ENOUGH_DATA_KIB}"),
+        (f"-d {ENOUGH_DATA_KIB - 1}", f"ulimit -d {ENOUGH_DATA_KIB}"),
         ("-n 12", "ulimit -n 1024"),
     ],
 )
@@ -36,7 +41,20 @@ def test_too_narrow_a_limit_is_told_before_anything_is_done(
     assert not (tmp_path / "data").exists()
 
 
-@pytest.mark.parametrize("limit", [f"-v {ENOUGH_KIB}", f"-n {limits.OPEN_FILES}"])
+@pytest.mark.parametrize("command", ["status", "select", "sql 'SELECT 1'"])
+@pytest.mark.parametrize("limit", ["-v 65536", "-v 524288", "-d 150000"])
+def test_every_command_tells_it_before_it_imports_anything(
+    command: str, limit: str, tmp_path: Path
+) -> None:
+    line = f"ulimit {limit} && exec {COMMAND} --root {tmp_path / 'data'} {command}"
+    done = run(["bash", "-c", line])
+    assert (done.exit_code, len(done.stderr.splitlines())) == (StorageError.exit_code, 1)
+    assert f"ulimit {limit[:2]}" in done.stderr
+
+
+@pytest.mark.parametrize(
+    "limit", [f"-v {ENOUGH_KIB}", f"-d {ENOUGH_DATA_KIB}", f"-n {limits.OPEN_FILES}"]
+)
 def test_what_is_said_to_be_enough_is_enough(tmp_path: Path, limit: str) -> None:
     done = run_limited(tmp_path / "data", limit)
     assert done.exit_code == 0, done.stderr
@@ -70,5 +88,18 @@ def test_data_gets_what_the_libraries_leave_of_the_address_space(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     allowed = limits.LIBRARIES_BYTES + 10**9
-    monkeypatch.setattr(resource, "getrlimit", lambda _kind: (allowed, allowed))
+    unlimited = resource.RLIM_INFINITY
+    monkeypatch.setattr(
+        resource,
+        "getrlimit",
+        lambda kind: (allowed if kind == resource.RLIMIT_AS else unlimited,) * 2,
+    )
     assert limits.memory_bytes() == 10**9
+
+
+def test_data_gets_what_the_libraries_leave_of_a_limit_of_data(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    hard = {resource.RLIMIT_AS: resource.RLIM_INFINITY, resource.RLIMIT_DATA: 2 * 10**9}
+    monkeypatch.setattr(resource, "getrlimit", lambda kind: (hard[kind], hard[kind]))
+    assert limits.memory_bytes() == 2 * 10**9 - limits.DATA_BYTES // 2

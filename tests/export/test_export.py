@@ -10,7 +10,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.canonical import canonical_json
-from fleet_slip.cli.main import app
+from fleet_slip.cli.app import app
 from fleet_slip.errors import QuestionError, UsageError
 from fleet_slip.export.checks import angles_of_columns
 from fleet_slip.export.compile import compile_program

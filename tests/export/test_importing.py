@@ -14,7 +14,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.canonical import canonical_json, sha256_of
-from fleet_slip.cli.main import app
+from fleet_slip.cli.app import app
 from fleet_slip.errors import DataError, InputError, RefusedError, UsageError
 from fleet_slip.export.files import export_files
 from fleet_slip.files.documents import checksum

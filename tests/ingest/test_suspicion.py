@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.cli.main import app
+from fleet_slip.cli.app import app
 from fleet_slip.errors import AlarmError, UsageError
 from fleet_slip.ingest.drafting import label_delay
 from fleet_slip.ingest.drafting.suspicion import RADIUS_M, WHEELS, find_refusals, find_suspicions

@@ -6,7 +6,7 @@ from typing import Any
 
 from typer.testing import CliRunner
 
-from fleet_slip.cli.main import app
+from fleet_slip.cli.app import app
 from tests.support.once import require_no_failed_run
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from fleet_slip.cli.main import app
+from fleet_slip.cli.app import app
 from fleet_slip.comparison.evaluation.estimators import published_estimate
 from fleet_slip.comparison.evaluation.evaluated_drives import load_drives
 from fleet_slip.comparison.evaluation.evaluation_document import keep

@@ -11,7 +11,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.cli.main import app
+from fleet_slip.cli.app import app
 from fleet_slip.delta import Change
 from fleet_slip.errors import FleetSlipError, RefusedError
 from fleet_slip.grams.rows.gram_job import update_grams

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip.cli.main import app
+from fleet_slip.cli.app import app
 from fleet_slip.errors import InputError, QuestionError
 from fleet_slip.grams.received import messages
 from fleet_slip.grams.received.messages import read_messages

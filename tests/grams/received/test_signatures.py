@@ -13,7 +13,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.cli.main import app
+from fleet_slip.cli.app import app
 from fleet_slip.delta import Change
 from fleet_slip.errors import AlarmError, ConfigError, DataError, InputError
 from fleet_slip.grams.received.car_keys import KEYS_VARIABLE
