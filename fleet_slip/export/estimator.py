@@ -10,7 +10,7 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.catalogue.car_numbers import round_number
-from fleet_slip.columns.operations import operation_of, plain_of
+from fleet_slip.columns.operations import operands_of, operation_of, plain_of, size_of
 from fleet_slip.errors import InputError
 from fleet_slip.export import stepping as do
 from fleet_slip.export.compile import compile_program
@@ -156,31 +156,42 @@ class _Layout:
     def _written(self) -> Iterator[tuple[int, ...]]:
         signals, terms = self._program.signals, self._program.angle.terms
         slid: set[tuple[int, ...]] = set()
+        at = list(range(len(self._program.steps)))
         for place, step in enumerate(self._program.steps):
             name, plain = operation_of(step), plain_of(step)
-            if name == "signal":
+            operands = [at[one] for one in operands_of(step)]
+            if self._changes_nothing(name, plain):
+                at[place] = operands[0]
+            elif name == "signal":
                 one = signals[plain[0]]
                 scale = len(signals) + plain[0]
                 yield (do.SIGNAL, place, plain[0], scale, one.min_count, one.max_count)
             elif name == "ago":
-                yield (do.AGO, place, plain[0], *self._rings[plain[0]], plain[1])
+                yield (do.AGO, place, operands[0], *self._rings[plain[0]], plain[1])
             elif name in ("sum", "values"):
                 if plain not in slid:
-                    yield self._slide(*plain)
+                    yield self._slide(operands[0], *plain)
                 slid.add(plain)
             elif name not in ("constant", "fact", "number"):
-                yield (do.OPERATIONS[name], place, plain[0], plain[-1])
+                yield (do.OPERATIONS[name], place, operands[0], operands[-1])
         for of, ring in self._rings.items():
             if ring[1]:
-                yield (do.KEEP, 0, of, *ring)
+                yield (do.KEEP, 0, at[of], *ring)
         first = 2 * len(signals)
         for i, (column, _) in enumerate(terms):
-            yield (do.TERM, 0, column, first + i, first + len(terms) + i)
+            yield (do.TERM, 0, at[column], first + i, first + len(terms) + i)
 
-    def _slide(self, of: int, ticks: int, most: int) -> tuple[int, ...]:
+    def _changes_nothing(self, name: str, plain: tuple[int, ...]) -> bool:
+        """Whether a step is always what it works on first: it takes no time then."""
+        ranges = self._program.ranges
+        if name == "clip":
+            return size_of(ranges[plain[0]]) <= ranges[plain[1]][1]
+        return name in ("nearest", "//") and ranges[plain[1]] == (1, 1)
+
+    def _slide(self, at: int, of: int, ticks: int, most: int) -> tuple[int, ...]:
         """Return what brings a sum and its number of values to this tick."""
         known = {step: place for place, step in enumerate(self._program.steps)}
         both = [known.get((name, of, ticks, most)) for name in ("sum", "values")]
         total, count = (self._keep((0,)) if one is None else one for one in both)
         ring = self._rings[of] if ticks else (0, 0, 0)
-        return (do.SLIDE, total, of, *ring, ticks or most, count)
+        return (do.SLIDE, total, at, *ring, ticks or most, count)
