@@ -15,7 +15,7 @@ from tests.export.models import MODELS, export_texts, model_of
 from tests.support.cortex_m import measure_cortex_m, run_self_test
 
 DEVIATIONS = {"misra-c2012-15.5", "misra-c2012-2.5", "misra-c2012-8.7"}
-"""All are advisory: a feature returns where a value is missing, the header names the version, and
+"""All are advisory: a message of no part returns at once, the header names the version, and
 the functions are called from elsewhere, which recent versions look for. docs/export.md says so."""
 
 
