@@ -75,7 +75,7 @@ def land(warehouse: Warehouse, campaign: Campaign) -> None:
 
 
 def train(warehouse: Warehouse) -> None:
-    planned = answer_request(warehouse, SelectionRequest(cohort=COHORT))
+    planned = answer_request(warehouse, SelectionRequest(), COHORT)
     manifest = manifest_of(planned, "sideslip")
     publish(Registry(warehouse.root / "models"), manifest, planned)
 

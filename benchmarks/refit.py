@@ -58,9 +58,7 @@ def main(root: str, condition: str) -> None:
         "read_and_fit_ms": median_ms(lambda: fitted_from_disk(warehouse)),
         "read_again_and_fit_ms": again_ms,
         "fit_ms": median_ms(lambda: fit(cohort.serving(INPUTS).table.total(), INPUTS, label)),
-        "select_ms": median_ms(
-            lambda: answer_request(warehouse, SelectionRequest(cohort=condition))
-        ),
+        "select_ms": median_ms(lambda: answer_request(warehouse, SelectionRequest(), condition)),
     }
     print(json.dumps(figures))
 

@@ -1,6 +1,7 @@
 """What calls of a `Fleet` share: their record, their progress, and where their tasks run."""
 
 import functools
+import inspect
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
@@ -28,6 +29,7 @@ executor."""
 
 S = TypeVar("S", bound=Rooted)
 P = ParamSpec("P")
+T = TypeVar("T")
 R = TypeVar("R")
 
 
@@ -45,6 +47,30 @@ def record_call(method: Callable[Concatenate[S, P], R]) -> Callable[Concatenate[
             return method(self, *arguments, **options)
 
     return call
+
+
+def takes(
+    options: Callable[P, T],
+) -> Callable[[Callable[[S, T], R]], Callable[Concatenate[S, P], R]]:
+    """Let a method be called with the fields of a dataclass of options instead of one of these.
+
+    Signature and docstring are those of the dataclass, which says once what there is to ask for.
+    """
+
+    def expand(method: Callable[[S, T], R]) -> Callable[Concatenate[S, P], R]:
+        @functools.wraps(method)
+        def call(self: S, /, *arguments: P.args, **chosen: P.kwargs) -> R:
+            return method(self, options(*arguments, **chosen))
+
+        own = inspect.signature(method)
+        first = next(iter(own.parameters.values()))
+        given = inspect.signature(options).parameters.values()
+        signature = own.replace(parameters=[first, *given])
+        call.__signature__ = signature  # type: ignore[attr-defined]
+        call.__doc__ = "\n\n".join(inspect.cleandoc(one.__doc__ or "") for one in (method, options))
+        return call
+
+    return expand
 
 
 def _as_typed(arguments: Sequence[object], options: Mapping[str, object]) -> list[str]:

@@ -3,8 +3,10 @@
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
+from fleet_slip.api.calls import takes
 from fleet_slip.api.root import Rooted
 from fleet_slip.errors import UsageError
+from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.warehouse.tables import Warehouse
 
 if TYPE_CHECKING:
@@ -15,7 +17,7 @@ if TYPE_CHECKING:
     from fleet_slip.regression.inference.drive_moments import ClusterUnit
     from fleet_slip.selection.diagnostics import Diagnosis
     from fleet_slip.selection.regimes import RegimeComparison
-    from fleet_slip.selection.request import Label, RequestedSelection
+    from fleet_slip.selection.requested_selection import RequestedSelection
     from fleet_slip.selection.shrinkage import Shrunk
     from fleet_slip.selection.what_if import WhatIf
 
@@ -38,87 +40,17 @@ class FleetCohort(Rooted):
         """Return the data root and the condition."""
         return f"{type(self).__name__}({str(self.root)!r}, {self.condition!r})"
 
-    def select(
-        self,
-        *,
-        models: str | None = None,
-        model: str | None = None,
-        nested: str | None = None,
-        features: str | None = None,
-        label: "Label | None" = None,
-        by: "FoldKey | None" = None,
-        folds: int | str | None = None,
-        rank: str | None = None,
-        criterion: str | None = None,
-        worth: str = "0.005deg",
-        all_subsets: bool = False,
-        robust: bool = False,
-        naive: bool = False,
-        cluster: "ClusterUnit | None" = None,
-        intercept: bool = True,
-        search: str | None = None,
-        most: int | None = None,
-        bootstrap: int | None = None,
-        repeat: int | None = None,
-    ) -> "RequestedSelection":
+    @takes(SelectionRequest)
+    def select(self, request: SelectionRequest) -> "RequestedSelection":
         """Compare models by cross-validation and choose one; `Fleet.publish` takes the answer.
 
-        Without options the models of Table I are compared.
-
-        Args:
-            models: a model list of `configs/models`, or the path of a TOML file.
-            model: the inputs of the one model to take, separated by commas, instead of a list.
-            nested: an order of inputs, separated by commas, or `catalogue` for all inputs; adds the
-                nested models of its first 1, 2 ... inputs.
-            features: a feature set; by default what the list says, else the logged signals.
-            label: `course` to learn without a reference sensor, from changes of the course; the
-                feature set and the list are then those called `course` unless others are named.
-            by: what a fold is made of; by default what the list says. By `row` leaks.
-            folds: how many folds, or `each`: every drive, or whatever folds are made of, is one.
-            rank: ranks the inputs of `nested` first, such as `backward`.
-            criterion: what decides how many of the ranked inputs are kept: `cv`, `bic` ...
-            worth: the smallest gain in RMSE that is worth a signal, such as `0.005deg` or `2%`.
-            all_subsets: search all subsets of the inputs of `nested` instead of an order.
-            robust: leave out the cars whose influence on the model no honest car has; they are
-                `left_out` of the answer, and its cohort names them.
-            naive: take rows for independent evidence, not drives or cars.
-            cluster: what is independent evidence, `vehicle` or `drive`; by default cars where there
-                are several.
-            intercept: whether models have one; without it they go through the origin.
-            search: search among the inputs of `nested`, or all, in every fold, as by `exchange`.
-            most: the most columns of `search`.
-            bootstrap: draw the drives so many times for an interval of the winner's correlation.
-            repeat: cross-validate the winner again with so many other deals of folds.
-
-        Raises `UsageError` for options that do not go together or a list that is not valid, and
+        The options are keywords, those of `fleet_slip.selection.request.SelectionRequest`. Raises
+        `UsageError` for options that do not go together or a list that is not valid, and
         `DataError` if no model can be fitted.
         """
         from fleet_slip.selection.answer_request import answer_request
-        from fleet_slip.selection.request import SelectionRequest
 
-        request = SelectionRequest(
-            cohort=self.condition,
-            models=models,
-            model=model,
-            nested=nested,
-            features=features,
-            label=label,
-            by=by,
-            folds=folds,
-            rank=rank,
-            criterion=criterion,
-            worth=worth,
-            all_subsets=all_subsets,
-            robust=robust,
-            naive=naive,
-            cluster=cluster,
-            intercept=intercept,
-            search=search,
-            most=most,
-            bootstrap=bootstrap,
-            repeat=repeat,
-        )
-        return answer_request(self.warehouse, request)
+        return answer_request(self.warehouse, request, self.condition)
 
     def diagnose(
         self,

@@ -9,7 +9,7 @@ from fleet_slip.errors import RefusedError
 if TYPE_CHECKING:
     from fleet_slip.api.fleet import Fleet
     from fleet_slip.models.publish import Publication
-    from fleet_slip.selection.request import RequestedSelection
+    from fleet_slip.selection.requested_selection import RequestedSelection
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from fleet_slip.grams.rows.gram_job import GramReport
 from fleet_slip.models.publish import Publication
-from fleet_slip.selection.request import RequestedSelection
+from fleet_slip.selection.requested_selection import RequestedSelection
 
 if TYPE_CHECKING:  # it brings a compiler
     from fleet_slip.simulation.job import SimulationReport

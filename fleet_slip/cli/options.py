@@ -19,9 +19,6 @@ from fleet_slip.selection.request import DEFAULT_MODELS, SelectionRequest
 R = TypeVar("R")
 
 SELECTION: dict[str, Any] = {
-    "cohort": typer.Option(
-        help="SQL condition on the view drives, such as \"track = 'waterford_hills'\"."
-    ),
     "models": typer.Option(
         help=f"A model list of configs/models, or a TOML file. Default: {DEFAULT_MODELS}, unless "
         "--nested or an option that searches is given.",
@@ -117,7 +114,10 @@ TEXTS = {"folds": str | None}
 RESAMPLING = ("repeat", "bootstrap")
 """Fields that tell more of a winner and choose none."""
 
-Cohort = Annotated[str, SELECTION["cohort"]]
+Cohort = Annotated[
+    str,
+    typer.Option(help="SQL condition on the view drives, such as \"track = 'waterford_hills'\"."),
+]
 FoldCount = Annotated[str | None, SELECTION["folds"]]
 Worth = Annotated[str, SELECTION["worth"]]
 Naive = Annotated[bool, SELECTION["naive"]]

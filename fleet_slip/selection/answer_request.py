@@ -6,6 +6,7 @@ from typing import Any
 from fleet_slip.canonical import canonical_json, sha256_of
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
+from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.errors import QuestionError, UsageError
 from fleet_slip.grams.cohorts.fold_sums import SummedCohort, sum_cohort
 from fleet_slip.grams.cohorts.folding import EACH, ROW_FOLDS, Folding, make_folding
@@ -21,12 +22,8 @@ from fleet_slip.selection.model_list import (
     nested_candidates,
 )
 from fleet_slip.selection.named_inputs import WHOLE_SET, inputs_of, require_inputs
-from fleet_slip.selection.request import (
-    COURSE,
-    DEFAULT_MODELS,
-    RequestedSelection,
-    SelectionRequest,
-)
+from fleet_slip.selection.request import COURSE, DEFAULT_MODELS, SelectionRequest
+from fleet_slip.selection.requested_selection import RequestedSelection
 from fleet_slip.selection.search import (
     require_criterion,
     select_ranked,
@@ -42,8 +39,13 @@ GIVEN = "given"
 """The name of a model whose inputs were asked for one by one."""
 
 
-def answer_request(warehouse: Warehouse, request: SelectionRequest) -> RequestedSelection:
-    """Select as asked. Raises `UsageError` for options that do not go together."""
+def answer_request(
+    warehouse: Warehouse, request: SelectionRequest, condition: str = TRAINING_DRIVES
+) -> RequestedSelection:
+    """Select on the drives that satisfy a condition.
+
+    Raises `UsageError` for options that do not go together.
+    """
     request.check()
     named = request.nested or request.ordered or request.search
     usual = COURSE if request.label == COURSE else DEFAULT_MODELS
@@ -52,13 +54,13 @@ def answer_request(warehouse: Warehouse, request: SelectionRequest) -> Requested
     folds = _folding(request, model_list)
     feature_set = _feature_set(request, model_list)
     if request.robust:
-        return _answer_without(warehouse, request, model_list, feature_set)
+        return _answer_without(warehouse, request, condition, model_list, feature_set)
     distances = bool(request.nested and not request.ordered and not _search_of(request, model_list))
     if not (request.ordered or request.resampled or distances):
         return _compare_listed(
-            sum_cohort(warehouse, folds, request.cohort, feature_set), request, model_list, folds
+            sum_cohort(warehouse, folds, condition, feature_set), request, model_list, folds
         )
-    cohort = load_cohort(warehouse, request.cohort, feature_set)
+    cohort = load_cohort(warehouse, condition, feature_set)
     answer = (
         _search(cohort, request, folds)
         if request.ordered
@@ -87,18 +89,19 @@ def answer_request(warehouse: Warehouse, request: SelectionRequest) -> Requested
 def _answer_without(
     warehouse: Warehouse,
     request: SelectionRequest,
+    condition: str,
     model_list: ModelList | None,
     feature_set: str,
 ) -> RequestedSelection:
     """Select without the cars whose influence on a model of all compared inputs is unusual."""
-    cohort = load_cohort(warehouse, request.cohort, feature_set)
+    cohort = load_cohort(warehouse, condition, feature_set)
     inputs = inputs_of(cohort, request.nested or WHOLE_SET)
     if model_list and model_list.model and not (request.nested or request.search):
         listed = {name for one in model_list.model for name in one.signals}
         inputs = tuple(name for name in cohort.inputs if name in listed)
     left_out = influential_cars(cohort, inputs)
-    condition = without_vehicles(cohort.condition, left_out)
-    answer = answer_request(warehouse, replace(request, cohort=condition.text, robust=False))
+    others = without_vehicles(cohort.condition, left_out)
+    answer = answer_request(warehouse, replace(request, robust=False), others.text)
     return replace(answer, left_out=left_out)
 
 

@@ -1,16 +1,12 @@
-"""What to select, as it is asked for on the command line."""
+"""How to select: the one definition of what `FleetCohort.select` and `fleet-slip select` take."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Literal
 
-from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.errors import UsageError
 from fleet_slip.grams.cohorts.folding import FoldKey
 from fleet_slip.regression.inference.drive_moments import ClusterUnit
-from fleet_slip.selection.select_models import Selection
 from fleet_slip.selection.worth import WORTH, parse_worth
-from fleet_slip.warehouse.minimum_cohort import tells_single_cars
 
 DEFAULT_MODELS = "table1"
 
@@ -23,28 +19,35 @@ COURSE: Label = "course"
 
 @dataclass(frozen=True, kw_only=True)
 class SelectionRequest:
-    """What to select.
+    """How models are compared and one is chosen; without options, those of Table I.
 
     Attributes:
-        cohort: SQL condition on the view `drives`.
-        models: name or path of a model list; by default `table1`, unless signals are named.
-        model: inputs of the one model to take, separated by commas, instead of a list.
-        nested: order of inputs, separated by commas, or `catalogue`; adds its nested models.
-        features: name of the feature set; by default what the list says, or what the folds need.
-        label: `course` to learn from changes of the course, by a feature set of them.
-        by, folds: how to fold; by default what the list says.
-        rank, criterion: rank the inputs of `nested` first; choose by a criterion.
-        all_subsets: choose among the best subsets of `nested` instead of an order's.
-        worth: gain in RMSE for which cross-validation keeps a signal, such as `0.005deg` or `2%`.
-        robust: leave out the cars whose influence on the model is unusual.
-        naive: take rows for independent instead of drives or cars.
-        cluster: what is independent; by default cars where there are several, else drives.
+        models: a model list of `configs/models`, or the path of a TOML file; by default `table1`,
+            unless inputs are named or searched.
+        model: the inputs of the one model to take, separated by commas, instead of a list.
+        nested: an order of inputs, separated by commas, or `catalogue` for all inputs; adds the
+            nested models of its first 1, 2 ... inputs.
+        features: a feature set; by default what the list says, else the logged signals.
+        label: `course` to learn without a reference sensor, from changes of the course; the
+            feature set and the list are then those called `course` unless others are named.
+        by: what a fold is made of; by default what the list says. By `row` leaks.
+        folds: how many folds, or `each`: every drive, or whatever folds are made of, is one.
+        rank: ranks the inputs of `nested` first, such as `backward`.
+        criterion: what decides how many of the ranked inputs are kept: `cv`, `bic` ...
+        worth: the smallest gain in RMSE that is worth a signal, such as `0.005deg` or `2%`.
+        all_subsets: search all subsets of the inputs of `nested` instead of an order.
+        robust: leave out the cars whose influence on the model no honest car has; they are
+            `left_out` of the answer, and its cohort names them.
+        naive: take rows for independent evidence, not drives or cars.
+        cluster: what is independent evidence, `vehicle` or `drive`; by default cars where there
+            are several.
         intercept: whether models have one; without it they go through the origin.
-        search, most: search among the inputs of `nested`, or all, for models of up to so many.
-        bootstrap, repeat: how often to resample the winner's figures.
+        search: search among the inputs of `nested`, or all, in every fold, as by `exchange`.
+        most: the most columns of `search`.
+        repeat: cross-validate the winner again with so many other deals of folds.
+        bootstrap: draw the drives so many times for an interval of the winner's correlation.
     """
 
-    cohort: str = TRAINING_DRIVES
     models: str | None = None
     model: str | None = None
     nested: str | None = None
@@ -104,30 +107,3 @@ class SelectionRequest:
                 "a search is made again in every fold, and looks at folds alone: leave out rank, "
                 "criterion, all_subsets and naive."
             )
-
-
-@dataclass(frozen=True, kw_only=True)
-class RequestedSelection(Selection[Any]):
-    """A selection that can be published: it tells what it was made from.
-
-    Attributes:
-        model_list: what was compared, such as `table1`.
-        config_sha256: checksum of all that says what to compare.
-        left_out: the cars that `robust` left out, and their influence as a multiple of the median.
-    """
-
-    model_list: str
-    config_sha256: str
-    left_out: Mapping[str, float] = field(default_factory=dict)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return what `select --json` prints."""
-        named = dict(self.left_out) if tells_single_cars() else {}
-        return {**super().as_dict(), "vehicles_left_out": named}
-
-    @classmethod
-    def of(
-        cls, selection: Selection[Any], model_list: str, config_sha256: str
-    ) -> "RequestedSelection":
-        """Return a selection with what it was made from."""
-        return cls(**vars(selection), model_list=model_list, config_sha256=config_sha256)

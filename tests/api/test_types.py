@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 import fleet_slip
 from fleet_slip import Fleet, FleetCohort, ModelVersion
-from fleet_slip.selection.request import RequestedSelection
+from fleet_slip.selection.requested_selection import RequestedSelection
 
 
 def test_a_users_lines_are_typed(fleet: Fleet) -> None:

@@ -254,8 +254,8 @@ def test_versions_published_from_gram_rows_before_an_erasure_are_judged_by_their
     registry, answers = Registry(warehouse.root / "models"), {}
     cohorts = {"of_all": "true", "of_others": "vehicle_id <> 'beta'"}
     for name, cohort in cohorts.items():
-        request = SelectionRequest(cohort=cohort, nested="ay,yaw_rate")
-        answers[name] = answer_request(warehouse, request)
+        request = SelectionRequest(nested="ay,yaw_rate")
+        answers[name] = answer_request(warehouse, request, cohort)
     manifests = {name: manifest_of(answer, name) for name, answer in answers.items()}
     forget(warehouse, BETA, now=True)
     for name, answer in answers.items():

@@ -55,9 +55,7 @@ def publish_from(
     warehouse: Warehouse, cohort: str = "true", signals: str = "ay,yaw_rate", **options: Any
 ) -> Publication:
     """Select on a cohort and publish the winner."""
-    answer = answer_request(
-        warehouse, SelectionRequest(cohort=cohort, nested=signals, worth="0.0001deg")
-    )
+    answer = answer_request(warehouse, SelectionRequest(nested=signals, worth="0.0001deg"), cohort)
     manifest = manifest_of(answer, "beta")
     return publish(registry_of(warehouse), manifest, answer, **options)
 
@@ -109,8 +107,9 @@ def test_more_data_of_the_same_replaces_the_champion_and_says_what_was_compared(
 def test_the_champion_is_compared_as_it_is_not_fitted_anew(champion: Warehouse) -> None:
     write(champion, "more", 48)
     version = registry_of(champion).load("beta", 1)
-    request = SelectionRequest(cohort="drive_id LIKE 'more%'", nested="ay,yaw_rate")
-    comparison = gate.compare(answer_request(champion, request), [version])
+    request = SelectionRequest(nested="ay,yaw_rate")
+    answer = answer_request(champion, request, "drive_id LIKE 'more%'")
+    comparison = gate.compare(answer, [version])
     (as_it_is,) = comparison.incumbents
     assert as_it_is.counts.coefficients == counts_model(version.manifest).coefficients
     assert as_it_is.pooled.rows == comparison.challenger.pooled.rows == 48 * ROWS
@@ -123,8 +122,8 @@ def test_cars_are_held_out_where_there_are_several_else_drives(
     write(warehouse, "good", 60)
     cohort = " OR ".join(f"vehicle_id = 'car-{i}'" for i in range(cars))
     version = publish_from(warehouse, cohort).version
-    request = SelectionRequest(cohort=cohort, nested="ay,yaw_rate")
-    comparison = gate.compare(answer_request(warehouse, request), [version])
+    request = SelectionRequest(nested="ay,yaw_rate")
+    comparison = gate.compare(answer_request(warehouse, request, cohort), [version])
     assert (comparison.by, len(comparison.challenger.folds)) == (by, groups)
 
 

@@ -52,7 +52,7 @@ def champion(campaign_root: Path, tmp_path: Path) -> Warehouse:
 
 
 def publish_from(warehouse: Warehouse, cohort: str = "true") -> Publication:
-    answer = answer_request(warehouse, SelectionRequest(cohort=cohort, nested=SIGNALS))
+    answer = answer_request(warehouse, SelectionRequest(nested=SIGNALS), cohort)
     registry = Registry(warehouse.root / "models")
     return publish(registry, manifest_of(answer, "beta"), answer)
 

@@ -78,8 +78,8 @@ def test_a_training_day_is_judged_by_a_model_that_it_did_not_make(
     warehouse, version = trained
     first = monitor(warehouse, version).days[0]
     signals = ",".join(version.manifest.signals)
-    plan = SelectionRequest(cohort=f"day > '{DAY}'", nested=signals)
-    without = answer_request(warehouse, plan)
+    plan = SelectionRequest(nested=signals)
+    without = answer_request(warehouse, plan, f"day > '{DAY}'")
     model = next(m for m in without.models if m.signals == version.manifest.signals)
     estimate = " + ".join(
         f"{float(b)!r} * {term.column}"

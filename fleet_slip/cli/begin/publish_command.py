@@ -4,15 +4,17 @@ from typing import Annotated
 
 import typer
 
-from fleet_slip.cli.begin.select_command import answer, print_selection
+from fleet_slip.catalogue.sources import TRAINING_DRIVES
+from fleet_slip.cli.begin.select_command import print_selection
 from fleet_slip.cli.completing import complete_model
 from fleet_slip.cli.models.signing_commands import SignKey, signing_key
-from fleet_slip.cli.options import RESAMPLING, selection_options
+from fleet_slip.cli.options import RESAMPLING, Cohort, selection_options
 from fleet_slip.cli.output import Json, print_json, say
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.publish import Publication
 from fleet_slip.runs.log import step
+from fleet_slip.selection.answer_request import answer_request
 from fleet_slip.selection.request import SelectionRequest
 
 
@@ -25,6 +27,7 @@ def publish(
         typer.Argument(help="Name of the model, such as sideslip.", autocompletion=complete_model),
     ],
     request: SelectionRequest,
+    cohort: Cohort = TRAINING_DRIVES,
     force: Annotated[
         bool, typer.Option("--force", help="Publish even what is worse than the champion.")
     ] = False,
@@ -49,7 +52,7 @@ def publish(
     """
     require_model_name(name)
     with step("select"):
-        selection = answer(context.obj, request)
+        selection = answer_request(context.obj.warehouse, request, cohort)
     publication = context.obj.publish(
         name, selection, force=force, candidate=candidate, sign_key=signing_key(sign_key)
     )

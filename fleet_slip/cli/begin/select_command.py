@@ -1,12 +1,10 @@
 """Selecting: the command select, and how a selection is printed."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
 from typing import Any
 
 import typer
 
-from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli.left_out import (
@@ -15,7 +13,7 @@ from fleet_slip.cli.left_out import (
     say_untold,
     say_without_log,
 )
-from fleet_slip.cli.options import selection_options
+from fleet_slip.cli.options import Cohort, selection_options
 from fleet_slip.cli.output import Json, print_json, print_table, say, stdout
 from fleet_slip.grams.cohorts.folding import BANDS, PARTS, ROW_FOLDS
 from fleet_slip.grams.cohorts.outweighing import drives_by_car
@@ -26,7 +24,9 @@ from fleet_slip.regression.choice.nested_choice import (
 )
 from fleet_slip.regression.inference.evidence import Evidence
 from fleet_slip.regression.validation.crossval import CrossValidation
-from fleet_slip.selection.request import RequestedSelection, SelectionRequest
+from fleet_slip.selection.answer_request import answer_request
+from fleet_slip.selection.request import SelectionRequest
+from fleet_slip.selection.requested_selection import RequestedSelection
 from fleet_slip.selection.search import SearchChoice
 from fleet_slip.selection.select_models import Selection
 from fleet_slip.selection.uncertainty import Uncertainty
@@ -42,7 +42,12 @@ FIGURES = ("drives", "correlation", "RMSE deg", "mean deg", "std deg", "conditio
 
 
 @selection_options()
-def select(context: typer.Context, request: SelectionRequest, json: Json = False) -> None:
+def select(
+    context: typer.Context,
+    request: SelectionRequest,
+    cohort: Cohort = TRAINING_DRIVES,
+    json: Json = False,
+) -> None:
     """Compare models on a cohort by cross-validation and choose one. Reads Gram rows only.
 
     Compare a list of models: **fleet-slip select --models table1**
@@ -53,17 +58,11 @@ def select(context: typer.Context, request: SelectionRequest, json: Json = False
 
     Search all subsets: **fleet-slip select --all-subsets --criterion cv --bootstrap 1000**
     """
-    selection = answer(context.obj, request)
+    selection = answer_request(context.obj.warehouse, request, cohort)
     if json:
         print_json(selection)
     else:
         print_selection(selection)
-
-
-def answer(fleet: Fleet, request: SelectionRequest) -> RequestedSelection:
-    """Select as asked on the command line."""
-    options = asdict(request)
-    return fleet.cohort(options.pop("cohort")).select(**options)
 
 
 def print_selection(selection: Selection[Any]) -> None:

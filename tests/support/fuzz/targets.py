@@ -129,9 +129,7 @@ def names(rng: random.Random, place: Path) -> None:
         database.sql("FROM log").fetchall()
         database.sql("FROM drives").fetchall()
     load_cohort(warehouse, condition)
-    answer_request(
-        warehouse, SelectionRequest(cohort=condition, nested="ax", by=rng.choice(FOLD_KEYS))
-    )
+    answer_request(warehouse, SelectionRequest(nested="ax", by=rng.choice(FOLD_KEYS)), condition)
 
 
 def references(rng: random.Random, place: Path) -> None:
