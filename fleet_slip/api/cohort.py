@@ -10,7 +10,7 @@ from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.warehouse.tables import Warehouse
 
 if TYPE_CHECKING:
-    from fleet_slip.api.subject import Examined
+    from fleet_slip.api.examined_model import ExaminedModel
     from fleet_slip.grams.cohorts.folding import Folding, FoldKey
     from fleet_slip.grams.cohorts.gram_cohort import Cohort
     from fleet_slip.models.model_version import ModelVersion
@@ -191,8 +191,8 @@ class FleetCohort(Rooted):
 
     def _examined(
         self, model: "str | ModelVersion | None", signals: str | None, features: str | None
-    ) -> "Examined":
-        from fleet_slip.api.subject import subject_of
+    ) -> "ExaminedModel":
+        from fleet_slip.api.examined_model import subject_of
         from fleet_slip.models.versions import Registry
 
         return subject_of(Registry(self.root / "models"), model, signals, features)

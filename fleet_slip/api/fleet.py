@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 from fleet_slip.api.calls import Workers, open_workers, record_call
 from fleet_slip.api.cohort import FleetCohort
-from fleet_slip.api.filling import Filling
-from fleet_slip.api.tending import Tending
+from fleet_slip.api.health_and_upkeep import HealthAndUpkeep
+from fleet_slip.api.logs_and_grams import LogsAndGrams
 from fleet_slip.catalogue.car_numbers import CALIBRATION, DELAY
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
@@ -31,7 +31,7 @@ ShowStep = Callable[[str, int, int], None]
 """Like `ShowProgress`, with the name of the step first."""
 
 
-class Fleet(Filling, Tending):
+class Fleet(LogsAndGrams, HealthAndUpkeep):
     """All that can be asked of a data root, and done to it; `fleet_slip.open` makes one.
 
     A fleet holds no connection and no file open, and threads may share it. What changes the

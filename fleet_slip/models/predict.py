@@ -24,7 +24,7 @@ from fleet_slip.catalogue.feature_counts import feature_counts
 from fleet_slip.catalogue.signals import COUNT_MAX, SAMPLE_TIME_S, catalogue
 from fleet_slip.errors import DataError, InputError
 from fleet_slip.grams.rows.drive_rows import counts_of
-from fleet_slip.models.frames import Frame, open_frame
+from fleet_slip.models.data_frames import Frame, open_frame
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predictor import Predictor
 

@@ -18,7 +18,7 @@ Labels = Mapping[str, str]
 
 
 @dataclass(frozen=True)
-class Sample:
+class Metric:
     """One figure: its name with its unit at the end, what it is, of what, and its value."""
 
     name: str
@@ -29,7 +29,7 @@ class Sample:
 
 def as_openmetrics(status: WarehouseStatus) -> str:
     """Return the metrics as text, grouped by name."""
-    groups: dict[str, list[Sample]] = {}
+    groups: dict[str, list[Metric]] = {}
     for sample in _samples(status):
         if sample.value is not None:
             groups.setdefault(f"fleet_slip_{sample.name}", []).append(sample)
@@ -42,9 +42,9 @@ def as_openmetrics(status: WarehouseStatus) -> str:
     return "\n".join([*lines, "# EOF", ""])
 
 
-def _samples(status: WarehouseStatus) -> Iterator[Sample]:
-    def of_root(name: str, text: str, value: float | None) -> Sample:
-        return Sample(name, text, {}, value)
+def _samples(status: WarehouseStatus) -> Iterator[Metric]:
+    def of_root(name: str, text: str, value: float | None) -> Metric:
+        return Metric(name, text, {}, value)
 
     age = None if status.data_age_hours is None else 3600 * status.data_age_hours
     checked = _seconds(status.checked_at)
@@ -62,36 +62,36 @@ def _samples(status: WarehouseStatus) -> Iterator[Sample]:
     yield from _of_champions(status)
 
 
-def _of_tables(status: WarehouseStatus) -> Iterator[Sample]:
+def _of_tables(status: WarehouseStatus) -> Iterator[Metric]:
     for name, one in status.tables.items():
         of = {"table": name}
-        yield Sample("table_files", "Active files of a table", of, one.files)
-        yield Sample("table_rows", "Rows of a table", of, one.rows)
-        yield Sample("table_size_bytes", "Size of a table's files", of, one.size_bytes)
+        yield Metric("table_files", "Active files of a table", of, one.files)
+        yield Metric("table_rows", "Rows of a table", of, one.rows)
+        yield Metric("table_size_bytes", "Size of a table's files", of, one.size_bytes)
         committed = _seconds(one.committed_at)
-        yield Sample("table_committed_timestamp_seconds", "Newest commit of a table", of, committed)
+        yield Metric("table_committed_timestamp_seconds", "Newest commit of a table", of, committed)
 
 
-def _of_runs(status: WarehouseStatus) -> Iterator[Sample]:
+def _of_runs(status: WarehouseStatus) -> Iterator[Metric]:
     for run in status.last_runs:
         of = {"command": str(run["command"])}
         started = _seconds(run["started_at"])
-        yield Sample("run_started_timestamp_seconds", "Begin of a command's last run", of, started)
-        yield Sample("run_duration_seconds", "How long it took", of, run["seconds"])
-        yield Sample("run_exit_code", "How it ended", of, run["exit_code"])
+        yield Metric("run_started_timestamp_seconds", "Begin of a command's last run", of, started)
+        yield Metric("run_duration_seconds", "How long it took", of, run["seconds"])
+        yield Metric("run_exit_code", "How it ended", of, run["exit_code"])
         for state in STATES:
             here = {**of, "state": state}
-            yield Sample("run_state", "1 for the state that it is in", here, run["state"] == state)
+            yield Metric("run_state", "1 for the state that it is in", here, run["state"] == state)
 
 
-def _of_champions(status: WarehouseStatus) -> Iterator[Sample]:
+def _of_champions(status: WarehouseStatus) -> Iterator[Metric]:
     for one in status.champions:
         of, published = {"model": one.model}, _seconds(one.published_at)
         logs, grams = one.logs_behind, one.grams_behind
-        yield Sample("champion_version", "Number of the version in use", of, one.version)
-        yield Sample("champion_published_timestamp_seconds", "Its publication", of, published)
-        yield Sample("champion_logs_behind", "Commits of logs since its training", of, logs)
-        yield Sample("champion_grams_behind", "The same of Gram rows", of, grams)
+        yield Metric("champion_version", "Number of the version in use", of, one.version)
+        yield Metric("champion_published_timestamp_seconds", "Its publication", of, published)
+        yield Metric("champion_logs_behind", "Commits of logs since its training", of, logs)
+        yield Metric("champion_grams_behind", "The same of Gram rows", of, grams)
 
 
 def _seconds(moment: datetime | date | None) -> float | None:
@@ -102,7 +102,7 @@ def _seconds(moment: datetime | date | None) -> float | None:
     return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
 
 
-def _told(root: str, sample: Sample) -> str:
+def _told(root: str, sample: Metric) -> str:
     labels = {"root": root, **sample.labels}
     return ",".join(f'{key}="{_escaped(text)}"' for key, text in labels.items())
 

@@ -13,7 +13,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.cli import app as program
-from fleet_slip.cli.progress import progress, progress_of_steps
+from fleet_slip.cli.progress_bar import progress, progress_of_steps
 from fleet_slip.runs.log import LOGGER
 from tests.support.commands import run
 

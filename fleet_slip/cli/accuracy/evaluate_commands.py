@@ -13,7 +13,7 @@ from fleet_slip.cli.models.diff_command import score_against
 from fleet_slip.cli.models.version_commands import Reference
 from fleet_slip.cli.options import Cohort
 from fleet_slip.cli.output import Json, print_json, print_table, say
-from fleet_slip.cli.progress import progress
+from fleet_slip.cli.progress_bar import progress
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.workers import Threads
 from fleet_slip.models.score import score_statement

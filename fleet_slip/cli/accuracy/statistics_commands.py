@@ -9,9 +9,9 @@ from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.catalogue.feature_sets import PLAIN, FeatureSet
 from fleet_slip.catalogue.features import features as known_features
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
+from fleet_slip.cli.examined_options import FeatureSetOption, Model, Signals, quantities
 from fleet_slip.cli.options import Cluster, Cohort, FoldCount, Naive, Worth
 from fleet_slip.cli.output import Json, print_json, print_table, stdout
-from fleet_slip.cli.subject import FeatureSetOption, Model, Signals, quantities
 from fleet_slip.columns.column_sql import column_query
 from fleet_slip.grams.cohorts.folding import FoldKey
 from fleet_slip.regression.exact.figures import Figures

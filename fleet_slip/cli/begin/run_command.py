@@ -16,7 +16,7 @@ from fleet_slip.cli.models.signing_commands import signing_key
 from fleet_slip.cli.next_steps import next_steps
 from fleet_slip.cli.options import Worth
 from fleet_slip.cli.output import Json, print_json, say
-from fleet_slip.cli.progress import progress_of_steps
+from fleet_slip.cli.progress_bar import progress_of_steps
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.workers import Cluster, Threads
 from fleet_slip.selection.worth import WORTH

@@ -12,7 +12,7 @@ from fleet_slip.api.calls import open_workers
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.cli.completing import complete_config
 from fleet_slip.cli.output import Json, print_json, say
-from fleet_slip.cli.progress import progress
+from fleet_slip.cli.progress_bar import progress
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.workers import Cluster, Threads
 from fleet_slip.errors import UsageError

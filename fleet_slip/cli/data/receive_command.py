@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fleet_slip.cli.output import Json, print_json, say
-from fleet_slip.cli.progress import progress
+from fleet_slip.cli.progress_bar import progress
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.errors import InputError
 from fleet_slip.words import number_of

@@ -11,7 +11,7 @@ import typer
 from fleet_slip.api.calls import open_workers
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.cli.output import Json, print_json, print_table, say
-from fleet_slip.cli.progress import progress
+from fleet_slip.cli.progress_bar import progress
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.workers import Cluster
 from fleet_slip.errors import DamageError, PendingError

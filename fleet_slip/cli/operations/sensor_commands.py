@@ -11,7 +11,7 @@ from fleet_slip.cli.begin.run_command import DEFAULT_CAMPAIGN
 from fleet_slip.cli.left_out import say_revoked, say_untold, say_without_log
 from fleet_slip.cli.models.version_commands import Reference
 from fleet_slip.cli.output import Json, print_json, print_table, say
-from fleet_slip.cli.progress import progress
+from fleet_slip.cli.progress_bar import progress
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.errors import AlarmError, UsageError
 from fleet_slip.monitoring.monitor import Chart

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from fleet_slip.selection.requested_selection import RequestedSelection
 
 
-class Serving(Rooted):
+class PublishedModels(Rooted):
     """Published models. A reference is `NAME@VERSION`, `NAME@ALIAS`, or `NAME` for its champion."""
 
     def models(self, name: str | None = None) -> "pa.Table":

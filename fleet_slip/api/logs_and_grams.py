@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from fleet_slip.simulation.job import SimulationReport
 
 
-class Filling(Rooted):
+class LogsAndGrams(Rooted):
     """Simulated and measured logs, and Gram rows. Whatever was done is not done again."""
 
     @record_call

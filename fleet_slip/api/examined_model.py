@@ -12,7 +12,7 @@ from fleet_slip.selection.named_inputs import WHOLE_SET, inputs_of
 
 
 @dataclass(frozen=True)
-class Examined:
+class ExaminedModel:
     """The inputs of a published model, or named ones."""
 
     feature_set: str
@@ -36,7 +36,7 @@ def subject_of(
     model: str | ModelVersion | None,
     signals: str | None,
     feature_set: str | None,
-) -> Examined:
+) -> ExaminedModel:
     """Return what is to be examined; by default the only model that there is.
 
     Raises `UsageError` if a model and signals are named.
@@ -44,14 +44,14 @@ def subject_of(
     if signals is not None or feature_set is not None:
         if model is not None:
             raise UsageError("name a published model or signals (of a feature set), not both.")
-        return Examined(feature_set or PLAIN, signals, None)
+        return ExaminedModel(feature_set or PLAIN, signals, None)
     version = (
         model
         if isinstance(model, ModelVersion)
         else registry.resolve(model or _only_model(registry))
     )
     identity = version.manifest.trained_on.feature_set
-    return Examined(features().name_of(identity), None, version)
+    return ExaminedModel(features().name_of(identity), None, version)
 
 
 def _only_model(registry: Registry) -> str:
