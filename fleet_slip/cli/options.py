@@ -9,6 +9,7 @@ from typing import Annotated, Any, TypeVar
 import typer
 
 from fleet_slip.cli.completing import complete_config, complete_feature_set
+from fleet_slip.grams.cohorts.folding import FoldKey
 from fleet_slip.regression.choice.criteria import CRITERIA
 from fleet_slip.regression.choice.signal_orders import RANKINGS
 from fleet_slip.regression.choice.stepwise import METHODS
@@ -118,6 +119,7 @@ Cohort = Annotated[
     str,
     typer.Option(help="SQL condition on the view drives, such as \"track = 'waterford_hills'\"."),
 ]
+By = Annotated[FoldKey, typer.Option(help="What a fold is made of.")]
 FoldCount = Annotated[str | None, SELECTION["folds"]]
 Worth = Annotated[str, SELECTION["worth"]]
 Naive = Annotated[bool, SELECTION["naive"]]

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, is_dataclass
 from decimal import Decimal
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.cells import cell_len
@@ -18,6 +18,9 @@ from rich.text import Text
 from fleet_slip.cli.logs import wrapped
 from fleet_slip.errors import printable
 from fleet_slip.runs.log import LOGGER
+
+if TYPE_CHECKING:
+    from fleet_slip.regression.exact.figures import Figures
 
 Json = Annotated[bool, typer.Option("--json", help="Print machine-readable JSON on stdout.")]
 
@@ -93,6 +96,16 @@ def print_table(
     with console.capture() as captured:
         console.print(table)
     _print_lines("\n".join(line.rstrip() for line in captured.get().splitlines()))
+
+
+def figures_cells(figures: "Figures") -> list[str]:
+    """Return correlation, RMSE, mean and standard deviation of an error as a table shows them."""
+    return [
+        f"{figures.correlation:.4f}",
+        f"{figures.rmse_deg:.4f}",
+        f"{figures.error_mean_deg:+.4f}",
+        f"{figures.error_std_deg:.4f}",
+    ]
 
 
 GAP = 2

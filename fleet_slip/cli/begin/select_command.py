@@ -14,7 +14,7 @@ from fleet_slip.cli.left_out import (
     say_without_log,
 )
 from fleet_slip.cli.options import Cohort, selection_options
-from fleet_slip.cli.output import Json, print_json, print_table, say, stdout
+from fleet_slip.cli.output import Json, figures_cells, print_json, print_table, say, stdout
 from fleet_slip.grams.cohorts.folding import BANDS, PARTS, ROW_FOLDS
 from fleet_slip.grams.cohorts.outweighing import drives_by_car
 from fleet_slip.regression.choice.nested_choice import (
@@ -138,10 +138,7 @@ def _print_folds(model: CrossValidation) -> None:
             [
                 name,
                 f"{found.rows:,}",
-                f"{found.correlation:.4f}",
-                f"{found.rmse_deg:.4f}",
-                f"{found.error_mean_deg:+.4f}",
-                f"{found.error_std_deg:.4f}",
+                *figures_cells(found),
             ]
             for name, found in zip(model.fold_names, model.folds, strict=True)
         ],
@@ -175,10 +172,7 @@ def in_families(signals: Sequence[str]) -> str:
 def _figures(model: CrossValidation) -> list[str]:
     return [
         f"{model.drives:,}",
-        f"{model.correlation:.4f}",
-        f"{model.pooled.rmse_deg:.4f}",
-        f"{model.pooled.error_mean_deg:+.4f}",
-        f"{model.pooled.error_std_deg:.4f}",
+        *figures_cells(model.pooled),
         f"{model.condition_number:.3g}",
     ]
 

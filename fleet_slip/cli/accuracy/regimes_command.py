@@ -1,0 +1,82 @@
+"""The command that shows a model's error by regime: regimes."""
+
+import math
+from typing import Annotated
+
+import typer
+
+from fleet_slip.catalogue.sources import TRAINING_DRIVES
+from fleet_slip.cli.examined_options import Signals
+from fleet_slip.cli.options import By, Cohort, FoldCount, Worth
+from fleet_slip.cli.output import Json, print_json, print_table, stdout
+from fleet_slip.selection.regimes import RegimeComparison
+from fleet_slip.selection.worth import WORTH
+from fleet_slip.words import number_of
+
+
+def regimes(
+    context: typer.Context,
+    signals: Signals = None,
+    over: Annotated[
+        str | None,
+        typer.Option(
+            help="Regimes to divide by, separated by commas, such as speed. Default: all of the "
+            "set's."
+        ),
+    ] = None,
+    cohort: Cohort = TRAINING_DRIVES,
+    feature_set: Annotated[
+        str, typer.Option("--features", help="Feature set that divides rows by regimes.")
+    ] = "regimes",
+    by: By = "drive",
+    folds: FoldCount = None,
+    worth: Worth = WORTH,
+    json: Json = False,
+) -> None:
+    """Show a model's error by speed and lateral acceleration, and whether to split it there.
+
+    One model for all rows is cross-validated against one for each regime. Needs Gram rows by
+    regime: **fleet-slip gram --features regimes**
+
+    Example: **fleet-slip regimes --over speed**
+    """
+    divided_by = [name.strip() for name in over.split(",")] if over else []
+    result: RegimeComparison = context.obj.cohort(cohort).regimes(
+        signals, over=divided_by, features=feature_set, by=by, folds=folds, worth=worth
+    )
+    if json:
+        print_json({"cohort": cohort, **result.as_dict()})
+    else:
+        _print_regimes(result, by)
+
+
+def _print_regimes(result: RegimeComparison, by: str) -> None:
+    print_table(
+        f"{number_of(result.drives, 'drive')}, {number_of(result.folds, 'fold')} by {by}: "
+        f"{' '.join(result.signals)}",
+        ["regime", "rows", "share", "pooled RMSE deg", "std", "split RMSE deg", "std", ""],
+        [
+            [
+                one.name,
+                f"{one.rows:,}",
+                f"{one.share:.1%}",
+                f"{one.pooled.rmse_deg:.4f}",
+                f"{one.pooled.error_std_deg:.4f}",
+                f"{one.split.rmse_deg:.4f}",
+                f"{one.split.error_std_deg:.4f}",
+                "" if one.own else "too few rows",
+            ]
+            for one in result.regimes
+        ],
+    )
+    one, own = result.pooled, result.split
+    better = "a model for each regime" if result.split_wins else "one model for all"
+    stdout().print(
+        f"one model: correlation {one.correlation:.4f}, RMSE {one.rmse_deg:.4f} deg; one for each "
+        f"regime: {own.correlation:.4f}, {own.rmse_deg:.4f} deg. Over the folds, splitting adds "
+        f"{result.gain:+.4f} +- {result.gain_standard_error:.4f} to the correlation and takes "
+        f"{math.degrees(result.rmse_gain):.4f} +- "
+        f"{math.degrees(result.rmse_gain_standard_error):.4f} deg from the RMSE; worth having is "
+        f"{result.worth}. Choose {better}.",
+        markup=False,
+    )

@@ -1,0 +1,52 @@
+"""The command that compares least squares with what shrinks coefficients: shrink."""
+
+import typer
+
+from fleet_slip.catalogue.feature_sets import PLAIN
+from fleet_slip.catalogue.sources import TRAINING_DRIVES
+from fleet_slip.cli.examined_options import FeatureSetOption, Signals
+from fleet_slip.cli.options import By, Cluster, Cohort, FoldCount, Naive
+from fleet_slip.cli.output import Json, figures_cells, print_json, print_table
+from fleet_slip.selection.shrinkage import Shrunk
+from fleet_slip.words import number_of
+
+
+def shrink(
+    context: typer.Context,
+    signals: Signals = None,
+    feature_set: FeatureSetOption = None,
+    cohort: Cohort = TRAINING_DRIVES,
+    by: By = "drive",
+    folds: FoldCount = None,
+    naive: Naive = False,
+    cluster: Cluster = None,
+    json: Json = False,
+) -> None:
+    """Compare least squares with ridge, lasso, James-Stein and Pace regression.
+
+    Penalties are chosen by cross-validation inside each training fold. With many drives for each
+    signal there is little to shrink; with few drives, or many features, it shows here.
+
+    Example: **fleet-slip shrink --signals ay,yaw_rate**
+    """
+    found: tuple[Shrunk, ...] = context.obj.cohort(cohort).shrink(
+        signals, features=feature_set or PLAIN, by=by, folds=folds, naive=naive, cluster=cluster
+    )
+    inputs = found[0].cross_validation.signals  # least squares keeps all
+    if json:
+        print_json({"cohort": cohort, "methods": found})
+        return
+    first = found[0].cross_validation
+    print_table(
+        f"{number_of(first.drives, 'drive')}, {number_of(len(first.folds), 'fold')} by {by}",
+        ["method", "signals kept", "penalty", "correlation", "RMSE deg", "mean deg", "std deg"],
+        [
+            [
+                one.cross_validation.name,
+                f"{len(one.cross_validation.signals)} of {len(inputs)}",
+                "" if one.penalty is None else f"{one.penalty:.2g}",
+                *figures_cells(one.cross_validation.pooled),
+            ]
+            for one in found
+        ],
+    )

@@ -1,0 +1,98 @@
+"""The command that lists the features and feature sets: features."""
+
+from typing import Annotated
+
+import typer
+
+from fleet_slip.catalogue.feature_sets import PLAIN, FeatureSet
+from fleet_slip.catalogue.features import features as known_features
+from fleet_slip.cli.output import Json, print_json, print_table
+from fleet_slip.columns.column_sql import column_query
+from fleet_slip.words import number_of
+
+
+def features(
+    sets: Annotated[
+        bool, typer.Option("--sets", help="List the feature sets instead of the features.")
+    ] = False,
+    sql: Annotated[
+        str | None,
+        typer.Option(
+            "--sql",
+            help="Print the query over log_counts that computes this feature, window or factor.",
+            show_default=False,
+        ),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """List the features and feature sets of configs/features.toml.
+
+    Features are integer functions of the logged counts, such as yaw rate over speed. Compute the
+    Gram rows of a set with: **fleet-slip gram --features NAME**, then use it with: **fleet-slip
+    select --features NAME**
+
+    Example: **fleet-slip features --sql ay_mean_16**
+    """
+    known = known_features()
+    if sql is not None:
+        typer.echo(column_query(known, sql))
+    elif json:
+        print_json(
+            {
+                "windows": {
+                    name: one.model_dump(mode="json") for name, one in known.time_columns.items()
+                },
+                "features": {
+                    name: {**one.model_dump(mode="json"), "sql": one.sql}
+                    for name, one in known.features.items()
+                },
+                "sets": {
+                    name: {"identity": known.identity(name), **known.feature_set(name).model_dump()}
+                    for name in (PLAIN, *known.sets)
+                },
+            }
+        )
+    elif sets:
+        print_table(
+            "",
+            ["set", "columns", "rows of a drive", "description"],
+            [
+                [
+                    name,
+                    " ".join(known.feature_set(name).inputs),
+                    _parts(known.feature_set(name)),
+                    one.description,
+                ]
+                for name, one in ((n, known.feature_set(n)) for n in (PLAIN, *known.sets))
+            ],
+            left=4,
+        )
+    else:
+        print_table(
+            "",
+            ["feature", "unit", "scale", "from", "description"],
+            [
+                [name, one.unit, str(one.scale), " ".join(one.inputs), one.description]
+                for name, one in known.features.items()
+            ],
+            left=5,
+        )
+        print_table(
+            "\ncolumns over time",
+            ["column", "unit", "scale", "of", "description"],
+            [
+                [name, one.unit, str(one.scale), one.definition.of, one.description]
+                for name, one in known.time_columns.items()
+            ],
+            left=5,
+        )
+
+
+def _parts(one: FeatureSet) -> str:
+    if one.regimes:
+        return f"by {' and '.join(one.regimes)}"
+    if one.block_s:
+        return f"in blocks of {one.block_s:f} s"
+    if one.row_folds:
+        return f"{number_of(one.row_folds, 'fold')} of rows"
+    return "with the one before" if one.lagged else "together"

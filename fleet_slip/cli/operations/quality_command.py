@@ -1,0 +1,69 @@
+"""The command that finds faulty sensors: quality."""
+
+from typing import Annotated
+
+import typer
+
+from fleet_slip.catalogue.sources import TRAINING_DRIVES
+from fleet_slip.cli.left_out import say_revoked
+from fleet_slip.cli.output import Json, print_json, print_table
+from fleet_slip.errors import AlarmError
+from fleet_slip.monitoring.quality import QualityReport
+from fleet_slip.warehouse.minimum_cohort import tells_single_cars
+from fleet_slip.words import number_of
+
+
+def quality(
+    context: typer.Context,
+    cohort: Annotated[
+        str,
+        typer.Option(help="SQL condition on the view drives: which drives to examine together."),
+    ] = TRAINING_DRIVES,
+    json: Json = False,
+) -> None:
+    """Find stuck, saturated, biased, noisy, scaled, reversed and swapped sensors, drive by drive.
+
+    Reads Gram rows only. Exit code 10 if a drive's sensors are not in order.
+
+    Example: **fleet-slip quality --cohort "day >= '2024-05-02'"**
+    """
+    found: QualityReport = context.obj.quality(cohort)
+    if json:
+        print_json(found)
+    else:
+        _print_quality(found)
+        say_revoked(found.revoked)
+    if found.findings:
+        raise AlarmError(
+            f"{len(found.findings)} of {number_of(found.drives, 'drive')} are not in order"
+        )
+
+
+def _print_quality(found: QualityReport) -> None:
+    examined = (
+        f"{number_of(found.drives, 'drive')} examined, {found.compared:,} of them beside their "
+        "peers"
+    )
+    if not found.findings:
+        order = "all are in order" if found.drives else "none is long enough"
+        typer.echo(f"{examined}: {order}")
+        return
+    if not tells_single_cars():
+        rows = [[kind, signals, f"{many:,}"] for (kind, signals), many in found.by_fault().items()]
+        print_table(examined, ["fault", "signals", "drives"], rows, left=2)
+        return
+    print_table(
+        examined,
+        ["drive", "car", "fault", "signals", "what shows it"],
+        [
+            [
+                finding.drive_id,
+                finding.vehicle_id,
+                finding.fault.kind,
+                " ".join(finding.fault.signals),
+                finding.fault.figure,
+            ]
+            for finding in found.findings
+        ],
+        left=5,
+    )
