@@ -174,7 +174,7 @@ def counts_of_table(table: pa.Table) -> DriveCounts:
     return DriveCounts(table["tick"].to_numpy(), counts, present, facts)
 
 
-@settings(max_examples=100)
+@settings(max_examples=40)
 @given(drives())
 def test_kernel_sql_and_plain_integers_agree_on_hostile_drives(table: pa.Table) -> None:
     plan = ColumnPlan.of(list(DEFINITIONS), {}, DEFINITIONS)
