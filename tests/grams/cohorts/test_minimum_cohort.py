@@ -15,6 +15,8 @@ from fleet_slip.errors import CohortError, ConfigError, QuestionError
 from fleet_slip.monitoring.plausibility import Fault
 from fleet_slip.monitoring.quality import QualityReport, SensorFault
 from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.selection.influential_cars import without_vehicles
+from fleet_slip.warehouse.condition import parse_condition
 from fleet_slip.warehouse.minimum_cohort import MINIMUM_VARIABLE
 from tests.support.messages import START_S, gram_of, message_of
 
@@ -202,3 +204,15 @@ def test_masks_of_pairs_of_cars_cancel_exactly_in_sums_of_gram_rows() -> None:
         assert not (row == hidden).any()
     five = np.sum(masked[1:], axis=0, dtype=np.uint64)
     assert (five != np.sum(rows[1:], axis=0, dtype=np.uint64)).all()
+
+
+def test_cars_that_are_left_out_stand_in_a_version_by_their_hashes(
+    fleet: fleet_slip.Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    everybody = parse_condition(FULL)
+    for least in (None, "3"):
+        if least:
+            monkeypatch.setenv(MINIMUM_VARIABLE, least)
+        others = without_vehicles(everybody, ["VIN3", "it's"]).text
+        assert ("VIN3" in others) == (least is None)
+        assert fleet.cohort(others).select(model="ax,ay").cohort.drive_count == 8
