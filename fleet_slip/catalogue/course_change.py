@@ -67,8 +67,9 @@ def rounded(number: str, divisor: int) -> str:
 def with_changes(rows: str, columns: tuple[str, ...], ticks: int) -> str:
     """Return a subquery: columns less what they were so many ticks ago, `TURNED` and the label.
 
-    Only rows that have a fix now and had one then, and the yaw rate all the time between. `rows`
-    has the columns, course and yaw rate, and the column `clipped`; of the label it is the change.
+    Only rows that have a fix now and had one then, and the yaw rate all the time between; and the
+    first of a drive, which has no change, so that a drive without a course is known to have none.
+    `rows` has the columns, course and yaw rate, and the column `clipped`.
     """
     units, label = course_units(), catalogue().label
     ago = {name: f"(max({name}) OVER ago)::BIGINT" for name in (*columns, COURSE, YAW_RATE)}
@@ -99,5 +100,5 @@ def with_changes(rows: str, columns: tuple[str, ...], ticks: int) -> str:
                         RANGE BETWEEN {ticks - 1} PRECEDING AND CURRENT ROW)
             )
         )
-        WHERE abs({label}) <= {units.largest}
+        WHERE abs({label}) <= {units.largest} OR tick = 0
     )"""

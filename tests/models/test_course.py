@@ -100,5 +100,9 @@ def test_a_fleet_without_receivers_is_told_so(tmp_path: Path) -> None:
     plain.simulate("smoke", days=1)
     plain.gram()
     plain.gram("course")
-    with pytest.raises(DataError):
-        plain.cohort("true").select(label="course", model=COLUMNS)
+    assert plain.gram("course").rows_read == 0, "nothing is left to do"
+    cohort = plain.cohort("true")
+    with pytest.raises(DataError, match="nothing tells the course"):
+        cohort.select(label="course", model=COLUMNS)
+    with pytest.raises(DataError, match="nothing tells the course"):
+        cohort.select(label="course", nested="ay", rank="declared")

@@ -1,5 +1,6 @@
 """The error for a cohort without drives."""
 
+from fleet_slip.catalogue.features import features
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohorts.reader import GramReader, OpenedGrams, open_grams
 from fleet_slip.warehouse.condition import Condition
@@ -27,6 +28,13 @@ def empty_cohort_error(opened: OpenedGrams, condition: Condition) -> DataError:
         return DataError(
             f"all {number_of(left_out, 'drive')} of the cohort {condition.text!r} are of cars that "
             "sent Gram rows of the logged signals and no log. Select with features = signals."
+        )
+    change_s = features().feature_set(features().name_of(opened.identity)).change_s
+    if change_s:
+        return DataError(
+            f"no drive of the cohort {condition.text!r} has fixes of a satellite receiver that are "
+            f"{change_s} s apart: nothing tells the course. Choose another cohort, or map the "
+            "course and ingest again: docs/course.md."
         )
     examples = opened.database.execute(
         "SELECT string_agg(DISTINCT source, ', ' ORDER BY source), "

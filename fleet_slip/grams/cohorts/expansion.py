@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray
 from fleet_slip.catalogue.car_numbers import CALIBRATION
+from fleet_slip.catalogue.course_change import TURNED
 from fleet_slip.catalogue.definitions import Number
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import ALL_DRIVES
@@ -54,11 +55,12 @@ class Expansion:
         Rows of a car without a number do not have the columns that need it.
         """
         for names, rows, here in by_signals(batch):
-            table = gram_table(names, rows)
             if self.sweep:
-                table = swept(table)
-                yield ",".join(table.signals), table, here
+                if TURNED in names.split(","):  # else these drives have no change
+                    table = swept(gram_table(names, rows))
+                    yield ",".join(table.signals), table, here
                 continue
+            table = gram_table(names, rows)
             if not self.columns:
                 yield names, table, here
                 continue

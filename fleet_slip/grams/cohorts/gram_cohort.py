@@ -14,7 +14,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import SCENARIO, TRAINING_DRIVES
 from fleet_slip.errors import RefusedError
 from fleet_slip.grams.cohorts.cohort_origin import CohortOrigin
-from fleet_slip.grams.cohorts.empty_cohort import empty_cohort_error
+from fleet_slip.grams.cohorts.empty_cohort import empty_cohort, empty_cohort_error
 from fleet_slip.grams.cohorts.expansion import expansion_of
 from fleet_slip.grams.cohorts.fold_assignment import assign_folds, require_divided
 from fleet_slip.grams.cohorts.folding import (
@@ -168,6 +168,8 @@ def load_cohort(
             raise empty_cohort_error(opened, condition)
     require_training(rows["source"].unique().to_pylist(), condition)
     parts = list(expansion.tables(rows))
+    if not parts:  # of changes, and there are none
+        raise empty_cohort(warehouse, condition, feature_set)
     # Rows whose calibrated columns are not the same are apart now: their metadata follows them.
     told = [
         one

@@ -22,7 +22,7 @@ class Changes:
     """The changes of a drive's columns between fixes that are so many ticks apart.
 
     Attributes:
-        rows: each row that has a change, shape (changes,).
+        rows: each row that has a change, after that of tick 0, shape (changes,).
         columns: shape (columns + 2, changes), NaN where missing; `TURNED` and the label come last.
         clipped: how many columns of each row were clipped, shape (changes,).
     """
@@ -41,6 +41,7 @@ def course_changes(workspace: Workspace, ticks: NDArray[Any], apart: int) -> Cha
     fixes: list[IntArray] = []
     values: list[FloatArray] = []
     clipped: list[FloatArray] = []
+    first_clipped = np.zeros(0)
     for first in range(0, workspace.rows, BLOCK_ROWS):
         workspace.compute_block(first)
         block, here = workspace.block(first)
@@ -49,6 +50,7 @@ def course_changes(workspace: Workspace, ticks: NDArray[Any], apart: int) -> Cha
         fixes.append(fixed + first)
         values.append(block[:-1, fixed])
         clipped.append(here[fixed])
+        first_clipped = here[:1].copy() if first == 0 else first_clipped
     at, counts = np.concatenate(fixes), np.concatenate(values, axis=1)
     before, now = _pairs(ticks[at].astype(np.int64), apart)
     turned, known = _twice_turned(ticks.astype(np.int64), yaw_rate, at[before], at[now])
@@ -62,7 +64,12 @@ def course_changes(workspace: Workspace, ticks: NDArray[Any], apart: int) -> Cha
             change[None, kept],
         ]
     )
-    return Changes(at[now], columns, np.concatenate(clipped)[now])
+    began = ticks[:1] == 0  # known to have no change: so a drive without a course is remembered
+    return Changes(
+        np.concatenate([np.flatnonzero(began), at[now]]),
+        np.concatenate([np.full((len(columns), int(began.sum())), np.nan), columns], axis=1),
+        np.concatenate([first_clipped[began], np.concatenate(clipped)[now]]),
+    )
 
 
 def _pairs(ticks: IntArray, apart: int) -> tuple[IntArray, IntArray]:

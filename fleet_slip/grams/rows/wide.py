@@ -175,7 +175,9 @@ def change_sums(workspace: Workspace, counts: DriveCounts, apart: int) -> dict[K
         sums = found.setdefault(kind, PartSums(len(has)))
         for first in range(0, len(rows), exact_rows):
             some = rows[first : first + exact_rows]
-            sums.add(changes.columns[np.ix_(np.array(has), some)], changes.clipped[some])
+            sums.add(
+                changes.columns[np.ix_(np.array(has, dtype=np.int64), some)], changes.clipped[some]
+            )
     return found
 
 
