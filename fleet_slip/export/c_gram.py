@@ -4,6 +4,8 @@ The layout of a message is that of `fleet_slip.grams.received.messages`. Counts 
 that a product is at most 2^30 and a sum of `MOST_ROWS` of them below 2^61: nothing overflows.
 """
 
+from collections.abc import Sequence
+
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.export.c_names import literal
 from fleet_slip.grams.received.messages import (
@@ -82,22 +84,17 @@ uint32_t {prefix}_gram_message(const {prefix}_gram *gram, uint32_t part, const u
 
 def c_gram_source(prefix: str) -> str:
     """Return the source that goes with the header."""
-    signals = catalogue()
-    names = signals.gram_signals
-    k = len(names)
-    takes = "\n".join(
-        f"    counts[{i}] = in_range(sample->{name}_count, {literal(s.min_count)}, {s.max_count});"
-        for i, name in enumerate(names)
-        for s in [signals[name]]
-    )
-    magic = "\n".join(
-        f"    message[{i}] = {byte}U; /* {chr(byte)} */" for i, byte in enumerate(MAGIC)
-    )
+    names = catalogue().gram_signals
+    counting = _beginning(prefix, names) + _parts(prefix, names) + _adding(prefix, names)
+    return counting + _PUTTING + _message(prefix)
+
+
+def _beginning(prefix: str, names: Sequence[str]) -> str:
     return f"""/* Gram rows of a drive, exported by fleet-slip. Do not edit.
  * Signals, a bit of a mask each, the first the lowest: {", ".join(names)}. */
 #include "{prefix}_gram.h"
 
-#define SIGNALS {k}U
+#define SIGNALS {len(names)}U
 #define MISSING INT32_MIN
 
 static int32_t in_range(int32_t value, int32_t least, int32_t most)
@@ -105,6 +102,12 @@ static int32_t in_range(int32_t value, int32_t least, int32_t most)
     return ((value < least) || (value > most)) ? MISSING : value;
 }}
 
+"""
+
+
+def _parts(prefix: str, names: Sequence[str]) -> str:
+    """Return what finds the part of a tick, and what begins a drive."""
+    return f"""\
 /* The part of a set of signals, begun if it is new; the number of parts if none is left. */
 static uint32_t part_of({prefix}_gram *gram, uint32_t mask)
 {{
@@ -119,7 +122,7 @@ static uint32_t part_of({prefix}_gram *gram, uint32_t mask)
         for (uint32_t i = 0U; i < SIGNALS; i++) {{
             part->sums[i] = 0;
         }}
-        for (uint32_t i = 0U; i < {packed_size(k)}U; i++) {{
+        for (uint32_t i = 0U; i < {packed_size(len(names))}U; i++) {{
             part->products[i] = 0;
         }}
         gram->used++;
@@ -133,6 +136,18 @@ void {prefix}_gram_start({prefix}_gram *gram)
     gram->lost = 0U;
 }}
 
+"""
+
+
+def _adding(prefix: str, names: Sequence[str]) -> str:
+    """Return what counts a tick."""
+    known = catalogue()
+    takes = "\n".join(
+        f"    counts[{i}] = in_range(sample->{name}_count, {literal(s.min_count)}, {s.max_count});"
+        for i, name in enumerate(names)
+        for s in [known[name]]
+    )
+    return f"""\
 void {prefix}_gram_add({prefix}_gram *gram, const {prefix}_gram_sample *sample)
 {{
     int32_t counts[SIGNALS];
@@ -162,30 +177,44 @@ void {prefix}_gram_add({prefix}_gram *gram, const {prefix}_gram_sample *sample)
     }}
 }}
 
+"""
+
+
+_PUTTING = """\
 /* Writes the lowest bytes of a number, the lowest first; returns where the next one goes. */
 static uint32_t put(uint8_t *message, uint32_t at, uint64_t value, uint32_t bytes)
-{{
+{
     uint64_t rest = value;
-    for (uint32_t i = 0U; i < bytes; i++) {{
+    for (uint32_t i = 0U; i < bytes; i++) {
         message[at + i] = (uint8_t)(rest & 0xFFU);
         rest >>= 8U;
-    }}
+    }
     return at + bytes;
-}}
+}
 
 /* CRC-32 as in Ethernet and zlib. */
 static uint32_t crc_32(const uint8_t *bytes, uint32_t size)
-{{
+{
     uint32_t crc = 0xFFFFFFFFU;
-    for (uint32_t i = 0U; i < size; i++) {{
+    for (uint32_t i = 0U; i < size; i++) {
         crc ^= bytes[i];
-        for (uint32_t bit = 0U; bit < 8U; bit++) {{
+        for (uint32_t bit = 0U; bit < 8U; bit++) {
             crc = ((crc & 1U) != 0U) ? ((crc >> 1U) ^ 0xEDB88320U) : (crc >> 1U);
-        }}
-    }}
+        }
+    }
     return ~crc;
-}}
+}
 
+"""
+"""What writes a number, and the checksum of a message."""
+
+
+def _message(prefix: str) -> str:
+    """Return what writes the message of a part."""
+    magic = "\n".join(
+        f"    message[{i}] = {byte}U; /* {chr(byte)} */" for i, byte in enumerate(MAGIC)
+    )
+    return f"""\
 uint32_t {prefix}_gram_message(const {prefix}_gram *gram, uint32_t part, const uint8_t *vehicle,
                                uint64_t start_s, uint8_t *message)
 {{
