@@ -10,7 +10,7 @@ from typing import Any
 from deltalake.transaction import AddAction, RemoveAction
 
 from fleet_slip.delta.encoding import Encoded
-from fleet_slip.delta.files import TableFile
+from fleet_slip.delta.table_files import TableFile
 
 
 @dataclass(frozen=True)

@@ -13,14 +13,14 @@ from deltalake.transaction import AddAction
 
 from fleet_slip.delta.change import addition, columns_in
 from fleet_slip.delta.conflicts import is_conflict, retry_conflicts
+from fleet_slip.delta.dictionary_names import Names, read_names
 from fleet_slip.delta.encoding import Encoded, Encoding
-from fleet_slip.delta.files import TableFile
 from fleet_slip.delta.log_check import require_sound_log
-from fleet_slip.delta.names import Names, read_names
 from fleet_slip.delta.preface import read_preface
 from fleet_slip.delta.schema import require_readable, require_writable
 from fleet_slip.delta.sealing import NOTE, seal_note
 from fleet_slip.delta.snapshot import Snapshot
+from fleet_slip.delta.table_files import TableFile
 from fleet_slip.errors import ConflictError, StorageError
 from fleet_slip.files.checksums import checksum_in
 from fleet_slip.files.folder import Folder

@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 
 from fleet_slip.compute.tasks import LocalThreads, run_tasks
 from fleet_slip.delta import Snapshot, Table, TableFile, checksum_in, checksum_of
-from fleet_slip.delta.names import Names, read_names
+from fleet_slip.delta.dictionary_names import Names, read_names
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.files.storage_errors import storage_errors
 from fleet_slip.maintenance.verification import Damage, Verification

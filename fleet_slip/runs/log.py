@@ -50,7 +50,7 @@ _current: ContextVar["Run | None"] = ContextVar("run", default=None)
 
 
 @dataclass
-class Step:
+class MeasuredStep:
     """One step of a run. Whoever does it fills in the figures while it lasts."""
 
     name: str
@@ -76,7 +76,7 @@ class Run:
     arguments: tuple[str, ...]
     started_at: datetime
     run_id: str
-    steps: list[Step] = field(default_factory=list)
+    steps: list[MeasuredStep] = field(default_factory=list)
 
     @classmethod
     def start(cls, command: str, arguments: Sequence[str]) -> "Run":
@@ -158,10 +158,10 @@ def recording(root: Folder, command: str, arguments: Sequence[str]) -> Iterator[
 
 
 @contextlib.contextmanager
-def step(name: str) -> Iterator[Step]:
+def step(name: str) -> Iterator[MeasuredStep]:
     """Time a step of the run under way, and log it. Without a run it is logged only."""
     run = _current.get()
-    one = Step(name)
+    one = MeasuredStep(name)
     begun = time.monotonic()
     try:
         yield one
