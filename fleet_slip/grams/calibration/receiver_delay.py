@@ -9,7 +9,7 @@ lags need. What the lag would be without each drive in turn tells how sure it is
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,7 +28,7 @@ SPAN, STEP, STEPS = 50, 5, 8
 """Ticks of the integral, between two lags, and how many lags there are beside none."""
 SPEEDS = ("satellite_speed", f"satellite_speed_late_{SPAN}")
 FEWEST_DRIVES = 3
-"""Of fewer the uncertainty is not told."""
+"""Of fewer the uncertainty is that of a usual drive of other cars."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class ReceiverDelay:
 
     Attributes:
         value: s.
-        uncertainty: standard error, s; None of few drives.
+        uncertainty: standard error, s; None if all cars have few drives.
         drives, rows: what tells it.
     """
 
@@ -92,7 +92,25 @@ def receiver_delays(opened: OpenedGrams, condition: Condition) -> dict[str, Rece
         car: _delay(np.array([own[drive] for drive in sorted(own)]), rows[car])
         for car, own in sorted(products.items())
     }
-    return {car: one for car, one in found.items() if one is not None}
+    return with_pooled({car: one for car, one in found.items() if one is not None})
+
+
+def with_pooled(delays: dict[str, ReceiverDelay]) -> dict[str, ReceiverDelay]:
+    """Return the delays with the uncertainty of cars of few drives, as drives of others differ."""
+    known = [one for one in delays.values() if one.uncertainty is not None]
+    if not known:
+        return delays
+    free = sum(one.drives - 1 for one in known)
+    of_drive = (
+        math.fsum((one.drives - 1) * one.drives * (one.uncertainty or 0.0) ** 2 for one in known)
+        / free
+    )
+    return {
+        car: one
+        if one.uncertainty is not None
+        else replace(one, uncertainty=math.sqrt(of_drive / one.drives))
+        for car, one in delays.items()
+    }
 
 
 def _delay(products: FloatArray, rows: int) -> ReceiverDelay | None:

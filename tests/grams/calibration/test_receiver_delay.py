@@ -7,6 +7,7 @@ import pytest
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.errors import RefusedError
+from fleet_slip.grams.calibration.receiver_delay import ReceiverDelay, with_pooled
 
 CAMPAIGN = """
 name = "late"
@@ -46,6 +47,14 @@ def test_the_delay_is_found_with_its_uncertainty(tmp_path: Path, delay_s: float)
     assert abs(value - delay_s) < 0.005
     assert 0 < uncertainty < 0.005
     assert abs(value - delay_s) < 3 * uncertainty + 0.001
+
+
+def test_a_car_of_few_drives_is_as_sure_as_usual_drives_make_it() -> None:
+    known, few = ReceiverDelay(0.1, 0.002, 4, 9000), ReceiverDelay(0.09, None, 1, 2000)
+    assert with_pooled({"a": few}) == {"a": few}
+    found = with_pooled({"a": few, "b": known})
+    assert found["b"] == known
+    assert found["a"].uncertainty == pytest.approx(0.004)
 
 
 def test_what_a_late_course_taught_is_not_published(tmp_path: Path) -> None:
