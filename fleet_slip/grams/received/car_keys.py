@@ -29,9 +29,10 @@ from fleet_slip.config import Config, faults_of, read_named_file
 from fleet_slip.errors import ConfigError
 
 KEYS_VARIABLE = "FLEET_SLIP_CAR_KEYS"
+"""Environment variable: path of the list of keys. If it is set, messages must be signed."""
+
 MOST_BYTES = 2**28
 """Size of the largest list that is read: one of a million cars."""
-"""Environment variable: path of the list of keys. If it is set, messages must be signed."""
 
 _DER = bytes.fromhex("302a300506032b6570032100")
 """What stands before the 32 bytes of an Ed25519 public key (RFC 8410)."""
