@@ -8,9 +8,16 @@ from collections.abc import Mapping
 from decimal import Decimal
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    StringConstraints,
+    ValidationError,
+)
 from pydantic_core import ErrorDetails
 
 from fleet_slip.errors import ConfigError, StorageError
@@ -56,6 +63,18 @@ _SAID = {
     "finite_number": "must be a finite number",
 }
 """What is said of a fault, by its type in pydantic; what is not listed keeps pydantic's words."""
+
+
+def _printable(text: str) -> str:
+    if not text.isprintable():
+        raise ValueError("has characters that cannot be printed")
+    return text
+
+
+Name = Annotated[str, StringConstraints(min_length=1, max_length=200), AfterValidator(_printable)]
+"""Text that names a column, a car or a file."""
+
+PositiveFloat = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 LONGEST_FILE_BYTES = 2**20
 FAULTS_SHOWN = 10

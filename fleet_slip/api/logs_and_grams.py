@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from fleet_slip.grams.rows.gram_job import GramReport
     from fleet_slip.ingest.drafting.preview import Preview
     from fleet_slip.ingest.landing.ingest_job import IngestReport
-    from fleet_slip.ingest.landing.log_files import Log
+    from fleet_slip.ingest.logs.log_files import Log
     from fleet_slip.ingest.mapping.mapping import Mapping
     from fleet_slip.maintenance.migration import MigrationReport
     from fleet_slip.simulation.campaign import Campaign
@@ -129,7 +129,7 @@ class LogsAndGrams(Rooted):
         """
         from fleet_slip.ingest.landing.folders import KnownFiles
         from fleet_slip.ingest.landing.ingest_job import ingest_files
-        from fleet_slip.ingest.landing.log_files import find_logs, find_whole_logs, names_several
+        from fleet_slip.ingest.logs.log_files import find_logs, find_whole_logs, names_several
         from fleet_slip.ingest.mapping.mapping import load_mapping
 
         plan = load_mapping(mapping) if isinstance(mapping, str) else mapping
@@ -180,7 +180,7 @@ class LogsAndGrams(Rooted):
         Of a folder every log is read, or with `as_one` all as one. Raises like `ingest`.
         """
         from fleet_slip.ingest.drafting.preview import preview_log
-        from fleet_slip.ingest.landing.log_files import find_logs, find_whole_logs
+        from fleet_slip.ingest.logs.log_files import find_logs, find_whole_logs
         from fleet_slip.ingest.mapping.mapping import load_mapping
 
         plan = load_mapping(mapping) if isinstance(mapping, str) else mapping

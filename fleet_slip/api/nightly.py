@@ -15,7 +15,7 @@ from fleet_slip.catalogue.car_numbers import CALIBRATION, DELAY
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.errors import DataError, FleetSlipError, InputError
-from fleet_slip.ingest.landing.log_files import Place, find_logs, is_url
+from fleet_slip.ingest.logs.log_files import Place, find_logs, is_url
 from fleet_slip.ingest.mapping.mapping import load_mapping
 from fleet_slip.models.aliases import CANDIDATE
 from fleet_slip.models.model_version import ModelVersion

@@ -21,8 +21,8 @@ import pyarrow.compute as pc
 
 from fleet_slip.delta import Change, retry_conflicts, rows_in
 from fleet_slip.errors import FleetSlipError, QuestionError
-from fleet_slip.grams.cohorts.members import hash_numbers
 from fleet_slip.grams.rows.gram_job import reconcile
+from fleet_slip.grams.rows.rollup import hash_numbers
 from fleet_slip.maintenance.find_drives import (
     Located,
     cars_with_rows,

@@ -6,8 +6,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.delta import Change, TableFile, retry_conflicts
-from fleet_slip.grams.received.received_rows import is_received
 from fleet_slip.grams.rows.gram_files import read_rows, write_rows
+from fleet_slip.grams.rows.gram_rows import is_received
 from fleet_slip.maintenance.old_files import rows_of
 from fleet_slip.warehouse.audit import Forgettable
 from fleet_slip.warehouse.tables import Warehouse

@@ -13,7 +13,7 @@ import numpy as np
 
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.files.folder import Folder
-from fleet_slip.grams.cohorts.members import Hashes, hash_numbers
+from fleet_slip.grams.rows.rollup import Hashes, hash_numbers
 from fleet_slip.models.trained_drives import hash_drives, read_trained_drives
 from fleet_slip.models.versions import Registry
 from fleet_slip.warehouse.audit import Audit

@@ -27,6 +27,7 @@ from fleet_slip.grams.cohorts.folding import FoldKey
 from fleet_slip.models.counts_model import counts_model
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.regression.choice.paired import compare_paired, compare_typical
 from fleet_slip.regression.choice.winner import Shortfall, Worth
 from fleet_slip.regression.exact.figures import error_sums
 from fleet_slip.regression.validation.crossval import (
@@ -36,7 +37,6 @@ from fleet_slip.regression.validation.crossval import (
     least_squares,
 )
 from fleet_slip.regression.validation.folds import Folds
-from fleet_slip.regression.validation.paired import compare_paired, compare_typical
 from fleet_slip.resources import config_file
 from fleet_slip.selection.select_models import Selection
 from fleet_slip.words import number_of

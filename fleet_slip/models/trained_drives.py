@@ -14,7 +14,7 @@ import numpy as np
 
 from fleet_slip.errors import StorageError
 from fleet_slip.files.folder import Folder
-from fleet_slip.grams.cohorts.members import Hashes
+from fleet_slip.grams.rows.rollup import Hashes
 from fleet_slip.models.manifest import Manifest
 
 _SALT = b"fleet-slip trained drives\n"

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.formats import spool
-from fleet_slip.ingest.formats.spool import Spool
+from fleet_slip.ingest.logs import spool
+from fleet_slip.ingest.logs.spool import Spool
 
 
 @pytest.mark.parametrize("in_memory", [1, 2**20])

@@ -12,12 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fleet_slip.compute import read_ahead as read_ahead_module
+from fleet_slip.compute.read_ahead import AHEAD, map_ahead, read_ahead
 from fleet_slip.errors import InputError
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.ingest.drives import drive_cutter, open_drives, stream
-from fleet_slip.ingest.drives import read_ahead as read_ahead_module
 from fleet_slip.ingest.drives.drive_cutter import DriveCutter
-from fleet_slip.ingest.drives.read_ahead import AHEAD, map_ahead, read_ahead
 from fleet_slip.ingest.formats import csv_batches
 from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.csv_batches import CsvFormat, PlainNumbers, open_csv

@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 from fleet_slip.arrays import FloatArray
 from fleet_slip.cli.app import app
 from fleet_slip.errors import AlarmError, UsageError
-from fleet_slip.ingest.drafting import label_delay
-from fleet_slip.ingest.drafting.suspicion import RADIUS_M, WHEELS, find_refusals, find_suspicions
+from fleet_slip.ingest.drives import label_delay
+from fleet_slip.ingest.drives.suspicion import RADIUS_M, WHEELS, find_refusals, find_suspicions
 from tests.support.reported import call
 from tests.support.textbook_car import Car, a_car
 

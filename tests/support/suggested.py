@@ -15,7 +15,7 @@ from asammdf import MDF, Signal
 
 from fleet_slip.ingest.drafting.draft import Draft, draft_mapping, signal_keys
 from fleet_slip.ingest.drafting.profile import FileFormats, profile_file
-from fleet_slip.ingest.drafting.suspicion import RADIUS_M, WHEELS
+from fleet_slip.ingest.drives.suspicion import RADIUS_M, WHEELS
 from fleet_slip.ingest.formats.can_bus import CanBus
 from fleet_slip.ingest.mapping.signal_column import SignalColumn
 from tests.support.textbook_car import Car, a_car

@@ -151,7 +151,7 @@ def ingest(
 
     Example: **fleet-slip ingest drive.csv --mapping logger.toml --dry-run**
     """
-    from fleet_slip.ingest.landing.log_files import names_several  # noqa: PLC0415 - takes a while
+    from fleet_slip.ingest.logs.log_files import names_several  # noqa: PLC0415 - takes a while
 
     fleet: Fleet = context.obj
     if plot is not None and not (dry_run and len(files) == 1):

@@ -17,8 +17,15 @@ import pyarrow.compute as pc
 from fleet_slip.catalogue.sources import RECEIVED, RECEIVED_FILES
 from fleet_slip.delta import Snapshot
 from fleet_slip.grams.cohorts.folding import EACH, FOLD_KEYS, Folding
-from fleet_slip.grams.cohorts.members import Hashed, Hashes, hash_numbers
-from fleet_slip.grams.rows.rollup import BUCKET_KEYS, BUCKETS, Rollup, read_rollup
+from fleet_slip.grams.cohorts.members import Hashed
+from fleet_slip.grams.rows.rollup import (
+    BUCKET_KEYS,
+    BUCKETS,
+    Hashes,
+    Rollup,
+    hash_numbers,
+    read_rollup,
+)
 from fleet_slip.warehouse.condition import Condition, asking
 from fleet_slip.warehouse.database import open_database
 from fleet_slip.warehouse.table_views import add_table

@@ -14,9 +14,10 @@ from fleet_slip.grams.cohorts.empty_cohort import empty_cohort
 from fleet_slip.grams.cohorts.expansion import expansion_of
 from fleet_slip.grams.cohorts.folding import EACH, Folding
 from fleet_slip.grams.cohorts.gram_cohort import require_training
-from fleet_slip.grams.cohorts.members import Hashed, Members, add_hashed, hash_numbers
+from fleet_slip.grams.cohorts.members import Hashed, Members, add_hashed
 from fleet_slip.grams.cohorts.reader import GramReader, open_grams
 from fleet_slip.grams.rows.gram_rows import gram_table
+from fleet_slip.grams.rows.rollup import hash_numbers
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.gram_table import GramTable
 from fleet_slip.regression.inference.drive_moments import missing_signals_error

@@ -27,16 +27,10 @@ from fleet_slip.grams.cohorts.folding import (
     FoldKey,
 )
 from fleet_slip.grams.cohorts.gram_cohort import require_training
-from fleet_slip.grams.cohorts.members import (
-    Hashed,
-    Hashes,
-    Members,
-    add_hashed,
-    hash_numbers,
-    received_among,
-)
+from fleet_slip.grams.cohorts.members import Hashed, Members, add_hashed, received_among
 from fleet_slip.grams.cohorts.reader import GramReader, OpenedGrams, open_grams
 from fleet_slip.grams.rows.gram_rows import by_signals, gram_table
+from fleet_slip.grams.rows.rollup import Hashes, hash_numbers
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.gram_table import GramTable
 from fleet_slip.regression.validation.folds import CohortFolds

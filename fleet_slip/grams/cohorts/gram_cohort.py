@@ -22,8 +22,9 @@ from fleet_slip.grams.cohorts.folding import (
     FoldCount,
     FoldKey,
 )
-from fleet_slip.grams.cohorts.members import Hashed, Members, hash_numbers, received_among
+from fleet_slip.grams.cohorts.members import Hashed, Members, received_among
 from fleet_slip.grams.cohorts.reader import GramReader, open_grams
+from fleet_slip.grams.rows.rollup import hash_numbers
 from fleet_slip.regression.exact.gram_table import GramTable
 from fleet_slip.regression.inference.drive_moments import serving_drives
 from fleet_slip.regression.validation.folds import (

@@ -2,19 +2,15 @@
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from hashlib import sha256
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray
 from fleet_slip.catalogue.sources import RECEIVED
+from fleet_slip.grams.rows.rollup import Hashes
 from fleet_slip.warehouse.minimum_cohort import minimum_vehicles
-
-Hashes = NDArray[np.uint64]
-"""Hashes of drives or cars, `hash_number`: what tells one from others, in 8 bytes."""
 
 AT_ONCE = 2**21
 """So many hashes of cars, most of them again and again, are looked through at once."""
@@ -105,12 +101,6 @@ def received_among(rows: pa.Table | pa.RecordBatch) -> BoolArray:
     came = pc.fill_null(pc.equal(rows["source"].cast(pa.string()), RECEIVED), False)
     found: BoolArray = np.asarray(came.to_numpy(zero_copy_only=False), dtype=np.bool_)
     return found
-
-
-def hash_numbers(ids: pa.Array | pa.ChunkedArray) -> Hashes:
-    """Return the hash of each id of a drive or a car, see `Hashes`."""
-    first = b"".join([sha256(one.encode("utf-8")).digest()[:8] for one in ids.to_pylist()])
-    return np.frombuffer(first, dtype=">u8").astype(np.uint64)
 
 
 def _kinds_with(hashed: Mapping[str, Hashed], signals: Collection[str]) -> frozenset[str]:

@@ -21,8 +21,7 @@ import pyarrow.compute as pc
 
 from fleet_slip.arrays import IntArray
 from fleet_slip.grams.cohorts.cells import Cells
-from fleet_slip.grams.cohorts.members import hash_numbers
-from fleet_slip.grams.rows.rollup import BUCKETS
+from fleet_slip.grams.rows.rollup import BUCKETS, hash_numbers
 from fleet_slip.warehouse.condition import Condition, asking
 from fleet_slip.warehouse.minimum_cohort import UNNAMED, tells_single_cars
 

@@ -12,7 +12,7 @@ import pyarrow.compute as pc
 from fleet_slip.arrays import BoolArray
 from fleet_slip.delta import Change, Unit
 from fleet_slip.grams.received.new_messages import NewMessages
-from fleet_slip.grams.received.received_rows import Refused, is_received
+from fleet_slip.grams.received.received_rows import Refused
 from fleet_slip.grams.received.received_table import received_table
 from fleet_slip.grams.rows.gram_files import (
     files_to_rewrite,
@@ -20,6 +20,7 @@ from fleet_slip.grams.rows.gram_files import (
     rows_to_keep,
     write_rows,
 )
+from fleet_slip.grams.rows.gram_rows import is_received
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA, SIGNED, Warehouse
 
 ONE_AT_A_TIME = "receive"

@@ -12,11 +12,11 @@ from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.delta import Snapshot, TableFile
-from fleet_slip.grams.received.received_rows import ReceivedRows, Refused, is_received, signals_of
+from fleet_slip.grams.received.received_rows import ReceivedRows, Refused, signals_of
 from fleet_slip.grams.received.received_table import received_table
 from fleet_slip.grams.received.screening import Screened, screen
 from fleet_slip.grams.rows.gram_files import is_of_received
-from fleet_slip.grams.rows.gram_rows import by_signals, gram_table
+from fleet_slip.grams.rows.gram_rows import by_signals, gram_table, is_received
 from fleet_slip.grams.rows.same_drives import content_keys
 from fleet_slip.warehouse.tables import SIGNED, Warehouse, gram_schema
 

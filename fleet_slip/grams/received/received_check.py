@@ -15,10 +15,9 @@ from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.grams.received.car_keys import KEYS_VARIABLE, CarKeys
 from fleet_slip.grams.received.plausible import find_impossible
-from fleet_slip.grams.received.received_rows import is_received
 from fleet_slip.grams.received.received_table import messages_again
 from fleet_slip.grams.received.signatures import FORGED, check_signatures
-from fleet_slip.grams.rows.gram_rows import by_signals, gram_table
+from fleet_slip.grams.rows.gram_rows import by_signals, gram_table, is_received
 from fleet_slip.warehouse.tables import SIGNED
 from fleet_slip.words import number_of
 

@@ -13,7 +13,6 @@ import pyarrow.compute as pc
 
 from fleet_slip.arrays import BoolArray, IntArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
-from fleet_slip.catalogue.sources import RECEIVED_FILES
 from fleet_slip.grams.received.messages import (
     LONGEST_VEHICLE,
     Found,
@@ -146,11 +145,6 @@ class ReceivedRows:
 def signals_of(mask: int) -> str:
     """Return the names of a message's signals, as the table `grams` has them."""
     return ",".join(n for i, n in enumerate(catalogue().gram_signals) if mask >> i & 1)
-
-
-def is_received(rows: pa.Table) -> pa.ChunkedArray:
-    """Return which rows of `grams` came without a log."""
-    return pc.starts_with(rows["file"].cast(pa.string()), RECEIVED_FILES)
 
 
 Judge = Callable[["ReceivedRows"], Iterable[str | None]]

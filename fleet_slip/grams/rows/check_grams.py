@@ -15,10 +15,10 @@ from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.delta import TableFile, on_newest
 from fleet_slip.errors import DataError, StorageError
-from fleet_slip.grams.received.received_rows import is_received
 from fleet_slip.grams.rows.aggregation import aggregate, by_sql
 from fleet_slip.grams.rows.backlog import find_backlog
 from fleet_slip.grams.rows.gram_job import unit_name
+from fleet_slip.grams.rows.gram_rows import is_received
 from fleet_slip.grams.rows.wide import wide_grams
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.regression.exact.gram import Gram

@@ -7,6 +7,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.arrays import BoolArray, IntArray
+from fleet_slip.catalogue.sources import RECEIVED_FILES
 from fleet_slip.regression.exact.gram import packed_size
 from fleet_slip.regression.exact.gram_table import GramTable
 
@@ -47,3 +48,8 @@ def list_array(values: IntArray) -> pa.ListArray:
     flat = pa.array(np.ascontiguousarray(values).reshape(-1), pa.int64())
     offsets = pa.array(np.arange(rows + 1, dtype=np.int32) * width, pa.int32())
     return pa.ListArray.from_arrays(offsets, flat)
+
+
+def is_received(rows: pa.Table) -> pa.ChunkedArray:
+    """Return which rows of `grams` came without a log."""
+    return pc.starts_with(rows["file"].cast(pa.string()), RECEIVED_FILES)

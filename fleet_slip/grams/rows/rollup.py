@@ -12,19 +12,23 @@ where a sum has more than 64 bits, and where it takes other files to tell the tr
 import json
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
+from hashlib import sha256
 from typing import Any, ClassVar
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from numpy.typing import NDArray
 
 from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.delta import Table
-from fleet_slip.grams.cohorts.members import Hashes, hash_numbers
 from fleet_slip.grams.rows.gram_rows import by_signals, gram_table, list_array
 from fleet_slip.regression.exact.gram_table import GramTable
 from fleet_slip.warehouse.tables import gram_schema
+
+Hashes = NDArray[np.uint64]
+"""Hashes of drives or cars: what tells one from others, in 8 bytes."""
 
 BUCKETS = 60
 """Drives and cars are dealt into so many buckets by their hashes: folds in any number that divides
@@ -251,3 +255,9 @@ def _unpacked(content: bytes) -> tuple[pa.Table, dict[str, Any]]:
     with pa.ipc.open_stream(content) as reader:
         cells = reader.read_all()
     return cells.replace_schema_metadata(), json.loads(cells.schema.metadata[b"rollup"])
+
+
+def hash_numbers(ids: pa.Array | pa.ChunkedArray) -> Hashes:
+    """Return the hash of each id of a drive or a car, see `Hashes`."""
+    first = b"".join([sha256(one.encode("utf-8")).digest()[:8] for one in ids.to_pylist()])
+    return np.frombuffer(first, dtype=">u8").astype(np.uint64)

@@ -18,8 +18,8 @@ from fleet_slip.arrays import BoolArray
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.delta import Snapshot, TableFile
-from fleet_slip.grams.received.received_rows import is_received
 from fleet_slip.grams.rows.gram_files import is_of_received
+from fleet_slip.grams.rows.gram_rows import is_received
 
 
 @dataclass

@@ -22,16 +22,16 @@ from fleet_slip.ingest.drafting.guessing import (
 )
 from fleet_slip.ingest.drafting.preview import preview_log
 from fleet_slip.ingest.drafting.profile import FileProfile, Profile, sample_rate_hz
-from fleet_slip.ingest.drafting.suspicion import (
+from fleet_slip.ingest.drives.suspicion import (
     RADIUS_M,
     WHEELS,
     Suspicion,
     find_suspicions,
     speed_ratio,
 )
-from fleet_slip.ingest.formats.columns import shown
 from fleet_slip.ingest.mapping.mapping import Mapping
 from fleet_slip.ingest.mapping.satellite_columns import COURSE, SPEED
+from fleet_slip.words import shown
 
 _TIME_NAMES = ("time", "timestamp", "zeit", "t", "sec", "seconds")
 _TIME_UNITS = {"s": "s", "sec": "s", "ms": "ms", "us": "us", "µs": "us", "ns": "ns"}

@@ -5,8 +5,8 @@ from typing import Any
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.ingest.drafting.draft import Draft, signal_keys
-from fleet_slip.ingest.formats.columns import shown
 from fleet_slip.ingest.mapping.satellite_columns import COURSE, SPEED
+from fleet_slip.words import shown
 
 _HEAD = """\
 # A draft for {file}. Every line is a guess: check it, with

@@ -10,12 +10,12 @@ import pyarrow.compute as pc
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.ingest.drafting.suspicion import Suspicion, find_suspicions
 from fleet_slip.ingest.drives.measured_drives import MeasuredDrive
 from fleet_slip.ingest.drives.stream import open_measured
+from fleet_slip.ingest.drives.suspicion import Suspicion, find_suspicions
 from fleet_slip.ingest.drives.totals import IngestCounts
-from fleet_slip.ingest.landing.local_copies import local_copy
-from fleet_slip.ingest.landing.log_files import Log
+from fleet_slip.ingest.logs.local_copies import local_copy
+from fleet_slip.ingest.logs.log_files import Log
 from fleet_slip.ingest.mapping.mapping import Mapping
 
 MOST_TICKS = 200_000

@@ -19,10 +19,10 @@ from fleet_slip.ingest.drives.fields import (
 )
 from fleet_slip.ingest.drives.log_rows import read_batches
 from fleet_slip.ingest.drives.time_bases import ROW
-from fleet_slip.ingest.formats.columns import shown
 from fleet_slip.ingest.formats.source import BASE
 from fleet_slip.ingest.mapping.mapping import Mapping
 from fleet_slip.ingest.mapping.row_condition import describe
+from fleet_slip.words import shown
 
 MAX_KEYS = 100_000
 """Combinations of drive metadata in one file, of whatever rows."""

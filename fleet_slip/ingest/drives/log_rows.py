@@ -17,12 +17,12 @@ from fleet_slip.errors import InputError
 from fleet_slip.ingest.drives.spread_bases import PartBases, join_parts
 from fleet_slip.ingest.drives.time_bases import merge_bases
 from fleet_slip.ingest.formats.budget import Budget
-from fleet_slip.ingest.formats.columns import shown
 from fleet_slip.ingest.formats.parquet_batches import BATCH_ROWS
 from fleet_slip.ingest.formats.reading import file_errors, open_source
 from fleet_slip.ingest.formats.source import Base, ClockSource, Source
-from fleet_slip.ingest.landing.log_files import parts_of
+from fleet_slip.ingest.logs.log_files import parts_of
 from fleet_slip.ingest.mapping.mapping import Mapping
+from fleet_slip.words import shown
 
 _CLOCK = "this format says when each sample was taken: write own_clock = true under [time]"
 _NO_CLOCK = "this format has no clock of its own: write column or rate_hz under [time]"

@@ -10,10 +10,10 @@ from pathlib import Path
 import polars as pl
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.formats.columns import shown
 from fleet_slip.ingest.formats.reading import file_errors
 from fleet_slip.ingest.formats.source import Base
 from fleet_slip.ingest.mapping.mapping import Mapping
+from fleet_slip.words import shown
 
 _OpenIt = Callable[[Path], AbstractContextManager[tuple[list[Base], set[str]]]]
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import polars as pl
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.formats.columns import shown
+from fleet_slip.words import shown
 
 FREE_ROWS, ROWS_PER_BYTE = 10**6, 4
 """Rows that any file may have, and rows for each of its bytes if those are more."""

@@ -12,7 +12,7 @@ from typing import BinaryIO
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.budget import Budget
-from fleet_slip.ingest.formats.columns import shown
+from fleet_slip.words import shown
 
 BLF_MAGIC = b"LOGG"
 _MARK, _OBJECT = b"LOBJ", struct.Struct("<4s4xII")

@@ -5,9 +5,8 @@ from pathlib import Path
 
 from pydantic import Field
 
-from fleet_slip.config import Config, read_named_file
+from fleet_slip.config import Config, Name, read_named_file
 from fleet_slip.errors import ConfigError
-from fleet_slip.ingest.mapping.names import Name
 
 FORMATS = {".dbc": "dbc", ".arxml": "arxml", ".kcd": "kcd", ".sym": "sym"}
 MAX_DATABASE_BYTES = 2**28

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.ingest.formats.can_decoding import Bytes
-from fleet_slip.ingest.formats.spool import Spool
+from fleet_slip.ingest.logs.spool import Spool
 
 PIECE_FRAMES = 2**12
 """Frames of one message that are in memory at once."""

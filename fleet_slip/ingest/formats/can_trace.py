@@ -30,9 +30,10 @@ from fleet_slip.ingest.formats.can_decoding import (
     raw_numbers,
 )
 from fleet_slip.ingest.formats.can_frames import CanFrames
-from fleet_slip.ingest.formats.columns import describe_missing, shown
+from fleet_slip.ingest.formats.column_names import describe_missing
 from fleet_slip.ingest.formats.source import OWN_TIME, Base, Channel, reading_with
-from fleet_slip.ingest.formats.spool import Spool
+from fleet_slip.ingest.logs.spool import Spool
+from fleet_slip.words import shown
 
 SUFFIXES = {".blf", ".asc", ".log", ".trc"}
 

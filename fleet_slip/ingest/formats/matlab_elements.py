@@ -20,8 +20,8 @@ import numpy as np
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.budget import Budget
-from fleet_slip.ingest.formats.columns import shown
-from fleet_slip.ingest.formats.spool import needing_room
+from fleet_slip.ingest.logs.spool import needing_room
+from fleet_slip.words import shown
 
 _HEADER = 128
 _BYTE_ORDER_AT = 126

@@ -17,7 +17,7 @@ import polars as pl
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.budget import Budget
-from fleet_slip.ingest.formats.columns import describe_missing, shown
+from fleet_slip.ingest.formats.column_names import describe_missing
 from fleet_slip.ingest.formats.mcap_messages import (
     LARGEST_MESSAGE,
     Decode,
@@ -28,7 +28,8 @@ from fleet_slip.ingest.formats.mcap_messages import (
     stamp_s,
 )
 from fleet_slip.ingest.formats.source import OWN_TIME, Base, Channel, reading_with
-from fleet_slip.ingest.formats.spool import Spool
+from fleet_slip.ingest.logs.spool import Spool
+from fleet_slip.words import shown
 
 MAGIC = b"\x89MCAP0\r\n"
 PIECE_ROWS = 2**13

@@ -11,8 +11,8 @@ import pyarrow as pa
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.budget import Budget
-from fleet_slip.ingest.formats.columns import shown
 from fleet_slip.ingest.formats.source import reading_with
+from fleet_slip.words import shown
 
 _LARGEST_RECORD, _LARGEST_RATIO = 2**27, 1000
 """Bytes of a record or of a chunk unpacked, and how many times its size a chunk may become."""

@@ -15,9 +15,9 @@ from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.can_bus import CanBus
 from fleet_slip.ingest.formats.can_decoding import Bytes
 from fleet_slip.ingest.formats.can_trace import CanSource, parse_database
-from fleet_slip.ingest.formats.columns import shown
 from fleet_slip.ingest.formats.mdf import MdfSource, open_mdf
-from fleet_slip.ingest.formats.spool import Spool
+from fleet_slip.ingest.logs.spool import Spool
+from fleet_slip.words import shown
 
 _FRAME = "CAN_DataFrame."
 _EXTENDED = 1 << 31

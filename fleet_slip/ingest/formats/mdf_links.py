@@ -10,7 +10,7 @@ import struct
 from pathlib import Path
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.formats.columns import shown
+from fleet_slip.words import shown
 
 _FIRST, _VERSION = 64, 8
 """Where the header block is, and before it the version of the format."""

@@ -17,7 +17,6 @@ from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.can_blocks import BLF_MAGIC
 from fleet_slip.ingest.formats.can_bus import CanBus
 from fleet_slip.ingest.formats.can_trace import open_can_trace
-from fleet_slip.ingest.formats.columns import shown
 from fleet_slip.ingest.formats.csv_batches import CsvFormat, PlainNumbers, open_csv
 from fleet_slip.ingest.formats.duckdb_table import MAGIC as DUCKDB_MAGIC
 from fleet_slip.ingest.formats.duckdb_table import MAGIC_AT as DUCKDB_AT
@@ -30,7 +29,8 @@ from fleet_slip.ingest.formats.mdf import open_mdf
 from fleet_slip.ingest.formats.mdf_bus import open_mdf_bus
 from fleet_slip.ingest.formats.parquet_batches import PARQUET_MAGIC, open_parquet
 from fleet_slip.ingest.formats.source import Source
-from fleet_slip.ingest.landing.log_files import parts_of
+from fleet_slip.ingest.logs.log_files import parts_of
+from fleet_slip.words import shown
 
 _ARCHIVES = {b"PK\x03\x04": "unzip", b"7z\xbc\xaf": "7z x", b"Rar!": "unrar x"}
 _BINARY = {

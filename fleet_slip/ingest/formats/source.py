@@ -18,7 +18,7 @@ import polars as pl
 
 from fleet_slip.errors import FleetSlipError, InputError
 from fleet_slip.extras import needed
-from fleet_slip.ingest.formats.columns import shown
+from fleet_slip.words import shown
 
 OWN_TIME = "\0time"
 """Column of times in s, where the file has clocks of its own."""

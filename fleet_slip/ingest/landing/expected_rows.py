@@ -7,7 +7,7 @@ import pyarrow.parquet as pq
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.parquet_batches import PARQUET_MAGIC
-from fleet_slip.ingest.landing.log_files import Log, parts_of
+from fleet_slip.ingest.logs.log_files import Log, parts_of
 
 _SAMPLE_BYTES = 2**18
 

@@ -17,7 +17,7 @@ from typing import Any
 
 from fleet_slip.files.folder import StoredFile
 from fleet_slip.ingest.landing.data_files import unit_of
-from fleet_slip.ingest.landing.log_files import Log, StoredParts
+from fleet_slip.ingest.logs.log_files import Log, StoredParts
 from fleet_slip.ingest.mapping.mapping import Mapping
 from fleet_slip.warehouse.tables import Warehouse
 

@@ -9,14 +9,14 @@ from typing import Any, TypeAlias
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import InputError
 from fleet_slip.files.folder import StoredFile
-from fleet_slip.ingest.drafting.suspicion import Suspicion
+from fleet_slip.ingest.drives.look_alikes import find_vehicles_like
+from fleet_slip.ingest.drives.suspicion import Suspicion
 from fleet_slip.ingest.drives.totals import IngestCounts
 from fleet_slip.ingest.landing.data_files import unit_of
 from fleet_slip.ingest.landing.folders import KnownFiles
 from fleet_slip.ingest.landing.landing import AskedFile, WrittenBatch, land_batch, write_batch
-from fleet_slip.ingest.landing.log_files import Log, StoredParts
-from fleet_slip.ingest.landing.look_alikes import find_vehicles_like
 from fleet_slip.ingest.landing.writing import FileOutcome
+from fleet_slip.ingest.logs.log_files import Log, StoredParts
 from fleet_slip.ingest.mapping.mapping import Mapping
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.tables import Warehouse

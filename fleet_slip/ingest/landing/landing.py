@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 from fleet_slip.delta import Change, Table, retry_conflicts
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.drafting.preview import signals_of
-from fleet_slip.ingest.drafting.suspicion import find_suspicions
 from fleet_slip.ingest.drives.measured_drives import MeasuredDrive
 from fleet_slip.ingest.drives.stream import open_measured
-from fleet_slip.ingest.formats.columns import shown
+from fleet_slip.ingest.drives.suspicion import find_suspicions
 from fleet_slip.ingest.landing.data_files import (
     WRITERS,
     DataFiles,
@@ -19,13 +18,14 @@ from fleet_slip.ingest.landing.data_files import (
     digest_of,
     unit_of,
 )
-from fleet_slip.ingest.landing.local_copies import LocalCopies
-from fleet_slip.ingest.landing.log_files import Log
 from fleet_slip.ingest.landing.writing import FileOutcome, FileWriter
+from fleet_slip.ingest.logs.local_copies import LocalCopies
+from fleet_slip.ingest.logs.log_files import Log
 from fleet_slip.ingest.mapping.mapping import Mapping
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.audit import Audit
 from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.words import shown
 
 
 @dataclass(frozen=True)

@@ -10,15 +10,15 @@ from typing import IO, Self
 import polars as pl
 import pyarrow as pa
 
-from fleet_slip.ingest.drafting.suspicion import Suspicion
 from fleet_slip.ingest.drives.measured_drives import MeasuredDrive
 from fleet_slip.ingest.drives.stream import MeasuredStream
+from fleet_slip.ingest.drives.suspicion import Suspicion
 from fleet_slip.ingest.drives.totals import IngestCounts
 from fleet_slip.ingest.landing import data_files
 from fleet_slip.ingest.landing.data_files import DataFiles, Rows, TableName, Writing
 from fleet_slip.ingest.landing.expected_rows import expected_rows
 from fleet_slip.ingest.landing.forgotten import keep_drives, keep_refused
-from fleet_slip.ingest.landing.log_files import Log
+from fleet_slip.ingest.logs.log_files import Log
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.audit import Audit
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA

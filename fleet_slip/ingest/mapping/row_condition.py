@@ -9,8 +9,7 @@ import polars as pl
 from pydantic import Field, model_validator
 
 from fleet_slip.catalogue.signals import Identifier
-from fleet_slip.config import Config
-from fleet_slip.ingest.mapping.names import Name
+from fleet_slip.config import Config, Name
 
 Bound = Annotated[float, Field(allow_inf_nan=False)]
 _BOUNDS: dict[str, Callable[[pl.Expr, float], Any]] = {

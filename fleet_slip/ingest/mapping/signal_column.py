@@ -8,8 +8,7 @@ import polars as pl
 from pydantic import AfterValidator, Field, model_validator
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.config import Config
-from fleet_slip.ingest.mapping.names import Name
+from fleet_slip.config import Config, Name
 from fleet_slip.ingest.mapping.units import conversion_factor, require_unit
 
 FiniteFloat = Annotated[float, Field(allow_inf_nan=False)]

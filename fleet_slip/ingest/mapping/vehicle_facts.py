@@ -8,9 +8,8 @@ from typing import Annotated, TypeVar
 from pydantic import AfterValidator, Field, ValidationError
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.config import Config, faults_of, read_named_file
+from fleet_slip.config import Config, Name, PositiveFloat, faults_of, read_named_file
 from fleet_slip.errors import ConfigError
-from fleet_slip.ingest.mapping.names import Name, PositiveFloat
 
 Told = TypeVar("Told")
 

@@ -13,7 +13,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import LinearModel, correlation_matrix
-from fleet_slip.regression.shrinkage.standard import from_standardised
+from fleet_slip.regression.exact.standard import from_standardised
 
 _TIE = 1e-12
 

@@ -21,7 +21,7 @@ from fleet_slip.regression.exact.least_squares import (
     correlation_matrix,
     moments,
 )
-from fleet_slip.regression.shrinkage.standard import from_standardised, through_means
+from fleet_slip.regression.exact.standard import from_standardised, through_means
 
 
 def fit_penalised(

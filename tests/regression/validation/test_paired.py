@@ -6,13 +6,13 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
+from fleet_slip.regression.choice.paired import compare_paired, compare_typical
 from fleet_slip.regression.choice.winner import Shortfall, Worth
 from fleet_slip.regression.exact.figures import error_sums
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import LinearModel
 from fleet_slip.regression.validation.crossval import CrossValidation, assemble
 from fleet_slip.regression.validation.folds import Folds
-from fleet_slip.regression.validation.paired import compare_paired, compare_typical
 
 SIGNALS = ("x", "z", "y")
 SCALES = dict.fromkeys(SIGNALS, Fraction(1))

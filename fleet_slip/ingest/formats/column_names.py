@@ -5,16 +5,11 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from fleet_slip.errors import InputError
+from fleet_slip.words import shown
 
 MAX_COLUMNS = 10_000
 
 _SHOWN_COLUMNS = 30
-
-
-def shown(text: object) -> str:
-    """Return a name as it can stand in a one-line message, whatever characters it has."""
-    plain = str(text)
-    return plain if plain.isprintable() else repr(plain)
 
 
 def require_columns(file: Path, names: Sequence[str], wanted: Iterable[str]) -> dict[str, int]:

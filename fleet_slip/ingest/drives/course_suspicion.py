@@ -6,7 +6,7 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
-from fleet_slip.ingest.drafting.relations import slope_of
+from fleet_slip.ingest.drives.relations import slope_of
 
 SECOND = round(1 / float(SAMPLE_TIME_S))
 LEAST_CORRELATION = 0.6

@@ -15,7 +15,7 @@ from typing import Self
 from fleet_slip.errors import FleetSlipError, InputError
 from fleet_slip.files.folder import StoredFile
 from fleet_slip.files.storage_errors import storage_errors
-from fleet_slip.ingest.landing.log_files import Log, StoredParts, require_inside, stored_parts
+from fleet_slip.ingest.logs.log_files import Log, StoredParts, require_inside, stored_parts
 
 AT_ONCE = 16
 

@@ -15,7 +15,7 @@ from typing import TypeAlias
 from fleet_slip.errors import InputError, UsageError
 from fleet_slip.extras import needed
 from fleet_slip.files.folder import StoredFile
-from fleet_slip.ingest.formats.columns import shown
+from fleet_slip.words import shown
 
 SUFFIXES = (
     ".csv", ".csv.gz", ".csv.zst", ".parquet", ".pq", ".mf4", ".mdf", ".mat", ".h5", ".hdf5",

@@ -6,7 +6,7 @@ import numpy as np
 
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
-from fleet_slip.ingest.drafting.relations import fit, moving
+from fleet_slip.ingest.drives.relations import fit, moving
 
 MOST_TICKS = 20_000
 FEWEST_TICKS = 1000

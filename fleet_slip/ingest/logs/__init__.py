@@ -1,0 +1,1 @@
+"""Where measured logs lie: which files there are, and copies of them on this machine."""
