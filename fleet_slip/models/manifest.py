@@ -210,13 +210,13 @@ class LearnedFrom(Config):
     """What stood for a label: changes of the course over so many seconds.
 
     The intercept is that of `cars`, where they go straight, with its uncertainty and the standard
-    deviation between them.
+    deviation between them; the uncertainty is None where drives do not tell it.
     """
 
     label: Literal["course"]
     change_s: Annotated[FiniteFloat, Field(gt=0)]
     cars: Count
-    intercept_uncertainty_deg: FiniteFloat
+    intercept_uncertainty_deg: FiniteFloat | None
     intercept_spread_deg: FiniteFloat
 
 

@@ -108,7 +108,9 @@ def with_straight_intercept(warehouse: Warehouse, manifest: Manifest) -> Manifes
         label="course",
         change_s=float(change_s),
         cars=found.cars,
-        intercept_uncertainty_deg=math.degrees(found.uncertainty),
+        intercept_uncertainty_deg=(
+            None if found.uncertainty is None else math.degrees(found.uncertainty)
+        ),
         intercept_spread_deg=math.degrees(found.spread),
     )
     told = 0.0 if manifest.through_origin else found.intercept

@@ -39,13 +39,14 @@ class StraightOn:
 
     Attributes:
         intercept: rad, the mean of the cars, each counting as often as it has rows.
-        uncertainty: rad, of the mean, from the uncertainty of the cars' offsets.
+        uncertainty: rad, of the mean, from the uncertainty of the cars' offsets; where that of one
+            is not known, from how cars differ, and None of one car.
         spread: rad, standard deviation between cars.
         cars: how many.
     """
 
     intercept: float
-    uncertainty: float
+    uncertainty: float | None
     spread: float
     cars: int
 
@@ -74,12 +75,12 @@ def straight_on(warehouse: Warehouse, condition: Condition, manifest: Manifest) 
     rows, means, variances = np.array(found, dtype=np.float64).T
     share = rows / rows.sum()
     mean = float(share @ means)
-    return StraightOn(
-        intercept=mean,
-        uncertainty=math.sqrt(float(share**2 @ variances)),
-        spread=math.sqrt(float(share @ (means - mean) ** 2)),
-        cars=len(found),
-    )
+    spread = math.sqrt(float(share @ (means - mean) ** 2))
+    variance = float(share**2 @ variances)
+    if math.isnan(variance):
+        variance = spread**2 / len(found) if len(found) > 1 else math.nan
+    uncertainty = None if math.isnan(variance) else math.sqrt(variance)
+    return StraightOn(mean, uncertainty, spread, len(found))
 
 
 def _by_car(cohort: Cohort, signals: Sequence[str]) -> list[tuple[str, Gram, Mapping[str, object]]]:
@@ -106,7 +107,7 @@ def _of_car(
     known: Mapping[NumberName, CalibratedNumber],
     facts: Mapping[str, object],
 ) -> tuple[float, float]:
-    """Return the intercept that a car asks for in rad, and its variance."""
+    """Return the intercept that a car asks for in rad, and its variance; NaN if not known."""
     planes = {
         name: fit(gram, tuple(OFFSETS), name).model for name in signals if name not in OFFSETS
     }
@@ -130,7 +131,10 @@ def _of_car(
     straight = estimate()
     if math.isnan(straight):
         raise DataError("a column of the model has no value where the car goes straight on.")
-    steps = [known[of].uncertainty or 0.0 for of in OFFSETS.values()]
+    told = [known[of].uncertainty for of in OFFSETS.values()]
+    steps = [one for one in told if one is not None]
+    if len(steps) < len(told):
+        return -straight, math.nan
     shifts = [
         estimate(**{name: step}) - straight for name, step in zip(OFFSETS, steps, strict=True)
     ]

@@ -66,6 +66,7 @@ def test_a_model_without_a_label_is_one_of_the_angle(fleet: Fleet) -> None:
         4.0,
         1,
     )
+    assert learned.intercept_uncertainty_deg is not None
     assert 0 < learned.intercept_uncertainty_deg < 0.1
     score = fleet.score("freed")
     assert score.correlation is not None and score.correlation > 0.995

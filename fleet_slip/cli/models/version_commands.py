@@ -157,11 +157,12 @@ def _origin(origin: ImportedFrom) -> str:
 
 def _teacher(learned: LearnedFrom) -> str:
     """Say what stood for a label, and where the intercept is from."""
+    unsure = learned.intercept_uncertainty_deg
+    uncertain = "not known how surely" if unsure is None else f"uncertain by {unsure:.2g} deg"
     return (
         f"changes of the {learned.label} over {learned.change_s:g} s: the figures are of changes. "
         f"Intercept where {number_of(learned.cars, 'car')} "
-        f"{'goes' if learned.cars == 1 else 'go'} straight, uncertain by "
-        f"{learned.intercept_uncertainty_deg:.3f} deg, between cars "
+        f"{'goes' if learned.cars == 1 else 'go'} straight, {uncertain}, between cars "
         f"{learned.intercept_spread_deg:.3f} deg"
     )
 
