@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any
 
 import fleet_slip
-from fleet_slip.export.c_names import c_prefix
-from fleet_slip.export.c_source import c_header, c_source
+from fleet_slip.export.c.c_names import c_prefix
+from fleet_slip.export.c.c_source import c_header, c_source
 from fleet_slip.export.compile import compile_program
 from fleet_slip.export.files import export_files
 from fleet_slip.models.model_version import ModelVersion

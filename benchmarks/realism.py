@@ -40,7 +40,7 @@ from fleet_slip.simulation.campaign import DriveSpec, load_campaign
 from fleet_slip.simulation.drives import DriveLog, simulate_logs
 from fleet_slip.simulation.imperfections import NONE, WORN_RADIUS, WORN_STIFFNESS, Imperfections
 from fleet_slip.simulation.scenario import load_scenario
-from fleet_slip.simulation.sensors import GPS_SIGNALS
+from fleet_slip.simulation.sensing.sensors import GPS_SIGNALS
 
 LABEL = catalogue().label
 TABLE = {model.name: model.signals for model in load_model_list("table1").model}

@@ -29,7 +29,7 @@ from fleet_slip.delta import Change, checksum_of
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.simulation.campaign import Batch, load_campaign
 from fleet_slip.simulation.drives import lane_drive, simulate_logs, tabulate
-from fleet_slip.simulation.sensors import Recorder
+from fleet_slip.simulation.sensing.sensors import Recorder
 from fleet_slip.vehicle.lanes import lane_kernel
 from fleet_slip.vehicle.lanes.lane_drives import LaneDrive, simulate_blocks
 from fleet_slip.warehouse.tables import Warehouse

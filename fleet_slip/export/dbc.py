@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from itertools import islice
 
-from fleet_slip.export.c_names import different
+from fleet_slip.export.c.c_names import different
 from fleet_slip.export.program import Input, Program
 from fleet_slip.models.model_version import ModelVersion
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 from fleet_slip.errors import ConfigError, UsageError
-from fleet_slip.export.c_checks import c_fuzz_target, c_self_test
-from fleet_slip.export.c_gram import c_gram_header, c_gram_source
-from fleet_slip.export.c_names import c_prefix, file_prefix
-from fleet_slip.export.c_source import c_header, c_source
+from fleet_slip.export.c.c_checks import c_fuzz_target, c_self_test
+from fleet_slip.export.c.c_gram import c_gram_header, c_gram_source
+from fleet_slip.export.c.c_names import c_prefix, file_prefix
+from fleet_slip.export.c.c_source import c_header, c_source
 from fleet_slip.export.checks import Check, make_checks
 from fleet_slip.export.checks_table import checks_csv
 from fleet_slip.export.compile import compile_program

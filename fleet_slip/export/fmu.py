@@ -19,8 +19,8 @@ from xml.sax.saxutils import quoteattr
 
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 from fleet_slip.errors import ConfigError
-from fleet_slip.export.c_names import c_prefix, different, field_names
-from fleet_slip.export.c_source import c_header, c_source
+from fleet_slip.export.c.c_names import c_prefix, different, field_names
+from fleet_slip.export.c.c_source import c_header, c_source
 from fleet_slip.export.program import Program
 from fleet_slip.models.model_version import ModelVersion
 

@@ -22,12 +22,12 @@ from fleet_slip.catalogue.signals import Identifier
 from fleet_slip.config import Config, load_config, load_toml
 from fleet_slip.errors import ConfigError, UsageError
 from fleet_slip.resources import find_config
-from fleet_slip.simulation.distortion import Distortion
 from fleet_slip.simulation.drive_plan import FleetPlan, GridPlan, random_generator
 from fleet_slip.simulation.imperfections import NONE, Imperfections
 from fleet_slip.simulation.manoeuvres import Manoeuvre
-from fleet_slip.simulation.receivers import Receiver, Receivers
-from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ, Sensors
+from fleet_slip.simulation.sensing.distortion import Distortion
+from fleet_slip.simulation.sensing.receivers import Receiver, Receivers
+from fleet_slip.simulation.sensing.sensors import SAMPLE_RATE_HZ, Sensors
 from fleet_slip.simulation.speed_profile import SpeedLimits, SpeedProfile, speed_profile
 from fleet_slip.simulation.surface import surface
 from fleet_slip.simulation.track import Track

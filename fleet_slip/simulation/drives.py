@@ -9,8 +9,8 @@ import pyarrow as pa
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.simulation.campaign import Batch, DriveSpec
 from fleet_slip.simulation.manoeuvres import road_with
-from fleet_slip.simulation.receivers import Fixes, ReceiverLog
-from fleet_slip.simulation.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ, Measurement, Recorder
+from fleet_slip.simulation.sensing.receivers import Fixes, ReceiverLog
+from fleet_slip.simulation.sensing.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ, Measurement, Recorder
 from fleet_slip.vehicle.lanes.lane_drives import LaneDrive, simulate_blocks
 from fleet_slip.vehicle.lanes.road import Road
 

@@ -14,7 +14,7 @@ from fleet_slip.simulation.drive_plan import (
 )
 from fleet_slip.simulation.imperfections import NotNegative
 from fleet_slip.simulation.manoeuvres import KINDS, Manoeuvre
-from fleet_slip.simulation.sensors import Sensors
+from fleet_slip.simulation.sensing.sensors import Sensors
 from fleet_slip.simulation.track import Track
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2, VehicleParameters
 

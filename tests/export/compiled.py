@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from fleet_slip.export.c_names import c_prefix, field_names
-from fleet_slip.export.c_source import c_header, c_source
+from fleet_slip.export.c.c_names import c_prefix, field_names
+from fleet_slip.export.c.c_source import c_header, c_source
 from fleet_slip.export.checks import Sample
 from fleet_slip.export.program import Car, Program
 from fleet_slip.models.model_version import ModelVersion

@@ -9,7 +9,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.columns.blocks.drive_columns import DriveCounts
-from fleet_slip.export.c_steps import LARGEST_UNSIGNED
+from fleet_slip.export.c.c_steps import LARGEST_UNSIGNED
 from fleet_slip.export.checks import Sample, angles_by_kernel, angles_of_columns
 from fleet_slip.export.compile import compile_program
 from fleet_slip.export.program import Car, Program

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 import fleet_slip
-from fleet_slip.export.c_names import c_prefix
-from fleet_slip.export.c_source import c_header
+from fleet_slip.export.c.c_names import c_prefix
+from fleet_slip.export.c.c_source import c_header
 from fleet_slip.export.compile import compile_program
 from fleet_slip.export.costs import cost_on_board, costs_content, count_costs, describe_costs
 from fleet_slip.export.files import export_files

@@ -21,7 +21,7 @@ from cantools.database.can.database import Database
 from fleet_slip.catalogue.definitions import Definition, Fact
 from fleet_slip.errors import InputError
 from fleet_slip.export import fmu
-from fleet_slip.export.c_names import different
+from fleet_slip.export.c.c_names import different
 from fleet_slip.export.files import export_files
 from fleet_slip.export.mlflow_model import LoggedVersion
 from fleet_slip.models.model_version import ModelVersion

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.simulation.distortion import Distortion
 from fleet_slip.simulation.imperfections import Imperfections, SensorImperfections
-from fleet_slip.simulation.lags import Delay, LowPass
-from fleet_slip.simulation.pulses import Pulses
-from fleet_slip.simulation.wander import Wander
+from fleet_slip.simulation.sensing.distortion import Distortion
+from fleet_slip.simulation.sensing.lags import Delay, LowPass
+from fleet_slip.simulation.sensing.pulses import Pulses
+from fleet_slip.simulation.sensing.wander import Wander
 from fleet_slip.vehicle.car_imperfections import CarImperfections
 from fleet_slip.vehicle.lanes.lane_blocks import CHANNELS, IMPERFECT_CHANNELS
 

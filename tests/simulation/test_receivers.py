@@ -11,7 +11,7 @@ from fleet_slip.errors import ConfigError
 from fleet_slip.simulation.campaign import Campaign, load_campaign
 from fleet_slip.simulation.drives import simulate_logs
 from fleet_slip.simulation.imperfections import Range
-from fleet_slip.simulation.receivers import Fixes, Receiver, ReceiverLog, Receivers
+from fleet_slip.simulation.sensing.receivers import Fixes, Receiver, ReceiverLog, Receivers
 
 TICK_S = 0.01
 RAD = 2 * np.pi / 65536

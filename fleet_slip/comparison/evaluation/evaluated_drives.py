@@ -15,7 +15,7 @@ from fleet_slip.catalogue.sources import SCENARIO
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.resources import read_sql
 from fleet_slip.simulation.scenario import Failure, Scenario
-from fleet_slip.simulation.sensors import GPS_SIGNALS
+from fleet_slip.simulation.sensing.sensors import GPS_SIGNALS
 from fleet_slip.views import connect
 from fleet_slip.warehouse.database import reading_files
 from fleet_slip.warehouse.tables import Warehouse

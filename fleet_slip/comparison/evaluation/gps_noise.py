@@ -16,7 +16,7 @@ from fleet_slip.comparison.evaluation.error_figures import error_figures
 from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive
 from fleet_slip.comparison.evaluation.filters import FilterEstimate
 from fleet_slip.comparison.evaluation.scenario_runs import EvaluatedScenario
-from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
+from fleet_slip.simulation.sensing.sensors import SAMPLE_RATE_HZ
 
 SCENARIO = "nominal"
 LEVELS_MPS = (0.01, 0.015, 0.02, 0.025, 0.03, 0.035, 0.04, 0.05, 0.06, 0.08, 0.1)

@@ -17,7 +17,7 @@ from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.simulation.job import SimulationReport, simulate_batches
 from fleet_slip.simulation.scenario import Scenario
-from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
+from fleet_slip.simulation.sensing.sensors import SAMPLE_RATE_HZ
 from fleet_slip.warehouse.tables import Warehouse
 
 GPS_OUTAGE_S = 1.0

@@ -17,7 +17,7 @@ import numpy as np
 
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive
-from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
+from fleet_slip.simulation.sensing.sensors import SAMPLE_RATE_HZ
 from fleet_slip.vehicle.parameters import VehicleParameters, constants
 from fleet_slip.vehicle.tyre import brush_force
 

@@ -13,7 +13,7 @@ from fleet_slip.comparison.evaluation.error_figures import ErrorFigures
 from fleet_slip.comparison.evaluation.estimators import LinearEstimate
 from fleet_slip.comparison.evaluation.scenario_runs import GPS_OUTAGE_S, EvaluatedScenario
 from fleet_slip.comparison.evaluation.stability import find_stretches, rear_compliance
-from fleet_slip.simulation.sensors import Sensors
+from fleet_slip.simulation.sensing.sensors import Sensors
 
 PAPER_TABLE_TWO = {
     "1": (0.0135, 0.3018),

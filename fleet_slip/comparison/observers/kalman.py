@@ -20,7 +20,7 @@ from fleet_slip.comparison.observers.yaw_rate import YawRateNoise
 from fleet_slip.compiling import kernel
 from fleet_slip.config import Config
 from fleet_slip.errors import DataError
-from fleet_slip.simulation.sensors import Sensors
+from fleet_slip.simulation.sensing.sensors import Sensors
 from fleet_slip.vehicle.parameters import VehicleParameters
 
 

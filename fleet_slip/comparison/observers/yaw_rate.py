@@ -24,7 +24,7 @@ from fleet_slip.comparison.observers.drive_signals import STEP_S, DriveSignals
 from fleet_slip.comparison.observers.wheel_speeds import undriven_axle
 from fleet_slip.compiling import kernel
 from fleet_slip.config import Config
-from fleet_slip.simulation.sensors import Sensors
+from fleet_slip.simulation.sensing.sensors import Sensors
 from fleet_slip.vehicle.parameters import VehicleParameters
 
 INITIAL_STD_RAD_S = 1.0

@@ -11,7 +11,7 @@ from fleet_slip.comparison.report.findings.stretches import BLOCK_S, blocks_won,
 from fleet_slip.export.costs import describe_costs
 from fleet_slip.pages.text import degrees
 from fleet_slip.regression.choice.winner import Winner
-from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
+from fleet_slip.simulation.sensing.sensors import SAMPLE_RATE_HZ
 
 SLIPPERY = "adhesion_0_4"
 OUTAGES = {"gps_urban": "between high buildings", "gps_tunnel": "in the tunnel"}

@@ -11,7 +11,7 @@ from fleet_slip.comparison.report.figures.labels import End, error_axes, finish_
 from fleet_slip.comparison.report.figures.lines import smooth
 from fleet_slip.comparison.report.figures.series import Line
 from fleet_slip.pages.style import Size, colour
-from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
+from fleet_slip.simulation.sensing.sensors import SAMPLE_RATE_HZ
 
 BIN_MPS2 = 0.5
 LEAST_ROWS = 200

@@ -13,7 +13,7 @@ from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive
 from fleet_slip.comparison.evaluation.scenario_runs import EvaluatedScenario
 from fleet_slip.comparison.report.figures.lines import smooth
 from fleet_slip.pages.style import Size, colour
-from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
+from fleet_slip.simulation.sensing.sensors import SAMPLE_RATE_HZ
 
 SMOOTHED_S = 0.5
 """Noise of single samples would hide where the error is."""

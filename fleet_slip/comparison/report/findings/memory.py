@@ -23,7 +23,7 @@ from fleet_slip.regression.validation.crossval import CrossValidation, cross_val
 from fleet_slip.regression.validation.folds import CohortFolds
 from fleet_slip.selection.model_list import Search
 from fleet_slip.selection.searched_models import SearchedModels, search_models
-from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
+from fleet_slip.simulation.sensing.sensors import SAMPLE_RATE_HZ
 
 DRIVES = ("nominal", "melbourne", "noise_doubled", "style_sporty")
 """Test drives whose errors stand beside the cross-validated one."""

@@ -9,7 +9,7 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.comparison.evaluation.scenario_runs import EvaluatedScenario
 from fleet_slip.regression.exact.special import student_t_two_sided
-from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
+from fleet_slip.simulation.sensing.sensors import SAMPLE_RATE_HZ
 
 BLOCK_S = 5.0
 """Errors of neighbouring samples depend on each other; over this time they nearly do not."""

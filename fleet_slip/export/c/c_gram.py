@@ -7,7 +7,7 @@ that a product is at most 2^30 and a sum of `MOST_ROWS` of them below 2^61: noth
 from collections.abc import Sequence
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.export.c_names import literal
+from fleet_slip.export.c.c_names import literal
 from fleet_slip.grams.received.messages import (
     HEADER_BYTES,
     LAYOUT,

@@ -2,10 +2,10 @@
 
 from collections.abc import Mapping, Sequence
 
-from fleet_slip.export.c_helpers import HELPERS
-from fleet_slip.export.c_names import c_prefix, field_names, integer_type, literal, plain_text
-from fleet_slip.export.c_state import state_fields
-from fleet_slip.export.c_steps import StepWriter, ring_width, sum_key
+from fleet_slip.export.c.c_helpers import HELPERS
+from fleet_slip.export.c.c_names import c_prefix, field_names, integer_type, literal, plain_text
+from fleet_slip.export.c.c_state import state_fields
+from fleet_slip.export.c.c_steps import StepWriter, ring_width, sum_key
 from fleet_slip.export.program import Program
 from fleet_slip.models.model_version import ModelVersion
 

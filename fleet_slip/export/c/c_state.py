@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-from fleet_slip.export.c_names import field_names
-from fleet_slip.export.c_steps import ring_width, sum_key, sum_type
+from fleet_slip.export.c.c_names import field_names
+from fleet_slip.export.c.c_steps import ring_width, sum_key, sum_type
 from fleet_slip.export.program import Program
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from fleet_slip.export.c_names import c_prefix, field_names, plain_text
+from fleet_slip.export.c.c_names import c_prefix, field_names, plain_text
 from fleet_slip.export.checks import Check
 from fleet_slip.export.program import Program
 from fleet_slip.models.model_version import ModelVersion

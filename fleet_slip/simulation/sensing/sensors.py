@@ -12,7 +12,7 @@ from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, Signal, catalogue
 from fleet_slip.compiling import kernel
 from fleet_slip.config import Config
-from fleet_slip.simulation.distortion import Distortion
+from fleet_slip.simulation.sensing.distortion import Distortion
 
 SAMPLE_RATE_HZ = int(1 / SAMPLE_TIME_S)
 GPS_SIGNALS = {"gps_vx": "vx_mps", "gps_vy": "vy_mps"}

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 
 from fleet_slip.columns.operations import operation_of, plain_of, size_of
-from fleet_slip.export.c_names import LARGEST_32, field_names, integer_type, literal
+from fleet_slip.export.c.c_names import LARGEST_32, field_names, integer_type, literal
 from fleet_slip.export.program import Program
 
 LARGEST_UNSIGNED = 2**32 - 1

@@ -1,0 +1,1 @@
+"""What sensors and satellite receivers make of the truth."""
