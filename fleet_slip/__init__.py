@@ -2,7 +2,7 @@
 
 Many cars log cheap signals, a few also log their side-slip angle. Logs become exact Gram matrices;
 from these every model, cohort and fold follows without reading a row again; the winner becomes a
-numbered model version, which is one dot product.
+numbered model version, which a car computes in whole numbers.
 
     import fleet_slip
 
