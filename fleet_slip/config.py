@@ -20,7 +20,7 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails
 
-from fleet_slip.errors import ConfigError, StorageError
+from fleet_slip.errors import ConfigError, FleetSlipError, StorageError
 
 
 class Config(BaseModel):
@@ -82,12 +82,16 @@ LONGEST_FAULT = 300
 """Characters of one fault that are shown; what was given may stand in it."""
 
 
-def read_named_file(file: Traversable, most_bytes: int = LONGEST_FILE_BYTES) -> bytes:
+def read_named_file(
+    file: Traversable,
+    most_bytes: int = LONGEST_FILE_BYTES,
+    error: type[FleetSlipError] = ConfigError,
+) -> bytes:
     """Return the content of a file that a person, a variable or another config names.
 
     It must be a regular file, since a device has no end and a pipe may never begin. No error here
     or in what parses it may quote a line before it is known to be such a file: a name such as
-    `/etc/shadow` must not show its content. Raises `ConfigError`.
+    `/etc/shadow` must not show its content. Raises the `error` that is given.
     """
     try:
         if not isinstance(file, Path):  # of an installation that is an archive
@@ -96,17 +100,17 @@ def read_named_file(file: Traversable, most_bytes: int = LONGEST_FILE_BYTES) -> 
         descriptor = os.open(file, os.O_RDONLY | os.O_NONBLOCK)
         with os.fdopen(descriptor, "rb") as stream:
             if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-                raise ConfigError(f"{file}: not a regular file. Give the path of a file.")
+                raise error(f"{file}: not a regular file. Give the path of a file.")
             content = stream.read(most_bytes + 1)
     except FileNotFoundError:
         is_link = isinstance(file, Path) and file.is_symlink()
         what = "a link to a file that does not exist" if is_link else "no such file"
-        raise ConfigError(f"{file}: {what}.") from None
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or "no file can have this name"
-        raise ConfigError(f"{file}: cannot be read: {reason}.") from None
+        raise error(f"{file}: {what}.") from None
+    except (OSError, ValueError) as fault:
+        reason = getattr(fault, "strerror", None) or "no file can have this name"
+        raise error(f"{file}: cannot be read: {reason}.") from None
     if len(content) > most_bytes:
-        raise ConfigError(f"{file}: larger than {most_bytes:,} bytes. Is it the right file?")
+        raise error(f"{file}: larger than {most_bytes:,} bytes. Is it the right file?")
     return content
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from fleet_slip.canonical import canonical_json, sha256_of
-from fleet_slip.config import parse_document
+from fleet_slip.config import parse_document, read_named_file
 from fleet_slip.errors import InputError, RefusedError, StorageError
 from fleet_slip.export.compile import compile_program
 from fleet_slip.export.document import FORMAT, SCHEMA, program_content
@@ -45,13 +45,7 @@ def import_version(registry: Registry, file: Path) -> ModelVersion:
 
 def _read(file: Path) -> dict[str, Any]:
     """Return a document whose checksum is right. Raises `InputError` for anything else."""
-    try:
-        with file.open("rb") as stream:
-            text = stream.read(LONGEST_FILE_BYTES + 1)
-    except OSError as error:
-        raise InputError(f"{file}: cannot be read: {error.strerror}.") from None
-    if len(text) > LONGEST_FILE_BYTES:
-        raise InputError(f"{file}: is larger than {LONGEST_FILE_BYTES:,} bytes. {_EXPORT}")
+    text = read_named_file(file, LONGEST_FILE_BYTES, InputError)
     try:
         content = json.loads(text)
         known = (content["format"], content["schema"])

@@ -8,13 +8,14 @@ from typing import Any
 import pytest
 
 from fleet_slip.config import LONGEST_FILE_BYTES, load_config, read_named_file
-from fleet_slip.errors import ConfigError, FleetSlipError
+from fleet_slip.errors import ConfigError, FleetSlipError, InputError
 from fleet_slip.grams.received.car_keys import KEYS_VARIABLE, load_car_keys
 from fleet_slip.ingest.formats.can_bus import CanBus, read_can_database
 from fleet_slip.ingest.formats.can_trace import parse_database
 from fleet_slip.ingest.mapping.vehicle_facts import read_vehicle_facts
 from fleet_slip.models.gate import Floor
 from fleet_slip.resources import CONFIG_VARIABLE, config_file, find_config
+from tests.support.commands import RunCommand
 from tests.support.waiting import within
 
 LINE = "s3cret:x:0:0:root:/root:/bin/bash"
@@ -109,3 +110,24 @@ def test_a_folder_of_configs_that_leads_nowhere_does_not_count_as_empty(
     (tmp_path / kind).symlink_to("nowhere")
     with pytest.raises(ConfigError, match=f"{kind}: not a folder that can be read"):
         find_config("campaigns", "smoke")
+
+
+@pytest.mark.parametrize("command", [("models", "import"), ("receive",)])
+def test_a_pipe_given_to_a_command_is_refused_at_once(
+    tmp_path: Path, run_command: RunCommand, command: tuple[str, ...]
+) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    done = run_command(*command, str(tmp_path / "pipe"))
+    assert done.exit_code == InputError.exit_code
+    assert "pipe" in done.stderr
+
+
+def test_the_list_of_configs_tells_of_a_link_that_leads_nowhere(
+    tmp_path: Path, run_command: RunCommand
+) -> None:
+    own = tmp_path / "own"
+    own.mkdir()
+    (own / "publish.toml").symlink_to("nowhere")
+    done = run_command("--config", str(own), "config")
+    assert done.exit_code == ConfigError.exit_code
+    assert "publish.toml: a link to a file that does not exist" in done.stderr

@@ -4,6 +4,7 @@ from fleet_slip.canonical import sha256_of
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.cli.output import Json, print_json, print_table
+from fleet_slip.config import read_named_file
 from fleet_slip.resources import config_files, own_configs
 
 
@@ -23,7 +24,7 @@ def config(json: Json = False) -> None:
             "file": name,
             "from": "own" if own and str(file).startswith(str(own)) else "shipped",
             "path": str(file),
-            "sha256": sha256_of(file.read_text(encoding="utf-8")),
+            "sha256": sha256_of(read_named_file(file).decode("utf-8", "replace")),
         }
         for name, file in config_files().items()
     ]

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from fleet_slip.config import read_named_file
 from fleet_slip.delta import retry_conflicts
 from fleet_slip.errors import InputError
 from fleet_slip.grams.received.car_keys import load_car_keys
@@ -158,16 +159,7 @@ def _tell(reports: Sequence[ReceiveReport], new: NewMessages) -> None:
 
 
 def _read(path: Path) -> bytes:
-    try:
-        with path.open("rb") as stream:
-            content = stream.read(LARGEST_FILE_BYTES + 1)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}.") from None
-    if len(content) > LARGEST_FILE_BYTES:
-        raise InputError(
-            f"{path}: has more than {LARGEST_FILE_BYTES:,} bytes. Messages stand one behind the "
-            "other, so that a file can be cut between them."
-        )
+    content = read_named_file(path, LARGEST_FILE_BYTES, InputError)
     if not content:
         raise InputError(f"{path}: is empty.")
     return content
