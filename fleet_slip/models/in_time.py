@@ -34,8 +34,9 @@ def require_in_time(warehouse: Warehouse, manifest: Manifest) -> None:
     raise RefusedError(
         f"{manifest.name} was not published: not all receivers are known to be in time to "
         f"{1000 * MOST_S:g} ms ({'; '.join(problems)}). Give delay_s of the course in the mapping "
-        "and ingest again, or choose other cars by --cohort: the view calibration has the number "
-        "receiver_delay of each. --force publishes all the same."
+        "and ingest again, or choose other cars: the view calibration has the number "
+        f"receiver_delay of each. To publish all the same: fleet-slip publish {manifest.name} "
+        "--label course --force"
     )
 
 

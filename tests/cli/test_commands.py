@@ -201,7 +201,7 @@ FORGED = (
 @pytest.mark.parametrize(
     ("arguments", "exit_code", "message"),
     [
-        (["run", "--campaign", "nowhere"], 3, "Known: fleet, fleet_realistic, proving_ground"),
+        (["run", "--campaign", "nowhere"], 3, "Known: fleet, fleet_course, fleet_realistic"),
         (["run", "--campaign", "missing.toml"], 3, "no such file"),
         (["run", "--campaign", "smoke", "--through", "yesterday"], 2, "write it as 2024-05-01"),
         (["run", "--campaign", "smoke", "--through", "1999-01-01"], 2, "lasts from"),
@@ -218,7 +218,7 @@ FORGED = (
         (["score", "smoke", "--cohort", "true) OR (true"], 5, "not valid SQL"),
         (["select", "--cohort", "1; DROP VIEW grams"], 5, "not valid SQL"),
         (["select", "--nested", "ax,beta"], 5, "beta is not an input"),
-        (["select", "--models", "table9"], 3, "Known: estimator, gated, table1"),
+        (["select", "--models", "table9"], 3, "Known: course, estimator, gated, table1"),
         (["select", "--by", "vehicle"], 5, "at least two folds"),
         (["show", "nothing"], 5, "no model is called"),
         (["score", "smoke@9"], 5, "has no version"),

@@ -27,7 +27,7 @@ from fleet_slip.cli.app import app
 from fleet_slip.errors import FleetSlipError
 
 RUN = frozenset({"console", "bash", "python", "sql"})
-SHOWN = frozenset({"text", "json", "toml", "yaml", "csv"})
+SHOWN = frozenset({"text", "json", "toml", "yaml", "csv", "diff"})
 DEADLINE_S = 120
 
 _FENCES = RawFencedCodeBlockLexer(re.compile(r"(?P<language>\S*)(?P<options>[^\n]*)$\n", re.M))

@@ -173,10 +173,8 @@ def test_a_data_root_of_before_takes_what_has_no_extras_and_asks_to_migrate_for_
 ) -> None:
     shipped = (folder("configs") / "signals.toml").read_text(encoding="utf-8")
     before, _, rest = shipped.partition("[signals.steer]\n")
-    old = tmp_path / "signals.toml"
-    old.write_text(
-        before + rest[rest.index("# What is known of a whole drive") :], encoding="utf-8"
-    )
+    old = tmp_path / "signals.toml"  # without the extras but those that shipped feature sets are of
+    old.write_text(before + rest[rest.index("[signals.course]") :], encoding="utf-8")
     monkeypatch.setenv(CATALOGUE_VARIABLE, str(old))
     catalogue.cache_clear()
     ingest_file(warehouse, write(tmp_path / "a.csv"), a_mapping(signals=PLAIN))

@@ -18,11 +18,12 @@ INGEST = """
 import sys
 from pathlib import Path
 from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.ingest.landing.ingest_job import ingest_files
 from fleet_slip.ingest.mapping.mapping import Mapping
 from fleet_slip.warehouse.tables import Warehouse
 root, log, mapping = sys.argv[1:]
 warehouse = Warehouse(LocalFolder(Path(root)))
-ingest_file(warehouse, Path(log), Mapping.model_validate_json(mapping))
+(_,) = ingest_files(warehouse, [Path(log)], Mapping.model_validate_json(mapping))
 assert "polars" in sys.modules
 assert "pandas" not in sys.modules
 """

@@ -198,7 +198,7 @@ def test_no_gram_row_of_a_forgotten_car_lands_after_the_erasure(
     warehouse = fill(tmp_path, "alfa")
     land(warehouse, "new", drive("beta", 1))
     just_before_its_commit(monkeypatch, lambda: forget(warehouse, BETA, now=True), "grams")
-    monkeypatch.setattr(gram_job, "_require_active", lambda *_: None)  # killed before its last look
+    monkeypatch.setattr(gram_job, "require_active", lambda *_: None)  # killed before its last look
     update_grams(warehouse)
     assert not mentions(tmp_path, "beta")
 
