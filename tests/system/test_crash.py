@@ -15,7 +15,7 @@ from tests.support.commands import RunCommand, run
 from tests.support.state import state
 
 JOB = ["run", "--campaign", "smoke", "--threads", "1"]
-KILLS = 130
+KILLS = 40
 """Ten of each command."""
 
 
