@@ -84,7 +84,7 @@ def tiny_root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Pat
     def make(root: Path) -> None:
         shutil.copytree(smoke_root, root)
         done_on(root, "simulate", "fleet", "--days", "1")
-        for feature_set in ("signals", "calibration", "fleet"):
+        for feature_set in ("signals", "calibration", "fleet", "windows"):
             done_on(root, "gram", "--features", feature_set)
 
     return made_once(tmp_path_factory, "benchmarks", make)

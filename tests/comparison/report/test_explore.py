@@ -8,7 +8,7 @@ import pytest
 
 from tests.support.commands import run
 
-NOTEBOOK = Path(__file__).parents[2] / "jobs/explore.py"
+NOTEBOOK = Path(__file__).parents[3] / "jobs/explore.py"
 
 pytestmark = [pytest.mark.slow, pytest.mark.tools("marimo")]
 
