@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from fleet_slip.delta.sealing import NOTE, SEAL, seal_of
+from fleet_slip.delta.commits import NOTE, SEAL, seal_of
 from fleet_slip.files.folder import TEMPORARY_PREFIX
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.resources import find_config

@@ -39,9 +39,8 @@ from fleet_slip.comparison.rivals.sample import draw_sample
 from fleet_slip.files.data_root import data_root
 from fleet_slip.grams.calibration.calibration import Calibration, calibrate
 from fleet_slip.grams.cohorts import expansion, fold_sums
-from fleet_slip.grams.cohorts.fold_assignment import assign_folds
 from fleet_slip.grams.cohorts.fold_sums import sum_cohort
-from fleet_slip.grams.cohorts.folding import Folding
+from fleet_slip.grams.cohorts.folding import Folding, assign_folds
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.regression.validation.crossval import cross_validate_inputs
 from fleet_slip.simulation.campaign import DriveSpec, load_campaign

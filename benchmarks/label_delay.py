@@ -18,7 +18,7 @@ import polars as pl
 import fleet_slip
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.ingest.drives.label_delay import MOST_TICKS
+from fleet_slip.ingest.drives.relations import MOST_TICKS
 from fleet_slip.ingest.drives.suspicion import find_suspicions
 
 DELAYS_S = (0.0, 0.05, 0.1, 0.2)

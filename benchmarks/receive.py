@@ -20,9 +20,8 @@ from pathlib import Path
 
 import fleet_slip
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.received.car_keys import KEYS_VARIABLE, load_car_keys
 from fleet_slip.grams.received.messages import message_size
-from fleet_slip.grams.received.signatures import sign_messages
+from fleet_slip.grams.received.signatures import KEYS_VARIABLE, load_car_keys, sign_messages
 from fleet_slip.models.ed25519 import generate
 from fleet_slip.regression.exact.gram import Gram
 from tests.support.fleet_messages import messages_of

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from fleet_slip.maintenance.forget import ForgetReport
     from fleet_slip.maintenance.retention import RetentionReport
     from fleet_slip.maintenance.vacuum import VacuumReport
-    from fleet_slip.maintenance.verification import Verification
+    from fleet_slip.maintenance.verify_files import Verification
     from fleet_slip.models.model_version import ModelVersion
     from fleet_slip.monitoring.fitness import Fitness
     from fleet_slip.monitoring.monitor import Chart

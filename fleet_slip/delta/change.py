@@ -1,16 +1,134 @@
-"""What one commit does to a table, and which units of work land with it."""
+"""The files of a table as the Delta log has them, and what one commit does to them."""
 
 import json
+import re
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import date
 from typing import Any
 
+import pyarrow as pa
+from deltalake import DeltaTable
 from deltalake.transaction import AddAction, RemoveAction
 
 from fleet_slip.delta.encoding import Encoded
-from fleet_slip.delta.table_files import TableFile
+from fleet_slip.errors import StorageError
+
+_DATA_FILE = re.compile(r"[\w.=-][\w.=/-]*\.parquet", re.ASCII)
+"""Path of a data file below its table: relative, and without characters that could be a pattern."""
+
+_NULLS = "null_count."
+"""Before a column's name: how many nulls a file has in it. Null, if it has no such column."""
+
+
+@dataclass(frozen=True)
+class TableFile:
+    """One active file of a table, as the Delta log has it.
+
+    `days` are the first and the last day of its rows, where the log tells them.
+    """
+
+    path: str
+    rows: int
+    size_bytes: int
+    null_counts: Mapping[str, int]
+    day: date | None = None
+    days: tuple[date, date] | None = None
+
+
+def absent_columns(files: Iterable[TableFile], names: Iterable[str]) -> tuple[str, ...]:
+    """Return the columns that none of the files has: they came to the table later."""
+    absent = dict.fromkeys(names)
+    for file in files:
+        if not absent:
+            break
+        for name in [name for name in absent if name in file.null_counts]:
+            del absent[name]
+    return tuple(absent)
+
+
+def read_actions(delta: DeltaTable | None) -> pa.Table:
+    """Return what the log says of each active file, a row a file; none without a table."""
+    if delta is None:
+        return pa.Table.from_pylist([])
+    # pa.table() would import pandas, which takes half a second.
+    stream = delta.get_add_actions(flatten=True)
+    return pa.RecordBatchReader.from_stream(stream).read_all().combine_chunks()
+
+
+def active_files(actions: pa.Table, where: object) -> tuple[TableFile, ...]:
+    """Return the active files of a Delta table, sorted by path.
+
+    Raises `StorageError`, which says where, if the log names a file as this program never does.
+    """
+    files = sorted(_table_files(actions), key=lambda file: file.path)
+    for file in files:
+        _require_sound(file, where)
+    return tuple(files)
+
+
+def have_same_columns(actions: pa.Table, names: Iterable[str]) -> bool:
+    """Whether each of the columns is in all active files or in none."""
+    counts = [actions[f"{_NULLS}{n}"] for n in names if f"{_NULLS}{n}" in actions.column_names]
+    return all(column.null_count in (0, len(column)) for column in counts)
+
+
+def _require_sound(file: TableFile, where: object) -> None:
+    parts = file.path.split("/")
+    if not _DATA_FILE.fullmatch(file.path) or ".." in parts or "." in parts:
+        raise StorageError(
+            f"{where}: the Delta log names the file {file.path[:200]!r}, which is "
+            "not one of this table. Restore the log from a backup."
+        )
+    if file.rows is None or file.rows < 0 or file.size_bytes is None or file.size_bytes < 0:
+        raise StorageError(
+            f"{where}: the Delta log does not say how large {file.path} is. "
+            "Another program wrote it, or it was damaged: restore the log from a backup."
+        )
+
+
+class _NullCounts(Mapping[str, int]):
+    """The null counts of one file, looked up among those of all files when they are asked for.
+
+    A table may have 100,000 files, and few jobs ask for more than a few of them.
+    """
+
+    def __init__(self, columns: Mapping[str, pa.ChunkedArray], row: int) -> None:
+        self._columns = columns
+        self._row = row
+
+    def __getitem__(self, name: str) -> int:
+        count: int | None = self._columns[name][self._row].as_py()
+        if count is None:
+            raise KeyError(name)
+        return count
+
+    def __iter__(self) -> Iterator[str]:
+        return (name for name in self._columns if name in self)
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+    def __reduce__(self) -> tuple[type[dict[str, int]], tuple[dict[str, int]]]:
+        """Send another process what is of this file only."""
+        return dict, (dict(self),)
+
+
+def _table_files(actions: pa.Table) -> Iterator[TableFile]:
+    nulls = {
+        name.removeprefix(_NULLS): actions[name]
+        for name in actions.column_names
+        if name.startswith(_NULLS)
+    }
+    unknown = [None] * actions.num_rows
+    columns = (
+        actions[name].to_pylist() if name in actions.column_names else unknown
+        for name in ("path", "num_records", "size_bytes", "partition.day", "min.day", "max.day")
+    )
+    for row, (path, rows, size_bytes, day, first, last) in enumerate(zip(*columns, strict=True)):
+        days = (first, last) if first and last else None
+        yield TableFile(path, rows, size_bytes, _NullCounts(nulls, row), day, days)
 
 
 @dataclass(frozen=True)

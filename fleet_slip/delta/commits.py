@@ -1,14 +1,88 @@
-"""The commits of a table's Delta log as they stand there, and what is wrong with one."""
+"""The commits of a table's Delta log, each with a checksum of what it does to the table.
 
+Delta's log has no checksums. Each commit's note therefore states the SHA-256 of the note and of
+the actions that stand beside it, in a form that does not depend on how they were written as JSON.
+It lands with the commit or not at all, needs no order among writers, and other programs that read
+the table ignore it. `fleet_slip.delta.log_check` compares.
+"""
+
+import hashlib
 import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from fleet_slip.delta.sealing import NOTE, SEAL, Action, seal_of
+import pyarrow as pa
+import pyarrow.parquet as pq
+from deltalake.transaction import AddAction, RemoveAction
+
+from fleet_slip.canonical import canonical_json
+from fleet_slip.delta.checkpoints import newest_checkpoint
 from fleet_slip.errors import StorageError
 from fleet_slip.files.folder import Folder
+
+NOTE = "fleet_slip"
+"""Key of the note in a commit's own metadata."""
+
+SEAL = "sha256"
+"""Key of the checksum in the note."""
+
+Action = Mapping[str, Any]
+"""One action as the log has it: `{"add": {...}}`, `{"remove": {...}}`, `{"txn": {...}}`."""
+
+
+def seal_note(
+    note: Mapping[str, Any],
+    actions: Sequence[AddAction | RemoveAction],
+    units: Mapping[str, int],
+) -> str:
+    """Return a commit's note as text, with the checksum of itself, its actions and its units."""
+    stated = [_added(a) if isinstance(a, AddAction) else _removed(a) for a in actions]
+    stated += [{"txn": {"appId": name, "version": number}} for name, number in units.items()]
+    return json.dumps({**note, SEAL: seal_of(note, stated)})
+
+
+def seal_of(note: Mapping[str, Any], actions: Sequence[Action]) -> str:
+    """Return the checksum of a note and of actions as the log has them, in any order."""
+    rest = {key: value for key, value in note.items() if key != SEAL}
+    texts = [canonical_json({k: _stated(k, v) for k, v in action.items()}) for action in actions]
+    text = "\n".join([canonical_json(rest), *sorted(texts)])
+    return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
+
+
+def _added(action: AddAction) -> Action:
+    return {
+        "add": {
+            "path": action.path,
+            "partitionValues": action.partition_values,
+            "size": action.size,
+            "modificationTime": action.modification_time,
+            "dataChange": action.data_change,
+            "stats": action.stats,
+        }
+    }
+
+
+def _removed(action: RemoveAction) -> Action:
+    return {
+        "remove": {
+            "path": action.path,
+            "partitionValues": action.partition_values,
+            "size": action.size,
+            "deletionTimestamp": action.deletion_timestamp,
+            "dataChange": action.data_change,
+        }
+    }
+
+
+def _stated(kind: str, content: Any) -> Any:
+    """Return what an action states, without what the Delta library adds to it."""
+    if not isinstance(content, Mapping):
+        return content
+    added = {"extendedFileMetadata"} if kind == "remove" else set()
+    return {k: v for k, v in content.items() if v is not None and k not in added}
+
 
 LOG = "_delta_log"
 
@@ -105,3 +179,28 @@ def _object(text: Any) -> Mapping[str, Any]:
     except (TypeError, ValueError, RecursionError):
         return {}
     return found if isinstance(found, dict) else {}
+
+
+def read_landed_units(table: Folder, version: int) -> frozenset[str]:
+    """Return the names of all units that have landed in a version of a table.
+
+    Raises `StorageError` for a log that cannot be read.
+    """
+    log = table / LOG
+    files = log.files()
+    names: set[str] = set()
+    checkpoint = newest_checkpoint(files, version)
+    after = commit_number(checkpoint.name) if checkpoint else -1
+    for file in files:  # a checkpoint may be of several
+        if checkpoint and file.name.startswith(f"{after:020}.checkpoint."):
+            with pq.ParquetFile(pa.BufferReader(log.read(file.name))) as parquet:
+                told = parquet.read(columns=["txn.appId"])["txn"].combine_chunks()
+            names.update(name for name in told.field("appId").to_pylist() if name is not None)
+    for file in files:
+        if COMMIT_FILE.fullmatch(file.name) and after < commit_number(file.name) <= version:
+            try:
+                commit = read_commit(log, file.name)
+            except ValueError as error:
+                raise StorageError(f"{file}: {error}") from None
+            names.update(action["txn"]["appId"] for action in commit.actions if "txn" in action)
+    return frozenset(names)

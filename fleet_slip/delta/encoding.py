@@ -1,6 +1,16 @@
-"""Rows as the bytes of a Parquet file, and the checksum of those bytes."""
+"""Rows as the bytes of a Parquet file, its checksum, and what stands before the rows.
+
+A file may begin with parts of its own, such as a rollup, each with a checksum:
+
+    PAR1 | FSPF, layout, number of parts; length and XXH3 of each; XXH3 of all this | parts | rows …
+
+Parquet finds its rows from the end of a file, so that every reader passes over what stands here, as
+over a Bloom filter. It is one file with its rows: it is committed, found, checked and deleted with
+them. The first bytes of a file tell it, without the others.
+"""
 
 import json
+import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import date
@@ -9,9 +19,11 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
+import xxhash
 
-from fleet_slip.delta.preface import pack_preface
+from fleet_slip.errors import StorageError
 from fleet_slip.files.checksums import checksum_of, fast_checksum_of
+from fleet_slip.files.folder import Folder
 
 DAY = "day"
 """The one column of which the Delta log tells the least and the largest value."""
@@ -58,7 +70,7 @@ class Encoding:
         """Return the content of a file with these rows, without some of their columns.
 
         A dictionary is stored as far as the rows have its values. The parts of a `preface` stand
-        before the rows; see `fleet_slip.delta.preface`.
+        before the rows; see `fleet_slip.delta.encoding`.
         """
         kept = rows.drop_columns([name for name in omitted if name in rows.schema.names])
         stored = _required(_only_used_values(kept))
@@ -114,3 +126,96 @@ def _compact(column: pa.ChunkedArray) -> pa.ChunkedArray:
     codes = whole.indices.dictionary_encode()
     values = whole.dictionary.take(codes.dictionary)
     return pa.chunked_array([pa.DictionaryArray.from_arrays(codes.indices, values)])
+
+
+_PARQUET = b"PAR1"
+_MAGIC = b"FSPF"
+_LAYOUT = 1
+_HEAD = struct.Struct("<4sHH")
+_PART = struct.Struct("<QQ")
+_CHECKSUM = struct.Struct("<Q")
+
+FIRST_BYTES = 2**17
+"""So much of a file is read at first: with it, mostly, the part that is wanted."""
+
+
+def pack_preface(parts: Sequence[bytes]) -> bytes:
+    """Return what stands before the rows of a file that has some parts."""
+    told = [_PART.pack(len(part), xxhash.xxh3_64_intdigest(part)) for part in parts]
+    head = _HEAD.pack(_MAGIC, _LAYOUT, len(parts)) + b"".join(told)
+    return head + _CHECKSUM.pack(xxhash.xxh3_64_intdigest(head)) + b"".join(parts)
+
+
+def read_preface(folder: Folder, path: str, wanted: int) -> bytes | None:
+    """Return one of the parts, from 0, before the rows of a file; None for a file without any.
+
+    A preface of a layout that is not known is none. Raises `StorageError` if the part is not what
+    was written.
+    """
+    content = folder.read(path, FIRST_BYTES)
+    places = _places(content, f"{folder}/{path}")
+    if wanted >= len(places):
+        return None
+    start, length, checksum = places[wanted]
+    if start + length > len(content):
+        content = folder.read(path, start + length)
+    part = content[start : start + length]
+    if xxhash.xxh3_64_intdigest(part) != checksum:
+        raise _damaged(f"{folder}/{path}")
+    return part
+
+
+def _places(content: bytes, where: str) -> list[tuple[int, int, int]]:
+    """Return where each part begins, its length and its checksum."""
+    if not content.startswith(_PARQUET + _MAGIC) or len(content) < len(_PARQUET) + _HEAD.size:
+        return []
+    begin = len(_PARQUET)
+    _, layout, count = _HEAD.unpack_from(content, begin)
+    if layout != _LAYOUT:
+        return []
+    stop = begin + _HEAD.size + count * _PART.size
+    start = stop + _CHECKSUM.size
+    if start > len(content):
+        raise _damaged(where)
+    if _CHECKSUM.unpack_from(content, stop) != (xxhash.xxh3_64_intdigest(content[begin:stop]),):
+        raise _damaged(where)
+    places = []
+    for length, checksum in _PART.iter_unpack(content[begin + _HEAD.size : stop]):
+        places.append((start, length, checksum))
+        start += length
+    return places
+
+
+def _damaged(where: str) -> StorageError:
+    return StorageError(
+        f"{where}: what stands before its rows does not match its checksum: the file was damaged. "
+        "See what can be repaired with: fleet-slip verify --repair; or restore it from a backup."
+    )
+
+
+@dataclass(frozen=True)
+class Names:
+    """The values of one column's dictionary that rows have, and those that none has."""
+
+    used: frozenset[str]
+    unused: frozenset[str]
+
+
+def read_names(file: pa.NativeFile, columns: Sequence[str]) -> dict[str, Names]:
+    """Return the names in each dictionary of a Parquet file, of the columns with texts."""
+    metadata = pq.read_metadata(file)
+    stored = [name for name in columns if name in metadata.schema.names]
+    with pq.ParquetFile(file, metadata=metadata, read_dictionary=stored) as parquet:
+        schema = parquet.schema_arrow
+        there = [n for n in schema.names if pa.types.is_dictionary(schema.field(n).type)]
+        groups = [parquet.read_row_group(i, there) for i in range(parquet.num_row_groups)]
+    return {n: _names([part for rows in groups for part in rows[n].chunks]) for n in there}
+
+
+def _names(parts: Sequence[pa.DictionaryArray]) -> Names:
+    every: set[str] = set()
+    used: set[str] = set()
+    for part in parts:
+        every.update(part.dictionary.to_pylist())
+        used.update(part.dictionary.take(part.indices.unique().drop_null()).to_pylist())
+    return Names(frozenset(used), frozenset(every - used))

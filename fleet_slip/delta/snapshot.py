@@ -11,12 +11,10 @@ import pyarrow as pa
 from deltalake import CommitProperties, DeltaTable, Transaction
 from deltalake.exceptions import CommitFailedError
 
-from fleet_slip.delta.change import Change
+from fleet_slip.delta.change import Change, TableFile, active_files, have_same_columns, read_actions
 from fleet_slip.delta.checkpoints import seal_new_checkpoint
-from fleet_slip.delta.landed_units import read_landed_units
+from fleet_slip.delta.commits import NOTE, read_landed_units, seal_note
 from fleet_slip.delta.schema import require_writable
-from fleet_slip.delta.sealing import NOTE, seal_note
-from fleet_slip.delta.table_files import TableFile, active_files, have_same_columns, read_actions
 from fleet_slip.errors import ConflictError, StorageError
 from fleet_slip.files.storage_errors import storage_errors
 

@@ -11,16 +11,13 @@ from deltalake import CommitProperties, DeltaTable
 from deltalake.exceptions import CommitFailedError, TableNotFoundError
 from deltalake.transaction import AddAction
 
-from fleet_slip.delta.change import addition, columns_in
+from fleet_slip.delta.change import TableFile, addition, columns_in
+from fleet_slip.delta.commits import NOTE, seal_note
 from fleet_slip.delta.conflicts import is_conflict, retry_conflicts
-from fleet_slip.delta.dictionary_names import Names, read_names
-from fleet_slip.delta.encoding import Encoded, Encoding
+from fleet_slip.delta.encoding import Encoded, Encoding, Names, read_names, read_preface
 from fleet_slip.delta.log_check import require_sound_log
-from fleet_slip.delta.preface import read_preface
 from fleet_slip.delta.schema import require_readable, require_writable
-from fleet_slip.delta.sealing import NOTE, seal_note
 from fleet_slip.delta.snapshot import Snapshot
-from fleet_slip.delta.table_files import TableFile
 from fleet_slip.errors import ConflictError, StorageError
 from fleet_slip.files.checksums import checksum_in
 from fleet_slip.files.folder import Folder
@@ -104,7 +101,7 @@ class Table:
             return pq.read_metadata(file)
 
     def read_preface(self, path: str, part: int) -> bytes | None:
-        """Return a part of what stands before a file's rows; see `fleet_slip.delta.preface`."""
+        """Return a part of what stands before a file's rows; see `fleet_slip.delta.encoding`."""
         return read_preface(self.folder, path, part)
 
     def read_names(self, path: str) -> dict[str, Names]:

@@ -1,17 +1,109 @@
-"""The client for a bucket of an object store: its credentials, time limits and retries."""
+"""The client for a bucket of an object store: its credentials, time limits and retries.
+
+With AWS_ACCESS_KEY_ID in the environment no file is read. Otherwise both libraries that talk to
+the store follow Amazon's own chain: ~/.aws/credentials and ~/.aws/config (AWS_PROFILE,
+AWS_SHARED_CREDENTIALS_FILE, AWS_CONFIG_FILE), with what a profile may refer to (a role, a process,
+a single sign-on), then the roles of containers and machines. For obstore botocore does it, for
+Delta logs delta-rs does. Each gets temporary credentials anew before they expire.
+"""
 
 import functools
 import os
-from datetime import timedelta
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from os import environ
+from typing import TYPE_CHECKING, Any
 
 from obstore.store import from_url
 
-from fleet_slip.files.object_credentials import AwsProfile, aws_profile
-from fleet_slip.files.object_errors import object_errors
+from fleet_slip.errors import StorageError
+from fleet_slip.extras import needed
+from fleet_slip.files.storage_errors import object_errors
 
 if TYPE_CHECKING:
+    from botocore.credentials import Credentials
     from obstore.store import ObjectStore
+
+
+FRESH = timedelta(minutes=1)
+"""For so long a copy of credentials is used before botocore is asked, which knows their end."""
+
+CHAIN_VARIABLE = "AWS_FORCE_CREDENTIAL_LOAD"
+"""Option of the Delta library: follow Amazon's chain even where AWS_ENDPOINT_URL is set."""
+
+
+@dataclass(frozen=True)
+class AwsProfile:
+    """What a profile says of S3, where credentials are not in the environment."""
+
+    credentials: "Credentials"
+    region: str | None
+    endpoint: str | None
+
+    @property
+    def store_options(self) -> dict[str, Any]:
+        """Options of obstore."""
+        return {"credential_provider": self._fresh, **self._location}
+
+    @property
+    def delta_options(self) -> dict[str, str]:
+        """Options of the Delta library, which looks for the credentials itself."""
+        return {CHAIN_VARIABLE: "true"} | self._location
+
+    @property
+    def _location(self) -> dict[str, str]:
+        known = {"region": self.region, "endpoint": self.endpoint}
+        return {name: value for name, value in known.items() if value}
+
+    def _fresh(self) -> dict[str, Any]:
+        found = self.credentials.get_frozen_credentials()
+        return {
+            "access_key_id": found.access_key,
+            "secret_access_key": found.secret_key,
+            "token": found.token,
+            "expires_at": datetime.now(UTC) + FRESH if found.token else None,
+        }
+
+
+@functools.cache
+def aws_profile() -> AwsProfile | None:
+    """Return the profile in use; None if the environment has the credentials.
+
+    Raises `StorageError` if there are none, or a file or profile cannot be used.
+    """
+    if environ.get("AWS_ACCESS_KEY_ID"):
+        return None
+    with needed("objects", "a file of credentials"):
+        # A fifth of a second to import.
+        from botocore.exceptions import BotoCoreError, ProfileNotFound  # noqa: PLC0415
+        from botocore.session import Session  # noqa: PLC0415
+    session = Session()
+    try:
+        credentials = session.get_credentials()
+        if credentials is not None:
+            credentials.get_frozen_credentials()
+        scoped = session.get_scoped_config()
+        region = session.get_config_variable("region")
+    except ProfileNotFound:
+        raise StorageError(
+            f"there is no profile {session.profile!r} in ~/.aws/config or ~/.aws/credentials. "
+            "Check AWS_PROFILE, AWS_CONFIG_FILE and AWS_SHARED_CREDENTIALS_FILE."
+        ) from None
+    except (BotoCoreError, OSError, RuntimeError, ValueError) as error:
+        # Its text may quote what a process printed.
+        raise StorageError(
+            f"the credentials of the AWS profile {session.profile or 'default'!r} cannot be had "
+            f"({type(error).__name__}). Check them with: aws sts get-caller-identity"
+        ) from None
+    if credentials is None:
+        raise StorageError(
+            "there are no credentials for S3. Set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or "
+            "AWS_PROFILE, or run: aws configure"
+        )
+    endpoint = environ.get("AWS_ENDPOINT_URL_S3") or environ.get("AWS_ENDPOINT_URL")
+    endpoint = endpoint or scoped.get("endpoint_url")
+    return AwsProfile(credentials, region, endpoint)
+
 
 HTTP_VARIABLE = "AWS_ALLOW_HTTP"
 """Environment variable, which the Delta library reads too: true lets an endpoint be http."""

@@ -3,24 +3,73 @@
 Objects of a data root that are read in this way never change, so that a size is asked for once.
 One whose name tells its checksum is fetched as a whole and compared, and what is read is read from
 those very bytes: another answer of the store might be another.
+
+A request has a time limit, whatever it asks for. So a large object is fetched in parts that come
+well within it: one that does not come is asked for again, smaller, and what has come is kept.
 """
 
 import io
 import threading
+import time
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 import fsspec
 import obstore
+from obstore.exceptions import BaseError
 
 from fleet_slip.files.checksums import checksum_in, require_content
-from fleet_slip.files.object_errors import object_errors
-from fleet_slip.files.object_transfer import fetch_parts
+from fleet_slip.files.storage_errors import is_timeout, object_errors
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from obstore.store import ObjectStore
+
+
+FIRST_BYTES, MOST_BYTES, LEAST_BYTES = 2**20, 2**23, 2**15
+"""Bytes that a request asks for: at first, and within what limits it adapts to the network."""
+
+QUICK_S = 2.0
+"""After a request that took less the next asks for twice as much."""
+
+
+def fetch_parts(store: "ObjectStore", key: str, where: str) -> Iterator[tuple[Any, bytes]]:
+    """Yield the parts of an object in their order, each with what the store says of the object.
+
+    `where` names it in errors. Raises `StorageError`, also if not even `LEAST_BYTES` come within
+    the time limit of a request.
+    """
+    position, length = 0, FIRST_BYTES
+    with object_errors(where):
+        whole = obstore.get(store, key)
+        size = whole.meta["size"]
+        if size <= length and (content := _in_time(whole)) is not None:
+            yield whole.meta, content
+            return
+        while position < size:
+            begun = time.monotonic()
+            end = min(position + length, size)
+            part = obstore.get(store, key, options={"range": (position, end)})
+            content = _in_time(part, may_fail=length > LEAST_BYTES)
+            if content is None:
+                length //= 4
+                continue
+            yield part.meta, content
+            position += len(content)
+            if time.monotonic() - begun < QUICK_S:
+                length = min(2 * length, MOST_BYTES)
+
+
+def _in_time(answer: Any, *, may_fail: bool = True) -> bytes | None:
+    """Return what an answer brings; None if it does not come within the time limit."""
+    try:
+        return bytes(answer.bytes())
+    except (BaseError, OSError) as error:
+        if may_fail and is_timeout(error):
+            return None
+        raise
 
 
 class ObjectReader(io.RawIOBase):

@@ -23,9 +23,8 @@ from obstore.exceptions import AlreadyExistsError
 from fleet_slip.errors import StorageError
 from fleet_slip.files.folder import Content, StoredFile
 from fleet_slip.files.object_client import client, delta_options
-from fleet_slip.files.object_errors import object_errors
-from fleet_slip.files.object_files import LentFile, ObjectFilesystem, open_object
-from fleet_slip.files.object_transfer import fetch_parts
+from fleet_slip.files.object_files import LentFile, ObjectFilesystem, fetch_parts, open_object
+from fleet_slip.files.storage_errors import object_errors
 
 if TYPE_CHECKING:
     from obstore.store import ObjectStore

@@ -2,20 +2,62 @@
 
 import hashlib
 import re
+from collections.abc import Iterator
+from os import environ
 from pathlib import Path
 
 import obstore
 from fsspec.utils import glob_translate
 from obstore.exceptions import InvalidPathError
 
-from fleet_slip.errors import InputError
+from fleet_slip.errors import InputError, StorageError
+from fleet_slip.extras import needed
 from fleet_slip.files.folder import StoredFile
-from fleet_slip.files.object_client import client
-from fleet_slip.files.object_errors import NoSuchObjectError, object_errors
+from fleet_slip.files.object_client import CONNECT_TIMEOUT_S, TIMEOUT_S, client, profile_of
+from fleet_slip.files.object_files import fetch_parts
 from fleet_slip.files.object_folder import ObjectFolder
-from fleet_slip.files.object_names import list_any_names
-from fleet_slip.files.object_transfer import fetch_parts
-from fleet_slip.files.storage_errors import storage_errors
+from fleet_slip.files.storage_errors import (
+    NoSuchObjectError,
+    meaning_of,
+    object_errors,
+    storage_errors,
+)
+
+
+def list_any_names(bucket: ObjectFolder, path: str) -> Iterator[StoredFile]:
+    """Yield the objects below a folder of a bucket of S3. Raises `StorageError`."""
+    with needed("objects", "a listing of an object store"):
+        from botocore.config import Config  # noqa: PLC0415 - a fifth of a second
+        from botocore.exceptions import BotoCoreError, ClientError  # noqa: PLC0415
+        from botocore.session import Session  # noqa: PLC0415
+    profile = profile_of(bucket.bucket)
+    endpoint = environ.get("AWS_ENDPOINT_URL_S3") or environ.get("AWS_ENDPOINT_URL")
+    style = "path" if endpoint else "auto"
+    limits = {"connect_timeout": CONNECT_TIMEOUT_S, "read_timeout": TIMEOUT_S}
+    store = Session().create_client(
+        "s3",
+        region_name=(profile and profile.region) or environ.get("AWS_REGION"),
+        endpoint_url=(profile and profile.endpoint) or endpoint,
+        config=Config(s3={"addressing_style": style}, **limits),
+    )
+    name = bucket.bucket.removeprefix("s3://")
+    try:
+        pages = store.get_paginator("list_objects_v2").paginate(
+            Bucket=name, Prefix=f"{path}/" if path else ""
+        )
+        for page in pages:
+            for one in page.get("Contents", ()):
+                yield bucket.found(
+                    {
+                        "path": one["Key"],
+                        "size": one["Size"],
+                        "last_modified": one["LastModified"],
+                        "e_tag": one["ETag"],
+                    }
+                )
+    except (BotoCoreError, ClientError) as error:
+        raise StorageError(f"{bucket}/{path}: {meaning_of(error)}") from None
+
 
 ATTEMPTS = 3
 """So often an object is fetched that does not arrive as the store says that it is."""

@@ -15,7 +15,7 @@ The way of a row, in the order of its stations; each is one module, visited once
 9. `landing.landing` commits the files of a batch; `landing.ingest_job` goes through all batches.
 """
 
-from fleet_slip.ingest.drives.totals import IngestCounts
+from fleet_slip.ingest.drives.measured_drives import IngestCounts
 from fleet_slip.ingest.mapping.mapping import Mapping, load_mapping
 
 __all__ = [

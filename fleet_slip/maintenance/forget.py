@@ -30,15 +30,13 @@ from fleet_slip.maintenance.find_drives import (
     locate,
     recordings_of,
 )
-from fleet_slip.maintenance.forget_received import forget_received
 from fleet_slip.maintenance.marks import newest_versions
 from fleet_slip.maintenance.old_files import (
     quarantined_of,
     remove_old_files,
     remove_uncommitted_files,
 )
-from fleet_slip.maintenance.rewriting import Rewriting, rewrite
-from fleet_slip.maintenance.unused_names import drop_unused_names
+from fleet_slip.maintenance.rewriting import Rewriting, drop_unused_names, forget_received, rewrite
 from fleet_slip.models.manifest import TrainedOn
 from fleet_slip.models.trained_drives import hash_drives, read_trained_drives
 from fleet_slip.models.versions import Registry

@@ -33,14 +33,13 @@ from numpy.typing import NDArray
 from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.signals import COUNT_MAX
 from fleet_slip.delta import Snapshot, Table, TableFile
+from fleet_slip.delta.commits import NOTE, seal_note
 from fleet_slip.delta.schema import SCALE, TARGET, Evolution, compare_schemas, scales_of
-from fleet_slip.delta.sealing import NOTE, seal_note
 from fleet_slip.delta.table import ALL_STATISTICS
 from fleet_slip.errors import ConflictError, RefusedError, StorageError
 from fleet_slip.files.storage_errors import storage_errors
 from fleet_slip.grams.rows.landing_before_logs import land_ahead
-from fleet_slip.maintenance.rewriting import read_kept_drives
-from fleet_slip.maintenance.unused_names import drop_unused_names
+from fleet_slip.maintenance.rewriting import drop_unused_names, read_kept_drives
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.tables import Warehouse
 

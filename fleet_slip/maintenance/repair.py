@@ -23,8 +23,7 @@ from fleet_slip.errors import FleetSlipError, StorageError
 from fleet_slip.files.storage_errors import storage_errors
 from fleet_slip.grams.rows.gram_files import is_of_received
 from fleet_slip.grams.rows.gram_job import reconcile
-from fleet_slip.maintenance.verification import Verification
-from fleet_slip.maintenance.verify_files import read_whole
+from fleet_slip.maintenance.verify_files import Verification, read_whole
 from fleet_slip.resources import config_names
 from fleet_slip.simulation.campaign import Batch, Campaign, DriveSpec, load_campaign
 from fleet_slip.simulation.drives import simulate_batch

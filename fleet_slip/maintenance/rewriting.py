@@ -1,12 +1,12 @@
-"""Writes rows of the logs again, for compaction and forgetting, as they were written first.
+"""Writes rows again, to compact the logs or to forget drives.
 
-A file holds whole drives in the order of their names, each in the order of its ticks, and a
-dictionary holds only values that occur. So the bytes of a file follow from its drives alone: what
-was compacted or rewritten can be simulated again and is the same file.
+A file of the logs holds whole drives in the order of their names, each in the order of its ticks,
+and a dictionary holds only values that occur. So the bytes of a file follow from its drives alone:
+what was compacted or rewritten can be simulated again and is the same file.
 """
 
 import dataclasses
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,10 +16,14 @@ import pyarrow.compute as pc
 from deltalake.transaction import AddAction
 
 from fleet_slip.arrays import IntArray
-from fleet_slip.delta import Change, Snapshot, Table, TableFile, Unit
+from fleet_slip.delta import Change, Snapshot, Table, TableFile, Unit, retry_conflicts
 from fleet_slip.errors import FleetSlipError
+from fleet_slip.grams.rows.gram_files import read_rows, write_rows
+from fleet_slip.grams.rows.gram_rows import is_received
 from fleet_slip.grams.rows.landing_before_logs import land_ahead
+from fleet_slip.maintenance.old_files import rows_of
 from fleet_slip.progress import Progress, no_progress
+from fleet_slip.warehouse.audit import Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 
 
@@ -121,3 +125,55 @@ def _order(rows: pa.Table) -> IntArray:
     rank = np.argsort(np.argsort(np.array(ids.dictionary.to_pylist(), dtype=object)))
     drive = rank[ids.indices.to_numpy()] if len(rank) else np.empty(0, dtype=np.int64)
     return np.lexsort((rows["tick"].to_numpy(), drive))
+
+
+def drop_unused_names(warehouse: Warehouse) -> int:
+    """Write log files anew without the names that none of their rows has; return how many.
+
+    It reads the texts of every file. Raises `StorageError`, and `ConflictError` if other processes
+    keep changing the same files.
+    """
+
+    def attempt() -> int:
+        logs = warehouse.logs.snapshot()
+        files = [file for file in logs.files if warehouse.logs.has_unused_names(file.path)]
+        if files:
+            rewritings = [Rewriting("kept", [file]) for file in files]
+            rewrite(warehouse, logs, rewritings, note={"job": "names"}, data_change=False)
+        return len(files)
+
+    return retry_conflicts(attempt)
+
+
+def forget_received(warehouse: Warehouse, subject: Forgettable) -> int:
+    """Commit the Gram rows without those of a subject that came without a log.
+
+    Called after the fence, so that none lands any more. Returns how many rows of drives they were
+    of. Raises `StorageError`, or `ConflictError`.
+    """
+
+    def attempt() -> int:
+        snapshot = warehouse.grams.snapshot()
+        concerned: list[TableFile] = []
+        rows = 0
+        for file in snapshot.files:
+            told = warehouse.grams.read(file.path, ["file", "drive_id", "vehicle_id", "day", "n"])
+            mine = pc.and_(rows_of(told, subject), is_received(told))
+            if pc.any(mine).as_py():
+                concerned.append(file)
+                rows += pc.sum(told.filter(mine)["n"]).as_py()
+        if concerned:
+            add = write_rows(warehouse, _kept(warehouse, concerned, subject))
+            snapshot.commit_or_discard(Change(add=add, remove=concerned, note={"job": "forget"}))
+        return rows
+
+    return retry_conflicts(attempt)
+
+
+def _kept(
+    warehouse: Warehouse, files: Sequence[TableFile], subject: Forgettable
+) -> Iterator[pa.Table]:
+    """Yield the Gram rows of files without those of a subject, file by file."""
+    for file in files:
+        rows = read_rows(warehouse.grams, file)
+        yield rows.filter(pc.invert(pc.and_(rows_of(rows, subject), is_received(rows))))

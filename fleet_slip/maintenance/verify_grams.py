@@ -7,8 +7,8 @@ from functools import partial
 
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.delta import TableFile
-from fleet_slip.grams.received.car_keys import load_car_keys
-from fleet_slip.grams.received.received_check import check_signed_rows, find_unsound
+from fleet_slip.grams.received.received_table import check_signed_rows, find_unsound
+from fleet_slip.grams.received.signatures import load_car_keys
 from fleet_slip.grams.rows.check_grams import (
     DriveGrams,
     differing_drives,
@@ -19,7 +19,7 @@ from fleet_slip.grams.rows.check_grams import (
 )
 from fleet_slip.grams.rows.gram_files import is_of_received
 from fleet_slip.grams.rows.rollup import is_rollup_of, read_rollup
-from fleet_slip.maintenance.verification import Damage, Verification
+from fleet_slip.maintenance.verify_files import Damage, Verification
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.database import database_errors, open_database
 from fleet_slip.warehouse.tables import Warehouse

@@ -14,8 +14,12 @@ from fleet_slip.arrays import BoolArray
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.grams.cohorts.empty_cohort import empty_cohort_error
-from fleet_slip.grams.cohorts.gram_cohort import Cohort, load_cohort, require_training
+from fleet_slip.grams.cohorts.gram_cohort import (
+    Cohort,
+    empty_cohort_error,
+    load_cohort,
+    require_training,
+)
 from fleet_slip.grams.cohorts.reader import GramReader
 from fleet_slip.monitoring.moments import DriveBatches
 from fleet_slip.monitoring.peers import settle

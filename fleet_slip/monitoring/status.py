@@ -15,9 +15,8 @@ from fleet_slip.grams.rows.backlog import find_backlog
 from fleet_slip.models.versions import Registry
 from fleet_slip.monitoring.thresholds import StatusThresholds, thresholds
 from fleet_slip.resources import read_sql
-from fleet_slip.runs.anchors import find_missing_documents
 from fleet_slip.runs.history import lend_runs, run_source, state_of
-from fleet_slip.runs.records import find_changed_lines
+from fleet_slip.runs.records import find_changed_lines, find_missing_documents
 from fleet_slip.warehouse.database import database_errors, open_database
 from fleet_slip.warehouse.tables import Warehouse
 

@@ -24,8 +24,13 @@ import duckdb
 from fleet_slip.files.folder import Folder, StoredFile
 from fleet_slip.resources import read_sql
 from fleet_slip.runs.log import current_run_id
-from fleet_slip.runs.processes import process_began
-from fleet_slip.runs.records import FOLDER, RECORD_COLUMNS, is_intact, require_unchanged
+from fleet_slip.runs.records import (
+    FOLDER,
+    RECORD_COLUMNS,
+    is_intact,
+    process_began,
+    require_unchanged,
+)
 
 REMOVALS_AT_ONCE = 16
 RUNNING = "running"

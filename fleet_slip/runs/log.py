@@ -25,9 +25,7 @@ from typing import Any
 
 from fleet_slip.errors import HIDDEN, StorageError, hide_passwords
 from fleet_slip.files.folder import Folder
-from fleet_slip.runs.anchors import newest_documents
-from fleet_slip.runs.processes import process_began
-from fleet_slip.runs.records import ANCHORS, FOLDER, write_line
+from fleet_slip.runs.records import ANCHORS, FOLDER, newest_documents, process_began, write_line
 
 LOGGER = logging.getLogger("fleet_slip")
 INTERRUPTED = 130

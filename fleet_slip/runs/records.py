@@ -5,20 +5,48 @@
 The checksum is of the line's bytes before it. So a line that was changed is told from one that a
 full disk or a power cut tore, which lacks its end and is skipped, and from one of an earlier
 version, which has no checksum. Lines are no chain: processes add them at once, without a lock.
+
+Every run keeps the number and the checksum of the newest document of each folder, its anchors.
+Numbered documents tell a gap among them, but not that the last ones are gone: a version, a move of
+an alias, an entry of `forgotten/`. Whoever deletes one would have to rewrite the records of all
+runs since as well. Who can do that, and owns every copy of the history, leaves no trace:
+docs/security.md.
 """
 
+import contextlib
 import hashlib
 import json
 import re
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 from fleet_slip.errors import StorageError
+from fleet_slip.files.documents import DocumentFolder
 from fleet_slip.files.folder import Folder
+
+PROC = Path("/proc")
+START = 19
+"""Place of the start among the fields behind the name, proc(5): ticks since the machine booted."""
+
+
+def process_began(number: int) -> str | None:
+    """Return the boot and the start of a process of this machine; None if it is not known.
+
+    The system gives the number of a process that is gone to another one. Neither the boot nor the
+    ticks since it depend on the clock.
+    """
+    try:
+        boot = (PROC / "sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+        status = (PROC / str(number) / "stat").read_bytes()
+    except OSError:
+        return None
+    return f"{boot}/{status.rpartition(b')')[2].split()[START].decode()}"
+
 
 FOLDER = "runs"
 ANCHORS = "documents"
-"""Name of the anchors in the record of a run (`fleet_slip.runs.anchors`)."""
+"""Name of the anchors in the record of a run (`fleet_slip.runs.records`)."""
 
 RECORD_COLUMNS = {
     "run_id": "VARCHAR",
@@ -119,3 +147,83 @@ def _parsed(line: bytes) -> dict[str, Any] | None:
 
 def _checksum(body: bytes) -> bytes:
     return hashlib.sha256(body).hexdigest()[:_DIGITS].encode()
+
+
+Anchors = Mapping[str, tuple[int, str]]
+"""Number and SHA-256 of the newest document of each folder, by its path below the data root."""
+
+
+def newest_documents(root: Folder) -> dict[str, tuple[int, str]]:
+    """Return the anchors as they are now; nothing of a folder that cannot be read."""
+    found = {}
+    for path in _document_folders(root):
+        documents = _documents(root, path)
+        with contextlib.suppress(StorageError):
+            if numbers := documents.numbers():
+                found[path] = (numbers[-1], documents.read(numbers[-1]).sha256)
+    return found
+
+
+def find_missing_documents(root: Folder, since: str = "") -> Iterator[tuple[str, str]]:
+    """Yield the folders that have lost documents that a run had seen, and what is wrong.
+
+    `since` is the first month whose records are looked at, as YYYY-MM.
+    """
+    for path, (number, sha256) in sorted(_kept_anchors(root, since).items()):
+        documents = _documents(root, path)
+        newest = max(documents.numbers(), default=0)
+        if newest < number:
+            yield path, f"had {number} documents when a run ended, and has {newest} now"
+            continue
+        with contextlib.suppress(StorageError):  # told as a document
+            if documents.read(number).sha256 != sha256:
+                yield path, f"{number}.json is not the document that a run had seen"
+
+
+def _kept_anchors(root: Folder, since: str) -> dict[str, tuple[int, str]]:
+    folder = root / FOLDER
+    paths = [f.path for f in folder.files() if f.path.endswith(".jsonl") and f.path >= since]
+    kept: dict[str, tuple[int, str]] = {}
+    for content in folder.read_many(paths):
+        for line in (content or b"").splitlines():
+            for path, number, sha256 in _anchors_in(line):
+                if number >= kept.get(path, (0, ""))[0]:
+                    kept[path] = (number, sha256)
+    return kept
+
+
+def _anchors_in(line: bytes) -> Iterator[tuple[str, int, str]]:
+    """Yield the anchors of a record; none of a line that is torn, changed, or without them."""
+    if not is_intact(line):
+        return
+    try:
+        record: Any = json.loads(line)
+        found = record.get(ANCHORS) or {}
+        for path, (number, sha256) in found.items():
+            if _is_document_folder(str(path)):
+                yield str(path), int(number), str(sha256)
+    except (ValueError, TypeError, AttributeError, RecursionError):
+        return
+
+
+def _document_folders(root: Folder) -> list[str]:
+    models = [f"models/{name}" for name in (root / "models").names()]
+    return [
+        "forgotten",
+        *(f"{model}/{kind}" for model in models for kind in ("versions", "history")),
+    ]
+
+
+def _is_document_folder(path: str) -> bool:
+    parts = path.split("/")
+    if path == "forgotten":
+        return True
+    known = len(parts) == 3 and parts[0] == "models" and parts[2] in ("versions", "history")
+    return known and ".." not in parts
+
+
+def _documents(root: Folder, path: str) -> DocumentFolder:
+    folder = root
+    for part in path.split("/"):
+        folder = folder / part
+    return DocumentFolder(folder)

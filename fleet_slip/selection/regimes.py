@@ -11,8 +11,7 @@ from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.grams.cohorts.fold_assignment import assign_folds
-from fleet_slip.grams.cohorts.folding import FOLD_KEYS, PARTS, ROW_FOLDS, Folding
+from fleet_slip.grams.cohorts.folding import FOLD_KEYS, PARTS, ROW_FOLDS, Folding, assign_folds
 from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.grams.rows.drive_parts import UNKNOWN_PART
 from fleet_slip.regression.choice.winner import DEFAULT_WORTH, Worth

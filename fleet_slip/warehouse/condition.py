@@ -20,8 +20,7 @@ import duckdb
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError, StorageError, printable
 from fleet_slip.warehouse.database import duckdb_message, reading_files
-from fleet_slip.warehouse.lasting_sql import Tree, columns_of, problems
-from fleet_slip.warehouse.read_only_sql import LONGEST_QUERY
+from fleet_slip.warehouse.read_only_sql import LONGEST_QUERY, Tree, columns_of, problems
 
 LONGEST_S = 3600.0
 """No condition is asked for longer: what a manifest keeps is read by jobs that nobody watches."""

@@ -11,7 +11,7 @@ import pytest
 from deltalake import DeltaTable
 
 from fleet_slip.delta import Change, Unit
-from fleet_slip.delta.commit_check import find_commit_faults
+from fleet_slip.delta.log_check import find_commit_faults
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.maintenance.compaction import compact
 from fleet_slip.maintenance.verify import verify

@@ -8,7 +8,7 @@ import pyarrow.parquet
 import pytest
 
 from fleet_slip.delta import Encoding
-from fleet_slip.delta.preface import FIRST_BYTES, pack_preface, read_preface
+from fleet_slip.delta.encoding import FIRST_BYTES, pack_preface, read_preface
 from fleet_slip.errors import StorageError
 from fleet_slip.files.local_folder import LocalFolder
 

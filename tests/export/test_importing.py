@@ -18,8 +18,8 @@ from fleet_slip.cli.app import app
 from fleet_slip.errors import DataError, InputError, RefusedError, UsageError
 from fleet_slip.export.files import export_files
 from fleet_slip.files.documents import checksum
-from fleet_slip.maintenance.verification import Verification
-from fleet_slip.maintenance.verify_documents import verify_models
+from fleet_slip.maintenance.verify import verify_models
+from fleet_slip.maintenance.verify_files import Verification
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.signing import VERIFY_VARIABLE, make_keys
 from fleet_slip.models.trained_drives import read_trained_drives

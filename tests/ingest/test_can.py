@@ -22,8 +22,7 @@ from fleet_slip.ingest import load_mapping
 from fleet_slip.ingest.formats import can_frames
 from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.can_bus import CanBus, read_can_database
-from fleet_slip.ingest.formats.can_decoding import physical, raw_numbers
-from fleet_slip.ingest.formats.can_frames import CanFrames
+from fleet_slip.ingest.formats.can_frames import CanFrames, physical, raw_numbers
 from fleet_slip.ingest.formats.can_trace import open_can_trace
 from fleet_slip.ingest.logs.spool import Spool
 from tests.support.logs import without_names

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.compute import read_ahead as read_ahead_module
-from fleet_slip.compute.read_ahead import AHEAD, map_ahead, read_ahead
+from fleet_slip.compute import tasks as read_ahead_module
+from fleet_slip.compute.tasks import AHEAD, map_ahead, read_ahead
 from fleet_slip.errors import InputError
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.ingest.drives import drive_cutter, open_drives, stream

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from fleet_slip.arrays import FloatArray
 from fleet_slip.cli.app import app
 from fleet_slip.errors import AlarmError, UsageError
-from fleet_slip.ingest.drives import label_delay
+from fleet_slip.ingest.drives import relations
 from fleet_slip.ingest.drives.suspicion import RADIUS_M, WHEELS, find_refusals, find_suspicions
 from tests.support.reported import call
 from tests.support.textbook_car import Car, a_car
@@ -107,7 +107,7 @@ def test_a_car_that_lags_behind_its_inputs_is_not_taken_for_a_late_label(
     assert [s.value for s in find_suspicions(late) if s.kind == "delay"] == [
         pytest.approx(0.2, abs=0.02)
     ]
-    monkeypatch.setattr(label_delay, "LEAST_EXPLAINED", 1.0)  # without the witness
+    monkeypatch.setattr(relations, "LEAST_EXPLAINED", 1.0)  # without the witness
     assert "delay" in {kind for kind, _ in kinds(lazy)}
 
 

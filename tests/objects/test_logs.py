@@ -12,7 +12,7 @@ import pytest
 from fleet_slip.errors import InputError
 from fleet_slip.files.object_client import client
 from fleet_slip.files.object_inputs import copy_object, find_object
-from fleet_slip.ingest.logs.local_copies import local_copy
+from fleet_slip.ingest.logs.log_files import local_copy
 from tests.ingest.test_as_one import MAPPING as PLAIN
 from tests.ingest.test_as_one import write_parts
 from tests.ingest.test_folders import MAPPING, write_log

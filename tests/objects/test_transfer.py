@@ -9,7 +9,7 @@ import pytest
 from botocore.session import Session
 
 from fleet_slip.errors import InputError, StorageError
-from fleet_slip.files import object_client, object_inputs, object_transfer
+from fleet_slip.files import object_client, object_files, object_inputs
 from fleet_slip.files.object_client import client
 from fleet_slip.files.object_folder import ObjectFolder
 from fleet_slip.files.object_inputs import copy_object, find_below, find_object
@@ -30,8 +30,8 @@ def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
     """A client that gives a request a second, and asks for little at once."""
     monkeypatch.setattr(object_client, "TIMEOUT_S", 1)
     monkeypatch.setattr(object_client, "RETRIES", 0)
-    monkeypatch.setattr(object_transfer, "FIRST_BYTES", 2**16)
-    monkeypatch.setattr(object_transfer, "LEAST_BYTES", 2**12)
+    monkeypatch.setattr(object_files, "FIRST_BYTES", 2**16)
+    monkeypatch.setattr(object_files, "LEAST_BYTES", 2**12)
     forget_clients()
 
 

@@ -8,8 +8,8 @@ import pytest
 
 from fleet_slip.files.documents import DocumentFolder
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.runs.anchors import find_missing_documents, newest_documents
 from fleet_slip.runs.log import publishable, recording
+from fleet_slip.runs.records import find_missing_documents, newest_documents
 
 PLACES = ("forgotten", "models/beta/versions", "models/beta/history")
 

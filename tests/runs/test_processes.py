@@ -11,10 +11,9 @@ from typing import Any
 import pytest
 
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.runs import processes
+from fleet_slip.runs import records
 from fleet_slip.runs.history import runs_under_way, state_of
-from fleet_slip.runs.processes import process_began
-from fleet_slip.runs.records import write_line
+from fleet_slip.runs.records import process_began, write_line
 
 
 def run_of(**changes: Any) -> dict[str, Any]:
@@ -52,7 +51,7 @@ def test_where_the_system_does_not_tell_a_run_counts_as_running(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     recorded = run_of()
-    monkeypatch.setattr(processes, "PROC", tmp_path)
+    monkeypatch.setattr(records, "PROC", tmp_path)
     assert process_began(os.getpid()) is None
     assert state_of(recorded) == "running"
 

@@ -8,12 +8,17 @@ import pytest
 import fleet_slip
 from fleet_slip.errors import StorageError
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.maintenance.verification import Verification
-from fleet_slip.maintenance.verify_documents import verify_documents
-from fleet_slip.runs.anchors import find_missing_documents
+from fleet_slip.maintenance.verify import verify_documents
+from fleet_slip.maintenance.verify_files import Verification
 from fleet_slip.runs.history import runs_under_way
 from fleet_slip.runs.log import recording
-from fleet_slip.runs.records import changed_lines, find_changed_lines, is_intact, write_line
+from fleet_slip.runs.records import (
+    changed_lines,
+    find_changed_lines,
+    find_missing_documents,
+    is_intact,
+    write_line,
+)
 
 
 @pytest.fixture

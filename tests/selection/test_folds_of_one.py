@@ -7,9 +7,8 @@ from sklearn.model_selection import LeaveOneGroupOut, cross_val_predict
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError
-from fleet_slip.grams.cohorts import fold_assignment
-from fleet_slip.grams.cohorts.fold_assignment import assign_folds
-from fleet_slip.grams.cohorts.folding import EACH, FoldCount, Folding
+from fleet_slip.grams.cohorts import folding
+from fleet_slip.grams.cohorts.folding import EACH, FoldCount, Folding, assign_folds
 from fleet_slip.selection.model_list import CandidateModel
 from fleet_slip.selection.select_models import select
 from tests.support.cohorts import INPUTS, LABEL, cohort_of, driven
@@ -46,6 +45,6 @@ def test_five_drives_are_five_folds(count: FoldCount) -> None:
 
 
 def test_more_folds_than_can_be_fitted_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fold_assignment, "MOST_FOLDS", 4)
+    monkeypatch.setattr(folding, "MOST_FOLDS", 4)
     with pytest.raises(DataError, match="the cohort has 5, and at most 4 can be folds"):
         assign_folds(list("abcde"), "drive", EACH)

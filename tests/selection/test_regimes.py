@@ -7,8 +7,7 @@ import pytest
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError
-from fleet_slip.grams.cohorts.fold_assignment import assign_folds
-from fleet_slip.grams.cohorts.folding import Folding
+from fleet_slip.grams.cohorts.folding import Folding, assign_folds
 from fleet_slip.regression.choice.winner import Worth
 from fleet_slip.selection.regimes import (
     ROWS_PER_COEFFICIENT,

@@ -8,8 +8,7 @@ import pytest
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.grams.cohorts.fold_assignment import assign_folds
-from fleet_slip.grams.cohorts.folding import Folding
+from fleet_slip.grams.cohorts.folding import Folding, assign_folds
 from fleet_slip.grams.cohorts.training_folds import drive_folds
 from fleet_slip.regression.choice.nested_choice import CROSS_VALIDATION, Rule, select_nested
 from fleet_slip.regression.inference.drive_moments import ClusterUnit

@@ -5,8 +5,7 @@ import pytest
 
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.grams.cohorts.fold_assignment import assign_folds
-from fleet_slip.grams.cohorts.folding import Folding
+from fleet_slip.grams.cohorts.folding import Folding, assign_folds
 from fleet_slip.regression.shrinkage.pace import ESTIMATORS
 from fleet_slip.regression.validation.crossval import cross_validate_inputs
 from fleet_slip.selection.shrinkage import PENALTIES, Shrunk, compare_shrinkage

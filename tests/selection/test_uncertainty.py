@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from fleet_slip.errors import QuestionError
-from fleet_slip.grams.cohorts.fold_assignment import assign_folds
-from fleet_slip.grams.cohorts.folding import Folding
+from fleet_slip.grams.cohorts.folding import Folding, assign_folds
 from fleet_slip.regression.inference.drive_moments import ClusterUnit
 from fleet_slip.regression.validation.crossval import CrossValidation, cross_validate_inputs
 from fleet_slip.selection.uncertainty import estimate_uncertainty

@@ -46,8 +46,7 @@ def mapping(
     from fleet_slip.ingest.drafting.profile import FileFormats, profile_file  # noqa: PLC0415
     from fleet_slip.ingest.formats.can_bus import CanBus, read_can_database  # noqa: PLC0415 - takes a while
     from fleet_slip.ingest.formats.duckdb_table import DuckdbRows  # noqa: PLC0415
-    from fleet_slip.ingest.logs.local_copies import local_copy  # noqa: PLC0415
-    from fleet_slip.ingest.logs.log_files import find_logs  # noqa: PLC0415
+    from fleet_slip.ingest.logs.log_files import find_logs, local_copy  # noqa: PLC0415
 
     if output is not None and output.exists():
         raise UsageError(f"{output}: it exists. Give another name, or remove it.")

@@ -4,8 +4,7 @@ from pathlib import Path
 
 from fleet_slip.cli.output import print_json, print_table, print_text, say
 from fleet_slip.errors import AlarmError
-from fleet_slip.ingest.drafting.preview import Preview
-from fleet_slip.ingest.drafting.preview_chart import draw_preview
+from fleet_slip.ingest.drafting.preview import Preview, draw_preview
 from fleet_slip.words import number_of
 
 

@@ -18,7 +18,7 @@ from fleet_slip.errors import DamageError, PendingError
 from fleet_slip.maintenance.compaction import TARGET_ROWS
 from fleet_slip.maintenance.forget import ForgetReport
 from fleet_slip.maintenance.vacuum import RETENTION_HOURS, VacuumReport
-from fleet_slip.maintenance.verification import Damage, Verification
+from fleet_slip.maintenance.verify_files import Damage, Verification
 from fleet_slip.runs.log import recording
 from fleet_slip.words import number_of
 

@@ -10,7 +10,7 @@ from fleet_slip.comparison.rivals.inputs import Inputs
 from fleet_slip.comparison.rivals.learner import Names
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohorts.expansion import CarCounts
-from fleet_slip.grams.cohorts.fold_assignment import assign_folds
+from fleet_slip.grams.cohorts.folding import assign_folds
 from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.grams.cohorts.reader import cohort_files
 from fleet_slip.grams.rows.drive_rows import read_drives

@@ -10,10 +10,9 @@ import pyarrow as pa
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.grams.cohorts.empty_cohort import empty_cohort
 from fleet_slip.grams.cohorts.expansion import expansion_of
 from fleet_slip.grams.cohorts.folding import EACH, Folding
-from fleet_slip.grams.cohorts.gram_cohort import require_training
+from fleet_slip.grams.cohorts.gram_cohort import empty_cohort, require_training
 from fleet_slip.grams.cohorts.members import Hashed, Members, add_hashed
 from fleet_slip.grams.cohorts.reader import GramReader, open_grams
 from fleet_slip.grams.rows.gram_rows import gram_table

@@ -17,16 +17,16 @@ from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohorts.cells import Cells, dealt_folds
 from fleet_slip.grams.cohorts.cohort_origin import CohortOrigin
-from fleet_slip.grams.cohorts.empty_cohort import empty_cohort
 from fleet_slip.grams.cohorts.expansion import Expansion, expansion_of
-from fleet_slip.grams.cohorts.fold_assignment import assign_folds, require_divided
 from fleet_slip.grams.cohorts.folding import (
     FOLD_KEYS,
     FoldCount,
     Folding,
     FoldKey,
+    assign_folds,
+    require_divided,
 )
-from fleet_slip.grams.cohorts.gram_cohort import require_training
+from fleet_slip.grams.cohorts.gram_cohort import empty_cohort, require_training
 from fleet_slip.grams.cohorts.members import Hashed, Members, add_hashed, received_among
 from fleet_slip.grams.cohorts.reader import GramReader, OpenedGrams, open_grams
 from fleet_slip.grams.rows.gram_rows import by_signals, gram_table

@@ -1,11 +1,15 @@
-"""How a cohort is divided into folds, and the columns that folds are made of."""
+"""How a cohort is divided into folds, and which fold each of its Gram rows falls into."""
 
-from typing import Annotated, Literal, TypeAlias
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import Field, model_validator
 
+from fleet_slip.catalogue.features import features
 from fleet_slip.config import Config
-from fleet_slip.errors import UsageError
+from fleet_slip.errors import DataError, QuestionError, UsageError
+from fleet_slip.regression.validation.folds import FoldAssignment, by_band, by_hash, by_value
+from fleet_slip.warehouse.minimum_cohort import tells_single_cars
 
 FoldKey = Literal["drive", "vehicle", "track", "day", "mass", "adhesion", "speed", "part", "row"]
 
@@ -65,3 +69,60 @@ def make_folding(by: FoldKey, count: int | str | None, usual: FoldCount) -> Fold
     except ValueError:
         each = "" if by == ROW_FOLDS else f", or each: every {by} a fold of its own"
         raise UsageError(f"folds = {count}: choose a number from 2 to 1000{each}.") from None
+
+
+MOST_FOLDS = 10_000
+"""Each fold is an exact fit of every model."""
+
+
+def require_divided(feature_set: str, by: str, count: FoldCount) -> None:
+    """Raise `QuestionError` if a feature set has not divided the rows of drives as folds need."""
+    if by == ROW_FOLDS:
+        _require_row_folds(feature_set, count)
+    one = features().feature_set(feature_set)
+    if by == PARTS and not (one.regimes or one.block_s):
+        known = ", ".join(n for n, s in features().sets.items() if s.regimes or s.block_s)
+        raise QuestionError(
+            f"the feature set {feature_set} does not divide the rows of a drive. Feature sets with "
+            f"bands or blocks: {known}."
+        )
+
+
+def _require_row_folds(feature_set: str, count: FoldCount) -> None:
+    made = features().feature_set(feature_set).row_folds
+    if made is None:
+        known = ", ".join(name for name, one in features().sets.items() if one.row_folds)
+        raise QuestionError(
+            f"the Gram rows of the feature set {feature_set} are of whole drives: folds of rows "
+            f"are made when the logs are read. Feature sets that make them: {known}."
+        )
+    if count == EACH or count > made:
+        raise QuestionError(
+            f"the feature set {feature_set} made {made} folds of rows; choose no more."
+        )
+
+
+def assign_folds(values: Sequence[Any], by: str, count: FoldCount) -> FoldAssignment:
+    """Assign Gram rows to folds by the values of a fold key.
+
+    Folds are not called after drives and cars where a minimum cohort is asked for. Raises
+    `DataError` if there are not two folds, or too many.
+    """
+    of_their_own = len({*values}) <= (MOST_FOLDS if count == EACH else count)
+    if by in ("drive", "vehicle") and of_their_own and not tells_single_cars():
+        place = {name: i for i, name in enumerate(sorted({*values} - {None}), 1)}
+        values = [place.get(name) for name in values]
+    if count == EACH:
+        if (number := len(set(values))) > MOST_FOLDS:
+            raise DataError(
+                f"the cohort has {number:,}, and at most {MOST_FOLDS:,} can be folds of their own. "
+                f"Fold by another key than {by}, or say how many folds."
+            )
+        return by_value(values)
+    if by == BANDS:
+        return by_band(values, count)
+    if by == ROW_FOLDS:
+        return by_value([(int(value) - 1) % count + 1 for value in values])
+    if len(set(values)) > count:
+        return by_hash([str(value) for value in values], count)
+    return by_value(values)

@@ -10,20 +10,21 @@ import pyarrow.compute as pc
 
 from fleet_slip.arrays import BoolArray, IntArray
 from fleet_slip.catalogue.feature_sets import PLAIN
+from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import SCENARIO, TRAINING_DRIVES
-from fleet_slip.errors import RefusedError
+from fleet_slip.errors import DataError, RefusedError
 from fleet_slip.grams.cohorts.cohort_origin import CohortOrigin
-from fleet_slip.grams.cohorts.empty_cohort import empty_cohort, empty_cohort_error
 from fleet_slip.grams.cohorts.expansion import expansion_of
-from fleet_slip.grams.cohorts.fold_assignment import assign_folds, require_divided
 from fleet_slip.grams.cohorts.folding import (
     FOLD_KEYS,
     FoldCount,
     FoldKey,
+    assign_folds,
+    require_divided,
 )
 from fleet_slip.grams.cohorts.members import Hashed, Members, received_among
-from fleet_slip.grams.cohorts.reader import GramReader, open_grams
+from fleet_slip.grams.cohorts.reader import GramReader, OpenedGrams, open_grams
 from fleet_slip.grams.rows.rollup import hash_numbers
 from fleet_slip.regression.exact.gram_table import GramTable
 from fleet_slip.regression.inference.drive_moments import serving_drives
@@ -33,6 +34,7 @@ from fleet_slip.regression.validation.folds import (
 from fleet_slip.warehouse.condition import Condition, asking, parse_condition
 from fleet_slip.warehouse.minimum_cohort import has_enough, require_vehicles
 from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.words import number_of
 
 
 @dataclass(frozen=True)
@@ -194,3 +196,43 @@ def require_training(sources: Iterable[str], condition: Condition) -> None:
             f"the cohort {condition.text!r} has drives of evaluation scenarios, which no model "
             f"may be trained on. Add to the condition: AND {TRAINING_DRIVES}"
         )
+
+
+def empty_cohort(
+    source: Warehouse | GramReader, condition: Condition, feature_set: str
+) -> DataError:
+    """Return the error that tells why a condition leaves no drive, from all Gram rows."""
+    with open_grams(source, feature_set, condition) as opened:  # all of them: it says what there is
+        return empty_cohort_error(opened, condition)
+
+
+def empty_cohort_error(opened: OpenedGrams, condition: Condition) -> DataError:
+    """Return the error that tells why a condition leaves no drive."""
+    if revoked := opened.revoked(condition):
+        drives = number_of(sum(revoked.values()), "drive")
+        return DataError(
+            f"all {drives} of the cohort {condition.text!r} are left out: they are of "
+            f"{number_of(len(revoked), 'car')} a key of which was revoked. Choose another cohort."
+        )
+    if left_out := opened.count_left_out(condition):
+        return DataError(
+            f"all {number_of(left_out, 'drive')} of the cohort {condition.text!r} are of cars that "
+            "sent Gram rows of the logged signals and no log. Select with features = signals."
+        )
+    change_s = features().feature_set(features().name_of(opened.identity)).change_s
+    if change_s:
+        return DataError(
+            f"no drive of the cohort {condition.text!r} has fixes of a satellite receiver that are "
+            f"{change_s} s apart: nothing tells the course. Choose another cohort, or map the "
+            "course and ingest again: docs/course.md."
+        )
+    examples = opened.database.execute(
+        "SELECT string_agg(DISTINCT source, ', ' ORDER BY source), "
+        "string_agg(DISTINCT campaign, ', ' ORDER BY campaign) FROM grams"
+    ).fetchone()
+    sources, campaigns = examples or ("", "")
+    return DataError(
+        f"no drive satisfies the cohort condition {condition.text!r}. The warehouse has sources "
+        f"{sources} and campaigns {campaigns}. See the columns with: "
+        'fleet-slip sql "DESCRIBE drives"'
+    )

@@ -20,7 +20,7 @@ from fleet_slip.grams.cohorts.cells import NO_CELLS, Cells, RollupReader
 from fleet_slip.grams.cohorts.cohort_origin import CohortOrigin
 from fleet_slip.grams.cohorts.folding import Folding
 from fleet_slip.grams.cohorts.outweighing import Outweighing, find_outweighing
-from fleet_slip.grams.received.car_keys import load_car_keys
+from fleet_slip.grams.received.signatures import load_car_keys
 from fleet_slip.grams.rows.backlog import find_backlog
 from fleet_slip.grams.rows.same_drives import has_received
 from fleet_slip.regression.exact.gram import packed_size

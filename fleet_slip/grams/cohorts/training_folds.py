@@ -9,8 +9,7 @@ from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError
-from fleet_slip.grams.cohorts.fold_assignment import assign_folds
-from fleet_slip.grams.cohorts.folding import FOLD_KEYS, PARTS, ROW_FOLDS, Folding
+from fleet_slip.grams.cohorts.folding import FOLD_KEYS, PARTS, ROW_FOLDS, Folding, assign_folds
 from fleet_slip.grams.cohorts.gram_cohort import Cohort, Served
 from fleet_slip.regression.choice.nested_choice import TrainingFolds
 from fleet_slip.regression.inference.drive_moments import ClusterUnit, DriveMoments

@@ -4,7 +4,7 @@
     vehicles   the hashes of each cell's cars, each once, 8 bytes each
     drives     the hashes of each cell's drives
 
-These are the parts of what stands before the rows (`fleet_slip.delta.preface`). So a rollup lands,
+These are the parts of what stands before the rows (`fleet_slip.delta.encoding`). So a rollup lands,
 moves and goes with its rows, and cannot be of others. A file has none where it would save little,
 where a sum has more than 64 bits, and where it takes other files to tell the trips of its drives.
 """

@@ -30,7 +30,7 @@ from fleet_slip.ingest.drives.suspicion import (
     speed_ratio,
 )
 from fleet_slip.ingest.mapping.mapping import Mapping
-from fleet_slip.ingest.mapping.satellite_columns import COURSE, SPEED
+from fleet_slip.ingest.mapping.signal_column import COURSE, SPEED
 from fleet_slip.words import shown
 
 _TIME_NAMES = ("time", "timestamp", "zeit", "t", "sec", "seconds")

@@ -5,7 +5,7 @@ from typing import Any
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.ingest.drafting.draft import Draft, signal_keys
-from fleet_slip.ingest.mapping.satellite_columns import COURSE, SPEED
+from fleet_slip.ingest.mapping.signal_column import COURSE, SPEED
 from fleet_slip.words import shown
 
 _HEAD = """\

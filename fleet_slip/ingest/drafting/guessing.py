@@ -12,7 +12,7 @@ import numpy as np
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.ingest.drafting.profile import Profile
 from fleet_slip.ingest.drives.suspicion import RADIUS_M
-from fleet_slip.ingest.mapping.satellite_columns import COURSE, SPEED, Component
+from fleet_slip.ingest.mapping.signal_column import COURSE, SPEED, Component
 from fleet_slip.ingest.mapping.units import conversion_factor
 
 NAMES: dict[str, tuple[str, ...]] = {

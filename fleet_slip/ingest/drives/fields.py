@@ -18,8 +18,7 @@ from fleet_slip.errors import InputError
 from fleet_slip.ingest.drives.time_bases import DISORDER, HELD
 from fleet_slip.ingest.formats.csv_batches import EXTRA_FIELDS
 from fleet_slip.ingest.mapping.mapping import FromColumn, Mapping, is_number
-from fleet_slip.ingest.mapping.satellite_columns import count_range
-from fleet_slip.ingest.mapping.signal_column import SignalColumn
+from fleet_slip.ingest.mapping.signal_column import SignalColumn, count_range
 from fleet_slip.ingest.mapping.units import conversion_factor
 
 RAW = "raw "

@@ -1,7 +1,8 @@
-"""Makes drives of checked rows: their names, their ticks and counts, their Arrow table."""
+"""Makes drives of checked rows: their names and trips, their ticks and counts; and counts them."""
 
+from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, date, datetime, timedelta
 from functools import partial
 from typing import Any
@@ -14,19 +15,22 @@ from numpy.typing import NDArray
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.counts import round_chunks
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalogue.sources import LONGEST_PAUSE_S
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.drives.open_drives import DriveRows
 from fleet_slip.ingest.drives.resampling import (
     SNAP_TOLERANCE_S,
     STEP_S,
+    Antenna,
     Method,
     Resampler,
     build_resampler,
     choose_method,
+    course_and_speed,
+    fixes_on_ticks,
 )
-from fleet_slip.ingest.drives.satellite_fixes import Antenna, course_and_speed, fixes_on_ticks
 from fleet_slip.ingest.mapping.mapping import FromColumn, Mapping
-from fleet_slip.ingest.mapping.satellite_columns import COURSE, SPEED
+from fleet_slip.ingest.mapping.signal_column import COURSE, SPEED
 
 SOURCE = "measured"
 _SECONDS_PER_DAY = 86_400
@@ -224,3 +228,67 @@ def _facts_of(mapping: Mapping, known: dict[str, Any]) -> dict[str, Any]:
     if told.get("vehicle_model", "") is None:
         raise InputError(f"nobody says the vehicle_model of the car {vehicle!r}. Add it.")
     return told
+
+
+class Trips:
+    """Names each drive's trip: the first of the drives of one file that follow each other."""
+
+    def __init__(self) -> None:
+        """Begin without drives."""
+        self._last: dict[int, tuple[str, float]] = {}
+
+    def name(self, drive_id: str, group: int, start_s: float, end_s: float) -> str:
+        """Return the trip of the next drive of a group of rows, in the order of the file.
+
+        A clock that goes back begins another trip.
+        """
+        trip_id, ended_s = self._last.get(group, (drive_id, start_s))
+        if not 0 <= start_s - ended_s <= LONGEST_PAUSE_S:
+            trip_id = drive_id
+        self._last[group] = trip_id, end_s
+        return trip_id
+
+
+@dataclass(frozen=True)
+class IngestCounts:
+    """What became of a file's rows.
+
+    `rows_read == rows_left_out + rows_kept + sum(quarantined.values())`.
+    """
+
+    rows_read: int
+    rows_left_out: int
+    """Rows that do not meet the mapping's conditions."""
+    rows_kept: int
+    quarantined: dict[str, int]
+    """Rejected rows by reason."""
+    drives: int
+    drives_resampled: int
+    ticks: int
+    """Rows of the result; equal to `rows_kept` where nothing was resampled."""
+
+
+@dataclass
+class Totals:
+    """What became of a file's rows so far."""
+
+    rows_kept: int = 0
+    quarantined: Counter[str] = field(default_factory=Counter)
+    refused: Counter[tuple[str, str]] = field(default_factory=Counter)
+    """Rejected rows by what is wrong, where that is a signal, and by the reason."""
+    drives: int = 0
+    drives_resampled: int = 0
+    ticks: int = 0
+    samples: Counter[str] = field(default_factory=Counter)
+    """Values of each signal in the file's rows; `values` are those on ticks."""
+    values: Counter[str] = field(default_factory=Counter)
+
+    def add(self, rows: DriveRows, drive: MeasuredDrive) -> None:
+        """Count a drive that was made of rows."""
+        self.rows_kept += rows.height
+        self.drives += 1
+        self.drives_resampled += drive.method != "snap"
+        self.ticks += drive.ticks.size
+        for name, counts in drive.counts.items():
+            self.samples[name] += rows.number_of(name)
+            self.values[name] += len(counts) - counts.null_count

@@ -1,8 +1,11 @@
-"""How signals of a drive go with one another: slopes, correlations and fits."""
+"""How signals of a drive go with one another: slopes, fits, the course, a label's delay."""
+
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from fleet_slip.arrays import BoolArray, FloatArray
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 
 FEWEST_TICKS = 200
 MOVING_MPS = 2.0
@@ -41,3 +44,112 @@ def fit(y: FloatArray, inputs: FloatArray, rows: BoolArray) -> tuple[FloatArray,
     coefficients = np.linalg.lstsq(x @ x.T, x @ centred, rcond=1e-12)[0]
     left = centred - coefficients @ x
     return coefficients, 1 - float(left @ left) / total
+
+
+SECOND = round(1 / float(SAMPLE_TIME_S))
+LEAST_CORRELATION = 0.6
+SOUND = (0.8, 1.25)
+
+
+def course_fault(signals: Mapping[str, FloatArray]) -> tuple[str, str, str] | None:
+    """Return what kind of fault the course of a drive seems to have, its figure and a remedy."""
+    if not {"course", "yaw_rate"} <= set(signals):
+        return None
+    course, turned = signals["course"], np.cumsum(signals["yaw_rate"]) * float(SAMPLE_TIME_S)
+    change = course[SECOND:] - course[:-SECOND]
+    change = (change + np.pi) % (2 * np.pi) - np.pi
+    slope, correlation = slope_of(
+        change, turned[SECOND:] - turned[:-SECOND], np.ones(change.size, dtype=np.bool_)
+    )
+    if (slope, correlation) == (1.0, 0.0):  # too little to tell
+        return None
+    figure = f"over a second it changes by {slope:+.2f} times what the yaw rate adds up to"
+    if correlation < -LEAST_CORRELATION:
+        return "sign", figure, "Turn clockwise_from_north round, or swap north and east."
+    if correlation < LEAST_CORRELATION:
+        figure = f"over a second its change hardly goes with the yaw rate ({correlation:+.2f})"
+        return "values", figure, "Is it a course over ground, and of this car?"
+    if not SOUND[0] <= slope <= SOUND[1]:
+        return "unit", figure, "Check its unit, and that of the yaw rate."
+    return None
+
+
+MOST_TICKS = 20_000
+FEWEST_DELAY_TICKS = 1000
+MOST_LAG = 50
+"""A label is looked for this many ticks before and after its inputs."""
+HALF_CHANGE = 25
+"""The lateral velocity changes over twice so many ticks: the label's noise matters less."""
+EACH = 5
+"""Of what is that smooth, each fifth tick tells as much."""
+
+LEAST_EXPLAINED = 0.6
+"""Where accelerations explain less of the change of lateral velocity, they are no witness."""
+LEAST_KINEMATIC_LAG, LEAST_KINEMATIC_GAIN = 5, 0.1
+"""Simulated drives without a delay reach 11 ticks and .04, one of these at a time."""
+LEAST_LAG, LEAST_GAIN = 3, 0.3
+"""A delay explains away this part of a label's variance: a car's own lag of 0.1 s does 0.23."""
+
+
+def find_delay(
+    angle_rad: FloatArray,
+    ay_mps2: FloatArray,
+    yaw_rate_rad_s: FloatArray,
+    speed_mps: FloatArray,
+    inputs: Sequence[FloatArray],
+) -> tuple[float, float] | None:
+    """Return the delay of a side-slip angle in s, and what part of its variance it explains away.
+
+    All are of one shape, (n_ticks,). The lateral velocity changes with ay - yaw_rate * speed, at
+    the same moment whatever car it is (Rajamani, Vehicle Dynamics and Control, eq. 2.9): where that
+    can be seen, it settles the matter. Else the delay is that at which the inputs explain the angle
+    best; a car that lags behind its inputs has one, too, so that it must be large. None if there is
+    none to be seen.
+    """
+    rows = moving(speed_mps)
+    if rows.sum() < FEWEST_DELAY_TICKS:
+        return None
+    n = min(angle_rad.size, MOST_TICKS)
+    angle, speed, rows = angle_rad[:n], speed_mps[:n], np.broadcast_to(rows, angle_rad.shape)[:n]
+    turning = yaw_rate_rad_s[:n] * speed
+    moves = np.array([_mean(ay_mps2[:n]), _mean(turning), _mean(speed)])
+    smooth = rows & (np.arange(n) % EACH == 0)
+    left = _unexplained(_change(speed * np.tan(angle)), moves, smooth)
+    if 1 - min(left.values()) > LEAST_EXPLAINED:
+        return _judged(left, LEAST_KINEMATIC_LAG, LEAST_KINEMATIC_GAIN)
+    left = _unexplained(angle, np.array([*(one[:n] for one in inputs), speed]), rows)
+    return None if min(left.values()) > 1 / 2 else _judged(left, LEAST_LAG, LEAST_GAIN)
+
+
+def _unexplained(label: FloatArray, inputs: FloatArray, rows: BoolArray) -> dict[int, float]:
+    """Return what part of a label's variance its inputs leave, by how many ticks it is late."""
+    n, m = label.size, MOST_LAG
+    within = slice(m, n - m)
+    return {
+        lag: 1 - fit(label[m + lag : n - m + lag], inputs[:, within], rows[within])[1]
+        for lag in range(-m, m + 1)
+    }
+
+
+def _judged(
+    left: dict[int, float], least_lag: int, least_gain: float
+) -> tuple[float, float] | None:
+    best = min(left, key=lambda lag: left[lag])
+    gain = 1 - left[best] / left[0] if left[0] > 0 else 0.0
+    if not least_lag <= abs(best) < MOST_LAG or gain < least_gain:
+        return None
+    return best * float(SAMPLE_TIME_S), gain
+
+
+def _change(velocity_mps: FloatArray) -> FloatArray:
+    """Return the mean rate of change around each tick, NaN at both ends."""
+    change = np.full(velocity_mps.size, np.nan)
+    width = 2 * HALF_CHANGE
+    change[HALF_CHANGE:-HALF_CHANGE] = velocity_mps[width:] - velocity_mps[:-width]
+    return change / (width * float(SAMPLE_TIME_S))
+
+
+def _mean(values: FloatArray) -> FloatArray:
+    """Return the mean over the same ticks."""
+    width = 2 * HALF_CHANGE
+    return np.convolve(values, np.ones(width) / width, "same")

@@ -14,7 +14,7 @@ import polars as pl
 import pyarrow as pa
 
 from fleet_slip.canonical import canonical_ascii
-from fleet_slip.compute.read_ahead import read_ahead
+from fleet_slip.compute.tasks import read_ahead
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.drives.checking import (
     Block,
@@ -29,12 +29,17 @@ from fleet_slip.ingest.drives.drive_cutter import (
     sample_intervals_s,
 )
 from fleet_slip.ingest.drives.look_alikes import find_look_alikes
-from fleet_slip.ingest.drives.measured_drives import MeasuredDrive, drive_id, to_ticks
+from fleet_slip.ingest.drives.measured_drives import (
+    IngestCounts,
+    MeasuredDrive,
+    Totals,
+    Trips,
+    drive_id,
+    to_ticks,
+)
 from fleet_slip.ingest.drives.open_drives import MAX_OPEN_ROWS, DriveRows, OpenDrives
 from fleet_slip.ingest.drives.resampling import STEP_S, TIME_EPSILON_S
 from fleet_slip.ingest.drives.suspicion import Suspicion, find_refusals
-from fleet_slip.ingest.drives.totals import IngestCounts, Totals
-from fleet_slip.ingest.drives.trips import Trips
 from fleet_slip.ingest.formats.parquet_batches import partition_keys
 from fleet_slip.ingest.formats.reading import log_digest, require_unchanged_log
 from fleet_slip.ingest.logs.log_files import parts_of

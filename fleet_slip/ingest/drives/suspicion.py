@@ -14,9 +14,14 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.catalogue.turning import WITNESSES
-from fleet_slip.ingest.drives.course_suspicion import course_fault
-from fleet_slip.ingest.drives.label_delay import find_delay
-from fleet_slip.ingest.drives.relations import FEWEST_TICKS, fit, moving, slope_of
+from fleet_slip.ingest.drives.relations import (
+    FEWEST_TICKS,
+    course_fault,
+    find_delay,
+    fit,
+    moving,
+    slope_of,
+)
 
 Signals: TypeAlias = Mapping[str, FloatArray]
 """Values in SI units on consecutive ticks, NaN where there is none; all of one shape (n_ticks,)."""

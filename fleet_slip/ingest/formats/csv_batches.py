@@ -14,12 +14,11 @@ import pyarrow as pa
 from pydantic import field_validator, model_validator
 
 from fleet_slip.arrays import is_finite
-from fleet_slip.compute.read_ahead import map_ahead
+from fleet_slip.compute.tasks import map_ahead
 from fleet_slip.config import Config
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.budget import Budget
-from fleet_slip.ingest.formats.column_names import require_columns
-from fleet_slip.ingest.formats.source import Channel
+from fleet_slip.ingest.formats.source import Channel, require_columns
 from fleet_slip.words import shown
 
 BLOCK_BYTES = 2**22

@@ -17,9 +17,8 @@ from pydantic import model_validator
 from fleet_slip.config import Config, Name
 from fleet_slip.errors import InputError, QuestionError
 from fleet_slip.ingest.formats.budget import Budget
-from fleet_slip.ingest.formats.column_names import require_columns
 from fleet_slip.ingest.formats.parquet_batches import BATCH_ROWS, plain_column
-from fleet_slip.ingest.formats.source import Channel
+from fleet_slip.ingest.formats.source import Channel, require_columns
 from fleet_slip.limits import memory_bytes
 from fleet_slip.warehouse.read_only_sql import one_query
 from fleet_slip.words import shown

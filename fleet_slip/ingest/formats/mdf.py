@@ -15,9 +15,15 @@ import polars as pl
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.budget import Budget
-from fleet_slip.ingest.formats.column_names import describe_missing
 from fleet_slip.ingest.formats.mdf_links import require_tree
-from fleet_slip.ingest.formats.source import OWN_TIME, Base, Channel, as_column, reading_with
+from fleet_slip.ingest.formats.source import (
+    OWN_TIME,
+    Base,
+    Channel,
+    as_column,
+    describe_missing,
+    reading_with,
+)
 from fleet_slip.words import shown
 
 MAGICS = (b"MDF     ", b"UnFinMF ")

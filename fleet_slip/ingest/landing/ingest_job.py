@@ -10,8 +10,8 @@ from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import InputError
 from fleet_slip.files.folder import StoredFile
 from fleet_slip.ingest.drives.look_alikes import find_vehicles_like
+from fleet_slip.ingest.drives.measured_drives import IngestCounts
 from fleet_slip.ingest.drives.suspicion import Suspicion
-from fleet_slip.ingest.drives.totals import IngestCounts
 from fleet_slip.ingest.landing.data_files import unit_of
 from fleet_slip.ingest.landing.folders import KnownFiles
 from fleet_slip.ingest.landing.landing import AskedFile, WrittenBatch, land_batch, write_batch

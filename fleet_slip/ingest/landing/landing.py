@@ -19,8 +19,7 @@ from fleet_slip.ingest.landing.data_files import (
     unit_of,
 )
 from fleet_slip.ingest.landing.writing import FileOutcome, FileWriter
-from fleet_slip.ingest.logs.local_copies import LocalCopies
-from fleet_slip.ingest.logs.log_files import Log
+from fleet_slip.ingest.logs.log_files import LocalCopies, Log
 from fleet_slip.ingest.mapping.mapping import Mapping
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.audit import Audit

@@ -10,10 +10,9 @@ from typing import IO, Self
 import polars as pl
 import pyarrow as pa
 
-from fleet_slip.ingest.drives.measured_drives import MeasuredDrive
+from fleet_slip.ingest.drives.measured_drives import IngestCounts, MeasuredDrive
 from fleet_slip.ingest.drives.stream import MeasuredStream
 from fleet_slip.ingest.drives.suspicion import Suspicion
-from fleet_slip.ingest.drives.totals import IngestCounts
 from fleet_slip.ingest.landing import data_files
 from fleet_slip.ingest.landing.data_files import DataFiles, Rows, TableName, Writing
 from fleet_slip.ingest.landing.expected_rows import expected_rows

@@ -19,14 +19,15 @@ from fleet_slip.catalogue.signals import Identifier, catalogue
 from fleet_slip.config import Config, Name, PositiveFloat, load_config
 from fleet_slip.errors import ConfigError
 from fleet_slip.ingest.formats.can_bus import CanBus, read_can_database
-from fleet_slip.ingest.formats.column_names import describe_unknown
 from fleet_slip.ingest.formats.csv_batches import CsvFormat, PlainNumbers
 from fleet_slip.ingest.formats.duckdb_table import DuckdbRows
-from fleet_slip.ingest.formats.source import OWN_TIME
-from fleet_slip.ingest.mapping.condition_text import text_conditions
-from fleet_slip.ingest.mapping.row_condition import RowCondition
-from fleet_slip.ingest.mapping.satellite_columns import require_satellites, split_components
-from fleet_slip.ingest.mapping.signal_column import SignalColumn
+from fleet_slip.ingest.formats.source import OWN_TIME, describe_unknown
+from fleet_slip.ingest.mapping.row_condition import RowCondition, text_conditions
+from fleet_slip.ingest.mapping.signal_column import (
+    SignalColumn,
+    require_satellites,
+    split_components,
+)
 from fleet_slip.ingest.mapping.units import require_unit
 from fleet_slip.ingest.mapping.vehicle_facts import (
     VehicleFacts,

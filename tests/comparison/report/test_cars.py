@@ -21,7 +21,7 @@ from fleet_slip.comparison.report.findings.report_data import ReportData
 from fleet_slip.comparison.report.page import render
 from fleet_slip.comparison.report.pictures import draw_pictures
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohorts.fold_assignment import assign_folds
+from fleet_slip.grams.cohorts.folding import assign_folds
 from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.pages.style import DESK, PHONE

@@ -10,8 +10,7 @@ import pyarrow as pa
 
 from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.cohorts.fold_assignment import assign_folds
-from fleet_slip.grams.cohorts.folding import FOLD_KEYS
+from fleet_slip.grams.cohorts.folding import FOLD_KEYS, assign_folds
 from fleet_slip.regression.exact.least_squares import LinearModel
 from fleet_slip.regression.validation.crossval import CrossValidation, least_squares
 from fleet_slip.resources import read_sql

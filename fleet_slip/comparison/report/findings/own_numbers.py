@@ -10,7 +10,7 @@ from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.errors import DataError
-from fleet_slip.grams.cohorts.fold_assignment import assign_folds
+from fleet_slip.grams.cohorts.folding import assign_folds
 from fleet_slip.grams.cohorts.gram_cohort import Cohort, load_cohort
 from fleet_slip.regression.exact.figures import ErrorSums
 from fleet_slip.regression.exact.least_squares import fit
