@@ -15,8 +15,8 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
-from fleet_slip.grams.cohorts.expansion import swept
 from fleet_slip.grams.cohorts.reader import OpenedGrams
+from fleet_slip.grams.cohorts.sweeping import swept
 from fleet_slip.grams.rows.gram_rows import by_signals, gram_table
 from fleet_slip.regression.exact.gram import packed_positions
 from fleet_slip.warehouse.condition import Condition
