@@ -2,8 +2,8 @@
 
 from fleet_slip.catalogue.car_numbers import DELAY
 from fleet_slip.errors import RefusedError
-from fleet_slip.grams.calibration.receiver_delay import ReceiverDelay, receiver_delays
 from fleet_slip.grams.cohorts.reader import open_grams
+from fleet_slip.grams.rows.receiver_delay import ReceiverDelay, receiver_delays
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.warehouse.condition import parse_condition
 from fleet_slip.warehouse.tables import Warehouse
@@ -21,7 +21,7 @@ def require_in_time(warehouse: Warehouse, manifest: Manifest) -> None:
     """
     condition = parse_condition(manifest.trained_on.cohort)
     with open_grams(warehouse, DELAY, condition) as opened:
-        delays = receiver_delays(opened, condition)
+        delays = receiver_delays(opened.batches(condition))
     late = {car: one for car, one in delays.items() if not _in_time(one)}
     untold = (manifest.trained_on.vehicles or 0) - len(delays)
     if not late and untold <= 0:

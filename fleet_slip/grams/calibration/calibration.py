@@ -16,10 +16,10 @@ from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 from fleet_slip.catalogue.sources import ALL_DRIVES
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.calibration.car_evidence import CalibratedNumber, CarEvidence, Convergence
-from fleet_slip.grams.calibration.receiver_delay import RECEIVER_DELAY, receiver_delays
 from fleet_slip.grams.calibration.tell_numbers import KINDS
 from fleet_slip.grams.cohorts.drive_sums import collect_sums
 from fleet_slip.grams.cohorts.reader import GramReader, OpenedGrams, open_grams
+from fleet_slip.grams.rows.receiver_delay import RECEIVER_DELAY, receiver_delays
 from fleet_slip.warehouse.condition import Condition, parse_condition
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -116,7 +116,7 @@ def calibration_table(opened: OpenedGrams, of_delay: OpenedGrams) -> pa.Table:
             "count": round(one.value / grain),
             "grain": grain,
         }
-        for car, one in receiver_delays(of_delay, parse_condition(ALL_DRIVES)).items()
+        for car, one in receiver_delays(of_delay.batches(parse_condition(ALL_DRIVES))).items()
     ]
     found = calibration_of(opened, parse_condition(ALL_DRIVES))
     rows = [

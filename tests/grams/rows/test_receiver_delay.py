@@ -7,7 +7,7 @@ import pytest
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.errors import RefusedError
-from fleet_slip.grams.calibration.receiver_delay import ReceiverDelay, with_pooled
+from fleet_slip.grams.rows.receiver_delay import ReceiverDelay, with_pooled
 
 CAMPAIGN = """
 name = "late"

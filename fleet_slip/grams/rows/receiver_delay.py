@@ -9,17 +9,16 @@ lags need. What the lag would be without each drive in turn tells how sure it is
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pyarrow as pa
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
-from fleet_slip.grams.cohorts.reader import OpenedGrams
-from fleet_slip.grams.cohorts.sweeping import swept
 from fleet_slip.grams.rows.gram_rows import by_signals, gram_table
-from fleet_slip.regression.exact.gram import packed_positions
-from fleet_slip.warehouse.condition import Condition
+from fleet_slip.regression.exact.gram_table import GramTable
 
 RECEIVER_DELAY = "receiver_delay"
 """What the view `calibration` calls it."""
@@ -65,34 +64,42 @@ def _weights() -> FloatArray:
     return weights
 
 
-def receiver_delays(opened: OpenedGrams, condition: Condition) -> dict[str, ReceiverDelay]:
-    """Return the delay of each car of a cohort whose Gram rows tell it.
-
-    `opened` are the Gram rows of the feature set `delay`.
-    """
-    columns, weights = _columns(), _weights()
-    square = np.array(packed_positions(tuple(range(len(columns)))))
-    lower = np.tril_indices(len(columns))
+def receiver_delays(rows_of_delay: Iterable[pa.RecordBatch]) -> dict[str, ReceiverDelay]:
+    """Return the delay of each car that Gram rows of the feature set `delay` tell."""
+    columns = _columns()
     products: dict[str, dict[str, FloatArray]] = {}
     rows: dict[str, int] = {}
-    for batch in opened.batches(condition):
+    for batch in rows_of_delay:
         for names, some, _ in by_signals(batch.filter(batch["vehicle_id"].is_valid())):
             if not set(columns) <= set(names.split(",")):
                 continue
-            table = swept(gram_table(names, some)).restrict(columns)
+            table = gram_table(names, some).restrict(columns)
             cars, drives = (some[name].to_pylist() for name in ("vehicle_id", "drive_id"))
+            about = _about_means(table)
             for i, (car, drive) in enumerate(zip(cars, drives, strict=True)):
-                full = np.zeros((len(columns), len(columns)))
-                full[lower] = table.products[i][square]
-                full += np.tril(full, -1).T
                 own = products.setdefault(car, {})
-                own[drive] = own.get(drive, 0.0) + weights @ full @ weights.T
+                own[drive] = own.get(drive, 0.0) + about[i]
                 rows[car] = rows.get(car, 0) + int(table.n[i])
     found = {
         car: _delay(np.array([own[drive] for drive in sorted(own)]), rows[car])
         for car, own in sorted(products.items())
     }
     return with_pooled({car: one for car, one in found.items() if one is not None})
+
+
+def _about_means(table: GramTable) -> FloatArray:
+    """Return the products of speed and late integrals about their means in each drive.
+
+    Shape (drives, 2 + STEPS, 2 + STEPS): an offset of the accelerometer is not in them.
+    """
+    weights, k = _weights(), len(table.signals)
+    full = np.zeros((len(table), k, k))
+    full[:, *np.tril_indices(k)] = table.products
+    full += np.tril(full, -1).transpose(0, 2, 1)
+    sums = table.sums.astype(np.float64) @ weights.T
+    squares = sums[:, :, None] * sums[:, None, :] / table.n[:, None, None]
+    about: FloatArray = weights @ full @ weights.T - squares
+    return about
 
 
 def with_pooled(delays: dict[str, ReceiverDelay]) -> dict[str, ReceiverDelay]:
