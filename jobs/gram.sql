@@ -53,7 +53,7 @@ SELECT
     gram.n,
     gram.clipped,
     [s FOR s IN gram.sums IF s IS NOT NULL] AS sums,
-    [p FOR p IN {all_products} IF p IS NOT NULL] AS products
+    [p FOR p IN {all_products} IF p IS NOT NULL] AS products{course_late}
 FROM gram
 JOIN drive USING (drive_id){joined}
 ORDER BY drive.file, drive_id, gram.absent, gram.part

@@ -31,8 +31,17 @@ LONGEST_TICKS = 1000
 LARGEST_RAD = Fraction(1, 2)
 LARGEST_CHANGE_BITS = 21
 """A difference of two counts of 20 bits."""
+LATE_PARTS = 4
+"""A course's delay is a whole number of these parts of a tick, 2.5 ms: the yaw rate does not change
+by enough in half of it to matter."""
+MOST_LATE = LATE_PARTS * 50
+COURSE_LATE = "course_late"
+"""Column of `grams`: by how many parts of a tick the course was taken to be late. And the variable
+of the SQL statement that tells it of each car."""
 
-HIDDEN = ("hidden_course", "hidden_turned")
+HIDDEN = ("hidden_course", "hidden_turned", "hidden_rest")
+HIDDEN_LATE = "hidden_late"
+WHOLE_TICKS = f"(({HIDDEN_LATE} + {LATE_PARTS // 2}) // {LATE_PARTS})"
 
 
 @dataclass(frozen=True)
@@ -59,17 +68,43 @@ def course_units() -> CourseUnits:
     return CourseUnits(turn, divisor, int(2 * HALF_TURN * LARGEST_RAD / grain))
 
 
+def split_late(late: int) -> tuple[int, int]:
+    """Return how many whole ticks late a course is, and what its label gains per count of r."""
+    whole = (late + LATE_PARTS // 2) // LATE_PARTS
+    return whole, (late - whole * LATE_PARTS) * 4 * HALF_TURN // LATE_PARTS
+
+
 def rounded(number: str, divisor: int) -> str:
     """Return SQL of an integer over another, to the nearest, halves away from zero."""
     return f"(2 * ({number}) + sign({number}) * {divisor}) // {2 * divisor}"
 
 
-def with_changes(rows: str, columns: tuple[str, ...], ticks: int) -> str:
+def _in_time(rows: str) -> str:
+    """Return a subquery: each course on the tick that it is of, but for a rest, and `HIDDEN_LATE`.
+
+    The variable `course_late` is a map from cars to the delays of their receivers.
+    """
+    return f"""(
+            SELECT * REPLACE (max({COURSE}) OVER (PARTITION BY drive_id ORDER BY tick
+                RANGE BETWEEN {WHOLE_TICKS} FOLLOWING AND {WHOLE_TICKS} FOLLOWING) AS {COURSE})
+            FROM (
+                SELECT *, coalesce(getvariable('{COURSE_LATE}')[vehicle_id], 0) AS {HIDDEN_LATE}
+                FROM {rows}
+            )
+        )"""
+
+
+def _as_logged(rows: str) -> str:
+    return f"(SELECT *, 0 AS {HIDDEN_LATE} FROM {rows})"
+
+
+def with_changes(rows: str, columns: tuple[str, ...], ticks: int, *, in_time: bool) -> str:
     """Return a subquery: columns less what they were so many ticks ago, `TURNED` and the label.
 
     Only rows that have a fix now and had one then, and the yaw rate all the time between; and the
     first of a drive, which has no change, so that a drive without a course is known to have none.
-    `rows` has the columns, course and yaw rate, and the column `clipped`.
+    `rows` has the columns, course and yaw rate, `vehicle_id` and the column `clipped`. With
+    `in_time` the course is moved by what the variable `course_late` says of the car.
     """
     units, label = course_units(), catalogue().label
     ago = {name: f"(max({name}) OVER ago)::BIGINT" for name in (*columns, COURSE, YAW_RATE)}
@@ -78,11 +113,13 @@ def with_changes(rows: str, columns: tuple[str, ...], ticks: int) -> str:
         f"CASE WHEN (count({YAW_RATE}) OVER since) = {ticks} THEN "
         f"2 * (sum({YAW_RATE}) OVER since)::BIGINT - {YAW_RATE} + {ago[YAW_RATE]} END"
     )
-    left = f"({units.turn} * {HIDDEN[0]} - {2 * HALF_TURN} * {HIDDEN[1]})"
+    left = f"({units.turn} * {HIDDEN[0]} - {2 * HALF_TURN} * {HIDDEN[1]} + {HIDDEN[2]})"
+    gain = f"({HIDDEN_LATE} - {WHOLE_TICKS} * {LATE_PARTS}) * {4 * HALF_TURN // LATE_PARTS}"
     whole = 2 * HALF_TURN * units.turn
     near = f"({left} - {whole} * ({rounded(left, whole)}))"
+    hidden = ", ".join((*HIDDEN, HIDDEN_LATE))
     return f"""(
-        SELECT * EXCLUDE ({", ".join(HIDDEN)}) REPLACE ({rounded(label, units.divisor)} AS {label}),
+        SELECT * EXCLUDE ({hidden}) REPLACE ({rounded(label, units.divisor)} AS {label}),
             {rounded(HIDDEN[1], COARSER)} AS {TURNED}
         FROM (
             SELECT * REPLACE ({near} AS {label})
@@ -92,8 +129,9 @@ def with_changes(rows: str, columns: tuple[str, ...], ticks: int) -> str:
             0::BIGINT AS {label}
                 ),
                     {COURSE}::BIGINT - {ago[COURSE]} AS {HIDDEN[0]},
-                    {turned} AS {HIDDEN[1]}
-                FROM {rows}
+                    {turned} AS {HIDDEN[1]},
+                    {gain} * ({YAW_RATE}::BIGINT - {ago[YAW_RATE]}) AS {HIDDEN[2]}
+                FROM {_in_time(rows) if in_time else _as_logged(rows)}
                 WINDOW ago AS (PARTITION BY drive_id ORDER BY tick
                         RANGE BETWEEN {ticks} PRECEDING AND {ticks} PRECEDING),
                     since AS (PARTITION BY drive_id ORDER BY tick

@@ -63,6 +63,8 @@ class FeatureSet(Config):
     lagged: bool = False
     change_s: Decimal | None = Field(default=None, gt=0, le=10)
     """Instead of the columns, what they change by in so much time, with the course as the label."""
+    as_logged: bool = False
+    """Whether the course of changes stays where it was logged, however late its receiver is."""
 
     @model_validator(mode="after")
     def _consistent(self) -> "FeatureSet":
@@ -79,6 +81,8 @@ class FeatureSet(Config):
             raise ValueError("a set with change_s does not divide rows")
         if self.change_ticks and (not self.windows or self.calibrated):
             raise ValueError("a set with change_s has windows, and no calibrated columns")
+        if self.as_logged and not self.change_ticks:
+            raise ValueError("only a set with change_s is as_logged")
         for name in ("block_s", "change_s"):
             time_s = getattr(self, name)
             if time_s is not None and Fraction(time_s) % SAMPLE_TIME_S:
@@ -94,6 +98,11 @@ class FeatureSet(Config):
     def change_ticks(self) -> int | None:
         """Number of ticks over which columns change; None where they stand for themselves."""
         return None if self.change_s is None else int(Fraction(self.change_s) / SAMPLE_TIME_S)
+
+    @property
+    def in_time(self) -> bool:
+        """Whether the delays of receivers are corrected in the Gram rows."""
+        return bool(self.change_ticks) and not self.as_logged
 
     @property
     def inputs(self) -> tuple[str, ...]:

@@ -5,6 +5,7 @@ from functools import cached_property
 
 import pyarrow as pa
 
+from fleet_slip.catalogue.course_change import COURSE_LATE
 from fleet_slip.catalogue.signals import SignalCatalogue, catalogue
 from fleet_slip.delta import Encoding, Table
 from fleet_slip.delta.schema import SCALE
@@ -68,7 +69,13 @@ class Warehouse:
         """Gram rows of drives, by feature set: n, sums and sums of products of counts."""
         return Table(
             folder=self.root / "grams",
-            schema=gram_schema(self.catalogue).append(pa.field(SIGNED, pa.binary())),
+            schema=pa.schema(
+                [
+                    *gram_schema(self.catalogue),
+                    (SIGNED, pa.binary()),
+                    (COURSE_LATE, pa.int64()),
+                ]
+            ),
             encoding=Encoding(
                 dictionary=("feature_set", "file", "part", "signals", *self.catalogue.drive),
                 # A seventh smaller, and twice as fast to write and read, as zstd alone.
@@ -76,8 +83,13 @@ class Warehouse:
                 compression="zstd",
             ),
             description="Gram rows: exact sums and sums of products of counts, one a drive",
-            optional=(SIGNED,),
+            optional=(SIGNED, COURSE_LATE),
         )
+
+    def computed_schema(self, *, in_time: bool) -> pa.Schema:
+        """Return the schema of computed Gram rows, with delays corrected in them or not."""
+        usual = self.grams.usual_schema
+        return usual.append(self.grams.schema.field(COURSE_LATE)) if in_time else usual
 
     @cached_property
     def quarantine(self) -> Table:

@@ -1,6 +1,6 @@
 """Computes the Gram rows of log files: plain sets by `jobs/gram.sql`, windows by the kernel."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import nullcontext
 from functools import partial
@@ -10,6 +10,7 @@ from os import cpu_count
 import duckdb
 import pyarrow as pa
 
+from fleet_slip.catalogue.course_change import COURSE_LATE
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.compute.tasks import LocalThreads, in_flight, run_tasks
@@ -23,6 +24,9 @@ from fleet_slip.words import number_of
 FILES_PER_QUERY = 16
 """Planning 77 aggregates costs 20 ms, so that one query takes many files."""
 
+Late = Mapping[str, int] | None
+"""By how many parts of a tick the course of each car is late; in time where it says nothing."""
+
 LAGGED_FILES_PER_QUERY = 2
 """Rows are sorted to find the one before, which takes memory for all rows of a query."""
 
@@ -34,11 +38,13 @@ def aggregate(
     threads: int | None = None,
     feature_set: str = PLAIN,
     executor: Executor | None = None,
+    late: Late = None,
 ) -> pa.Table:
     """Return the Gram rows of log files, in the schema of `grams`, sorted by file and drive."""
-    empty = warehouse.grams.usual_schema.empty_table()
+    in_time = features().feature_set(feature_set).in_time
+    empty = warehouse.computed_schema(in_time=in_time).empty_table()
     return pa.concat_tables(
-        [empty, *compute_grams(warehouse, files, progress, threads, feature_set, executor)]
+        [empty, *compute_grams(warehouse, files, progress, threads, feature_set, executor, late)]
     )
 
 
@@ -49,8 +55,11 @@ def compute_grams(
     threads: int | None = None,
     feature_set: str = PLAIN,
     executor: Executor | None = None,
+    late: Late = None,
 ) -> Iterator[pa.Table]:
     """Yield the Gram rows of some log files after the other, in the schema of `grams`.
+
+    `late` is by how many parts of a tick the course of each car is.
 
     In this process, on all of its cores unless `threads` says how many; or, with an executor of
     other processes, as tasks of some files and one thread each.
@@ -60,7 +69,7 @@ def compute_grams(
 
         own = LocalThreads(threads or cpu_count() or 1) if executor is None else None
         with own or nullcontext():
-            task = partial(wide_grams, warehouse, feature_set=feature_set)
+            task = partial(wide_grams, warehouse, feature_set=feature_set, late=late)
             yield from _by_tasks(executor or own, task, _groups(files, 1), progress)
         return
     step = LAGGED_FILES_PER_QUERY if features().feature_set(feature_set).lagged else FILES_PER_QUERY
@@ -110,10 +119,12 @@ def _aggregate_group(
         return _query(database, warehouse, files, feature_set)
 
 
-def by_sql(warehouse: Warehouse, files: Sequence[TableFile], feature_set: str) -> pa.Table:
+def by_sql(
+    warehouse: Warehouse, files: Sequence[TableFile], feature_set: str, late: Late = None
+) -> pa.Table:
     """Return the Gram rows of log files as `jobs/gram.sql` defines them, of any feature set."""
     with open_database(reading=warehouse.logs.folder) as database:
-        return _query(database, warehouse, files, feature_set)
+        return _query(database, warehouse, files, feature_set, late)
 
 
 def _query(
@@ -121,6 +132,7 @@ def _query(
     warehouse: Warehouse,
     files: Sequence[TableFile],
     feature_set: str,
+    late: Late = None,
 ) -> pa.Table:
     paths = {warehouse.logs.uri(file.path): file.path for file in files}
     whole = feature_set == PLAIN and _signals_are_whole(warehouse, files)
@@ -130,10 +142,21 @@ def _query(
     doing = f"the Gram query over {number_of(len(files), 'log file')} in {warehouse.logs.folder}"
     with reading_files(database, doing):
         database.execute("SET VARIABLE log_files = $files", {"files": list(paths)})
+        set_late(database, late)
         rows = database.sql(statement, params={"feature_set": identity}).to_arrow_table()
     relative = pa.array([paths[path] for path in rows["file"].to_pylist()], pa.string())
+    in_time = features().feature_set(feature_set).in_time
     return rows.set_column(rows.schema.get_field_index("file"), "file", relative).cast(
-        warehouse.grams.usual_schema
+        warehouse.computed_schema(in_time=in_time)
+    )
+
+
+def set_late(database: duckdb.DuckDBPyConnection, late: Late) -> None:
+    """Tell the statements of a connection how late the course of each car is."""
+    cars = sorted(late or {})
+    database.execute(
+        f"SET VARIABLE {COURSE_LATE} = map($cars::VARCHAR[], $late::INTEGER[])",
+        {"cars": cars, "late": [(late or {})[car] for car in cars]},
     )
 
 

@@ -5,16 +5,14 @@ rows and a drive of any length fits into memory.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
-from fleet_slip.catalogue.course_change import COARSER, course_units
+from fleet_slip.catalogue.course_change import COARSER, COURSE, course_units, split_late
 from fleet_slip.catalogue.signals import HALF_TURN
 from fleet_slip.columns.blocks.block_operations import BLOCK_ROWS
-from fleet_slip.columns.blocks.drive_columns import Workspace
+from fleet_slip.columns.blocks.drive_columns import DriveCounts, Workspace
 
 
 @dataclass(frozen=True)
@@ -32,13 +30,15 @@ class Changes:
     clipped: FloatArray
 
 
-def course_changes(workspace: Workspace, ticks: NDArray[Any], apart: int) -> Changes:
-    """Return the changes of the drive that is loaded.
+def course_changes(workspace: Workspace, drive: DriveCounts, apart: int, late: int = 0) -> Changes:
+    """Return the changes of the drive, which is loaded; its course is late by `late`.
 
     The last two columns of the workspace's plan are the course and the yaw rate.
     """
+    ticks = drive.ticks.astype(np.int64)
+    whole, gain = split_late(late)
+    at, course = _fixes(drive, ticks, whole)
     yaw_rate = np.empty(workspace.rows)
-    fixes: list[IntArray] = []
     values: list[FloatArray] = []
     clipped: list[FloatArray] = []
     first_clipped = np.zeros(0)
@@ -46,22 +46,23 @@ def course_changes(workspace: Workspace, ticks: NDArray[Any], apart: int) -> Cha
         workspace.compute_block(first)
         block, here = workspace.block(first)
         yaw_rate[first : first + block.shape[1]] = block[-1]
-        fixed = np.flatnonzero(~np.isnan(block[-2]))
-        fixes.append(fixed + first)
-        values.append(block[:-1, fixed])
+        begin, end = np.searchsorted(at, (first, first + block.shape[1]))
+        fixed = at[begin:end] - first
+        values.append(block[:-2, fixed])
         clipped.append(here[fixed])
         first_clipped = here[:1].copy() if first == 0 else first_clipped
-    at, counts = np.concatenate(fixes), np.concatenate(values, axis=1)
-    before, now = _pairs(ticks[at].astype(np.int64), apart)
-    turned, known = _twice_turned(ticks.astype(np.int64), yaw_rate, at[before], at[now])
-    change, sound = _change(counts[-1, now] - counts[-1, before], turned)
-    kept = known & sound
-    before, now = before[kept], now[kept]
+    counts = np.concatenate(values, axis=1)
+    before, now = _pairs(ticks[at], apart)
+    turned, known = _twice_turned(ticks, yaw_rate, at[before], at[now])
+    before, now, turned = before[known], now[known], turned[known]
+    rest = gain * (yaw_rate[at[now]] - yaw_rate[at[before]]).astype(np.int64)
+    change, sound = _change(course[now] - course[before], turned, rest)
+    before, now = before[sound], now[sound]
     columns = np.concatenate(
         [
-            counts[:-1, now] - counts[:-1, before],
-            _rounded(turned[kept], COARSER)[None],
-            change[None, kept],
+            counts[:, now] - counts[:, before],
+            _rounded(turned[sound], COARSER)[None],
+            change[None, sound],
         ]
     )
     began = ticks[:1] == 0  # known to have no change: so a drive without a course is remembered
@@ -70,6 +71,14 @@ def course_changes(workspace: Workspace, ticks: NDArray[Any], apart: int) -> Cha
         np.concatenate([np.full((len(columns), int(began.sum())), np.nan), columns], axis=1),
         np.concatenate([first_clipped[began], np.concatenate(clipped)[now]]),
     )
+
+
+def _fixes(drive: DriveCounts, ticks: IntArray, whole: int) -> tuple[IntArray, IntArray]:
+    """Return the rows that a fix is of, so many ticks before it, and the course there."""
+    fixed = np.flatnonzero(drive.present.get(COURSE, np.ones(len(ticks), dtype=np.bool_)))
+    place = np.searchsorted(ticks, ticks[fixed] - whole)
+    there = ticks[np.minimum(place, len(ticks) - 1)] == ticks[fixed] - whole
+    return place[there], drive.counts[COURSE][fixed[there]].astype(np.int64)
 
 
 def _pairs(ticks: IntArray, apart: int) -> tuple[IntArray, IntArray]:
@@ -93,10 +102,10 @@ def _twice_turned(
     return turned, whole & (gaps[now] == gaps[before]) & ~missing[before]
 
 
-def _change(course: FloatArray, turned: IntArray) -> tuple[IntArray, BoolArray]:
+def _change(course: IntArray, turned: IntArray, rest: IntArray) -> tuple[IntArray, BoolArray]:
     """Return the change of the side-slip angle in counts of the label, and where it is one."""
     units = course_units()
-    left = units.turn * course.astype(np.int64) - 2 * HALF_TURN * turned
+    left = units.turn * course - 2 * HALF_TURN * turned + rest
     whole = 2 * HALF_TURN * units.turn
     left -= whole * _rounded(left, whole)
     return _rounded(left, units.divisor), np.abs(left) <= units.largest

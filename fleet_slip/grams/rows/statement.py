@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from fleet_slip.catalogue.course_change import with_changes
+from fleet_slip.catalogue.course_change import COURSE_LATE, with_changes
 from fleet_slip.catalogue.feature_sets import LAG, PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import COUNT_MAX, SignalCatalogue
@@ -55,7 +55,7 @@ def gram_statement(
     if windows:
         rows = over_windows(rows if used else f"(SELECT *, 0 AS clipped FROM {logs})", windows)
     if one.change_ticks:
-        rows = with_changes(rows, one.inputs, one.change_ticks)
+        rows = with_changes(rows, one.inputs, one.change_ticks, in_time=one.in_time)
     wide = windows or any(feature.limit > COUNT_MAX for feature in used.values())
     kind = "BIGINT" if wide else "INTEGER"
     parts = Parts.of_set(known, one)
@@ -93,9 +93,16 @@ def gram_statement(
         all_products=" || ".join(
             ["gram.products", *(f"further_{i}.products" for i in range(len(further)))]
         ),
+        course_late=_course_late(one.in_time),
         part_name=parts.name_sql("gram.part") if parts else "NULL::VARCHAR",
         names=", ".join(f"'{name}'" for name in names),
     )
+
+
+def _course_late(in_time: bool) -> str:
+    """Return what a Gram row records of the delay that was corrected in it."""
+    known = f"getvariable('{COURSE_LATE}')[drive.vehicle_id]"
+    return f",\n    {known}::BIGINT AS {COURSE_LATE}" if in_time else ""
 
 
 def _further(number: int, products: Sequence[str]) -> str:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from fleet_slip.arrays import FloatArray, IntArray
+from fleet_slip.catalogue.course_change import COURSE_LATE
 from fleet_slip.catalogue.feature_sets import FeatureSet
 from fleet_slip.catalogue.features import features
 from fleet_slip.columns.blocks.block_operations import BLOCK_ROWS
@@ -31,17 +32,24 @@ _EXACT = 2**53
 _INT64 = 2**63
 
 
-def wide_grams(warehouse: Warehouse, files: Sequence[TableFile], feature_set: str) -> pa.Table:
+def wide_grams(
+    warehouse: Warehouse,
+    files: Sequence[TableFile],
+    feature_set: str,
+    late: Mapping[str, int] | None = None,
+) -> pa.Table:
     """Return the Gram rows of log files for a feature set, as `jobs/gram.sql` would.
 
-    Sorted by file and drive. Raises `DataError` for a drive that cannot be looked back on, and
-    `StorageError` for one whose sums need more than 64 bits.
+    `late` is by how much the course of cars is, in parts of a tick. Sorted by file and drive.
+    Raises `DataError` for a drive that cannot be looked back on, and `StorageError` for one whose
+    sums need more than 64 bits.
     """
     one = features().feature_set(feature_set)
     workspace = Workspace(ColumnPlan.of_set(features(), feature_set))
     plan = workspace.plan
     identity = features().identity(feature_set)
-    columns: dict[str, list[Any]] = {name: [] for name in warehouse.grams.usual_schema.names}
+    schema = warehouse.computed_schema(in_time=one.in_time)
+    columns: dict[str, list[Any]] = {name: [] for name in schema.names}
     # Files are shared out among threads; a BLAS with threads of its own would be in their way.
     with threadpool_limits(1, user_api="blas"):
         for file in sorted(files, key=lambda one: one.path):
@@ -51,9 +59,14 @@ def wide_grams(warehouse: Warehouse, files: Sequence[TableFile], feature_set: st
                     workspace,
                     one,
                     drive,
-                    {"feature_set": identity, "file": file.path, "day": file.day},
+                    {
+                        "feature_set": identity,
+                        "file": file.path,
+                        "day": file.day,
+                        COURSE_LATE: (late or {}).get(drive.metadata["vehicle_id"]),
+                    },
                 )
-    return pa.table(columns, schema=warehouse.grams.usual_schema)
+    return pa.table(columns, schema=schema)
 
 
 def _append_rows(
@@ -67,7 +80,8 @@ def _append_rows(
     where = f"{known['file']}: drive {drive.drive_id}"
     try:
         if one.change_ticks:
-            found = change_sums(workspace, drive.counts, one.change_ticks)
+            late = (known[COURSE_LATE] or 0) if one.in_time else 0
+            found = change_sums(workspace, drive.counts, one.change_ticks, late)
         else:
             found = drive_sums(workspace, parts, drive.counts)
     except DataError as error:
@@ -158,17 +172,19 @@ def drive_sums(workspace: Workspace, parts: Parts, counts: DriveCounts) -> dict[
     return {kind: sums for kind, sums in found.items() if sums.n}
 
 
-def change_sums(workspace: Workspace, counts: DriveCounts, apart: int) -> dict[Kind, PartSums]:
+def change_sums(
+    workspace: Workspace, counts: DriveCounts, apart: int, late: int = 0
+) -> dict[Kind, PartSums]:
     """Return the sums of the changes of a drive's columns, by which of them they lack.
 
-    Raises like `drive_sums`.
+    The course is `late` parts of a tick. Raises like `drive_sums`.
     """
     largest = 2 * max(workspace.plan.limits)
     exact_rows = (_EXACT - 1) // largest**2
     if len(counts.ticks) * largest**2 >= _INT64:
         raise StorageError(f"the drive has {len(counts.ticks):,} rows: too many for 64-bit sums.")
     workspace.load(counts)
-    changes = course_changes(workspace, counts.ticks, apart)
+    changes = course_changes(workspace, counts, apart, late)
     found: dict[Kind, PartSums] = {}
     for kind, rows in _kinds(changes.columns, None):
         has = [i for i in range(len(changes.columns)) if not kind[0] >> i & 1]

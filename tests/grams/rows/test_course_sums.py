@@ -48,30 +48,34 @@ def nearest(value: Fraction) -> int:
     return int(math.copysign(math.floor(abs(value) + Fraction(1, 2)), value))
 
 
-def plain_changes(table: pa.Table) -> dict[int, tuple[int, int]]:
+def plain_changes(table: pa.Table, late: int = 0) -> dict[int, tuple[int, int]]:
     """Tick of each change, and its turned and label, in words of plain Python."""
     rows = {row["tick"]: row for row in table.to_pylist()}
     units, found = course_units(), {}
-    for tick, row in rows.items():
-        before = rows.get(tick - APART)
+    whole = math.floor(Fraction(late, 4) + Fraction(1, 2))
+    for tick in rows:
+        now, before = (rows.get(t + whole, {}).get("course") for t in (tick, tick - APART))
         between = [rows.get(t, {}).get("yaw_rate") for t in range(tick - APART, tick + 1)]
-        if before is None or None in (row["course"], before["course"], *between):
+        if None in (now, before, *between):
             continue
         turned = between[0] + between[-1] + 2 * sum(between[1:-1])
-        angle = Fraction(row["course"] - before["course"], 65536) * units.turn - turned
+        rest = Fraction(late, 4) - whole  # of a tick, which is two counts of what is turned
+        angle = Fraction(now - before, 65536) * units.turn - turned
+        angle += 2 * rest * (between[-1] - between[0])
         angle -= units.turn * nearest(angle / units.turn)
         if abs(angle) * Fraction(1, 2_000_000) <= LARGEST_RAD:
             found[tick] = (nearest(Fraction(turned, 256)), nearest(angle / 200))
     return found
 
 
-def test_the_changes_of_a_hostile_drive_are_those_of_plain_integers() -> None:
+@pytest.mark.parametrize("late", [0, -2, 1, 3, 34, 80])
+def test_the_changes_of_a_hostile_drive_are_those_of_plain_integers(late: int) -> None:
     table = hostile_drive("a", 6000, 7)
     plan = ColumnPlan.of_set(features(), "course")
     workspace, counts = Workspace(plan), counts_of(table, plan, {})
     workspace.load(counts)
-    found = course_changes(workspace, counts.ticks, APART)
-    expected = plain_changes(table)
+    found = course_changes(workspace, counts, APART, late)
+    expected = plain_changes(table, late)
     assert len(expected) > 40
     assert counts.ticks[found.rows].tolist() == [0, *expected]
     assert np.isnan(found.columns[:, 0]).all()
@@ -79,19 +83,23 @@ def test_the_changes_of_a_hostile_drive_are_those_of_plain_integers() -> None:
     assert list(zip(*changes, strict=True)) == list(expected.values())
 
 
-def test_gram_rows_of_the_kernel_are_those_of_the_statement(warehouse: Warehouse) -> None:
+@pytest.mark.parametrize("late", [None, {"car-1": -1}, {"car-1": 34, "other": 1}])
+def test_gram_rows_of_the_kernel_are_those_of_the_statement(
+    warehouse: Warehouse, late: dict[str, int] | None
+) -> None:
     land(warehouse, "one", hostile_drive("b", 4000, 1), hostile_drive("a", 300, 2))
     land(warehouse, "two", hostile_drive("c", 9000, 3), hostile_drive("d", 2500, 4, every=1))
     files = warehouse.logs.snapshot().files
-    kernel = wide_grams(warehouse, files, "course")
-    defined = by_sql(warehouse, files, "course").cast(kernel.schema)
+    kernel = wide_grams(warehouse, files, "course", late)
+    defined = by_sql(warehouse, files, "course", late).cast(kernel.schema)
     changed = kernel.filter(pc.match_substring(kernel["signals"], TURNED))
     assert set(changed["drive_id"].to_pylist()) == {"b", "c", "d"}
     assert {"ay", TURNED, LABEL} <= set(changed["signals"][0].as_py().split(","))
     assert grams_of(kernel) == grams_of(defined)
     for name in kernel.column_names:
         assert kernel[name].to_pylist() == defined[name].to_pylist(), name
-    assert aggregate(warehouse, files, feature_set="course").equals(kernel)
+    assert aggregate(warehouse, files, feature_set="course", late=late).equals(kernel)
+    assert set(kernel["course_late"].to_pylist()) == {(late or {}).get("car-1")}
 
 
 def test_a_log_without_a_course_has_no_changes(warehouse: Warehouse) -> None:
@@ -116,7 +124,7 @@ def test_the_label_is_the_change_of_the_side_slip_angle() -> None:
     plan = ColumnPlan.of_set(features(), "course")
     workspace, loaded = Workspace(plan), counts_of(log_rows("a", counts), plan, {})
     workspace.load(loaded)
-    found = course_changes(workspace, loaded.ticks, APART)
+    found = course_changes(workspace, loaded, APART)
     rows, columns = found.rows[1:], found.columns[:, 1:]
     assert len(rows) == 460
     changed = slip[rows] - slip[rows - APART]
