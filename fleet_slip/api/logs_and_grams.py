@@ -127,8 +127,8 @@ class LogsAndGrams(Rooted):
         for files that cannot be used, of which nothing is written; `StorageError` and
         `ClusterError`.
         """
-        from fleet_slip.ingest.landing.folders import KnownFiles
         from fleet_slip.ingest.landing.ingest_job import ingest_files
+        from fleet_slip.ingest.landing.known_files import KnownFiles
         from fleet_slip.ingest.logs.log_files import find_logs, find_whole_logs, names_several
         from fleet_slip.ingest.mapping.mapping import load_mapping
 
@@ -258,7 +258,7 @@ class LogsAndGrams(Rooted):
 
 def _rows_of(logs: "Iterable[Log]", told: Progress) -> Progress:
     """Return what counts the rows read of each log among about so many that all have."""
-    from fleet_slip.ingest.landing.expected_rows import expected_rows
+    from fleet_slip.ingest.formats.reading import expected_rows
 
     total = sum(map(expected_rows, logs))
     left = total

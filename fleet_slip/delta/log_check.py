@@ -9,7 +9,6 @@ and at what they add up to: at the name of a unit of work, too, or a commit behi
 import functools
 from collections.abc import Iterator, Sequence
 
-from fleet_slip.delta import Snapshot
 from fleet_slip.delta.checkpoints import newest_checkpoint, require_sealed
 from fleet_slip.delta.commits import (
     COMMIT_FILE,
@@ -20,6 +19,7 @@ from fleet_slip.delta.commits import (
     problem_of_commit,
     read_commit,
 )
+from fleet_slip.delta.snapshot import Snapshot
 from fleet_slip.errors import StorageError
 from fleet_slip.files.folder import Folder, StoredFile
 

@@ -1,6 +1,6 @@
 """Brings measured logs in: a file and a mapping become counts at 100 Hz.
 
-The way of a row, in the order of its stations; each is one module, visited once:
+The way of a row, in the order of its stations:
 
 1. `formats.reading` opens the file. Its format yields batches of the columns that the mapping uses.
 2. `drives.log_rows` joins the parts of a log, and `drives.time_bases` its time bases.
@@ -10,9 +10,8 @@ The way of a row, in the order of its stations; each is one module, visited once
 5. `drives.open_drives` keeps the rows of a part until it has ended.
 6. `drives.measured_drives` brings a drive to ticks, by `drives.resampling`, and to counts.
 7. `drives.stream` goes through the steps above; it yields ended drives and refused rows.
-8. `landing.writing` leaves out what was forgotten. `landing.data_files` writes files of many
-   drives, whose table `landing.log_table` makes.
-9. `landing.landing` commits the files of a batch; `landing.ingest_job` goes through all batches.
+8. `landing.landing` leaves out what was forgotten, passes the rest on to `landing.data_files`, and
+   commits the files of a batch; `landing.ingest_job` goes through all batches.
 """
 
 from fleet_slip.ingest.drives.measured_drives import IngestCounts

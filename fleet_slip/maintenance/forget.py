@@ -31,11 +31,7 @@ from fleet_slip.maintenance.find_drives import (
     recordings_of,
 )
 from fleet_slip.maintenance.marks import newest_versions
-from fleet_slip.maintenance.old_files import (
-    quarantined_of,
-    remove_old_files,
-    remove_uncommitted_files,
-)
+from fleet_slip.maintenance.old_files import quarantined_of, remove_old_files
 from fleet_slip.maintenance.rewriting import Rewriting, drop_unused_names, forget_received, rewrite
 from fleet_slip.models.manifest import TrainedOn
 from fleet_slip.models.trained_drives import hash_drives, read_trained_drives
@@ -113,10 +109,10 @@ def forget(
     if drives or state:
         warehouse.grams.fence()
     rows += forget_received(warehouse, subject)
-    uncommitted = remove_uncommitted_files(warehouse, subject)
+    uncommitted = remove_old_files(warehouse, subject, replaced=False)
     reconcile(warehouse)
     cleared.keep(present)
-    old = (remove_old_files if now else remove_uncommitted_files)(warehouse, subject)
+    old = remove_old_files(warehouse, subject, replaced=now)
     if drives or state in ("begun", ALLOWED):
         audit.end(subject, warehouse.grams.snapshot().version)
     under_way = [f"the run {run}" for run in runs_under_way(warehouse.root)] if now else []

@@ -1,6 +1,6 @@
 """Files on disk that no version of a table refers to any more, and the drives that they hold."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from datetime import date
 
@@ -11,7 +11,7 @@ from fleet_slip.delta import Snapshot
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.files.folder import StoredFile
 from fleet_slip.grams.rows.backlog import BEING_WRITTEN_HOURS
-from fleet_slip.maintenance.vacuum import find_replaced, find_temporary_files, find_unreferenced
+from fleet_slip.maintenance.vacuum import find_temporary_files, find_unreferenced
 from fleet_slip.warehouse.audit import Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -27,37 +27,22 @@ class OldFiles:
     """Files that may be being written, and may have the drives: they are left alone."""
 
 
-def remove_old_files(warehouse: Warehouse, subject: Forgettable) -> OldFiles:
-    """Delete the files with the drives that no version refers to, those of `vacuum` included.
-
-    See `remove_uncommitted_files`.
-    """
-    return _remove(warehouse, subject, find_old_files(warehouse, subject), kept=0)
-
-
-def remove_uncommitted_files(warehouse: Warehouse, subject: Forgettable) -> OldFiles:
-    """Delete the files with the drives that no version ever referred to; keep replaced ones.
+def remove_old_files(warehouse: Warehouse, subject: Forgettable, *, replaced: bool) -> OldFiles:
+    """Delete the files with the drives that no version refers to; `replaced` ones if asked to.
 
     What was never committed is deleted at once: since the fence no commit can land a row of a
     forgotten car or drive, so that whoever wrote the file will be told. Drives before a day are not
     barred; there a file younger than an hour is left to its writer.
     """
-    old = find_old_files(warehouse, subject)
-    uncommitted = [one for one in old if not one.replaced]
-    return _remove(warehouse, subject, uncommitted, kept=len(old) - len(uncommitted))
-
-
-def _remove(
-    warehouse: Warehouse, subject: Forgettable, files: Sequence["OldFile"], kept: int
-) -> OldFiles:
-    deleted, pending = 0, list[str]()
-    for one in files:
-        if one.is_young and subject.kind == "before":
+    deleted = kept = 0
+    pending: list[str] = []
+    for one in find_old_files(warehouse, subject):
+        if one.replaced and not replaced:
+            kept += 1
+        elif (one.is_young and subject.kind == "before") or not one.file.folder.remove(one.file):
             pending.append(str(one.file))
-        elif one.file.folder.remove(one.file):
-            deleted += 1
         else:
-            pending.append(str(one.file))
+            deleted += 1
     gone, left = _remove_half_written(warehouse)
     names = [name.removeprefix(f"{warehouse.root}/") for name in (*pending, *left)]
     return OldFiles(deleted + gone, kept, tuple(names))
@@ -108,7 +93,7 @@ class OldFile:
 
 def read_old_files(snapshot: Snapshot) -> Iterator[OldFile]:
     """Yield replaced files and leftovers, with what tells the drives."""
-    known = find_replaced(snapshot)
+    known = snapshot.removed()
     wanted = {"drive_id", "drive_name", "source_file", "vehicle_id", "day"}
     for file in find_unreferenced(snapshot.table):
         try:

@@ -7,7 +7,6 @@ file's checksum, it is the same file or it is refused.
 
 import contextlib
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from datetime import date
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -98,7 +97,7 @@ def _simulate_again(
     ]
     if not files:
         return []
-    known = _campaigns(campaigns)
+    known = [load_campaign(name) for name in (*campaigns, *config_names("campaigns"))]
     drives = _drives_of(warehouse, {file.path for file in files})
     rebuilt = []
     for file in files:
@@ -107,10 +106,6 @@ def _simulate_again(
                 rebuilt.append(f"logs/{file.path}")
                 break
     return rebuilt
-
-
-def _campaigns(named: Sequence[str]) -> list[Campaign]:
-    return [load_campaign(name) for name in (*named, *config_names("campaigns"))]
 
 
 def _drives_of(warehouse: Warehouse, paths: Collection[str]) -> dict[str, frozenset[str]]:
@@ -134,18 +129,15 @@ def _candidates(
             continue
         specs: Mapping[str, DriveSpec] = {spec.drive_id: spec for spec in campaign.drives(file.day)}
         if drives and specs.keys() >= set(drives):
-            yield _batch(campaign, file.day, [specs[drive] for drive in sorted(drives)])
+            chosen = tuple(specs[drive] for drive in sorted(drives))
+            yield Batch(campaign.name, file.day, 0, chosen)
         for batch in campaign.batches(file.day):
             if f"/{file_name(batch)}-" in file.path:
                 yield batch
 
 
-def _batch(campaign: Campaign, day: date, drives: Sequence[DriveSpec]) -> Batch:
-    return Batch(campaign.name, day, 0, tuple(drives))
-
-
 def _aggregate_again(
-    warehouse: Warehouse, damaged: Collection[str], wrong: Collection[str], lost: Collection[str]
+    warehouse: Warehouse, damaged: Collection[str], wrong: set[str], lost: Collection[str]
 ) -> list[str]:
     """Drop the Gram files that are damaged or have wrong rows, and compute what is missing.
 
@@ -156,12 +148,13 @@ def _aggregate_again(
     def attempt() -> None:
         removed.clear()
         snapshot = warehouse.grams.unchecked_snapshot()
-        readable = _readable_grams(warehouse)
+        readable = _readable_grams(warehouse).items()
+        named = {path: rows["file"].unique().to_pylist() for path, rows in readable}
         bad = [
             file
             for file in snapshot.files
             if (f"grams/{file.path}" in damaged and not is_of_received(file))
-            or (file.path in readable and _names_any(readable[file.path], wrong))
+            or not wrong.isdisjoint(named.get(file.path, ()))
         ]
         if bad:
             snapshot.commit(Change(remove=bad, note={"job": "repair"}))
@@ -170,10 +163,6 @@ def _aggregate_again(
     retry_conflicts(attempt)
     reconcile(warehouse, unreadable=lost)  # also what an interrupted repair has dropped
     return removed
-
-
-def _names_any(rows: pa.Table, files: Collection[str]) -> bool:
-    return not set(files).isdisjoint(rows["file"].unique().to_pylist())
 
 
 def _readable_grams(warehouse: Warehouse) -> dict[str, pa.Table]:

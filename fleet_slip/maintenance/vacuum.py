@@ -9,7 +9,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from fleet_slip.delta import Snapshot, Table
+from fleet_slip.delta import Table
 from fleet_slip.files.folder import TEMPORARY_PREFIX, StoredFile
 from fleet_slip.runs.history import gather_runs
 from fleet_slip.warehouse.tables import Warehouse
@@ -54,14 +54,14 @@ def _report(warehouse: Warehouse, files: Sequence[StoredFile], *, dry_run: bool)
 
 
 def find_expired(warehouse: Warehouse, retention_hours: float) -> list[StoredFile]:
-    """Return the files that `vacuum` removes."""
+    """Return the files that `vacuum` removes: of no version of so many hours, and as old."""
     found = []
     for table in warehouse.tables:
         files = find_unreferenced(table)
         snapshot = table.snapshot()
         if snapshot.version is None:  # its Delta log may have been lost, and these be its data
             continue
-        kept = removed_since(snapshot, retention_hours)
+        kept = snapshot.removed() - snapshot.removed(retention_hours)
         found += [file for file in files if file.path not in kept]
     found += find_temporary_files(warehouse)
     return [file for file in found if file.age_hours >= retention_hours]
@@ -92,13 +92,3 @@ def find_temporary_files(warehouse: Warehouse) -> list[StoredFile]:
 
 _OF_DELTA = re.compile(r"[^/]+/_delta_log/[^/]*#[^/]*")
 """Temporary names of the Delta library, in a file system."""
-
-
-def find_replaced(snapshot: Snapshot) -> set[str]:
-    """Return the paths of files that a commit removed from a table, ever."""
-    return snapshot.removed()
-
-
-def removed_since(snapshot: Snapshot, hours: float) -> set[str]:
-    """Return the paths of files that a commit of the last hours removed from a table."""
-    return snapshot.removed() - snapshot.removed(hours)

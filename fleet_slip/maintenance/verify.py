@@ -20,7 +20,7 @@ from fleet_slip.errors import DataError, FleetSlipError, QuestionError, RefusedE
 from fleet_slip.files.documents import DocumentFolder
 from fleet_slip.files.folder import Folder, StoredFile
 from fleet_slip.grams.rows.backlog import named_files
-from fleet_slip.maintenance.vacuum import find_replaced, find_temporary_files, find_unreferenced
+from fleet_slip.maintenance.vacuum import find_temporary_files, find_unreferenced
 from fleet_slip.maintenance.verify_files import Damage, Verification, verify_files, verify_names
 from fleet_slip.maintenance.verify_grams import SoundFiles, verify_drives, verify_grams
 from fleet_slip.models.trained_drives import read_trained_drives
@@ -48,12 +48,9 @@ def _document_folders(root: Folder) -> list[DocumentFolder]:
     for name in root.names():
         if not (root / name / "_delta_log").exists():
             files = (root / name).files()
-            found.update(f"{name}/{f.path}".rpartition("/")[0] for f in files if _is_document(f))
+            documents = (f"{name}/{f.path}" for f in files if f.path.endswith(".json"))
+            found.update(path.rpartition("/")[0] for path in documents)
     return [DocumentFolder(root / path) for path in sorted(found)]
-
-
-def _is_document(file: StoredFile) -> bool:
-    return file.path.endswith(".json")
 
 
 def verify_models(
@@ -130,7 +127,8 @@ def _verify(
     verify_documents(warehouse.root, report)
     verify_models(warehouse, snapshots, report)
     _list_unreferenced(warehouse, snapshots, report)
-    if not report.findings and not report.documents and not _any_table(snapshots):
+    written = any(snapshot.version is not None for snapshot in snapshots.values())
+    if not report.findings and not report.documents and not written:
         raise StorageError(
             f"{warehouse.root}: there is nothing to verify, neither tables nor models. Is it the "
             "right folder, and is its disk there? Choose another data root."
@@ -172,10 +170,6 @@ def _verify_checkpoints(table: Table, report: Verification) -> None:
         report.findings.append(Damage("backlog", f"{name}/_delta_log/{checkpoint}", problem))
 
 
-def _any_table(snapshots: Mapping[str, Snapshot]) -> bool:
-    return any(snapshot.version is not None for snapshot in snapshots.values())
-
-
 def _report_missing_logs(
     snapshots: Mapping[str, Snapshot], sound: Sequence[TableFile], report: Verification
 ) -> None:
@@ -194,7 +188,7 @@ def _list_unreferenced(
 ) -> None:
     for snapshot in snapshots.values():
         try:
-            known, files = find_replaced(snapshot), find_unreferenced(snapshot.table)
+            known, files = snapshot.removed(), find_unreferenced(snapshot.table)
         except StorageError:  # its log is damaged, as was told: it says of no file what that is
             continue
         for file in files:

@@ -66,6 +66,8 @@ RECORD_COLUMNS = {
 }
 """What a line of the history may say, with DuckDB's types."""
 
+_DOCUMENT_FOLDER = re.compile(r"forgotten|models/(?!\.\./)[^/]*/(?:versions|history)")
+
 _DIGITS = 32
 _END = b',"sha256":"' + b"0" * _DIGITS + b'"}'
 _SEALED = re.compile(rb'(.*),"sha256":"([0-9a-f]{%d})"\}' % _DIGITS)
@@ -157,7 +159,7 @@ def newest_documents(root: Folder) -> dict[str, tuple[int, str]]:
     """Return the anchors as they are now; nothing of a folder that cannot be read."""
     found = {}
     for path in _document_folders(root):
-        documents = _documents(root, path)
+        documents = DocumentFolder(root / path)
         with contextlib.suppress(StorageError):
             if numbers := documents.numbers():
                 found[path] = (numbers[-1], documents.read(numbers[-1]).sha256)
@@ -170,7 +172,7 @@ def find_missing_documents(root: Folder, since: str = "") -> Iterator[tuple[str,
     `since` is the first month whose records are looked at, as YYYY-MM.
     """
     for path, (number, sha256) in sorted(_kept_anchors(root, since).items()):
-        documents = _documents(root, path)
+        documents = DocumentFolder(root / path)
         newest = max(documents.numbers(), default=0)
         if newest < number:
             yield path, f"had {number} documents when a run ended, and has {newest} now"
@@ -200,7 +202,7 @@ def _anchors_in(line: bytes) -> Iterator[tuple[str, int, str]]:
         record: Any = json.loads(line)
         found = record.get(ANCHORS) or {}
         for path, (number, sha256) in found.items():
-            if _is_document_folder(str(path)):
+            if _DOCUMENT_FOLDER.fullmatch(str(path)):
                 yield str(path), int(number), str(sha256)
     except (ValueError, TypeError, AttributeError, RecursionError):
         return
@@ -212,18 +214,3 @@ def _document_folders(root: Folder) -> list[str]:
         "forgotten",
         *(f"{model}/{kind}" for model in models for kind in ("versions", "history")),
     ]
-
-
-def _is_document_folder(path: str) -> bool:
-    parts = path.split("/")
-    if path == "forgotten":
-        return True
-    known = len(parts) == 3 and parts[0] == "models" and parts[2] in ("versions", "history")
-    return known and ".." not in parts
-
-
-def _documents(root: Folder, path: str) -> DocumentFolder:
-    folder = root
-    for part in path.split("/"):
-        folder = folder / part
-    return DocumentFolder(folder)

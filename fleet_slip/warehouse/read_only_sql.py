@@ -8,7 +8,6 @@ ever.
 """
 
 import json
-import re
 from collections.abc import Iterator, Mapping
 from itertools import accumulate
 from typing import Any
@@ -21,28 +20,20 @@ from fleet_slip.warehouse.database import duckdb_message
 LONGEST_QUERY = 100_000
 """Characters of one query. Planning takes more than linear time in some of them."""
 
+
+def _words(text: str) -> frozenset[str]:
+    return frozenset(text.split())
+
+
 QUERY_NODES = frozenset({"SELECT_NODE", "SET_OPERATION_NODE", "RECURSIVE_CTE_NODE", "CTE_NODE"})
 """Parts of a statement that read. Others, such as COPY_QUERY_NODE, write."""
 
-TABLE_FUNCTIONS = frozenset(
-    {
-        "generate_series",
-        "histogram",
-        "histogram_values",
-        "json_each",
-        "json_tree",
-        "parquet_file_metadata",
-        "parquet_full_metadata",
-        "parquet_metadata",
-        "parquet_schema",
-        "pragma_table_info",
-        "range",
-        "read_parquet",
-        "repeat",
-        "repeat_row",
-        "summary",
-        "unnest",
-    }
+TABLE_FUNCTIONS = _words(
+    """
+    generate_series histogram histogram_values json_each json_tree parquet_file_metadata
+    parquet_full_metadata parquet_metadata parquet_schema pragma_table_info range read_parquet
+    repeat repeat_row summary unnest
+    """
 )
 """What may stand after FROM like a function, beside duckdb_tables() and its like."""
 
@@ -125,40 +116,20 @@ def _checked(node: dict[str, Any]) -> dict[str, Any]:
 Tree = Mapping[str, Any]
 """An expression as DuckDB's parser serialises it."""
 
-_EXPRESSIONS = frozenset(
-    {
-        "BETWEEN",
-        "CASE",
-        "CAST",
-        "COLUMN_REF",
-        "COMPARISON",
-        "CONJUNCTION",
-        "CONSTANT",
-        "FUNCTION",
-        "OPERATOR",
-        "TYPE",
-    }
+_EXPRESSIONS = _words(
+    "BETWEEN CASE CAST COLUMN_REF COMPARISON CONJUNCTION CONSTANT FUNCTION OPERATOR TYPE"
 )
 """Kinds of expressions, as DuckDB calls them; others are subqueries, windows, lambdas, stars …"""
 
-_OPERATORS = frozenset(
-    {
-        "COMPARE_IN",
-        "COMPARE_NOT_IN",
-        "OPERATOR_COALESCE",
-        "OPERATOR_IS_NOT_NULL",
-        "OPERATOR_IS_NULL",
-        "OPERATOR_NOT",
-    }
+_OPERATORS = _words(
+    "COMPARE_IN COMPARE_NOT_IN OPERATOR_COALESCE OPERATOR_IS_NOT_NULL OPERATOR_IS_NULL OPERATOR_NOT"
 )
 
 _SYMBOLS = frozenset({"+", "-", "*", "/", "//", "%", "||", "~~", "!~~", "~~*", "!~~*", "~~~"})
 """Operators that are functions to DuckDB; the last ones are LIKE, ILIKE and GLOB."""
 
-FUNCTIONS = frozenset(
-    re.findall(
-        r"\w+",
-        """
+FUNCTIONS = _words(
+    """
         abs ceil ceiling floor greatest least mod nullif round sign sqrt trunc
         contains ends_with left length lower ltrim prefix right rtrim split_part starts_with strpos
         substr substring suffix trim upper
@@ -168,19 +139,13 @@ FUNCTIONS = frozenset(
         dayofyear isodow isoyear make_date month quarter week weekday weekofyear year yearweek
         to_days to_months to_weeks to_years
         """,
-    )
 )
 """Functions of their arguments alone, the same on every machine and in every version of DuckDB.
 
 None makes a text longer than its arguments together, so that the cost of a condition is bounded by
 its length. `to_days` and its like are what INTERVAL becomes, `list_value` is a list in brackets."""
 
-TYPES = frozenset(
-    re.findall(
-        r"\w+",
-        "BOOLEAN TINYINT SMALLINT INTEGER BIGINT HUGEINT FLOAT DOUBLE DECIMAL VARCHAR DATE",
-    )
-)
+TYPES = _words("BOOLEAN TINYINT SMALLINT INTEGER BIGINT HUGEINT FLOAT DOUBLE DECIMAL VARCHAR DATE")
 """What may be cast to. Not a time with a zone: the zone is the machine's."""
 
 

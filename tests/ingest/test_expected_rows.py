@@ -8,7 +8,7 @@ import pytest
 import fleet_slip
 from fleet_slip.ingest.drives import stream
 from fleet_slip.ingest.formats import csv_batches
-from fleet_slip.ingest.landing.expected_rows import expected_rows
+from fleet_slip.ingest.formats.reading import expected_rows
 from tests.support.measured import a_mapping, csv_text, good_columns
 
 ROWS = 30_000

@@ -9,7 +9,7 @@ import pytest
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.ingest.drives.measured_drives import MeasuredDrive
 from fleet_slip.ingest.drives.stream import open_measured
-from fleet_slip.ingest.landing.forgotten import keep_drives, keep_refused
+from fleet_slip.ingest.landing.landing import keep_drives, keep_refused
 from fleet_slip.warehouse.audit import Audit, Forgettable
 from tests.support.measured import a_mapping, csv_text, good_columns
 
@@ -36,14 +36,8 @@ def cars(rows: pa.Table) -> set[str]:
 def test_without_a_record_all_rows_are_kept(tmp_path: Path) -> None:
     drives, refused = two_cars(tmp_path)
     audit = Audit(LocalFolder(tmp_path / "data"))
-    kept = keep_drives(drives, audit)
-    assert (list(kept.drives), set(kept.vehicles), set(kept.left_out)) == (
-        drives,
-        {"a", "b"},
-        set(),
-    )
-    rows, vehicles = keep_refused(refused, audit)
-    assert (rows, set(vehicles)) == (refused, {"a", "b"})
+    assert keep_drives(drives, audit) == drives
+    assert keep_refused(refused, audit) == refused
 
 
 @pytest.mark.parametrize("kind", ["vehicle", "drive"])
@@ -54,11 +48,9 @@ def test_the_rows_of_what_was_forgotten_are_left_out(
     of_a, of_b = drives
     audit = Audit(LocalFolder(tmp_path / "data"))
     audit.begin(Forgettable(kind, "a" if kind == "vehicle" else of_a.drive_id), 1, [], {})
-    kept = keep_drives(drives, audit)
-    assert (list(kept.drives), set(kept.vehicles)) == ([of_b], {"b"})
-    assert set(kept.left_out) == {of_a.drive_id}
+    assert keep_drives(drives, audit) == [of_b]
     assert cars(refused) == {"a", "b"}
-    assert cars(keep_refused(refused, audit)[0]) == {"b"}
+    assert cars(keep_refused(refused, audit)) == {"b"}
 
 
 def test_the_refused_rows_of_a_drive_go_with_any_stretch_of_it(tmp_path: Path) -> None:
@@ -66,5 +58,5 @@ def test_the_refused_rows_of_a_drive_go_with_any_stretch_of_it(tmp_path: Path) -
     stretch = f"{refused['drive_id'][0]}-2"
     audit = Audit(LocalFolder(tmp_path / "data"))
     audit.begin(Forgettable("drive", stretch), 1, [], {})
-    assert cars(keep_refused(refused, audit, {stretch})[0]) == {"b"}
-    assert cars(keep_refused(refused, audit)[0]) == {"a", "b"}
+    assert cars(keep_refused(refused, audit, {stretch})) == {"b"}
+    assert cars(keep_refused(refused, audit)) == {"a", "b"}

@@ -10,7 +10,7 @@ import pytest
 
 from fleet_slip.catalogue.counts import as_arrow
 from fleet_slip.ingest.drives.measured_drives import MeasuredDrive
-from fleet_slip.ingest.landing.log_table import SHARED_ROWS, log_table
+from fleet_slip.ingest.landing.data_files import SHARED_ROWS, log_table
 from tests.support.commands import run
 from tests.support.measured import a_mapping, csv_text, good_columns
 

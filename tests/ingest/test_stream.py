@@ -21,7 +21,7 @@ from fleet_slip.ingest.drives.drive_cutter import DriveCutter
 from fleet_slip.ingest.formats import csv_batches
 from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.csv_batches import CsvFormat, PlainNumbers, open_csv
-from fleet_slip.ingest.landing import data_files, landing
+from fleet_slip.ingest.landing import data_files
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.measured import (
     a_mapping,
@@ -152,7 +152,6 @@ def test_the_bits_that_land_depend_on_neither_threads_nor_blocks(
     expected = _land_in(tmp_path / "as it is", tmp_path / "log.csv")
     monkeypatch.setattr(read_ahead_module, "WORKERS", threads)
     monkeypatch.setattr(data_files, "WRITERS", threads)
-    monkeypatch.setattr(landing, "WRITERS", threads)
     monkeypatch.setattr(csv_batches, "BLOCK_BYTES", block_bytes)
     assert _land_in(tmp_path / "otherwise", tmp_path / "log.csv") == expected
     assert len(expected) == 3  # 4 drives in two files, and the quarantine

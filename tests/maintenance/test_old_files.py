@@ -14,7 +14,6 @@ from fleet_slip.maintenance.old_files import (
     find_old_files,
     quarantined_of,
     remove_old_files,
-    remove_uncommitted_files,
     rows_of,
 )
 from fleet_slip.warehouse.audit import Forgettable
@@ -73,11 +72,11 @@ def test_a_leftover_is_deleted_at_once_unless_a_job_may_commit_it(
     land(warehouse, "other", log_rows("beta-1", random_counts(np.random.default_rng(1), 30)))
     path = path_of(warehouse.logs.folder) / warehouse.logs.write_file("left", rows, DAY).path
     before = Forgettable("before", "2024-05-02")
-    assert remove_old_files(warehouse, before).pending == (
+    assert remove_old_files(warehouse, before, replaced=True).pending == (
         f"logs/{path.relative_to(path_of(warehouse.logs.folder))}",
     )
     assert path.exists()
-    assert remove_uncommitted_files(warehouse, vehicle("alfa")).deleted == 1
+    assert remove_old_files(warehouse, vehicle("alfa"), replaced=False).deleted == 1
     assert not path.exists()
 
 

@@ -10,8 +10,8 @@ import pyarrow as pa
 
 from fleet_slip.ingest import IngestCounts, Mapping
 from fleet_slip.ingest.drives.stream import open_measured
+from fleet_slip.ingest.landing.data_files import log_table
 from fleet_slip.ingest.landing.ingest_job import IngestReport, ingest_files
-from fleet_slip.ingest.landing.log_table import log_table
 from fleet_slip.warehouse.tables import Warehouse
 
 TIME = {"column": "t", "unit": "s"}

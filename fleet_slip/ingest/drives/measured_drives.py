@@ -267,6 +267,10 @@ class IngestCounts:
     ticks: int
     """Rows of the result; equal to `rows_kept` where nothing was resampled."""
 
+    def without(self, drives: int, ticks: int) -> "IngestCounts":
+        """Return the counts where some drives were left out, and so many ticks are left."""
+        return replace(self, drives=self.drives - drives, ticks=ticks)
+
 
 @dataclass
 class Totals:

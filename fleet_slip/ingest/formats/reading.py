@@ -11,6 +11,7 @@ from typing import Protocol, TypeVar
 
 import polars as pl
 import pyarrow as pa
+import pyarrow.parquet as pq
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.budget import Budget
@@ -28,10 +29,11 @@ from fleet_slip.ingest.formats.mdf import open_mdf
 from fleet_slip.ingest.formats.mdf_bus import open_mdf_bus
 from fleet_slip.ingest.formats.parquet_batches import PARQUET_MAGIC, open_parquet
 from fleet_slip.ingest.formats.source import Source
-from fleet_slip.ingest.logs.log_files import parts_of
+from fleet_slip.ingest.logs.log_files import Log, parts_of
 from fleet_slip.words import shown
 
 _ARCHIVES = {b"PK\x03\x04": "unzip", b"7z\xbc\xaf": "7z x", b"Rar!": "unrar x"}
+_SAMPLE_BYTES = 2**18
 _BINARY = {
     (".parquet", ".pq"): "a Parquet file",
     (".mf4", ".mdf"): "an MDF file",
@@ -193,3 +195,28 @@ def file_errors(file: Path) -> Iterator[None]:
         raise InputError(
             f"{shown(file)}: cannot be read: {reason}. Is it complete? Copy or export it again."
         ) from None
+
+
+def expected_rows(log: Log) -> int:
+    """Return about how many rows a log has, for its progress; 0 where only reading it would tell.
+
+    A Parquet file says it, text has the lines of its begin throughout; objects are not asked.
+    Never raises for what is wrong with the log: who reads it does.
+    """
+    if not isinstance(log, Path):
+        return 0
+    try:
+        return sum(map(_expected_in, parts_of(log)))
+    except (InputError, OSError, pa.ArrowException):
+        return 0
+
+
+def _expected_in(file: Path) -> int:
+    with file.open("rb") as stream:
+        sample = stream.read(_SAMPLE_BYTES)
+    if sample.startswith(PARQUET_MAGIC):
+        return int(pq.read_metadata(file).num_rows)
+    lines = sample.count(b"\n") - 1  # without the header
+    if b"\0" in sample or lines < 1:
+        return 0
+    return round(file.stat().st_size * lines / len(sample))

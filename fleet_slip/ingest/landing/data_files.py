@@ -1,18 +1,22 @@
 """Writes rows of measured files to data files of bounded size. Nothing is committed."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from hashlib import sha256
+from itertools import groupby
+from operator import itemgetter
 from typing import Any, Literal, TypeAlias
 
+import polars as pl
 import pyarrow as pa
 import pyarrow.compute as pc
 from deltalake.transaction import AddAction
 
+from fleet_slip.catalogue.counts import as_arrow
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.delta import Table, Unit
 from fleet_slip.ingest.drives.measured_drives import MeasuredDrive
-from fleet_slip.ingest.landing.log_table import log_table
 from fleet_slip.ingest.mapping.mapping import Mapping
 
 FILE_ROWS = 2**18
@@ -21,10 +25,22 @@ FILE_ROWS = 2**18
 WRITERS = 2
 """Data files that are written at once: encoding them is the longest part of an ingest."""
 
+SHARED_ROWS = 2**14
+"""Rows of a drive that share the memory of what is the same in all of them."""
+
 TableName: TypeAlias = Literal["quarantine", "logs"]
 Rows: TypeAlias = Sequence[MeasuredDrive] | Sequence[pa.Table]
 """Drives for the logs, or refused rows for the quarantine."""
 Writing: TypeAlias = Future[list[AddAction]]
+
+_POLARS_TYPES: dict[pa.DataType, type[pl.DataType] | pl.DataType] = {
+    pa.string(): pl.String,
+    pa.float64(): pl.Float64,
+    pa.int64(): pl.Int64,
+    pa.int32(): pl.Int32,
+    pa.date32(): pl.Date,
+    pa.timestamp("us", tz="UTC"): pl.Datetime("us", "UTC"),
+}
 
 
 @dataclass(frozen=True)
@@ -46,7 +62,11 @@ def digest_of(digests: Sequence[str]) -> str:
 
 
 class DataFiles:
-    """Data files of one table that a batch of measured files becomes, written by threads."""
+    """Data files of one table that a batch of measured files becomes, written by threads.
+
+    Measured files are read one after the other: rows are added, then their file is ended, or, if it
+    turned out not to be usable, discarded.
+    """
 
     def __init__(
         self,
@@ -58,6 +78,7 @@ class DataFiles:
         """Take the table, the files' mapping, the threads, and what tells which units it has."""
         self._table, self._mapping, self._threads, self._landed = table, mapping, threads, landed
         self._begun: list[Writing] = []
+        self._of_this: list[Writing] = []
         self._of_one: list[Writing] = []
         self._of_several: list[Writing] = []
         self._waiting: dict[str, Rows] = {}
@@ -67,25 +88,29 @@ class DataFiles:
         """Whether a file's rows are neither in the table nor about to be."""
         return digest not in self._digests and not self._landed(unit_of(digest).name)
 
-    def write(self, name: str, rows: Rows) -> Writing:
-        """Write rows while the caller goes on; at most `WRITERS` files are under way."""
-        if len(self._begun) >= WRITERS:
-            self._begun[-WRITERS].result()
-        self._begun.append(self._threads.submit(self._write, name, rows))
-        return self._begun[-1]
+    def add(self, name: str, rows: Rows) -> None:
+        """Write rows of the file that is being read to a data file of their own."""
+        self._of_this.append(self._begin(name, rows))
 
-    def take(self, digest: str, own: Sequence[Writing], rest: Rows) -> None:
-        """Take what a file became: data files of its own, and rows that wait for those of others.
+    def end_file(self, digest: str, rest: Rows) -> None:
+        """End the file that is being read: the rest of its rows wait for those of others.
 
         These are the rows of a small file, or the last of a large one.
         """
-        if own or rest:
+        if self._of_this or rest:
             self._digests.append(digest)
-        self._of_one += own
+        self._of_one += self._of_this
+        self._of_this = []
         if rest:
             self._waiting[digest] = rest
         if sum(one.num_rows for rows in self._waiting.values() for one in rows) >= FILE_ROWS:
             self.write_waiting()
+
+    def discard_file(self) -> None:
+        """Delete what was written of the file that is being read."""
+        written = [writing for writing in self._of_this if writing.exception() is None]
+        self._table.discard(file for writing in written for file in writing.result())
+        self._of_this = []
 
     def write_waiting(self) -> None:
         """Write rows in the order of their files' digests, and so of the names of drives."""
@@ -93,7 +118,7 @@ class DataFiles:
         if digests:
             rows: Any = [one for digest in digests for one in self._waiting[digest]]
             name = f"measured-{digest_of(digests)[:24]}"
-            self._of_several.append(self.write(name, rows))
+            self._of_several.append(self._begin(name, rows))
             self._waiting = {}
 
     def finish(self) -> Part:
@@ -103,10 +128,12 @@ class DataFiles:
         files = tuple(file for writing in writings for file in writing.result())
         return Part(tuple(map(unit_of, sorted(self._digests))), files)
 
-    def discard(self, own: Collection[Writing]) -> None:
-        """Delete data files of a file that turned out not to be usable."""
-        written = [writing for writing in own if writing.exception() is None]
-        self._table.discard(file for writing in written for file in writing.result())
+    def _begin(self, name: str, rows: Rows) -> Writing:
+        """Write rows while the caller goes on; at most `WRITERS` files are under way."""
+        if len(self._begun) >= WRITERS:
+            self._begun[-WRITERS].result()
+        self._begun.append(self._threads.submit(self._write, name, rows))
+        return self._begun[-1]
 
     def _write(self, name: str, rows: Rows) -> list[AddAction]:
         parts = _by_day(_as_table(rows, self._mapping))
@@ -131,3 +158,63 @@ def _by_day(rows: pa.Table) -> dict[Any, pa.Table]:
     if len(days) == 1:
         return {days[0]: rows}
     return {day: rows.filter(pc.equal(rows["day"], pa.scalar(day, pa.date32()))) for day in days}
+
+
+def log_table(drives: Sequence[MeasuredDrive], mapping: Mapping) -> pa.Table:
+    """Return the rows of `logs` for these drives; strings are dictionary-encoded."""
+    sizes = [drive.ticks.size for drive in drives]
+    columns = {}
+    for field in catalogue().log_schema:
+        if field.name == "tick":
+            columns[field.name] = pa.chunked_array(
+                [as_arrow(drive.ticks) for drive in drives], field.type
+            )
+        elif field.name in mapping.signals:
+            columns[field.name] = pa.chunked_array([drive.counts[field.name] for drive in drives])
+        elif field.name in catalogue().extras:
+            continue
+        elif field.name in catalogue().signals:
+            absent = _shared(pa.nulls(SHARED_ROWS, field.type), sum(sizes))
+            columns[field.name] = pa.chunked_array(absent, field.type)
+        else:
+            values = [drive.metadata.get(field.name) for drive in drives]
+            columns[field.name] = _repeat(values, field.type, sizes)
+    return pa.table(columns)
+
+
+def _repeat(values: Sequence[Any], kind: pa.DataType, times: Sequence[int]) -> pa.ChunkedArray:
+    """Return each value as often as it is told; texts as codes of a dictionary."""
+    if pa.types.is_string(kind):
+        texts = list(dict.fromkeys(text for text in values if text is not None))
+        codes = {text: i for i, text in enumerate(texts)}
+        repeated = _repeat([codes.get(text) for text in values], pa.int32(), times)
+        named = _as_arrow(texts, kind)
+        return pa.chunked_array(
+            [pa.DictionaryArray.from_arrays(chunk, named, safe=False) for chunk in repeated.chunks],
+            pa.dictionary(pa.int32(), kind),
+        )
+    runs = [
+        (value, sum(number for _, number in run))
+        for value, run in groupby(zip(values, times, strict=True), key=itemgetter(0))
+    ]
+    scalars = zip(_as_arrow([value for value, _ in runs], kind), runs, strict=True)
+    chunks = [
+        chunk
+        for scalar, (_, number) in scalars
+        for chunk in _shared(pa.repeat(scalar, min(number, SHARED_ROWS)), number)
+    ]
+    repeated = pa.chunked_array(chunks, kind)
+    many_short_runs = len(runs) * SHARED_ROWS > sum(times)
+    return pa.chunked_array([repeated.combine_chunks()]) if many_short_runs else repeated
+
+
+def _shared(rows: pa.Array, number: int) -> list[pa.Array]:
+    """Return so many rows that are all the same, in chunks of some that share their memory."""
+    return [
+        rows.slice(0, min(SHARED_ROWS, number - start)) for start in range(0, number, SHARED_ROWS)
+    ]
+
+
+def _as_arrow(values: Sequence[Any], kind: pa.DataType) -> pa.Array:
+    """Return values as Arrow has them; not by `pa.array`, which imports pandas if it is there."""
+    return pl.Series(values, dtype=_POLARS_TYPES[kind]).to_arrow().cast(kind)

@@ -13,9 +13,14 @@ from fleet_slip.ingest.drives.look_alikes import find_vehicles_like
 from fleet_slip.ingest.drives.measured_drives import IngestCounts
 from fleet_slip.ingest.drives.suspicion import Suspicion
 from fleet_slip.ingest.landing.data_files import unit_of
-from fleet_slip.ingest.landing.folders import KnownFiles
-from fleet_slip.ingest.landing.landing import AskedFile, WrittenBatch, land_batch, write_batch
-from fleet_slip.ingest.landing.writing import FileOutcome
+from fleet_slip.ingest.landing.known_files import KnownFiles
+from fleet_slip.ingest.landing.landing import (
+    AskedFile,
+    FileOutcome,
+    WrittenBatch,
+    land_batch,
+    write_batch,
+)
 from fleet_slip.ingest.logs.log_files import Log, StoredParts
 from fleet_slip.ingest.mapping.mapping import Mapping
 from fleet_slip.progress import Progress, no_progress

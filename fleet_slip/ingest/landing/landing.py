@@ -1,29 +1,35 @@
-"""Writes what a batch of measured files became, and commits it as one."""
+"""The way of a batch of measured files into the warehouse, from an open file to the commit.
 
-from collections.abc import Callable
+`write_batch` goes through the files of a batch, `_write_file` through the rows of one: what was
+forgotten is left out, drives and refused rows become data files. `land_batch` commits them as one.
+"""
+
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
+from itertools import chain, count, pairwise
 
+import polars as pl
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from fleet_slip.catalogue.counts import as_arrow
 from fleet_slip.delta import Change, Table, retry_conflicts
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.drafting.preview import signals_of
-from fleet_slip.ingest.drives.measured_drives import MeasuredDrive
-from fleet_slip.ingest.drives.stream import open_measured
-from fleet_slip.ingest.drives.suspicion import find_suspicions
-from fleet_slip.ingest.landing.data_files import (
-    WRITERS,
-    DataFiles,
-    Part,
-    TableName,
-    digest_of,
-    unit_of,
-)
-from fleet_slip.ingest.landing.writing import FileOutcome, FileWriter
+from fleet_slip.ingest.drives.measured_drives import IngestCounts, MeasuredDrive
+from fleet_slip.ingest.drives.stream import MeasuredStream, open_measured
+from fleet_slip.ingest.drives.suspicion import Suspicion, find_suspicions
+from fleet_slip.ingest.formats.reading import expected_rows
+from fleet_slip.ingest.landing import data_files
+from fleet_slip.ingest.landing.data_files import DataFiles, Part, Rows, TableName, digest_of
 from fleet_slip.ingest.logs.log_files import LocalCopies, Log
+from fleet_slip.ingest.logs.spool import Spool
 from fleet_slip.ingest.mapping.mapping import Mapping
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.audit import Audit
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.recordings import Recording, record_drive
+from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA, Warehouse
 from fleet_slip.words import shown
 
 
@@ -33,6 +39,25 @@ class AskedFile:
 
     file: Log
     earlier: str | None = None
+
+
+@dataclass
+class FileOutcome:
+    """What one file became.
+
+    Attributes:
+        is_new: whether its drives had not landed.
+        vehicles: the cars of what lands; `left_out` are drives that do not, as forgotten.
+    """
+
+    file: Log
+    digest: str
+    is_new: bool
+    counts: IngestCounts
+    look_alikes: tuple[tuple[str, ...], ...]
+    suspicions: tuple[Suspicion, ...] = ()
+    vehicles: set[str] = field(default_factory=set)
+    left_out: int = 0
 
 
 @dataclass(frozen=True)
@@ -62,41 +87,175 @@ def write_batch(
     before is not written again. The longest drive of what is new is looked at: one of a batch, so
     that a folder of small files is not held up. `progress` counts rows of each file.
     """
-    forgotten = Audit(warehouse.root).begun()
-    longest: tuple[int, MeasuredDrive] | None = None
+    audit = Audit(warehouse.root)
+    forgotten = audit.begun()
+    longest: tuple[FileOutcome, MeasuredDrive] | None = None
     outcomes: list[FileOutcome] = []
     failures: list[InputError] = []
     landed = {n: t.snapshot().landed_among(len(files)) for n, t in _tables(warehouse).items()}
     copies = LocalCopies(asked.file for asked in files)
-    with copies, ThreadPoolExecutor(WRITERS) as threads:
+    with copies, ThreadPoolExecutor(data_files.WRITERS) as threads:
         tables = {
             name: DataFiles(table, mapping, threads, landed[name])
             for name, table in _tables(warehouse).items()
         }
         for asked in files:
             try:
-                with (
-                    FileWriter(tables, Audit(warehouse.root), progress) as writer,
-                    copies.of(asked.file) as file,
-                    open_measured(file, mapping) as stream,
-                ):
+                with copies.of(asked.file) as file, open_measured(file, mapping) as stream:
                     _require_not_grown(asked, stream.digest, landed["logs"], mapping)
-                    writer.read(stream)
-            except InputError as error:
+                    outcome, drive, rest = _write_file(stream, asked.file, tables, audit, progress)
+            except BaseException as error:
+                for table in tables.values():
+                    table.discard_file()
+                if not isinstance(error, InputError):
+                    raise
                 failures.append(error)
                 continue
-            drive = writer.longest if writer.is_new else None
+            for name, table in tables.items():
+                table.end_file(outcome.digest, rest.get(name, ()))
+            outcomes.append(outcome)
             if drive and (longest is None or drive.ticks.size > longest[1].ticks.size):
-                longest = len(outcomes), drive
-            outcomes.append(writer.outcome(asked.file))
-        for rows in tables.values():
-            rows.write_waiting()
+                longest = outcome, drive
+        for table in tables.values():
+            table.write_waiting()
         if longest is not None:
-            number, drive = longest
-            found = (*outcomes[number].suspicions, *find_suspicions(signals_of(drive)))
-            outcomes[number] = replace(outcomes[number], suspicions=found)
-        parts = {name: rows.finish() for name, rows in tables.items()}
+            outcome, drive = longest
+            outcome.suspicions += tuple(find_suspicions(signals_of(drive)))
+        parts = {name: table.finish() for name, table in tables.items()}
     return WrittenBatch(tuple(outcomes), tuple(failures), forgotten, parts)
+
+
+def _write_file(
+    stream: MeasuredStream,
+    file: Log,
+    tables: dict[TableName, DataFiles],
+    audit: Audit,
+    progress: Progress,
+) -> tuple[FileOutcome, MeasuredDrive | None, dict[TableName, Rows]]:
+    """Read a file to its end, and write all but its last rows, in those tables that lack them.
+
+    Returns what it became, its longest drive if that is new, and the last rows of each table.
+    """
+    is_new = tables["logs"].lacks(stream.digest)
+    lacking = {n for n, table in tables.items() if is_new and table.lacks(stream.digest)}
+    names = (f"measured-{stream.digest[:24]}-{number}" for number in count(1))
+    refused, rest = _RefusedRows(stream), dict[TableName, Rows]()
+    longest: MeasuredDrive | None = None
+    left_out, vehicles, ticks = set[str](), set[str](), 0
+    for drives in _groups(_read_drives(stream, refused, progress)):
+        longest = max([*([longest] if longest else []), *drives], key=lambda one: one.ticks.size)
+        kept = keep_drives(sorted(drives, key=lambda drive: drive.drive_id), audit)
+        left_out |= {drive.drive_id for drive in drives} - {drive.drive_id for drive in kept}
+        vehicles |= set(map(_car_of, kept))
+        ticks += _rows_of(kept)
+        if not kept or "logs" not in lacking:
+            continue
+        if _rows_of(drives) >= data_files.FILE_ROWS:
+            tables["logs"].add(next(names), kept)
+        else:
+            rest["logs"] = kept
+    for table, following in pairwise(chain(refused.tables(), [None])):
+        allowed = keep_refused(table, audit, left_out)
+        vehicles |= _names(allowed, "vehicle_id")
+        if not allowed.num_rows or "quarantine" not in lacking:
+            continue
+        if following is not None:
+            tables["quarantine"].add(next(names), [allowed])
+        else:
+            rest["quarantine"] = [allowed]
+    counts = stream.counts()
+    outcome = FileOutcome(file, stream.digest, is_new, counts, stream.look_alikes())
+    if not is_new:
+        return outcome, None, {}
+    outcome.counts = counts.without(len(left_out), ticks)
+    outcome.vehicles, outcome.left_out = vehicles, len(left_out)
+    outcome.suspicions = stream.suspicions()
+    return outcome, longest, rest
+
+
+def _read_drives(
+    stream: MeasuredStream, refused: "_RefusedRows", progress: Progress
+) -> Iterator[MeasuredDrive]:
+    """Yield the drives of a file; keep its refused rows, and tell how many rows were read."""
+    expected = expected_rows(stream.file) if progress is not no_progress else 0
+    read = 0
+    for piece in stream.pieces():
+        rows = stream.checker.rows
+        if expected:
+            progress(rows - read, max(expected, rows))
+        read = rows
+        refused.add(piece.refused)
+        yield from piece.drives
+
+
+def _groups(drives: Iterable[MeasuredDrive]) -> Iterator[list[MeasuredDrive]]:
+    """Yield drives with as many rows as a data file has; the last ones may have fewer."""
+    group: list[MeasuredDrive] = []
+    for drive in drives:
+        group.append(drive)
+        if _rows_of(group) >= data_files.FILE_ROWS:
+            yield group
+            group = []
+    if group:
+        yield group
+
+
+class _RefusedRows:
+    """Rows for the quarantine until the end of their file; of many, most are in a temporary file.
+
+    Only then is it known whether a drive that they are of was forgotten.
+    """
+
+    def __init__(self, stream: MeasuredStream) -> None:
+        self._stream, self._spool = stream, Spool()
+        self._rows: list[pl.DataFrame] = []
+
+    def add(self, rows: pl.DataFrame) -> None:
+        if rows.height:
+            self._rows.append(rows)
+        if sum(one.height for one in self._rows) >= data_files.FILE_ROWS:
+            sink = pa.BufferOutputStream()
+            with pa.ipc.new_stream(sink, QUARANTINE_SCHEMA) as writer:
+                writer.write_table(self._stream.quarantine_table(self._rows))
+            self._spool.add("", sink.getvalue().to_pybytes())
+            self._rows = []
+
+    def tables(self) -> Iterator[pa.Table]:
+        for piece in self._spool.read(""):
+            yield pa.ipc.open_stream(piece).read_all()
+        if self._rows:
+            yield self._stream.quarantine_table(self._rows)
+
+
+def keep_drives(drives: Sequence[MeasuredDrive], audit: Audit) -> list[MeasuredDrive]:
+    """Return the drives that were not forgotten under any name, nor their cars."""
+    barred = audit.barred(set(map(_car_of, drives)), {drive.drive_id for drive in drives})
+    known = audit.recordings()
+    return [
+        drive
+        for drive in drives
+        if drive.drive_id not in barred.drives
+        and _car_of(drive) not in barred.vehicles
+        and not (known is not None and known.has(_recording_of(drive)))
+    ]
+
+
+def keep_refused(refused: pa.Table, audit: Audit, left_out: Collection[str] = ()) -> pa.Table:
+    """Return the refused rows that may land, where some drives of their file may not.
+
+    A refused row goes with its car, or with the drive that it would have been of: the name of a
+    drive that was cut at gaps in time begins with it.
+    """
+    vehicles, named = _names(refused, "vehicle_id"), _names(refused, "drive_id")
+    barred = audit.barred(vehicles, named)
+    drives = barred.drives | set(left_out)
+    whole = {name for name in named if any(drive.startswith(f"{name}-") for drive in drives)}
+    for column, unwanted in (("vehicle_id", barred.vehicles), ("drive_id", drives | whole)):
+        if unwanted:
+            names = pa.array(sorted(unwanted), pa.string())
+            mine = pc.is_in(refused[column].cast(pa.string()), names)
+            refused = refused.filter(pc.invert(pc.fill_null(mine, False)))
+    return refused
 
 
 def land_batch(
@@ -140,12 +299,29 @@ def _tables(warehouse: Warehouse) -> dict[TableName, Table]:
     return {"quarantine": warehouse.quarantine, "logs": warehouse.logs}
 
 
+def _rows_of(drives: Iterable[MeasuredDrive]) -> int:
+    return sum(drive.ticks.size for drive in drives)
+
+
+def _car_of(drive: MeasuredDrive) -> str:
+    return str(drive.metadata["vehicle_id"])
+
+
+def _recording_of(drive: MeasuredDrive) -> Recording:
+    ticks = as_arrow(drive.ticks)
+    return record_drive(_car_of(drive), str(drive.metadata["day"]), ticks, drive.counts)
+
+
+def _names(rows: pa.Table, column: str) -> frozenset[str]:
+    return frozenset(rows[column].unique().drop_null().cast(pa.string()).to_pylist())
+
+
 def _require_not_grown(
     asked: AskedFile, digest: str, landed: Callable[[str], bool], mapping: Mapping
 ) -> None:
     """Raise `InputError` for a file whose earlier content is in the logs: it would count twice."""
     earlier = asked.earlier
-    if earlier is None or earlier == digest or not landed(unit_of(earlier).name):
+    if earlier is None or earlier == digest or not landed(data_files.unit_of(earlier).name):
         return
     raise InputError(
         f"{shown(asked.file)}: it has changed since it was ingested, and its drives would count "
