@@ -33,9 +33,9 @@ from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.comparison.observers import ekf
 from fleet_slip.comparison.observers.drive_signals import DriveSignals, read_drive
 from fleet_slip.comparison.rivals.compare import all_signals, cross_validate_learner
+from fleet_slip.comparison.rivals.inputs import draw_sample
 from fleet_slip.comparison.rivals.learner import one_thread
 from fleet_slip.comparison.rivals.learners import ANFIS, PERCEPTRON, TREES
-from fleet_slip.comparison.rivals.sample import draw_sample
 from fleet_slip.files.data_root import data_root
 from fleet_slip.grams.calibration.calibration import Calibration, calibrate
 from fleet_slip.grams.cohorts import expansion, fold_sums

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from fleet_slip.comparison.evaluation.evaluate import TrainRivals
-    from fleet_slip.comparison.report.write import Written
+    from fleet_slip.comparison.report.page import Written
     from fleet_slip.export.estimator import Estimator
     from fleet_slip.export.files import Target
     from fleet_slip.files.documents import Document
@@ -187,8 +187,7 @@ class PublishedModels(Rooted):
         Raises `ConfigError` for a scenario that is not valid, `DataError`, `RefusedError` for a
         scenario that was changed since its drive was simulated, and what `model` raises.
         """
-        from fleet_slip.comparison.evaluation.evaluate import evaluate
-        from fleet_slip.comparison.evaluation.evaluation_document import keep
+        from fleet_slip.comparison.evaluation.evaluate import evaluate, keep
         from fleet_slip.comparison.evaluation.scenario_runs import simulate_scenarios
         from fleet_slip.files.documents import Document
         from fleet_slip.simulation.scenario import load_scenario, shipped_scenarios
@@ -221,7 +220,7 @@ class PublishedModels(Rooted):
         require_single_cars("the report", "Ask evaluate, of drives that are simulated.")
 
         with needed("report", "the report"):
-            from fleet_slip.comparison.report.write import write_report
+            from fleet_slip.comparison.report.page import write_report
 
         folder = LocalFolder(output) if output else self.root / "report"
         return write_report(self.warehouse, self.resolve(model), folder)
@@ -252,8 +251,7 @@ class PublishedModels(Rooted):
                 is_scenario,
                 scenario_frames,
             )
-            from fleet_slip.comparison.watch.film import write_film
-            from fleet_slip.comparison.watch.watch_page import write_page
+            from fleet_slip.comparison.watch.playing import write_film, write_page
 
         writers = {".html": write_page, ".mp4": write_film, ".gif": write_film}
         if output.suffix not in writers:

@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.comparison.evaluation.error_figures import error_figures
 from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive
 from fleet_slip.comparison.evaluation.filters import FilterEstimate
-from fleet_slip.comparison.evaluation.scenario_runs import EvaluatedScenario
+from fleet_slip.comparison.evaluation.scenario_runs import EvaluatedScenario, error_figures
 from fleet_slip.simulation.sensing.sensors import SAMPLE_RATE_HZ
 
 SCENARIO = "nominal"

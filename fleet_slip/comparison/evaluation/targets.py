@@ -9,10 +9,13 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.comparison.evaluation.error_figures import ErrorFigures
 from fleet_slip.comparison.evaluation.estimators import LinearEstimate
-from fleet_slip.comparison.evaluation.scenario_runs import GPS_OUTAGE_S, EvaluatedScenario
-from fleet_slip.comparison.evaluation.stability import find_stretches, rear_compliance
+from fleet_slip.comparison.evaluation.evaluated_drives import find_stretches, rear_compliance
+from fleet_slip.comparison.evaluation.scenario_runs import (
+    GPS_OUTAGE_S,
+    ErrorFigures,
+    EvaluatedScenario,
+)
 from fleet_slip.simulation.sensing.sensors import Sensors
 
 PAPER_TABLE_TWO = {

@@ -1,4 +1,9 @@
-"""What an estimator may read of one drive, in SI units at 100 Hz."""
+"""What an estimator may read of one drive, in SI units at 100 Hz, and what its wheels tell.
+
+Dead reckoning by wheel speeds: Carlson, Gerdes and Powell, "Error sources when land vehicle dead
+reckoning with differential wheelspeeds", Navigation 51 (2004): the axle without drive torque rolls
+with the least slip.
+"""
 
 from dataclasses import dataclass, fields
 
@@ -8,6 +13,7 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.vehicle.parameters import VehicleParameters
 from fleet_slip.warehouse.database import reading_files
 
 STEP_S = float(SAMPLE_TIME_S)
@@ -81,3 +87,62 @@ def hold_last(values: FloatArray, name: str) -> FloatArray:
         )
     latest = np.maximum.accumulate(np.where(valid, np.arange(len(values)), valid.argmax()))
     return values[latest]
+
+
+@dataclass(frozen=True)
+class AxleSpeeds:
+    """Rolling velocity of the two wheels of one axle over cos δ, and their distance."""
+
+    left_mps: FloatArray
+    right_mps: FloatArray
+    track_m: FloatArray | float
+    turned_m: FloatArray | float = 0.0
+    """Mean of tan δ times the axle's distance before the centre of gravity."""
+
+    @property
+    def vx_mps(self) -> FloatArray:
+        """Longitudinal velocity of the centre of gravity."""
+        return (self.left_mps + self.right_mps) / 2 - self.turned_m * self.yaw_rate_rad_s
+
+    @property
+    def yaw_rate_rad_s(self) -> FloatArray:
+        """Yaw rate of the line through the wheels."""
+        return (self.right_mps - self.left_mps) / self.track_m
+
+
+def undriven_axle(drive: DriveSignals, car: VehicleParameters) -> AxleSpeeds:
+    """Return the speeds of the axle that takes the smaller share of the drive torque.
+
+    A wheel that rolls without slip at a hub with velocity (vx ∓ t/2 r, vy + a r), steered by δ, has
+
+        R ω / cos δ = vx ∓ t/2 r + tan δ (vy + a r).
+
+    At the rear δ = 0. At the front the wheels travel with the yaw of the car, too: tan δ a r is
+    taken off their mean. tan δ vy, a thousandth of vx, is neglected.
+    """
+    radius, front = car.tyre.rolling_radius_m, car.body.front_axle_m
+    if car.drivetrain.front_drive_share >= 0.5:
+        return AxleSpeeds(
+            radius * drive.wheel_rl_rad_s, radius * drive.wheel_rr_rad_s, car.body.track_rear_m
+        )
+    left, right = np.tan(drive.steer_fl_rad), np.tan(drive.steer_fr_rad)
+    return AxleSpeeds(
+        radius * drive.wheel_fl_rad_s / np.cos(drive.steer_fl_rad),
+        radius * drive.wheel_fr_rad_s / np.cos(drive.steer_fr_rad),
+        car.body.track_front_m + front * (right - left),
+        front * (left + right) / 2,
+    )
+
+
+SLOWEST_MPS = 1.0
+"""Longitudinal velocity below which the angle is taken as if the car drove so fast."""
+
+
+def sideslip_angle(vx_mps: FloatArray, vy_mps: FloatArray) -> FloatArray:
+    """Return β = arctan(vy / vx) in rad, equations (12) and (13).
+
+    At rest the quotient has no limit and noise would turn the angle by up to π. Below
+    `SLOWEST_MPS`, and in reverse, vx is therefore replaced by `SLOWEST_MPS`: β stays continuous and
+    goes to zero with vy. NaN stays NaN.
+    """
+    return np.arctan2(vy_mps, np.maximum(vx_mps, SLOWEST_MPS))

@@ -21,11 +21,21 @@ from pydantic import Field, FiniteFloat
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.comparison.observers import yaw_rate
-from fleet_slip.comparison.observers.angle import sideslip_angle
-from fleet_slip.comparison.observers.axle_forces import Axles, Chassis, loaded_axles, rates
 from fleet_slip.comparison.observers.belief import Belief, Row, belief_of, condition, spread
-from fleet_slip.comparison.observers.drive_signals import STEP_S, DriveSignals, hold_last
-from fleet_slip.comparison.observers.single_track import measured_speed_mps, measured_steer_rad
+from fleet_slip.comparison.observers.drive_signals import (
+    STEP_S,
+    DriveSignals,
+    hold_last,
+    sideslip_angle,
+)
+from fleet_slip.comparison.observers.single_track import (
+    Axles,
+    Chassis,
+    loaded_axles,
+    measured_speed_mps,
+    measured_steer_rad,
+    rates,
+)
 from fleet_slip.comparison.observers.yaw_rate import YawRateNoise
 from fleet_slip.compiling import kernel
 from fleet_slip.config import Config

@@ -13,9 +13,13 @@ from pydantic import Field, FiniteFloat
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.comparison.observers import yaw_rate
-from fleet_slip.comparison.observers.angle import sideslip_angle
 from fleet_slip.comparison.observers.belief import Belief, belief_of, condition, spread
-from fleet_slip.comparison.observers.drive_signals import STEP_S, DriveSignals, hold_last
+from fleet_slip.comparison.observers.drive_signals import (
+    STEP_S,
+    DriveSignals,
+    hold_last,
+    sideslip_angle,
+)
 from fleet_slip.comparison.observers.yaw_rate import YawRateNoise
 from fleet_slip.compiling import kernel
 from fleet_slip.config import Config

@@ -1,6 +1,8 @@
-"""The linear single-track model in lateral velocity and yaw rate, on which the observers stand.
+"""The single-track model of the observers, linear and, with the forces of its axles, nonlinear.
 
-Riekert and Schunck (1940); in this form Rajamani, "Vehicle Dynamics and Control" (2012), 2.3.
+The linear one is in lateral velocity and yaw rate: Riekert and Schunck (1940); in this form
+Rajamani, "Vehicle Dynamics and Control" (2012), 2.3.
+
 With x = [vy, r], the steering angle δ of the front axle and C the cornering stiffness of an axle:
 
     v̇y = −(Cf + Cr)/(m v) vy − ((a Cf − b Cr)/(m v) + vx) r + Cf/m δ
@@ -8,16 +10,26 @@ With x = [vy, r], the steering angle δ of the front axle and C the cornering st
 
 where v = vx. Below `SLOWEST_MPS` slip is measured against that speed: v = SLOWEST_MPS, and the
 steering of a wheel that hardly rolls counts by vx / v. So the poles stay finite at rest.
+
+In the nonlinear one the lateral forces follow the loads of the moment: bends load the outer wheels
+and braking the front ones. Two wheels with different loads hold less than two with their mean,
+because a tyre's stiffness and grip grow less than its load (Pacejka, "Tire and Vehicle Dynamics"
+(2012), sections 1.2.3 and 4.E25).
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple, Self
+from typing import NamedTuple, Self, cast
 
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.comparison.observers.drive_signals import DriveSignals, hold_last
-from fleet_slip.comparison.observers.wheel_speeds import undriven_axle
+from fleet_slip.comparison.observers.drive_signals import (
+    STEP_S,
+    DriveSignals,
+    hold_last,
+    undriven_axle,
+)
+from fleet_slip.compiling import kernel
 from fleet_slip.vehicle.parameters import VehicleParameters, constants
 from fleet_slip.vehicle.tyre import cornering_stiffness
 
@@ -109,3 +121,132 @@ def measured_speed_mps(drive: DriveSignals, car: VehicleParameters) -> FloatArra
 def measured_steer_rad(drive: DriveSignals) -> FloatArray:
     """Return the mean angle of the front wheels. Raises `DataError` without them."""
     return hold_last((drive.steer_fl_rad + drive.steer_fr_rad) / 2, "steer_fl and steer_fr")
+
+
+LEAST_LOAD = 0.05
+"""Smallest load of a wheel over that at rest: noise lifts none."""
+
+
+class Axles(NamedTuple):
+    """What both tyres of an axle can do together."""
+
+    stiffness_front_n: float
+    """Cornering stiffness per unit of slip."""
+    stiffness_rear_n: float
+    grip_front_n: float
+    """Largest lateral force."""
+    grip_rear_n: float
+
+
+def loaded_axles(
+    car: VehicleParameters, ax_mps2: FloatArray, ay_mps2: FloatArray, adhesion: float
+) -> FloatArray:
+    """Return the `Axles` of a car under accelerations of shape (rows,), as measured.
+
+    The shape is (4, rows): a row for each of their fields. The body leans with the lag of its
+    suspension, which takes the accelerations' noise away.
+    """
+    c = constants(car, adhesion)
+    pitch = c.pitch_transfer * follow(ax_mps2, c.inverse_pitch_lag * STEP_S)
+    leaning = follow(ay_mps2, c.inverse_roll_lag * STEP_S)
+
+    def axle(mean: FloatArray, roll: FloatArray, peak: float) -> tuple[FloatArray, FloatArray]:
+        loads = np.maximum(np.stack([mean - roll, mean + roll]), LEAST_LOAD * c.static_rear)
+        stiffness = cast(FloatArray, cornering_stiffness(cast(float, loads), peak, c))
+        grip = (c.friction - c.friction_per_load * loads) * loads
+        return stiffness.sum(axis=0), grip.sum(axis=0)
+
+    front = axle(c.static_front - pitch, c.roll_transfer_front * leaning, c.stiffness_front)
+    rear = axle(c.static_rear + pitch, c.roll_transfer_rear * leaning, c.stiffness_rear)
+    return np.stack([front[0], rear[0], front[1], rear[1]])
+
+
+@kernel
+def follow(values: FloatArray, gain: float) -> FloatArray:
+    """Return what follows values with a lag, x ← x + gain (value − x), from the first value on."""
+    lagged = np.empty(len(values))
+    x = values[0]
+    for k in range(len(values)):
+        x += gain * (values[k] - x)
+        lagged[k] = x
+    return lagged
+
+
+class LateralForce(NamedTuple):
+    """Lateral force of an axle across the car, and its derivatives."""
+
+    force: float
+    per_vx: float
+    per_vy: float
+    per_r: float
+
+
+@kernel
+def lateral_force(
+    vx: float, vy: float, r: float, steer: float, lever: float, stiffness: float, grip: float
+) -> LateralForce:
+    """Return the force of an axle at the distance `lever` before the centre of gravity.
+
+    With slip σ = −across / along of the axle's velocity in the wheel's frame, the brush tyre of
+    Fiala gives, up to the slip where all of it slides,
+
+        F = C σ − C² |σ| σ / (3 G) + C³ σ³ / (27 G²),   dF/dσ = C (1 − C |σ| / (3 G))²
+
+    and beyond it ±G (Pacejka, "Tire and Vehicle Dynamics" (2012), section 3.2.1).
+    """
+    cosine, sine = np.cos(steer), np.sin(steer)
+    side = vy + lever * r
+    across = cosine * side - sine * vx
+    along = cosine * vx + sine * side
+    rolling = max(along, SLOWEST_MPS)
+    turning = 1.0 if along > SLOWEST_MPS else 0.0
+    slip = -across / rolling
+    use = stiffness * slip / (3.0 * grip)
+    stuck = max(1.0 - abs(use), 0.0)
+    force = 3.0 * grip * use * (1.0 - abs(use) + use * use / 3.0)
+    if stuck == 0.0:
+        force = grip if slip > 0.0 else -grip
+    per_slip = stiffness * stuck * stuck / rolling
+    # dσ = −(d across + σ d along) / rolling
+    per_side = -per_slip * (cosine + turning * slip * sine) * cosine
+    per_vx = -per_slip * (-sine + turning * slip * cosine) * cosine
+    return LateralForce(cosine * force, per_vx, per_side, lever * per_side)
+
+
+class Chassis(NamedTuple):
+    """Mass, yaw inertia and the axles' distances from the centre of gravity."""
+
+    mass_kg: float
+    yaw_inertia_kgm2: float
+    front_m: float
+    rear_m: float
+
+
+class Rates(NamedTuple):
+    """Lateral acceleration and yaw acceleration, with their derivatives."""
+
+    ay: float
+    ay_vx: float
+    ay_vy: float
+    ay_r: float
+    yaw: float
+    yaw_vx: float
+    yaw_vy: float
+    yaw_r: float
+
+
+@kernel
+def rates(vx: float, vy: float, r: float, steer: float, axles: Axles, c: Chassis) -> Rates:
+    """Return (Ff cos δ + Fr)/m and (a Ff cos δ − b Fr)/I, linearised."""
+    f = lateral_force(vx, vy, r, steer, c.front_m, axles.stiffness_front_n, axles.grip_front_n)
+    b = lateral_force(vx, vy, r, 0.0, -c.rear_m, axles.stiffness_rear_n, axles.grip_rear_n)
+    return Rates(
+        (f.force + b.force) / c.mass_kg,
+        (f.per_vx + b.per_vx) / c.mass_kg,
+        (f.per_vy + b.per_vy) / c.mass_kg,
+        (f.per_r + b.per_r) / c.mass_kg,
+        (c.front_m * f.force - c.rear_m * b.force) / c.yaw_inertia_kgm2,
+        (c.front_m * f.per_vx - c.rear_m * b.per_vx) / c.yaw_inertia_kgm2,
+        (c.front_m * f.per_vy - c.rear_m * b.per_vy) / c.yaw_inertia_kgm2,
+        (c.front_m * f.per_r - c.rear_m * b.per_r) / c.yaw_inertia_kgm2,
+    )

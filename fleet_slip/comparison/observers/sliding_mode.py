@@ -17,8 +17,12 @@ from pydantic import Field, FiniteFloat, model_validator
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.comparison.observers import yaw_rate
-from fleet_slip.comparison.observers.angle import sideslip_angle
-from fleet_slip.comparison.observers.drive_signals import STEP_S, DriveSignals, hold_last
+from fleet_slip.comparison.observers.drive_signals import (
+    STEP_S,
+    DriveSignals,
+    hold_last,
+    sideslip_angle,
+)
 from fleet_slip.comparison.observers.single_track import (
     SingleTrack,
     measured_speed_mps,

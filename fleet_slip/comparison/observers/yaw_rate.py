@@ -20,8 +20,7 @@ from pydantic import Field, FiniteFloat
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.comparison.observers.belief import belief_of, condition
-from fleet_slip.comparison.observers.drive_signals import STEP_S, DriveSignals
-from fleet_slip.comparison.observers.wheel_speeds import undriven_axle
+from fleet_slip.comparison.observers.drive_signals import STEP_S, DriveSignals, undriven_axle
 from fleet_slip.compiling import kernel
 from fleet_slip.config import Config
 from fleet_slip.simulation.sensing.sensors import Sensors

@@ -1,17 +1,22 @@
-"""The report as one static page, without a request to anywhere."""
+"""The report: one static page without a request to anywhere, and its figures as files."""
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from fleet_slip.comparison.evaluation.targets import PAPER_TABLE_TWO
-from fleet_slip.comparison.report.claims.judging import Judged, Status, judge_claims
-from fleet_slip.comparison.report.findings.report_data import ReportData
-from fleet_slip.comparison.report.tables import further_tables, paper_tables
-from fleet_slip.pages.drawing import draw
+from fleet_slip.comparison.report import further_tables, paper_tables
+from fleet_slip.comparison.report.further_pictures import draw_pictures
+from fleet_slip.comparison.report.judging import Judged, Status, judge_claims
+from fleet_slip.comparison.report.report_data import ReportData, gather
+from fleet_slip.files.folder import Folder
+from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.pages.drawing import draw, png_file, svg_file
 from fleet_slip.pages.page_table import ReportTable, Tile
 from fleet_slip.pages.picture import Picture
 from fleet_slip.pages.templating import fill_in
 from fleet_slip.pages.text import count, degrees, size
+from fleet_slip.warehouse.tables import Warehouse
 from fleet_slip.words import number_of
 
 SECTIONS = ("figure-", "memory-", "road-", "fleet-")
@@ -135,3 +140,37 @@ def _commands(data: ReportData) -> list[str]:
         f"fleet-slip evaluate --one-car {reference}{options}",
         f"fleet-slip report --model {reference}",
     ]
+
+
+PAGE = "report.html"
+FIGURES = "figures"
+
+
+@dataclass(frozen=True)
+class Written:
+    """What was written."""
+
+    page: str
+    size_bytes: int
+    figures: int
+
+    @property
+    def figures_folder(self) -> str:
+        """Where the figures are as files."""
+        return f"{self.page.removesuffix(PAGE)}{FIGURES}"
+
+
+def write_report(warehouse: Warehouse, version: ModelVersion, output: Folder) -> Written:
+    """Write the report about a model version into a folder.
+
+    A file is replaced as a whole or not at all; the page comes last. Raises `DataError` if the
+    version has not been evaluated, or not on today's data.
+    """
+    data = gather(warehouse, version)
+    shown = draw_pictures(data)
+    page = render(data, shown).encode("utf-8")
+    for picture in shown:
+        output.put(f"{FIGURES}/{picture.key}.svg", svg_file(picture).encode("utf-8"))
+        output.put(f"{FIGURES}/{picture.key}.png", png_file(picture))
+    output.put(PAGE, page)
+    return Written(f"{output}/{PAGE}", len(page), len(shown))

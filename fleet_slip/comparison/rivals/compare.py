@@ -7,14 +7,13 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.comparison.evaluation.error_figures import ErrorFigures, error_figures
 from fleet_slip.comparison.evaluation.estimators import TABLE_ONE
 from fleet_slip.comparison.evaluation.evaluate import Rival
 from fleet_slip.comparison.evaluation.filters import Bank, read_labelled
-from fleet_slip.comparison.rivals.inputs import Inputs, LearnedEstimate
+from fleet_slip.comparison.evaluation.scenario_runs import ErrorFigures, error_figures
+from fleet_slip.comparison.rivals.inputs import Inputs, LearnedEstimate, RowSample, draw_sample
 from fleet_slip.comparison.rivals.learner import Fitted, Learner, one_thread
 from fleet_slip.comparison.rivals.learners import LEARNERS, OF_WINDOWS
-from fleet_slip.comparison.rivals.sample import RowSample, draw_sample
 from fleet_slip.comparison.rivals.tree_filter import BASE, train_tree_filter
 from fleet_slip.grams.calibration.calibration import calibrate
 from fleet_slip.grams.cohorts.gram_cohort import Cohort

@@ -1,5 +1,7 @@
 """The learners: how each is fitted to a sample, and how much a car would have to carry of it."""
 
+import warnings
+
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
@@ -9,10 +11,109 @@ from fleet_slip.comparison.rivals.learner import (
     Fitted,
     Learner,
     Names,
+    Scaling,
     hold_back,
     scikit_learn,
 )
-from fleet_slip.comparison.rivals.networks import fit_general_regression, fit_perceptron
+
+LAYERS = (64, 64)
+BATCH_ROWS = 256
+RATES = (3e-3, 1e-3, 3e-4, 1e-4)
+"""Learning rates, one after the other: each until the drives held back are estimated no better."""
+
+PASSES_AT_ONCE = 3
+PASSES = 60
+"""Passes over the sample, at most."""
+
+
+def fit_perceptron(inputs: FloatArray, label: FloatArray, trip: Names) -> Fitted:
+    """Fit a network with two hidden layers of 64 neurons, on scaled inputs and label, by Adam.
+
+    It keeps the weights that estimate drives best which it does not learn from.
+    """
+    network = scikit_learn("neural_network").MLPRegressor(
+        hidden_layer_sizes=LAYERS, activation="tanh", batch_size=BATCH_ROWS,
+        max_iter=PASSES_AT_ONCE, tol=0.0, warm_start=True, random_state=SEED,
+    )  # fmt: skip
+    scaling, of_label = Scaling.of(inputs), Scaling.of(label)
+    scaled, wanted = scaling(inputs).astype(np.float32), of_label(label).astype(np.float32)
+    held = hold_back(trip)
+    least, best, passes = np.inf, None, 0
+    for rate in RATES:
+        network.set_params(learning_rate_init=rate)
+        better = True
+        while better and passes < PASSES:
+            with warnings.catch_warnings():
+                # That a few passes do not converge is no news.
+                warnings.simplefilter("ignore")
+                network.fit(scaled[~held], wanted[~held])
+            passes += PASSES_AT_ONCE
+            error = float(np.mean((network.predict(scaled[held]) - wanted[held]) ** 2))
+            better = error < least
+            if better:
+                least = error
+                best = [array.copy() for array in (*network.coefs_, *network.intercepts_)]
+        if best is not None:
+            layers = len(LAYERS) + 1
+            network.coefs_ = [array.copy() for array in best[:layers]]
+            network.intercepts_ = [array.copy() for array in best[layers:]]
+
+    def predict(rows: FloatArray) -> FloatArray:
+        found: FloatArray = network.predict(scaling(rows).astype(np.float32)).astype(np.float64)
+        return found * of_label.std + of_label.mean
+
+    parameters = sum(array.nbytes for array in (*network.coefs_, *network.intercepts_))
+    return Fitted(predict, int(parameters) + scaling.size_bytes + of_label.size_bytes)
+
+
+CENTRES = 1000
+"""Rows that the general regression network remembers."""
+
+BANDWIDTHS = (0.1, 0.15, 0.2, 0.3, 0.45, 0.7, 1.0)
+"""Widths of its kernel to choose from, in standard deviations of the inputs."""
+
+
+def fit_general_regression(inputs: FloatArray, label: FloatArray, trip: Names) -> Fitted:
+    """Fit a general regression network (Specht 1991): a mean of remembered labels.
+
+    Each remembered row counts with exp(−d²/2h²), d its distance in scaled inputs. The width h is
+    the one that estimates drives best which are not remembered.
+    """
+    scaling = Scaling.of(inputs)
+    held = hold_back(trip)
+    order = np.random.default_rng(SEED).permutation(len(inputs))
+    kept, others = order[~held[order]][:CENTRES], order[held[order]][:CENTRES]
+    centres, labels = scaling(inputs[kept]), label[kept]
+
+    def error(width: float) -> float:
+        estimate = kernel_mean(scaling(inputs[others]), centres, labels, width)
+        return float(np.mean((estimate - label[others]) ** 2))
+
+    width = min(BANDWIDTHS, key=error)
+    return Fitted(
+        lambda rows: kernel_mean(scaling(rows), centres, labels, width),
+        int(centres.nbytes + labels.nbytes) + scaling.size_bytes + 8,
+    )
+
+
+BLOCK = 2048
+
+
+def kernel_mean(
+    rows: FloatArray, centres: FloatArray, labels: FloatArray, width: float
+) -> FloatArray:
+    """Return the mean of labels at rows, weighted by Gaussian kernels around the centres.
+
+    The nearest centre always counts, however far it is.
+    """
+    half = (centres**2).sum(axis=1) / 2
+    estimates = np.empty(len(rows))
+    for first in range(0, len(rows), BLOCK):
+        # −d²/2 but for a term that is the same for all centres of a row, which cancels.
+        closeness = (rows[first : first + BLOCK] @ centres.T - half) / width**2
+        weights = np.exp(closeness - closeness.max(axis=1, keepdims=True))
+        estimates[first : first + BLOCK] = weights @ labels / weights.sum(axis=1)
+    return estimates
 
 
 def fit_regression(inputs: FloatArray, label: FloatArray, _: Names) -> Fitted:

@@ -17,15 +17,14 @@ import numpy as np
 from pydantic import Field, FiniteFloat
 
 from fleet_slip.arrays import FloatArray, IntArray
-from fleet_slip.comparison.evaluation.error_figures import error_figures
 from fleet_slip.comparison.evaluation.estimators import Signals
 from fleet_slip.comparison.evaluation.evaluate import Rival
 from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive
 from fleet_slip.comparison.evaluation.filters import FilterEstimate, seen
+from fleet_slip.comparison.evaluation.scenario_runs import error_figures
 from fleet_slip.comparison.observers import ekf
-from fleet_slip.comparison.observers.axle_forces import follow
 from fleet_slip.comparison.observers.drive_signals import DriveSignals, LabelledDrive, hold_last
-from fleet_slip.comparison.observers.single_track import measured_speed_mps
+from fleet_slip.comparison.observers.single_track import follow, measured_speed_mps
 from fleet_slip.comparison.observers.tuning import tune
 from fleet_slip.comparison.rivals.learner import SEED, scikit_learn
 from fleet_slip.config import Config

@@ -11,7 +11,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.comparison.evaluation.evaluated_drives import load_drives
 from fleet_slip.comparison.evaluation.scenario_runs import simulate_scenarios
-from fleet_slip.comparison.report.findings.gate_openings import gates_on
+from fleet_slip.comparison.report.gate_strips import gates_on
 from fleet_slip.errors import DataError, QuestionError, UsageError
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.resources import config_names

@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 
 from fleet_slip.cli.app import app
 from fleet_slip.comparison.evaluation.estimators import published_estimate
+from fleet_slip.comparison.evaluation.evaluate import keep
 from fleet_slip.comparison.evaluation.evaluated_drives import load_drives
-from fleet_slip.comparison.evaluation.evaluation_document import keep
 from fleet_slip.comparison.evaluation.filters import FILTERS, FilterEstimate
 from fleet_slip.comparison.observers import kalman
 from fleet_slip.comparison.observers.drive_signals import read_drive

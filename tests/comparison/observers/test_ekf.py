@@ -7,17 +7,17 @@ from hypothesis import strategies as st
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.comparison.observers import ekf
-from fleet_slip.comparison.observers.axle_forces import (
+from fleet_slip.comparison.observers.belief import Belief, belief_of, condition
+from fleet_slip.comparison.observers.drive_signals import STEP_S, DriveSignals
+from fleet_slip.comparison.observers.ekf import EkfNoise, axles_of, chassis, variances
+from fleet_slip.comparison.observers.single_track import (
     Axles,
     Rates,
+    SingleTrack,
     lateral_force,
     loaded_axles,
     rates,
 )
-from fleet_slip.comparison.observers.belief import Belief, belief_of, condition
-from fleet_slip.comparison.observers.drive_signals import STEP_S, DriveSignals
-from fleet_slip.comparison.observers.ekf import EkfNoise, axles_of, chassis, variances
-from fleet_slip.comparison.observers.single_track import SingleTrack
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.support.drives import noisy, rolling_drive, steady_sideslip_rad
 

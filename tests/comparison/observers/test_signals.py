@@ -6,8 +6,12 @@ import duckdb
 import numpy as np
 import pytest
 
-from fleet_slip.comparison.observers.angle import sideslip_angle
-from fleet_slip.comparison.observers.drive_signals import DriveSignals, hold_last, read_drive
+from fleet_slip.comparison.observers.drive_signals import (
+    DriveSignals,
+    hold_last,
+    read_drive,
+    sideslip_angle,
+)
 from fleet_slip.errors import DataError, QuestionError
 
 

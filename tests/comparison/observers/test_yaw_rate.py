@@ -7,8 +7,7 @@ import pytest
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.comparison.observers import yaw_rate
-from fleet_slip.comparison.observers.drive_signals import STEP_S, DriveSignals
-from fleet_slip.comparison.observers.wheel_speeds import undriven_axle
+from fleet_slip.comparison.observers.drive_signals import STEP_S, DriveSignals, undriven_axle
 from fleet_slip.comparison.observers.yaw_rate import YawRateNoise
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.support.drives import noisy, rolling_drive, slalom

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from fleet_slip.comparison.report.findings.report_data import ReportData, gather
+from fleet_slip.comparison.report.report_data import ReportData, gather
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.models.versions import Registry
 from fleet_slip.warehouse.tables import Warehouse

@@ -15,7 +15,7 @@ from pypdfium2 import PdfDocument
 
 import fleet_slip
 from fleet_slip.comparison.watch.drive_frames import drive_frames
-from fleet_slip.comparison.watch.watch_page import render_watch
+from fleet_slip.comparison.watch.playing import render_watch
 from fleet_slip.monitoring.night_page import render_night
 from tests.support.landing import Landing
 from tests.support.reported import Reported

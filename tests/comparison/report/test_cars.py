@@ -9,7 +9,7 @@ import pytest
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.features import input_scales
-from fleet_slip.comparison.report.findings.own_numbers import (
+from fleet_slip.comparison.report.column_worth import (
     FEWEST_CARS,
     FOLDS,
     Cars,
@@ -17,9 +17,9 @@ from fleet_slip.comparison.report.findings.own_numbers import (
     largest_fleet,
     weigh_cars,
 )
-from fleet_slip.comparison.report.findings.report_data import ReportData
+from fleet_slip.comparison.report.further_pictures import draw_pictures
 from fleet_slip.comparison.report.page import render
-from fleet_slip.comparison.report.pictures import draw_pictures
+from fleet_slip.comparison.report.report_data import ReportData
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.cohorts.folding import assign_folds
 from fleet_slip.grams.cohorts.gram_cohort import Cohort

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from fleet_slip.comparison.report.figures.labels import apart
-from fleet_slip.comparison.report.figures.lines import band, smooth
+from fleet_slip.comparison.report.error_charts import apart
+from fleet_slip.comparison.report.time_series import band, smooth
 
 
 @given(

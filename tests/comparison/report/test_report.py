@@ -15,11 +15,16 @@ import pytest
 from jinja2 import meta
 
 from fleet_slip.catalogue.features import features, input_scales
-from fleet_slip.comparison.evaluation.evaluation_document import keep
+from fleet_slip.comparison.evaluation.evaluate import keep
 from fleet_slip.comparison.evaluation.ranking import LEAST_COVERAGE
 from fleet_slip.comparison.evaluation.targets import PAPER_TABLE_TWO
-from fleet_slip.comparison.report.claims.facts import NAMES, Facts
-from fleet_slip.comparison.report.claims.judging import (
+from fleet_slip.comparison.report import paper_tables
+from fleet_slip.comparison.report.column_worth import by_length, looks_back
+from fleet_slip.comparison.report.facts import NAMES, Facts
+from fleet_slip.comparison.report.further_pictures import draw_pictures, road_pictures
+from fleet_slip.comparison.report.further_tables import standings
+from fleet_slip.comparison.report.gate_strips import gates_of, opening
+from fleet_slip.comparison.report.judging import (
     CLAIMS,
     LIMITS,
     TEXTS,
@@ -27,16 +32,10 @@ from fleet_slip.comparison.report.claims.judging import (
     judge,
     judge_claims,
 )
-from fleet_slip.comparison.report.findings.gate_openings import gates_of, opening
-from fleet_slip.comparison.report.findings.histogram import ANGLE_DEG, held_out_coefficients
-from fleet_slip.comparison.report.findings.memory import by_length, looks_back
-from fleet_slip.comparison.report.findings.report_data import ReportData
-from fleet_slip.comparison.report.findings.stretches import blocks_won, difference
+from fleet_slip.comparison.report.kept_evaluation import blocks_won, difference
 from fleet_slip.comparison.report.page import render
-from fleet_slip.comparison.report.pictures import draw_pictures
-from fleet_slip.comparison.report.pictures.further_pictures import road_pictures
-from fleet_slip.comparison.report.tables import paper_tables
-from fleet_slip.comparison.report.tables.further_tables import standings
+from fleet_slip.comparison.report.report_data import ReportData
+from fleet_slip.comparison.report.training_findings import ANGLE_DEG, held_out_coefficients
 from fleet_slip.errors import DataError
 from fleet_slip.files.documents import Document
 from fleet_slip.files.local_folder import LocalFolder

@@ -11,17 +11,18 @@ from fleet_slip.comparison.rivals.compare import (
     cross_validate_learner,
     train,
 )
-from fleet_slip.comparison.rivals.inputs import Inputs
+from fleet_slip.comparison.rivals.inputs import Inputs, RowSample
 from fleet_slip.comparison.rivals.learner import Fitted, Learner, Names, hold_back
-from fleet_slip.comparison.rivals.learners import LEARNERS, fit_regression, fit_trees
-from fleet_slip.comparison.rivals.networks import (
+from fleet_slip.comparison.rivals.learners import (
     CENTRES,
     LAYERS,
+    LEARNERS,
     fit_general_regression,
     fit_perceptron,
+    fit_regression,
+    fit_trees,
     kernel_mean,
 )
-from fleet_slip.comparison.rivals.sample import RowSample
 from fleet_slip.regression.validation.folds import by_hash
 
 

@@ -8,9 +8,8 @@ import pytest
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.blocks.drive_columns import DriveCounts
-from fleet_slip.comparison.rivals.inputs import Inputs, LearnedEstimate
+from fleet_slip.comparison.rivals.inputs import Inputs, LearnedEstimate, draw_sample
 from fleet_slip.comparison.rivals.learner import Fitted
-from fleet_slip.comparison.rivals.sample import draw_sample
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.models.versions import Registry

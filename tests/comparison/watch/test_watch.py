@@ -15,7 +15,7 @@ from PIL import Image
 
 import fleet_slip
 from fleet_slip.comparison.watch.drive_frames import FRAMES_PER_S, DriveFrames, drive_frames
-from fleet_slip.comparison.watch.watch_page import render_watch
+from fleet_slip.comparison.watch.playing import render_watch
 from fleet_slip.errors import ExtraError, QuestionError, UsageError
 from tests.support.commands import run
 

@@ -4,10 +4,10 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from fleet_slip.comparison.evaluation.error_figures import ErrorFigures
+from fleet_slip.comparison.evaluation.scenario_runs import ErrorFigures
 from fleet_slip.comparison.evaluation.targets import PAPER_TABLE_TWO
-from fleet_slip.comparison.report.findings.report_data import DRAWN_FILTERS, ReportData
-from fleet_slip.comparison.report.findings.stretches import BLOCK_S, blocks_won, difference
+from fleet_slip.comparison.report.kept_evaluation import BLOCK_S, blocks_won, difference
+from fleet_slip.comparison.report.report_data import DRAWN_FILTERS, ReportData
 from fleet_slip.export.costs import describe_costs
 from fleet_slip.pages.text import degrees
 from fleet_slip.regression.choice.winner import Winner

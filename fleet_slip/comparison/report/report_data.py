@@ -20,12 +20,22 @@ from fleet_slip.comparison.evaluation.estimators import (
 from fleet_slip.comparison.evaluation.filters import rebuild
 from fleet_slip.comparison.evaluation.scenario_runs import EvaluatedScenario, run_all
 from fleet_slip.comparison.evaluation.targets import THE_PAPERS_CHOICE
-from fleet_slip.comparison.report.findings.coefficients import Coefficients, coefficient_table
-from fleet_slip.comparison.report.findings.histogram import Histogram, held_out_histogram
-from fleet_slip.comparison.report.findings.kept_evaluation import Evaluated, latest_of
-from fleet_slip.comparison.report.findings.memory import Memory, looks_back, weigh_memory
-from fleet_slip.comparison.report.findings.ordering import Ordering, compare_orders
-from fleet_slip.comparison.report.findings.own_numbers import Cars, weigh_cars
+from fleet_slip.comparison.report.column_worth import (
+    Cars,
+    Memory,
+    looks_back,
+    weigh_cars,
+    weigh_memory,
+)
+from fleet_slip.comparison.report.kept_evaluation import Evaluated, latest_of
+from fleet_slip.comparison.report.training_findings import (
+    Coefficients,
+    Histogram,
+    Ordering,
+    coefficient_table,
+    compare_orders,
+    held_out_histogram,
+)
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.cohorts.folding import BANDS, Folding
 from fleet_slip.grams.cohorts.gram_cohort import Cohort, load_cohort

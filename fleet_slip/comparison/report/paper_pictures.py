@@ -3,9 +3,8 @@
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from fleet_slip.comparison.report.figures.series import DriveBlock, Line, side_slip
-from fleet_slip.comparison.report.figures.speed import KMH_PER_MPS, speed
-from fleet_slip.comparison.report.findings.report_data import DRAWN_FILTERS, ReportData
+from fleet_slip.comparison.report.report_data import DRAWN_FILTERS, ReportData
+from fleet_slip.comparison.report.time_series import KMH_PER_MPS, DriveBlock, Line, side_slip, speed
 from fleet_slip.pages.picture import Picture
 from fleet_slip.pages.text import degrees, listed, number
 

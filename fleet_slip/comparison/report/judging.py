@@ -10,8 +10,8 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined, meta
 
 from fleet_slip.comparison.evaluation.targets import PAPER_TABLE_TWO
-from fleet_slip.comparison.report.claims.facts import Facts, NotEvaluatedError
-from fleet_slip.comparison.report.findings.report_data import ReportData
+from fleet_slip.comparison.report.facts import Facts, NotEvaluatedError
+from fleet_slip.comparison.report.report_data import ReportData
 from fleet_slip.pages import text
 
 TEXTS = Environment(undefined=StrictUndefined, keep_trailing_newline=True)  # noqa: S701 - no HTML

@@ -1,23 +1,138 @@
-"""True angles and estimates of all training rows, counted in one pass over the logs.
+"""What the training drives tell: coefficients, the order of variables, held-out estimates."""
 
-Each drive is estimated by the model that was fitted without its fold, as in cross-validation.
-"""
-
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
 
 from fleet_slip.arrays import FloatArray, IntArray
+from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.grams.cohorts.folding import FOLD_KEYS, assign_folds
-from fleet_slip.regression.exact.least_squares import LinearModel
+from fleet_slip.grams.cohorts.gram_cohort import Cohort
+from fleet_slip.grams.cohorts.training_folds import clustered_moments
+from fleet_slip.regression.choice.nested import nested_fits
+from fleet_slip.regression.choice.signal_orders import RANKINGS, rank
+from fleet_slip.regression.choice.subsets import best_subsets
+from fleet_slip.regression.exact.least_squares import LinearModel, fit
+from fleet_slip.regression.inference.drive_moments import ClusterUnit
+from fleet_slip.regression.inference.standard_errors import (
+    INTERCEPT,
+    Estimate,
+    infer_by_clusters,
+    infer_classically,
+    variance_inflation,
+)
 from fleet_slip.regression.validation.crossval import CrossValidation, least_squares
 from fleet_slip.resources import read_sql
 from fleet_slip.selection.select_models import Selection
 from fleet_slip.views import connect
 from fleet_slip.warehouse.database import reading_files
 from fleet_slip.warehouse.tables import Warehouse
+
+
+@dataclass(frozen=True)
+class Coefficient:
+    """One row of a coefficient table.
+
+    Attributes:
+        estimate: of a signal or the intercept, with drives, or cars, as the independent pieces of
+            evidence.
+        unit: of the value.
+        row_error: standard error as if every row were independent.
+        share_deg: degrees of estimate for one standard deviation of the signal; None of a constant.
+        inflation: variance inflation factor; None of the intercept.
+    """
+
+    estimate: Estimate
+    unit: str
+    row_error: float
+    share_deg: float | None
+    inflation: float | None
+
+
+@dataclass(frozen=True)
+class Coefficients:
+    """The coefficients of one model, and the data that they are from."""
+
+    model: str
+    rows: Sequence[Coefficient]
+    drives: int
+    cluster: ClusterUnit
+    log_rows: int
+
+
+def coefficient_table(
+    cohort: Cohort, model: str, inputs: Sequence[str], *, intercept: bool = True
+) -> Coefficients:
+    """Fit the label on the inputs over all drives of a cohort that have them.
+
+    Raises `DataError` if no drive has them, or there is one only.
+    """
+    label = catalogue().label
+    served = cohort.serving(inputs)
+    moments = clustered_moments(served, intercept=intercept)
+    fitted = fit(served.table.total(), inputs, label, intercept=intercept)
+    scales = input_scales()
+    robust, naive = infer_by_clusters(fitted, moments, scales), infer_classically(fitted, scales)
+    inflation = variance_inflation(fitted.gram, inputs)
+    spread = dict(zip(moments.signals, moments.spread.tolist(), strict=True))
+    rows = []
+    for estimate, other in zip(robust.estimates, naive.estimates, strict=True):
+        constant = estimate.name == INTERCEPT
+        unit = "rad" if constant else f"rad per {features().of(estimate.name).unit}"
+        share = None
+        if not constant:
+            deviation = spread[estimate.name] * float(scales[estimate.name])
+            share = math.degrees(estimate.value * deviation)
+        found = inflation.get(estimate.name)
+        rows.append(Coefficient(estimate, unit, other.standard_error, share, found))
+    return Coefficients(model, tuple(rows), len(moments), moments.unit, served.table.total().n)
+
+
+CLOSE = 0.001
+"""A model explains nearly all if it leaves no more than this of the variance to the full one."""
+
+
+@dataclass(frozen=True)
+class Ordering:
+    """How many signals each order needs to explain nearly as much as all of them.
+
+    Attributes:
+        signals: all of them.
+        needed: by ranking algorithm.
+        best: by the best subset.
+        subsets: number of subsets that were compared.
+    """
+
+    signals: tuple[str, ...]
+    needed: dict[str, int]
+    best: int
+    subsets: int
+
+
+def compare_orders(cohort: Cohort, signals: Sequence[str]) -> Ordering:
+    """Rank the signals in every way, and compare with all subsets.
+
+    Raises `DataError` if no drive of the cohort has them all.
+    """
+    label = catalogue().label
+    total = cohort.serving(signals).table.total()
+    best = best_subsets(total, signals, label, count=1)
+    enough = best[-1].best.r_squared - CLOSE
+    needed = {}
+    for ranking in RANKINGS:
+        fits = nested_fits(total, rank(ranking, total, signals, label), label)
+        needed[ranking] = next(fit.size for fit in fits if fit.r_squared >= enough)
+    return Ordering(
+        signals=tuple(signals),
+        needed=needed,
+        best=next(size.best.size for size in best if size.best.r_squared >= enough),
+        subsets=2 ** len(signals),
+    )
+
 
 ANGLE_DEG = 0.05
 ACCELERATION_MPS2 = 0.1

@@ -1,4 +1,4 @@
-"""Side-slip angles over time, true and estimated, and beneath them the differences."""
+"""Series over time: the speed, true and estimated angles, and beneath them the differences."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -8,11 +8,52 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from fleet_slip.arrays import FloatArray
+from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive, find_stretches
 from fleet_slip.comparison.evaluation.scenario_runs import EvaluatedScenario
-from fleet_slip.comparison.evaluation.stability import find_stretches
-from fleet_slip.comparison.report.figures.lines import band
 from fleet_slip.pages.style import Size, colour
 from fleet_slip.pages.text import degrees
+
+
+@dataclass(frozen=True)
+class Band:
+    """A series in bins of equal length; all arrays have shape (bins,).
+
+    Attributes:
+        x: middle of each bin.
+        mean: mean of the bin's values; NaN where there is none.
+        low, high: its smallest and its largest value.
+    """
+
+    x: FloatArray
+    mean: FloatArray
+    low: FloatArray
+    high: FloatArray
+
+
+def band(x: FloatArray, y: FloatArray, bins: int) -> Band:
+    """Cut a series, shape (rows,), into at most so many bins. NaN stands for no value."""
+    size = max(1, -(-len(x) // bins))
+    count = -(-len(x) // size)
+    padded = np.full((2, count * size), np.nan)
+    padded[:, : len(x)] = x, y
+    xs, ys = padded.reshape(2, count, size)
+    finite = np.isfinite(ys)
+    none = ~finite.any(axis=1)
+    rows = np.maximum(finite.sum(axis=1), 1)
+    mean = np.where(finite, ys, 0.0).sum(axis=1) / rows
+    low = np.where(finite, ys, np.inf).min(axis=1)
+    high = np.where(finite, ys, -np.inf).max(axis=1)
+    middle = np.nansum(xs, axis=1) / np.isfinite(xs).sum(axis=1)
+    return Band(middle, *(np.where(none, np.nan, values) for values in (mean, low, high)))
+
+
+def smooth(values: FloatArray, samples: int) -> FloatArray:
+    """Return the mean over a window around each sample, shorter at both ends; shape (rows,)."""
+    window = np.ones(samples)
+    count = np.convolve(np.ones(len(values)), window, mode="same")
+    mean: FloatArray = np.convolve(values, window, mode="same") / count
+    return mean
+
 
 ANGLE_IN = 1.75
 STRIP_IN = 0.62
@@ -189,3 +230,23 @@ def _caption(axes: Axes, block: DriveBlock, line: Line, size: Size) -> None:
         va="center",
         bbox={"facecolor": colour("surface"), "edgecolor": "none", "pad": 1.0, "alpha": 0.8},
     )
+
+
+HEIGHT_IN = 2.0
+KMH_PER_MPS = 3.6
+
+
+def speed(drive: EvaluatedDrive, size: Size) -> Figure:
+    """Draw the true speed of a drive."""
+    figure = Figure(figsize=(size.width_in, HEIGHT_IN))
+    axes = figure.add_axes(
+        (0.42 / size.width_in, 0.42 / HEIGHT_IN, 1 - 0.5 / size.width_in, 1.32 / HEIGHT_IN)
+    )
+    kmh = drive.speed_mps * KMH_PER_MPS
+    series = band(drive.time_s, kmh, size.bins)
+    axes.plot(series.x, series.mean, color=colour("model_4"), linewidth=1.3)
+    axes.set_xlim(drive.time_s[0], drive.time_s[-1])
+    axes.set_ylim(0, 1.05 * float(kmh.max()))
+    axes.set_xlabel("time (s)", labelpad=2)
+    axes.set_title("speed (km/h)", color=colour("muted"))
+    return figure

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from fleet_slip.comparison.evaluation.targets import FILTER_SCENARIOS, PAPER_TABLE_TWO
-from fleet_slip.comparison.report.findings.report_data import ReportData
+from fleet_slip.comparison.report.report_data import ReportData
 from fleet_slip.pages.page_table import Cell, ReportTable, table
 from fleet_slip.pages.text import count, degrees, number
 

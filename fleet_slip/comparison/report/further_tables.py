@@ -4,10 +4,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.comparison.evaluation.error_figures import ErrorFigures
 from fleet_slip.comparison.evaluation.ranking import LEAST_COVERAGE
-from fleet_slip.comparison.report.findings.coefficients import Coefficient, Coefficients
-from fleet_slip.comparison.report.findings.report_data import ReportData
+from fleet_slip.comparison.evaluation.scenario_runs import ErrorFigures
+from fleet_slip.comparison.report.report_data import ReportData
+from fleet_slip.comparison.report.training_findings import Coefficient, Coefficients
 from fleet_slip.pages.page_table import Cell, ReportTable, table
 from fleet_slip.pages.text import count, degrees, number, percent, scientific, size
 from fleet_slip.words import number_of

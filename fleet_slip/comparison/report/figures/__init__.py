@@ -1,1 +1,0 @@
-"""One figure a function: from a report's data to a matplotlib figure."""
