@@ -1,9 +1,9 @@
 """Reads the drives of scenarios: what estimators see, the truth, and where the car is unstable.
 
-It is unstable where the tyres of an axle slip beyond their peak. Past the slip at which its lateral force is largest, an axle gives less force the more it slips: a
-front axle no longer turns the car into its path, a rear axle no longer holds it from spinning
-(Pacejka 2012, section 1.3). The slip angles follow from the true velocity, the yaw rate and the
-road wheel angles:
+It is unstable where the tyres of an axle slip beyond their peak. Past the slip at which its lateral
+force is largest, an axle gives less force the more it slips: a front axle no longer turns the car
+into its path, a rear axle no longer holds it from spinning (Pacejka 2012, section 1.3). The slip
+angles follow from the true velocity, the yaw rate and the road wheel angles:
 
     tan(alpha_rear) = (vy - b r) / vx,    alpha_front = arctan((vy + a r) / vx) - delta.
 """
