@@ -24,6 +24,7 @@ from benchmarks.documents import insert
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.columns.blocks.drive_columns import DriveColumns
 from fleet_slip.comparison.evaluation.estimators import (
     ColumnEstimate,
     LinearEstimate,
@@ -172,7 +173,7 @@ def fitted_again(published: ColumnEstimate, logs: Sequence[DriveLog]) -> ColumnE
     names = (*published.manifest.signals, LABEL)
     for log in logs:
         counts = as_counts(signals_of(log), predictor.plan.signals, log.metadata)
-        columns = predictor.columns.compute(counts)
+        columns = DriveColumns(predictor.plan, counts).compute()
         rows = np.vstack([columns, log.measurement.counts[LABEL]])
         known = rows[:, np.isfinite(rows).all(axis=0)].astype(np.int64)
         gram = Gram.from_counts(names, known.T)

@@ -18,9 +18,18 @@ LARGEST_INPUT = 2**15
 _CAST = re.compile(r"::BIGINT\b")
 _GUARDED = re.compile(r"CASE WHEN (.+) >= ([0-9]+) THEN (.+) END", re.DOTALL)
 _OVERFLOW = 2**63
-_EXACT = 2**53
 
 _OPERATORS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.FloorDiv: "//"}
+
+
+def truncated(a: int, b: int) -> int:
+    """Return a / b, truncated towards zero; b is positive."""
+    return a // b if a >= 0 else -(-a // b)
+
+
+def nearest(a: int, b: int) -> int:
+    """Return a / b to the nearest, halves away from zero; b is positive."""
+    return truncated(2 * a + (b if a >= 0 else -b), 2 * b)
 
 
 @dataclass(frozen=True)
@@ -41,31 +50,12 @@ class Arithmetic:
         steps: what to compute, in order.
         guard: the step that must be at least `at_least` for the row to have a value.
         inputs: names of the signals in it.
-        bound: largest size that the result can have.
-        largest: largest size that anything in it can have.
     """
 
     steps: tuple[Step, ...]
     guard: int | None
     at_least: int
     inputs: tuple[str, ...]
-    bound: int
-    largest: int
-
-    @property
-    def needs_integers(self) -> bool:
-        """Whether it needs int64: not every integer in it is below 2^53, as binary64 has them."""
-        return self.largest >= _EXACT
-
-    def is_positive(self, number: int) -> bool:
-        """Whether a step is above zero wherever the expression has a value."""
-        step = self.steps[number]
-        if step.function in ("+", "*"):
-            return all(map(self.is_positive, step.operands)) or self._guards(number)
-        return (not step.function and step.value > 0) or self._guards(number)
-
-    def _guards(self, number: int) -> bool:
-        return number == self.guard and self.at_least > 0
 
 
 @cache
@@ -86,8 +76,7 @@ def parse(sql: str) -> Arithmetic:
     at_least = int(guarded[2]) if guarded else 0
     if max(builder.bounds) + at_least >= _OVERFLOW:
         raise QuestionError(f"{sql[:200]!r} can need more than 64 bits: divide earlier.")
-    largest = max(builder.bounds)
-    return Arithmetic(tuple(builder.steps), guard, at_least, names, builder.bounds[-1], largest)
+    return Arithmetic(tuple(builder.steps), guard, at_least, names)
 
 
 def _tree(text: str) -> ast.expr:

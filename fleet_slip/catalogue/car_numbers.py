@@ -4,11 +4,11 @@ Each is a physical value; models and boards use it as an integer count of its gr
 nearest, halves away from zero. A number that 16 bits cannot count is not known.
 """
 
-import math
 from decimal import Decimal
 from fractions import Fraction
 from typing import Literal
 
+from fleet_slip.catalogue.arithmetic import nearest
 from fleet_slip.catalogue.signals import COUNT_MAX, SIUnit
 from fleet_slip.config import Config
 
@@ -47,10 +47,9 @@ class CarNumber(Config):
 
 def round_number(value: Fraction, grain: Fraction) -> int | None:
     """Return a value in counts, to the nearest, halves away from zero; None beyond 16 bits."""
-    size = math.floor(abs(value) / grain + Fraction(1, 2))
-    if size > COUNT_MAX:
-        return None
-    return -size if value < 0 else size
+    ratio = value / grain
+    count = nearest(ratio.numerator, ratio.denominator)
+    return count if abs(count) <= COUNT_MAX else None
 
 
 CAR_NUMBERS: dict[NumberName, CarNumber] = {

@@ -11,11 +11,10 @@ rule for all, in SQL, in the compiled kernel and on board:
   the count is clipped to its bits.
 """
 
-import math
 from collections.abc import Mapping
 from decimal import Decimal
 from fractions import Fraction
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import (
     AfterValidator,
@@ -113,26 +112,6 @@ class Fact(Config):
         if text != (self.equals is not None):
             raise ValueError(f"{self.name} {'needs' if text else 'is a number without'} equals")
         return self
-
-    def number(self, value: Any) -> int | None:
-        """Return the number for what the car knows; None where it does not know it."""
-        if value is None:
-            return None
-        if self.equals is not None:
-            return int(value == self.equals)
-        if not abs(value) <= LARGEST_FACT:
-            return None
-        return int(math.copysign(math.floor(abs(value) + 0.5), value)) - self.less
-
-    @property
-    def sql(self) -> str:
-        """The number as SQL over the drive's columns; null where the car does not know it."""
-        if self.equals is not None:
-            return f"({self.name} = '{self.equals}')::BIGINT"
-        return (
-            f"CASE WHEN abs({self.name}) <= {LARGEST_FACT} "
-            f"THEN round({self.name})::BIGINT - ({self.less}) END"
-        )
 
 
 WEIGHT = 2**10
@@ -256,6 +235,11 @@ class Definition(Config):
 
 Gate.model_rebuild()
 Number.model_rebuild()
+
+
+def plain_column(name: str, sql: str = "", bits: int = COUNT_BITS) -> Definition:
+    """Return the definition of a signal, or of a feature of so many bits, as a column itself."""
+    return Definition.model_construct(of=name, sql=sql, of_bits=bits, bits=bits)
 
 
 def features_behind(definitions: Mapping[str, Definition]) -> dict[str, Definition]:

@@ -5,7 +5,7 @@ feature over time; a factor is a column times what a car knows of itself; a gate
 as another one opens it.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from fractions import Fraction
 from functools import cache, cached_property
 from importlib.resources.abc import Traversable
@@ -15,7 +15,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from fleet_slip.canonical import canonical_json, sha256_of
 from fleet_slip.catalogue.course_change import TURNED, course_units
-from fleet_slip.catalogue.definitions import COUNT_BITS, Definition
+from fleet_slip.catalogue.definitions import COUNT_BITS, Definition, plain_column
 from fleet_slip.catalogue.feature_sets import PLAIN, FeatureSet, Regime
 from fleet_slip.catalogue.gates import GateFamily, gated_columns
 from fleet_slip.catalogue.row_features import Feature
@@ -140,6 +140,11 @@ class FeatureCatalogue(Config):
         if one is None or one.bits == COUNT_BITS:
             return None
         return Definition(of=name, sql=one.sql, of_bits=one.bits, bits=one.bits)
+
+    def rows(self, names: Iterable[str]) -> dict[str, Definition]:
+        """Return the definitions of those names that are features, as columns of one row."""
+        known = {name: self.features[name] for name in names if name in self.features}
+        return {name: plain_column(name, one.sql, one.bits) for name, one in known.items()}
 
     def definitions(self, name: str) -> dict[str, Definition]:
         """Return the definitions of a set's columns over time, by name."""

@@ -4,15 +4,15 @@ What a column is stands in `fleet_slip.catalogue.definitions`; what a step compu
 `fleet_slip.columns.operations`. Equal steps stand once.
 """
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
-from typing import TypeVar
+from typing import Any, TypeVar
 
-from fleet_slip.catalogue.arithmetic import parse
+from fleet_slip.catalogue.arithmetic import nearest, parse
 from fleet_slip.catalogue.car_numbers import CAR_NUMBERS
 from fleet_slip.catalogue.definitions import (
-    COUNT_BITS,
+    LARGEST_FACT,
     WEIGHT,
     Definition,
     Fact,
@@ -21,7 +21,7 @@ from fleet_slip.catalogue.definitions import (
     limit_of,
 )
 from fleet_slip.catalogue.signals import COUNT_MAX
-from fleet_slip.columns.operations import Step
+from fleet_slip.columns.operations import Range, Step, ranges_of
 
 Key = TypeVar("Key", bound=Hashable)
 
@@ -38,6 +38,16 @@ class CarFact:
 
     name: str
     equals: str | None = None
+
+    def count(self, value: Any) -> int | None:
+        """Return the whole number for what a car knows; None where it does not know it."""
+        if value is None:
+            return None
+        if self.equals is not None:
+            return int(value == self.equals)
+        if isinstance(value, str) or not abs(value) <= LARGEST_FACT:
+            return None
+        return nearest(*value.as_integer_ratio())
 
     @property
     def field(self) -> str:
@@ -80,6 +90,10 @@ class Lowering:
             self._rows(one)
         return self, [self.column(one) for one in columns]
 
+    def ranges(self, signals: Sequence[Range]) -> list[Range]:
+        """Return the range of each step, given those of the signals."""
+        return ranges_of(tuple(self.steps), given_ranges(signals, self.facts, self.numbers))
+
     def do(self, operation: str, *operands: int) -> int:
         """Add a step; return its number."""
         return self.steps.setdefault((operation, *operands), len(self.steps))
@@ -91,6 +105,10 @@ class Lowering:
     def clip(self, step: int, limit: int) -> int:
         """Return a step within ±limit."""
         return self.do("clip", step, self.constant(limit))
+
+    def clip_where(self, step: int, limit: int, there: int) -> int:
+        """Return a step within ±limit, where another one is there too."""
+        return self.do("where", self.clip(step, limit), there)
 
     def nearest(self, step: int, numerator: int, divisor: int) -> int:
         """Return a step times a constant over another step, rounded."""
@@ -122,11 +140,13 @@ class Lowering:
                 found.append(self.constant(step.value))
             else:
                 found.append(self.do(step.function, *(found[i] for i in step.operands)))
-        result = self.clip(found[-1], limit_of(one.of_bits))
+        limit = limit_of(one.of_bits)
         if arithmetic.guard is None:
-            return result
+            return self.clip(found[-1], limit)
         least = self.constant(arithmetic.at_least)
-        return self.do("where", result, self.do("at_least", found[arithmetic.guard], least))
+        return self.clip_where(
+            found[-1], limit, self.do("at_least", found[arithmetic.guard], least)
+        )
 
     def column(self, one: Definition) -> int:
         """Return the step of a column."""
@@ -149,8 +169,8 @@ class Lowering:
             total = self.do("sum", *window)
             if one.over != "sum":
                 divisor = self.do("*", divisor, self.do("values", *window))
-        found = self.clip(self.nearest(total, numerator, divisor), limit_of(one.bits))
-        return found if total == now else self.do("where", found, now)
+        found, limit = self.nearest(total, numerator, divisor), limit_of(one.bits)
+        return self.clip(found, limit) if total == now else self.clip_where(found, limit, now)
 
     def _factor(self, one: Definition, fact: Fact) -> int:
         place = _place(self.facts, CarFact(fact.name, fact.equals))
@@ -189,6 +209,18 @@ class Lowering:
         return self.do("where", factor, of) if number.alone else self.do("*", of, factor)
 
 
+def given_ranges(
+    signals: Sequence[Range], facts: Iterable[CarFact], numbers: Collection[CarCount]
+) -> dict[str, list[Range]]:
+    """Return the valid ranges of signals, facts and numbers: what is beyond is missing."""
+    fact = (-LARGEST_FACT, LARGEST_FACT)
+    return {
+        "signal": list(signals),
+        "fact": [fact if one.equals is None else (0, 1) for one in facts],
+        "number": [(-COUNT_MAX, COUNT_MAX)] * len(numbers),
+    }
+
+
 def most_values(one: Definition) -> int:
     """Return how many values a window adds up at most: a running mean stays after so many.
 
@@ -199,11 +231,6 @@ def most_values(one: Definition) -> int:
     limit = limit_of(one.of_bits) if one.sql else COUNT_MAX
     each = 2 * limit * one.ratio.numerator + one.ratio.denominator
     return min(MOST_VALUES, LARGEST_WORD // each)
-
-
-def plain_column(name: str, sql: str = "") -> Definition:
-    """Return the definition of a signal, or of a feature of 16 bits, as a column of its own."""
-    return Definition.model_construct(of=name, sql=sql, bits=COUNT_BITS)
 
 
 def _place(known: dict[Key, int], key: Key) -> int:

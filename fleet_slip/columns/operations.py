@@ -12,6 +12,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from fleet_slip.catalogue.arithmetic import nearest, truncated
+
 Step = tuple[str | int, ...]
 Range = tuple[int, int]
 """The smallest and the largest value."""
@@ -37,16 +39,6 @@ class Operation:
     steps: int = 2
     missing: Missing = "operands"
     over_time: bool = False
-
-
-def truncated(a: int, b: int) -> int:
-    """Return a / b, truncated towards zero; b is positive."""
-    return a // b if a >= 0 else -(-a // b)
-
-
-def nearest(a: int, b: int) -> int:
-    """Return a / b to the nearest, halves away from zero; b is positive."""
-    return truncated(2 * a + (b if a >= 0 else -b), 2 * b)
 
 
 def _corners(compute: Callable[[int, int], int]) -> Callable[[Range, Range], Range]:

@@ -5,6 +5,9 @@ Null is a missing value. Integers have 64 bits.
 
 from collections.abc import Mapping
 
+from fleet_slip.catalogue.definitions import LARGEST_FACT
+from fleet_slip.columns.lowering import CarFact
+
 QUOTIENT = "CAST(ROUND(({0} - {0} % {1}) / {1}) AS BIGINT)"
 """{0} / {1}, truncated. Where `/` of whole numbers is a division in floating point, it is exact
 too: what is divided is a multiple of the divisor, and the quotient far below 2^53."""
@@ -44,6 +47,15 @@ DIVIDES = ("//", "nearest")
 def sql_constant(value: int) -> str:
     """Return a constant; a negative one may stand behind a minus."""
     return str(value) if value >= 0 else f"({value})"
+
+
+def fact_sql(one: CarFact) -> str:
+    """Return the whole number of a fact, given the column of the drive; null if not known."""
+    if one.equals is None:
+        known = f"ABS({one.name}) <= {LARGEST_FACT}"
+        return f"CASE WHEN {known} THEN CAST(ROUND({one.name}) AS BIGINT) END"
+    is_it = f"{one.name} = '{one.equals}'"
+    return f"CASE WHEN {is_it} THEN 1 WHEN {one.name} IS NOT NULL THEN 0 END"
 
 
 def sql_of(

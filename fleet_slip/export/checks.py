@@ -13,7 +13,7 @@ import pyarrow as pa
 
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.signals import COUNT_MAX
-from fleet_slip.columns.blocks.drive_columns import DriveCounts
+from fleet_slip.columns.blocks.drive_columns import DriveColumns, DriveCounts
 from fleet_slip.columns.lowering import CarFact
 from fleet_slip.export.program import UNKNOWN_CAR, Car, Input, Program
 from fleet_slip.grams.rows.drive_rows import counts_of
@@ -65,7 +65,7 @@ def angles_by_kernel(
     """Return the angle of each tick, by the columns of the kernel and exact integers."""
     predictor = Predictor.of(manifest)
     drive = drive_counts(program, predictor, car, samples)
-    return angles_of_columns(program, predictor.columns.compute(drive))
+    return angles_of_columns(program, DriveColumns(predictor.plan, drive).compute())
 
 
 def drive_counts(

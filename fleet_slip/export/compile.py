@@ -3,12 +3,13 @@
 from decimal import Decimal
 
 from fleet_slip.catalogue.arithmetic import parse
+from fleet_slip.catalogue.definitions import plain_column
 from fleet_slip.catalogue.signals import COUNT_MAX, catalogue
-from fleet_slip.columns.lowering import Lowering, plain_column
-from fleet_slip.columns.operations import ranges_of, size_of
+from fleet_slip.columns.lowering import Lowering
+from fleet_slip.columns.operations import size_of
 from fleet_slip.errors import DataError
 from fleet_slip.export.fixed_point import LARGEST_ANGLE, OUTPUT_COUNTS, fixed_point
-from fleet_slip.export.program import Angle, Input, Program, given_ranges
+from fleet_slip.export.program import Angle, Input, Program
 from fleet_slip.models.counts_model import counts_model
 from fleet_slip.models.manifest import Manifest
 
@@ -35,7 +36,7 @@ def write_program(manifest: Manifest) -> Program:
     columns = [term.definition or plain_column(term.signal, term.sql) for term in manifest.terms]
     lowered, places = Lowering.of([one.name for one in signals], columns)
     steps, facts, numbers = tuple(lowered.steps), tuple(lowered.facts), tuple(lowered.numbers)
-    ranges = ranges_of(steps, given_ranges(signals, facts, numbers))
+    ranges = lowered.ranges([(one.min_count, one.max_count) for one in signals])
     exact = counts_model(manifest)
     fixed = fixed_point(
         exact.intercept * OUTPUT_COUNTS,

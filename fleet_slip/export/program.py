@@ -6,15 +6,13 @@
 * **The angle** is a dot product of steps, and missing where one of them is.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
 from functools import cached_property
 
-from fleet_slip.catalogue.definitions import LARGEST_FACT
-from fleet_slip.catalogue.signals import COUNT_MAX
-from fleet_slip.columns.lowering import CarCount, CarFact
+from fleet_slip.columns.lowering import CarCount, CarFact, given_ranges
 from fleet_slip.columns.operations import Range, Step, plain_of, ranges_of, rings_of, roots_of
 
 
@@ -81,7 +79,8 @@ class Program:
     @cached_property
     def given(self) -> dict[str, list[Range]]:
         """The valid ranges of signals, facts and numbers: what is beyond is missing."""
-        return given_ranges(self.signals, self.facts, self.numbers)
+        ends = [(one.min_count, one.max_count) for one in self.signals]
+        return given_ranges(ends, self.facts, self.numbers)
 
     @cached_property
     def ranges(self) -> list[Range]:
@@ -109,18 +108,6 @@ class Program:
         return max(self.rings.values(), default=0)
 
 
-def given_ranges(
-    signals: Sequence[Input], facts: Sequence[CarFact], numbers: Sequence[CarCount]
-) -> dict[str, list[Range]]:
-    """Return the valid ranges of signals, facts and numbers: what is beyond is missing."""
-    fact = (-LARGEST_FACT, LARGEST_FACT)
-    return {
-        "signal": [(one.min_count, one.max_count) for one in signals],
-        "fact": [fact if one.equals is None else (0, 1) for one in facts],
-        "number": [(-COUNT_MAX, COUNT_MAX)] * len(numbers),
-    }
-
-
 @dataclass(frozen=True)
 class Car:
     """What a program is told of a car: facts as the drive's metadata, numbers as counts."""
@@ -130,7 +117,7 @@ class Car:
 
     def fact_counts(self, program: Program) -> tuple[int | None, ...]:
         """Return the facts of a program as whole numbers, None where not known."""
-        return tuple(_fact_count(one, self.facts.get(one.name)) for one in program.facts)
+        return tuple(one.count(self.facts.get(one.name)) for one in program.facts)
 
     def number_counts(self, program: Program) -> tuple[int | None, ...]:
         """Return the numbers of a program as counts, None where not known."""
@@ -139,14 +126,3 @@ class Car:
 
 UNKNOWN_CAR = Car({}, {})
 """A car of which nothing is known."""
-
-
-def _fact_count(fact: CarFact, value: object) -> int | None:
-    if value is None:
-        return None
-    if fact.equals is not None:
-        return int(value == fact.equals)
-    if not isinstance(value, int | float) or not abs(value) <= LARGEST_FACT:
-        return None
-    size = int(abs(value) + 0.5)
-    return -size if value < 0 else size

@@ -3,27 +3,14 @@
 DuckDB, SQLite and PostgreSQL do. What is used more than once is a column of a layer of its own.
 """
 
-from collections import Counter, defaultdict
-
-from fleet_slip.catalogue.definitions import LARGEST_FACT
 from fleet_slip.catalogue.signals import COUNT_MAX
-from fleet_slip.columns.lowering import CarFact
-from fleet_slip.columns.operations import (
-    GIVEN,
-    OPERATIONS,
-    operands_of,
-    operation_of,
-    plain_of,
-)
-from fleet_slip.columns.sql_operations import PLAIN_SQL, sql_constant, sql_of
+from fleet_slip.columns.sql_layers import SqlLayers
+from fleet_slip.columns.sql_operations import PLAIN_SQL, fact_sql
 from fleet_slip.export.program import Program
 from fleet_slip.models.model_version import ModelVersion
 
 ROWS = "log"
 """The table or view that the plain statement reads: `drive_id`, `tick`, and columns in SI units."""
-
-INLINE = ("+", "-", "*", "negative")
-"""What may stand within another step, where it is used once."""
 
 
 def sql_statement(version: ModelVersion, program: Program, rows: str = ROWS) -> str:
@@ -32,7 +19,7 @@ def sql_statement(version: ModelVersion, program: Program, rows: str = ROWS) -> 
     `angle` is null where there is none. Rows are the ticks of drives, in any order.
     """
     angle, text, before = program.angle, [], rows
-    for number, columns in enumerate([*_given(program), *_Layers(program).written()]):
+    for number, columns in enumerate([*_given(program), *_layers(program)]):
         kept = ["*"] if number else ["drive_id", "tick"]
         listed = ",\n        ".join([*kept, *columns])
         text.append(f"layer_{number} AS (\n    SELECT\n        {listed}\n    FROM {before}\n)")
@@ -79,7 +66,7 @@ def _given(program: Program) -> list[list[str]]:
     for place, number in enumerate(program.numbers):
         counts.append(f"ROUND({number.name} / {number.grain:f}) AS told_{place}")
         valid.append(f"{_within(f'told_{place}', -COUNT_MAX, COUNT_MAX)} AS number_{place}")
-    facts = [f"{_fact(one)} AS fact_{place}" for place, one in enumerate(program.facts)]
+    facts = [f"{fact_sql(one)} AS fact_{place}" for place, one in enumerate(program.facts)]
     return [[*counts, *facts], rounded, valid]
 
 
@@ -87,70 +74,15 @@ def _within(value: str, least: int, most: int) -> str:
     return f"CASE WHEN {value} BETWEEN {least} AND {most} THEN CAST({value} AS BIGINT) END"
 
 
-def _fact(one: CarFact) -> str:
-    if one.equals is None:
-        known = f"ABS({one.name}) <= {LARGEST_FACT}"
-        return f"CASE WHEN {known} THEN CAST(ROUND({one.name}) AS BIGINT) END"
-    is_it = f"{one.name} = '{one.equals}'"
-    return f"CASE WHEN {is_it} THEN 1 WHEN {one.name} IS NOT NULL THEN 0 END"
-
-
-class _Layers:
-    """The layers of a program: each has columns made of those of the layers before."""
-
-    def __init__(self, program: Program) -> None:
-        """Take a program."""
-        self._program = program
-        self._layers: defaultdict[int, list[str]] = defaultdict(list)
-        self._uses = Counter(of for step in program.steps for of in operands_of(step))
-        self._texts: dict[int, tuple[str, int]] = {}
-
-    def written(self) -> list[list[str]]:
-        """Return the columns of each layer; the last has the parts of the angle."""
-        terms = [(*self._text(step), step) for step, _ in self._program.angle.terms]
-        last = max(layer for _, layer, _ in terms)
-        self._layers[last + 1] += _parts(self._program, [text for text, _, _ in terms])
-        return [self._layers[number] for number in sorted(self._layers)]
-
-    def _text(self, number: int) -> tuple[str, int]:
-        """Return a step in SQL, and the layer that has all columns in it."""
-        if number not in self._texts:
-            self._texts[number] = self._written(number)
-        return self._texts[number]
-
-    def _written(self, number: int) -> tuple[str, int]:
-        step = self._program.steps[number]
-        name, plain = operation_of(step), plain_of(step)
-        if name == "constant":
-            return sql_constant(plain[0]), 0
-        if name in GIVEN:
-            return f"{name}_{plain[0]}", 0
-        one = OPERATIONS[name]
-        own = plain[: one.steps]
-        inline = name in INLINE
-        parts = [self._text(i) if inline else self._column(i) for i in own]
-        text = sql_of(
-            name,
-            [part for part, _ in parts],
-            *plain[one.steps :],
-            divides_by=self._program.ranges[own[-1]][0],
-            table=PLAIN_SQL,
-        )
-        layer = max(layer for _, layer in parts)
-        if inline and self._uses[number] == 1:
-            return text, layer
-        return self._named(number, text, layer)
-
-    def _column(self, number: int) -> tuple[str, int]:
-        """Return a step as one word."""
-        text, layer = self._text(number)
-        if " " in text:
-            self._texts[number] = self._named(number, text, layer)
-        return self._texts[number]
-
-    def _named(self, number: int, text: str, layer: int) -> tuple[str, int]:
-        self._layers[layer + 1].append(f"{text} AS step_{number}")
-        return f"step_{number}", layer + 1
+def _layers(program: Program) -> list[list[str]]:
+    """Return the columns of each layer; the last has the parts of the angle."""
+    found = SqlLayers(
+        program.steps, program.ranges, PLAIN_SQL, lambda name, place: f"{name}_{place}"
+    )
+    terms = [found.text(step) for step, _ in program.angle.terms]
+    last = max(layer for _, layer in terms)
+    found.layers[last + 1] += _parts(program, [text for text, _ in terms])
+    return [found.layers[number] for number in sorted(found.layers)]
 
 
 def _parts(program: Program, terms: list[str]) -> list[str]:

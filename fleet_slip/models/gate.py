@@ -190,8 +190,8 @@ def _shrunk(manifest: Manifest, champion: Manifest, part: float) -> list[str]:
 
 def _require_same_features(version: ModelVersion) -> None:
     known, then = features(), version.manifest
-    for name, sql in then.features.items():
-        if name not in known.features or known.features[name].sql != sql:
+    for name, one in then.features.items():
+        if known.rows([name]).get(name) != one:
             raise DataError(f"the feature {name} of {version.reference} is not defined as then.")
     for name, definition in then.definitions.items():
         if name not in known.inputs or known.definition(name) != definition:

@@ -21,7 +21,7 @@ from pydantic import (
     model_validator,
 )
 
-from fleet_slip.catalogue.definitions import Definition
+from fleet_slip.catalogue.definitions import Definition, plain_column
 from fleet_slip.catalogue.feature_sql import names_in, require_integer_sql
 from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN, Identifier, catalogue
 from fleet_slip.config import Config
@@ -287,9 +287,9 @@ class Manifest(Config):
         return tuple(dict.fromkeys(needed))
 
     @property
-    def features(self) -> dict[str, str]:
-        """SQL of each input that is a feature."""
-        return {term.signal: term.sql for term in self.terms if term.sql}
+    def features(self) -> dict[str, Definition]:
+        """Definition of each input that is a feature of 16 bits."""
+        return {term.signal: plain_column(term.signal, term.sql) for term in self.terms if term.sql}
 
     def require_same_counts(self) -> None:
         """Raise `RefusedError` if counts that a column looks back on mean something else now."""

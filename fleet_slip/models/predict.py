@@ -17,11 +17,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.arrays import FloatArray, IntArray
-from fleet_slip.catalogue.arithmetic import parse
 from fleet_slip.catalogue.car_numbers import round_number
 from fleet_slip.catalogue.counts import round_to_counts, valid_values
-from fleet_slip.catalogue.feature_counts import feature_counts
-from fleet_slip.catalogue.signals import COUNT_MAX, SAMPLE_TIME_S, catalogue
+from fleet_slip.catalogue.definitions import plain_column
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
+from fleet_slip.columns.row_counts import row_counts
 from fleet_slip.errors import DataError, InputError
 from fleet_slip.grams.rows.drive_rows import counts_of
 from fleet_slip.models.data_frames import Frame, open_frame
@@ -136,19 +136,18 @@ def _ticks(frame: Frame, rows: int) -> IntArray:
 def _features(manifest: Manifest, columns: dict[str, FloatArray]) -> dict[str, FloatArray]:
     """Return the features in SI units by column, NaN where one has no value."""
     terms = [term for term in manifest.terms if term.sql]
-    made = {term.column: parse(term.sql) for term in terms}
-    if not all(one.inputs for one in made.values()):
+    made = [(term, plain_column(term.signal, term.sql)) for term in terms]
+    if not all(one.signals for _, one in made):
         raise DataError(f"the features of {manifest.name} are of no signal. Publish it again.")
     signals = catalogue()
     counts, present = {}, {}
-    for name in {name for one in made.values() for name in one.inputs}:
+    for name in {name for _, one in made for name in one.signals}:
         rounded = round_to_counts(columns[signals[name].column], signals[name])
         present[name] = rounded.is_valid().to_numpy(zero_copy_only=False)
         counts[name] = rounded.fill_null(0).to_numpy().astype(np.int64)
     found = {}
-    for term in terms:
-        arithmetic = made[term.column]
-        given = np.logical_and.reduce([present[name] for name in arithmetic.inputs])
-        values, there = feature_counts(arithmetic, COUNT_MAX, counts, given)
+    for term, one in made:
+        given = np.logical_and.reduce([present[name] for name in one.signals])
+        values, there = row_counts(one, counts, given)
         found[term.column] = np.where(there, values * float(term.scale), np.nan)
     return found

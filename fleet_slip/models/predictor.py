@@ -8,13 +8,10 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.arithmetic import parse
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.blocks.block_operations import BLOCK_ROWS
 from fleet_slip.columns.blocks.column_plan import ColumnPlan
 from fleet_slip.columns.blocks.drive_columns import DriveCounts, Workspace
-from fleet_slip.columns.blocks.numbered_columns import NumberedColumns
-from fleet_slip.columns.blocks.row_code import RowColumn
 from fleet_slip.compiling import kernel
 from fleet_slip.models.manifest import Manifest
 
@@ -27,13 +24,13 @@ class Predictor:
     """A published model on counts: the columns that it needs, and what a count of each adds.
 
     Attributes:
-        columns: those of the Gram rows that it was made of.
+        plan: the columns, as the Gram rows had them that it was made of.
         intercept: rad.
         coefficients: rad per physical value of each column.
         scales: physical value of a count of each column.
     """
 
-    columns: NumberedColumns
+    plan: ColumnPlan
     intercept: float
     coefficients: tuple[float, ...]
     scales: tuple[float, ...]
@@ -46,20 +43,14 @@ class Predictor:
         Raises `DataError` for definitions that contradict each other, and `RefusedError` if
         counts mean something else now.
         """
-        features = {name: RowColumn(name, parse(sql)) for name, sql in manifest.features.items()}
         manifest.require_same_counts()
         coefficients = tuple(term.coefficient for term in manifest.terms)
         scales = tuple(
             float(catalogue()[term.signal].scale if term.logged else term.scale)
             for term in manifest.terms
         )
-        columns = NumberedColumns.of(manifest.signals, features, manifest.definitions)
-        return cls(columns, manifest.intercept, coefficients, scales)
-
-    @property
-    def plan(self) -> ColumnPlan:
-        """What the kernel computes of a drive."""
-        return self.columns.plan
+        plan = ColumnPlan.of(manifest.signals, manifest.features, manifest.definitions)
+        return cls(plan, manifest.intercept, coefficients, scales)
 
     @contextmanager
     def lend_workspace(self) -> Iterator[Workspace]:
@@ -87,7 +78,7 @@ class Predictor:
         estimate: FloatArray = np.full(len(drive.ticks), self.intercept)
         for first in range(0, len(estimate), BLOCK_ROWS):
             workspace.compute_block(first)
-            columns = self.columns.complete(workspace.block(first)[0], drive)
+            columns = workspace.block(first)[0]
             add_terms(columns, coefficients, scales, estimate[first : first + BLOCK_ROWS])
         return estimate
 

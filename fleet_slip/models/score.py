@@ -11,7 +11,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.definitions import limit_of
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import COUNT_MAX, SAMPLE_TIME_S, catalogue
-from fleet_slip.columns.column_sql import with_windows
+from fleet_slip.columns.column_sql import with_columns
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.calibration.calibration import calibrate
 from fleet_slip.grams.cohorts.expansion import CarCounts
@@ -110,7 +110,7 @@ def _rows(manifest: Manifest) -> str:
     computed = [
         f"{t.signal} * {t.scale}::DOUBLE AS {t.column}" for t in manifest.terms if not t.logged
     ]
-    rows = with_windows("log_counts", manifest.features, manifest.definitions)
+    rows = with_columns("log_counts", manifest.features, manifest.definitions)
     return _si_rows(rows, computed)
 
 
@@ -191,7 +191,7 @@ def _score_over_time(
     predictor = Predictor.of(manifest)
     label = manifest.label.signal
     needed = [*predictor.plan.signals, label, *predictor.plan.facts, "vehicle_id"]
-    cars = calibrated_cars(warehouse) if predictor.columns.numbers else {}
+    cars = calibrated_cars(warehouse) if predictor.plan.numbers else {}
     counts = ", ".join(dict.fromkeys(needed))
     text = read_sql("jobs", "drives_in_time.sql").format(
         columns=counts, rows=_si_rows("log_counts"), condition=condition.sql

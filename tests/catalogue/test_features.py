@@ -13,14 +13,12 @@ import pyarrow as pa
 import pytest
 
 from fleet_slip.catalogue import features as features_module
-from fleet_slip.catalogue.arithmetic import parse
 from fleet_slip.catalogue.feature_sets import lag_signals
 from fleet_slip.catalogue.features import features, load_features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.blocks.column_plan import ColumnPlan
 from fleet_slip.columns.blocks.drive_columns import DriveColumns, DriveCounts
-from fleet_slip.columns.blocks.row_code import RowColumn
-from fleet_slip.columns.column_sql import with_features
+from fleet_slip.columns.column_sql import with_columns
 from fleet_slip.delta import Change, Unit
 from fleet_slip.errors import ConfigError, DataError, QuestionError
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
@@ -133,7 +131,7 @@ def counts(rows: int, seed: int) -> dict[str, Any]:
 
 def computed_by_kernel(logged: dict[str, Any]) -> dict[str, list[float | None]]:
     known = features().features
-    rows = {name: RowColumn(name, parse(one.sql), one.limit) for name, one in known.items()}
+    rows = features().rows(known)
     drive = DriveCounts(np.arange(len(logged["ay"])), {name: logged[name] for name in INPUTS})
     columns = DriveColumns(ColumnPlan.of(tuple(known), rows, {}), drive).compute()
     return {
@@ -147,12 +145,11 @@ def test_every_feature_is_its_physical_definition_rounded_and_clipped() -> None:
     # Ordinary driving too, where the guarded quotients exist and nothing is clipped.
     for name in INPUTS:
         logged[name][200:] = (logged[name][200:] // 40) + (1500 if "wheel" in name else 0)
-    definitions = {name: one.sql for name, one in features().features.items()}
-    limits = {name: one.limit for name, one in features().features.items()}
+    definitions = features().rows(features().features)
     assert set(definitions) == set(PHYSICS)
     with duckdb.connect() as database:
         database.register("log_counts", pa.table(logged))
-        query = f"SELECT * FROM {with_features('log_counts', definitions, limits)}"
+        query = f"SELECT * FROM {with_columns('log_counts', definitions, {})}"
         found: pa.Table = database.sql(query).to_arrow_table()
     by_kernel = computed_by_kernel(logged)
     for name in definitions:
@@ -168,8 +165,9 @@ def test_every_feature_is_its_physical_definition_rounded_and_clipped() -> None:
                 assert row[name] is None
                 continue
             count = nearest(value / features().features[name].exact_scale)
-            out_of_range += abs(count) > limits[name]
-            assert row[name] == max(-limits[name], min(limits[name], count)), (name, i)
+            limit = features().features[name].limit
+            out_of_range += abs(count) > limit
+            assert row[name] == max(-limit, min(limit, count)), (name, i)
         assert row["clipped"] == out_of_range
         clipped += out_of_range
     assert clipped > 100

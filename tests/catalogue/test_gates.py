@@ -9,10 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.definitions import WEIGHT, Definition, Gate
 from fleet_slip.catalogue.features import features, load_features_over
-from fleet_slip.columns.blocks.quotients import weight
-from fleet_slip.columns.column_sql import weight_sql
+from fleet_slip.columns.blocks.column_plan import ColumnPlan
+from fleet_slip.columns.blocks.drive_columns import DriveColumns, DriveCounts
+from fleet_slip.columns.column_sql import with_columns
 from fleet_slip.errors import ConfigError
 from fleet_slip.resources import folder
 from fleet_slip.selection.model_list import load_model_list
@@ -35,16 +37,25 @@ def family(edges: list[int]) -> list[Gate]:
     ]
 
 
-def weights(gate: Gate, at: list[int]) -> list[float]:
-    """Weights by the kernel."""
-    high = np.inf if gate.high is None else float(gate.high)
-    return [weight(float(one), float(gate.low), float(gate.peak), high) for one in at]
+def columns_of(gates: list[Gate]) -> dict[str, Definition]:
+    """A column for each gate that is its weight: what is gated is `WEIGHT` everywhere."""
+    return {
+        f"w{n}": Definition(of="full", sql=f"ay - ay + {WEIGHT}", gate=gate)
+        for n, gate in enumerate(gates)
+    }
+
+
+def weights(gates: list[Gate], at: list[int]) -> FloatArray:
+    """Weights by the kernel, shape (gates, counts)."""
+    columns = columns_of(gates)
+    drive = DriveCounts(np.arange(len(at)), {"ay": np.array(at, dtype=np.int16)})
+    return DriveColumns(ColumnPlan.of(list(columns), {}, columns), drive).compute()
 
 
 @given(knots)
 def test_weights_add_up_to_one_above_the_second_knot(edges: list[int]) -> None:
     at = list(range(edges[1], edges[-1] + 50, 7))
-    total = np.sum([weights(gate, at) for gate in family(edges)], axis=0)
+    total = weights(family(edges), at).sum(axis=0)
     assert total.tolist() == [WEIGHT] * len(at)
 
 
@@ -53,8 +64,7 @@ def test_a_weight_changes_by_no_more_than_its_slope(edges: list[int]) -> None:
     """From count to count: at most WEIGHT over the distance of the knots, and a rounding."""
     steepest = WEIGHT / min(high - low for low, high in pairwise(edges)) + 1
     at = list(range(edges[0] - 3, edges[-1] + 4))
-    for gate in family(edges):
-        assert np.abs(np.diff(weights(gate, at))).max() <= steepest
+    assert np.abs(np.diff(weights(family(edges), at))).max() <= steepest
 
 
 @settings(max_examples=30)
@@ -63,10 +73,11 @@ def test_sql_and_kernel_weigh_alike(edges: list[int]) -> None:
     at = sorted({edge + shift for edge in edges for shift in (-1, 0, 1, 5)})
     gates = family(edges)
     rows = ", ".join(f"({value})" for value in at)
-    columns = ", ".join(weight_sql("g", gate) for gate in gates)
+    columns = columns_of(gates)
     with duckdb.connect() as database:
-        found = database.sql(f"SELECT {columns} FROM (VALUES {rows}) AS t(g)").fetchall()
-    assert list(map(list, zip(*found, strict=True))) == [weights(gate, at) for gate in gates]
+        counts = with_columns(f"(VALUES {rows}) AS t(ay)", {}, columns)
+        found = database.sql(f"SELECT {', '.join(columns)} FROM {counts} ORDER BY ay").fetchall()
+    assert np.array(found).T.tolist() == weights(gates, at).tolist()
 
 
 def test_members_have_the_scale_of_their_column_and_neighbours_share_a_knot() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip.columns.blocks.drive_columns import DriveCounts
+from fleet_slip.columns.blocks.drive_columns import DriveColumns, DriveCounts
 from fleet_slip.export.c.c_steps import LARGEST_UNSIGNED
 from fleet_slip.export.checks import Sample, angles_by_kernel, angles_of_columns
 from fleet_slip.export.compile import compile_program
@@ -92,7 +92,9 @@ def test_whole_drives_give_the_angles_of_score(smoke_root: Path, tmp_path: Path)
     assert drives
     for one in drives:
         found = drive(driver, program, Car({}, {}), samples_of(program, one.counts))
-        assert found == angles_of_columns(program, predictor.columns.compute(one.counts))
+        assert found == angles_of_columns(
+            program, DriveColumns(predictor.plan, one.counts).compute()
+        )
         estimate = predictor(one.counts) / float(program.angle.scale)
         rounded = [None if np.isnan(x) else int(np.floor(x + 0.5)) for x in estimate]
         assert found == rounded

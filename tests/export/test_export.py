@@ -11,6 +11,7 @@ import pytest
 import fleet_slip
 from fleet_slip.canonical import canonical_json
 from fleet_slip.cli.app import app
+from fleet_slip.columns.blocks.drive_columns import DriveColumns
 from fleet_slip.errors import QuestionError, UsageError
 from fleet_slip.export.checks import angles_of_columns
 from fleet_slip.export.compile import compile_program
@@ -36,7 +37,9 @@ def test_the_angles_of_all_drives_are_those_of_score(smoke_root: Path) -> None:
     scale, rows = float(program.angle.scale), 0
     for file in fleet.warehouse.logs.snapshot().files:
         for drive in read_drives(fleet.warehouse, file, predictor.plan):
-            angles = angles_of_columns(program, predictor.columns.compute(drive.counts))
+            angles = angles_of_columns(
+                program, DriveColumns(predictor.plan, drive.counts).compute()
+            )
             rounded = np.floor(predictor(drive.counts) / scale + 0.5)
             assert angles == [None if np.isnan(one) else int(one) for one in rounded]
             rows += len(angles)

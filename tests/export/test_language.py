@@ -20,7 +20,7 @@ from pydantic import ValidationError
 from fleet_slip.catalogue.car_numbers import NumberName
 from fleet_slip.catalogue.definitions import Definition, Fact, Gate, Number, Over
 from fleet_slip.catalogue.row_features import Feature
-from fleet_slip.columns.column_sql import with_windows
+from fleet_slip.columns.column_sql import with_columns
 from fleet_slip.export.checks import Sample, angles_by_kernel, angles_of_columns
 from fleet_slip.export.compile import compile_program
 from fleet_slip.export.document import program_content
@@ -192,7 +192,7 @@ def by_warehouse(one: Manifest, program: Program, car: Car, samples: Sequence[Sa
     )  # fmt: skip
     with duckdb.connect() as database:
         database.register("log_counts", log.to_arrow())
-        rows_sql = with_windows("log_counts", {}, one.definitions)
+        rows_sql = with_columns("log_counts", {}, one.definitions)
         found = database.sql(f"SELECT * FROM {rows_sql} ORDER BY tick").to_arrow_table()
     columns = np.array(
         [[np.nan if n is None else n for n in found[name].to_pylist()] for name in one.definitions],

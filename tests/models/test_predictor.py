@@ -9,7 +9,7 @@ import pyarrow as pa
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.blocks.block_operations import BLOCK_ROWS
-from fleet_slip.columns.blocks.drive_columns import DriveCounts, Workspace
+from fleet_slip.columns.blocks.drive_columns import DriveColumns, DriveCounts, Workspace
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.predictor import Predictor
 from tests.export.models import MODELS, model_of
@@ -36,8 +36,9 @@ def test_blocks_of_rows_have_the_bits_of_the_whole_drive() -> None:
     for rows, seed in ((3 * BLOCK_ROWS + 7, 1), (BLOCK_ROWS, 2), (1, 3), (BLOCK_ROWS + 1, 4)):
         drive = drive_of(rows, seed)
         expected = np.full(rows, predictor.intercept)
+        columns = DriveColumns(predictor.plan, drive).compute()
         for column, coefficient, scale in zip(
-            predictor.columns.compute(drive), predictor.coefficients, predictor.scales, strict=True
+            columns, predictor.coefficients, predictor.scales, strict=True
         ):
             expected += coefficient * (column * scale)
         found = predictor(drive, workspace)

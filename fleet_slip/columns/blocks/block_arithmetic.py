@@ -8,39 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from fleet_slip.catalogue.definitions import WEIGHT
-from fleet_slip.columns.blocks.block_operations import (
-    ABSOLUTE,
-    ABSOLUTE_INTEGERS,
-    ADD,
-    ADD_INTEGERS,
-    CLIP,
-    COPY,
-    DIVIDE,
-    FACT,
-    FILL,
-    FILL_INTEGERS,
-    GUARD,
-    MULTIPLY,
-    MULTIPLY_BY,
-    MULTIPLY_INTEGERS,
-    MULTIPLY_INTEGERS_BY,
-    NEAREST,
-    NEAREST_INTEGERS,
-    SIGN,
-    SIGN_INTEGERS,
-    SUBTRACT,
-    SUBTRACT_INTEGERS,
-    TO_BINARY64,
-    TO_INTEGERS,
-    WEIGH,
-)
-from fleet_slip.columns.blocks.quotients import clip, nearest, nearest_integer, truncated, weight
+from fleet_slip.columns.blocks import block_operations as op
+from fleet_slip.columns.blocks.quotients import clip, nearest, nearest_integer, truncated
 from fleet_slip.compiling import inner_loop
 
 
 @inner_loop
-def compute(  # noqa: PLR0912 - one loop for each operation
+def compute(  # noqa: PLR0912, PLR0915 - one loop for each operation
     operation: int,
     memory: Any,
     places: Any,
@@ -48,111 +22,123 @@ def compute(  # noqa: PLR0912 - one loop for each operation
     numerator: float,
     divisor: float,
     limit: float,
+    times: float,
 ) -> None:
     """Do an operation that writes binary64.
 
-    `places` are where what is written and read begins: out, a, b and c. The first rows of the
-    memory count what is clipped.
+    `places` are where what is written and read begins: out, a and b. What is clipped counts so
+    many `times` in the first rows of the memory.
     """
-    at, of_a, of_b, of_c = places
+    at, of_a, of_b = places
     out, a = memory[at : at + size], memory[of_a : of_a + size]
-    b, c = memory[of_b : of_b + size], memory[of_c : of_c + size]
-    if operation == COPY:
+    b = memory[of_b : of_b + size]
+    if operation == op.COPY:
         for i in range(size):
             out[i] = a[i]
-    elif operation == ADD:
+    elif operation == op.ADD:
         for i in range(size):
             out[i] = a[i] + b[i]
-    elif operation == SUBTRACT:
+    elif operation == op.SUBTRACT:
         for i in range(size):
             out[i] = a[i] - b[i]
-    elif operation == MULTIPLY:
+    elif operation == op.MULTIPLY:
         for i in range(size):
             out[i] = a[i] * b[i]
-    elif operation == MULTIPLY_BY:
+    elif operation == op.NEGATE:
         for i in range(size):
-            out[i] = a[i] * numerator
-    elif operation == ABSOLUTE:
+            out[i] = -a[i]
+    elif operation == op.ABSOLUTE:
         for i in range(size):
             out[i] = abs(a[i])
-    elif operation == SIGN:
+    elif operation == op.SIGN:
         for i in range(size):
             out[i] = 1.0 if a[i] > 0.0 else (-1.0 if a[i] < 0.0 else a[i])
-    elif operation == DIVIDE:
+    elif operation == op.DIVIDE:
         for i in range(size):
             out[i] = np.trunc(a[i] / b[i])
-    elif operation == NEAREST:
+    elif operation == op.NEAREST:
         for i in range(size):
             out[i] = nearest(a[i], 1.0, b[i])
-    elif operation == FILL:
+    elif operation == op.FILL:
         for i in range(size):
             out[i] = numerator
-    elif operation == TO_BINARY64:
+    elif operation == op.BROADCAST:
+        for i in range(size):
+            out[i] = a[0]
+    elif operation == op.LEAST:  # missing where one is: no `min`, which takes the other
+        for i in range(size):
+            out[i] = a[i] if a[i] <= b[i] else (b[i] if b[i] < a[i] else np.nan)
+    elif operation == op.MOST:
+        for i in range(size):
+            out[i] = a[i] if a[i] >= b[i] else (b[i] if b[i] > a[i] else np.nan)
+    elif operation == op.AT_LEAST:
+        for i in range(size):
+            out[i] = a[i] if a[i] >= b[i] else np.nan
+    elif operation == op.WHERE:
+        for i in range(size):
+            out[i] = a[i] if b[i] == b[i] else np.nan
+    elif operation == op.ELSE:
+        for i in range(size):
+            out[i] = a[i] if a[i] == a[i] else b[i]
+    elif operation == op.TO_BINARY64:
         whole = memory.view(np.int64)[of_a : of_a + size]
         for i in range(size):
-            out[i] = np.float64(whole[i]) + c[i]
-    elif operation == GUARD:
-        for i in range(size):
-            out[i] = 0.0 if a[i] >= numerator else np.nan
-    elif operation == CLIP:
+            out[i] = np.float64(whole[i])
+    elif operation == op.CLIP:
         outside = 0
         for i in range(size):
             outside += 1 if abs(a[i]) > limit else 0
             out[i] = clip(a[i], limit)
         if outside:
             for i in range(size):
-                memory[i] += 1.0 if abs(a[i]) > limit else 0.0
-    elif operation == WEIGH:
-        for i in range(size):
-            out[i] = nearest(a[i], weight(b[i], numerator, divisor, limit), WEIGHT)
+                memory[i] += times if abs(a[i]) > limit else 0.0
     else:
-        factor = b[0] if operation == FACT else 1.0
         outside = 0
         for i in range(size):
-            value = nearest(a[i] * factor, numerator, divisor)
+            value = nearest(a[i], numerator, divisor)
             outside += 1 if abs(value) > limit else 0
             out[i] = clip(value, limit)
         if outside:
             for i in range(size):
-                value = nearest(a[i] * factor, numerator, divisor)
-                memory[i] += 1.0 if abs(value) > limit else 0.0
+                value = nearest(a[i], numerator, divisor)
+                memory[i] += times if abs(value) > limit else 0.0
 
 
 @inner_loop
 def compute_integers(  # noqa: PLR0912 - one loop for each operation
     operation: int, memory: Any, places: Any, size: int, number: int
 ) -> None:
-    """Do an operation that writes int64."""
-    at, of_a, of_b, of_c = places
+    """Do an operation that writes int64; `COPY` is from binary64."""
+    at, of_a, of_b = places
     whole = memory.view(np.int64)
     out, a, b = whole[at : at + size], whole[of_a : of_a + size], whole[of_b : of_b + size]
-    valid = memory[of_c : of_c + size]
-    if operation == TO_INTEGERS:
+    given = memory[of_a : of_a + size]
+    if operation == op.COPY:
         for i in range(size):
-            out[i] = np.int64(valid[i] if valid[i] == valid[i] else 0.0)
-    elif operation == ADD_INTEGERS:
+            out[i] = np.int64(given[i] if given[i] == given[i] else 0.0)
+    elif operation == op.ADD:
         for i in range(size):
             out[i] = a[i] + b[i]
-    elif operation == SUBTRACT_INTEGERS:
+    elif operation == op.SUBTRACT:
         for i in range(size):
             out[i] = a[i] - b[i]
-    elif operation == MULTIPLY_INTEGERS:
+    elif operation == op.MULTIPLY:
         for i in range(size):
             out[i] = a[i] * b[i]
-    elif operation == MULTIPLY_INTEGERS_BY:
+    elif operation == op.NEGATE:
         for i in range(size):
-            out[i] = a[i] * number
-    elif operation == ABSOLUTE_INTEGERS:
+            out[i] = -a[i]
+    elif operation == op.ABSOLUTE:
         for i in range(size):
             out[i] = abs(a[i])
-    elif operation == SIGN_INTEGERS:
+    elif operation == op.SIGN:
         for i in range(size):
             out[i] = (1 if a[i] > 0 else 0) - (1 if a[i] < 0 else 0)
-    elif operation == FILL_INTEGERS:
+    elif operation == op.FILL:
         for i in range(size):
             out[i] = number
     else:
-        rounds = operation == NEAREST_INTEGERS
+        rounds = operation == op.NEAREST
         for i in range(size):
             divisor = max(b[i], 1)
             out[i] = nearest_integer(a[i], divisor) if rounds else truncated(a[i], divisor)

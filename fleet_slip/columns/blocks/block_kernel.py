@@ -10,6 +10,7 @@ from fleet_slip.columns.blocks.block_operations import (
     AGO,
     BLOCK_ROWS,
     FIXED,
+    INTEGERS,
     KEEP,
     KIND,
     LIMIT,
@@ -20,7 +21,6 @@ from fleet_slip.columns.blocks.block_operations import (
     OUT,
     SLOT,
     TICKS,
-    TO_INTEGERS,
     A,
     B,
     C,
@@ -97,17 +97,18 @@ def _do(
     out = step[OUT] + step[MOVES + OUT] * first
     a, b = step[A] + step[MOVES + A] * first, step[B] + step[MOVES + B] * first
     c, d = step[C] + step[MOVES + C] * first, step[D] + step[MOVES + D] * first
-    if operation >= TO_INTEGERS:
-        compute_integers(operation, memory, (out, a, b, c), size, step[NUMBER])
+    if operation >= INTEGERS:
+        compute_integers(operation - INTEGERS, memory, (out, a, b), size, step[NUMBER])
     elif operation < ADD_UP:
         compute(
             operation,
             memory,
-            (out, a, b, c),
+            (out, a, b),
             size,
             ratio[NUMERATOR],
             ratio[FIXED],
             ratio[LIMIT],
+            np.float64(step[NUMBER]),
         )
     elif operation == ADD_UP:
         flags[GAPS, slot] = add_up(memory, a, b, c, first, size, flags[GAPS, slot])
@@ -122,7 +123,8 @@ def _do(
             values_ago(memory, (out, a, ticks, c), first, size, step[TICKS])
         else:
             places, gaps = (out, b, d, c, a), flags[GAPS, slot]
-            divide_sums(memory, places, first, size, step[TICKS], ratio, gaps)
+            times = np.float64(step[NUMBER])
+            divide_sums(memory, places, first, size, step[TICKS], ratio, times, gaps)
 
 
 @inner_loop

@@ -8,14 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.definitions import Fact
 from fleet_slip.columns.blocks.block_operations import ADD_UP, BLOCK_ROWS, COPY, KEEP, TILE, Region
+from fleet_slip.columns.lowering import CarCount, CarFact
 
 Place = tuple[Region, int]
 """A part of the memory, and its number there."""
 
 Value = int | Place
 """What an operation reads: the result of an earlier one, by its number, or a part of the memory."""
+
+MOST_READ = 4
+"""So many values an operation reads at most."""
 
 NOWHERE: Place = (Region.CLIPPED, 0)
 
@@ -29,20 +32,12 @@ class VectorOperation:
     """One operation; `operations` says what it reads and does."""
 
     operation: int
-    a: Value = NOWHERE
-    b: Value = NOWHERE
-    c: Value = NOWHERE
-    d: Value = NOWHERE
+    reads: tuple[Value, ...] = ()
     slot: int = 0
     kind: int = 0
     ticks: int = 0
     number: int = 0
     ratio: tuple[float, float, float, float] = (0.0, 1.0, 0.0, np.inf)
-
-    @property
-    def reads(self) -> tuple[Value, ...]:
-        """What it reads."""
-        return (self.a, self.b, self.c, self.d)
 
 
 @dataclass
@@ -51,14 +46,14 @@ class Code:
 
     Attributes:
         operations: they are numbered from 0.
-        signals, facts: what the program reads of a drive, with their numbers.
+        signals, told: what the program reads of a drive and its car, with their numbers.
         summed, kept: what is summed up, and what is kept, over a drive.
         kinds: windows of different lengths in ticks.
     """
 
     operations: list[VectorOperation] = field(default_factory=list)
     signals: dict[str, int] = field(default_factory=dict)
-    facts: dict[Fact, int] = field(default_factory=dict)
+    told: dict[CarFact | CarCount, int] = field(default_factory=dict)
     summed: dict[Value, int] = field(default_factory=dict)
     kept: dict[Value, int] = field(default_factory=dict)
     kinds: dict[int, int] = field(default_factory=dict)
@@ -67,43 +62,41 @@ class Code:
     def add(self, one: VectorOperation) -> int:
         """Add an operation if there is no equal one; return its number."""
         if one not in self._known:
-            self._known[one] = self.add_anew(one)
+            self._known[one] = self._append(one)
         return self._known[one]
 
-    def add_anew(self, one: VectorOperation) -> int:
-        """Add an operation that counts what it clips, for each column that it does so."""
+    def _append(self, one: VectorOperation) -> int:
         self.operations.append(one)
         return len(self.operations) - 1
-
-    def signal(self, name: str) -> Place:
-        """Return where the counts of a signal are."""
-        return (Region.SIGNAL, self.signals.setdefault(name, len(self.signals)))
 
     def assemble(self, results: Sequence[Value], also: Sequence[Value] = ()) -> "BlockProgram":
         """Return the program that leaves some results in the first registers, in their order.
 
         Those of `also` come after them and what pads them to whole tiles.
         """
-        columns = [
-            one if isinstance(one, int) else self.add_anew(VectorOperation(COPY, one))
-            for one in results
-        ]
-        beside = [self.add_anew(VectorOperation(COPY, one)) for one in also]
+        columns: list[int] = []
+        for one in results:
+            if isinstance(one, int) and one not in columns:
+                columns.append(one)
+            else:
+                columns.append(self._append(VectorOperation(COPY, (one,))))
+        beside = [self._append(VectorOperation(COPY, (one,))) for one in also]
         registers = {value: register for register, value in enumerate(columns)}
         registers |= {value: padded(len(columns)) + i for i, value in enumerate(beside)}
         last = {read: number for number, one in enumerate(self.operations) for read in one.reads}
         count, free = padded(len(columns)) + len(beside), list[int]()
-        for number, one in enumerate(self.operations):
-            if number not in registers and one.operation not in {ADD_UP, KEEP}:
+        for number, operation in enumerate(self.operations):
+            if number not in registers and operation.operation not in {ADD_UP, KEEP}:
                 if not free:
                     free, count = [count], count + 1
                 registers[number] = free.pop()
             # Given back after the result has a register: loops do not write what they read.
-            ended = {read for read in one.reads if isinstance(read, int) and last[read] == number}
+            ended = {r for r in operation.reads if isinstance(r, int) and last[r] == number}
             free += [registers[read] for read in ended.difference(columns, beside)]
         places = [
             [(Region.REGISTER, registers[number]) if number in registers else NOWHERE]
             + [(Region.REGISTER, registers[r]) if isinstance(r, int) else r for r in one.reads]
+            + [NOWHERE] * (MOST_READ - len(one.reads))
             for number, one in enumerate(self.operations)
         ]
         return BlockProgram(self, np.array(places, dtype=np.int64), len(columns), count)
@@ -141,9 +134,9 @@ class BlockProgram:
         return tuple(self.code.signals)
 
     @cached_property
-    def facts(self) -> tuple[Fact, ...]:
-        """The facts that it reads, in the order of their numbers."""
-        return tuple(self.code.facts)
+    def told(self) -> tuple[CarFact | CarCount, ...]:
+        """What it is told of a car, in the order of their numbers."""
+        return tuple(self.code.told)
 
     @property
     def slots(self) -> int:
@@ -164,7 +157,7 @@ class BlockProgram:
         shapes = {
             Region.CLIPPED: (1, STRIDE),
             Region.REGISTER: (self.registers, STRIDE),
-            Region.FACT: (len(code.facts), 1),
+            Region.TOLD: (len(code.told), 1),
             Region.SIGNAL: (len(code.signals), rows),
             Region.TICK: (1, rows),
             Region.SUM: (len(code.summed), rows + 1),
@@ -172,7 +165,7 @@ class BlockProgram:
             Region.VALUE: (len(code.kept), rows),
             Region.BEGIN: (len(code.kinds), rows),
         }
-        # Whoever reads a fact as a block must not read beyond the end.
+        # Whoever reads what is told as a block must not read beyond the end.
         sizes = [parts * size for parts, size in shapes.values()] + [BLOCK_ROWS]
         begins = np.cumsum([0, *sizes])
         strides = [shapes[region][1] for region in Region] + [0]

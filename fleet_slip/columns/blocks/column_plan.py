@@ -4,15 +4,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
-from fleet_slip.catalogue.arithmetic import parse
 from fleet_slip.catalogue.course_change import COURSE, YAW_RATE
-from fleet_slip.catalogue.definitions import Definition, features_behind, limit_of
+from fleet_slip.catalogue.definitions import Definition, limit_of, plain_column
 from fleet_slip.catalogue.features import FeatureCatalogue
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.blocks.block_program import BlockProgram
 from fleet_slip.columns.blocks.compile_plan import compile_plan
-from fleet_slip.columns.blocks.row_code import RowColumn
-from fleet_slip.errors import DataError
+from fleet_slip.columns.counted_columns import CountedColumns, parts_of, rows_of
 
 
 @dataclass(frozen=True)
@@ -27,7 +25,7 @@ class ColumnPlan:
     """
 
     names: tuple[str, ...]
-    rows: Mapping[str, RowColumn]
+    rows: Mapping[str, Definition]
     windows: Mapping[str, Definition]
     also: tuple[str, ...] = ()
 
@@ -35,7 +33,7 @@ class ColumnPlan:
     def of(
         cls,
         names: Sequence[str],
-        features: Mapping[str, RowColumn],
+        features: Mapping[str, Definition],
         windows: Mapping[str, Definition],
         also: Sequence[str] = (),
     ) -> "ColumnPlan":
@@ -44,42 +42,39 @@ class ColumnPlan:
         `also` are columns of one row that are computed beside them. Raises `DataError` if two of
         them define the same feature differently.
         """
-        rows: dict[str, RowColumn] = {}
-        for name in (*names, *also):
-            if name not in windows:
-                rows[name] = features.get(name, RowColumn(name))
-        features_behind(windows)
-        for one in (part for window in windows.values() for part in window.parts):
-            row = RowColumn(one.of)
-            if one.sql:
-                row = RowColumn(one.of, parse(one.sql), limit_of(one.of_bits))
-            if rows.setdefault(one.of, row) != row:
-                raise DataError(f"the feature {one.of} is defined in two ways.")
-        return cls(tuple(names), rows, dict(windows), tuple(also))
+        rows = {
+            name: features.get(name, plain_column(name))
+            for name in (*names, *also)
+            if name not in windows
+        }
+        return cls(tuple(names), rows_of(rows, windows), dict(windows), tuple(also))
 
     @classmethod
     def of_set(cls, known: FeatureCatalogue, name: str) -> "ColumnPlan":
         """Plan the columns of a feature set, the label last; of changes, what makes it."""
         one = known.feature_set(name)
         divided_by = [known.regimes[regime].of for regime in one.regimes]
-        features = {
-            f: RowColumn(f, parse(known.features[f].sql), known.features[f].limit)
-            for f in (*one.features, *divided_by)
-            if f in known.features
-        }
+        features = known.rows((*one.features, *divided_by))
         columns = (*one.inputs, COURSE, YAW_RATE) if one.change_ticks else one.columns
         return cls.of(columns, features, known.definitions(name), divided_by)
 
     @property
     def signals(self) -> tuple[str, ...]:
         """The logged signals that are needed, in catalogue order."""
-        used = {name for row in self.rows.values() for name in row.inputs}
+        used = {name for row in self.rows.values() for name in row.signals}
         return tuple(name for name in catalogue().signals if name in used)
 
     @property
     def facts(self) -> tuple[str, ...]:
         """The drive columns that are needed."""
-        return tuple(dict.fromkeys(w.fact.name for w in self.windows.values() if w.fact))
+        parts = [part for one in self.windows.values() for part in parts_of(one)]
+        return tuple(dict.fromkeys(part.fact.name for part in parts if part.fact))
+
+    @property
+    def numbers(self) -> tuple[str, ...]:
+        """What the drives of a car must have told of it, or running means stand for."""
+        found = (one.number.name for one in self.windows.values() if one.number)
+        return tuple(dict.fromkeys(found))
 
     @property
     def limits(self) -> tuple[int, ...]:
@@ -87,7 +82,7 @@ class ColumnPlan:
         return tuple(
             limit_of(self.windows[name].bits)
             if name in self.windows
-            else self.rows[name].limit + (self.rows[name].arithmetic is None)
+            else limit_of(self.rows[name].of_bits) + (not self.rows[name].sql)
             for name in self.names
         )
 
@@ -105,8 +100,8 @@ class ColumnPlan:
 @lru_cache(maxsize=64)
 def _program(
     names: tuple[str, ...],
-    rows: tuple[tuple[str, RowColumn], ...],
+    rows: tuple[tuple[str, Definition], ...],
     windows: tuple[tuple[str, Definition], ...],
     also: tuple[str, ...],
 ) -> BlockProgram:
-    return compile_plan(names, dict(rows), dict(windows), also)
+    return compile_plan(CountedColumns.of(dict(rows), dict(windows)), names, also)

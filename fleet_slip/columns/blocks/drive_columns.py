@@ -17,6 +17,7 @@ from fleet_slip.columns.blocks.block_kernel import GAPS, run
 from fleet_slip.columns.blocks.block_operations import BLOCK_ROWS, Region
 from fleet_slip.columns.blocks.block_program import padded
 from fleet_slip.columns.blocks.column_plan import ColumnPlan
+from fleet_slip.columns.lowering import CarFact
 from fleet_slip.errors import DataError
 
 _EXACT = 2**53
@@ -87,9 +88,13 @@ class Workspace:
             if name in drive.present:
                 counts[~drive.present[name]] = np.nan
         self._part(Region.TICK, 0, self.rows)[:] = drive.ticks
-        for number, fact in enumerate(program.facts):
-            known = fact.number(drive.facts[fact.name])
-            self._part(Region.FACT, number, 1)[:] = np.nan if known is None else known
+        for number, one in enumerate(program.told):
+            known = (
+                one.count(drive.facts[one.name])
+                if isinstance(one, CarFact)
+                else drive.numbers.get(one.name)
+            )
+            self._part(Region.TOLD, number, 1)[:] = np.nan if known is None else known
         self._flags = np.zeros((2, max(program.slots, program.kinds, 1)), dtype=np.bool_)
         self._flags[GAPS] = not drive.whole
 

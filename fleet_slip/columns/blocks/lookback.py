@@ -47,9 +47,16 @@ def add_up(
 
 @inner_loop
 def divide_sums(
-    memory: Any, places: Any, first: int, size: int, ticks: int, ratio: Any, gaps: Any
+    memory: Any,
+    places: Any,
+    first: int,
+    size: int,
+    ticks: int,
+    ratio: Any,
+    times: float,
+    gaps: Any,
 ) -> None:
-    """Write the rounded quotients of a window, clipped; count what is clipped in the first rows.
+    """Write the rounded quotients of a window, clipped; count it `times` in the first rows.
 
     `places` are where what is written, the sums, the counts, the begins and the values begin.
     0 ticks are all rows since the start. A row without a value of its own gets NaN. See
@@ -72,7 +79,7 @@ def divide_sums(
         value = nearest(sums[t + 1] - sums[begin], numerator, divisor)
         if np.isnan(values[i]):
             value = np.nan
-        clipped[i] += 1.0 if abs(value) > limit else 0.0
+        clipped[i] += times if abs(value) > limit else 0.0
         out[i] = clip(value, limit)
     # Slices of one length and a count of integers: then the loop is vectorised.
     rows, until = size - single, first + single + 1
@@ -86,7 +93,7 @@ def divide_sums(
     if outside:
         for i in range(rows):
             value = nearest(newest[i] - oldest[i], numerator, divisor)
-            clipped[single + i] += 1.0 if abs(value) > limit else 0.0
+            clipped[single + i] += times if abs(value) > limit else 0.0
 
 
 @inner_loop

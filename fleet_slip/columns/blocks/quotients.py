@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from fleet_slip.catalogue.definitions import WEIGHT
 from fleet_slip.compiling import equation
 
 
@@ -35,19 +34,6 @@ def truncated(value: int, divisor: int) -> Any:
     """Return value / divisor, truncated, of int64."""
     size = abs(value) // divisor
     return -size if value < 0 else size
-
-
-@equation
-def weight(at: float, low: float, peak: float, high: float) -> Any:
-    """Return how far a gate is open, in parts of `WEIGHT`; NaN stays.
-
-    All are integers, the knots rising; `high` is infinite where it stays open.
-    """
-    if at < peak:
-        return 0.0 if at <= low else np.floor((at - low) * WEIGHT / (peak - low))
-    if at < high:
-        return WEIGHT - np.floor((at - peak) * WEIGHT / (high - peak))
-    return 0.0 if at >= high else np.nan
 
 
 @equation

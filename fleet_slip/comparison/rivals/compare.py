@@ -45,7 +45,7 @@ def train_rivals(
     filter with a tree is fitted on the drives that filters are tuned on.
     """
     every = Inputs.of_model(manifest, all_signals())
-    numbers = calibrate(warehouse).counts() if every.columns.numbers else None
+    numbers = calibrate(warehouse).counts() if every.plan.numbers else None
     sample = draw_sample(warehouse, cohort, every, numbers=numbers)
     sets: list[tuple[str, Inputs, Sequence[Learner]]] = [
         (str(len(names)), Inputs.of_signals(names), LEARNERS)

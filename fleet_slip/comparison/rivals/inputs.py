@@ -8,12 +8,10 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.arithmetic import parse
 from fleet_slip.catalogue.definitions import Definition
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.columns.blocks.drive_columns import DriveCounts
-from fleet_slip.columns.blocks.numbered_columns import NumberedColumns
-from fleet_slip.columns.blocks.row_code import RowColumn
+from fleet_slip.columns.blocks.column_plan import ColumnPlan
+from fleet_slip.columns.blocks.drive_columns import DriveColumns, DriveCounts
 from fleet_slip.comparison.evaluation.estimators import Signals, as_counts
 from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive
 from fleet_slip.comparison.rivals.learner import Fitted, Names, one_thread
@@ -39,7 +37,7 @@ class Inputs:
     """
 
     scales: Mapping[str, float]
-    features: Mapping[str, RowColumn] = field(default_factory=dict)
+    features: Mapping[str, Definition] = field(default_factory=dict)
     definitions: Mapping[str, Definition] = field(default_factory=dict)
 
     @classmethod
@@ -67,8 +65,7 @@ class Inputs:
                     name = term.signal if part == one else _name(part, scales)
                     definitions[name] = part
                     scales[name] = 1.0 if one.gate and part == one.gate.by else scale
-        rows = {name: RowColumn(name, parse(sql)) for name, sql in manifest.features.items()}
-        return cls(scales, rows, definitions)
+        return cls(scales, manifest.features, definitions)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -76,9 +73,9 @@ class Inputs:
         return tuple(self.scales)
 
     @cached_property
-    def columns(self) -> NumberedColumns:
-        """What computes the columns of a drive."""
-        return NumberedColumns.of(self.names, self.features, self.definitions)
+    def plan(self) -> ColumnPlan:
+        """What to compute of a drive."""
+        return ColumnPlan.of(self.names, self.features, self.definitions)
 
     def beside(self, signal: str) -> "Inputs":
         """Return the same with a logged signal as the last one."""
@@ -90,7 +87,7 @@ class Inputs:
         Raises `DataError` for a drive that cannot be looked back on.
         """
         scales = np.array(list(self.scales.values()))
-        return np.asarray((self.columns.compute(drive) * scales[:, None]).T)
+        return np.asarray((DriveColumns(self.plan, drive).compute() * scales[:, None]).T)
 
 
 def _name(column: Definition, taken: Mapping[str, float]) -> str:
@@ -119,7 +116,7 @@ class LearnedEstimate:
 
     def __call__(self, signals: Signals) -> FloatArray:
         """Estimate side-slip in rad at every tick; NaN where an input is missing."""
-        plan = self.inputs.columns.plan
+        plan = self.inputs.plan
         inputs = self.inputs.values(as_counts(signals, plan.signals, self.facts))
         complete = np.isfinite(inputs).all(axis=1)
         estimates = np.full(len(inputs), np.nan)
@@ -171,7 +168,7 @@ def draw_sample(
     `numbers` are what the cars' drives told of them. Raises `DataError` if there is no such row.
     """
     with_label = inputs.beside(catalogue().label)
-    plan = with_label.columns.plan
+    plan = with_label.plan
     trips = dict(zip(*(cohort.drives[n].to_pylist() for n in ("drive_id", "trip")), strict=True))
     stride = max(1, cohort.rows // rows)
     parts: list[FloatArray] = []

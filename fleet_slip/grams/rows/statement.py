@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 
 from fleet_slip.catalogue.course_change import COURSE_LATE, with_changes
+from fleet_slip.catalogue.definitions import COUNT_BITS
 from fleet_slip.catalogue.feature_sets import LAG, PLAIN
 from fleet_slip.catalogue.features import features
-from fleet_slip.catalogue.signals import COUNT_MAX, SignalCatalogue
-from fleet_slip.columns.column_sql import over_windows, with_absent, with_features
+from fleet_slip.catalogue.signals import SignalCatalogue
+from fleet_slip.columns.column_sql import with_absent, with_columns
 from fleet_slip.grams.rows.drive_parts import Parts
 from fleet_slip.resources import read_sql
 
@@ -40,23 +41,12 @@ def gram_statement(
     names = one.columns
     windows = known.definitions(feature_set)
     regimes = [known.regimes[name].of for name in one.regimes]
-    looked_at = [*regimes, *(part.of for one in windows.values() for part in one.parts)]
-    used = {
-        name: known.features[name]
-        for name in dict.fromkeys([*one.features, *looked_at])
-        if name in known.features
-    }
-    definitions = {name: feature.sql for name, feature in used.items()}
+    used = known.rows(dict.fromkeys([*one.features, *regimes]))
     logs = with_absent(LOGS, absent)
-    if one.lagged:
-        rows = _lagged(names, logs)
-    else:
-        rows = with_features(logs, definitions, {n: feature.limit for n, feature in used.items()})
-    if windows:
-        rows = over_windows(rows if used else f"(SELECT *, 0 AS clipped FROM {logs})", windows)
+    rows = _lagged(names, logs) if one.lagged else with_columns(logs, used, windows)
     if one.change_ticks:
         rows = with_changes(rows, one.inputs, one.change_ticks, in_time=one.in_time)
-    wide = windows or any(feature.limit > COUNT_MAX for feature in used.values())
+    wide = windows or any(feature.bits > COUNT_BITS for feature in used.values())
     kind = "BIGINT" if wide else "INTEGER"
     parts = Parts.of_set(known, one)
     absent_sql, part = "0" if whole else _absent(names), parts.number_sql if parts else "NULL"
@@ -69,7 +59,7 @@ def gram_statement(
     group = ", ".join(_group(whole=whole, divided=bool(parts)))
     counted = ""
     if further:
-        clipped = ", clipped" if definitions or windows else ""
+        clipped = ", clipped" if used or windows else ""
         columns = f"{absent_sql} AS absent, {part} AS part{clipped}, {', '.join(names)}"
         counted = (
             f"counted AS MATERIALIZED (\n    SELECT drive_id, {columns}\n    FROM {rows}\n),\n\n"
@@ -83,7 +73,7 @@ def gram_statement(
         absent=absent_sql,
         part=part,
         counted=counted,
-        clipped="sum(clipped)::BIGINT" if definitions or windows else "0",
+        clipped="sum(clipped)::BIGINT" if used or windows else "0",
         sums=_SEPARATOR.join(sums),
         products=_SEPARATOR.join(products[:first]),
         counts=rows,

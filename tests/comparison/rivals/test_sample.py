@@ -7,7 +7,7 @@ import pytest
 
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.columns.blocks.drive_columns import DriveCounts
+from fleet_slip.columns.blocks.drive_columns import DriveColumns, DriveCounts
 from fleet_slip.comparison.rivals.inputs import Inputs, LearnedEstimate, draw_sample
 from fleet_slip.comparison.rivals.learner import Fitted
 from fleet_slip.files.local_folder import LocalFolder
@@ -108,6 +108,6 @@ def test_of_a_gated_model_a_rival_sees_columns_and_what_opens_the_gates(smoke_ro
     counts = {name: generator.integers(2000, 6000, 40) for name in catalogue().inputs}
     drive = DriveCounts(np.arange(40), counts)
     alone = inputs_today(("rear_ay_mean_16", "steering_excess_mean_32"))
-    expected = alone.columns.compute(drive)
+    expected = DriveColumns(alone.plan, drive).compute()
     assert (np.ptp(expected, axis=1) > 0).all()
-    np.testing.assert_array_equal(found.columns.compute(drive)[2:], expected)
+    np.testing.assert_array_equal(DriveColumns(found.plan, drive).compute()[2:], expected)

@@ -10,8 +10,7 @@ import fleet_slip
 from fleet_slip.catalogue.car_numbers import CAR_NUMBERS
 from fleet_slip.catalogue.features import features
 from fleet_slip.columns.blocks.column_plan import ColumnPlan
-from fleet_slip.columns.blocks.drive_columns import DriveCounts
-from fleet_slip.columns.blocks.numbered_columns import NumberedColumns
+from fleet_slip.columns.blocks.drive_columns import DriveColumns, DriveCounts
 from fleet_slip.errors import DataError, InputError, QuestionError
 from fleet_slip.grams.calibration.calibration import calibrate
 from fleet_slip.grams.cohorts.expansion import expand
@@ -100,7 +99,7 @@ def filled(tmp_path_factory: pytest.TempPathFactory) -> Warehouse:
 
 
 def counts_of_drive(warehouse: Warehouse, drive_id: str, numbers: dict[str, int]) -> DriveCounts:
-    plan = plan_of(WANTED).plan
+    plan = plan_of(WANTED)
     rows = fleet_slip.open(warehouse.root).sql(
         f"SELECT tick, {', '.join(plan.signals)} FROM log_counts WHERE drive_id = '{drive_id}' "
         "ORDER BY tick"
@@ -109,10 +108,10 @@ def counts_of_drive(warehouse: Warehouse, drive_id: str, numbers: dict[str, int]
     return DriveCounts(found.pop("tick"), found, numbers=numbers)
 
 
-def plan_of(names: tuple[str, ...]) -> NumberedColumns:
+def plan_of(names: tuple[str, ...]) -> ColumnPlan:
     known = features()
     definitions = {name: one for name in names if (one := known.definition(name)) is not None}
-    return NumberedColumns.of(names, ColumnPlan.of_set(known, "fleet").rows, definitions)
+    return ColumnPlan.of(names, ColumnPlan.of_set(known, "fleet").rows, definitions)
 
 
 def test_gram_rows_have_the_bits_of_the_rows(filled: Warehouse) -> None:
@@ -123,7 +122,9 @@ def test_gram_rows_have_the_bits_of_the_rows(filled: Warehouse) -> None:
     for at, row in enumerate(cohort.drives.to_pylist()):
         known = numbers[row["vehicle_id"]]
         assert known["ay_offset"] != 0
-        columns = plan_of(WANTED).compute(counts_of_drive(filled, row["drive_id"], known))
+        columns = DriveColumns(
+            plan_of(WANTED), counts_of_drive(filled, row["drive_id"], known)
+        ).compute()
         assert not np.isnan(columns).any()
         by_rows = Gram.from_counts(WANTED, columns.T.astype(np.int64).astype(object))
         assert table.restrict(WANTED).row(at) == by_rows
@@ -140,7 +141,7 @@ def test_sums_over_folds_are_those_of_the_drives(filled: Warehouse) -> None:
 
 def test_a_new_car_takes_running_means_and_is_usual(filled: Warehouse) -> None:
     names = ("slowness", "yaw_rate_bias", "yaw_rate_offset_slowness", "understeer_ay")
-    rows = plan_of(names).compute(counts_of_drive(filled, "car-0-0", {}))
+    rows = DriveColumns(plan_of(names), counts_of_drive(filled, "car-0-0", {})).compute()
     np.testing.assert_array_equal(rows[2], rows[0] * rows[1])
     assert not rows[3].any()
     usual = features().time_columns["understeer_ay"].definition.number

@@ -17,7 +17,7 @@ from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.blocks.column_plan import ColumnPlan
 from fleet_slip.columns.blocks.drive_columns import DriveColumns, DriveCounts
-from fleet_slip.columns.column_sql import with_windows
+from fleet_slip.columns.column_sql import with_columns
 from fleet_slip.errors import DataError
 from fleet_slip.grams.rows import statement
 from fleet_slip.grams.rows.aggregation import aggregate, by_sql
@@ -182,7 +182,7 @@ def test_kernel_sql_and_plain_integers_agree_on_hostile_drives(table: pa.Table) 
     kernel = columns.compute()
     with duckdb.connect() as database:
         database.register("log_counts", table.drop_columns(["day"]))
-        rows = with_windows("log_counts", {}, DEFINITIONS)
+        rows = with_columns("log_counts", {}, DEFINITIONS)
         query = f"SELECT {', '.join(DEFINITIONS)}, clipped FROM {rows} ORDER BY tick"
         sql: pa.Table = database.sql(query).to_arrow_table()
     logged = table.to_pylist()
