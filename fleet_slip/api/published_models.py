@@ -78,18 +78,20 @@ class PublishedModels(Rooted):
         whatever is published while the champion is held by `rollback` or `pin`. `sign_key` is the
         private key that signs the version.
 
-        Raises `RefusedError` for a worse winner, or one that a late course taught; `UsageError` for
-        a name that no model may have, `ConfigError` for a key that cannot be used, and what
-        `FleetCohort.select` raises.
+        Raises `RefusedError` for a worse winner, or one that a late or false course taught;
+        `UsageError` for a name that no model may have, `ConfigError` for a key that cannot be used,
+        and what `FleetCohort.select` raises.
         """
         from fleet_slip.models.in_time import require_in_time
         from fleet_slip.models.publish import manifest_of, publish, with_straight_intercept
+        from fleet_slip.models.sound_course import require_sound_course
 
         require_model_name(name)
         selection = choice.select() if isinstance(choice, FleetCohort) else choice
         manifest = with_straight_intercept(self.warehouse, manifest_of(selection, name))
         if manifest.learned_from and not force:
-            require_in_time(self.warehouse, manifest)
+            delays_s = require_in_time(self.warehouse, manifest)
+            require_sound_course(self.warehouse, manifest, delays_s)
         registry = self.registry(sign_key)
         return publish(registry, manifest, selection, force=force, candidate=candidate)
 

@@ -14,8 +14,10 @@ MOST_S, SURE_S = 0.01, 0.005
 NAMED = 5
 
 
-def require_in_time(warehouse: Warehouse, manifest: Manifest) -> None:
-    """Raise `RefusedError` unless the receivers of all cars that taught a model were in time.
+def require_in_time(warehouse: Warehouse, manifest: Manifest) -> dict[str, float]:
+    """Return how late the receivers of the cars that taught a model are, in s.
+
+    Raises `RefusedError` unless all are known to be in time.
 
     Raises `DataError` if the Gram rows that tell it are missing.
     """
@@ -25,7 +27,7 @@ def require_in_time(warehouse: Warehouse, manifest: Manifest) -> None:
     late = {car: one for car, one in delays.items() if not _in_time(one)}
     untold = (manifest.trained_on.vehicles or 0) - len(delays)
     if not late and untold <= 0:
-        return
+        return {car: one.value for car, one in delays.items()}
     shown = ", ".join(f"{car} by {_said(one)}" for car, one in list(late.items())[:NAMED])
     more = f", and {len(late) - NAMED} more" if len(late) > NAMED else ""
     problems = [f"late: {shown}{more}"] if late else []

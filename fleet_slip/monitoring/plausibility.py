@@ -28,8 +28,9 @@ class Fault:
     """What is wrong with the sensors of a drive.
 
     Attributes:
-        kind: stuck, reversed, swapped, saturated, scaled, biased, noisy, unexplained, or repeated:
-            another drive of the car was under way, so that its rows count twice.
+        kind: stuck, reversed, swapped, saturated, scaled, biased, noisy, unexplained, no slip: a
+            course that is a heading, or repeated: another drive of the car was under way, so that
+            its rows count twice.
         signals: those concerned; of an unexplained fault, the one that is furthest off.
         figure: the figure that shows it.
     """

@@ -11,9 +11,11 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.arrays import BoolArray
+from fleet_slip.catalogue.course_relation import relate
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
+from fleet_slip.grams.calibration.course_drives import course_moments
 from fleet_slip.grams.cohorts.gram_cohort import (
     Cohort,
     empty_cohort_error,
@@ -95,8 +97,9 @@ def examine_drives(
     """
     drives = parse_condition(condition)
     with GramReader(warehouse) as reader:
+        courses = _faulty_courses(reader, drives)
         reports = [
-            examine(load_cohort(reader, drives & of_model, training=False), limits)
+            examine(load_cohort(reader, drives & of_model, training=False), limits, courses)
             for of_model in _vehicle_models(reader, drives)
         ]
         revoked = reader.opened(PLAIN, drives).revoked(drives)
@@ -107,6 +110,20 @@ def examine_drives(
         tuple(sorted(findings, key=_day_and_drive)),
         revoked,
     )
+
+
+def _faulty_courses(reader: GramReader, condition: Condition) -> dict[str, Fault]:
+    """Return the drives whose course is not one, if Gram rows of its changes are there."""
+    related = {
+        drive: relate(moments)
+        for drives in course_moments(reader, condition).values()
+        for drive, moments in drives.items()
+    }
+    return {
+        drive: Fault(fault.kind, fault.signals, fault.figure)
+        for drive, relation in related.items()
+        if relation and (fault := relation.fault)
+    }
 
 
 def _vehicle_models(reader: GramReader, condition: Condition) -> list[Condition]:
@@ -135,15 +152,19 @@ def _day_and_drive(finding: SensorFault) -> tuple[date, str]:
     return finding.day, finding.drive_id
 
 
-def examine(cohort: Cohort, limits: QualityThresholds | None = None) -> QualityReport:
+def examine(
+    cohort: Cohort,
+    limits: QualityThresholds | None = None,
+    courses: Mapping[str, Fault] | None = None,
+) -> QualityReport:
     """Examine each drive of a cohort, beside other drives of its car and of its vehicle model.
 
     First for what no car does (`find_implausible`), then by comparison with its peers, if it has
-    `min_drives` of them; see `_peer_groups`.
+    `min_drives` of them; see `_peer_groups`. `courses` are drives whose course is known as faulty.
     """
     limits = limits or thresholds().quality
     drives = compared = 0
-    repeated = find_repeated(cohort.drives)
+    known = {**(courses or {}), **find_repeated(cohort.drives)}
     findings = []
     for table, metadata in _groups(cohort, limits.min_rows):
         faults = find_implausible(table, limits.min_correlation)
@@ -160,8 +181,8 @@ def examine(cohort: Cohort, limits: QualityThresholds | None = None) -> QualityR
                 found = _unlike_peers(table, group, in_order, limits)
                 faults |= {drive: fault for drive, fault in found.items() if drive not in faults}
         for drive, name in enumerate(metadata["drive_id"].to_pylist()):
-            if name in repeated and drive not in faults:
-                faults[drive] = repeated[name]
+            if name in known and drive not in faults:
+                faults[drive] = known[name]
         drives += len(table)
         compared += int(beside_peers.sum())
         findings += _findings(metadata, faults)

@@ -1,6 +1,7 @@
 """The course of measured logs: of the centre of gravity, at its fixes' ticks, whatever tells it."""
 
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,10 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from fleet_slip.ingest.drives.suspicion import find_suspicions
+from tests.support.cars import Signals, drive
 from tests.support.measured import MeasuredLog, a_mapping, physical, read_columns
 from tests.support.reported import call
+from tests.support.satellites import speed_of, with_course
 
 ROWS = 3000
 ANTENNA = {"antenna_x_m": 1.2, "antenna_y_m": -0.4}
@@ -191,3 +194,75 @@ def test_a_draft_finds_the_course_and_asks_for_the_antenna(
     assert {k: v.removesuffix("_mps") if isinstance(v, str) else v for k, v in found.items()} == (
         expected
     )
+
+
+def test_a_course_that_stands_still_while_the_car_turns_is_none(tmp_path: Path) -> None:
+    columns = on_time()
+    kept = range(0, ROWS, FIX)
+    for row in kept:
+        columns["cog"][row] = columns["cog"][row - row % (5 * FIX)]
+        columns["sog"][row] += row / 1e4
+    log = read_columns(tmp_path, columns, a_mapping(signals=ANGLE))
+    course, speed = (physical(log, name, 1.0) for name in ("course", "satellite_speed"))
+    assert np.flatnonzero(~np.isnan(course)).tolist() == list(range(0, ROWS, 5 * FIX))
+    assert np.flatnonzero(~np.isnan(speed)).tolist() == list(kept)
+    signals = {
+        "course": course * 2 * np.pi / 65536,
+        "satellite_speed": speed * 0.005,
+        "yaw_rate": np.array(columns["r"]),
+    }
+    (found,) = (s for s in find_suspicions(signals) if "course" in s.signals)
+    assert "80% of its fixes repeat it" in found.figure
+
+
+def test_driving_backwards_has_no_course(tmp_path: Path) -> None:
+    """Of wheels without a sign: the accelerometer tells."""
+    columns = on_time()
+    ay = 15 * np.array(columns["r"])
+    ay[1000:2000] *= -0.2
+    columns["ay"] = list(ay)
+    for name in ("vn", "ve"):
+        columns[name][1000:2000] = [v and -v / 5 for v in columns[name][1000:2000]]
+    signals = {**VELOCITIES, "ay": {"column": "ay", "unit": "m/s^2"}}
+    course = physical(read_columns(tmp_path, columns, a_mapping(signals=signals)), "course", 1.0)
+    assert np.isnan(course[1050:1950]).all()
+    assert not np.isnan(course[:900:FIX]).any() and not np.isnan(course[2100::FIX]).any()
+
+
+def suspected(change: Callable[[Signals], None], slip: float = 1.0) -> list[tuple[str, str]]:
+    """Return the kinds and remedies of what looks wrong in the course of a usual drive."""
+    rng = np.random.default_rng(3)
+    signals = with_course(drive(rng, gentleness=2), rng, slip)
+    change(signals)
+    found = [s for s in find_suspicions(signals) if "course" in s.signals]
+    return [(s.kind, s.remedy) for s in found]
+
+
+def shift(place_m: float) -> Callable[[Signals], None]:
+    def change(signals: Signals) -> None:
+        signals["course"] = signals["course"] + place_m * signals["yaw_rate"] / speed_of(signals)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "slip", "kind", "said"),
+    [
+        (lambda signals: None, 0.0, "no slip", "It is a heading"),
+        (shift(-1.5), 1.0, "place", "antenna_x_m"),
+        (shift(2.0), 1.0, "place", "antenna_x_m"),
+        (
+            lambda s: s.update(satellite_speed=s["satellite_speed"] / 3.6),
+            1.0,
+            "unit",
+            "Check both units",
+        ),
+        (lambda s: s.update(yaw_rate=s["yaw_rate"] * 1.04), 1.0, "scale", "gyroscope"),
+    ],
+)
+def test_what_is_no_course_is_suspicious(
+    change: Callable[[Signals], None], slip: float, kind: str, said: str
+) -> None:
+    assert suspected(lambda signals: None) == []
+    ((found, remedy),) = suspected(change, slip)
+    assert found == kind and said in remedy

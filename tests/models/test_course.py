@@ -75,6 +75,18 @@ def test_a_model_without_a_label_is_one_of_the_angle(fleet: Fleet) -> None:
     assert manifest.intercept != 0 and manifest.cross_validation.error_mean_deg == 0
 
 
+def test_a_course_of_another_place_is_refused(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As if the receiver were known to be 200 ms late: then the place is 4 m from where it was."""
+    cars = fleet.sql("SELECT DISTINCT vehicle_id FROM drives").fetchall()
+    late = {car: 0.2 for (car,) in cars}
+    monkeypatch.setattr("fleet_slip.models.in_time.require_in_time", lambda *_: late)
+    with pytest.raises(RefusedError, match="course of 1 of 1 car is not that of a car") as refused:
+        without_label(fleet)
+    assert "Check antenna_x_m" in str(refused.value)
+
+
 def test_the_same_again_is_nothing_new_and_the_gate_compares_changes(fleet: Fleet) -> None:
     first = without_label(fleet)
     assert without_label(fleet) == first

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from fleet_slip.warehouse.tables import Warehouse
 from tests.support.cars import TICKS, Signals, broken, counts, drive
 from tests.support.commands import RunCommand
 from tests.support.logs import land, log_rows, random_counts
+from tests.support.satellites import with_course
 
 DRIVES = 30
 
@@ -198,3 +200,28 @@ def test_the_command_tells_by_its_exit_code(run_command: RunCommand, warehouse: 
     good = run_command("quality", "--cohort", "drive_id <> 'd29'")
     assert good.exit_code == 0
     assert "29 drives examined" in good.stdout
+
+
+def test_a_heading_and_a_reversed_course_are_found(warehouse: Warehouse) -> None:
+    """From the Gram rows of changes of the course, where they are; before, both trained models."""
+    rng = np.random.default_rng(5)
+    drives = {}
+    for name in ("sound", "heading", "turned"):
+        signals = with_course(drive(rng, gentleness=4), rng, slip=name != "heading")
+        signals["course"] *= -1 if name == "turned" else 1
+        fixes = ~np.isnan(signals["course"])
+        whole: dict[str, Any] = {**counts({k: np.nan_to_num(v) for k, v in signals.items()})}
+        for extra in ("course", "satellite_speed"):
+            whole[extra] = [
+                v if fix else None for v, fix in zip(whole[extra].tolist(), fixes, strict=True)
+            ]
+        drives[name] = whole
+    land(warehouse, "all", *(log_rows(name, one) for name, one in drives.items()))
+    update_grams(warehouse)
+    assert examine_drives(warehouse).findings == ()
+    update_grams(warehouse, feature_set="course")
+    found = {one.drive_id: one.fault for one in examine_drives(warehouse).findings}
+    assert {name: (one.kind, one.signals) for name, one in found.items()} == {
+        "heading": ("no slip", ("course",)),
+        "turned": ("reversed", ("course",)),
+    }

@@ -97,7 +97,7 @@ def to_ticks(
         # Rounding clips a resampled value's last bit, no more: the rest is in quarantine.
         counts[signal] = round_chunks(values, catalogue()[signal])
     if COURSE in mapping.signals:
-        counts |= _fixes(rows, resampler, intervals_s, mapping, counts["yaw_rate"])
+        counts |= _fixes(rows, resampler, intervals_s, mapping, counts)
     for signal in counts:
         if not counts[signal].null_count:
             somewhere[:] = True
@@ -118,9 +118,14 @@ def _fixes(
     resampler: Resampler,
     intervals_s: dict[int, float],
     mapping: Mapping,
-    yaw_rate: pa.Array,
+    counts: dict[str, pa.Array],
 ) -> dict[str, pa.Array]:
     """Return the counts of course and speed over ground, null between fixes."""
+
+    def physical(name: str) -> FloatArray:
+        told = pl.Series(counts[name]).cast(pl.Float64).fill_null(float("nan")).to_numpy()
+        return np.asarray(told * float(catalogue()[name].scale))
+
     source = mapping.signals[COURSE]
     if len(intervals_s) == 1:
         first, second = rows.column(COURSE), rows.column(SPEED)
@@ -128,13 +133,13 @@ def _fixes(
         samples = rows.samples(COURSE).join(rows.samples(SPEED), on="time", how="inner")
         resampler = _on_own_times(samples, rows.start_s, resampler, intervals_s)
         first, second = samples[COURSE].to_numpy(), samples[SPEED].to_numpy()
-    told = pl.Series(yaw_rate).cast(pl.Float64).fill_null(float("nan")).to_numpy()
     fixes = fixes_on_ticks(
         *course_and_speed(source, first, second),
         resampler,
         source.delay_s,
         Antenna(source.antenna_x_m or 0.0, source.antenna_y_m or 0.0),
-        told * float(catalogue()["yaw_rate"].scale),
+        physical("yaw_rate"),
+        physical("ay") if "ay" in counts else None,
     )
     both = zip((COURSE, SPEED), fixes, strict=True)
     return {name: round_chunks([values], catalogue()[name]) for name, values in both}

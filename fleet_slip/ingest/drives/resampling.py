@@ -14,6 +14,7 @@ import numpy as np
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
+from fleet_slip.ingest.drives.sound_fixes import is_backwards, is_held
 from fleet_slip.ingest.mapping.signal_column import SignalColumn
 
 Method = Literal["snap", "interpolate", "average"]
@@ -210,11 +211,13 @@ def fixes_on_ticks(
     delay_s: float,
     antenna: Antenna,
     yaw_rate: FloatArray,
+    ay: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Return course in rad and speed in m/s at the ticks nearest to the fixes, NaN elsewhere.
 
-    `course` and `speed` are the antenna's, of the resampler's samples; `yaw_rate` is of the ticks,
-    in rad/s. A sample that repeats the one before is no fix: the file holds values in between.
+    `course` and `speed` are the antenna's, of the resampler's samples; `yaw_rate` in rad/s and
+    `ay` in m/s² are of the ticks. A sample that repeats the one before is no fix: the file holds
+    values in between. One of a course that `is_held`, or of a car that `is_backwards`, has none.
 
     In the car's axes the antenna moves by (-r y, r x) against the centre of gravity, with the yaw
     rate r. Where the car does not slip, that tells how the axes lie to the antenna's course; what
@@ -233,7 +236,10 @@ def fixes_on_ticks(
     turned = course[fixes] - np.arctan2(across, along) + r * late_s
     courses, speeds = (np.full(resampler.ticks.size, np.nan) for _ in range(2))
     speeds[place] = along + r * antenna.y_m
-    courses[place] = np.where(speed[fixes] >= LEAST_SPEED_MPS, _in_one_turn(turned), np.nan)
+    sound = (speed[fixes] >= LEAST_SPEED_MPS) & ~is_held(course[fixes], yaw_rate, place)
+    if ay is not None:
+        sound &= ~is_backwards(yaw_rate, ay, speed[fixes], place)
+    courses[place] = np.where(sound, _in_one_turn(turned), np.nan)
     return courses, speeds
 
 

@@ -14,9 +14,9 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.catalogue.turning import WITNESSES
+from fleet_slip.ingest.drives.course_suspicion import course_fault
 from fleet_slip.ingest.drives.relations import (
     FEWEST_TICKS,
-    course_fault,
     find_delay,
     fit,
     moving,
@@ -73,7 +73,7 @@ def find_suspicions(signals: Signals) -> list[Suspicion]:
         found += check(usual, speed)
     if not any({"ay", "yaw_rate"} & set(one.signals) for one in found):
         found += _label(usual, speed)  # which is judged by them
-    if fault := course_fault(usual):
+    if fault := course_fault(usual, speed):
         kind, figure, remedy = fault
         found.append(Suspicion(kind, ("course",), figure, remedy))
     return found
