@@ -266,3 +266,22 @@ def test_what_is_no_course_is_suspicious(
     assert suspected(lambda signals: None) == []
     ((found, remedy),) = suspected(change, slip)
     assert found == kind and said in remedy
+
+
+def test_fixes_at_irregular_times_come_onto_a_grid_and_lost_rows_are_bridged(
+    tmp_path: Path,
+) -> None:
+    """A logger that lost one row in thirty: no two fixes were whole seconds apart any more."""
+    columns = on_time()
+    rng = np.random.default_rng(11)
+    rows = np.sort(rng.choice(np.arange(1, ROWS), ROWS * 29 // 30, replace=False))
+    rows = np.concatenate([[0], rows])
+    fixes = rows[::FIX]
+    lossy = logged(fixes / 100, fixes)
+    lost = {name: [values[row] for row in rows] for name, values in {**columns, **lossy}.items()}
+    log = read_columns(tmp_path, lost, a_mapping(signals=VELOCITIES))
+    assert log.drives.num_rows == rows[-1] + 1, "lost rows are interpolated"
+    course = physical(log, "course", 1.0)
+    found = np.flatnonzero(~np.isnan(course))
+    assert (found % FIX == 0).all() and len(found) > 0.95 * ROWS / FIX
+    assert np.abs(course_error(log)).max() < 1e-3

@@ -80,7 +80,7 @@ def to_ticks(
     Raises `InputError` for what nobody says.
     """
     start_s = rows.start_s
-    resampler = _build_resampler(rows, intervals_s)
+    resampler = _build_resampler(rows, intervals_s, whole=COURSE in mapping.signals)
     method, ticks = resampler.method, resampler.ticks.astype(np.int32)
     counts, somewhere = {}, np.zeros(ticks.size, dtype=np.bool_)
     for signal, source in mapping.signals.items():
@@ -158,12 +158,19 @@ def _resample(
     return _on_the_circle(resample, values) if signal == catalogue().label else resample(values)
 
 
-def _build_resampler(rows: DriveRows, intervals_s: dict[int, float]) -> Resampler:
-    """Return what says the ticks of a drive, and brings its signals there if they share times."""
+def _build_resampler(rows: DriveRows, intervals_s: dict[int, float], *, whole: bool) -> Resampler:
+    """Return what says the ticks of a drive, and brings its signals there if they share times.
+
+    A `whole` drive is one without missing ticks where gaps are short: a lost sample, of which some
+    loggers have one in a hundred, would leave no seconds in which the yaw rate adds up.
+    """
     if len(intervals_s) == 1:
         (interval_s,) = intervals_s.values()
         time_s = rows.time_s - rows.start_s
-        return build_resampler(time_s, choose_method(time_s, interval_s))
+        resampler = build_resampler(time_s, choose_method(time_s, interval_s))
+        if whole and resampler.method == "snap" and (np.diff(resampler.ticks) > 1).any():
+            return build_resampler(time_s, "interpolate")
+        return resampler
     return build_resampler(np.array([0.0, rows.end_s - rows.start_s]), "interpolate")
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
-from fleet_slip.ingest.drives.sound_fixes import is_backwards, is_held
+from fleet_slip.ingest.drives.sound_fixes import is_backwards, is_held, on_grid
 from fleet_slip.ingest.mapping.signal_column import SignalColumn
 
 Method = Literal["snap", "interpolate", "average"]
@@ -218,6 +218,7 @@ def fixes_on_ticks(
     `course` and `speed` are the antenna's, of the resampler's samples; `yaw_rate` in rad/s and
     `ay` in m/s² are of the ticks. A sample that repeats the one before is no fix: the file holds
     values in between. One of a course that `is_held`, or of a car that `is_backwards`, has none.
+    Fixes at irregular times are brought `on_grid`.
 
     In the car's axes the antenna moves by (-r y, r x) against the centre of gravity, with the yaw
     rate r. Where the car does not slip, that tells how the axes lie to the antenna's course; what
@@ -239,8 +240,9 @@ def fixes_on_ticks(
     sound = (speed[fixes] >= LEAST_SPEED_MPS) & ~is_held(course[fixes], yaw_rate, place)
     if ay is not None:
         sound &= ~is_backwards(yaw_rate, ay, speed[fixes], place)
-    courses[place] = np.where(sound, _in_one_turn(turned), np.nan)
-    return courses, speeds
+    courses[place] = np.where(sound, turned, np.nan)
+    courses, speeds = on_grid(resampler.ticks, courses, speeds, yaw_rate)
+    return _in_one_turn(courses), speeds
 
 
 def _is_new(course: FloatArray, speed: FloatArray) -> BoolArray:

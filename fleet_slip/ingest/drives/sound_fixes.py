@@ -1,4 +1,8 @@
-"""Which fixes of a satellite receiver tell where the car goes: not all that have a course do."""
+"""Which fixes of a satellite receiver tell where the car goes, and where they stand.
+
+Not all that have a course do, and changes over some seconds are of fixes that are exactly so far
+apart.
+"""
 
 import numpy as np
 
@@ -14,6 +18,15 @@ BACKWARDS_MPS = 8.0
 """Nobody drives backwards faster."""
 LEAST_TURNING_RAD_S = 0.1
 """An accelerometer that is off by 0.15 m/s² seems to drive backwards at 1.5 m/s then, no faster."""
+
+SECOND = round(1 / STEP_S)
+GRIDS = tuple(ticks for ticks in range(1, SECOND + 1) if SECOND % ticks == 0)
+"""Spacings of fixes, in ticks, of which a whole number is a second."""
+REGULAR = 0.8
+LONGEST_BETWEEN = 25
+"""Ticks between two fixes, in which the side-slip angle is nearly a straight line."""
+LONGEST_BESIDE = 5
+"""Ticks from the only fix near: it changes by some tenths of a degree at most."""
 
 
 def is_held(course: FloatArray, yaw_rate: FloatArray, place: IntArray) -> BoolArray:
@@ -49,3 +62,53 @@ def is_backwards(
     turning = squares > second.size * LEAST_TURNING_RAD_S**2
     backwards: BoolArray = turning & (speed < BACKWARDS_MPS) & (products < -0.5 * speed * squares)
     return backwards
+
+
+def on_grid(
+    ticks: IntArray, course: FloatArray, speed: FloatArray, yaw_rate: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return course and speed at regular ticks, if the fixes are at irregular ones.
+
+    They are regular if most that have a fix about a second later have one exactly then. What is
+    interpolated is the course less the yaw rate's integral, that is the slip, between two fixes
+    that are near, or taken from one that is nearer. All arrays are of the ticks.
+    """
+    fixes = np.flatnonzero(~np.isnan(course))
+    if fixes.size < 2 or _is_regular(ticks[fixes]):
+        return course, speed
+    heading = np.cumsum(np.nan_to_num(yaw_rate)) * STEP_S
+    heading[np.isnan(yaw_rate)] = np.nan
+    slip = np.full(course.size, np.nan)
+    slip[fixes] = np.unwrap(course[fixes] - heading[fixes])
+    usual = float(np.median(np.diff(ticks[fixes])))
+    spacing = min(GRIDS, key=lambda grid: abs(np.log(grid / usual)))
+    chosen = ticks % spacing == 0
+    found = []
+    for values in (slip, speed):
+        placed = np.full(values.size, np.nan)
+        placed[chosen] = _between(ticks, values, ticks[chosen])
+        found.append(placed)
+    return found[0] + heading, found[1]
+
+
+def _is_regular(fixes: IntArray) -> bool:
+    """Return whether most fixes that have one about a second later have one exactly then."""
+    later = np.isin(fixes + SECOND, fixes)
+    next_one = np.searchsorted(fixes, fixes + SECOND - SECOND // 10)
+    there = next_one < fixes.size
+    there[there] = fixes[next_one[there]] <= fixes[there] + SECOND + SECOND // 10
+    return not there.any() or bool(later[there].mean() >= REGULAR)
+
+
+def _between(ticks: IntArray, values: FloatArray, at: IntArray) -> FloatArray:
+    """Return values at ticks, by straight lines between near samples, else beside a nearer one."""
+    known = np.flatnonzero(~np.isnan(values))
+    times, told = ticks[known], values[known]
+    right = np.clip(np.searchsorted(times, at), 0, times.size - 1)
+    left = np.maximum(right - 1, 0)
+    bridged = (times[right] >= at) & (times[right] - times[left] <= LONGEST_BETWEEN)
+    bridged &= times[left] <= at
+    nearer = np.where(at - times[left] < times[right] - at, left, right)
+    beside = np.abs(times[nearer] - at) <= LONGEST_BESIDE
+    line = np.where(bridged, np.interp(at, times, told), np.nan)
+    return np.where(bridged | ~beside, line, told[nearer])
