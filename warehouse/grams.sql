@@ -10,5 +10,6 @@ SELECT
     n,
     clipped,
     sums,
-    products
+    products,
+    course_late
 FROM {stored_grams}

@@ -1,8 +1,13 @@
 """Whether the course came in time: a late one looks like a side-slip angle, in all figures."""
 
+from collections.abc import Iterable, Iterator, Mapping
+
 from fleet_slip.catalogue.car_numbers import DELAY
+from fleet_slip.catalogue.features import features
+from fleet_slip.catalogue.sources import ALL_DRIVES
 from fleet_slip.errors import RefusedError
 from fleet_slip.grams.cohorts.reader import open_grams
+from fleet_slip.grams.rows.course_delays import GRAIN_S
 from fleet_slip.grams.rows.receiver_delay import ReceiverDelay, receiver_delays
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.warehouse.condition import parse_condition
@@ -10,41 +15,70 @@ from fleet_slip.warehouse.tables import Warehouse
 from fleet_slip.words import number_of
 
 MOST_S, SURE_S = 0.01, 0.005
-"""Delay, and standard error of it, that may be: 20 ms cost 0.4 deg on a real car."""
+"""Delay that may be left, and its standard error: 20 ms cost 0.4 deg on a real car."""
 NAMED = 5
 
 
 def require_in_time(warehouse: Warehouse, manifest: Manifest) -> dict[str, float]:
-    """Return how late the receivers of the cars that taught a model are, in s.
+    """Return how late courses still are in the Gram rows of the cars that taught a model, in s.
 
-    Raises `RefusedError` unless all are known to be in time.
-
-    Raises `DataError` if the Gram rows that tell it are missing.
+    Raises `RefusedError` unless it is known of all of them how late they were, and their Gram rows
+    are corrected by it; `DataError` if the Gram rows that tell it are missing.
     """
     condition = parse_condition(manifest.trained_on.cohort)
     with open_grams(warehouse, DELAY, condition) as opened:
-        delays = receiver_delays(opened.batches(condition))
-    late = {car: one for car, one in delays.items() if not _in_time(one)}
-    untold = (manifest.trained_on.vehicles or 0) - len(delays)
-    if not late and untold <= 0:
-        return {car: one.value for car, one in delays.items()}
-    shown = ", ".join(f"{car} by {_said(one)}" for car, one in list(late.items())[:NAMED])
-    more = f", and {len(late) - NAMED} more" if len(late) > NAMED else ""
-    problems = [f"late: {shown}{more}"] if late else []
-    if untold > 0:
-        problems.append(f"{number_of(untold, 'car')} whose drives do not tell it")
-    raise RefusedError(
-        f"{manifest.name} was not published: not all receivers are known to be in time to "
-        f"{1000 * MOST_S:g} ms ({'; '.join(problems)}). Give delay_s of the course in the mapping "
-        "and ingest again, or choose other cars: the view calibration has the number "
-        f"receiver_delay of each. To publish all the same: fleet-slip publish {manifest.name} "
-        "--label course --force"
-    )
+        told = opened.batches(parse_condition(ALL_DRIVES))
+        delays = receiver_delays(told)
+    feature_set = features().name_of(manifest.trained_on.feature_set)
+    with open_grams(warehouse, feature_set, condition) as opened:
+        cars = dict(opened.course_delays(condition))
+    problems = [*_unsure(delays, cars), *_not_corrected(delays, cars)]
+    if problems:
+        raise RefusedError(
+            f"{manifest.name} was not published: a course that is late looks like a side-slip "
+            f"angle, and {'; '.join(problems)}. The view calibration has the number receiver_delay "
+            "of each car. Choose other cars, or more drives of them. To publish all the same: "
+            f"fleet-slip publish {manifest.name} --label course --force"
+        )
+    return {car: max(_left(delays[car], corrected), key=abs) for car, corrected in cars.items()}
 
 
-def _in_time(one: ReceiverDelay) -> bool:
-    sure = one.uncertainty is not None and one.uncertainty <= SURE_S
-    return sure and abs(one.value) <= MOST_S
+def _unsure(delays: Mapping[str, ReceiverDelay], cars: Iterable[str]) -> Iterator[str]:
+    """Yield a sentence where the delays of some cars are not known well enough."""
+    unsure = {car: delays[car] for car in cars if car in delays and not _sure(delays[car])}
+    if unsure:
+        yield f"delays are not known to {1000 * SURE_S:g} ms ({_named(unsure)})"
+    if untold := sum(car not in delays for car in cars):
+        yield f"that of {number_of(untold, 'car')} is not known at all: their drives do not tell it"
+
+
+def _not_corrected(
+    delays: Mapping[str, ReceiverDelay], cars: Mapping[str, tuple[int, int]]
+) -> Iterator[str]:
+    """Yield a sentence where Gram rows are not corrected by the delays that are known by now."""
+    late = {
+        car: delays[car]
+        for car, corrected in cars.items()
+        if car in delays and max(map(abs, _left(delays[car], corrected))) > MOST_S
+    }
+    if late:
+        yield (
+            f"the Gram rows of some cars are corrected by another delay than they have "
+            f"({_named(late)}): run fleet-slip gram --features course"
+        )
+
+
+def _left(one: ReceiverDelay, corrected: tuple[int, int]) -> list[float]:
+    return [one.value - GRAIN_S * parts for parts in corrected]
+
+
+def _named(delays: Mapping[str, ReceiverDelay]) -> str:
+    shown = ", ".join(f"{car}: {_said(one)}" for car, one in list(delays.items())[:NAMED])
+    return f"{shown}, and {len(delays) - NAMED} more" if len(delays) > NAMED else shown
+
+
+def _sure(one: ReceiverDelay) -> bool:
+    return one.uncertainty is not None and one.uncertainty <= SURE_S
 
 
 def _said(one: ReceiverDelay) -> str:

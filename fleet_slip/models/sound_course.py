@@ -22,7 +22,7 @@ def require_sound_course(
 ) -> None:
     """Raise `RefusedError` unless the course of all cars that taught a model is that of a car.
 
-    `delays_s` are how late the receivers of the cars are known to be.
+    `delays_s` are how late the courses of the cars are in their Gram rows.
     """
     condition = parse_condition(manifest.trained_on.cohort)
     with GramReader(warehouse) as reader:

@@ -7,6 +7,7 @@ from typing import Any
 import duckdb
 import pyarrow as pa
 
+from fleet_slip.catalogue.course_change import COURSE_LATE
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, SignalCatalogue, catalogue
 from fleet_slip.columns.column_sql import with_absent
 from fleet_slip.delta import Snapshot, absent_columns
@@ -135,6 +136,8 @@ def _source(database: duckdb.DuckDBPyConnection, snapshot: Snapshot) -> str:
             differ = not snapshot.has_same_columns
             database.execute("SET VARIABLE log_columns_differ = $differ", {"differ": differ})
         known = [n for n in catalogue().stored_columns if n in snapshot.table.schema.names]
+        if COURSE_LATE in absent_columns(snapshot.files, snapshot.table.optional):
+            rows = f"(SELECT *, NULL::BIGINT AS {COURSE_LATE} FROM {rows})"
         return with_absent(rows, absent_columns(snapshot.files, known))
     empty = f"empty_{snapshot.table.folder.name}"
     add_table(database, empty, snapshot.table.schema.empty_table())

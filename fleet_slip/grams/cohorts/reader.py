@@ -11,6 +11,7 @@ import duckdb
 import pyarrow as pa
 
 from fleet_slip.catalogue.car_numbers import CALIBRATION
+from fleet_slip.catalogue.course_change import TURNED
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import ALL_DRIVES, LONGEST_PAUSE_S, TRAINING_DRIVES
@@ -110,6 +111,16 @@ class OpenedGrams:
         statement = self.statement("cohort_files.sql", condition)
         with asking(self.database, condition):
             return {file for (file,) in self.database.sql(statement).fetchall()}
+
+    def course_delays(self, condition: Condition) -> Iterator[tuple[str, tuple[int, int]]]:
+        """Yield each car of a cohort with a course, least and largest delay of its Gram rows.
+
+        In parts of a tick, as they were corrected by.
+        """
+        statement = self.statement("course_delays.sql", condition, turned=TURNED)
+        with asking(self.database, condition):
+            for car, least, largest in self.database.execute(statement).fetchall():
+                yield car, (least, largest)
 
     @property
     def _batch_rows(self) -> int:

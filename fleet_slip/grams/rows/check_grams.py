@@ -17,6 +17,7 @@ from fleet_slip.delta import TableFile, on_newest
 from fleet_slip.errors import DataError, StorageError
 from fleet_slip.grams.rows.aggregation import aggregate, by_sql
 from fleet_slip.grams.rows.backlog import find_backlog
+from fleet_slip.grams.rows.course_delays import recorded_cars
 from fleet_slip.grams.rows.gram_job import unit_name
 from fleet_slip.grams.rows.gram_rows import is_received
 from fleet_slip.grams.rows.wide import wide_grams
@@ -112,9 +113,11 @@ def _check_wide(warehouse: Warehouse, file: TableFile, feature_set: str) -> int:
     kept = stored_grams(warehouse, [file], grams, identity).get(file.path)
     if not kept:
         return 0
-    rows = by_sql(warehouse, [file], feature_set)
+    late = recorded_cars(warehouse.grams.snapshot(), identity, file.path)
+    rows = by_sql(warehouse, [file], feature_set, late)
     from_sql = grams_of(rows)
-    _compare(file, "the kernel", from_sql, grams_of(wide_grams(warehouse, [file], feature_set)))
+    by_kernel = grams_of(wide_grams(warehouse, [file], feature_set, late))
+    _compare(file, "the kernel", from_sql, by_kernel)
     _compare(file, f"the stored Gram rows of {feature_set}", from_sql, kept)
     return len(rows["drive_id"].unique())
 

@@ -12,12 +12,14 @@ from dataclasses import dataclass, field
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from fleet_slip.catalogue.car_numbers import DELAY
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.delta import Change, Snapshot, TableFile, Unit, retry_conflicts
 from fleet_slip.errors import StorageError
 from fleet_slip.grams.rows.aggregation import compute_grams
 from fleet_slip.grams.rows.backlog import Backlog, find_backlog, require_active
+from fleet_slip.grams.rows.course_delays import course_delays, files_of_other_delay
 from fleet_slip.grams.rows.gram_files import files_to_rewrite, rows_to_keep, write_rows
 from fleet_slip.grams.rows.same_drives import LoggedDrives, has_received
 from fleet_slip.progress import Progress, no_progress
@@ -58,7 +60,12 @@ def update_grams(
     these paths are read. Raises `QuestionError` for an unknown
     set, `StorageError`, `ConflictError` if other processes keep changing the table, or
     `ClusterError`.
+
+    A set in which delays of receivers are corrected has those of `delay` brought up to date first,
+    and is computed again for drives of cars whose delay they tell anew.
     """
+    if features().feature_set(feature_set).in_time and DELAY in features().sets:
+        update_grams(warehouse, progress, DELAY, executor, among)
     return retry_conflicts(lambda: _update_once(warehouse, progress, feature_set, executor, among))
 
 
@@ -126,15 +133,25 @@ def _update_once(
             f"{number_of(len(backlog.stale), 'file')}. Nothing is changed: restore the folder from "
             "a backup."
         )
+    late, others = None, frozenset[str]()
+    if features().feature_set(feature_set).in_time:
+        active = {file.path: file for file in logs.files}
+        late = course_delays(grams, frozenset(active))
+        others = frozenset(files_of_other_delay(grams, identity, late) & active.keys())
+        again = [active[path] for path in sorted(others)]
+        backlog = Backlog((*backlog.missing, *again), backlog.stale)
     if among is not None:
+        others &= frozenset(among)
         chosen = tuple(file for file in backlog.missing if file.path in among)
         backlog = Backlog(chosen, backlog.stale)
     version, gram_rows = grams.version, grams.rows
     logs_version = logs.version
     dropped = 0
     if backlog.missing or backlog.stale:
-        new_rows = compute_grams(warehouse, backlog.missing, progress, None, feature_set, executor)
-        merged = _Merged(grams, backlog.stale, LoggedDrives())
+        new_rows = compute_grams(
+            warehouse, backlog.missing, progress, None, feature_set, executor, late
+        )
+        merged = _Merged(grams, backlog.stale, LoggedDrives(), identity, others)
         grams.commit_or_discard(
             Change(
                 add=write_rows(warehouse, merged.parts(new_rows)),
@@ -172,12 +189,15 @@ class _Merged:
     Attributes:
         grams, stale: what there is, and the log files that are gone.
         logged: the drives of the new rows: what cars sent of them goes.
+        identity, again: the feature set, and the log files that it is computed again for.
         replaced: the files that are written again, once all parts were taken.
     """
 
     grams: Snapshot
     stale: frozenset[str]
     logged: LoggedDrives
+    identity: str
+    again: frozenset[str]
     replaced: list[TableFile] = field(default_factory=list)
 
     def parts(self, new_rows: Iterable[pa.Table]) -> Iterator[pa.Table]:
@@ -187,9 +207,14 @@ class _Merged:
             if looked_for:
                 self.logged.add(rows)
             yield rows
-        paths = {file.path for file in files_to_rewrite(self.grams, self.stale)}
+        paths = {file.path for file in files_to_rewrite(self.grams, self.stale | self.again)}
         if looked_for:
             paths.update(file.path for file in self.logged.files_with_received(self.grams))
         self.replaced += [file for file in self.grams.files if file.path in paths]
+        again = pa.array(sorted(self.again), pa.string())
         for rows in rows_to_keep(self.grams, self.replaced, self.stale):
-            yield self.logged.without_received(rows) if looked_for else rows
+            old = pc.and_(
+                pc.equal(rows["feature_set"], self.identity), pc.is_in(rows["file"], again)
+            )
+            kept = rows.filter(pc.invert(old)) if self.again else rows
+            yield self.logged.without_received(kept) if looked_for else kept

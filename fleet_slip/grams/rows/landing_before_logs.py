@@ -15,6 +15,7 @@ from fleet_slip.catalogue.features import features
 from fleet_slip.delta import Change, Snapshot, TableFile, Unit
 from fleet_slip.grams.rows.aggregation import aggregate
 from fleet_slip.grams.rows.backlog import named_files, require_active
+from fleet_slip.grams.rows.course_delays import course_delays
 from fleet_slip.grams.rows.gram_files import write_rows
 from fleet_slip.grams.rows.gram_job import unit_name
 from fleet_slip.warehouse.tables import Warehouse
@@ -40,7 +41,10 @@ def land_ahead(
         # it: a commit of Gram rows that has not seen the file go is in conflict.
         logs = Snapshot(warehouse.logs, warehouse.logs.open_delta())  # in whatever scales
         require_active(logs, replaced)
-        rows = aggregate(warehouse, missing, feature_set=name)
+        late = None
+        if features().feature_set(name).in_time:
+            late = course_delays(grams, frozenset(file.path for file in logs.files))
+        rows = aggregate(warehouse, missing, feature_set=name, late=late)
         grams.commit_or_discard(
             Change(
                 add=write_rows(warehouse, [rows]),

@@ -1,0 +1,86 @@
+"""By how much the course of each car is late, and which Gram rows were computed otherwise.
+
+The delay that Gram rows of changes are corrected by is a pure function of those of the set `delay`:
+of the same drives, in whatever order they came, follow the same Gram rows, and what a forgotten
+drive told is gone. It is a whole number of parts of a tick, so that a drive more seldom moves it.
+"""
+
+from collections.abc import Iterator, Mapping
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from fleet_slip.catalogue.car_numbers import DELAY
+from fleet_slip.catalogue.course_change import COURSE_LATE, LATE_PARTS, MOST_LATE
+from fleet_slip.catalogue.features import features
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S
+from fleet_slip.catalogue.sources import RECEIVED_FILES
+from fleet_slip.delta import Snapshot, TableFile
+from fleet_slip.grams.rows.receiver_delay import ReceiverDelay, receiver_delays
+
+GRAIN_S = float(SAMPLE_TIME_S) / LATE_PARTS
+"""What a delay is a whole number of, s."""
+
+
+def course_delays(grams: Snapshot, active: frozenset[str]) -> dict[str, int]:
+    """Return the delay of each car's course in parts of a tick, as its Gram rows tell it.
+
+    `active` are the log files that count.
+    """
+    return {car: in_parts(one) for car, one in receiver_delays(_of_delay(grams, active)).items()}
+
+
+def in_parts(one: ReceiverDelay) -> int:
+    """Return a delay as Gram rows are corrected by it: none below zero by more than half a tick."""
+    return min(max(round(one.value / GRAIN_S), -LATE_PARTS // 2), MOST_LATE)
+
+
+def _of_delay(grams: Snapshot, active: frozenset[str]) -> Iterator[pa.RecordBatch]:
+    identity = features().identity(DELAY)
+    wanted = ["feature_set", "file", "vehicle_id", "drive_id", "signals", "n", "sums", "products"]
+    for file in _files_of(grams, identity):
+        rows = grams.table.read(file.path, wanted)
+        files = rows["file"].cast(pa.string())
+        counts = pc.is_in(files, pa.array(sorted(active), pa.string()))
+        counts = pc.or_(counts, pc.starts_with(files, RECEIVED_FILES))
+        mine = pc.and_(pc.equal(rows["feature_set"], identity), counts)
+        yield from rows.filter(mine).to_batches()
+
+
+def files_of_other_delay(grams: Snapshot, identity: str, late: Mapping[str, int]) -> set[str]:
+    """Return the log files that have Gram rows of a set with another delay than their cars have."""
+    return {
+        name
+        for name, car, told in _recorded(grams, identity)
+        if told != late.get(car, 0) and not name.startswith(RECEIVED_FILES)
+    }
+
+
+def recorded_cars(grams: Snapshot, identity: str, log_file: str) -> dict[str, int]:
+    """Return the delays that the Gram rows of a set of one log file were corrected by, by car."""
+    return {
+        car: told for name, car, told in _recorded(grams, identity) if name == log_file and told
+    }
+
+
+def _recorded(grams: Snapshot, identity: str) -> set[tuple[str, str, int]]:
+    """Return each log file, car and delay that Gram rows of a set are of; 0 where none was told."""
+    found: set[tuple[str, str, int]] = set()
+    for file in _files_of(grams, identity):
+        there = COURSE_LATE in grams.table.read_metadata(file.path).schema.names
+        wanted = ["feature_set", "file", "vehicle_id", *([COURSE_LATE] if there else [])]
+        rows = grams.table.read(file.path, wanted)
+        mine = rows.filter(pc.equal(rows["feature_set"], identity))
+        told = mine[COURSE_LATE].fill_null(0).to_pylist() if there else [0] * len(mine)
+        found.update(
+            zip(mine["file"].to_pylist(), mine["vehicle_id"].to_pylist(), told, strict=True)
+        )
+    return found
+
+
+def _files_of(grams: Snapshot, identity: str) -> Iterator[TableFile]:
+    """Yield the files that have Gram rows of a feature set."""
+    for file in grams.files:
+        sets = grams.table.read(file.path, ["feature_set"])["feature_set"].unique()
+        if identity in sets.to_pylist():
+            yield file
