@@ -9,7 +9,7 @@ import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 
-from fleet_slip.pages.style import PALETTE, STYLE
+from fleet_slip.pages.drawing import PALETTE, STYLE
 
 Size = dict[str, Any]
 

@@ -16,8 +16,7 @@ from functools import partial
 import numpy as np
 from highway_env.vehicle.dynamics import BicycleVehicle
 
-from fleet_slip.simulation.speed_profile import SpeedLimits, speed_profile
-from fleet_slip.simulation.track import load_track
+from fleet_slip.simulation.track import SpeedLimits, load_track, speed_profile
 from fleet_slip.vehicle.driver import SAMPLE_S
 from fleet_slip.vehicle.highway import FourWheelVehicle
 from fleet_slip.vehicle.lanes.lane_drives import STEPS_PER_SAMPLE, LaneDrive, simulate_blocks

@@ -16,13 +16,13 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.regression.choice.criteria import CRITERIA, criterion_values
-from fleet_slip.regression.choice.nested import nested_fits
 from fleet_slip.regression.choice.nested_choice import (
     CROSS_VALIDATION,
     Rule,
     TrainingFolds,
     cross_validate_nested,
     cross_validate_selection,
+    nested_fits,
 )
 from fleet_slip.regression.choice.signal_orders import RANKINGS, rank
 from fleet_slip.regression.choice.subsets import all_rss, best_subsets, pick_sizes, subset_sizes

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from benchmarks.schemes import SCHEMES
 from fleet_slip.vehicle.driver import SAMPLE_S
 from fleet_slip.vehicle.integration import FIRST_ORDER, SECOND_ORDER, STEP_S, Slopes
-from fleet_slip.vehicle.lanes.rows import LANES, read, write
+from fleet_slip.vehicle.lanes.lane_memory import LANES, read, write
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2, Constants, constants, load_vehicle
 from fleet_slip.vehicle.state import Controls, State
 

@@ -21,7 +21,7 @@ def _():
     from fleet_slip.comparison.watch.drive_frames import drive_frames
     from fleet_slip.errors import FleetSlipError
     from fleet_slip.monitoring.control_chart import control_chart
-    from fleet_slip.pages.style import DESK, STYLE, colour
+    from fleet_slip.pages.drawing import DESK, STYLE, colour
     from fleet_slip.words import number_of
 
     return (

@@ -10,7 +10,6 @@ from datetime import date
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
-from fleet_slip.api.root import Rooted
 from fleet_slip.compute.tasks import LocalThreads
 from fleet_slip.extras import needed
 from fleet_slip.files.folder import Folder
@@ -18,6 +17,24 @@ from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.runs.log import current_run_id, recording
 from fleet_slip.warehouse.tables import Warehouse
+
+
+class Rooted:
+    """The warehouse of a data root. Making one touches nothing."""
+
+    def __init__(self, warehouse: Warehouse) -> None:
+        """Take the tables; `fleet_slip.open` makes them."""
+        self.warehouse = warehouse
+
+    @property
+    def root(self) -> Folder:
+        """The data root: a folder, or a place on an object store."""
+        return self.warehouse.root
+
+    def __repr__(self) -> str:
+        """Return the class and the data root."""
+        return f"{type(self).__name__}({str(self.root)!r})"
+
 
 ShowProgress = Callable[[int, int], None]
 """Called now and then with the units done so far and the units to do in all: rows, bytes, files."""

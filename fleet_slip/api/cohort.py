@@ -3,8 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from fleet_slip.api.calls import takes
-from fleet_slip.api.root import Rooted
+from fleet_slip.api.calls import Rooted, takes
 from fleet_slip.errors import UsageError
 from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.warehouse.tables import Warehouse

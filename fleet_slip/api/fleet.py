@@ -111,8 +111,7 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
 
         Raises what `simulate`, `gram`, `FleetCohort.select` and `publish` raise.
         """
-        from fleet_slip.api.retraining import Training
-        from fleet_slip.api.run_report import RunReport
+        from fleet_slip.api.run_report import RunReport, Training
         from fleet_slip.catalogue.features import features
         from fleet_slip.selection.model_list import load_model_list
         from fleet_slip.selection.worth import parse_worth
@@ -200,7 +199,7 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
         worth that is none, and `StorageError` if the night cannot be recorded.
         """
         from fleet_slip.api.nightly import Night
-        from fleet_slip.api.retraining import Training
+        from fleet_slip.api.run_report import Training
         from fleet_slip.selection.worth import parse_worth
 
         parse_worth(worth)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fleet_slip.api.calls import (
+    Rooted,
     ShowProgress,
     Workers,
     count_from_start,
@@ -14,7 +15,6 @@ from fleet_slip.api.calls import (
     unless_local,
     within_reach,
 )
-from fleet_slip.api.root import Rooted
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.runs.log import step
 

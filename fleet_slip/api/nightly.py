@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fleet_slip.api.calls import ShowProgress, Workers
-from fleet_slip.api.retraining import Training
+from fleet_slip.api.run_report import Training
 from fleet_slip.catalogue.car_numbers import CALIBRATION, DELAY
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features

@@ -4,9 +4,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fleet_slip.api.calls import ShowProgress, count_from_start, open_workers, record_call
+from fleet_slip.api.calls import Rooted, ShowProgress, count_from_start, open_workers, record_call
 from fleet_slip.api.cohort import FleetCohort
-from fleet_slip.api.root import Rooted
 from fleet_slip.catalogue.sources import ALL_DRIVES
 from fleet_slip.errors import UsageError
 from fleet_slip.extras import needed

@@ -1,14 +1,15 @@
-"""Options that several commands share: those of a selection, as one parameter of a command."""
+"""Options that several commands share: a selection as one parameter, and what is examined."""
 
 import functools
 import inspect
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import fields
 from typing import Annotated, Any, TypeVar
 
 import typer
 
 from fleet_slip.cli.completing import complete_config, complete_feature_set
+from fleet_slip.errors import UsageError
 from fleet_slip.grams.cohorts.folding import FoldKey
 from fleet_slip.regression.choice.criteria import CRITERIA
 from fleet_slip.regression.choice.signal_orders import RANKINGS
@@ -160,3 +161,40 @@ def selection_options(
         return run
 
     return expand
+
+
+Model = Annotated[
+    str | None,
+    typer.Argument(
+        help="NAME, NAME@VERSION or NAME@ALIAS of a published model. Default: the only one that "
+        "there is, unless --signals is given.",
+        show_default=False,
+    ),
+]
+Signals = Annotated[
+    str | None,
+    typer.Option(
+        help="Instead of a published model: signals to fit, separated by commas; 'catalogue' is "
+        "all inputs."
+    ),
+]
+FeatureSetOption = Annotated[
+    str | None,
+    typer.Option(
+        "--features", help="Feature set that --signals are of. Default: the logged signals."
+    ),
+]
+
+
+def quantities(values: Sequence[str] | None, option: str) -> dict[str, float]:
+    """Return what options like `--noise ay=0.2` say, in SI units. Raises `UsageError`."""
+    found = {}
+    for value in values or ():
+        name, _, number = value.partition("=")
+        try:
+            found[name.strip()] = float(number)
+        except ValueError:
+            raise UsageError(
+                f"{option} {value}: write SIGNAL=NUMBER in SI units, such as ay=0.2."
+            ) from None
+    return found

@@ -27,8 +27,7 @@ from fleet_slip.grams.cohorts.folding import FoldKey
 from fleet_slip.models.counts_model import counts_model
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.regression.choice.paired import compare_paired, compare_typical
-from fleet_slip.regression.choice.winner import Shortfall, Worth
+from fleet_slip.regression.choice.winner import Shortfall, Worth, compare_paired, compare_typical
 from fleet_slip.regression.exact.figures import error_sums
 from fleet_slip.regression.validation.crossval import (
     CrossValidation,

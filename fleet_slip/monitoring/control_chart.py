@@ -7,7 +7,7 @@ from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.figure import Figure
 
 from fleet_slip.monitoring.monitor import Chart
-from fleet_slip.pages.style import Size, colour
+from fleet_slip.pages.drawing import Size, colour
 
 HEIGHT_IN = 3.6
 TONES = {"training": "muted", "new": "model_4", "beyond": "unstable"}

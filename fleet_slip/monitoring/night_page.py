@@ -7,11 +7,8 @@ from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.monitoring.control_chart import control_chart
 from fleet_slip.monitoring.monitor import Chart
 from fleet_slip.monitoring.night_report import NightReport
-from fleet_slip.pages.drawing import draw
-from fleet_slip.pages.page_table import Cell, Mark, ReportTable, Tile, table
-from fleet_slip.pages.picture import Picture
-from fleet_slip.pages.templating import fill_in
-from fleet_slip.pages.text import count
+from fleet_slip.pages.drawing import Picture, draw
+from fleet_slip.pages.page_parts import Cell, Mark, ReportTable, Tile, count, fill_in, table
 from fleet_slip.words import number_of
 
 MARKS: dict[str, Mark] = {"done": "good", "attention": "miss", "failed": "miss", "left out": ""}

@@ -10,7 +10,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohorts.gram_cohort import Cohort, Served
 from fleet_slip.grams.cohorts.training_folds import clustered_moments
-from fleet_slip.regression.choice.nested import nested_fits
+from fleet_slip.regression.choice.nested_choice import nested_fits
 from fleet_slip.regression.exact.least_squares import Fit, LinearModel, condition_number, fit
 from fleet_slip.regression.inference.coefficient_tests import (
     ChowTest,

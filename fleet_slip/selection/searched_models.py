@@ -14,7 +14,7 @@ from fleet_slip.errors import DataError
 from fleet_slip.grams.cohorts.fold_sums import SummedCohort
 from fleet_slip.grams.cohorts.folding import Folding
 from fleet_slip.grams.cohorts.gram_cohort import Cohort
-from fleet_slip.regression.choice.nested import nested_fits
+from fleet_slip.regression.choice.nested_choice import nested_fits
 from fleet_slip.regression.choice.stepwise import stepwise_order
 from fleet_slip.regression.choice.winner import DEFAULT_WORTH, Winner, Worth, choose
 from fleet_slip.regression.exact.figures import ErrorSums

@@ -12,8 +12,7 @@ from fleet_slip.grams.cohorts.folding import Folding
 from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.grams.cohorts.training_folds import drive_folds
 from fleet_slip.regression.choice.lars import fit_lasso
-from fleet_slip.regression.choice.nested import nested_fits
-from fleet_slip.regression.choice.nested_choice import FEWEST_FOLDS
+from fleet_slip.regression.choice.nested_choice import FEWEST_FOLDS, nested_fits
 from fleet_slip.regression.exact.least_squares import Scales
 from fleet_slip.regression.inference.drive_moments import ClusterUnit
 from fleet_slip.regression.inference.evidence import Evidence

@@ -28,9 +28,8 @@ from fleet_slip.simulation.manoeuvres import Manoeuvre
 from fleet_slip.simulation.sensing.distortion import Distortion
 from fleet_slip.simulation.sensing.receivers import Receiver, Receivers
 from fleet_slip.simulation.sensing.sensors import SAMPLE_RATE_HZ, Sensors
-from fleet_slip.simulation.speed_profile import SpeedLimits, SpeedProfile, speed_profile
 from fleet_slip.simulation.surface import surface
-from fleet_slip.simulation.track import Track
+from fleet_slip.simulation.track import SpeedLimits, SpeedProfile, Track, speed_profile
 from fleet_slip.simulation.trials import TrialPlan
 from fleet_slip.vehicle.lanes.road import Surface
 from fleet_slip.vehicle.parameters import VehicleParameters

@@ -20,8 +20,7 @@ from fleet_slip.simulation.imperfections import (
 )
 from fleet_slip.simulation.manoeuvres import Manoeuvre
 from fleet_slip.simulation.sensing.sensors import Sensors
-from fleet_slip.simulation.speed_profile import SpeedLimits
-from fleet_slip.simulation.track import Track, load_track
+from fleet_slip.simulation.track import SpeedLimits, Track, load_track
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2, VehicleParameters, load_vehicle
 
 GOLDEN_RATIO = (1 + math.sqrt(5)) / 2

@@ -25,7 +25,7 @@ from fleet_slip.simulation.campaign import Batch, DriveSpec
 from fleet_slip.simulation.drive_plan import NamedTrack, NamedVehicle, Positive
 from fleet_slip.simulation.imperfections import NONE, Imperfections, NotNegative
 from fleet_slip.simulation.sensing.sensors import GPS_SIGNALS, Sensors
-from fleet_slip.simulation.speed_profile import SpeedLimits, SpeedProfile
+from fleet_slip.simulation.track import SpeedLimits, SpeedProfile
 from fleet_slip.vehicle.parameters import VehicleParameters
 
 DAY = date(2024, 4, 1)

@@ -6,10 +6,8 @@ import re
 import pytest
 from matplotlib.figure import Figure
 
-from fleet_slip.pages.drawing import inline, inline_svgs
-from fleet_slip.pages.picture import Picture
-from fleet_slip.pages.style import PALETTE, Size, colour
-from fleet_slip.pages.text import degrees, listed, number, percent, scientific, size
+from fleet_slip.pages.drawing import PALETTE, Picture, Size, colour, inline, inline_svgs
+from fleet_slip.pages.page_parts import degrees, listed, number, percent, scientific, size
 
 
 def test_numbers_read_well() -> None:

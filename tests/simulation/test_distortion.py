@@ -10,7 +10,7 @@ from fleet_slip.simulation.sensing.lags import Delay, LowPass
 from fleet_slip.simulation.sensing.pulses import Pulses
 from fleet_slip.simulation.sensing.wander import Wander
 from fleet_slip.vehicle.car_imperfections import CarImperfections
-from fleet_slip.vehicle.lanes.lane_blocks import CHANNELS, IMPERFECT_CHANNELS
+from fleet_slip.vehicle.lanes.lane_memory import CHANNELS, IMPERFECT_CHANNELS
 
 TICKS = 3000
 TIME_S = np.arange(TICKS) / 100

@@ -16,7 +16,7 @@ from fleet_slip.simulation.campaign import Batch, DriveSpec, load_campaign
 from fleet_slip.simulation.drives import DriveLog, simulate_batch, simulate_logs, tabulate
 from fleet_slip.simulation.sensing.sensors import SAMPLE_RATE_HZ
 from fleet_slip.simulation.track import load_track
-from fleet_slip.vehicle.lanes.lane_blocks import BLOCK, CHANNELS
+from fleet_slip.vehicle.lanes.lane_memory import BLOCK, CHANNELS
 from tests.support.logs import schema_without
 from tests.support.measuring import measure
 

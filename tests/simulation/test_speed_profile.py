@@ -6,8 +6,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from fleet_slip.simulation.speed_profile import SpeedLimits, SpeedProfile, speed_profile
-from fleet_slip.simulation.track import Segment, Track, load_track
+from fleet_slip.simulation.track import (
+    Segment,
+    SpeedLimits,
+    SpeedProfile,
+    Track,
+    load_track,
+    speed_profile,
+)
 
 TRACKS = {name: load_track(name) for name in ("waterford_hills", "melbourne", "skid_pad")}
 S_BEND = Track(

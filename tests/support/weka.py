@@ -26,9 +26,9 @@ from fleet_slip.regression.shrinkage.mixture import (
     posterior,
     signed_density,
 )
-from fleet_slip.regression.shrinkage.orthogonal import OrthogonalResponses
 from fleet_slip.regression.shrinkage.pace import (
     Estimator,
+    OrthogonalResponses,
     empirical_bayes,
     half_contributions,
     pace5,

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.vehicle.lanes.lane_blocks import CHANNELS
 from fleet_slip.vehicle.lanes.lane_drives import STEPS_PER_SAMPLE, LaneDrive, simulate_blocks
+from fleet_slip.vehicle.lanes.lane_memory import CHANNELS
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from fleet_slip.vehicle.arctangent import arctan2
 from fleet_slip.vehicle.driver import LARGEST_GRIP_USE, Handling, slip_growth
-from fleet_slip.vehicle.integration import STEP_S, followed
+from fleet_slip.vehicle.integration import STEP_S, Pose, PoseSlopes, advance_pose, followed
 from fleet_slip.vehicle.parameters import constants, load_vehicle
-from fleet_slip.vehicle.pose import Pose, PoseSlopes, advance_pose
 from fleet_slip.vehicle.tyre import cornering_stiffness
 
 CARS = ("compact_hatchback", "d_class_sedan", "rear_drive_sedan", "suv")

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from fleet_slip.errors import ConfigError
-from fleet_slip.simulation.speed_profile import SpeedLimits, speed_profile
-from fleet_slip.simulation.track import load_track
+from fleet_slip.simulation.track import SpeedLimits, load_track, speed_profile
 from fleet_slip.vehicle.lanes import lane_kernel
-from fleet_slip.vehicle.lanes.lane_blocks import BLOCK, CHANNELS
 from fleet_slip.vehicle.lanes.lane_drives import LaneDrive, simulate_blocks
+from fleet_slip.vehicle.lanes.lane_memory import BLOCK, CHANNELS
 from fleet_slip.vehicle.lanes.road import Road
 from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
 from tests.support.rolling import SEDAN

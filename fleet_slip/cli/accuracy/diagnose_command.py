@@ -7,8 +7,7 @@ import typer
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.cli.examined_options import FeatureSetOption, Model, Signals, quantities
-from fleet_slip.cli.options import Cluster, Cohort
+from fleet_slip.cli.options import Cluster, Cohort, FeatureSetOption, Model, Signals, quantities
 from fleet_slip.cli.output import Json, print_json, print_table, say, stdout
 from fleet_slip.regression.inference.standard_errors import INTERCEPT, Estimate
 from fleet_slip.selection.diagnostics import CohortComparison, Diagnosis

@@ -5,8 +5,7 @@ from typing import Annotated
 import typer
 
 from fleet_slip.catalogue.sources import ALL_DRIVES
-from fleet_slip.cli.accuracy.evaluation_summary import print_summary
-from fleet_slip.cli.accuracy.evaluation_tables import print_evaluation
+from fleet_slip.cli.accuracy.evaluation_tables import print_evaluation, print_summary
 from fleet_slip.cli.begin.run_command import DEFAULT_CAMPAIGN
 from fleet_slip.cli.completing import complete_config, complete_model
 from fleet_slip.cli.models.diff_command import score_against

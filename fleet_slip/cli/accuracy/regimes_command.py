@@ -6,8 +6,7 @@ from typing import Annotated
 import typer
 
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.cli.examined_options import Signals
-from fleet_slip.cli.options import By, Cohort, FoldCount, Worth
+from fleet_slip.cli.options import By, Cohort, FoldCount, Signals, Worth
 from fleet_slip.cli.output import Json, print_json, print_table, stdout
 from fleet_slip.selection.regimes import RegimeComparison
 from fleet_slip.selection.worth import WORTH

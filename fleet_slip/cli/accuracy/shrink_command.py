@@ -4,8 +4,7 @@ import typer
 
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.cli.examined_options import FeatureSetOption, Signals
-from fleet_slip.cli.options import By, Cluster, Cohort, FoldCount, Naive
+from fleet_slip.cli.options import By, Cluster, Cohort, FeatureSetOption, FoldCount, Naive, Signals
 from fleet_slip.cli.output import Json, figures_cells, print_json, print_table
 from fleet_slip.selection.shrinkage import Shrunk
 from fleet_slip.words import number_of

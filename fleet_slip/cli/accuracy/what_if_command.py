@@ -5,8 +5,7 @@ from typing import Annotated
 import typer
 
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.cli.examined_options import FeatureSetOption, Model, Signals, quantities
-from fleet_slip.cli.options import Cohort
+from fleet_slip.cli.options import Cohort, FeatureSetOption, Model, Signals, quantities
 from fleet_slip.cli.output import Json, figures_cells, print_json, print_table
 from fleet_slip.regression.inference.standard_errors import INTERCEPT
 from fleet_slip.selection.what_if import WhatIf

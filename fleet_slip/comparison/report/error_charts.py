@@ -12,8 +12,8 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.comparison.evaluation.scenario_runs import EvaluatedScenario
 from fleet_slip.comparison.report.column_worth import Cars, Memory, Without
 from fleet_slip.comparison.report.time_series import Line, smooth
-from fleet_slip.pages.style import POINTS_PER_INCH, Size, colour
-from fleet_slip.pages.text import degrees
+from fleet_slip.pages.drawing import POINTS_PER_INCH, Size, colour
+from fleet_slip.pages.page_parts import degrees
 from fleet_slip.simulation.sensing.sensors import SAMPLE_RATE_HZ
 
 LINE_POINTS = 13.0

@@ -9,7 +9,7 @@ from fleet_slip.comparison.evaluation.targets import PAPER_TABLE_TWO
 from fleet_slip.comparison.report.kept_evaluation import BLOCK_S, blocks_won, difference
 from fleet_slip.comparison.report.report_data import DRAWN_FILTERS, ReportData
 from fleet_slip.export.costs import describe_costs
-from fleet_slip.pages.text import degrees
+from fleet_slip.pages.page_parts import degrees
 from fleet_slip.regression.choice.winner import Winner
 from fleet_slip.simulation.sensing.sensors import SAMPLE_RATE_HZ
 

@@ -27,8 +27,8 @@ from fleet_slip.comparison.report.point_charts import Named, density, points_by_
 from fleet_slip.comparison.report.report_data import DRAWN_FILTERS, ReportData
 from fleet_slip.comparison.report.time_series import Line
 from fleet_slip.comparison.report.track_map import FINE_EDGES_DEG, Map, error_map
-from fleet_slip.pages.picture import Picture
-from fleet_slip.pages.text import count, degrees, listed, number, percent
+from fleet_slip.pages.drawing import Picture
+from fleet_slip.pages.page_parts import count, degrees, listed, number, percent
 
 SLIPPERY = "adhesion_0_4"
 STYLES = ("style_gentle", "nominal", "style_brisk", "style_sporty", "style_limit")

@@ -8,8 +8,17 @@ from fleet_slip.comparison.evaluation.ranking import LEAST_COVERAGE
 from fleet_slip.comparison.evaluation.scenario_runs import ErrorFigures
 from fleet_slip.comparison.report.report_data import ReportData
 from fleet_slip.comparison.report.training_findings import Coefficient, Coefficients
-from fleet_slip.pages.page_table import Cell, ReportTable, table
-from fleet_slip.pages.text import count, degrees, number, percent, scientific, size
+from fleet_slip.pages.page_parts import (
+    Cell,
+    ReportTable,
+    count,
+    degrees,
+    number,
+    percent,
+    scientific,
+    size,
+    table,
+)
 from fleet_slip.words import number_of
 
 SHOWN_MODELS = ("1", "2", "4", "5")

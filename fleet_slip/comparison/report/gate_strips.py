@@ -15,7 +15,7 @@ from fleet_slip.comparison.evaluation.evaluated_drives import find_stretches
 from fleet_slip.comparison.evaluation.scenario_runs import EvaluatedScenario
 from fleet_slip.comparison.report.time_series import Line, band
 from fleet_slip.models.manifest import Manifest
-from fleet_slip.pages.style import Size, colour
+from fleet_slip.pages.drawing import Size, colour
 
 
 def gates_of(manifest: Manifest) -> dict[str, tuple[Definition, list[int]]]:

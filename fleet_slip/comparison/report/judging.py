@@ -12,7 +12,7 @@ from jinja2 import Environment, StrictUndefined, meta
 from fleet_slip.comparison.evaluation.targets import PAPER_TABLE_TWO
 from fleet_slip.comparison.report.facts import Facts, NotEvaluatedError
 from fleet_slip.comparison.report.report_data import ReportData
-from fleet_slip.pages import text
+from fleet_slip.pages import page_parts as text
 
 TEXTS = Environment(undefined=StrictUndefined, keep_trailing_newline=True)  # noqa: S701 - no HTML
 TEXTS.filters |= {

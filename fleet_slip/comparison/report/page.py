@@ -11,11 +11,8 @@ from fleet_slip.comparison.report.judging import Judged, Status, judge_claims
 from fleet_slip.comparison.report.report_data import ReportData, gather
 from fleet_slip.files.folder import Folder
 from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.pages.drawing import draw, png_file, svg_file
-from fleet_slip.pages.page_table import ReportTable, Tile
-from fleet_slip.pages.picture import Picture
-from fleet_slip.pages.templating import fill_in
-from fleet_slip.pages.text import count, degrees, size
+from fleet_slip.pages.drawing import Picture, draw, png_file, svg_file
+from fleet_slip.pages.page_parts import ReportTable, Tile, count, degrees, fill_in, size
 from fleet_slip.warehouse.tables import Warehouse
 from fleet_slip.words import number_of
 

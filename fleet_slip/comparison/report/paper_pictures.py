@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 from fleet_slip.comparison.report.report_data import DRAWN_FILTERS, ReportData
 from fleet_slip.comparison.report.time_series import KMH_PER_MPS, DriveBlock, Line, side_slip, speed
-from fleet_slip.pages.picture import Picture
-from fleet_slip.pages.text import degrees, listed, number
+from fleet_slip.pages.drawing import Picture
+from fleet_slip.pages.page_parts import degrees, listed, number
 
 FILTER_LABELS = {"kalman": "Kalman filter", "kalman_tuned": "Kalman filter, tuned"}
 

@@ -5,8 +5,7 @@ from typing import Any
 
 from fleet_slip.comparison.evaluation.targets import FILTER_SCENARIOS, PAPER_TABLE_TWO
 from fleet_slip.comparison.report.report_data import ReportData
-from fleet_slip.pages.page_table import Cell, ReportTable, table
-from fleet_slip.pages.text import count, degrees, number
+from fleet_slip.pages.page_parts import Cell, ReportTable, count, degrees, number, table
 
 PAPER_TABLE_ONE = {"1": 0.9013, "2": 0.9534, "3": 0.9796, "4": 0.9911, "5": 0.9911}
 """Cross-validated correlations, Table I."""

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from fleet_slip.comparison.report.error_charts import TICKS_DEG
 from fleet_slip.comparison.report.training_findings import Histogram
-from fleet_slip.pages.style import Size, colour
+from fleet_slip.pages.drawing import Size, colour
 
 ROW_IN = 0.19
 HEAD_IN = 0.5

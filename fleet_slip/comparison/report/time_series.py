@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from fleet_slip.arrays import FloatArray
 from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive, find_stretches
 from fleet_slip.comparison.evaluation.scenario_runs import EvaluatedScenario
-from fleet_slip.pages.style import Size, colour
-from fleet_slip.pages.text import degrees
+from fleet_slip.pages.drawing import Size, colour
+from fleet_slip.pages.page_parts import degrees
 
 
 @dataclass(frozen=True)

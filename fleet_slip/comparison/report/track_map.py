@@ -12,7 +12,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive
 from fleet_slip.comparison.evaluation.scenario_runs import EvaluatedScenario
 from fleet_slip.comparison.report.time_series import smooth
-from fleet_slip.pages.style import Size, colour
+from fleet_slip.pages.drawing import Size, colour
 from fleet_slip.simulation.sensing.sensors import SAMPLE_RATE_HZ
 
 SMOOTHED_S = 0.5

@@ -13,7 +13,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.grams.cohorts.folding import FOLD_KEYS, assign_folds
 from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.grams.cohorts.training_folds import clustered_moments
-from fleet_slip.regression.choice.nested import nested_fits
+from fleet_slip.regression.choice.nested_choice import nested_fits
 from fleet_slip.regression.choice.signal_orders import RANKINGS, rank
 from fleet_slip.regression.choice.subsets import best_subsets
 from fleet_slip.regression.exact.least_squares import LinearModel, fit

@@ -17,8 +17,8 @@ from fleet_slip.comparison.watch.drive_frames import FRAMES_PER_S, WHEELS, Drive
 from fleet_slip.extras import needed
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.files.storage_errors import storage_errors
-from fleet_slip.pages.style import STYLE, colour
-from fleet_slip.pages.templating import fill_in
+from fleet_slip.pages.drawing import STYLE, colour
+from fleet_slip.pages.page_parts import fill_in
 
 GIF_EVERY = 2
 """A GIF keeps time in hundredths of a second; every second frame keeps it small."""

@@ -12,8 +12,11 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
 from fleet_slip.regression.exact.gram import Gram
-from fleet_slip.regression.exact.least_squares import LinearModel, correlation_matrix
-from fleet_slip.regression.exact.standard import from_standardised
+from fleet_slip.regression.exact.least_squares import (
+    LinearModel,
+    correlation_matrix,
+    from_standardised,
+)
 
 _TIE = 1e-12
 

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.arrays import IntArray
-from fleet_slip.errors import QuestionError
+from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression.choice.criteria import best_size, criterion_values
-from fleet_slip.regression.choice.nested import nested_fits
 from fleet_slip.regression.choice.signal_orders import rank
 from fleet_slip.regression.choice.winner import DEFAULT_WORTH, Worth, choose
+from fleet_slip.regression.exact.elimination import eliminate
 from fleet_slip.regression.exact.gram import Gram
-from fleet_slip.regression.exact.least_squares import Fit, Scales
+from fleet_slip.regression.exact.least_squares import Fit, Scales, dependence, fit_leading, moments
 from fleet_slip.regression.inference.drive_moments import DriveMoments
 from fleet_slip.regression.inference.evidence import Evidence
 from fleet_slip.regression.validation.crossval import (
@@ -28,6 +28,23 @@ from fleet_slip.regression.validation.crossval import (
     least_squares,
 )
 from fleet_slip.regression.validation.folds import Folds
+
+
+def nested_fits(
+    gram: Gram, order: Sequence[str], label: str, *, intercept: bool = True
+) -> list[Fit]:
+    """Return the exact fits of the first 0, 1, ..., k signals of an order.
+
+    One Bareiss pass yields every residual sum of squares (bordered over principal minors) and
+    every leading triangular system. Raises `DataError` for dependent signals.
+    """
+    part = gram.restrict([*order, label])
+    triangle = eliminate(moments(part, intercept=intercept))
+    if triangle.singular is not None:
+        raise DataError(dependence(part, order, intercept=intercept))
+    sizes = range(len(order) + 1)
+    return [fit_leading(part, triangle, size, intercept=intercept) for size in sizes]
+
 
 CROSS_VALIDATION = "cross-validation"
 """The criterion that cross-validates all nested models; the smallest that is nearly best wins."""

@@ -19,9 +19,10 @@ from fleet_slip.regression.exact.least_squares import (
     LinearModel,
     Scales,
     correlation_matrix,
+    from_standardised,
     moments,
+    through_means,
 )
-from fleet_slip.regression.exact.standard import from_standardised, through_means
 
 
 def fit_penalised(

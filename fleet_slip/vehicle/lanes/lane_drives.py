@@ -13,8 +13,16 @@ from fleet_slip.vehicle.car_imperfections import PERFECT, CarImperfections, trai
 from fleet_slip.vehicle.driver import SAMPLE_S, handling
 from fleet_slip.vehicle.integration import STEP_S
 from fleet_slip.vehicle.lanes import lane_kernel, lane_memory
-from fleet_slip.vehicle.lanes.lane_blocks import BLOCK, CHANNELS, IMPERFECT_CHANNELS, empty_blocks
-from fleet_slip.vehicle.lanes.lane_memory import DRIVE, FIRST, NOBODY
+from fleet_slip.vehicle.lanes.lane_memory import (
+    BLOCK,
+    CHANNELS,
+    DRIVE,
+    FIRST,
+    IMPERFECT_CHANNELS,
+    NOBODY,
+    ROUTE,
+    empty_blocks,
+)
 from fleet_slip.vehicle.lanes.road import (
     Road,
     Surface,
@@ -23,7 +31,6 @@ from fleet_slip.vehicle.lanes.road import (
     road_table,
     surface_table,
 )
-from fleet_slip.vehicle.lanes.route import ROUTE
 from fleet_slip.vehicle.parameters import VehicleParameters, constants
 
 STEPS_PER_SAMPLE = round(SAMPLE_S / STEP_S)

@@ -1,16 +1,110 @@
-"""Where everything stands that a lane carries, and how a drive enters and leaves a lane."""
+"""Lanes in memory: what each carries, how a drive enters and leaves it, and the blocks it records.
+
+Every quantity is a row of `LANES` numbers in one flat array. With all rows in one array at offsets
+known at compile time, the compiler needs no check that they overlap, and a loop over lanes that
+reads, computes and writes becomes vector instructions. A block of samples is still in the
+processor's cache when it is measured, and a drive of any length needs the same memory.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from fleet_slip.arrays import FloatArray, IntArray
+from fleet_slip.compiling import equation
+from fleet_slip.extras import needed
+from fleet_slip.vehicle.arctangent import arctan2
 from fleet_slip.vehicle.car_imperfections import Traits
 from fleet_slip.vehicle.driver import Handling
 from fleet_slip.vehicle.imperfect_dynamics import Around, Give, GiveRates
-from fleet_slip.vehicle.integration import Slopes
-from fleet_slip.vehicle.lanes.rows import LANES
+from fleet_slip.vehicle.integration import Path, Pose, PoseSlopes, Slopes
 from fleet_slip.vehicle.parameters import Constants
-from fleet_slip.vehicle.pose import Path, Pose, PoseSlopes
 from fleet_slip.vehicle.state import Controls, State
+
+with needed("compiled", "simulating drives"):
+    from llvmlite import ir  # type: ignore[import-untyped]
+    from numba import types
+    from numba.extending import intrinsic
+
+LANES = 8
+"""Lanes of the kernel: one or two of a processor's vectors."""
+
+
+def _address(context: Any, builder: Any, array_type: Any, args: Any, index: int) -> Any:
+    """Emit the address of the `index`-th row after a first row, at a lane."""
+    memory, first_row, lane = args[:3]
+    integer = first_row.type
+    row = builder.add(first_row, ir.Constant(integer, index))
+    offset = builder.add(builder.mul(row, ir.Constant(integer, LANES)), lane)
+    data = context.make_array(array_type)(context, builder, memory).data
+    return builder.gep(data, [offset], inbounds=True)
+
+
+@intrinsic
+def _read(_typing_context: Any, memory: Any, _first_row: Any, _lane: Any, kind: Any) -> Any:
+    """Type and emit `read`."""
+    fields = kind.instance_class
+    count = len(fields._fields)
+    result = types.NamedUniTuple(types.float64, count, fields)  # type: ignore[no-untyped-call]
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        array_type = signature.args[0]
+        values = [
+            builder.load(_address(context, builder, array_type, args, index))
+            for index in range(count)
+        ]
+        return context.make_tuple(builder, result, values)
+
+    return result(memory, types.intp, types.intp, kind), codegen
+
+
+@intrinsic
+def _write(_typing_context: Any, memory: Any, _first_row: Any, _lane: Any, values: Any) -> Any:
+    """Type and emit `write`."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        array_type = signature.args[0]
+        for index in range(signature.args[3].count):
+            value = builder.extract_value(args[3], index)
+            builder.store(value, _address(context, builder, array_type, args, index))
+        return context.get_dummy_value()
+
+    return types.void(memory, types.intp, types.intp, values), codegen
+
+
+read: Callable[..., Any] = _read
+"""Return one lane of successive rows as a named tuple: `read(memory, ROW, lane, State)`."""
+
+write: Callable[..., None] = _write
+"""Write a tuple of floats to one lane of successive rows: `write(memory, ROW, lane, values)`."""
+
+
+ROUTE = np.dtype(
+    [
+        ("first", np.int64),  # index of the road's first entry in the table of all roads
+        ("last", np.int64),
+        ("inverse_spacing", np.float64),
+        ("length_m", np.float64),
+        ("closed", np.bool_),
+        ("distance_m", np.float64),
+        ("samples", np.int64),  # most that the drive may take
+    ]
+)
+"""What the kernel knows of a drive."""
+
+
+@equation
+def place(route: Any, station: float) -> tuple[int, float]:
+    """Return the entry at or before a station, and how far towards the next the station is.
+
+    A closed road's entries are continued beyond its length by what a driver sees ahead.
+    """
+    entries = station * route.inverse_spacing
+    entry = min(max(math.floor(entries), 0), route.last - route.first - 1)
+    return route.first + entry, min(max(entries - entry, 0.0), 1.0)
+
 
 NOBODY = -1
 """Drive of a lane that has none, and tick of a loss that has not happened."""
@@ -73,3 +167,101 @@ def clear(memory: FloatArray, book: IntArray, lane: int) -> None:
     """Let nothing stand on a lane: a car at rest."""
     book[DRIVE, lane] = NOBODY
     memory.reshape(ROWS, LANES)[:, lane] = 0.0
+
+
+CHANNELS = (
+    "ax_mps2",
+    "ay_mps2",
+    "yaw_rate_rad_s",
+    "steering_wheel_rad",
+    "wheel_fl_rad_s",
+    "wheel_fr_rad_s",
+    "wheel_rl_rad_s",
+    "wheel_rr_rad_s",
+    "steer_fl_rad",
+    "steer_fr_rad",
+    "sideslip_rad",
+    "vx_mps",
+    "vy_mps",
+    "station_m",
+    "lateral_offset_m",
+)
+"""What a lane records."""
+
+IMPERFECT_CHANNELS = ("yaw_acceleration_rad_s2", "leaning_ax_mps2", "leaning_ay_mps2")
+"""What a lane records besides of a car with imperfections, for its sensors: how the body begins to
+turn, and the accelerations as its pitch and roll have followed them."""
+
+BLOCK = 2**16
+"""Samples of a block: 11 minutes of a drive."""
+
+STRIDE = BLOCK + 8
+"""Distance between two channels of a block: with a power of two all channels would share the same
+few lines of the processor's cache."""
+
+BLOCK_SHAPE = (LANES, len(CHANNELS), STRIDE)
+"""Shape of the blocks of all lanes."""
+
+
+IMPERFECT_BLOCK_SHAPE = (LANES, len(IMPERFECT_CHANNELS), STRIDE)
+
+
+def empty_blocks(imperfect: bool) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return memory for the blocks of all lanes, flat, and its two parts in their shapes."""
+    usual = LANES * len(CHANNELS) * STRIDE
+    memory = np.empty(usual + (LANES * len(IMPERFECT_CHANNELS) * STRIDE if imperfect else 0))
+    more = memory[usual:].reshape(IMPERFECT_BLOCK_SHAPE if imperfect else (LANES, 0, STRIDE))
+    return memory, memory[:usual].reshape(BLOCK_SHAPE), more
+
+
+@equation
+def at(lane: int, channel: int, sample: int) -> int:
+    """Return where a sample of a channel stands in the blocks."""
+    return (lane * len(CHANNELS) + channel) * STRIDE + sample
+
+
+@equation
+def further_at(lane: int, channel: int, sample: int) -> int:
+    """Return where a sample of one of `IMPERFECT_CHANNELS` stands in the blocks."""
+    start = LANES * len(CHANNELS) * STRIDE
+    return start + (lane * len(IMPERFECT_CHANNELS) + channel) * STRIDE + sample
+
+
+@equation
+def record(truth: Any, lane: int, sample: int, x: State, pose: Pose) -> None:
+    """Write the sample that begins here, but for the specific force, which the next step gives."""
+    truth[at(lane, 2, sample)] = x.yaw_rate
+    truth[at(lane, 3, sample)] = x.steering_wheel
+    truth[at(lane, 4, sample)] = x.wheel_fl
+    truth[at(lane, 5, sample)] = x.wheel_fr
+    truth[at(lane, 6, sample)] = x.wheel_rl
+    truth[at(lane, 7, sample)] = x.wheel_rr
+    truth[at(lane, 11, sample)] = x.vx
+    truth[at(lane, 12, sample)] = x.vy
+    truth[at(lane, 13, sample)] = pose.station
+    truth[at(lane, 14, sample)] = pose.offset
+
+
+@equation
+def fill_recorded_angles(left: Any, right: Any, vx: Any, vy: Any, slip: Any) -> None:
+    """Fill in the angles of a block in which the wheels' tangents stand instead of their angles."""
+    for tick in range(len(left)):
+        left[tick] = arctan2(left[tick], 1.0)
+    for tick in range(len(right)):
+        right[tick] = arctan2(right[tick], 1.0)
+    for tick in range(len(slip)):
+        slip[tick] = arctan2(vy[tick], vx[tick])
+
+
+@equation
+def fill_angles(wheel: Any, left: Any, right: Any, vx: Any, vy: Any, slip: Any, car: Any) -> None:
+    """Fill in the road wheels' angles and the side-slip angle of a block."""
+    steer, ackermann = car[STEER], car[ACKERMANN]
+    for tick in range(len(wheel)):
+        tangent = steer * wheel[tick]
+        left[tick] = arctan2(tangent, 1.0 - ackermann * tangent)
+    for tick in range(len(wheel)):
+        tangent = steer * wheel[tick]
+        right[tick] = arctan2(tangent, 1.0 + ackermann * tangent)
+    for tick in range(len(wheel)):
+        slip[tick] = arctan2(vy[tick], vx[tick])

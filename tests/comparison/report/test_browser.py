@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from fleet_slip.pages.style import PALETTE
+from fleet_slip.pages.drawing import PALETTE
 from tests.support.reported import Reported
 
 DESK_PX = 1200

@@ -24,7 +24,7 @@ from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.cohorts.folding import assign_folds
 from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.grams.rows.gram_job import update_grams
-from fleet_slip.pages.style import DESK, PHONE
+from fleet_slip.pages.drawing import DESK, PHONE
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.gram_table import GramTable
 from fleet_slip.warehouse.condition import parse_condition

@@ -40,9 +40,8 @@ from fleet_slip.errors import DataError
 from fleet_slip.files.documents import Document
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
-from fleet_slip.pages.drawing import png_file, svg_file
-from fleet_slip.pages.style import DESK, PHONE
-from fleet_slip.pages.text import degrees, number
+from fleet_slip.pages.drawing import DESK, PHONE, png_file, svg_file
+from fleet_slip.pages.page_parts import degrees, number
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.resources import config_names
 from fleet_slip.selection.model_list import CandidateModel

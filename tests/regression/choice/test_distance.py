@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fleet_slip.regression.choice.nested import nested_fits
+from fleet_slip.regression.choice.nested_choice import nested_fits
 from fleet_slip.regression.inference.evidence import Evidence
 from tests.support.counts import gram_of
 

@@ -19,7 +19,7 @@ from fleet_slip.regression.choice.lars import (
     lasso_path_of_moments,
 )
 from fleet_slip.regression.choice.leaps import best_by_leaps
-from fleet_slip.regression.choice.nested import nested_fits
+from fleet_slip.regression.choice.nested_choice import nested_fits
 from fleet_slip.regression.choice.signal_orders import RANKINGS, rank, replacement_sets
 from fleet_slip.regression.choice.subsets import all_rss, best_subsets, candidates, signals_of
 from fleet_slip.regression.exact.gram import Gram

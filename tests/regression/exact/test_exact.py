@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet_slip.errors import DataError
-from fleet_slip.regression.choice.nested import nested_fits
+from fleet_slip.regression.choice.nested_choice import nested_fits
 from fleet_slip.regression.exact.elimination import eliminate, inverse_matrix
 from fleet_slip.regression.exact.exact_roots import sqrt
 from fleet_slip.regression.exact.gram import Gram

@@ -6,7 +6,7 @@ import statsmodels.api as sm
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.regression.choice.nested import nested_fits
+from fleet_slip.regression.choice.nested_choice import nested_fits
 from fleet_slip.regression.choice.signal_orders import rank
 from fleet_slip.regression.choice.subsets import best_subsets
 from fleet_slip.regression.exact.least_squares import fit

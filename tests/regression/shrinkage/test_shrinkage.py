@@ -11,7 +11,7 @@ from hypothesis.extra import numpy as hnp
 from sklearn.linear_model import Ridge
 
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.regression.choice.nested import nested_fits
+from fleet_slip.regression.choice.nested_choice import nested_fits
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import fit
 from fleet_slip.regression.inference.evidence import Evidence
@@ -19,11 +19,15 @@ from fleet_slip.regression.shrinkage.mixture import (
     ChiSquareKernel,
     NormalKernel,
     fit_mixture,
+    nonnegative_least_squares,
     separable_groups,
 )
-from fleet_slip.regression.shrinkage.nnls import nonnegative_least_squares
-from fleet_slip.regression.shrinkage.orthogonal import OrthogonalResponses
-from fleet_slip.regression.shrinkage.pace import ESTIMATORS, james_stein, shrink
+from fleet_slip.regression.shrinkage.pace import (
+    ESTIMATORS,
+    OrthogonalResponses,
+    james_stein,
+    shrink,
+)
 from fleet_slip.regression.shrinkage.ridge import (
     fit_errors_in_variables,
     fit_noise_matched,

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleet_slip.regression.choice.nested import nested_fits
+from fleet_slip.regression.choice.nested_choice import nested_fits
 from fleet_slip.regression.choice.signal_orders import backward
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import LinearModel, fit

@@ -6,8 +6,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from fleet_slip.regression.choice.paired import compare_paired, compare_typical
-from fleet_slip.regression.choice.winner import Shortfall, Worth
+from fleet_slip.regression.choice.winner import Shortfall, Worth, compare_paired, compare_typical
 from fleet_slip.regression.exact.figures import error_sums
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import LinearModel
