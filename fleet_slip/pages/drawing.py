@@ -15,30 +15,6 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 
-@dataclass(frozen=True)
-class Picture:
-    """One figure of the report.
-
-    Attributes:
-        key: name of its files, and of its place on the page.
-        title: what it shows.
-        caption: what it tells, in numbers.
-        seen: what is drawn, for those who cannot see it.
-        draw: makes it at a size.
-    """
-
-    key: str
-    title: str
-    caption: str
-    seen: str
-    draw: Callable[[Size], Figure]
-
-    @property
-    def alternative(self) -> str:
-        """The text in place of the figure."""
-        return f"{self.title}. {self.seen} {self.caption}"
-
-
 POINTS_PER_INCH = 72.0
 POINTS_PER_BIN = 1.5
 
@@ -129,6 +105,30 @@ class Size:
     def bins(self) -> int:
         """Number of bins that a series over the whole width is cut into."""
         return int(self.width_in * POINTS_PER_INCH / POINTS_PER_BIN)
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One figure of the report.
+
+    Attributes:
+        key: name of its files, and of its place on the page.
+        title: what it shows.
+        caption: what it tells, in numbers.
+        seen: what is drawn, for those who cannot see it.
+        draw: makes it at a size.
+    """
+
+    key: str
+    title: str
+    caption: str
+    seen: str
+    draw: Callable[[Size], Figure]
+
+    @property
+    def alternative(self) -> str:
+        """The text in place of the figure."""
+        return f"{self.title}. {self.seen} {self.caption}"
 
 
 DESK = Size(10.4, wide=True)

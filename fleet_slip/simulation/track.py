@@ -1,11 +1,9 @@
-"""Tracks as sequences of curvature segments, read from `configs/tracks/*.toml`.
+"""Tracks as sequences of curvature segments (`configs/tracks/*.toml`), and how fast a car follows.
 
-Speed over station, as fast as the friction circle lets a car follow a track.
-
-The usual forward-backward pass of lap-time simulation (Kapania, Subosits and Gerdes, 2016, "A
-sequential two-step algorithm for fast generation of vehicle racing trajectories"). Each step is
-taken implicitly, so that the limits hold exactly at every point of the grid and a higher limit
-never makes any point slower.
+The speed over station is the usual forward-backward pass of lap-time simulation (Kapania, Subosits
+and Gerdes, 2016, "A sequential two-step algorithm for fast generation of vehicle racing
+trajectories"), within the friction circle. Each step is taken implicitly, so that the limits hold
+exactly at every point of the grid and a higher limit never makes any point slower.
 """
 
 from dataclasses import dataclass

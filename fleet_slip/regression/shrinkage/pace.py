@@ -1,12 +1,11 @@
-"""The orthogonal basis of a nested order, in which shrinkage acts on one dimension at a time.
+"""Pace regression: adaptive shrinkage of orthogonal responses (Wang 2000, Wang and Witten 2002).
 
-Pace regression: adaptive shrinkage of orthogonal responses (Wang 2000, Wang and Witten 2002).
-
-The effects A_j of an order are samples from a mixture; the mixing distribution G, estimated from
-all of them, says how much each one is worth. Names follow Wang: pace1 truncates the nested
-sequence, pace3 selects dimensions, pace5 shrinks, by a chi-square mixture that is known; pace2,
-pace4 and pace6 do the same by the one that is estimated from the very effects. eb shrinks by a
-normal mixture of signed effects.
+In the orthogonal basis of a nested order, shrinkage acts on one dimension at a time. The effects
+A_j of an order are samples from a mixture; the mixing distribution G, estimated from all of them,
+says how much each one is worth. Names follow Wang: pace1 truncates the nested sequence, pace3
+selects dimensions, pace5 shrinks, by a chi-square mixture that is known; pace2, pace4 and pace6 do
+the same by the one that is estimated from the very effects. eb shrinks by a normal mixture of
+signed effects.
 """
 
 from collections.abc import Callable, Sequence
