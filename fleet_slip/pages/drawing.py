@@ -14,7 +14,6 @@ import matplotlib as mpl
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-
 POINTS_PER_INCH = 72.0
 POINTS_PER_BIN = 1.5
 

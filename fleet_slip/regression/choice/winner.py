@@ -9,11 +9,11 @@ Regression Trees (1984), section 3.4.3, takes the error of the best model's own 
 which may be ten times as large.
 
 Models are also compared on the same rows without folds. Cars differ, and rows of a car are alike.
-So the rows are divided into groups of whole units that
-are independent: cars, or drives. With d the difference of the squared errors of a group and n its
-rows, the difference of the mean squared errors is the ratio sum d / sum n, whose standard error is
-that of a ratio of sums over groups of unequal size (Cochran, Sampling Techniques, 3rd edition,
-1977, section 6.4). Both models share each group, so that what makes it difficult cancels.
+So the rows are divided into groups of whole units that are independent: cars, or drives. With d the
+difference of the squared errors of a group and n its rows, the difference of the mean squared
+errors is the ratio sum d / sum n, whose standard error is that of a ratio of sums over groups of
+unequal size (Cochran, Sampling Techniques, 3rd edition, 1977, section 6.4). Both models share each
+group, so that what makes it difficult cancels.
 """
 
 import math
