@@ -51,10 +51,7 @@ R = TypeVar("R")
 
 
 def record_call(method: Callable[Concatenate[S, P], R]) -> Callable[Concatenate[S, P], R]:
-    """Return the method so that each call leaves a record in the history of runs.
-
-    A command line that calls it has its own.
-    """
+    """Return the method, each call of which leaves a record, unless a command has one already."""
 
     @functools.wraps(method)
     def call(self: S, /, *arguments: P.args, **options: P.kwargs) -> R:
@@ -69,10 +66,7 @@ def record_call(method: Callable[Concatenate[S, P], R]) -> Callable[Concatenate[
 def takes(
     options: Callable[P, T],
 ) -> Callable[[Callable[[S, T], R]], Callable[Concatenate[S, P], R]]:
-    """Let a method be called with the fields of a dataclass of options instead of one of these.
-
-    Signature and docstring are those of the dataclass, which says once what there is to ask for.
-    """
+    """Let a method take the fields, the signature and the docstring of a dataclass of options."""
 
     def expand(method: Callable[[S, T], R]) -> Callable[Concatenate[S, P], R]:
         @functools.wraps(method)
@@ -91,10 +85,7 @@ def takes(
 
 
 def _as_typed(arguments: Sequence[object], options: Mapping[str, object]) -> list[str]:
-    """Return the arguments of a call as one would type them after a command.
-
-    So the history leaves out of them what it leaves out of a command line.
-    """
+    """Return the arguments of a call as one types them, so that the history leaves out the same."""
     typed = [text for argument in arguments for text in _texts(argument)]
     for name, value in options.items():
         option = f"--{name.replace('_', '-')}"
@@ -130,11 +121,7 @@ def count_from_start(show: ShowProgress | None) -> Progress:
 
 @contextmanager
 def open_workers(root: Folder, workers: Workers) -> Iterator[Executor]:
-    """Yield the executor that `workers` means; one that is given is not closed.
-
-    Raises `ExtraError` if a cluster is wanted and Dask is not installed, and what
-    `cluster_executor` raises.
-    """
+    """Yield the executor that `workers` means; a given one stays open. Raises `ExtraError`."""
     context: Any
     if isinstance(workers, Executor):
         context = nullcontext(workers)

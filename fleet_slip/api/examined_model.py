@@ -37,10 +37,7 @@ def subject_of(
     signals: str | None,
     feature_set: str | None,
 ) -> ExaminedModel:
-    """Return what is to be examined; by default the only model that there is.
-
-    Raises `UsageError` if a model and signals are named.
-    """
+    """Return what is examined, by default the only model. Raises `UsageError` for both kinds."""
     if signals is not None or feature_set is not None:
         if model is not None:
             raise UsageError("name a published model or signals (of a feature set), not both.")

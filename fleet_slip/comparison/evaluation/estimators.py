@@ -31,10 +31,7 @@ TABLE_ONE = "table1"
 
 @dataclass(frozen=True)
 class LinearEstimate:
-    """The paper's estimator: an intercept in rad and a coefficient for each SI column.
-
-    A null in any of its signals leaves no estimate.
-    """
+    """An intercept in rad and a coefficient for each SI column; a null leaves no estimate."""
 
     intercept: float
     coefficients: Mapping[str, float]
@@ -180,10 +177,7 @@ class TrainedModels:
 
 
 def train_models(warehouse: Warehouse, version: ModelVersion) -> TrainedModels:
-    """Fit the models of Table I on a published model's cohort, as it is now, from its Gram rows.
-
-    Raises `DataError` if the cohort is empty now.
-    """
+    """Fit Table I on a published model's cohort as it is now. Raises `DataError` if it is empty."""
     cohort = load_cohort(warehouse, version.manifest.trained_on.cohort)
     models = load_model_list(TABLE_ONE)
     return TrainedModels(version, select(cohort, models.model, models.folds))

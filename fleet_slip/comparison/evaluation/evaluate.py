@@ -231,10 +231,7 @@ def train_competitors(
     executor: Executor,
     train_rivals: TrainRivals | None,
 ) -> Competitors:
-    """Fit, tune and train all that compete, on cohorts without any drive of a scenario.
-
-    Filters and learned rivals get the training drives of the one-car model.
-    """
+    """Fit, tune and train all that compete; filters and rivals get the one-car model's drives."""
     first = train_models(warehouse, one_car)
     others = tuple(train_models(warehouse, version) for version in fleets)
     estimators: dict[str, Estimate] = {}

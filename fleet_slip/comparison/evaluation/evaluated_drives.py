@@ -90,10 +90,7 @@ def visible_signals() -> tuple[str, ...]:
 
 
 def load_drives(warehouse: Warehouse, scenarios: Sequence[Scenario]) -> tuple[EvaluatedDrive, ...]:
-    """Read the drives of scenarios and apply their failures.
-
-    Raises `DataError` if a drive is not in the logs.
-    """
+    """Read the drives of scenarios, failures applied. Raises `DataError` if one is not there."""
     signals = catalogue().signals
     names = [name for name in signals if name != catalogue().label]
     statement = read_sql("jobs", "scenario.sql").format(
@@ -253,10 +250,7 @@ def _runs(mask: BoolArray) -> Iterator[tuple[int, int]]:
 
 
 def rear_compliance(drive: EvaluatedDrive) -> float:
-    """Return the slip angle of the rear axle per lateral acceleration, in rad s²/m.
-
-    By least squares through the origin over the rows of the drive that have both.
-    """
+    """Return the rear slip angle per lateral acceleration, rad s²/m, fitted through the origin."""
     rear = -slip_angles(drive)[1]
     ay = drive.signals["ay_mps2"] - drive.scenario.sensors.ay_bias_mps2
     there = drive.evaluated & np.isfinite(rear) & np.isfinite(ay)

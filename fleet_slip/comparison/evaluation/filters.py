@@ -151,10 +151,7 @@ def filter_bank(
 
 
 def tuning_drives(cohort: Cohort, car: VehicleParameters) -> tuple[str, ...]:
-    """Return the names of the drives of a cohort that filters are tuned on.
-
-    They are drives of that car's model; of any, where the cohort has none.
-    """
+    """Return the drives of a cohort to tune filters on: of that car's model if there are any."""
     drives = cohort.drives.select(["drive_id", "vehicle_model"]).to_pylist()
     of_car = {row["drive_id"] for row in drives if row["vehicle_model"] == car.name}
     names = sorted(of_car or {row["drive_id"] for row in drives})

@@ -54,10 +54,7 @@ class GpsSweep:
     regressions: Mapping[str, float]
 
     def equal_at_mps(self, name: str, rmse_deg: float) -> float | None:
-        """Return the noise at which a filter's RMSE reaches a value, linear between the levels.
-
-        None if it is above or below the value at all levels.
-        """
+        """Return the noise at which a filter's RMSE reaches a value, interpolated; else None."""
         for low, high in pairwise(self.levels):
             below, above = low.rmse_deg[name], high.rmse_deg[name]
             if below <= rmse_deg <= above and below < above:
@@ -106,10 +103,7 @@ def sweep_gps_noise(
 
 
 def rmse_deg(drive: EvaluatedDrive, one: FilterEstimate, velocity_std_mps: float) -> float:
-    """Return the RMSE of a filter in degrees over all draws of the noise, which it is told.
-
-    A tuned filter is told as much more or less as it was tuned to believe of the stated noise.
-    """
+    """Return a filter's RMSE in deg over all draws; it believes as much more noise as there is."""
     stated = drive.scenario.sensors.gps.velocity_std_mps
     believed = {name: getattr(one.parameters, name) * velocity_std_mps / stated for name in STATED}
     told = replace(one, parameters=one.parameters.model_copy(update=believed)).in_drive(drive)

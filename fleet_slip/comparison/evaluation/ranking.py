@@ -80,10 +80,7 @@ class Ranking:
 
 
 def rank(runs: Sequence[EvaluatedScenario], estimator: str, gps: Collection[str]) -> Ranking:
-    """Rank an estimator on every drive against all but those that use satellite navigation.
-
-    The RMSE is over the whole drive. The one estimator wins a tie.
-    """
+    """Rank an estimator on every drive against all that use no GPS; it wins a tie."""
     return Ranking(estimator, tuple(_stand(run, estimator, gps) for run in runs))
 
 
@@ -106,10 +103,7 @@ def _stand(run: EvaluatedScenario, estimator: str, gps: Collection[str]) -> Stan
 
 @dataclass(frozen=True)
 class FleetComparison:
-    """Errors of the same set of signals, trained on one car and on a fleet, on one scenario.
-
-    Root mean square errors, because a bias is an error too.
-    """
+    """RMSE of the same set of signals, trained on one car and on a fleet, on one scenario."""
 
     scenario: str
     model: str

@@ -56,10 +56,7 @@ class ErrorFigures:
 def error_figures(
     estimate_rad: FloatArray, truth_rad: FloatArray, among: BoolArray
 ) -> ErrorFigures:
-    """Return the figures over the rows of a mask. An estimate that is not finite is none.
-
-    All arrays have shape (rows,).
-    """
+    """Return the figures over the rows of a mask, shape (rows,); what is not finite is none."""
     rows = int(among.sum())
     given = among & np.isfinite(estimate_rad)
     estimate, truth = estimate_rad[given], truth_rad[given]
@@ -140,10 +137,7 @@ def simulate_scenarios(
     executor: Executor,
     progress: Progress = no_progress,
 ) -> SimulationReport:
-    """Write the drives that are not in the logs yet, and bring the Gram rows up to date.
-
-    Raises `RefusedError` if a scenario was changed since its drive was simulated.
-    """
+    """Write drives that are missing, and update Gram rows. Raises `RefusedError` if changed."""
     batches = {scenario.drive_id: scenario.batch() for scenario in scenarios}
     report = simulate_batches(warehouse, list(batches.values()), executor, progress)
     if report.changed:

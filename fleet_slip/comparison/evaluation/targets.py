@@ -96,10 +96,7 @@ REQUIREMENTS = (
 
 @dataclass(frozen=True)
 class TargetCheck:
-    """One requirement on one estimator: `found` against `limit`.
-
-    Both are NaN where there are no estimates. `explanation` is empty where it is reached.
-    """
+    """A requirement on an estimator; NaN without estimates, a miss has an `explanation`."""
 
     requirement: str
     scenario: str
@@ -122,10 +119,7 @@ def check_targets(
     models: Mapping[str, str],
     estimators: Mapping[str, LinearEstimate],
 ) -> tuple[TargetCheck, ...]:
-    """TargetCheck the models of Table I, given the name of each one's estimator.
-
-    A requirement whose scenario is not among the runs is left out, and all without the nominal one.
-    """
+    """Check each model of Table I, named by its estimator, on the scenarios that were run."""
     by_name = {run.scenario.name: run for run in runs}
     if "nominal" not in by_name:
         return ()
@@ -167,10 +161,7 @@ THE_PAPERS_CHOICE = "4"
 def check_filter_targets(
     runs: Sequence[EvaluatedScenario], models: Mapping[str, str]
 ) -> tuple[TargetCheck, ...]:
-    """TargetCheck that the regression has a smaller error than the paper's Kalman filter has.
-
-    As it is and tuned; over the drive, and while satellite navigation is out in the tunnel.
-    """
+    """Check that the regression beats the paper's Kalman filter, as it is and tuned."""
     name = models.get(THE_PAPERS_CHOICE)
     if name is None:
         return ()
@@ -227,10 +218,7 @@ def stable(run: EvaluatedScenario, estimator: str) -> ErrorFigures:
 
 
 def passed_noise_deg(model: LinearEstimate, sensors: Sensors) -> float:
-    """Return the standard deviation that white noise of the signals gives the estimate.
-
-    Noises of different signals are independent: sqrt(sum (coefficient * std)²).
-    """
+    """Return the std that white noise gives the estimate: sqrt(sum (coefficient * std)²)."""
     stds = {catalogue()[name].column: std for name, (_, std) in sensors.bias_and_std.items()}
     squares = [(weight * stds[column]) ** 2 for column, weight in model.coefficients.items()]
     return math.degrees(math.sqrt(math.fsum(squares)))

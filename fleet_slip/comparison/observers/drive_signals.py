@@ -22,10 +22,7 @@ STEP_S = float(SAMPLE_TIME_S)
 
 @dataclass(frozen=True)
 class DriveSignals:
-    """One drive: float64 arrays of one length, NaN where there is no measurement.
-
-    Axes and signs are those of docs/conventions.md. GPS has its own rate and is NaN between fixes.
-    """
+    """One drive in float64, axes as in docs/conventions.md; NaN where nothing was measured."""
 
     ax_mps2: FloatArray
     ay_mps2: FloatArray
@@ -54,10 +51,7 @@ class LabelledDrive:
 
 
 def read_drive(database: duckdb.DuckDBPyConnection, drive_id: str) -> LabelledDrive:
-    """Read a drive from the view `log` of a warehouse (`fleet_slip.views.connect`).
-
-    Raises `QuestionError` if there is no such drive.
-    """
+    """Read a drive from the view `log`. Raises `QuestionError` if there is no such drive."""
     label = catalogue()[catalogue().label].column
     columns = [*(field.name for field in fields(DriveSignals)), label]
     with reading_files(database, f"reading the drive {drive_id!r}"):
@@ -73,10 +67,7 @@ def read_drive(database: duckdb.DuckDBPyConnection, drive_id: str) -> LabelledDr
 
 
 def hold_last(values: FloatArray, name: str) -> FloatArray:
-    """Return a signal with every gap filled by the value before it, a leading one by the first.
-
-    Raises `DataError` if there is no value at all.
-    """
+    """Return a signal, gaps filled by the last value. Raises `DataError` without any value."""
     valid = np.isfinite(values)
     if valid.all():
         return values

@@ -122,10 +122,7 @@ def update(
     c: Chassis,
     v: Variances,
 ) -> None:
-    """Take in wheel speed, yaw rate and lateral acceleration, one after the other.
-
-    Their noises are independent, so that the order does not matter but for the linearisation.
-    """
+    """Take in wheel speed, yaw rate and lateral acceleration, whose noises are independent."""
     condition(x, (1.0, 0.0, 0.0, 0.0), vx - x.mean[0], v.r_vx)
     condition(x, (0.0, 0.0, 1.0, 0.0), yaw_rate - x.mean[2], v.r_r)
     d = rates(x.mean[0], x.mean[1], x.mean[2], steer, axles, c)
@@ -180,10 +177,7 @@ def chassis(car: VehicleParameters) -> Chassis:
 def axles_of(
     car: VehicleParameters, ax_mps2: FloatArray, ay_mps2: FloatArray, noise: EkfNoise
 ) -> FloatArray:
-    """Return the axles under the measured accelerations, as stiff as the parameters say.
-
-    The shape is that of `loaded_axles`.
-    """
+    """Return `loaded_axles` under the measured accelerations, as stiff as the parameters say."""
     axles = loaded_axles(car, ax_mps2, ay_mps2, noise.adhesion)
     axles[0] *= noise.stiffness_front_factor
     axles[1] *= noise.stiffness_rear_factor

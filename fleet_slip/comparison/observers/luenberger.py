@@ -83,10 +83,7 @@ def _observe(
 
 
 def estimate(drive: DriveSignals, car: VehicleParameters, poles: ObserverPoles) -> FloatArray:
-    """Estimate side-slip in rad at every row. Gaps of a sensor are bridged by the value before.
-
-    Raises `DataError` if a sensor is absent.
-    """
+    """Estimate side-slip in rad at every row, gaps bridged. Raises `DataError` without a sensor."""
     vx_mps = measured_speed_mps(drive, car)
     space = state_space(SingleTrack.of(car, poles.stiffness_factor), vx_mps)
     vy_mps = _observe(

@@ -76,10 +76,7 @@ class SingleTrack:
 
 
 class StateSpace(NamedTuple):
-    """ẋ = A x + B δ for every row of a drive, and the lateral acceleration C x + D δ.
-
-    ay = v̇y + r vx gives C = [a11, a12 + vx] and D = b1.
-    """
+    """ẋ = A x + B δ by row, and ay = v̇y + r vx = C x + D δ: C = [a11, a12 + vx] and D = b1."""
 
     a11: FloatArray
     a12: FloatArray

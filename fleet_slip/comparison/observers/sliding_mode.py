@@ -102,10 +102,7 @@ def _observe(
 
 
 def estimate(drive: DriveSignals, car: VehicleParameters, gains: SlidingGains) -> FloatArray:
-    """Estimate side-slip in rad at every row. Gaps of a sensor are bridged by the value before.
-
-    Raises `DataError` if a sensor is absent.
-    """
+    """Estimate side-slip in rad at every row, gaps bridged. Raises `DataError` without a sensor."""
     vx_mps = measured_speed_mps(drive, car)
     space = state_space(SingleTrack.of(car, gains.stiffness_factor), vx_mps)
     steer = measured_steer_rad(drive)

@@ -40,10 +40,7 @@ def rmse_rad(
     drives: Sequence[LabelledDrive],
     executor: Executor,
 ) -> float:
-    """Return the root mean square of estimate − truth over all rows that have both.
-
-    Raises `DataError` if no row has.
-    """
+    """Return the RMSE over rows with estimate and truth. Raises `DataError` if no row has both."""
     estimates = executor.map(estimate, (drive.signals for drive in drives))
     errors = [found - drive.sideslip_rad for found, drive in zip(estimates, drives, strict=True)]
     error = np.concatenate(errors) if errors else np.empty(0)

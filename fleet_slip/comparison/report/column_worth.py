@@ -248,10 +248,7 @@ def largest_fleet(warehouse: Warehouse) -> str | None:
 
 
 def errors_by_car(cohort: Cohort, inputs: Sequence[str]) -> tuple[dict[str, float], float]:
-    """Return the RMSE in degrees of each car and of all, by models fitted on other cars.
-
-    Raises `DataError` if no drive of the cohort has all the inputs.
-    """
+    """Return the RMSE in deg of each car and of all, by models of others. Raises `DataError`."""
     label = catalogue().label
     served = cohort.serving(inputs)
     vehicles = served.drives["vehicle_id"].to_pylist()

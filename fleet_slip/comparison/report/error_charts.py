@@ -94,10 +94,7 @@ BEFORE, AFTER = "kalman", "model_3"
 
 
 def car_by_car(cars: Cars, size: Size) -> Figure:
-    """Draw a point for each car without its numbers and one with them, in the order of the first.
-
-    Dashed lines are the errors over all rows.
-    """
+    """Draw a point a car without its numbers and one with them; dashed are all rows together."""
     axes = error_axes(size)
     places = np.arange(1, len(cars.before_deg) + 1)
     axes.vlines(places, cars.before_deg, cars.after_deg, color=colour("grid"), linewidth=0.8)
@@ -122,10 +119,7 @@ ROOM_IN = 0.6
 
 @dataclass(frozen=True)
 class Series:
-    """One line: RMSE in deg at each place, such as of models of 1, 2, ... columns, shape (places,).
-
-    `mark_deg`, if there is one, is what it is compared with, and drawn dashed.
-    """
+    """RMSE in deg at each place, shape (places,); the mark, drawn dashed, is to compare with."""
 
     label: str
     colour: str

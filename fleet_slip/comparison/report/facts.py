@@ -30,10 +30,7 @@ class Facts:
         self._evaluated = data.evaluated
 
     def __getitem__(self, name: str) -> Any:
-        """Return a fact, or the figures of the paper's choice in the scenario of that name.
-
-        Raises `NotEvaluatedError` if the evaluation lacks it, and `KeyError` for another name.
-        """
+        """Return a fact, or a scenario's figures of the choice. Raises `NotEvaluatedError`."""
         if name in self.data.shipped:
             return self.figures(name, self.data.choice)
         if name not in NAMES:

@@ -74,10 +74,7 @@ class Evaluated:
         return None if found is None else _figures(found)
 
     def part(self, scenario: str, estimator: str, side: Side, section: str) -> ErrorFigures | None:
-        """Return the error figures inside or outside of a section of a drive.
-
-        None if that was not evaluated, or the drive has no such section.
-        """
+        """Return the error figures inside or outside of a section; None if there is none."""
         found = self._result(scenario, estimator)
         if found is None or section not in found[side]:
             return None
@@ -105,10 +102,7 @@ def _figures(found: Mapping[str, Any]) -> ErrorFigures:
 
 
 def latest_of(warehouse: Warehouse, version: ModelVersion) -> Evaluated:
-    """Return the latest evaluation that is about a model version.
-
-    Raises `DataError` if there is none.
-    """
+    """Return the latest evaluation about a model version. Raises `DataError` if there is none."""
     kept = evaluations_of(warehouse)
     for number in reversed(kept.numbers()):
         document = kept.read(number)

@@ -67,10 +67,7 @@ class Coefficients:
 def coefficient_table(
     cohort: Cohort, model: str, inputs: Sequence[str], *, intercept: bool = True
 ) -> Coefficients:
-    """Fit the label on the inputs over all drives of a cohort that have them.
-
-    Raises `DataError` if no drive has them, or there is one only.
-    """
+    """Fit the label on the inputs over a cohort. Raises `DataError` for fewer than two drives."""
     label = catalogue().label
     served = cohort.serving(inputs)
     moments = clustered_moments(served, intercept=intercept)
@@ -114,10 +111,7 @@ class Ordering:
 
 
 def compare_orders(cohort: Cohort, signals: Sequence[str]) -> Ordering:
-    """Rank the signals in every way, and compare with all subsets.
-
-    Raises `DataError` if no drive of the cohort has them all.
-    """
+    """Rank signals in every way beside all subsets. Raises `DataError` if no drive has them all."""
     label = catalogue().label
     total = cohort.serving(signals).table.total()
     best = best_subsets(total, signals, label, count=1)

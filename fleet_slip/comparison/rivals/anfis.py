@@ -117,10 +117,7 @@ def learn(
     rows: tuple[FloatArray, FloatArray, FloatArray],
     judge: tuple[FloatArray, FloatArray, FloatArray],
 ) -> Premises:
-    """Return the premises after hybrid learning, those by which `judge` is estimated best.
-
-    Both are (premises, inputs with a one, label) by row.
-    """
+    """Return the learned premises that estimate `judge` best; both (premises, inputs, 1; label)."""
     z, x, label = rows
     best, now, length = start, start, FIRST_STEP
     least, before = np.inf, np.inf

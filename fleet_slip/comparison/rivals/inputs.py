@@ -82,10 +82,7 @@ class Inputs:
         return replace(self, scales={**self.scales, signal: float(catalogue()[signal].scale)})
 
     def values(self, drive: DriveCounts) -> FloatArray:
-        """Return the physical values of a drive, shape (rows, columns); NaN where missing.
-
-        Raises `DataError` for a drive that cannot be looked back on.
-        """
+        """Return physical values, shape (rows, columns), NaN where missing. Raises `DataError`."""
         scales = np.array(list(self.scales.values()))
         return np.asarray((DriveColumns(self.plan, drive).compute() * scales[:, None]).T)
 

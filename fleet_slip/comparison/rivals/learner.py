@@ -72,10 +72,7 @@ def hold_back(trip: Names) -> BoolArray:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Keep numerical libraries to one thread: a car has few, and waiting for each other costs more.
-
-    Raises `ExtraError` if scikit-learn is not installed.
-    """
+    """Keep numerical libraries to one thread, as on board. Raises `ExtraError`."""
     # The limit holds for libraries that are loaded.
     scikit_learn("ensemble")
     with import_module("threadpoolctl").threadpool_limits(limits=1):

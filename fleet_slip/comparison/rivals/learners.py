@@ -27,10 +27,7 @@ PASSES = 60
 
 
 def fit_perceptron(inputs: FloatArray, label: FloatArray, trip: Names) -> Fitted:
-    """Fit a network with two hidden layers of 64 neurons, on scaled inputs and label, by Adam.
-
-    It keeps the weights that estimate drives best which it does not learn from.
-    """
+    """Fit two hidden layers of 64 neurons by Adam; keep the weights best on drives held back."""
     network = scikit_learn("neural_network").MLPRegressor(
         hidden_layer_sizes=LAYERS, activation="tanh", batch_size=BATCH_ROWS,
         max_iter=PASSES_AT_ONCE, tol=0.0, warm_start=True, random_state=SEED,
@@ -102,10 +99,7 @@ BLOCK = 2048
 def kernel_mean(
     rows: FloatArray, centres: FloatArray, labels: FloatArray, width: float
 ) -> FloatArray:
-    """Return the mean of labels at rows, weighted by Gaussian kernels around the centres.
-
-    The nearest centre always counts, however far it is.
-    """
+    """Return the mean of labels, weighted by Gaussian kernels; the nearest centre always counts."""
     half = (centres**2).sum(axis=1) / 2
     estimates = np.empty(len(rows))
     for first in range(0, len(rows), BLOCK):
@@ -133,10 +127,7 @@ MOST_TREES = 500
 
 
 def fit_trees(inputs: FloatArray, label: FloatArray, trip: Names) -> Fitted:
-    """Fit gradient-boosted trees with at most 31 leaves each.
-
-    As many, up to 500, as estimate drives better which they are not fitted to.
-    """
+    """Fit gradient-boosted trees of at most 31 leaves, as many as drives held back ask for."""
     trees = scikit_learn("ensemble").HistGradientBoostingRegressor(
         learning_rate=0.1, max_iter=MOST_TREES, early_stopping=True, n_iter_no_change=20,
         tol=0.0, random_state=SEED,

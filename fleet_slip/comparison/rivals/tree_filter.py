@@ -117,10 +117,7 @@ class TreeFilter:
 def fit_tree_filter(
     base: FilterEstimate, drives: Sequence[LabelledDrive], executor: Executor
 ) -> TreeFilter:
-    """Fit the tree to the filter's squared errors, and seek the leaves' factors.
-
-    Raises `ExtraError` without scikit-learn.
-    """
+    """Fit the tree to the filter's squared errors, and the leaves' factors. Raises `ExtraError`."""
     car = base.car
     seen_kinds = np.concatenate([kinds(drive.signals, car) for drive in drives])
     parameters = ekf.EkfNoise.model_validate(base.parameters.model_dump())

@@ -84,10 +84,7 @@ def is_scenario(what: str) -> bool:
 def scenario_frames(
     warehouse: Warehouse, name: str, version: ModelVersion, executor: Any
 ) -> DriveFrames:
-    """Return the frames of a test drive, which is simulated if it is not in the logs.
-
-    Raises `ConfigError` for an unknown scenario.
-    """
+    """Return the frames of a test drive, simulated if missing. Raises `ConfigError`."""
     scenario = load_scenario(name)
     simulate_scenarios(warehouse, [scenario], executor)
     (drive,) = load_drives(warehouse, [scenario])
@@ -105,10 +102,7 @@ def scenario_frames(
 
 
 def drive_frames(warehouse: Warehouse, drive_id: str, version: ModelVersion) -> DriveFrames:
-    """Return the frames of a drive of the logs.
-
-    Raises `QuestionError` if there is none, and `CohortError` where a minimum cohort is asked for.
-    """
+    """Return the frames of a drive of the logs. Raises `QuestionError` and `CohortError`."""
     require_single_cars("a drive of the logs", "Watch a scenario, which is simulated.")
     names = [one.column for one in catalogue().signals.values()]
     query = f"SELECT time_s, track, vehicle_model, mass_kg, {', '.join(names)} FROM log"
@@ -170,10 +164,7 @@ def _as_table(
 
 
 def _velocity(columns: Mapping[str, FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Return vx and vy: the true ones, else by wheels and the reference angle.
-
-    Raises `DataError` if neither velocity nor wheel speeds were logged.
-    """
+    """Return vx and vy: true, else by wheels and the reference angle. Raises `DataError`."""
     vx, vy = columns["vx_mps"], columns["vy_mps"]
     if np.isfinite(vx).any():
         return np.nan_to_num(vx), np.nan_to_num(vy)

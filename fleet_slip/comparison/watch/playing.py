@@ -29,10 +29,7 @@ ARROWS = (("truth", 9.0), ("model_4", 8.0))
 
 
 def write_film(frames: DriveFrames, file: Path) -> None:
-    """Write the film of a drive; the suffix says the format.
-
-    Raises `ExtraError` for an MP4 without the extra `watch`, and `StorageError`.
-    """
+    """Write the film of a drive; the suffix says how. Raises `ExtraError` and `StorageError`."""
     every = GIF_EVERY if file.suffix == ".gif" else 1
     rate = FRAMES_PER_S / every
     if file.suffix == ".gif":

@@ -68,10 +68,7 @@ KINDS: Mapping[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Telling:
-    """A number that a plane tells: its value, and its gradient by the plane's coefficients.
-
-    `also` are other numbers that it depends on, with the derivatives.
-    """
+    """A number of a plane, its gradient by the coefficients, and by others that it depends on."""
 
     kind: str
     shape: PlaneShape

@@ -87,10 +87,7 @@ def best_subsets(gram: Gram, inputs: Sequence[str], label: str, count: int = 2) 
 
 
 def pick_sizes(results: Sequence[SizeResult], evidence: Evidence) -> dict[str, int]:
-    """Return the size that each criterion picks among the best models of every size.
-
-    The evidence is that of the full model in any order.
-    """
+    """Return the size that each criterion picks; the evidence is that of the full model."""
     rss = np.array([float(result.best.rss) for result in results])
     size = np.arange(len(results), dtype=np.float64)
     return {name: int(np.argmin(subset_values(name, evidence, rss, size))) for name in CRITERIA}

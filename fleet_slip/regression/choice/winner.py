@@ -90,10 +90,7 @@ class Shortfall:
 
 @dataclass(frozen=True)
 class Winner:
-    """The chosen model, the best-correlated one, and the reason in a sentence.
-
-    `shortfalls` are those of all models in their declared order; none if a criterion chose.
-    """
+    """The chosen model, the best-correlated one, the reason, and the shortfalls of all if any."""
 
     model: CrossValidation
     best: CrossValidation
@@ -128,10 +125,7 @@ def fall_short(model: CrossValidation, best: CrossValidation, worth: Worth) -> S
 
 
 def _standard_error(one: CrossValidation, other: CrossValidation) -> float:
-    """Return the standard error of the difference of two models' RMSEs, over the folds.
-
-    Where they were not tested on the same rows, since drives lack signals, nothing can be paired.
-    """
+    """Return the standard error of the difference of RMSEs over folds, paired where rows agree."""
     first, second = ([fold.rmse for fold in model.folds] for model in (one, other))
     rows = [[fold.rows for fold in model.folds] for model in (one, other)]
     if one.fold_names == other.fold_names and rows[0] == rows[1]:
@@ -166,10 +160,7 @@ def _reason(winner: Shortfall, best: CrossValidation, near: int, total: int, wor
 
 
 def compare_paired(model: CrossValidation, other: CrossValidation, worth: Worth) -> Shortfall:
-    """Return how much larger a model's RMSE is than another's; each fold is an independent group.
-
-    Raises `ValueError` if they were not tested on the same rows.
-    """
+    """Return how much larger a model's RMSE is, folds being independent. Raises `ValueError`."""
     rows = _common_rows(model, other)
     differences = [
         n * (one.rmse - two.rmse) * (one.rmse + two.rmse)

@@ -39,10 +39,7 @@ class Elimination:
         return solution, determinant
 
     def residual(self, size: int) -> Fraction:
-        """Return the squared distance of the response from the first `size` inputs.
-
-        It is in the units of the matrix: corner over minor, a ratio of two determinants.
-        """
+        """Return the response's squared distance from `size` inputs, a ratio of determinants."""
         return Fraction(self.corners[size], self.minors[size])
 
 
@@ -80,10 +77,7 @@ def inverse_matrix(matrix: Sequence[Sequence[int]]) -> list[list[Fraction]]:
 
 
 def adjugate(matrix: Sequence[Sequence[int]]) -> tuple[list[list[int]], int]:
-    """Return the adjugate and the determinant of a positive definite integer matrix.
-
-    The inverse is their ratio. Fraction-free Gauss-Jordan elimination.
-    """
+    """Return adjugate and determinant, whose ratio is the inverse (fraction-free Gauss-Jordan)."""
     size = len(matrix)
     work = [[*row, *(int(i == j) for j in range(size))] for i, row in enumerate(matrix)]
     previous = 1

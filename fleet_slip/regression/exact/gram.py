@@ -118,10 +118,7 @@ class Gram:
         return rest
 
     def restrict(self, signals: Sequence[str]) -> "Gram":
-        """Return the Gram of some of the signals, in the given order.
-
-        Raises `DataError` for a signal that the Gram lacks.
-        """
+        """Return the Gram of some signals, in the given order. Raises `DataError` if one is missing."""
         at = positions(self.signals, signals)
         return Gram(
             tuple(signals),
@@ -131,10 +128,7 @@ class Gram:
         )
 
     def about_origin(self) -> "Gram":
-        """Return the Gram of a mirror of the rows beside them, at the same number of rows.
-
-        All sums are zero, and the products the same: a fit to it has no intercept.
-        """
+        """Return the Gram with all sums zero, of the rows and their mirror: no intercept."""
         return Gram(self.signals, self.n, (0,) * len(self.sums), self.products)
 
     def combine(self, combinations: Mapping[str, Mapping[str, int]]) -> "Gram":

@@ -60,10 +60,7 @@ class GramTable:
         return self._sum() if rows is None else self.take(rows)._sum()
 
     def totals(self, groups: NDArray[Any], count: int) -> list[Gram]:
-        """Return the exact sum over each group of drives; `groups` says each drive's, 0..count-1.
-
-        Exact also where a total needs more than 64 bits.
-        """
+        """Return the exact sum over each group of drives; `groups` says each one's, 0..count-1."""
         if groups.shape != self.n.shape:
             raise ValueError(f"{len(self)} drives need as many groups, not {groups.shape}")
         if len(groups) and not 0 <= groups.min() <= groups.max() < count:

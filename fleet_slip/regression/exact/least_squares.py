@@ -25,10 +25,7 @@ Scales = Mapping[str, Fraction]
 
 @dataclass(frozen=True)
 class LinearModel:
-    """label = intercept + sum of coefficient times signal, with exact rational numbers.
-
-    Whether signals are counts or physical values depends on who made it; `physical` converts.
-    """
+    """label = intercept + sum of coefficient times signal, exactly; of counts, or `physical`."""
 
     signals: tuple[str, ...]
     label: str
@@ -101,11 +98,7 @@ class Fit:
 
 
 def fit(gram: Gram, inputs: Sequence[str], label: str, *, intercept: bool = True) -> Fit:
-    """Fit the label on the inputs by exact least squares.
-
-    Raises `DataError` if there are no rows, or if the inputs are linearly dependent: the
-    message then names the dependent signals and the exact relation.
-    """
+    """Fit the label by exact least squares. Raises `DataError` that names dependent signals."""
     part = gram.restrict([*inputs, label])
     matrix = moments(part, intercept=intercept)
     if len(inputs) >= MANY_INPUTS and (lifted := _lifted(part, matrix, intercept=intercept)):
@@ -149,10 +142,7 @@ def _fit_of(
 
 
 def moments(gram: Gram, *, intercept: bool = True) -> list[list[int]]:
-    """Return n S (about the means), or the raw products without an intercept.
-
-    Raises `DataError` if there are no rows.
-    """
+    """Return n S about the means, or raw products. Raises `DataError` if there are no rows."""
     if gram.n == 0:
         raise DataError("no rows to fit: choose a cohort with drives that have all signals.")
     return gram.centred() if intercept else gram.raw()
@@ -192,10 +182,7 @@ def _relation(fitted: Fit) -> str:
 
 
 def correlation_matrix(gram: Gram) -> FloatArray:
-    """Return the correlations of all signals, shape (k, k), each rounded once.
-
-    A constant signal has zeros, also on the diagonal.
-    """
+    """Return all correlations, (k, k), each rounded once; zeros for a constant signal."""
     centred = gram.centred()
     squares = [centred[i][i] for i in range(len(centred))]
     return np.array(

@@ -46,10 +46,7 @@ class Plane:
 
 
 def fit_plane(gram: Gram, shape: PlaneShape) -> Plane | None:
-    """Fit a plane to the rows of a Gram; None if they do not determine it.
-
-    Raises `DataError` for a signal that the Gram lacks.
-    """
+    """Fit a plane to the rows of a Gram; None if undetermined. Raises `DataError`."""
     if gram.n == 0:
         return None
     factors = [lcm(*(w.denominator for w in one.values())) for one in _parts(shape)]

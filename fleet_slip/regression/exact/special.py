@@ -31,10 +31,7 @@ def student_t_two_sided(t: float, degrees: float) -> float:
 
 
 def student_t_quantile(p: float, degrees: float) -> float:
-    """Return the t that Student's t distribution exceeds with probability 1 - p, for p > 1/2.
-
-    Bisection of the distribution function down to neighbouring numbers.
-    """
+    """Return the t exceeded with probability 1 - p, p > 1/2, by bisection to adjacent numbers."""
     low, high = 0.0, 1.0
     while student_t_two_sided(high, degrees) > 2 * (1 - p):
         high *= 2
@@ -55,10 +52,7 @@ def f_upper(f: float, numerator: float, denominator: float) -> float:
 
 
 def incomplete_beta(a: float, b: float, x: float) -> float:
-    """Return the regularised incomplete beta function I_x(a, b).
-
-    Continued fraction of Abramowitz and Stegun 26.5.8, evaluated by Lentz's method.
-    """
+    """Return I_x(a, b), by Lentz's method on Abramowitz and Stegun 26.5.8."""
     if x <= 0:
         return 0.0
     if x >= 1:

@@ -85,10 +85,7 @@ def _correlation(n: Any, p: Any, pp: Any, py: Any, y: Any, yy: Any) -> Any:
 
 
 def solve(totals: FloatArray, *, intercept: bool = True) -> FloatArray:
-    """Solve for (constant, inputs) in each matrix of moments with the label last.
-
-    Without an intercept the constant is zero.
-    """
+    """Solve for (constant, inputs) in each moment matrix, label last; the constant may be zero."""
     if not intercept:
         slopes = solve(totals[..., 1:, 1:])
         return np.concatenate([np.zeros_like(slopes[..., :1]), slopes], axis=-1)

@@ -34,11 +34,7 @@ class ChowTest:
 def chow_test(
     groups: Sequence[Gram], inputs: Sequence[str], label: str, *, intercept: bool = True
 ) -> ChowTest:
-    """Compare one model for all groups with one for each.
-
-    F = ((RSS_pool - sum RSS_p) / ((P-1)(k+1))) / (sum RSS_p / (n - P(k+1))).
-    Raises `DataError` if there is one group only, or too few rows.
-    """
+    """F = ((RSS_pool - sum RSS_p) / ((P-1)(k+1))) / (sum RSS_p / (n - P(k+1))), or `DataError`."""
     count, size = len(groups), len(inputs) + intercept
     if count < 2:
         raise DataError("a Chow test compares at least two groups of drives.")

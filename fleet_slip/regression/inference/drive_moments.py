@@ -88,10 +88,7 @@ class DriveMoments:
         *,
         centred: bool = True,
     ) -> "DriveMoments":
-        """Scale a table of drives, about zero unless centred.
-
-        Raises `DataError` if it has no rows.
-        """
+        """Scale a table of drives, about zero unless centred. Raises `DataError` without rows."""
         total = table.total()
         if total.n == 0:
             raise DataError(f"no rows have all of {', '.join(table.signals)}.")
@@ -150,10 +147,7 @@ class DriveMoments:
         return packed[..., at]
 
     def direction(self, model: LinearModel) -> FloatArray:
-        """Return w with w'u = prediction minus label, in spreads of the label.
-
-        The model is one of counts; signals that it does not use get zero.
-        """
+        """Return w with w'u = prediction minus label, in spreads of the label; model in counts."""
         if model.label != self.signals[-1]:
             raise ValueError(f"the moments end with {self.signals[-1]}, not {model.label}")
         weights = dict(zip(model.signals, model.coefficients, strict=True))

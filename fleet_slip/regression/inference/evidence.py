@@ -47,10 +47,7 @@ class Evidence:
 
     @classmethod
     def naive(cls, fits: Sequence[Fit]) -> "Evidence":
-        """Take rows for independent: A_j = (RSS_{j-1} - RSS_j) / sigma^2.
-
-        `fits` are the k+1 nested ones. Raises `DataError` if sigma^2 is zero or unknown.
-        """
+        """A_j = (RSS_{j-1} - RSS_j) / sigma^2 of k+1 nested fits. Raises `DataError`."""
         full, variance = fits[-1], _variance(fits[-1])
         return cls(
             tuple(float(gain / variance) for gain in _gains(fits)),

@@ -60,10 +60,7 @@ class Inference:
 
 
 def noise_variance(fitted: Fit) -> Fraction:
-    """Return sigma^2 = RSS / (n - k - 1), in counts^2, exactly.
-
-    Raises `DataError` if there are no more rows than coefficients.
-    """
+    """Return sigma^2 = RSS / (n - k - 1) in counts^2. Raises `DataError` for too few rows."""
     _require_noise(fitted)
     return fitted.rss / fitted.degrees_of_freedom
 
@@ -153,10 +150,7 @@ def cluster_influences(fitted: Fit, drives: DriveMoments) -> FloatArray:
 
 
 def cluster_scores(fitted: Fit, drives: DriveMoments) -> FloatArray:
-    """Return each cluster's sum of (1, inputs) times residual, standardised.
-
-    The shape is (clusters, k+1).
-    """
+    """Return each cluster's sum of (1, inputs) times residual, standardised, (clusters, k+1)."""
     w = drives.direction(fitted.model)
     scores = -drives.products_with(w)[:, _columns(fitted, drives)]
     return drives.sum_clusters(scores)
@@ -172,10 +166,7 @@ def small_sample_factor(fitted: Fit, clusters: int, unit: str = "drive") -> floa
 
 
 def variance_inflation(gram: Gram, inputs: Sequence[str]) -> dict[str, float]:
-    """Return 1 / (1 - R^2) of each input on the others: how much collinearity costs it.
-
-    Raises `DataError` for dependent inputs.
-    """
+    """Return 1 / (1 - R^2) of each input on the others. Raises `DataError` if dependent."""
     relations = dependence(gram, inputs)
     if relations:
         raise DataError(relations)

@@ -28,10 +28,7 @@ from fleet_slip.regression.exact.least_squares import (
 def fit_penalised(
     gram: Gram, inputs: Sequence[str], label: str, penalties: Sequence[Fraction]
 ) -> LinearModel:
-    """Solve (S + diag(penalties)) b = S_xy exactly; penalties in counts^2 of each input.
-
-    Raises `DataError` if the matrix is not positive definite.
-    """
+    """Solve (S + diag(penalties)) b = S_xy exactly, penalties in counts^2, or `DataError`."""
     part = gram.restrict([*inputs, label])
     common = math.lcm(*(penalty.denominator for penalty in penalties))
     matrix = [[common * entry for entry in row] for row in moments(part)]
@@ -54,10 +51,7 @@ def fit_penalised(
 def fit_noise_matched(
     gram: Gram, inputs: Sequence[str], label: str, noise: Mapping[str, float], scales: Scales
 ) -> LinearModel:
-    """Return the model of counts that is best once noise is added to the signals.
-
-    `noise` is the standard deviation of independent noise to come, in physical units.
-    """
+    """Return the model of counts that is best with independent noise to come, in SI units."""
     return fit_penalised(gram, inputs, label, _variances(gram, inputs, noise, scales))
 
 

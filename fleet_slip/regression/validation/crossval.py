@@ -86,10 +86,7 @@ def least_squares(inputs: Sequence[str], label: str, *, intercept: bool = True) 
 def cross_validate(
     name: str, folds: Folds, procedure: Procedure, scales: Scales
 ) -> CrossValidation:
-    """Cross-validate a procedure, which sees nothing but the training Gram of each fold.
-
-    Raises `DataError` if a training fold cannot be fitted.
-    """
+    """Cross-validate a procedure that sees training Grams alone. Raises `DataError`."""
     tests = [
         held_out_errors(procedure(training), training, test) for training, test in folds.splits()
     ]
@@ -125,10 +122,7 @@ def cross_validate_inputs(
     *,
     intercept: bool = True,
 ) -> CrossValidation:
-    """Cross-validate ordinary least squares on given inputs, over every drive that has them.
-
-    Raises `DataError` if no drive has all the inputs, or if they are linearly dependent.
-    """
+    """Cross-validate least squares over all drives that have the inputs. Raises `DataError`."""
     folds = cohort.serving(inputs, label)
     return cross_validate(name, folds, least_squares(inputs, label, intercept=intercept), scales)
 

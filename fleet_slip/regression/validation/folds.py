@@ -76,10 +76,7 @@ def by_hash(keys: Sequence[str], count: int) -> FoldAssignment:
 
 
 def by_value(values: Sequence[Any]) -> FoldAssignment:
-    """Make one fold of each distinct value: leave one vehicle, track, day or mass out.
-
-    Raises `DataError` if a drive has no value, or all have the same.
-    """
+    """Make one fold of each distinct value. Raises `DataError` for none, or one alone."""
     if any(value is None for value in values):
         raise DataError(
             "a drive has no value of the column to fold by: fold by another, or leave such drives "
