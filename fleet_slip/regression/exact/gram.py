@@ -118,7 +118,7 @@ class Gram:
         return rest
 
     def restrict(self, signals: Sequence[str]) -> "Gram":
-        """Return the Gram of some signals, in the given order. Raises `DataError` if one is missing."""
+        """Return the Gram of some signals, in this order. Raises `DataError` if one is missing."""
         at = positions(self.signals, signals)
         return Gram(
             tuple(signals),
