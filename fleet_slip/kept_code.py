@@ -1,10 +1,16 @@
-"""Keeps compiled code from one process to the next, and checks it when it is read."""
+"""Keeps compiled code from one process to the next, and checks it when it is read.
+
+What numba 0.68 lets others set is where code is kept and which stamp it has
+(`NUMBA_CACHE_LOCATOR_CLASSES`, for all packages of a process), not how files are written and read.
+So its classes are extended here, which are not of its public interface.
+"""
 
 import contextlib
 import functools
 import hashlib
 import logging
 import pickle
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,7 +22,12 @@ LOGGER = logging.getLogger("fleet_slip")
 
 DIGEST_BYTES = hashlib.sha256().digest_size
 
-COMPILING = Path(__file__).with_name("compiling.py")
+PACKAGE = Path(__file__).parent
+
+COMPILING = PACKAGE / "compiling.py"
+
+_IMPORTS = re.compile(rf"^\s*from ({PACKAGE.name}[\w.]*) import (\([^)]*\)|.*)", re.MULTILINE)
+_WORD = re.compile(r"\w+")
 
 
 def keep(compiled: Any, function: Callable[..., Any]) -> None:
@@ -67,15 +78,29 @@ class _KeptCode(FunctionCache):
 
 @functools.cache
 def _sources_stamp(file: str) -> str:
-    """Return a checksum of a source file, of those beside it, and of how it is compiled.
+    """Return a checksum of a source file, of all that it imports, and of how it is compiled.
 
     Compiled code has the functions and constants of other files in it; numba looks at its own file
     alone, and would go on with what is no longer written in the others.
     """
     digest = hashlib.sha256()
-    for source in [*sorted(Path(file).parent.glob("*.py")), Path(__file__), COMPILING]:
+    for source in sorted({*_sources_of(Path(file)), Path(__file__), COMPILING}):
         digest.update(source.read_bytes())
     return digest.hexdigest()
+
+
+def _sources_of(file: Path) -> set[Path]:
+    """Return a source file and those of this package that it imports, if by way of others."""
+    found, waiting = set[Path](), [file]
+    while waiting:
+        source = waiting.pop()
+        if source not in found and source.exists():
+            found.add(source)
+            for module, names in _IMPORTS.findall(source.read_text(encoding="utf-8")):
+                base = PACKAGE.parent / module.replace(".", "/")
+                waiting.append(base.with_suffix(".py"))
+                waiting += [base / f"{name}.py" for name in _WORD.findall(names)]
+    return found
 
 
 class _DamagedCodeError(Exception):

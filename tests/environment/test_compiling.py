@@ -127,3 +127,26 @@ def test_a_change_of_any_source_changes_the_key_of_the_kept_code(
     assert lanes._source_digest() == before
     tyre.write_text("other")
     assert lanes._source_digest() != before
+
+
+def test_code_is_kept_no_longer_where_what_it_calls_in_another_folder_has_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Brakes and receivers, of the simulation, call equations of the vehicle."""
+    package = tmp_path / "fleet_slip"
+    for name, text in {
+        "simulation/braking.py": "from fleet_slip.vehicle import (\n    tyre,\n)\n",
+        "vehicle/tyre.py": "from fleet_slip.vehicle.pose import turn\n",
+        "vehicle/pose.py": "one",
+        "vehicle/driver.py": "",
+    }.items():
+        (package / name).parent.mkdir(parents=True, exist_ok=True)
+        (package / name).write_text(text)
+    monkeypatch.setattr(kept_code, "PACKAGE", package)
+    stamp = kept_code._sources_stamp.__wrapped__
+    braking = str(package / "simulation" / "braking.py")
+    before = stamp(braking)
+    (package / "vehicle" / "driver.py").write_text("not imported")
+    assert stamp(braking) == before
+    (package / "vehicle" / "pose.py").write_text("other")
+    assert stamp(braking) != before
