@@ -22,7 +22,7 @@ def compile_program(manifest: Manifest) -> Program:
     """
     from fleet_slip.models.predictor import Predictor  # noqa: PLC0415 - numba, not for show
 
-    Predictor.of(manifest)  # raises for definitions that it could not compute
+    _ = Predictor.of(manifest).plan.program  # raises for what the kernel could not compute
     return write_program(manifest)
 
 

@@ -20,7 +20,7 @@ import onnx
 from onnx import TensorProto, helper
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.columns.operations import GIVEN, operation_of, plain_of, size_of
+from fleet_slip.columns.operations import GIVEN, operands_of, operation_of, plain_of, size_of
 from fleet_slip.export.onnx_nodes import Nodes
 from fleet_slip.export.program import Program
 from fleet_slip.models.counts_model import counts_model
@@ -108,8 +108,17 @@ class _Writer(Nodes):
         """Write all; `exact` is the intercept and the coefficients in the unit of the angle."""
         places = [place for place, _ in self.program.angle.terms]
         self._declare_given()
-        values = [self._value(place) for place in places]
-        self._angle(values, self._there(*places), exact)
+        values, there = [self._value(place) for place in places], self._there(*places)
+        for number, place in enumerate(places):
+            if self._is_constant(place):  # of no car: with a row for each, it can stand by others
+                values[number] = self.do("Where", there, values[number], 0)
+        self._angle(values, there, exact)
+
+    def _is_constant(self, step: int) -> bool:
+        """Whether the value of a step is the same wherever it is there."""
+        name, of = operation_of(self.program.steps[step]), operands_of(self.program.steps[step])
+        values = of[:1] if name in ("where", "at_least") else of
+        return name == "constant" or (bool(of) and all(map(self._is_constant, values)))
 
     def _declare_given(self) -> None:
         program = self.program

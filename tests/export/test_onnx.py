@@ -8,6 +8,7 @@ import onnx
 import pytest
 
 import fleet_slip
+from fleet_slip.catalogue.definitions import Definition
 from fleet_slip.errors import ConfigError
 from fleet_slip.export.checks import drive_counts
 from fleet_slip.export.compile import compile_program
@@ -15,7 +16,7 @@ from fleet_slip.export.files import export_files
 from fleet_slip.export.onnx_graph import FloatName, error_bound
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.predictor import Predictor
-from tests.export.models import CARS, MODELS, hostile_drive, model_of
+from tests.export.models import CARS, DEFINITIONS, MODELS, hostile_drive, model_of
 from tests.export.onnx_drives import in_si, open_session, run_drives
 
 
@@ -40,6 +41,19 @@ def test_hostile_drives_are_within_the_stated_error(name: str, kind: FloatName) 
     bound = error_bound(version, program, kind)
     assert np.nanmax(np.abs(found - expected)) <= bound + 1e-12  # of `predict`, in float64
     assert bound < (1e-3 if kind == "float32" else 1e-11) * np.nanmax(np.abs(expected))
+
+
+def test_a_feature_of_one_value_stands_beside_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    always = Definition(of="always", sql="CASE WHEN ay >= 0 THEN -(1000) END")
+    monkeypatch.setitem(DEFINITIONS, "always", always)
+    manifest = model_of({"always": Fraction(1, 7), "mean_3": Fraction(1, 9)})
+    program, predictor = compile_program(manifest), Predictor.of(manifest)
+    samples = hostile_drive(program, 50, 1)
+    session = open_session(ModelVersion(1, manifest, "0" * 64), "float64")
+    found = run_drives(session, program, CARS[:1], in_si(program, samples, "float64")[None])[0]
+    expected = predictor(drive_counts(program, predictor, CARS[0], samples))
+    assert np.isfinite(expected).any()
+    assert np.allclose(found, expected, rtol=0, atol=1e-12, equal_nan=True)
 
 
 def test_a_whole_drive_is_that_of_predict(smoke_root: Path) -> None:

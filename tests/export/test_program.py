@@ -33,6 +33,14 @@ def test_a_fresh_implementation_agrees_with_the_kernel(
     assert found == angles_by_kernel(manifest, program, car, samples)
 
 
+def test_what_divides_by_a_constant_below_zero_has_no_program(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(DEFINITIONS, "by_minus_3", Definition(of="x", sql="ay // (-(3))"))
+    with pytest.raises(QuestionError, match="not positive"):
+        compile_program(model_of({"by_minus_3": Fraction(1, 7)}))
+
+
 def test_every_kind_of_column_has_an_angle_in_the_checks() -> None:
     """Else the checks that travel with a program would check nothing of it."""
     for name in DEFINITIONS:
