@@ -19,7 +19,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.delta import Table
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.files.data_root import data_root
-from fleet_slip.maintenance.marks import marked_models
+from fleet_slip.maintenance.marked_models import marked_models
 from fleet_slip.maintenance.verify import verify
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.versions import Registry

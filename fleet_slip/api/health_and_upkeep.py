@@ -200,8 +200,7 @@ class HealthAndUpkeep(PublishedModels):
         Raises `UsageError` unless one subject is given, `QuestionError` if there never was such a
         drive, `StorageError` and `ConflictError`.
         """
-        from fleet_slip.maintenance.forget import forget
-        from fleet_slip.maintenance.forget_called import forget_called
+        from fleet_slip.maintenance.forget import forget, forget_called
 
         if sum(one is not None for one in (vehicle, drive, drive_name, source_file)) != 1:
             raise UsageError("give one of vehicle, drive, drive_name and source_file.")

@@ -38,7 +38,7 @@ class PublishedModels(Rooted):
         was trained on drives that were forgotten since. Raises `QuestionError` for an unknown model
         and `StorageError` without a data root.
         """
-        from fleet_slip.maintenance.marks import marked_models
+        from fleet_slip.maintenance.marked_models import marked_models
 
         self.warehouse.require()
         registry = self.registry()

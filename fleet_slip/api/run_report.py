@@ -74,7 +74,7 @@ class Training:
 
     def made_already(self, fleet: "Fleet") -> "Publication | None":
         """Return the champion if a selection would come to it again, whatever it looks at."""
-        from fleet_slip.maintenance.marks import marked_models
+        from fleet_slip.maintenance.marked_models import marked_models
         from fleet_slip.models.publish import Publication
         from fleet_slip.models.up_to_date import is_up_to_date
 
@@ -97,7 +97,7 @@ class Training:
 
         With `replace_marked`, what was trained on forgotten drives is replaced even by a worse one.
         """
-        from fleet_slip.maintenance.marks import marked_models
+        from fleet_slip.maintenance.marked_models import marked_models
 
         champion = fleet.registry().champion(self.name)
         force = (

@@ -12,7 +12,6 @@ import hashlib
 import json
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 
 from fleet_slip.errors import ConflictError, StorageError
 from fleet_slip.files.documents import DocumentFolder
@@ -25,15 +24,7 @@ LOG = "_delta_log"
 LATEST = "_last_checkpoint"
 
 _CHECKPOINT = re.compile(r"(\d{20})\.checkpoint.*\.parquet")
-_COMMIT = re.compile(r"(\d{20})\.json")
-
-
-@dataclass(frozen=True)
-class CheckpointFault:
-    """A checkpoint whose bytes are not those that were written."""
-
-    name: str
-    problem: str
+COMMIT_FILE = re.compile(r"\d{20}\.json")
 
 
 def seal_new_checkpoint(table: Folder, before: int | None) -> None:
@@ -42,7 +33,9 @@ def seal_new_checkpoint(table: Folder, before: int | None) -> None:
     Also those of earlier ones that a killed job has left without. The commit has landed: what
     cannot be kept now is kept with the next checkpoint.
     """
-    latest = _latest(table)
+    latest = None
+    with contextlib.suppress(StorageError, ValueError, KeyError, TypeError, RecursionError):
+        latest = int(json.loads((table / LOG).read(LATEST))["version"])
     if latest is not None and (before is None or latest > before):
         with contextlib.suppress(StorageError, ConflictError):
             seal_checkpoints(table)
@@ -64,20 +57,20 @@ def sealed_checkpoints(table: Folder) -> dict[str, str]:
     return {str(one["checkpoint"]): str(one["sha256"]) for one in kept}
 
 
-def checkpoint_faults(table: Folder) -> Iterator[CheckpointFault]:
-    """Yield the checkpoints of a table that were damaged, in the order of their versions."""
+def checkpoint_faults(table: Folder) -> Iterator[tuple[str, str]]:
+    """Yield the damaged checkpoints of a table, in the order of their versions, and the problem."""
     known = sealed_checkpoints(table)
     for name in _checkpoints(table):
         try:
             if name in known and _digest(table, name) != known[name]:
-                yield CheckpointFault(name, "its bytes do not match the checksum kept of it")
+                yield (name, "its bytes do not match the checksum kept of it")
         except StorageError as error:
-            yield CheckpointFault(name, f"cannot be read: {error}")
+            yield (name, f"cannot be read: {error}")
 
 
 def newest_checkpoint(files: Iterable[StoredFile], version: int) -> StoredFile | None:
     """Return the newest checkpoint of a log that a version is told from; None without one."""
-    found = [f for f in files if _CHECKPOINT.fullmatch(f.name) and _version(f.name) <= version]
+    found = [f for f in files if _CHECKPOINT.fullmatch(f.name) and version_of(f.name) <= version]
     return max(found, key=lambda file: file.name, default=None)
 
 
@@ -100,38 +93,28 @@ def unsealed_checkpoints(table: Folder) -> list[str]:
 def list_dispensable(table: Folder, damaged: str) -> bool:
     """Whether a table can be read without a checkpoint: from an earlier one, or from its start."""
     names = (table / LOG).names()
-    commits = {int(found[1]) for found in map(_COMMIT.fullmatch, names) if found}
-    faulty = {fault.name for fault in checkpoint_faults(table)} | {damaged}
-    sound = {_version(name) for name in _checkpoints(table) if name not in faulty}
-    base = max((version for version in sound if version < _version(damaged)), default=-1)
+    commits = {version_of(name) for name in names if COMMIT_FILE.fullmatch(name)}
+    faulty = {name for name, _ in checkpoint_faults(table)} | {damaged}
+    sound = {version_of(name) for name in _checkpoints(table) if name not in faulty}
+    base = max((version for version in sound if version < version_of(damaged)), default=-1)
     return bool(commits) and commits >= set(range(base + 1, max(commits) + 1))
 
 
 def remove_checkpoint(table: Folder, name: str) -> None:
     """Remove a checkpoint that is `list_dispensable`, and the note that may name it."""
-    for file in _log_files(table):
+    for file in (table / LOG).files():
         if file.name in (name, LATEST):
             file.folder.remove(file)
-
-
-def _log_files(table: Folder) -> list[StoredFile]:
-    return (table / LOG).files()
 
 
 def _checkpoints(table: Folder) -> list[str]:
     return [name for name in (table / LOG).names() if _CHECKPOINT.fullmatch(name)]
 
 
-def _version(name: str) -> int:
+def version_of(name: str) -> int:
+    """Return the version that the file of a commit, or a checkpoint, makes or sums up."""
     return int(name.partition(".")[0])
 
 
 def _digest(table: Folder, name: str) -> str:
     return hashlib.sha256((table / LOG).read(name)).hexdigest()
-
-
-def _latest(table: Folder) -> int | None:
-    """Return the version of the newest checkpoint, as the Delta library notes it."""
-    with contextlib.suppress(StorageError, ValueError, KeyError, TypeError, RecursionError):
-        return int(json.loads((table / LOG).read(LATEST))["version"])
-    return None

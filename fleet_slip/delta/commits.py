@@ -8,7 +8,6 @@ the table ignore it. `fleet_slip.delta.log_check` compares.
 
 import hashlib
 import json
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -18,7 +17,7 @@ import pyarrow.parquet as pq
 from deltalake.transaction import AddAction, RemoveAction
 
 from fleet_slip.canonical import canonical_json
-from fleet_slip.delta.checkpoints import newest_checkpoint
+from fleet_slip.delta.checkpoints import COMMIT_FILE, LOG, newest_checkpoint, version_of
 from fleet_slip.errors import StorageError
 from fleet_slip.files.folder import Folder
 
@@ -84,9 +83,6 @@ def _stated(kind: str, content: Any) -> Any:
     return {k: v for k, v in content.items() if v is not None and k not in added}
 
 
-LOG = "_delta_log"
-
-COMMIT_FILE = re.compile(r"\d{20}\.json")
 _SEALED_KINDS = frozenset({"add", "remove", "txn"})
 _KINDS = _SEALED_KINDS | {"commitInfo", "metaData", "protocol"}
 
@@ -116,11 +112,6 @@ class Commit:
         return [action for action in self.actions if kinds & action.keys()]
 
 
-def commit_number(name: str) -> int:
-    """Return the version that a commit's file makes."""
-    return int(name.partition(".")[0])
-
-
 def read_commit(log: Folder, name: str) -> Commit:
     """Return a commit of a Delta log. Raises `ValueError` for what is none."""
     try:
@@ -145,7 +136,7 @@ def problem_of_commit(commit: Commit, must_be_sealed: bool) -> str | None:
         return "its content does not match the checksum that it states"
     if stated is None and must_be_sealed and commit.sealed_actions:
         return "states no checksum, although earlier commits do: damage, or another program's"
-    if commit_number(commit.name) == 0 and not _made_as_stated(commit):
+    if version_of(commit.name) == 0 and not _made_as_stated(commit):
         return "states in two ways what the table is"
     return None
 
@@ -190,14 +181,14 @@ def read_landed_units(table: Folder, version: int) -> frozenset[str]:
     files = log.files()
     names: set[str] = set()
     checkpoint = newest_checkpoint(files, version)
-    after = commit_number(checkpoint.name) if checkpoint else -1
+    after = version_of(checkpoint.name) if checkpoint else -1
     for file in files:  # a checkpoint may be of several
         if checkpoint and file.name.startswith(f"{after:020}.checkpoint."):
             with pq.ParquetFile(pa.BufferReader(log.read(file.name))) as parquet:
                 told = parquet.read(columns=["txn.appId"])["txn"].combine_chunks()
             names.update(name for name in told.field("appId").to_pylist() if name is not None)
     for file in files:
-        if COMMIT_FILE.fullmatch(file.name) and after < commit_number(file.name) <= version:
+        if COMMIT_FILE.fullmatch(file.name) and after < version_of(file.name) <= version:
             try:
                 commit = read_commit(log, file.name)
             except ValueError as error:

@@ -73,7 +73,13 @@ class Encoding:
         before the rows; see `fleet_slip.delta.encoding`.
         """
         kept = rows.drop_columns([name for name in omitted if name in rows.schema.names])
-        stored = _required(_only_used_values(kept))
+        # A dictionary that is shared with rows of another file, or of a drive that was forgotten,
+        # would bring their names along: Parquet stores one as it is given.
+        columns = [_only_used_values(column) for column in kept.columns]
+        # Declared so, a column without a null has no list of which values are null, which takes an
+        # eighth of the time to write.
+        fields = [f.with_nullable(kept[f.name].null_count > 0) for f in kept.schema]
+        stored = pa.Table.from_arrays(columns, schema=pa.schema(fields))
         sink = pa.BufferOutputStream()
         with pq.ParquetWriter(
             sink, stored.schema, write_batch_size=WRITE_BATCH_ROWS, **self.options()
@@ -84,15 +90,6 @@ class Encoding:
         content = sink.getvalue()
         statistics = json.dumps(_statistics(rows, stored.column_names))
         return Encoded(content, checksum_of(content), fast_checksum_of(content), statistics)
-
-
-def _required(rows: pa.Table) -> pa.Table:
-    """Return the rows with columns without a null declared so.
-
-    The file then has no list of which values are null, which takes an eighth of the time to write.
-    """
-    fields = [field.with_nullable(rows[field.name].null_count > 0) for field in rows.schema]
-    return pa.Table.from_arrays(rows.columns, schema=pa.schema(fields))
 
 
 def _statistics(rows: pa.Table, stored: Sequence[str]) -> dict[str, Any]:
@@ -106,17 +103,8 @@ def _statistics(rows: pa.Table, stored: Sequence[str]) -> dict[str, Any]:
     return told
 
 
-def _only_used_values(rows: pa.Table) -> pa.Table:
-    """Return rows whose dictionaries have the values that occur only, in the order they occur in.
-
-    Parquet stores a dictionary as it is given. One that is shared with rows of another file, or of
-    a drive that was forgotten, would bring their names along.
-    """
-    columns = [_compact(column) for column in rows.columns]
-    return pa.Table.from_arrays(columns, schema=rows.schema)
-
-
-def _compact(column: pa.ChunkedArray) -> pa.ChunkedArray:
+def _only_used_values(column: pa.ChunkedArray) -> pa.ChunkedArray:
+    """Return a column whose dictionary has only values that occur, in the order they occur in."""
     if not pa.types.is_dictionary(column.type):
         return column
     whole = column.combine_chunks()

@@ -9,13 +9,16 @@ and at what they add up to: at the name of a unit of work, too, or a commit behi
 import functools
 from collections.abc import Iterator, Sequence
 
-from fleet_slip.delta.checkpoints import newest_checkpoint, require_sealed
-from fleet_slip.delta.commits import (
+from fleet_slip.delta.checkpoints import (
     COMMIT_FILE,
     LOG,
+    newest_checkpoint,
+    require_sealed,
+    version_of,
+)
+from fleet_slip.delta.commits import (
     SEAL,
     Commit,
-    commit_number,
     problem_of_commit,
     read_commit,
 )
@@ -38,11 +41,11 @@ def require_sound_log(table: Folder, version: int) -> None:
     checkpoint = newest_checkpoint(files, version)
     if checkpoint is not None:
         require_sealed(table, checkpoint.name)
-    after = commit_number(checkpoint.name) if checkpoint else -1
+    after = version_of(checkpoint.name) if checkpoint else -1
     commits = [file for file in files if COMMIT_FILE.fullmatch(file.name)]
     sealed = bool(commits) and _is_sealed(commits[0])
     for file in commits:
-        if after < commit_number(file.name) <= version and (problem := _problem(file, sealed)):
+        if after < version_of(file.name) <= version and (problem := _problem(file, sealed)):
             raise StorageError(
                 f"{file}: {problem}. See what can be repaired with: fleet-slip verify --repair; or "
                 "restore the log from a backup."
@@ -72,9 +75,10 @@ def find_commit_faults(snapshot: Snapshot) -> Iterator[tuple[str, str]]:
         return
     commits = []
     must_be_sealed = False
-    log, there = snapshot.table.folder / LOG, _names(snapshot)
+    log, last = snapshot.table.folder / LOG, f"{snapshot.version:020}.json"
+    there = {name for name in log.names() if COMMIT_FILE.fullmatch(name) and name <= last}
     # Earlier ones were cleaned away.
-    first = min(map(commit_number, there), default=snapshot.version)
+    first = min(map(version_of, there), default=snapshot.version)
     for name in (f"{number:020}.json" for number in range(first, snapshot.version + 1)):
         if name not in there:
             yield name, "is missing"
@@ -90,13 +94,6 @@ def find_commit_faults(snapshot: Snapshot) -> Iterator[tuple[str, str]]:
         commits.append(commit)
     if len(commits) == snapshot.version + 1:
         yield from _state_problems(snapshot, commits)
-
-
-def _names(snapshot: Snapshot) -> set[str]:
-    """Return the files of the commits that the log still has, up to the snapshot's."""
-    last = f"{snapshot.version:020}.json"
-    names = (snapshot.table.folder / LOG).names()
-    return {name for name in names if COMMIT_FILE.fullmatch(name) and name <= last}
 
 
 def _state_problems(snapshot: Snapshot, commits: Sequence[Commit]) -> Iterator[tuple[str, str]]:

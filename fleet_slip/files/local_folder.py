@@ -36,57 +36,46 @@ class LocalFolder:
     path: Path
 
     def __str__(self) -> str:
-        """Return the path."""
         return str(self.path)
 
     @property
     def name(self) -> str:
-        """The last part of the folder's path."""
         return self.path.name
 
     @property
     def uri(self) -> str:
-        """The folder as DuckDB and the Delta library know it."""
         return str(self.path)
 
     @property
     def delta_options(self) -> dict[str, str] | None:
-        """Options of the Delta library: none are needed."""
         return None
 
     @property
     def spill(self) -> Path:
-        """A folder of this machine for what a query cannot hold in memory."""
         return self.path
 
     @property
     def is_local(self) -> bool:
-        """Return True."""
         return True
 
     def __truediv__(self, name: str) -> Self:
-        """Return a folder below this one."""
         return type(self)(self.path / name)
 
     def exists(self) -> bool:
-        """Whether there is such a folder."""
         with storage_errors(self):
             return self.path.is_dir()
 
     def names(self) -> list[str]:
-        """Return the names of files and folders directly below, sorted."""
         with storage_errors(self):
             return sorted(e.name for e in self.path.iterdir()) if self.path.is_dir() else []
 
     def files(self) -> list[StoredFile]:
-        """Return all files below, at any depth, sorted by path."""
         with storage_errors(self):
             walked = os.walk(self.path, onerror=_pass_over)
             paths = sorted(Path(folder) / name for folder, _, names in walked for name in names)
             return [file for file in map(self._judge, filter(Path.is_file, paths)) if file]
 
     def read(self, path: str, longest: int | None = None) -> bytes:
-        """Return the content of a file, or only its first bytes."""
         with (
             _regular_file(self.path / path, os.O_RDONLY) as descriptor,
             open(descriptor, "rb", closefd=False) as file,
@@ -94,28 +83,23 @@ class LocalFolder:
             return file.read(-1 if longest is None else longest)
 
     def read_many(self, paths: Sequence[str]) -> list[bytes | None]:
-        """Return the content of files, None for one that is gone."""
         return [self.read(path) if (self.path / path).is_file() else None for path in paths]
 
     def check(self, path: str) -> None:
-        """Raise `StorageError` if a data file is not what its name says."""
         check_local_files([str(self.path / path)])
 
     def open(self, path: str) -> pa.NativeFile:
-        """Open a file for reading anywhere in it."""
         with storage_errors(self.path / path):
             if not (self.path / path).is_file():  # a pipe would be waited for
                 raise FileNotFoundError(errno.ENOENT, "there is no such file")
             return pa.OSFile(str(self.path / path), "rb")
 
     def put(self, path: str, content: Content) -> None:
-        """Write a file as a whole, durably. A file of that name is replaced."""
         target = self.path / path
         with _written_aside(target, content) as temporary:
             temporary.replace(target)
 
     def create(self, path: str, content: Content) -> bool:
-        """Write a file as a whole, durably; False, and no change, if there is one of that name."""
         target = self.path / path
         with _written_aside(target, content) as temporary:
             try:
@@ -125,7 +109,6 @@ class LocalFolder:
         return True
 
     def append(self, path: str, content: bytes) -> None:
-        """Add to a file in one write, durably."""
         file = self.path / path
         with storage_errors(file):
             file.parent.mkdir(exist_ok=True)
@@ -157,12 +140,10 @@ class LocalFolder:
         return same
 
     def delete(self, path: str) -> None:
-        """Delete a file of a name that no other process writes; nothing if it is gone."""
         with storage_errors(self.path / path):
             (self.path / path).unlink(missing_ok=True)
 
     def settle_commits(self, before: int | None) -> None:
-        """Make the commits to this table after a version durable: the Delta library does not."""
         folder = self.path / "_delta_log"
         with contextlib.suppress(FileNotFoundError):
             for version in count(0 if before is None else before + 1):
@@ -171,7 +152,6 @@ class LocalFolder:
         _flush(folder)
 
     def free_bytes(self) -> tuple[int, int] | None:
-        """Return how much of the disk is free, and its size."""
         with storage_errors(self):
             disk = shutil.disk_usage(self.path)
         return disk.free, disk.total

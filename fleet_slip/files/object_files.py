@@ -148,34 +148,20 @@ _fetched: dict[str, bytes] = {}
 _fetching = threading.Lock()
 
 
-class ObjectFilesystem(fsspec.AbstractFileSystem):  # type: ignore[misc]
-    """The objects of one bucket, for `duckdb.DuckDBPyConnection.register_filesystem`; read only."""
+class _ReadOnlyFilesystem(fsspec.AbstractFileSystem):  # type: ignore[misc]
+    """Files that never change, for `duckdb.DuckDBPyConnection.register_filesystem`.
+
+    fsspec makes text of all that a filesystem is made with, which not every object survives.
+    """
 
     cachable = False
 
-    def __init__(self, bucket: str, store: "Callable[[], ObjectStore]") -> None:
-        """Serve a bucket, such as s3://BUCKET, of the store that is returned when asked for.
-
-        fsspec makes text of all that it is given, which not every store survives.
-        """
-        super().__init__()
-        self.protocol, _, self._name = bucket.partition("://")
-        self._store = store()
-        self._sizes: dict[str, int] = {}
-
-    def _key(self, path: str) -> str:
-        return path.removeprefix(f"{self.protocol}://").removeprefix(f"{self._name}/")
-
     def info(self, path: str, **_options: Any) -> dict[str, Any]:
-        """Return the name, type and size of an object."""
-        key = self._key(path)
-        if key not in self._sizes:
-            with object_errors(f"{self.protocol}://{self._name}/{key}"):
-                self._sizes[key] = obstore.head(self._store, key)["size"]
-        return {"name": path, "type": "file", "size": self._sizes[key]}
+        """Return the name, type and size of a file."""
+        return {"name": path, "type": "file", "size": self._size(path)}
 
     def modified(self, path: str) -> datetime:  # noqa: ARG002 - they never change
-        """Return one moment for all objects."""
+        """Return one moment for all files."""
         return datetime.fromtimestamp(0, UTC)
 
     def glob(self, path: str, **_options: Any) -> list[str]:
@@ -187,44 +173,52 @@ class ObjectFilesystem(fsspec.AbstractFileSystem):  # type: ignore[misc]
         return bool(path)
 
     def open(self, path: str, mode: str = "rb", **_options: Any) -> io.RawIOBase | io.BytesIO:
-        """Open an object for reading. Raises `PermissionError` for any other mode."""
+        """Open a file for reading. Raises `PermissionError` for any other mode."""
         if mode != "rb":
             raise PermissionError(f"{path}: a warehouse is only read through SQL")
-        key = self._key(path)
-        where = f"{self.protocol}://{self._name}/{key}"
-        return open_object(self._store, key, where, self.info(path)["size"])
+        reader: io.RawIOBase | io.BytesIO = self._reader(path)
+        return reader
 
 
-class LentFile(fsspec.AbstractFileSystem):  # type: ignore[misc]
-    """A file in memory, for a connection that it is registered with; read only."""
+class ObjectFilesystem(_ReadOnlyFilesystem):
+    """The objects of one bucket."""
 
-    cachable = False
+    def __init__(self, bucket: str, store: "Callable[[], ObjectStore]") -> None:
+        """Serve a bucket, such as s3://BUCKET, of the store that is returned when asked for."""
+        super().__init__()
+        self.protocol, _, self._name = bucket.partition("://")
+        self._store = store()
+        self._sizes: dict[str, int] = {}
+
+    def _key(self, path: str) -> tuple[str, str]:
+        """Return the key of an object, and its URL."""
+        key = path.removeprefix(f"{self.protocol}://").removeprefix(f"{self._name}/")
+        return key, f"{self.protocol}://{self._name}/{key}"
+
+    def _size(self, path: str) -> int:
+        key, where = self._key(path)
+        if key not in self._sizes:
+            with object_errors(where):
+                self._sizes[key] = obstore.head(self._store, key)["size"]
+        return self._sizes[key]
+
+    def _reader(self, path: str) -> io.RawIOBase | io.BytesIO:
+        return open_object(self._store, *self._key(path), self._size(path))
+
+
+class LentFile(_ReadOnlyFilesystem):
+    """A file in memory, for a connection that it is registered with."""
+
     protocol = "lent"
     uri = "lent://file"
 
     def __init__(self, content: memoryview) -> None:
-        """Serve a content; a view of it, since fsspec makes text of all that it is given."""
+        """Serve a content."""
         super().__init__()
         self._content = content
 
-    def info(self, path: str, **_options: Any) -> dict[str, Any]:
-        """Return the name, type and size."""
-        return {"name": path, "type": "file", "size": len(self._content)}
+    def _size(self, _path: str) -> int:
+        return len(self._content)
 
-    def modified(self, path: str) -> datetime:  # noqa: ARG002 - it never changes
-        """Return some moment."""
-        return datetime.fromtimestamp(0, UTC)
-
-    def glob(self, path: str, **_options: Any) -> list[str]:
-        """Return the path."""
-        return [path]
-
-    def exists(self, path: str, **_options: Any) -> bool:
-        """Return whether it is this file."""
-        return path.removeprefix("lent://") == "file"
-
-    def open(self, path: str, mode: str = "rb", **_options: Any) -> io.BytesIO:
-        """Open the file for reading. Raises `PermissionError` for any other mode."""
-        if mode != "rb":
-            raise PermissionError(f"{path}: it is only lent")
+    def _reader(self, _path: str) -> io.BytesIO:
         return io.BytesIO(self._content)

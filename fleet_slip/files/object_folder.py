@@ -47,22 +47,18 @@ class ObjectFolder:
     prefix: str
 
     def __str__(self) -> str:
-        """Return the URL."""
         return f"{self.bucket}/{self.prefix}".rstrip("/")
 
     @property
     def name(self) -> str:
-        """The last part of the folder's path."""
         return self.prefix.rpartition("/")[2]
 
     @property
     def uri(self) -> str:
-        """The folder as DuckDB and the Delta library know it."""
         return str(self)
 
     @property
     def is_local(self) -> bool:
-        """Return False."""
         return False
 
     @property
@@ -72,35 +68,29 @@ class ObjectFolder:
 
     @property
     def spill(self) -> Path:
-        """A folder of this machine for what a query cannot hold in memory."""
         return Path(tempfile.gettempdir())
 
     def __truediv__(self, name: str) -> Self:
-        """Return a folder below this one."""
         return replace(self, prefix=self._key(name))
 
     def exists(self) -> bool:
-        """Whether there is anything below this folder."""
         with object_errors(str(self)):
             pages = obstore.list(self._store, self.prefix or None, chunk_size=1)
             return any(len(page) for page in pages)
 
     def names(self) -> list[str]:
-        """Return the names of files and folders directly below, sorted."""
         with object_errors(str(self)):
             found = obstore.list_with_delimiter(self._store, self.prefix or None)
         paths = [*found["common_prefixes"], *(meta["path"] for meta in found["objects"])]
         return sorted(path.rpartition("/")[2] for path in paths)
 
     def files(self) -> list[StoredFile]:
-        """Return all files below, at any depth, sorted by path."""
         with object_errors(str(self)):
             pages = list(obstore.list(self._store, self.prefix or None))
         found = [self.found(meta) for page in pages for meta in page]
         return sorted(found, key=lambda file: file.path)
 
     def read(self, path: str, longest: int | None = None) -> bytes:
-        """Return the content of a file, or only its first bytes."""
         where = f"{self}/{path}"
         if longest is None:
             return b"".join(part for _, part in fetch_parts(self._store, self._key(path), where))
@@ -129,7 +119,6 @@ class ObjectFolder:
         return pa.PythonFile(file, "r")
 
     def put(self, path: str, content: Content) -> None:
-        """Write a file as a whole, durably. A file of that name is replaced."""
         self._put(path, content, "overwrite")
 
     def create(self, path: str, content: Content) -> bool:
@@ -164,7 +153,6 @@ class ObjectFolder:
         return True
 
     def delete(self, path: str) -> None:
-        """Delete a file of a name that no other process writes; nothing if it is gone."""
         with object_errors(f"{self}/{path}"), contextlib.suppress(FileNotFoundError):
             obstore.delete(self._store, self._key(path))
 
@@ -172,7 +160,6 @@ class ObjectFolder:
         """Make commits durable, as they are."""
 
     def free_bytes(self) -> tuple[int, int] | None:
-        """Return None: a bucket is never full."""
         return None
 
     @contextlib.contextmanager
@@ -184,7 +171,6 @@ class ObjectFolder:
         yield
 
     def let_read(self, database: duckdb.DuckDBPyConnection) -> None:
-        """Enable a connection to read the objects of this bucket."""
         database.register_filesystem(ObjectFilesystem(self.bucket, lambda: self._store))
 
     def lend(self, database: duckdb.DuckDBPyConnection, wanted: Callable[[str], bool]) -> list[str]:

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import date
 
-from fleet_slip.delta import Snapshot, TableFile, retry_conflicts
+from fleet_slip.delta import TableFile, retry_conflicts
 from fleet_slip.grams.rows.gram_job import reconcile
 from fleet_slip.maintenance.rewriting import Rewriting, rewrite
 from fleet_slip.progress import Progress, no_progress
@@ -69,7 +69,8 @@ def compact(
 def _compact_day(warehouse: Warehouse, day: date, target_rows: int) -> int:
     def attempt() -> int:
         snapshot = warehouse.logs.snapshot()
-        packs = list(_packs(_small_files(snapshot, day, target_rows), target_rows))
+        small = [f for f in snapshot.files if f.day == day and 2 * f.rows <= target_rows]
+        packs = list(_packs(small, target_rows))
         if packs:
             rewrite(
                 warehouse,
@@ -81,10 +82,6 @@ def _compact_day(warehouse: Warehouse, day: date, target_rows: int) -> int:
         return sum(file.rows for pack in packs for file in pack)
 
     return retry_conflicts(attempt)
-
-
-def _small_files(snapshot: Snapshot, day: date, target_rows: int) -> list[TableFile]:
-    return [file for file in snapshot.files if file.day == day and 2 * file.rows <= target_rows]
 
 
 def _packs(files: Iterable[TableFile], target_rows: int) -> Iterable[list[TableFile]]:

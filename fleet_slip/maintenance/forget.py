@@ -11,18 +11,17 @@ drives the Gram rows are fenced: a commit of Gram rows that has not seen the log
 a conflict. What such jobs have written is never committed, and deleted by them or here.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from functools import partial
+from typing import Literal, TypeAlias
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.delta import Change, retry_conflicts, rows_in
-from fleet_slip.errors import FleetSlipError, QuestionError
+from fleet_slip.errors import QuestionError
 from fleet_slip.grams.rows.gram_job import reconcile
-from fleet_slip.grams.rows.rollup import hash_numbers
 from fleet_slip.maintenance.find_drives import (
     Located,
     cars_with_rows,
@@ -30,18 +29,14 @@ from fleet_slip.maintenance.find_drives import (
     locate,
     recordings_of,
 )
-from fleet_slip.maintenance.marks import newest_versions
-from fleet_slip.maintenance.old_files import quarantined_of, remove_old_files
+from fleet_slip.maintenance.marked_models import models_trained_on, newest_versions
+from fleet_slip.maintenance.old_files import quarantined_of, read_old_files, remove_old_files
 from fleet_slip.maintenance.rewriting import Rewriting, drop_unused_names, forget_received, rewrite
-from fleet_slip.models.manifest import TrainedOn
-from fleet_slip.models.trained_drives import hash_drives, read_trained_drives
-from fleet_slip.models.versions import Registry
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.runs.history import runs_under_way
 from fleet_slip.views import connect
 from fleet_slip.warehouse.audit import ALLOWED, Audit, Forgettable
 from fleet_slip.warehouse.cleared_cars import ClearedCars
-from fleet_slip.warehouse.condition import asking, parse_condition
 from fleet_slip.warehouse.tables import Warehouse
 
 
@@ -199,96 +194,70 @@ def _forget_quarantined(
         retry_conflicts(attempt)
 
 
-def models_trained_on(warehouse: Warehouse, drives: Collection[str]) -> list[str]:
-    """Return the model versions that were trained on one of the drives.
+Calling: TypeAlias = Literal["drive_name", "source_file"]
+"""A column of `drives` by which people know a drive; several drives may have the same."""
 
-    Each keeps which drives those were. Of one from before that was kept, the question of its cohort
-    is asked again, of the Gram rows that it could see. Where it cannot be told, because they are
-    gone or the version is damaged, it counts as trained on them.
+
+def forget_called(
+    warehouse: Warehouse,
+    calling: Calling,
+    value: str,
+    *,
+    now: bool = False,
+    progress: Progress = no_progress,
+) -> ForgetReport:
+    """Forget every drive that is called like that, one after another.
+
+    Drives that come later under the same name are others, and land. Repeated after an interruption
+    it goes on: what is left of a drive still tells its name. Raises `QuestionError` if no drive is
+    called like that, and what `forget` raises.
     """
-    registry = Registry(warehouse.root / "models")
-    versions: dict[str, TrainedOn] = {}
-    known: list[str] = []
-    for name in registry.names():
-        hashed = hash_drives(name, hash_numbers(pa.array(sorted(drives), pa.string())))
-        for number in registry.versions(name):
-            reference = f"{name}@{number}"
-            try:
-                manifest = registry.load(name, number).manifest
-                kept = read_trained_drives(registry.folder_of(name), manifest)
-            except FleetSlipError:
-                known.append(reference)
-                continue
-            if kept is None:
-                versions[reference] = manifest.trained_on
-            elif np.isin(hashed, kept).any():
-                known.append(reference)
-    return sorted([*known, *_asked_again(warehouse, versions, drives)])
-
-
-def _asked_again(
-    warehouse: Warehouse, versions: Mapping[str, TrainedOn], drives: Collection[str]
-) -> list[str]:
-    cohorts = {trained.cohort for trained in versions.values()}
-    chosen = _in_cohorts(warehouse, cohorts, drives)
-    seen = _Seen(warehouse, drives)
-    return [
-        reference
-        for reference, trained in versions.items()
-        if seen.any(chosen[trained.cohort], trained.grams_version)
-    ]
-
-
-def _in_cohorts(
-    warehouse: Warehouse, cohorts: Collection[str], drives: Collection[str]
-) -> dict[str, frozenset[str]]:
-    """Return which of some drives each cohort has; all, of a cohort that cannot be asked for."""
-    found = {}
-    with connect(warehouse.root, query="grams") as database:
-        database.register(
-            "forgotten", pa.table({"drive_id": pa.array(sorted(drives), pa.string())})
+    drives = sorted(_drives_called(warehouse, calling, value, old=now))
+    if not drives:
+        raise QuestionError(
+            f"no drive has {calling} {value!r}. See: "
+            f'fleet-slip sql "SELECT drive_id, {calling} FROM drives"'
         )
-        for cohort in cohorts:
-            asked = "SELECT DISTINCT drive_id FROM grams WHERE drive_id IN (FROM forgotten) AND "
-            try:
-                condition = parse_condition(cohort)
-                with asking(database, condition):
-                    rows = database.execute(asked + condition.sql).fetchall()
-                found[cohort] = frozenset(row[0] for row in rows)
-            except FleetSlipError:
-                found[cohort] = frozenset(drives)
-    return found
+    reports = []
+    for drive in drives:
+        reports.append(forget(warehouse, Forgettable("drive", drive), now=now))
+        progress(1, len(drives))
+    return _together(reports)
 
 
-class _Seen:
-    """Which of some drives the Gram rows of each version of their table have.
+def _drives_called(
+    warehouse: Warehouse, calling: Calling, value: str, *, old: bool
+) -> frozenset[str]:
+    """Return the drives in logs and Gram rows, and in old files too if these are to go."""
+    with connect(warehouse.root, query="drives") as database:
+        statement = f"SELECT DISTINCT drive_id FROM drives WHERE {calling} = $value"
+        found = {name for (name,) in database.execute(statement, {"value": value}).fetchall()}
+    for rows in _named_rows(warehouse, calling, old=old):
+        if calling in rows.column_names:
+            mine = pc.equal(rows[calling].cast(pa.string()), value)
+            found.update(rows["drive_id"].filter(mine).cast(pa.string()).unique().to_pylist())
+    return frozenset(found)
 
-    A file of Gram rows is read once, however many versions it is part of.
-    """
 
-    def __init__(self, warehouse: Warehouse, drives: Collection[str]) -> None:
-        self._grams = warehouse.grams
-        self._drives = frozenset(drives)
-        self._of_file: dict[str, frozenset[str]] = {}
-        self._of_version: dict[int, frozenset[str]] = {}
+def _named_rows(warehouse: Warehouse, calling: Calling, *, old: bool) -> Iterator[pa.Table]:
+    grams = warehouse.grams
+    for file in grams.snapshot().files:
+        if calling in grams.read_metadata(file.path).schema.to_arrow_schema().names:
+            yield grams.read(file.path, ["drive_id", calling])
+    if old:
+        for table in (warehouse.logs, warehouse.grams):
+            yield from (one.rows for one in read_old_files(table.snapshot()))
 
-    def any(self, drives: frozenset[str], version: int) -> bool:
-        """Whether a version has one of the drives; true where the version is gone."""
-        if not drives:
-            return False
-        try:
-            return not drives.isdisjoint(self._at(version))
-        except FleetSlipError:
-            return True
 
-    def _at(self, version: int) -> frozenset[str]:
-        if version not in self._of_version:
-            files = self._grams.snapshot(version).files
-            self._of_version[version] = frozenset().union(*(self._in(f.path) for f in files))
-        return self._of_version[version]
-
-    def _in(self, path: str) -> frozenset[str]:
-        if path not in self._of_file:
-            ids = self._grams.read(path, ["drive_id"])["drive_id"].cast(pa.string())
-            self._of_file[path] = self._drives.intersection(ids.unique().to_pylist())
-        return self._of_file[path]
+def _together(reports: list[ForgetReport]) -> ForgetReport:
+    """Return one report of all; what may still have the rows of any of the drives is pending."""
+    return ForgetReport(
+        drives=sum(one.drives for one in reports),
+        rows=sum(one.rows for one in reports),
+        files_rewritten=sum(one.files_rewritten for one in reports),
+        files_removed=sum(one.files_removed for one in reports),
+        models=tuple(sorted({name for one in reports for name in one.models})),
+        old_files_deleted=sum(one.old_files_deleted for one in reports),
+        old_files_left=max(one.old_files_left for one in reports),
+        pending=tuple(dict.fromkeys(name for one in reports for name in one.pending)),
+    )

@@ -71,8 +71,10 @@ def migrate(warehouse: Warehouse, progress: Progress = no_progress) -> Migration
     Raises `ConflictError` if another process changed the table at the same moment.
     """
     warehouse.require()
-    for other in (warehouse.quarantine, warehouse.grams):
-        _add_columns_that_came_later(other)
+    for other in (warehouse.quarantine, warehouse.grams):  # columns that came later
+        known = other.open_delta()
+        if known is not None and (change := compare_schemas(other.schema, known)).added:
+            _add_columns(other, known, change)
     table = warehouse.logs
     delta = table.open_delta()
     if delta is None:
@@ -92,12 +94,6 @@ def migrate(warehouse: Warehouse, progress: Progress = no_progress) -> Migration
     return MigrationReport(
         found.added, found.retired, found.rescaled, files, rows, version, cleaned
     )
-
-
-def _add_columns_that_came_later(table: Table) -> None:
-    delta = table.open_delta()
-    if delta is not None and (found := compare_schemas(table.schema, delta)).added:
-        _add_columns(table, delta, found)
 
 
 def rescale_counts(counts: NDArray[np.int16], ratio: Fraction) -> IntArray:

@@ -55,7 +55,11 @@ def find_old_files(warehouse: Warehouse, subject: Forgettable) -> list["OldFile"
     """
     logs = list(_with_subject(warehouse.logs.snapshot(), subject))
     drives = {drive for one in logs for drive in one.drives}
-    old = list(_of_quarantine(warehouse.quarantine.snapshot(), subject, drives))
+    old = [
+        one
+        for one in read_old_files(warehouse.quarantine.snapshot())
+        if pc.any(quarantined_of(one.rows, subject, drives)).as_py()
+    ]
     return [*old, *_with_subject(warehouse.grams.snapshot(), subject), *logs]
 
 
@@ -119,14 +123,6 @@ def _with_subject(snapshot: Snapshot, subject: Forgettable) -> Iterator[OldFile]
         names = one.rows.filter(rows_of(one.rows, subject))["drive_id"].unique().to_pylist()
         if names or one.has_unused_names:
             yield replace(one, drives=frozenset(names))
-
-
-def _of_quarantine(
-    snapshot: Snapshot, subject: Forgettable, drives: Collection[str]
-) -> Iterator[OldFile]:
-    for one in read_old_files(snapshot):
-        if pc.any(quarantined_of(one.rows, subject, drives)).as_py():
-            yield one
 
 
 def rows_of(rows: pa.Table, subject: Forgettable) -> pa.ChunkedArray:

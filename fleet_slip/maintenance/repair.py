@@ -52,16 +52,16 @@ def _sum_up_again(warehouse: Warehouse) -> list[str]:
     """Write damaged checkpoints again that can be spared: from what is before them in the log."""
     rebuilt = []
     for table in warehouse.tables:
-        for fault in list(checkpoint_faults(table.folder)):
-            if not list_dispensable(table.folder, fault.name):
+        for name, _ in list(checkpoint_faults(table.folder)):
+            if not list_dispensable(table.folder, name):
                 continue
-            remove_checkpoint(table.folder, fault.name)
+            remove_checkpoint(table.folder, name)
             delta = table.open_delta()
             if delta is not None:
                 with storage_errors(table.folder):
                     delta.create_checkpoint()
                 seal_checkpoints(table.folder, again=f"{delta.version():020}.checkpoint.parquet")
-            rebuilt.append(f"{table.folder.name}/_delta_log/{fault.name}")
+            rebuilt.append(f"{table.folder.name}/_delta_log/{name}")
     return rebuilt
 
 

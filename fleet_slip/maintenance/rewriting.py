@@ -6,7 +6,7 @@ what was compacted or rewritten can be simulated again and is the same file.
 """
 
 import dataclasses
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -86,13 +86,10 @@ def read_kept_drives(
     order = _order(rows)
     if (np.diff(order) != 1).any():
         rows = rows.take(order)
-    empty = {name for name in table.optional if name in rows.column_names and _is_empty(rows[name])}
+    optional = [name for name in table.optional if name in rows.column_names]
+    empty = {name for name in optional if rows[name].null_count == len(rows)}
     names = dict.fromkeys([*table.schema.names, *rows.column_names])
     return rows.select([name for name in names if name in rows.column_names and name not in empty])
-
-
-def _is_empty(column: pa.ChunkedArray) -> bool:
-    return bool(column.null_count == len(column))
 
 
 def _read(table: Table, file: TableFile, without: Collection[str]) -> pa.Table:
@@ -163,17 +160,10 @@ def forget_received(warehouse: Warehouse, subject: Forgettable) -> int:
                 concerned.append(file)
                 rows += pc.sum(told.filter(mine)["n"]).as_py()
         if concerned:
-            add = write_rows(warehouse, _kept(warehouse, concerned, subject))
+            read = (read_rows(warehouse.grams, file) for file in concerned)
+            kept = (r.filter(pc.invert(pc.and_(rows_of(r, subject), is_received(r)))) for r in read)
+            add = write_rows(warehouse, kept)
             snapshot.commit_or_discard(Change(add=add, remove=concerned, note={"job": "forget"}))
         return rows
 
     return retry_conflicts(attempt)
-
-
-def _kept(
-    warehouse: Warehouse, files: Sequence[TableFile], subject: Forgettable
-) -> Iterator[pa.Table]:
-    """Yield the Gram rows of files without those of a subject, file by file."""
-    for file in files:
-        rows = read_rows(warehouse.grams, file)
-        yield rows.filter(pc.invert(pc.and_(rows_of(rows, subject), is_received(rows))))

@@ -162,9 +162,8 @@ def _verify_checkpoints(table: Table, report: Verification) -> None:
             where = f"{name}/{CHECKSUMS}/{file.rpartition('/')[2]}"
             report.findings.append(Damage("document", where, problem))
         return
-    for fault in checkpoint_faults(table.folder):
-        where = f"{name}/_delta_log/{fault.name}"
-        report.findings.append(Damage("log", where, fault.problem))
+    for checkpoint, problem in checkpoint_faults(table.folder):
+        report.findings.append(Damage("log", f"{name}/_delta_log/{checkpoint}", problem))
     for checkpoint in unsealed_checkpoints(table.folder):
         problem = "no checksum was kept of this checkpoint; the next one comes with both"
         report.findings.append(Damage("backlog", f"{name}/_delta_log/{checkpoint}", problem))

@@ -77,9 +77,9 @@ def verify_grams(
     by_place: dict[tuple[str, ...], list[TableFile]] = {}
     for file in covered[::step]:
         by_place.setdefault(where[file.path], []).append(file)
-    task = partial(_compute_grams, warehouse)
     for places, files in by_place.items():
         stored = stored_grams(warehouse, files, places)
+        task = partial(_compute_grams, warehouse)
         for file, computed in run_tasks(executor, task, files, _name_task):
             for drive in differing_drives(stored[file.path], computed):
                 problem = f"the stored Gram row of drive {drive} is not that of its rows"

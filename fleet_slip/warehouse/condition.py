@@ -124,7 +124,8 @@ def _parsed(text: str, columns: frozenset[str]) -> Condition:
         )
     try:
         tree = _expression(text, shown)
-        _require_plain(tree, columns, shown)
+        for problem in problems(tree, columns):
+            raise QuestionError(f"{shown} {problem}")
         sql = _written(tree)
         if sql is None or _meaning(_expression(sql, shown)) != _meaning(tree):
             raise QuestionError(f"{shown} cannot be written out again. Say it more simply.")
@@ -200,9 +201,3 @@ def _ask(statement: str, text: str) -> tuple[Any, ...]:
     with _asking:
         [row] = _parser().execute(statement, {"text": text}).fetchall()
     return tuple(row)
-
-
-def _require_plain(tree: Tree, columns: frozenset[str], shown: str) -> None:
-    """Raise `QuestionError` for the first part of an expression that is not allowed."""
-    for problem in problems(tree, columns):
-        raise QuestionError(f"{shown} {problem}")

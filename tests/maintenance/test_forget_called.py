@@ -11,7 +11,6 @@ import fleet_slip
 from fleet_slip import Fleet
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.ingest import Mapping
-from fleet_slip.maintenance import forget_called
 from fleet_slip.maintenance.forget import ForgetReport, forget
 from tests.support.commands import RunCommand
 from tests.support.measured import a_mapping, csv_text, good_columns
@@ -87,7 +86,7 @@ def test_what_may_have_the_rows_of_any_of_the_drives_is_pending(
         report = forget(*words, **options)
         return replace(report, old_files_left=number, pending=("logs/x.parquet",) * (number > 0))
 
-    monkeypatch.setattr(forget_called, "forget", first_one_is_pending)
+    monkeypatch.setattr("fleet_slip.maintenance.forget.forget", first_one_is_pending)
     report = fleet.forget(drive_name="lap", now=True)
     assert (report.drives, report.old_files_left, report.pending) == (2, 2, ("logs/x.parquet",))
 

@@ -21,7 +21,7 @@ from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.maintenance import compaction
 from fleet_slip.maintenance.compaction import compact
 from fleet_slip.maintenance.forget import forget
-from fleet_slip.maintenance.marks import marked_models
+from fleet_slip.maintenance.marked_models import marked_models
 from fleet_slip.maintenance.repair import repair
 from fleet_slip.maintenance.vacuum import find_expired
 from fleet_slip.maintenance.verify import verify

@@ -10,7 +10,8 @@ import pytest
 from fleet_slip.errors import ConfigError, RefusedError
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.rows.gram_job import update_grams
-from fleet_slip.maintenance.forget import forget, models_trained_on
+from fleet_slip.maintenance.forget import forget
+from fleet_slip.maintenance.marked_models import models_trained_on
 from fleet_slip.models import gate
 from fleet_slip.models.aliases import CANDIDATE
 from fleet_slip.models.counts_model import counts_model

@@ -21,7 +21,7 @@ from fleet_slip.grams.cohorts.cells import NO_CELLS, Cells, RollupReader
 from fleet_slip.grams.cohorts.cohort_origin import CohortOrigin
 from fleet_slip.grams.cohorts.folding import Folding
 from fleet_slip.grams.cohorts.outweighing import Outweighing, find_outweighing
-from fleet_slip.grams.received.signatures import load_car_keys
+from fleet_slip.grams.received.signatures import CarKey, load_car_keys
 from fleet_slip.grams.rows.backlog import find_backlog
 from fleet_slip.grams.rows.same_drives import has_received
 from fleet_slip.regression.exact.gram import packed_size
@@ -55,8 +55,7 @@ class OpenedGrams:
 
     def statement(self, name: str, condition: Condition, **values: str) -> str:
         """Return a statement from `jobs/` for a condition, without the rows that must not count."""
-        keys = load_car_keys()
-        without = [key.condition for key in keys.revoked()] if keys else []
+        without = [key.condition for key in _revoked_keys()]
         without += [one.condition for one in self.outweighing]
         sql = f"{condition.sql} AND NOT ({' OR '.join(without)})" if without else condition.sql
         trips = read_sql("jobs", "trips.sql").format(
@@ -70,8 +69,7 @@ class OpenedGrams:
 
         All together under `UNNAMED`, where a minimum cohort is asked for.
         """
-        keys = load_car_keys()
-        some = [key.condition for key in keys.revoked()] if keys else []
+        some = [key.condition for key in _revoked_keys()]
         if not some:
             return {}
         sql = f"{condition.sql} AND ({' OR '.join(some)})"
@@ -186,7 +184,8 @@ class GramReader:
                 _require_complete(logs, grams, rows, name, condition)
         cells = NO_CELLS
         if folding and not drive_by_drive:
-            identity, revoked = features().identity(feature_set), _revoked_cars()
+            identity = features().identity(feature_set)
+            revoked = {key.vehicle_id for key in _revoked_keys()}
             cells = self._rollups.cells(grams, logs, identity, condition, folding, revoked)
         opened = self._opened(grams, logs, feature_set, cells)
         if not (training and feature_set == PLAIN and has_received(grams)):
@@ -237,9 +236,9 @@ def open_grams(
             yield reader.opened(feature_set, condition, folding, training=training)
 
 
-def _revoked_cars() -> frozenset[str]:
+def _revoked_keys() -> tuple[CarKey, ...]:
     keys = load_car_keys()
-    return frozenset(key.vehicle_id for key in keys.revoked()) if keys else frozenset()
+    return keys.revoked if keys else ()
 
 
 def _require_complete(

@@ -2,7 +2,7 @@
 
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Any
@@ -140,6 +140,15 @@ class ReceivedRows:
         for file, number, drive, vehicle in zip(*(c.tolist() for c in columns), strict=True):
             yield Refused(file, number, reason, drive, vehicle)
 
+    def without(self, wrong: Mapping[str, BoolArray]) -> tuple["ReceivedRows", list[Refused]]:
+        """Return the messages that nothing is wrong with, and the others, by their first reason."""
+        left = np.ones(len(self), dtype=np.bool_)
+        refused: list[Refused] = []
+        for reason, bad in wrong.items():
+            refused += self.refuse(left & bad, reason)
+            left &= ~bad
+        return self.take(left), refused
+
 
 @cache
 def signals_of(mask: int) -> str:
@@ -163,7 +172,9 @@ def sort_out(
             told, nameless = _without_name(run)
             refused += nameless
             if judge is not None and len(told):
-                told, forged = _believed(told, judge(told))
+                reasons = np.array(list(judge(told)), dtype=object)
+                named = sorted({reason for reason in reasons if reason})
+                told, forged = told.without({reason: reasons == reason for reason in named})
                 refused += forged
             told = replace(told, messages=without_signatures(told.messages))
             for mask in np.unique(told.messages["mask"]).tolist():
@@ -215,15 +226,6 @@ def _without_name(run: ReceivedRows) -> tuple[ReceivedRows, list[Refused]]:
     return run.take(left), refused
 
 
-def _believed(rows: ReceivedRows, why: Iterable[str | None]) -> tuple[ReceivedRows, list[Refused]]:
-    """Divide messages into those that nothing speaks against, and the refused ones."""
-    reasons = np.array(list(why), dtype=object)
-    refused: list[Refused] = []
-    for reason in sorted({reason for reason in reasons if reason}):
-        refused += rows.refuse(reasons == reason, reason)
-    return rows.take(reasons == None), refused  # noqa: E711 - element by element
-
-
 def _is_name(vehicles: Messages) -> BoolArray:
     """Whether bytes are the name of a car: characters of names, then zeros."""
     letters = np.ascontiguousarray(vehicles).view(np.uint8).reshape(-1, LONGEST_VEHICLE)
@@ -236,20 +238,15 @@ def _is_name(vehicles: Messages) -> BoolArray:
 
 def _possible(rows: ReceivedRows) -> tuple[ReceivedRows, list[Refused]]:
     """Divide messages of the same signals into those that counts can have, and the others."""
-    lacking = rows.messages["lost"] != 0
-    refused = list(rows.refuse(lacking, LACKS_ROWS))
-    long = rows.n > LONGEST_ROWS
-    refused += rows.refuse(long & ~lacking, TOO_LONG)
-    whole = rows.take(~(lacking | long))
+    lacking, long = rows.messages["lost"] != 0, rows.n > LONGEST_ROWS
+    whole, refused = rows.without({LACKS_ROWS: lacking, TOO_LONG: long})
     signals = catalogue()
     names = [name for name in signals_of(rows.mask).split(",") if name]
     ranges = [(signals[name].min_count, signals[name].max_count) for name in names]
     why = find_impossible(whole.n, whole.sums, whole.products, ranges) if len(whole) else {}
-    left = np.ones(len(whole), dtype=np.bool_)
-    for reason, at in why.items():
-        refused += whole.refuse(at, reason)
-        left[at] = False
-    return whole.take(left), refused
+    places = np.arange(len(whole))
+    kept, impossible = whole.without({reason: np.isin(places, at) for reason, at in why.items()})
+    return kept, [*refused, *impossible]
 
 
 def _moments(start_s: Messages) -> Messages:

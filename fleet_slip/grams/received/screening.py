@@ -4,7 +4,7 @@ Names are compared by slow hashes, and only those of cars that are not known to 
 (`fleet_slip.warehouse.cleared_cars`): single drives only of cars that had one forgotten.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -54,7 +54,7 @@ class Screened:
     def remember(self, root: Folder, landed: Sequence[ReceivedRows]) -> None:
         """Keep which of the cars are cleared whose rows have landed."""
         if self.cleared.names:
-            cars = self.cleared.names.intersection(_names(landed, _vehicle_ids))
+            cars = self.cleared.names & _cars(landed)
             ClearedCars(root).add(Cleared(self.cleared.entries, cars))
 
 
@@ -64,7 +64,7 @@ def screen(root: Folder, rows: Sequence[ReceivedRows], refused: Sequence[Refused
     asked = audit.begun()
     if not asked:
         return Screened()
-    cars = _names(rows, _vehicle_ids) | {one.vehicle_id for one in refused if one.vehicle_id}
+    cars = _cars(rows) | {one.vehicle_id for one in refused if one.vehicle_id}
     known = ClearedCars(root).read()
     unknown = cars - known.names if known and known.entries >= asked else cars
     if len(unknown) > MANY:
@@ -76,22 +76,12 @@ def screen(root: Folder, rows: Sequence[ReceivedRows], refused: Sequence[Refused
         )
     watched = audit.with_forgotten_drives(unknown)
     drives = {one.drive_id for one in refused if one.drive_id and one.vehicle_id in watched}
-    if watched:
-        drives |= _names(rows, lambda some: _drive_ids_of(some, watched))
+    for some in rows if watched else ():
+        mine = pc.is_in(some.vehicle_ids, pa.array(sorted(watched), pa.string()))
+        drives.update(some.drive_ids.filter(mine).unique().to_pylist())
     barred = audit.barred(unknown, drives)
     return Screened(barred, Cleared(asked, unknown - watched - barred.vehicles))
 
 
-def _names(
-    rows: Sequence[ReceivedRows], column: Callable[[ReceivedRows], pa.StringArray]
-) -> frozenset[str]:
-    return frozenset(name for some in rows for name in column(some).unique().to_pylist())
-
-
-def _vehicle_ids(rows: ReceivedRows) -> pa.StringArray:
-    return rows.vehicle_ids
-
-
-def _drive_ids_of(rows: ReceivedRows, cars: frozenset[str]) -> pa.StringArray:
-    mine = pc.is_in(rows.vehicle_ids, pa.array(sorted(cars), pa.string()))
-    return rows.drive_ids.filter(mine)
+def _cars(rows: Sequence[ReceivedRows]) -> frozenset[str]:
+    return frozenset(name for some in rows for name in some.vehicle_ids.unique().to_pylist())

@@ -20,7 +20,7 @@ import csv
 import io
 import os
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from datetime import date
 from functools import cached_property, lru_cache
@@ -84,11 +84,6 @@ class CarKey(Config):
         return base64.b64decode(self.public_key)[len(_DER) :]
 
     @property
-    def revoked(self) -> bool:
-        """Whether it was revoked."""
-        return self.revoked_since is not None
-
-    @property
     def condition(self) -> str:
         """SQL condition of the received Gram rows that are not to count: of the days since then."""
         first = max(self.valid_from, self.revoked_since or date.max)
@@ -124,9 +119,10 @@ class CarKeys(Config):
         some = self._by_car.get(vehicle_id, ())
         return next((key for key in some if key.valid_from <= day <= key.valid_until), None)
 
-    def revoked(self) -> Iterator[CarKey]:
-        """Yield the keys that were revoked."""
-        return (key for key in self.keys if key.revoked)
+    @property
+    def revoked(self) -> tuple[CarKey, ...]:
+        """The keys that were revoked."""
+        return tuple(key for key in self.keys if key.revoked_since)
 
 
 def load_car_keys() -> CarKeys | None:
@@ -269,4 +265,4 @@ def _without_looking(layout: int, key: CarKey | None) -> str | None:
         return UNSIGNED
     if key is None:
         return NO_KEY
-    return REVOKED if key.revoked else None
+    return REVOKED if key.revoked_since else None

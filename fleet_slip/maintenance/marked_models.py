@@ -6,17 +6,22 @@ until the erasure is done; then it does if one of its own drives (`models/traine
 Gram rows any more. A version from before those were kept counts as trained on them for ever.
 """
 
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
+import pyarrow as pa
 
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.files.folder import Folder
 from fleet_slip.grams.rows.rollup import Hashes, hash_numbers
+from fleet_slip.models.manifest import TrainedOn
 from fleet_slip.models.trained_drives import hash_drives, read_trained_drives
 from fleet_slip.models.versions import Registry
+from fleet_slip.views import connect
 from fleet_slip.warehouse.audit import Audit
+from fleet_slip.warehouse.condition import asking, parse_condition
 from fleet_slip.warehouse.tables import Warehouse
 
 
@@ -90,3 +95,82 @@ def _may_have_seen(
         return kept is None or not bool(np.isin(kept, present.hashed_for(name)).all())
     except FleetSlipError:
         return True
+
+
+def models_trained_on(warehouse: Warehouse, drives: Collection[str]) -> list[str]:
+    """Return the model versions that were trained on one of the drives.
+
+    Each keeps which drives those were. Of one from before that was kept, the question of its cohort
+    is asked again, of the Gram rows that it could see. Where it cannot be told, because they are
+    gone or the version is damaged, it counts as trained on them.
+    """
+    registry = Registry(warehouse.root / "models")
+    versions: dict[str, TrainedOn] = {}
+    known: list[str] = []
+    for name in registry.names():
+        hashed = hash_drives(name, hash_numbers(pa.array(sorted(drives), pa.string())))
+        for number in registry.versions(name):
+            reference = f"{name}@{number}"
+            try:
+                manifest = registry.load(name, number).manifest
+                kept = read_trained_drives(registry.folder_of(name), manifest)
+            except FleetSlipError:
+                known.append(reference)
+                continue
+            if kept is None:
+                versions[reference] = manifest.trained_on
+            elif np.isin(hashed, kept).any():
+                known.append(reference)
+    return sorted([*known, *_asked_again(warehouse, versions, drives)])
+
+
+def _asked_again(
+    warehouse: Warehouse, versions: Mapping[str, TrainedOn], drives: Collection[str]
+) -> list[str]:
+    """Return the versions that were made of one of the drives, or may have been.
+
+    A version of the Gram rows, and each of its files, is read once.
+    """
+    cohorts = {trained.cohort for trained in versions.values()}
+    chosen = _in_cohorts(warehouse, cohorts, drives)
+
+    @cache
+    def drives_in(path: str) -> frozenset[str]:
+        ids = warehouse.grams.read(path, ["drive_id"])["drive_id"].cast(pa.string())
+        return frozenset(drives).intersection(ids.unique().to_pylist())
+
+    @cache
+    def drives_at(version: int) -> frozenset[str]:
+        try:
+            files = warehouse.grams.snapshot(version).files
+            return frozenset().union(*(drives_in(file.path) for file in files))
+        except FleetSlipError:
+            return frozenset(drives)  # that version is gone
+
+    return [
+        reference
+        for reference, trained in versions.items()
+        if (mine := chosen[trained.cohort])
+        and not mine.isdisjoint(drives_at(trained.grams_version))
+    ]
+
+
+def _in_cohorts(
+    warehouse: Warehouse, cohorts: Collection[str], drives: Collection[str]
+) -> dict[str, frozenset[str]]:
+    """Return which of some drives each cohort has; all, of a cohort that cannot be asked for."""
+    found = {}
+    with connect(warehouse.root, query="grams") as database:
+        database.register(
+            "forgotten", pa.table({"drive_id": pa.array(sorted(drives), pa.string())})
+        )
+        for cohort in cohorts:
+            asked = "SELECT DISTINCT drive_id FROM grams WHERE drive_id IN (FROM forgotten) AND "
+            try:
+                condition = parse_condition(cohort)
+                with asking(database, condition):
+                    rows = database.execute(asked + condition.sql).fetchall()
+                found[cohort] = frozenset(row[0] for row in rows)
+            except FleetSlipError:
+                found[cohort] = frozenset(drives)
+    return found
