@@ -20,7 +20,7 @@ from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.models.publish import manifest_of, publish
 from fleet_slip.models.versions import Registry
-from fleet_slip.monitoring.chart import draw
+from fleet_slip.monitoring.control_chart import save_chart
 from fleet_slip.monitoring.monitor import Chart, monitor
 from fleet_slip.selection.answer_request import answer_request
 from fleet_slip.selection.request import SelectionRequest
@@ -106,7 +106,7 @@ def main() -> None:
             version = Registry(LocalFolder(root / "models")).resolve("sideslip")
             chart = monitor(warehouse, version, COHORT)
             tell(name, chart)
-            draw(chart, Path(f"drift_{number}.svg"))
+            save_chart(chart, Path(f"drift_{number}.svg"))
 
 
 if __name__ == "__main__":

@@ -1,13 +1,17 @@
 """The control chart of a model: its error on each day, with limits."""
 
 from datetime import date
+from pathlib import Path
 from typing import Any
 
+import matplotlib as mpl
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.figure import Figure
 
+from fleet_slip.errors import ConfigError
+from fleet_slip.files.storage_errors import storage_errors
 from fleet_slip.monitoring.monitor import Chart
-from fleet_slip.pages.drawing import Size, colour
+from fleet_slip.pages.drawing import DESK, STYLE, Size, colour
 
 HEIGHT_IN = 3.6
 TONES = {"training": "muted", "new": "model_4", "beyond": "unstable"}
@@ -44,3 +48,18 @@ def control_chart(chart: Chart, size: Size) -> Figure:
     below.xaxis.set_major_locator(locator)
     below.xaxis.set_major_formatter(ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]
     return figure
+
+
+def save_chart(chart: Chart, file: Path) -> None:
+    """Draw a chart to a file, whose suffix says the format.
+
+    Raises `ConfigError` for an unknown suffix, and `StorageError` if it cannot be written.
+    """
+    with mpl.rc_context(STYLE), storage_errors(file):
+        figure = control_chart(chart, DESK)
+        figure.suptitle(f"{chart.model}: error on each day", x=0.01, ha="left")
+        try:
+            # Without a date, the same chart is the same file.
+            figure.savefig(file, metadata={"Date": None} if file.suffix == ".svg" else None)
+        except ValueError as error:
+            raise ConfigError(f"{file}: {error}") from None

@@ -11,6 +11,7 @@ from fleet_slip.cli.left_out import say_revoked, say_untold, say_without_log
 from fleet_slip.cli.models.version_commands import Reference
 from fleet_slip.cli.output import Json, print_json, print_table
 from fleet_slip.errors import AlarmError, UsageError
+from fleet_slip.extras import needed
 from fleet_slip.monitoring.monitor import Chart
 
 
@@ -42,9 +43,9 @@ def monitor(
     """
     chart: Chart = context.obj.monitor(reference, cohort, since=_first_new_day(since))
     if plot:
-        from fleet_slip.monitoring.chart import draw  # noqa: PLC0415 - an optional dependency
-
-        draw(chart, plot)
+        with needed("report", "a chart"):
+            from fleet_slip.monitoring.control_chart import save_chart  # noqa: PLC0415
+        save_chart(chart, plot)
     if json:
         print_json(chart)
     else:
