@@ -8,7 +8,6 @@ with their signs, then the sign with which each drive agrees with it.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.monitoring.moments import DriveBatches
@@ -78,13 +77,9 @@ def _settle(
 
 def _parts(covariances: FloatArray, label: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the covariances of the inputs, theirs with the label, and the label's variances."""
-    others = _others(covariances, label)
+    others = np.delete(np.arange(covariances.shape[1]), label)
     inputs = covariances[:, others[:, None], others]
     return inputs, covariances[:, others, label], covariances[:, label, label]
-
-
-def _others(covariances: FloatArray, label: int) -> NDArray[np.intp]:
-    return np.delete(np.arange(covariances.shape[1]), label)
 
 
 def _gain(covariances: FloatArray, label: int, weights: FloatArray) -> FloatArray:

@@ -13,7 +13,7 @@ from fleet_slip.files.folder import Folder
 from fleet_slip.files.storage_errors import storage_errors
 from fleet_slip.grams.rows.backlog import find_backlog
 from fleet_slip.models.versions import Registry
-from fleet_slip.monitoring.thresholds import StatusThresholds, thresholds
+from fleet_slip.monitoring.thresholds import thresholds
 from fleet_slip.resources import read_sql
 from fleet_slip.runs.history import lend_runs, run_source, state_of
 from fleet_slip.runs.records import find_changed_lines, find_missing_documents
@@ -21,6 +21,7 @@ from fleet_slip.warehouse.database import database_errors, open_database
 from fleet_slip.warehouse.tables import Warehouse
 
 SECONDS_PER_HOUR = 3600
+_FULL = "the disk has {:.1%} left, less than {:.0%}"
 
 REMEMBERED = timedelta(days=366)
 """Commands that last ran before that are not shown, so that old runs need not be read."""
@@ -95,11 +96,11 @@ def status_of(
     changed = list(find_changed_lines(warehouse.root, since))
     last_runs = () if changed else tuple(_last_runs(warehouse.root, since))
     age = _age_hours(tables["logs"].committed_at, now)
-    limits = thresholds().status
+    least = thresholds().status.min_free_fraction
     problems = [
         *_stale(age, _oldest_hours(logs, {f.path for f in backlog}, now), max_age_hours),
         *_failed(last_runs),
-        *_full(free, limits),
+        *([_FULL.format(free, least)] if free is not None and free < least else []),
         *damaged,
         *(
             f"{path}: {what}"
@@ -222,9 +223,3 @@ def _failed(runs: Sequence[Mapping[str, Any]]) -> list[str]:
         elif run["state"] in ("killed", "interrupted"):
             problems.append(f"{when} was {run['state']}")
     return problems
-
-
-def _full(free: float | None, limits: StatusThresholds) -> list[str]:
-    if free is None or free >= limits.min_free_fraction:
-        return []
-    return [f"the disk has {free:.1%} left, less than {limits.min_free_fraction:.0%}"]

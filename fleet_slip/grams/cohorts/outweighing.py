@@ -67,7 +67,8 @@ def find_outweighing(opened: "OpenedGrams", condition: Condition) -> tuple[Outwe
     rolled_up = len(opened.cells.table) > 0
     if not rolled_up and not pc.any(cars["received"]).as_py():
         return ()
-    if not _has_heavy_group(_rows_of_groups(cars, opened.cells)):
+    groups = _rows_of_groups(cars, opened.cells)
+    if groups.max() <= MOST_GROUPS * np.sort(groups)[BUCKETS // 2]:
         return ()
     if rolled_up:
         return None
@@ -119,10 +120,6 @@ def _rows_of_groups(cars: pa.Table, cells: Cells) -> IntArray:
         dealt = cells.dealt("vehicle")
         np.add.at(totals, dealt["bucket"].to_numpy(), dealt["n"].to_numpy())
     return totals
-
-
-def _has_heavy_group(rows: IntArray) -> bool:
-    return bool(rows.max() > MOST_GROUPS * np.sort(rows)[BUCKETS // 2])
 
 
 def drives_by_car(outweighing: Sequence[Outweighing]) -> dict[str, int]:

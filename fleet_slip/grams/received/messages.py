@@ -148,8 +148,9 @@ def read_messages(content: bytes) -> Found:
     found = Found()
     at, end, most = 0, len(content), 1
     while at < end:
-        if rest := _over_budget(found):
+        if len(found.refused) >= MOST_REFUSED or found.count >= MOST_MESSAGES:
             found.count += 1
+            rest = NO_FILE if len(found.refused) >= MOST_REFUSED else TOO_MANY
             found.refused.append((found.count, rest))
             break
         messages = _read_run(content, at, min(most, MOST_MESSAGES - found.count))
@@ -165,13 +166,6 @@ def read_messages(content: bytes) -> Found:
             following = content.find(MAGIC, at + 1)
             at, most = following if following >= 0 else end, 1
     return found
-
-
-def _over_budget(found: Found) -> str:
-    """Return why the rest of a file is not read; an empty text if it is."""
-    if len(found.refused) >= MOST_REFUSED:
-        return NO_FILE
-    return TOO_MANY if found.count >= MOST_MESSAGES else ""
 
 
 def _continued(

@@ -77,7 +77,7 @@ class RowChecker:
         raw = raw.rename({RAW + BASE: "base"}, strict=False)
         self.rows += batch.height
         self.left_out += batch.height - raw.height
-        valued = _with_values(raw, fields)
+        valued = raw.with_columns(f.value.alias(f.name) for f in fields if f.kind != "condition")
         rows, refused = _split(self.keys.number(valued, fields), fields)
         if len(self.keys) > MAX_KEYS:
             raise InputError(
@@ -141,11 +141,6 @@ class DriveKeys:
         if number == len(self.metadata):
             self.metadata.append(key)
         return number
-
-
-def _with_values(batch: pl.DataFrame, fields: list[Field]) -> pl.DataFrame:
-    """Add the fields' values to a raw batch, each under its field's name."""
-    return batch.with_columns(f.value.alias(f.name) for f in fields if f.kind != "condition")
 
 
 def _split(batch: pl.DataFrame, fields: list[Field]) -> tuple[pl.DataFrame, pl.DataFrame]:

@@ -186,7 +186,8 @@ class DriveCutter:
         """
         group, time, seen = rows["group"].to_numpy(), rows["time"].to_numpy(), self._state
         first, end = _ends(group)
-        is_first = _mask(first, time.size)
+        is_first = np.zeros(time.size, dtype=np.bool_)
+        is_first[first] = True
         before = np.concatenate([[np.nan], time[:-1]])
         before[first] = seen["kept"][group[first]]
         begins = ~(np.abs(time - before) <= self._gap_s)
@@ -264,12 +265,6 @@ def _ends(group: IntArray) -> tuple[IntArray, IntArray]:
         return nothing, nothing
     changes = np.flatnonzero(np.diff(group)) + 1
     return np.concatenate([[0], changes]), np.concatenate([changes - 1, [group.size - 1]])
-
-
-def _mask(places: IntArray, size: int) -> BoolArray:
-    mask = np.zeros(size, dtype=np.bool_)
-    mask[places] = True
-    return mask
 
 
 def _latest(

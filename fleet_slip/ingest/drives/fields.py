@@ -77,7 +77,9 @@ def fields_of(mapping: Mapping, schema: pl.Schema) -> list[Field]:
     signals = [_signal(name, schema, mapping) for name in names]
     nothing = pl.all_horizontal([pl.col(name).is_null() for name in names])
     no_value = _condition(nothing, "no_value", pl.lit(None, pl.String))
-    somewhere = replace(no_value, is_sound=lambda rows: any(map(_is_whole, rows[names])))
+    somewhere = replace(
+        no_value, is_sound=lambda rows: any(not rows[name].null_count() for name in names)
+    )
     fields += [*signals, somewhere]
     if RAW + EXTRA_FIELDS in schema:
         name = RAW + EXTRA_FIELDS
@@ -117,10 +119,6 @@ def find_problems(*cases: tuple[pl.Expr, str]) -> pl.Expr:
             for condition, reason in cases
         ]
     )
-
-
-def _is_whole(column: pl.Series) -> bool:
-    return not column.null_count()
 
 
 def _condition(condition: pl.Expr, reason: str, raw: pl.Expr) -> Field:

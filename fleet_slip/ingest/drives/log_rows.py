@@ -98,7 +98,9 @@ def join_parts(log: Path, parts: list[Path], mapping: Mapping, opened: PartBases
             for place, base in enumerate(there.bases):
                 first = next(base.read())
                 name = " ".join(sorted({*first.columns, time}))
-                found[name].append(_Stretch(part, place, _first_s(first[time]), base.count_rows()))
+                least = first[time].min()
+                first_s = least if isinstance(least, float) else 0.0
+                found[name].append(_Stretch(part, place, first_s, base.count_rows()))
     if missing:
         raise InputError(f"{shown(log)}: no file in it has the column {min(missing)!r}.")
     for stretches in found.values():
@@ -118,11 +120,6 @@ def _read(opened: PartBases, stretches: list[_Stretch]) -> Iterator[pl.DataFrame
     for stretch in stretches:
         with opened.using(stretch.part) as there:
             yield from there.bases[stretch.place].read()
-
-
-def _first_s(times: pl.Series) -> float:
-    first = times.min()
-    return first if isinstance(first, float) else 0.0
 
 
 _CLOCK = "this format says when each sample was taken: write own_clock = true under [time]"
@@ -205,11 +202,11 @@ def _bases_of(
             )
             for own, columns in wanted.items()
         ]
-    return [replace(base, read=partial(_metered, part, base.read)) for base in bases]
 
+    def metered(read: Callable[[], Iterator[pl.DataFrame]]) -> Iterator[pl.DataFrame]:
+        return Budget.of(part).metered(read())
 
-def _metered(part: Path, read: Callable[[], Iterator[pl.DataFrame]]) -> Iterator[pl.DataFrame]:
-    return Budget.of(part).metered(read())
+    return [replace(base, read=partial(metered, base.read)) for base in bases]
 
 
 def _count_rows(source: Source, own: str, is_main: bool) -> int:

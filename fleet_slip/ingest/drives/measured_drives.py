@@ -34,6 +34,7 @@ from fleet_slip.ingest.mapping.signal_column import COURSE, SPEED
 
 SOURCE = "measured"
 _SECONDS_PER_DAY = 86_400
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _EARLIEST_S = 10**8
 """Times before 1973 are counted from the start of a recording, not from 1970."""
 _FROM_FILE = ("drive_name", "source_file", "trip_id")
@@ -200,25 +201,18 @@ def _metadata(name: str, told: dict[str, Any], start_s: float, mapping: Mapping)
     if given["day"] is None:  # then time is in timestamps, or those of the file's own clock
         if mapping.time.own_clock and start_s < _EARLIEST_S:
             raise InputError("its clock does not tell the date. Give it in the mapping: drive.day.")
-        known["day"] = date.fromordinal(
-            date(1970, 1, 1).toordinal() + int(start_s // _SECONDS_PER_DAY)
-        )
+        known["day"] = date.fromordinal(_EPOCH.toordinal() + int(start_s // _SECONDS_PER_DAY))
     known |= {key: value for key, value in told.items() if key in given or key in _FROM_FILE}
     dated = mapping.time.is_dated and start_s >= _EARLIEST_S
     return {
         **known,
-        "started_at": _moment(start_s) if dated else None,
+        "started_at": _EPOCH + timedelta(seconds=start_s) if dated else None,  # to the microsecond
         **_facts_of(mapping, known),
         "drive_id": name,
         "source": SOURCE,
         "campaign": mapping.name,
         "saturated": 0,  # what is outside its range is quarantined, not clipped
     }
-
-
-def _moment(time_s: float) -> datetime:
-    """Return a time in s since 1970 to the microsecond."""
-    return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=time_s)
 
 
 def _facts_of(mapping: Mapping, known: dict[str, Any]) -> dict[str, Any]:

@@ -100,7 +100,8 @@ class MeasuredStream:
             cutter = DriveCutter(self.mapping.time, longest_s)
             for block in chain(early, blocks):
                 yield self._piece(cutter, block, intervals_s)
-            yield self._piece(cutter, _no_more(block), intervals_s, last=True)
+            no_more = Block(block.rows.clear(), no_rows(), block.read)
+            yield self._piece(cutter, no_more, intervals_s, last=True)
         self._require_usable()
 
     def _usual_intervals(self, blocks: Iterator[Block]) -> tuple[list[Block], dict[int, float]]:
@@ -302,7 +303,3 @@ def _trial(mapping: Mapping, blocks: list[Block], until: int) -> pl.DataFrame:
     elif until < blocks[-1].read:
         rows = rows.filter(pl.col("row") <= until)
     return DriveCutter(mapping.time).cut(rows, last=several)[0]
-
-
-def _no_more(block: Block) -> Block:
-    return Block(block.rows.clear(), no_rows(), block.read)

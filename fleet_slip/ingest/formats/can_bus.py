@@ -1,15 +1,21 @@
 """What a mapping says of a CAN trace: the database of its messages, and the bus."""
 
 import hashlib
+import re
 from pathlib import Path
+from typing import Any
 
 from pydantic import Field
 
 from fleet_slip.config import Config, Name, read_named_file
-from fleet_slip.errors import ConfigError
+from fleet_slip.errors import ConfigError, InputError
+from fleet_slip.ingest.formats.source import reading_with
+from fleet_slip.words import shown
 
 FORMATS = {".dbc": "dbc", ".arxml": "arxml", ".kcd": "kcd", ".sym": "sym"}
 MAX_DATABASE_BYTES = 2**28
+_ABSURD = re.compile(r"\d{7,}\s*\|\s*\d+\s*@|\|\s*\d{7,}\s*@|BO_\s+\d+\s+\S+\s*:\s*\d{7,}")
+"""Sizes in a DBC file of which cantools would make a format of so many characters."""
 
 
 class CanBus(Config):
@@ -42,3 +48,25 @@ def read_can_database(bus: CanBus, folder: Path) -> CanBus:
         text = content.decode("cp1252", "replace")  # what most tools on Windows write
     digest = hashlib.sha256(content).hexdigest()
     return bus.model_copy(update={"text": text, "digest": digest})
+
+
+def parse_database(bus: CanBus) -> Any:
+    """Return the messages that a database describes. Raises `InputError`.
+
+    What cantools says of a text that it cannot parse quotes a line of it; only the place is told.
+    """
+    database = Path(bus.database)
+    if _ABSURD.search(bus.text):
+        raise InputError(
+            f"{shown(database)}: a signal or a message of more than a million bits or bytes. Is "
+            "the file damaged?"
+        )
+    with reading_with(database, "cantools") as cantools:
+        try:
+            return cantools.database.load_string(bus.text, bus.format, strict=False)
+        except Exception as error:
+            place = re.search(r"line \d+", str(error))
+            raise InputError(
+                f"{shown(database)}: cantools cannot read it as {bus.format.upper()}"
+                f"{f', from {place[0]} on' if place else ''}. Is it the right file, and complete?"
+            ) from None

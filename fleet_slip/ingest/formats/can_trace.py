@@ -9,14 +9,12 @@ whatever its length, and an object of no size for ever. So these are looked at b
 """
 
 import os
-import re
 import struct
 import zlib
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from functools import partial
-from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -26,7 +24,7 @@ from numpy.typing import NDArray
 from fleet_slip.arrays import BoolArray
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.budget import Budget
-from fleet_slip.ingest.formats.can_bus import CanBus
+from fleet_slip.ingest.formats.can_bus import CanBus, parse_database
 from fleet_slip.ingest.formats.can_frames import (
     CanFrames,
     is_possible,
@@ -35,7 +33,14 @@ from fleet_slip.ingest.formats.can_frames import (
     physical,
     raw_numbers,
 )
-from fleet_slip.ingest.formats.source import OWN_TIME, Base, Channel, describe_missing, reading_with
+from fleet_slip.ingest.formats.source import (
+    OWN_TIME,
+    Base,
+    Channel,
+    ClockSource,
+    describe_missing,
+    reading_with,
+)
 from fleet_slip.ingest.logs.spool import Spool
 from fleet_slip.words import shown
 
@@ -116,16 +121,12 @@ def _damaged(budget: Budget, what: str) -> InputError:
 SUFFIXES = {".blf", ".asc", ".log", ".trc"}
 
 _MOST_NUMBERS = 100_000
-_ABSURD = re.compile(r"\d{7,}\s*\|\s*\d+\s*@|\|\s*\d{7,}\s*@|BO_\s+\d+\s+\S+\s*:\s*\d{7,}")
-"""Sizes in a DBC file of which cantools would make a format of so many characters."""
 _Key = tuple[int, bool]
 """Number of a message, and whether it is of 29 bits."""
 
 
-class CanSource:
+class CanSource(ClockSource):
     """The messages of a CAN trace."""
-
-    has_clock = True
 
     def __init__(self, bus: CanBus, database: Any, spool: Spool, budget: Budget) -> None:
         """Take what the mapping says of the trace, the parsed database, and what it may become."""
@@ -162,11 +163,6 @@ class CanSource:
             Base(name, partial(self._count, name, signals), partial(self._read, name, signals))
             for name, signals in wanted.items()
         ]
-
-    def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
-        """Yield the rows of each message that has one of the columns, message by message."""
-        for base in self.bases(columns):
-            yield from base.read()
 
     def _want(self, asked: set[_Key]) -> None:
         """Read the trace, once more if it was read without these messages."""
@@ -297,25 +293,3 @@ def open_can_trace(bus: CanBus, budget: Budget) -> Iterator[CanSource]:
     """Open a CAN trace. Raises `InputError`, for a database that cannot be parsed too."""
     with closing(Spool()) as spool:
         yield CanSource(bus, parse_database(bus), spool, budget)
-
-
-def parse_database(bus: CanBus) -> Any:
-    """Return the messages that a database describes. Raises `InputError`.
-
-    What cantools says of a text that it cannot parse quotes a line of it; only the place is told.
-    """
-    database = Path(bus.database)
-    if _ABSURD.search(bus.text):
-        raise InputError(
-            f"{shown(database)}: a signal or a message of more than a million bits or bytes. Is "
-            "the file damaged?"
-        )
-    with reading_with(database, "cantools") as cantools:
-        try:
-            return cantools.database.load_string(bus.text, bus.format, strict=False)
-        except Exception as error:
-            place = re.search(r"line \d+", str(error))
-            raise InputError(
-                f"{shown(database)}: cantools cannot read it as {bus.format.upper()}"
-                f"{f', from {place[0]} on' if place else ''}. Is it the right file, and complete?"
-            ) from None

@@ -21,7 +21,14 @@ import pyarrow as pa
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.budget import Budget
-from fleet_slip.ingest.formats.source import OWN_TIME, Base, Channel, describe_missing, reading_with
+from fleet_slip.ingest.formats.source import (
+    OWN_TIME,
+    Base,
+    Channel,
+    ClockSource,
+    describe_missing,
+    reading_with,
+)
 from fleet_slip.ingest.logs.spool import Spool
 from fleet_slip.words import shown
 
@@ -155,10 +162,8 @@ class _Rows:
     values: list[list[Any]] = field(default_factory=list)
 
 
-class McapSource:
+class McapSource(ClockSource):
     """The topics of an MCAP file."""
-
-    has_clock = True
 
     def __init__(self, budget: Budget, spool: Spool) -> None:
         """Take the file and what it may become, and where decoded messages are kept."""
@@ -202,8 +207,7 @@ class McapSource:
         """
         if not self._kept:
             self._keep({t: {f"{t}.{name}": name for name in of} for t, of in self._topics.items()})
-        for base in self.bases(columns):
-            yield from base.read()
+        yield from super().batches(columns)
 
     def _missing(self, column: str, names: list[str]) -> InputError:
         return InputError(f"{shown(self._file)}: {describe_missing(column, names)}")

@@ -20,6 +20,7 @@ from fleet_slip.ingest.formats.source import (
     OWN_TIME,
     Base,
     Channel,
+    ClockSource,
     as_column,
     describe_missing,
     reading_with,
@@ -36,10 +37,8 @@ _EARLIEST_S = 10**8
 """Loggers without a clock write 0: a start before 1973 is not a date."""
 
 
-class MdfSource:
+class MdfSource(ClockSource):
     """An open MDF file. A channel of several groups is named `CHANNEL@GROUP`."""
-
-    has_clock = True
 
     def __init__(self, mdf: Any, budget: Budget) -> None:
         """Take what asammdf has opened, and what may become of it."""
@@ -66,11 +65,6 @@ class MdfSource:
             Base(f"group {number}", partial(self._records, number), partial(self._read, number, of))
             for number, of in sorted(groups.items())
         ]
-
-    def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
-        """Yield the rows of each channel group that has one of the columns, group by group."""
-        for base in self.bases(columns):
-            yield from base.read()
 
     def _records(self, number: int) -> int:
         return int(self._mdf.groups[number].channel_group.cycles_nr)

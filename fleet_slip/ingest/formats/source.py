@@ -7,12 +7,13 @@ time is a column like any other.
 
 import difflib
 import logging
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 import numpy as np
 import polars as pl
@@ -77,13 +78,23 @@ class Source(Protocol):
         ...
 
 
-@runtime_checkable
-class ClockSource(Source, Protocol):
+class ClockSource(ABC):
     """A file that says when each sample was taken."""
 
+    has_clock = True
+
+    @abstractmethod
+    def channels(self) -> list[Channel]:
+        """Return all that can be read, in the file's order."""
+
+    @abstractmethod
     def bases(self, columns: Sequence[str]) -> list[Base]:
         """Return the time bases that have one of the columns. Raises `InputError`."""
-        ...
+
+    def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
+        """Yield the rows of each time base that has one of the columns, base by base."""
+        for base in self.bases(columns):
+            yield from base.read()
 
 
 @contextmanager
