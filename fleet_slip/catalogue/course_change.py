@@ -13,6 +13,9 @@ In 65,536ths of that count
 less the nearest multiple of 65536 turn, is the change of the side-slip angle; it is rounded once to
 counts of the label. For T of 10 s at most |J| < 2^27, so that all of it stays below 2^53. A change
 above `LARGEST_RAD` is none: the car spun, or a reflected signal told the course.
+
+Where a car goes straight on at both fixes and has hardly turned between them, its side-slip angle
+is none, and L is what the receiver and the gyroscope are wrong by: columns of their own say it.
 """
 
 import math
@@ -25,10 +28,17 @@ from fleet_slip.catalogue.signals import HALF_TURN, SAMPLE_TIME_S, catalogue
 COURSE, YAW_RATE = "course", "yaw_rate"
 TURNED = "turned"
 """Column of a Gram row: J over `COARSER`, which a scale error of the gyroscope goes with."""
+STRAIGHT, STRAIGHT_COURSE = "straight", "straight_course"
+"""Columns of a Gram row: 1 where the car went straight on, and the label there, else 0."""
+BESIDE = (TURNED, STRAIGHT, STRAIGHT_COURSE)
+"""The columns that tell of the course and are none of a model, in their order."""
 COARSER = 2**8
 """Keeps `TURNED` within 20 bits: 1.28e-4 rad a count."""
 LONGEST_TICKS = 1000
 LARGEST_RAD = Fraction(1, 2)
+STRAIGHT_RAD_S, STRAIGHT_RAD = Fraction(1, 50), Fraction(1, 20)
+"""Largest yaw rate at both fixes, and angle turned between them, of a car that goes straight on:
+a gyroscope is off by up to 0.01 rad/s."""
 LARGEST_CHANGE_BITS = 21
 """A difference of two counts of 20 bits."""
 LATE_PARTS = 4
@@ -39,7 +49,9 @@ COURSE_LATE = "course_late"
 """Column of `grams`: by how many parts of a tick the course was taken to be late. And the variable
 of the SQL statement that tells it of each car."""
 
-HIDDEN = ("hidden_course", "hidden_turned", "hidden_rest")
+OVER = "hidden_over"
+"""Column of changes: the place of their time among those of the set."""
+HIDDEN = ("hidden_course", "hidden_turned", "hidden_rest", "hidden_rate")
 HIDDEN_LATE = "hidden_late"
 WHOLE_TICKS = f"(({HIDDEN_LATE} + {LATE_PARTS // 2}) // {LATE_PARTS})"
 
@@ -52,11 +64,15 @@ class CourseUnits:
         turn: counts of J in a turn.
         divisor: of L, for a count of the label.
         largest: largest |L| that is a change of the side-slip angle.
+        slow: largest |r|, in counts, of a car that goes straight on.
+        unturned: largest |J| of it.
     """
 
     turn: int
     divisor: int
     largest: int
+    slow: int
+    unturned: int
 
 
 def course_units() -> CourseUnits:
@@ -65,7 +81,13 @@ def course_units() -> CourseUnits:
     grain = known[YAW_RATE].exact_scale * SAMPLE_TIME_S / 2
     turn = round(Fraction(Decimal(2) * Decimal(math.pi)) / grain)
     divisor = round(2 * HALF_TURN * known[known.label].exact_scale / grain)
-    return CourseUnits(turn, divisor, int(2 * HALF_TURN * LARGEST_RAD / grain))
+    return CourseUnits(
+        turn,
+        divisor,
+        int(2 * HALF_TURN * LARGEST_RAD / grain),
+        int(STRAIGHT_RAD_S / known[YAW_RATE].exact_scale),
+        int(STRAIGHT_RAD / grain),
+    )
 
 
 def split_late(late: int) -> tuple[int, int]:
@@ -98,13 +120,28 @@ def _as_logged(rows: str) -> str:
     return f"(SELECT *, 0 AS {HIDDEN_LATE} FROM {rows})"
 
 
-def with_changes(rows: str, columns: tuple[str, ...], ticks: int, *, in_time: bool) -> str:
-    """Return a subquery: columns less what they were so many ticks ago, `TURNED` and the label.
+def with_changes(
+    rows: str, columns: tuple[str, ...], times: tuple[int, ...], *, in_time: bool
+) -> str:
+    """Return a subquery of the changes over each of some numbers of ticks, `OVER` which it is.
+
+    `rows` has the columns, course and yaw rate, `vehicle_id` and the column `clipped`. With
+    `in_time` the course is moved by what the variable `course_late` says of the car.
+    """
+    moved = _in_time(rows) if in_time else _as_logged(rows)
+    changes = [
+        f"SELECT *, {number} AS {OVER} FROM {_changes(moved, columns, ticks)}"
+        for number, ticks in enumerate(times)
+    ]
+    return f"({' UNION ALL '.join(changes)})"
+
+
+def _changes(rows: str, columns: tuple[str, ...], ticks: int) -> str:
+    """Return a subquery: columns less what they were so many ticks ago, `BESIDE` and the label.
 
     Only rows that have a fix now and had one then, and the yaw rate all the time between; and the
     first of a drive, which has no change, so that a drive without a course is known to have none.
-    `rows` has the columns, course and yaw rate, `vehicle_id` and the column `clipped`. With
-    `in_time` the course is moved by what the variable `course_late` says of the car.
+    `rows` has the columns, course and yaw rate, the column `clipped` and `HIDDEN_LATE`.
     """
     units, label = course_units(), catalogue().label
     ago = {name: f"(max({name}) OVER ago)::BIGINT" for name in (*columns, COURSE, YAW_RATE)}
@@ -117,10 +154,15 @@ def with_changes(rows: str, columns: tuple[str, ...], ticks: int, *, in_time: bo
     gain = f"({HIDDEN_LATE} - {WHOLE_TICKS} * {LATE_PARTS}) * {4 * HALF_TURN // LATE_PARTS}"
     whole = 2 * HALF_TURN * units.turn
     near = f"({left} - {whole} * ({rounded(left, whole)}))"
+    change = rounded(label, units.divisor)
+    slow = f"{HIDDEN[3]} <= {units.slow} AND abs({HIDDEN[1]}) <= {units.unturned}"
+    straight = f"CASE WHEN {HIDDEN[1]} IS NOT NULL THEN ({slow})::BIGINT END"
     hidden = ", ".join((*HIDDEN, HIDDEN_LATE))
     return f"""(
-        SELECT * EXCLUDE ({hidden}) REPLACE ({rounded(label, units.divisor)} AS {label}),
-            {rounded(HIDDEN[1], COARSER)} AS {TURNED}
+        SELECT * EXCLUDE ({hidden}) REPLACE ({change} AS {label}),
+            {rounded(HIDDEN[1], COARSER)} AS {TURNED},
+            {straight} AS {STRAIGHT},
+            {straight} * ({change}) AS {STRAIGHT_COURSE}
         FROM (
             SELECT * REPLACE ({near} AS {label})
             FROM (
@@ -130,8 +172,9 @@ def with_changes(rows: str, columns: tuple[str, ...], ticks: int, *, in_time: bo
                 ),
                     {COURSE}::BIGINT - {ago[COURSE]} AS {HIDDEN[0]},
                     {turned} AS {HIDDEN[1]},
-                    {gain} * ({YAW_RATE}::BIGINT - {ago[YAW_RATE]}) AS {HIDDEN[2]}
-                FROM {_in_time(rows) if in_time else _as_logged(rows)}
+                    {gain} * ({YAW_RATE}::BIGINT - {ago[YAW_RATE]}) AS {HIDDEN[2]},
+                    greatest(abs({YAW_RATE}), abs({ago[YAW_RATE]})) AS {HIDDEN[3]}
+                FROM {rows}
                 WINDOW ago AS (PARTITION BY drive_id ORDER BY tick
                         RANGE BETWEEN {ticks} PRECEDING AND {ticks} PRECEDING),
                     since AS (PARTITION BY drive_id ORDER BY tick

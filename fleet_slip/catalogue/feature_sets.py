@@ -9,9 +9,9 @@ from decimal import Decimal
 from fractions import Fraction
 from itertools import pairwise
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
-from fleet_slip.catalogue.course_change import TURNED
+from fleet_slip.catalogue.course_change import BESIDE, LONGEST_TICKS
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, Identifier, catalogue
 from fleet_slip.config import Config
 
@@ -53,7 +53,9 @@ class FeatureSet(Config):
     """The columns of one kind of Gram row, and what divides a drive's rows."""
 
     description: str = Field(min_length=1)
-    signals: tuple[Identifier, ...] = Field(min_length=1)
+    of: Identifier | None = None
+    """The set whose columns these are the changes of."""
+    signals: tuple[Identifier, ...] = ()
     features: tuple[Identifier, ...] = ()
     windows: tuple[Identifier, ...] = ()
     calibrated: tuple[Identifier, ...] = ()
@@ -61,13 +63,23 @@ class FeatureSet(Config):
     block_s: Decimal | None = Field(default=None, gt=0, le=100_000)
     row_folds: int | None = Field(default=None, ge=2, le=1000)
     lagged: bool = False
-    change_s: Decimal | None = Field(default=None, gt=0, le=10)
-    """Instead of the columns, what they change by in so much time, with the course as the label."""
+    change_s: tuple[Decimal, ...] = ()
+    """Instead of the columns, what they change by in so much time, with the course as the label;
+    of several times, each is a part of the drive."""
     as_logged: bool = False
     """Whether the course of changes stays where it was logged, however late its receiver is."""
 
+    @field_validator("change_s", mode="before")
+    @classmethod
+    def _one_is_enough(cls, given: object) -> object:
+        return given if isinstance(given, list | tuple) else (given,)
+
     @model_validator(mode="after")
     def _consistent(self) -> "FeatureSet":
+        if self.of is None and not self.signals:
+            raise ValueError("a set has signals, or is of another set")
+        if self.of is not None and (self.inputs or not self.change_s):
+            raise ValueError("a set of another has change_s, and no columns of its own")
         unknown = [name for name in self.signals if name not in catalogue().feature_inputs]
         if unknown:
             raise ValueError(f"not input signals: {', '.join(unknown)}")
@@ -79,13 +91,14 @@ class FeatureSet(Config):
             raise ValueError("a set with windows has no row_folds or lagged")
         if self.change_ticks and (self.row_folds or self.lagged or self.regimes or self.block_s):
             raise ValueError("a set with change_s does not divide rows")
-        if self.change_ticks and (not self.windows or self.calibrated):
-            raise ValueError("a set with change_s has windows, and no calibrated columns")
+        if self.change_ticks and not (self.windows or self.of):
+            raise ValueError("a set with change_s has windows")
         if self.as_logged and not self.change_ticks:
             raise ValueError("only a set with change_s is as_logged")
-        for name in ("block_s", "change_s"):
-            time_s = getattr(self, name)
-            if time_s is not None and Fraction(time_s) % SAMPLE_TIME_S:
+        if any(not 0 < ticks <= LONGEST_TICKS for ticks in self.change_ticks):
+            raise ValueError(f"change_s is at most {LONGEST_TICKS * float(SAMPLE_TIME_S):g}")
+        for name, times_s in (("block_s", (self.block_s,)), ("change_s", self.change_s)):
+            if any(one and Fraction(one) % SAMPLE_TIME_S for one in times_s):
                 raise ValueError(f"{name} must be a multiple of {float(SAMPLE_TIME_S)}")
         return self
 
@@ -95,9 +108,15 @@ class FeatureSet(Config):
         return None if self.block_s is None else int(Fraction(self.block_s) / SAMPLE_TIME_S)
 
     @property
-    def change_ticks(self) -> int | None:
-        """Number of ticks over which columns change; None where they stand for themselves."""
-        return None if self.change_s is None else int(Fraction(self.change_s) / SAMPLE_TIME_S)
+    def change_ticks(self) -> tuple[int, ...]:
+        """Numbers of ticks over which columns change; none where they stand for themselves."""
+        return tuple(int(Fraction(time_s) / SAMPLE_TIME_S) for time_s in self.change_s)
+
+    @property
+    def change_text(self) -> str:
+        """The times over which columns change, as messages say them."""
+        *most, last = (f"{time_s:f}" for time_s in self.change_s)
+        return f"{', '.join(most)} and {last} s" if most else f"{last} s"
 
     @property
     def in_time(self) -> bool:
@@ -112,6 +131,6 @@ class FeatureSet(Config):
     @property
     def columns(self) -> tuple[str, ...]:
         """The columns of a Gram row, in its order; calibrated ones follow from it."""
-        turned = (TURNED,) if self.change_ticks else ()
-        now = (*self.signals, *self.features, *self.windows, *turned, catalogue().label)
+        beside = BESIDE if self.change_ticks else ()
+        now = (*self.signals, *self.features, *self.windows, *beside, catalogue().label)
         return lag_signals(now) if self.lagged else now

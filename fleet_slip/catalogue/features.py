@@ -14,7 +14,7 @@ from typing import TypeVar
 from pydantic import Field, ValidationError, model_validator
 
 from fleet_slip.canonical import canonical_json, sha256_of
-from fleet_slip.catalogue.course_change import TURNED, course_units
+from fleet_slip.catalogue.course_change import BESIDE, YAW_RATE, course_units
 from fleet_slip.catalogue.definitions import COUNT_BITS, Definition, plain_column
 from fleet_slip.catalogue.feature_sets import PLAIN, FeatureSet, Regime
 from fleet_slip.catalogue.gates import GateFamily, gated_columns
@@ -52,7 +52,7 @@ class FeatureCatalogue(Config):
         signals = catalogue()
         taken = {*signals.signals, *(s.column for s in signals.signals.values()), *signals.drive}
         columns: dict[str, Feature | TimeColumn] = {**self.features, **self.time_columns}
-        taken |= {"day", "tick", "clipped", TURNED}
+        taken |= {"day", "tick", "clipped", *BESIDE}
         names = [*columns, *(one.column for one in columns.values())]
         twice = sorted(name for name in names if name in taken or names.count(name) > 1)
         if twice:
@@ -68,6 +68,7 @@ class FeatureCatalogue(Config):
             known = {*self.windows, *self.gates, *self.time_columns}
             unknown += [w for w in one.windows if w not in known or w in self.calibrated]
             unknown += [c for c in one.calibrated if c not in self.calibrated]
+            unknown += [one.of] if one.of and one.of not in self.sets else []
             if unknown:
                 raise ValueError(f"sets.{name}: unknown {', '.join(unknown)}")
         return self
@@ -161,8 +162,25 @@ class FeatureCatalogue(Config):
             known = ", ".join((PLAIN, *self.sets))
             raise QuestionError(f"no feature set is called {name!r}. Feature sets: {known}.")
         one = self.sets[name]
+        if one.of is not None:
+            return self._changes_of(one, self.feature_set(one.of))
         members = [member for window in one.windows for member in self.members(window)]
         return one.model_copy(update={"windows": tuple(dict.fromkeys(members))})
+
+    def _changes_of(self, one: FeatureSet, of: FeatureSet) -> FeatureSet:
+        """Return a set with the columns of another that have no noise in common with the course.
+
+        A sum of the yaw rate has that of the gyroscope, which least squares takes for knowledge; a
+        mean since the drive began hardly changes.
+        """
+        kept = tuple(name for name in of.windows if not self._sums_yaw_rate(name))
+        calibrated = tuple(c for c in of.calibrated if not self._sums_yaw_rate(c))
+        columns = {"signals": of.signals, "features": of.features, "windows": kept}
+        return one.model_copy(update={**columns, "calibrated": calibrated})
+
+    def _sums_yaw_rate(self, name: str) -> bool:
+        one = self.time_columns[name].definition
+        return one.over == "running_mean" or (one.over == "sum" and YAW_RATE in one.signals)
 
     def members(self, name: str) -> tuple[str, ...]:
         """Return the columns of a family of windows or gates; any other name stays."""
@@ -192,7 +210,7 @@ class FeatureCatalogue(Config):
         if one.block_ticks:
             content["block_ticks"] = one.block_ticks
         if one.change_ticks:
-            content["change"] = {"ticks": one.change_ticks, **vars(course_units())}
+            content["change"] = {"ticks": list(one.change_ticks), **vars(course_units())}
         if one.windows:
             content["windows"] = {
                 w: self.time_columns[w].model_dump(mode="json", exclude={"description"})

@@ -206,6 +206,9 @@ class TrainedOn(Config):
         return content
 
 
+Seconds = Annotated[FiniteFloat, Field(gt=0)]
+
+
 class LearnedFrom(Config):
     """What stood for a label: changes of the course over so many seconds.
 
@@ -214,7 +217,7 @@ class LearnedFrom(Config):
     """
 
     label: Literal["course"]
-    change_s: Annotated[FiniteFloat, Field(gt=0)]
+    change_s: Seconds | Annotated[tuple[Seconds, ...], Field(min_length=2)]
     cars: Count
     intercept_uncertainty_deg: FiniteFloat | None
     intercept_spread_deg: FiniteFloat

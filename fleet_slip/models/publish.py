@@ -101,12 +101,12 @@ def with_straight_intercept(warehouse: Warehouse, manifest: Manifest) -> Manifes
     """
     name = features().name_of(manifest.trained_on.feature_set)
     change_s = features().feature_set(name).change_s
-    if change_s is None:
+    if not change_s:
         return manifest
     found = straight_on(warehouse, parse_condition(manifest.trained_on.cohort), manifest)
     learned = LearnedFrom(
         label="course",
-        change_s=float(change_s),
+        change_s=float(change_s[0]) if len(change_s) == 1 else tuple(map(float, change_s)),
         cars=found.cars,
         intercept_uncertainty_deg=(
             None if found.uncertainty is None else math.degrees(found.uncertainty)

@@ -88,10 +88,10 @@ def print_selection(selection: Selection[Any]) -> None:
         left=1 + listed,
     )
     _say_left_out(selection)
-    if change_s := features().feature_set(selection.cohort.feature_set).change_s:
+    if (one := features().feature_set(selection.cohort.feature_set)).change_s:
         say(
-            f"learned from changes of the course over {change_s} s: the figures are of changes, "
-            "with the noise of two fixes in them, and not of the angle."
+            f"learned from changes of the course over {one.change_text}: the figures are of "
+            "changes, with the noise of two fixes in them, and not of the angle."
         )
     if selection.folds.by in (PARTS, BANDS) and tells_single_cars():
         _print_folds(selection.winner.model)

@@ -55,7 +55,8 @@ class ColumnPlan:
         one = known.feature_set(name)
         divided_by = [known.regimes[regime].of for regime in one.regimes]
         features = known.rows((*one.features, *divided_by))
-        columns = (*one.inputs, COURSE, YAW_RATE) if one.change_ticks else one.columns
+        inputs = (*one.signals, *one.features, *one.windows)
+        columns = (*inputs, COURSE, YAW_RATE) if one.change_ticks else one.columns
         return cls.of(columns, features, known.definitions(name), divided_by)
 
     @property

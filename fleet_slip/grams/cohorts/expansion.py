@@ -56,13 +56,13 @@ class Expansion:
         """
         for names, rows, here in by_signals(batch):
             if self.sweep:
-                if TURNED in names.split(","):  # else these drives have no change
-                    table = swept(gram_table(names, rows))
-                    yield ",".join(table.signals), table, here
-                continue
-            table = gram_table(names, rows)
+                if TURNED not in names.split(","):
+                    continue  # these drives have no change
+                table = swept(gram_table(names, rows))
+            else:
+                table = gram_table(names, rows)
             if not self.columns:
-                yield names, table, here
+                yield ",".join(table.signals), table, here
                 continue
             ids = rows["vehicle_id"].to_pylist()
             known = np.array(["\0".join(sorted(self.cars.get(one) or ())) for one in ids])
@@ -86,8 +86,15 @@ class Expansion:
         }
         if not added:
             return table
+        # A number that stands alone does not change.
         factors = np.array(
-            [[self.cars[one][n.name] - n.less for _, n in added.values()] for one in ids],
+            [
+                [
+                    0 if self.sweep and n.alone else self.cars[one][n.name] - n.less
+                    for _, n in added.values()
+                ]
+                for one in ids
+            ],
             dtype=np.int64,
         )
         bases = [0 if n.alone else 1 + table.signals.index(of) for of, n in added.values()]
@@ -137,9 +144,10 @@ def expansion_of(opened: OpenedGrams, feature_set: str) -> Expansion:
     A number is told by all drives of a car that there are, whatever the cohort: it needs no label.
     """
     known = features()
-    names = known.feature_set(feature_set).calibrated
+    one = known.feature_set(feature_set)
+    names, sweep = one.calibrated, bool(one.change_ticks)
     if not names:
-        return Expansion({}, {}, sweep=bool(known.feature_set(feature_set).change_ticks))
+        return Expansion({}, {}, sweep)
     columns = {}
     for name in names:
         number = known.time_columns[name].definition.number
@@ -148,4 +156,5 @@ def expansion_of(opened: OpenedGrams, feature_set: str) -> Expansion:
     calibration = OpenedGrams(
         opened.database, known.identity(CALIBRATION), opened.logs_version, opened.grams_version
     )
-    return Expansion(columns, calibration_of(calibration, parse_condition(ALL_DRIVES)).counts())
+    cars = calibration_of(calibration, parse_condition(ALL_DRIVES)).counts()
+    return Expansion(columns, cars, sweep)

@@ -219,11 +219,11 @@ def empty_cohort_error(opened: OpenedGrams, condition: Condition) -> DataError:
             f"all {number_of(left_out, 'drive')} of the cohort {condition.text!r} are of cars that "
             "sent Gram rows of the logged signals and no log. Select with features = signals."
         )
-    change_s = features().feature_set(features().name_of(opened.identity)).change_s
-    if change_s:
+    one = features().feature_set(features().name_of(opened.identity))
+    if one.change_s:
         return DataError(
             f"no drive of the cohort {condition.text!r} has fixes of a satellite receiver that are "
-            f"{change_s} s apart: nothing tells the course. Choose another cohort, or map the "
+            f"{one.change_text} apart: nothing tells the course. Choose another cohort, or map the "
             "course and ingest again: docs/course.md."
         )
     examples = opened.database.execute(

@@ -6,43 +6,38 @@ drive: of the matrix of products, with z = (1, turned),
 
     P_ab − P_az P_zz⁻¹ P_zb,
 
-computed in whole numbers and rounded once to the nearest. What is left has sums of zero, and adds
-up over drives as the products of any Gram row do.
+in whole numbers: what is taken off is a sum of two quotients of exact numbers in binary64, rounded
+to the nearest, the same on any machine. What is left has sums of zero, and adds up over drives as
+the products of any Gram row do.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fleet_slip.arrays import IntArray
-from fleet_slip.catalogue.course_change import TURNED
+from fleet_slip.catalogue.course_change import BESIDE, TURNED
 from fleet_slip.regression.exact.gram import packed_position, packed_positions
 from fleet_slip.regression.exact.gram_table import GramTable
 
 
 def swept(table: GramTable) -> GramTable:
-    """Return the table without `TURNED`, nor what goes with it or is constant in a drive."""
-    signals = tuple(name for name in table.signals if name != TURNED)
-    z, k = table.signals.index(TURNED), len(table.signals)
-    n, sums = table.n.astype(object)[:, None], table.sums.astype(object)
-    left, right = np.tril_indices(k)
-    about = n * table.products.astype(object) - sums[:, left] * sums[:, right]
-    with_z = about[:, [packed_position(max(i, z), min(i, z)) for i in range(k)]]
-    turns = with_z[:, [z]]
-    straight = turns == 0
-    turns = np.where(straight, 1, turns)
-    with_z = np.where(straight, 0, with_z)
-    kept = [i for i in range(k) if i != z]
-    at = np.array(list(packed_positions(tuple(kept))))
-    above = about[:, at] * turns - with_z[:, left[at]] * with_z[:, right[at]]
+    """Return the table without `BESIDE`, nor what goes with the angle turned, nor what is constant.
+
+    In a drive, that is. `TURNED` is one of the signals.
+    """
+    signals = tuple(name for name in table.signals if name not in BESIDE)
+    kept = [table.signals.index(name) for name in signals]
+    z, n, sums = table.signals.index(TURNED), table.n.astype(object), table.sums.astype(object)
+    with_z = table.products[:, [packed_position(max(i, z), min(i, z)) for i in [*kept, z]]]
+    about = n[:, None] * with_z.astype(object) - sums[:, [*kept, z]] * sums[:, [z]]
+    turns = np.where(about[:, -1] == 0, 1, about[:, -1])  # straight on: the others are 0 as well
+    below = (n * turns).astype(np.float64)[:, None]
+    means, slopes = table.sums[:, kept].astype(np.float64), about[:, :-1].astype(np.float64)
+    left, right = np.tril_indices(len(kept))
+    taken = means[:, left] * means[:, right] / table.n[:, None]
+    taken += slopes[:, left] * slopes[:, right] / below
+    products = table.products[:, list(packed_positions(tuple(kept)))]
     return GramTable(
         signals,
         table.n,
         np.zeros((len(table), len(kept)), dtype=np.int64),
-        _rounded(above, n * turns).astype(np.int64),
+        products - np.rint(taken).astype(np.int64),
     )
-
-
-def _rounded(above: NDArray[np.object_], below: NDArray[np.object_]) -> IntArray:
-    """Return quotients by positive numbers, to the nearest, halves upwards."""
-    quotients: IntArray = (2 * above + below) // (2 * below)
-    return quotients

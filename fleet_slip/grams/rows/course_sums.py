@@ -16,12 +16,36 @@ from fleet_slip.columns.blocks.drive_columns import DriveCounts, Workspace
 
 
 @dataclass(frozen=True)
+class Fixes:
+    """The rows of a drive that have a fix.
+
+    Attributes:
+        ticks, yaw_rate: of all rows, shape (rows,); NaN where the rate is missing.
+        at: the rows with a fix, shape (fixes,).
+        course: the counts of each.
+        gain: what the label gains per count of r, see `split_late`.
+        counts: the columns of those rows, shape (columns, fixes).
+        clipped: how many columns of each were clipped, shape (fixes,).
+        first_clipped: the same of the first row.
+    """
+
+    ticks: IntArray
+    yaw_rate: FloatArray
+    at: IntArray
+    course: IntArray
+    gain: int
+    counts: FloatArray
+    clipped: FloatArray
+    first_clipped: FloatArray
+
+
+@dataclass(frozen=True)
 class Changes:
     """The changes of a drive's columns between fixes that are so many ticks apart.
 
     Attributes:
         rows: each row that has a change, after that of tick 0, shape (changes,).
-        columns: shape (columns + 2, changes), NaN where missing; `TURNED` and the label come last.
+        columns: shape (columns + 4, changes), NaN where missing; `BESIDE` and the label come last.
         clipped: how many columns of each row were clipped, shape (changes,).
     """
 
@@ -30,8 +54,8 @@ class Changes:
     clipped: FloatArray
 
 
-def course_changes(workspace: Workspace, drive: DriveCounts, apart: int, late: int = 0) -> Changes:
-    """Return the changes of the drive, which is loaded; its course is late by `late`.
+def find_fixes(workspace: Workspace, drive: DriveCounts, late: int = 0) -> Fixes:
+    """Return the fixes of the drive, which is loaded; its course is late by `late`.
 
     The last two columns of the workspace's plan are the course and the yaw rate.
     """
@@ -51,25 +75,40 @@ def course_changes(workspace: Workspace, drive: DriveCounts, apart: int, late: i
         values.append(block[:-2, fixed])
         clipped.append(here[fixed])
         first_clipped = here[:1].copy() if first == 0 else first_clipped
-    counts = np.concatenate(values, axis=1)
-    before, now = _pairs(ticks[at], apart)
-    turned, known = _twice_turned(ticks, yaw_rate, at[before], at[now])
+    return Fixes(
+        ticks,
+        yaw_rate,
+        at,
+        course,
+        gain,
+        np.concatenate(values, axis=1),
+        np.concatenate(clipped),
+        first_clipped,
+    )
+
+
+def course_changes(fixes: Fixes, apart: int) -> Changes:
+    """Return the changes of a drive's columns between fixes that are so many ticks apart."""
+    at, yaw_rate = fixes.at, fixes.yaw_rate
+    before, now = _pairs(fixes.ticks[at], apart)
+    turned, known = _twice_turned(fixes.ticks, yaw_rate, at[before], at[now])
     before, now, turned = before[known], now[known], turned[known]
-    rest = gain * (yaw_rate[at[now]] - yaw_rate[at[before]]).astype(np.int64)
-    change, sound = _change(course[now] - course[before], turned, rest)
-    before, now = before[sound], now[sound]
+    rest = fixes.gain * (yaw_rate[at[now]] - yaw_rate[at[before]]).astype(np.int64)
+    change, sound = _change(fixes.course[now] - fixes.course[before], turned, rest)
+    before, now, turned, change = before[sound], now[sound], turned[sound], change[sound]
+    straight = _straight(yaw_rate[at[before]], yaw_rate[at[now]], turned)
     columns = np.concatenate(
         [
-            counts[:, now] - counts[:, before],
-            _rounded(turned[sound], COARSER)[None],
-            change[None, sound],
+            fixes.counts[:, now] - fixes.counts[:, before],
+            [_rounded(turned, COARSER), straight, straight * change],  # `BESIDE`
+            change[None],
         ]
     )
-    began = ticks[:1] == 0  # known to have no change: so a drive without a course is remembered
+    began = fixes.ticks[:1] == 0  # no change: so a drive without a course is remembered
     return Changes(
         np.concatenate([np.flatnonzero(began), at[now]]),
         np.concatenate([np.full((len(columns), int(began.sum())), np.nan), columns], axis=1),
-        np.concatenate([first_clipped[began], np.concatenate(clipped)[now]]),
+        np.concatenate([fixes.first_clipped[began], fixes.clipped[now]]),
     )
 
 
@@ -79,6 +118,14 @@ def _fixes(drive: DriveCounts, ticks: IntArray, whole: int) -> tuple[IntArray, I
     place = np.searchsorted(ticks, ticks[fixed] - whole)
     there = ticks[np.minimum(place, len(ticks) - 1)] == ticks[fixed] - whole
     return place[there], drive.counts[COURSE][fixed[there]].astype(np.int64)
+
+
+def _straight(before: FloatArray, now: FloatArray, turned: IntArray) -> IntArray:
+    """Return 1 where the car went straight on, by the yaw rate at both fixes and in between."""
+    units = course_units()
+    slow = np.maximum(np.abs(before), np.abs(now)) <= units.slow
+    straight: IntArray = (slow & (np.abs(turned) <= units.unturned)).astype(np.int64)
+    return straight
 
 
 def _pairs(ticks: IntArray, apart: int) -> tuple[IntArray, IntArray]:

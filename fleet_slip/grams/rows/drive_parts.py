@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray, IntArray
+from fleet_slip.catalogue.course_change import OVER
 from fleet_slip.catalogue.feature_sets import FeatureSet
 from fleet_slip.catalogue.features import FeatureCatalogue
 
@@ -56,17 +57,19 @@ class Bands:
 
 @dataclass(frozen=True)
 class Parts:
-    """How the rows of a drive are divided: by at most one of the three.
+    """How the rows of a drive are divided: by at most one of the four.
 
     Attributes:
         bands: of each regime; a part is a combination of them, the last running fastest.
         block_ticks: length of a block of time.
         row_folds: number of folds that rows are dealt into.
+        times: over which columns change, if those are several; each has all rows.
     """
 
     bands: tuple[Bands, ...] = ()
     block_ticks: int | None = None
     row_folds: int | None = None
+    times: tuple[str, ...] = ()
 
     @classmethod
     def of_set(cls, known: FeatureCatalogue, one: FeatureSet) -> "Parts":
@@ -78,15 +81,18 @@ class Parts:
             # Counts are whole, so that reaching a bound is reaching the next whole count.
             bounds = tuple(math.ceil(Fraction(bound) / scale) for bound in regime.bounds)
             bands.append(Bands(regime.of, regime.absolute, bounds, regime.bands))
-        return cls(tuple(bands), one.block_ticks, one.row_folds)
+        times = tuple(f"{time_s:f} s" for time_s in one.change_s)
+        return cls(tuple(bands), one.block_ticks, one.row_folds, times if len(times) > 1 else ())
 
     def __bool__(self) -> bool:
         """Return whether rows are divided at all."""
-        return bool(self.bands or self.block_ticks or self.row_folds)
+        return bool(self.bands or self.block_ticks or self.row_folds or self.times)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the combinations of bands."""
+        """Names of the times, or of the combinations of bands."""
+        if self.times:
+            return self.times
         names = [""]
         for bands in self.bands:
             names = [f"{name}, {band}".removeprefix(", ") for name in names for band in bands.names]
@@ -99,6 +105,8 @@ class Parts:
             return _row_fold_sql(self.row_folds)
         if self.block_ticks:
             return f"tick // {self.block_ticks}"
+        if self.times:
+            return OVER
         number = "0"
         for bands in self.bands:
             number = f"({number}) * {len(bands.names)} + {bands.sql}"
@@ -131,7 +139,7 @@ class Parts:
         """Return the name of a part; None where rows are not divided."""
         if self.block_ticks:
             return BLOCK_FORMAT % (number + 1)
-        if not self.bands:
+        if not (self.bands or self.times):
             return None
         return UNKNOWN_PART if number == UNKNOWN else self.names[number]
 

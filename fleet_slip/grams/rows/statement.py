@@ -45,7 +45,8 @@ def gram_statement(
     logs = with_absent(LOGS, absent)
     rows = _lagged(names, logs) if one.lagged else with_columns(logs, used, windows)
     if one.change_ticks:
-        rows = with_changes(rows, one.inputs, one.change_ticks, in_time=one.in_time)
+        columns = (*one.signals, *one.features, *one.windows)
+        rows = with_changes(rows, columns, one.change_ticks, in_time=one.in_time)
     wide = windows or any(feature.bits > COUNT_BITS for feature in used.values())
     kind = "BIGINT" if wide else "INTEGER"
     parts = Parts.of_set(known, one)
@@ -60,10 +61,8 @@ def gram_statement(
     counted = ""
     if further:
         clipped = ", clipped" if used or windows else ""
-        columns = f"{absent_sql} AS absent, {part} AS part{clipped}, {', '.join(names)}"
-        counted = (
-            f"counted AS MATERIALIZED (\n    SELECT drive_id, {columns}\n    FROM {rows}\n),\n\n"
-        )
+        kept = f"{absent_sql} AS absent, {part} AS part{clipped}, {', '.join(names)}"
+        counted = f"counted AS MATERIALIZED (\n    SELECT drive_id, {kept}\n    FROM {rows}\n),\n\n"
         rows, absent_sql, part, group = "counted", "absent", "part", "drive_id, absent, part"
     return read_sql("jobs", "gram.sql").format(
         drive_columns=", ".join(

@@ -23,7 +23,7 @@ from fleet_slip.columns.blocks.column_plan import ColumnPlan
 from fleet_slip.columns.blocks.drive_columns import DriveCounts, Workspace
 from fleet_slip.delta import TableFile
 from fleet_slip.errors import DataError, StorageError
-from fleet_slip.grams.rows.course_sums import course_changes
+from fleet_slip.grams.rows.course_sums import course_changes, find_fixes
 from fleet_slip.grams.rows.drive_parts import UNKNOWN, Parts
 from fleet_slip.grams.rows.drive_rows import LoggedDrive, read_drives
 from fleet_slip.warehouse.tables import Warehouse
@@ -173,9 +173,9 @@ def drive_sums(workspace: Workspace, parts: Parts, counts: DriveCounts) -> dict[
 
 
 def change_sums(
-    workspace: Workspace, counts: DriveCounts, apart: int, late: int = 0
+    workspace: Workspace, counts: DriveCounts, times: Sequence[int], late: int = 0
 ) -> dict[Kind, PartSums]:
-    """Return the sums of the changes of a drive's columns, by which of them they lack.
+    """Return the sums of the changes of a drive's columns, by which they lack and over which time.
 
     The course is `late` parts of a tick. Raises like `drive_sums`.
     """
@@ -184,16 +184,17 @@ def change_sums(
     if len(counts.ticks) * largest**2 >= _INT64:
         raise StorageError(f"the drive has {len(counts.ticks):,} rows: too many for 64-bit sums.")
     workspace.load(counts)
-    changes = course_changes(workspace, counts, apart, late)
+    fixes = find_fixes(workspace, counts, late)
     found: dict[Kind, PartSums] = {}
-    for kind, rows in _kinds(changes.columns, None):
-        has = [i for i in range(len(changes.columns)) if not kind[0] >> i & 1]
-        sums = found.setdefault(kind, PartSums(len(has)))
-        for first in range(0, len(rows), exact_rows):
-            some = rows[first : first + exact_rows]
-            sums.add(
-                changes.columns[np.ix_(np.array(has, dtype=np.int64), some)], changes.clipped[some]
-            )
+    for part, apart in enumerate(times):
+        changes = course_changes(fixes, apart)
+        for (absent, _), rows in _kinds(changes.columns, None):
+            has = [i for i in range(len(changes.columns)) if not absent >> i & 1]
+            sums = found.setdefault((absent, part), PartSums(len(has)))
+            for first in range(0, len(rows), exact_rows):
+                some = rows[first : first + exact_rows]
+                block = changes.columns[np.ix_(np.array(has, dtype=np.int64), some)]
+                sums.add(block, changes.clipped[some])
     return found
 
 

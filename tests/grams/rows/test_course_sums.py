@@ -1,6 +1,7 @@
 """Changes from fix to fix: kernel, SQL and plain integers agree, and tell the angle's change."""
 
 import math
+from decimal import Decimal
 from fractions import Fraction
 from typing import Any
 
@@ -10,13 +11,14 @@ import pyarrow.compute as pc
 import pytest
 
 from fleet_slip.catalogue.course_change import LARGEST_RAD, TURNED, course_units
+from fleet_slip.catalogue.feature_sets import FeatureSet
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.blocks.column_plan import ColumnPlan
 from fleet_slip.columns.blocks.drive_columns import Workspace
 from fleet_slip.grams.rows.aggregation import aggregate, by_sql
 from fleet_slip.grams.rows.check_grams import grams_of
-from fleet_slip.grams.rows.course_sums import course_changes
+from fleet_slip.grams.rows.course_sums import course_changes, find_fixes
 from fleet_slip.grams.rows.drive_rows import counts_of
 from fleet_slip.grams.rows.wide import wide_grams
 from fleet_slip.warehouse.tables import Warehouse
@@ -33,6 +35,7 @@ def hostile_drive(name: str, rows: int, seed: int, *, every: int = 10) -> pa.Tab
     for wheel in ("fl", "fr", "rl", "rr"):
         counts[f"wheel_{wheel}"] = rng.integers(0, 12_000, rows).astype(np.int16)
     counts["yaw_rate"] = rng.integers(-9000, 9000, rows).astype(np.int16)
+    counts["yaw_rate"][rows // 2 :] //= 64
     lost = (np.arange(rows) % every != 0) | (rng.random(rows) < 0.1)
     counts["course"] = pa.array(counts["course"], mask=lost)
     counts["ay"] = pa.array(counts["ay"], mask=rng.random(rows) < 0.05)
@@ -48,10 +51,10 @@ def nearest(value: Fraction) -> int:
     return int(math.copysign(math.floor(abs(value) + Fraction(1, 2)), value))
 
 
-def plain_changes(table: pa.Table, late: int = 0) -> dict[int, tuple[int, int]]:
-    """Tick of each change, and its turned and label, in words of plain Python."""
+def plain_changes(table: pa.Table, late: int = 0) -> dict[int, tuple[int, ...]]:
+    """Tick of each change, and its last four columns, in words of plain Python."""
     rows = {row["tick"]: row for row in table.to_pylist()}
-    units, found = course_units(), {}
+    units, found = course_units(), dict[int, tuple[int, ...]]()
     whole = math.floor(Fraction(late, 4) + Fraction(1, 2))
     for tick in rows:
         now, before = (rows.get(t + whole, {}).get("course") for t in (tick, tick - APART))
@@ -64,7 +67,9 @@ def plain_changes(table: pa.Table, late: int = 0) -> dict[int, tuple[int, int]]:
         angle += 2 * rest * (between[-1] - between[0])
         angle -= units.turn * nearest(angle / units.turn)
         if abs(angle) * Fraction(1, 2_000_000) <= LARGEST_RAD:
-            found[tick] = (nearest(Fraction(turned, 256)), nearest(angle / 200))
+            change = nearest(angle / 200)
+            slow = max(abs(between[0]), abs(between[-1])) <= 200 and abs(turned) <= 100_000
+            found[tick] = (nearest(Fraction(turned, 256)), slow, slow * change, change)
     return found
 
 
@@ -74,31 +79,45 @@ def test_the_changes_of_a_hostile_drive_are_those_of_plain_integers(late: int) -
     plan = ColumnPlan.of_set(features(), "course")
     workspace, counts = Workspace(plan), counts_of(table, plan, {})
     workspace.load(counts)
-    found = course_changes(workspace, counts, APART, late)
+    found = course_changes(find_fixes(workspace, counts, late), APART)
     expected = plain_changes(table, late)
     assert len(expected) > 40
     assert counts.ticks[found.rows].tolist() == [0, *expected]
     assert np.isnan(found.columns[:, 0]).all()
-    changes = found.columns[-2:, 1:].astype(int).tolist()
+    changes = found.columns[-4:, 1:].astype(int).tolist()
     assert list(zip(*changes, strict=True)) == list(expected.values())
+    assert 0 < sum(slow for _, slow, _, _ in expected.values()) < len(expected)
 
 
-@pytest.mark.parametrize("late", [None, {"car-1": -1}, {"car-1": 34, "other": 1}])
+@pytest.mark.parametrize(
+    ("name", "late"),
+    [("course", None), ("course", {"car-1": -1}), ("three", {"car-1": 34, "other": 1})],
+)
 def test_gram_rows_of_the_kernel_are_those_of_the_statement(
-    warehouse: Warehouse, late: dict[str, int] | None
+    warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch, name: str, late: dict[str, int] | None
 ) -> None:
+    """Also of several times, and with what a car knows of itself."""
+    gated = features().members("cornering")[0]
+    windows = ("ay_mean_16", "ay_mean_16_mass", gated, "course_sum_16", "ay_bias")
+    few = FeatureSet(description="few", signals=("ax", "ay"), windows=windows)
+    three = FeatureSet(description="three", of="few", change_s=(Decimal("3.5"), 4, 5))
+    monkeypatch.setitem(features().sets, "few", few)
+    monkeypatch.setitem(features().sets, "three", three)
+    assert features().feature_set("three").windows == windows[:3]
     land(warehouse, "one", hostile_drive("b", 4000, 1), hostile_drive("a", 300, 2))
     land(warehouse, "two", hostile_drive("c", 9000, 3), hostile_drive("d", 2500, 4, every=1))
     files = warehouse.logs.snapshot().files
-    kernel = wide_grams(warehouse, files, "course", late)
-    defined = by_sql(warehouse, files, "course", late).cast(kernel.schema)
+    kernel = wide_grams(warehouse, files, name, late)
+    defined = by_sql(warehouse, files, name, late).cast(kernel.schema)
     changed = kernel.filter(pc.match_substring(kernel["signals"], TURNED))
     assert set(changed["drive_id"].to_pylist()) == {"b", "c", "d"}
     assert {"ay", TURNED, LABEL} <= set(changed["signals"][0].as_py().split(","))
     assert grams_of(kernel) == grams_of(defined)
-    for name in kernel.column_names:
-        assert kernel[name].to_pylist() == defined[name].to_pylist(), name
-    assert aggregate(warehouse, files, feature_set="course", late=late).equals(kernel)
+    for column in kernel.column_names:
+        assert kernel[column].to_pylist() == defined[column].to_pylist(), column
+    parts = {"course": {None}, "three": {"3.5 s", "4 s", "5 s"}}
+    assert set(changed["part"].to_pylist()) == parts[name]
+    assert aggregate(warehouse, files, feature_set=name, late=late).equals(kernel)
     assert set(kernel["course_late"].to_pylist()) == {(late or {}).get("car-1")}
 
 
@@ -124,13 +143,13 @@ def test_the_label_is_the_change_of_the_side_slip_angle() -> None:
     plan = ColumnPlan.of_set(features(), "course")
     workspace, loaded = Workspace(plan), counts_of(log_rows("a", counts), plan, {})
     workspace.load(loaded)
-    found = course_changes(workspace, loaded, APART)
+    found = course_changes(find_fixes(workspace, loaded), APART)
     rows, columns = found.rows[1:], found.columns[:, 1:]
     assert len(rows) == 460
     changed = slip[rows] - slip[rows - APART]
     assert np.abs(columns[-1] * 1e-4 - changed).max() < 3e-4
     turned = heading[rows] - heading[rows - APART]
-    assert np.abs(columns[-2] * 1.28e-4 - turned).max() < 2e-4
+    assert np.abs(columns[-4] * 1.28e-4 - turned).max() < 2e-4
 
 
 def test_a_turn_is_a_whole_number_of_integrated_counts() -> None:
