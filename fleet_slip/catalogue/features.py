@@ -69,6 +69,9 @@ class FeatureCatalogue(Config):
             unknown += [w for w in one.windows if w not in known or w in self.calibrated]
             unknown += [c for c in one.calibrated if c not in self.calibrated]
             unknown += [one.of] if one.of and one.of not in self.sets else []
+            still = [c for c in one.calibrated if one.change_s and self.calibrated[c].alone]
+            if still:
+                raise ValueError(f"sets.{name}: {', '.join(still)}: a number does not change")
             if unknown:
                 raise ValueError(f"sets.{name}: unknown {', '.join(unknown)}")
         return self
@@ -168,19 +171,22 @@ class FeatureCatalogue(Config):
         return one.model_copy(update={"windows": tuple(dict.fromkeys(members))})
 
     def _changes_of(self, one: FeatureSet, of: FeatureSet) -> FeatureSet:
-        """Return a set with the columns of another that have no noise in common with the course.
+        """Return a set with the columns of another whose changes tell something.
 
-        A sum of the yaw rate has that of the gyroscope, which least squares takes for knowledge; a
-        mean since the drive began hardly changes.
+        A sum of the yaw rate has the gyroscope's noise in common with the course, which least
+        squares takes for knowledge. A mean since the drive began hardly changes, a number of the
+        car not at all.
         """
-        kept = tuple(name for name in of.windows if not self._sums_yaw_rate(name))
-        calibrated = tuple(c for c in of.calibrated if not self._sums_yaw_rate(c))
-        columns = {"signals": of.signals, "features": of.features, "windows": kept}
-        return one.model_copy(update={**columns, "calibrated": calibrated})
+        columns = {"signals": of.signals, "features": of.features}
+        for kind in ("windows", "calibrated"):
+            columns[kind] = tuple(name for name in getattr(of, kind) if self._changes(name))
+        return one.model_copy(update=columns)
 
-    def _sums_yaw_rate(self, name: str) -> bool:
+    def _changes(self, name: str) -> bool:
         one = self.time_columns[name].definition
-        return one.over == "running_mean" or (one.over == "sum" and YAW_RATE in one.signals)
+        alone = one.number is not None and one.number.alone
+        summed = one.over == "sum" and YAW_RATE in one.signals
+        return not (alone or summed or one.over == "running_mean")
 
     def members(self, name: str) -> tuple[str, ...]:
         """Return the columns of a family of windows or gates; any other name stays."""

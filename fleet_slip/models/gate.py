@@ -29,6 +29,7 @@ from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.regression.choice.winner import Shortfall, Worth, compare_paired, compare_typical
 from fleet_slip.regression.exact.figures import error_sums
+from fleet_slip.regression.exact.least_squares import LinearModel
 from fleet_slip.regression.validation.crossval import (
     CrossValidation,
     assemble,
@@ -132,26 +133,29 @@ def compare(selection: Selection[Any], incumbents: Sequence[ModelVersion]) -> Co
     for version in incumbents:
         _require_same_features(version)
     label, inputs = catalogue().label, selection.winner.model.signals
-    every = (name for version in incumbents for name in version.manifest.signals)
+    feature_set = selection.cohort.feature_set
+    models = [counts_model(version.manifest, feature_set) for version in incumbents]
+    every = (name for model in models for name in model.signals)
     signals = tuple(dict.fromkeys((*inputs, *every)))
     cars = selection.cohort.members.count_vehicles_with((*signals, label))
     by: FoldKey = "vehicle" if cars >= LEAST_VEHICLES else "drive"
     groups = selection.cohort.folds(by, GROUPS).serving(signals, label, sparse=True)
     procedure = least_squares(inputs, label, intercept=selection.intercept)
     challenger = cross_validate(selection.winner.model.name, groups, procedure, input_scales())
-    feature_set = selection.cohort.feature_set
-    others = tuple(_as_it_is(version, groups, feature_set) for version in incumbents)
+    others = tuple(
+        _as_it_is(version.reference, model, groups)
+        for version, model in zip(incumbents, models, strict=True)
+    )
     worth = Worth(math.radians(floor().worth_deg))
     shortfalls = tuple(compare_paired(challenger, other, worth) for other in others)
     typical = tuple(compare_typical(challenger, other, worth) for other in others)
     return Comparison(by, challenger, others, shortfalls, typical if by == "vehicle" else ())
 
 
-def _as_it_is(version: ModelVersion, folds: Folds, feature_set: str) -> CrossValidation:
+def _as_it_is(name: str, model: LinearModel, folds: Folds) -> CrossValidation:
     """Return the figures of a published model over folds, none of which it is fitted to again."""
-    model = counts_model(version.manifest, feature_set)
     tests = [error_sums(model, test) for test in folds.grams]
-    return assemble(version.reference, folds, tests, model, input_scales())
+    return assemble(name, folds, tests, model, input_scales())
 
 
 def faults(manifest: Manifest, champion: Manifest | None) -> list[str]:

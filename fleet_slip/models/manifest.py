@@ -130,6 +130,12 @@ class ModelTerm(Config):
         return not self.sql and self.definition is None
 
     @property
+    def alone(self) -> bool:
+        """Whether it is a number of the car, the same all the time."""
+        number = self.definition.number if self.definition else None
+        return number is not None and number.alone
+
+    @property
     def scale_exact(self) -> Fraction:
         """Physical value of one count, exactly."""
         return Fraction(self.scale)

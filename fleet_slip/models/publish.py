@@ -7,7 +7,7 @@ from fractions import Fraction
 from importlib.metadata import version as package_version
 from typing import Any
 
-from fleet_slip.catalogue.features import features
+from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError, RefusedError
 from fleet_slip.models.aliases import CANDIDATE, CHAMPION, AliasMove
@@ -113,9 +113,11 @@ def with_straight_intercept(warehouse: Warehouse, manifest: Manifest) -> Manifes
         ),
         intercept_spread_deg=math.degrees(found.spread),
     )
-    told = 0.0 if manifest.through_origin else found.intercept
-    own = {"intercept": told, "intercept_exact": Fraction(told)}
-    return manifest.model_copy(update={**own, "learned_from": learned})
+    told = Fraction(0) if manifest.through_origin else found.intercept
+    scales = input_scales()
+    terms = (_term(column, slope / scales[column]) for column, slope in found.slopes.items())
+    own = {"intercept": float(told), "intercept_exact": told, "learned_from": learned}
+    return manifest.model_copy(update={**own, "terms": (*manifest.terms, *terms)})
 
 
 def _term(name: str, coefficient: Fraction) -> ModelTerm:

@@ -2,18 +2,26 @@
 
 What a car's signals are when it goes straight without lateral force follows from the offsets of its
 gyroscope and accelerometer, which its drives tell without a label (`calibrate`): each signal is
-fitted as a plane in both over all rows of the car, and read at these offsets. The model's columns
-of such a drive, without end and even, must add up to no side-slip angle.
+fitted as a plane in both over all rows of the car, and read at these offsets. From there the car is
+led into bends as hard as usual, left and right alike, each even and without end: the model's
+columns must add up to no side-slip angle on average, as an offset that is squared does not when
+going straight on alone.
+
+Cars differ in this, and mostly by their offsets: where there are several cars, these become columns
+of the model, whose coefficients no change can tell.
 """
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
+from statistics import NormalDist
 
 import numpy as np
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.car_numbers import NumberName
+from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.blocks.drive_columns import DriveCounts
 from fleet_slip.errors import DataError
@@ -23,14 +31,25 @@ from fleet_slip.grams.cohorts.gram_cohort import Cohort, load_cohort
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predictor import Predictor
 from fleet_slip.regression.exact.gram import Gram
-from fleet_slip.regression.exact.least_squares import fit
+from fleet_slip.regression.exact.least_squares import LinearModel, fit
 from fleet_slip.warehouse.condition import Condition
 from fleet_slip.warehouse.tables import Warehouse
 
 OFFSETS: Mapping[str, NumberName] = {"ay": "ay_offset", "yaw_rate": "yaw_rate_offset"}
 """The signals that are off, and the numbers that tell by how much."""
+COLUMNS: Mapping[str, NumberName] = {
+    "ay_offset_alone": "ay_offset",
+    "yaw_rate_offset_alone": "yaw_rate_offset",
+}
+"""The calibrated columns that are a car's offsets."""
+FEWEST_CARS, WORTH_RAD = 8, math.radians(0.005)
+"""Fewer cars, and cars that differ by less, have one intercept."""
+GRAIN_RAD = Fraction(1, 10**9)
+"""Of the intercepts that the offsets' coefficients are fitted to, in whole numbers."""
 ROWS = 2048
-"""Ticks of the even drive: more than the shipped windows look back on."""
+"""Ticks of an even bend: more than most shipped windows look back on."""
+BENDS = tuple(NormalDist().inv_cdf((i + 0.5) / 7) for i in range(7))
+"""Lateral acceleration in bends, in standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -38,14 +57,17 @@ class StraightOn:
     """What cars that go straight say of an intercept.
 
     Attributes:
-        intercept: rad, the mean of the cars, each counting as often as it has rows.
+        intercept: rad, the mean of the cars, each counting as often as it has rows; with slopes,
+            that of a car without offsets.
+        slopes: rad for a count of the offset, by its column; none of few cars, or of like ones.
         uncertainty: rad, of the mean, from the uncertainty of the cars' offsets; where that of one
             is not known, from how cars differ, and None of one car.
-        spread: rad, standard deviation between cars.
+        spread: rad, standard deviation between cars of what the slopes do not tell.
         cars: how many.
     """
 
-    intercept: float
+    intercept: Fraction
+    slopes: Mapping[str, Fraction]
     uncertainty: float | None
     spread: float
     cars: int
@@ -65,14 +87,15 @@ def straight_on(warehouse: Warehouse, condition: Condition, manifest: Manifest) 
     for car, gram, facts in _by_car(cohort, tuple(dict.fromkeys((*OFFSETS, *signals)))):
         known = numbers.get(car, {})
         if set(OFFSETS.values()) <= set(known):
-            found.append((gram.n, *_of_car(predictor, gram, signals, known, facts)))
+            told = _of_car(predictor, gram, signals, known, facts)
+            found.append((gram.n, *told, *(known[one].count for one in COLUMNS.values())))
     if not found:
         raise DataError(
             f"no car of {condition.text!r} tells the offsets of its sensors, which the intercept "
             f"follows from, and logs {', '.join(signals)}. Choose more drives; see fleet-slip "
             "calibrate."
         )
-    rows, means, variances = np.array(found, dtype=np.float64).T
+    rows, means, variances, *offsets = np.array(found, dtype=np.float64).T
     share = rows / rows.sum()
     mean = float(share @ means)
     spread = math.sqrt(float(share @ (means - mean) ** 2))
@@ -80,7 +103,44 @@ def straight_on(warehouse: Warehouse, condition: Condition, manifest: Manifest) 
     if math.isnan(variance):
         variance = spread**2 / len(found) if len(found) > 1 else math.nan
     uncertainty = None if math.isnan(variance) else math.sqrt(variance)
-    return StraightOn(mean, uncertainty, spread, len(found))
+    own = None
+    if len(found) >= FEWEST_CARS and spread >= WORTH_RAD:
+        own = _by_offsets(rows, np.array(offsets), means)
+    if own is None:
+        return StraightOn(Fraction(mean), {}, uncertainty, spread, len(found))
+    rest = means - float(own.offset) - np.array(own.coefficients, dtype=np.float64) @ offsets
+    spread = math.sqrt(float(share @ (rest - share @ rest) ** 2))
+    slopes = dict(zip(own.signals, own.coefficients, strict=True))
+    return StraightOn(own.intercept, slopes, uncertainty, spread, len(found))
+
+
+def _by_offsets(rows: FloatArray, offsets: FloatArray, means: FloatArray) -> LinearModel | None:
+    """Fit the intercepts of cars to the counts of their offsets; None if these go together.
+
+    In rad for a count, and exact.
+    """
+    if not set(COLUMNS) <= set(features().calibrated):
+        return None
+    grains = np.rint(means / float(GRAIN_RAD))
+    columns = np.stack([*offsets, grains]).astype(np.int64).astype(object)
+    weights = rows.astype(np.int64).astype(object)
+    products = [
+        int((weights * columns[i] * columns[j]).sum())
+        for i in range(len(columns))
+        for j in range(i + 1)
+    ]
+    sums = tuple(int(total) for total in (columns * weights).sum(axis=1))
+    names = (*COLUMNS, "intercept")
+    gram = Gram(names, int(weights.sum()), sums, tuple(products))
+    try:
+        found = fit(gram, tuple(COLUMNS), "intercept").model
+    except DataError:
+        return None
+    return replace(
+        found,
+        coefficients=tuple(one * GRAIN_RAD for one in found.coefficients),
+        intercept=found.intercept * GRAIN_RAD,
+    )
 
 
 def _by_car(cohort: Cohort, signals: Sequence[str]) -> list[tuple[str, Gram, Mapping[str, object]]]:
@@ -112,8 +172,13 @@ def _of_car(
         name: fit(gram, tuple(OFFSETS), name).model for name in signals if name not in OFFSETS
     }
     numbers: dict[str, int] = {name: one.count for name, one in known.items()}
+    bends = {
+        name: fit(gram, ("ay",), name).model.coefficients[0] for name in signals if name != "ay"
+    }
+    variance = gram.n * gram.products[0] - gram.sums[0] ** 2
+    usual = math.sqrt(variance) / gram.n
 
-    def estimate(**more: float) -> float:
+    def estimate(bend: Sequence[float], more: Mapping[str, float]) -> float:
         at = {
             name: Fraction(known[of].value + more.get(name, 0.0)) / catalogue()[name].exact_scale
             for name, of in OFFSETS.items()
@@ -121,21 +186,24 @@ def _of_car(
         for name, plane in planes.items():
             slopes = zip(OFFSETS, plane.coefficients, strict=True)
             at[name] = plane.intercept + sum((c * at[of] for of, c in slopes), Fraction(0))
+        further = usual * np.repeat(bend, ROWS)
         counts = {
-            name: np.full(ROWS, min(max(round(at[name]), -(2**15)), 2**15 - 1), dtype=np.int16)
+            name: np.clip(
+                np.rint(float(at[name]) + float(bends.get(name, 1)) * further), -(2**15), 2**15 - 1
+            ).astype(np.int16)
             for name in signals
         }
-        drive = DriveCounts(np.arange(ROWS, dtype=np.int32), counts, {}, facts, numbers)
-        return float(predictor(drive)[-1])
+        drive = DriveCounts(np.arange(len(further), dtype=np.int32), counts, {}, facts, numbers)
+        return math.fsum(predictor(drive)[ROWS - 1 :: ROWS].tolist()) / len(bend)
 
-    straight = estimate()
-    if math.isnan(straight):
+    straight, found = estimate((0.0,), {}), estimate(BENDS, {})
+    if math.isnan(found):
         raise DataError("a column of the model has no value where the car goes straight on.")
     told = [known[of].uncertainty for of in OFFSETS.values()]
     steps = [one for one in told if one is not None]
     if len(steps) < len(told):
-        return -straight, math.nan
+        return -found, math.nan
     shifts = [
-        estimate(**{name: step}) - straight for name, step in zip(OFFSETS, steps, strict=True)
+        estimate((0.0,), {name: step}) - straight for name, step in zip(OFFSETS, steps, strict=True)
     ]
-    return -straight, math.fsum(shift * shift for shift in shifts)
+    return -found, math.fsum(shift * shift for shift in shifts)

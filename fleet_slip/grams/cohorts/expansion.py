@@ -86,15 +86,8 @@ class Expansion:
         }
         if not added:
             return table
-        # A number that stands alone does not change.
         factors = np.array(
-            [
-                [
-                    0 if self.sweep and n.alone else self.cars[one][n.name] - n.less
-                    for _, n in added.values()
-                ]
-                for one in ids
-            ],
+            [[self.cars[one][n.name] - n.less for _, n in added.values()] for one in ids],
             dtype=np.int64,
         )
         bases = [0 if n.alone else 1 + table.signals.index(of) for of, n in added.values()]
