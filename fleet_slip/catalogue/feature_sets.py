@@ -54,7 +54,7 @@ class FeatureSet(Config):
 
     description: str = Field(min_length=1)
     of: Identifier | None = None
-    """The set whose columns these are the changes of."""
+    """The set whose columns these are the changes of, beside those that are named."""
     signals: tuple[Identifier, ...] = ()
     features: tuple[Identifier, ...] = ()
     windows: tuple[Identifier, ...] = ()
@@ -78,8 +78,8 @@ class FeatureSet(Config):
     def _consistent(self) -> "FeatureSet":
         if self.of is None and not self.signals:
             raise ValueError("a set has signals, or is of another set")
-        if self.of is not None and (self.inputs or not self.change_s):
-            raise ValueError("a set of another has change_s, and no columns of its own")
+        if self.of is not None and not self.change_s:
+            raise ValueError("a set of another has change_s")
         unknown = [name for name in self.signals if name not in catalogue().feature_inputs]
         if unknown:
             raise ValueError(f"not input signals: {', '.join(unknown)}")

@@ -165,24 +165,26 @@ class FeatureCatalogue(Config):
             known = ", ".join((PLAIN, *self.sets))
             raise QuestionError(f"no feature set is called {name!r}. Feature sets: {known}.")
         one = self.sets[name]
-        if one.of is not None:
-            return self._changes_of(one, self.feature_set(one.of))
         members = [member for window in one.windows for member in self.members(window)]
-        return one.model_copy(update={"windows": tuple(dict.fromkeys(members))})
+        one = one.model_copy(update={"windows": tuple(dict.fromkeys(members))})
+        return one if one.of is None else self._changes_of(one, self.feature_set(one.of))
 
     def _changes_of(self, one: FeatureSet, of: FeatureSet) -> FeatureSet:
-        """Return a set with the columns of another whose changes tell something.
+        """Return a set with the columns of another whose changes tell something, beside its own.
 
         A sum of the yaw rate has the gyroscope's noise in common with the course, which least
         squares takes for knowledge. A mean since the drive began hardly changes, a number of the
         car not at all.
         """
-        columns = {"signals": of.signals, "features": of.features}
-        for kind in ("windows", "calibrated"):
-            columns[kind] = tuple(name for name in getattr(of, kind) if self._changes(name))
+        columns = {}
+        for kind in ("signals", "features", "windows", "calibrated"):
+            both = dict.fromkeys((*getattr(of, kind), *getattr(one, kind)))
+            columns[kind] = tuple(name for name in both if self._changes(name))
         return one.model_copy(update=columns)
 
     def _changes(self, name: str) -> bool:
+        if name not in self.time_columns:
+            return True
         one = self.time_columns[name].definition
         alone = one.number is not None and one.number.alone
         summed = one.over == "sum" and YAW_RATE in one.signals

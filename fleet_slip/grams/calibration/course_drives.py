@@ -23,7 +23,8 @@ def course_moments(reader: GramReader, condition: Condition) -> Moments:
 
     Of the first feature set whose Gram rows are there for the whole cohort; empty without one.
     """
-    for name, one in features().sets.items():
+    for name in features().sets:
+        one = features().feature_set(name)
         if one.change_ticks and set(COLUMNS) <= set(one.columns):
             try:
                 opened = reader.opened(name, condition)
