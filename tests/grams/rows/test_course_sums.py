@@ -100,7 +100,9 @@ def test_gram_rows_of_the_kernel_are_those_of_the_statement(
     gated = features().members("cornering")[0]
     windows = ("ay_mean_16", "ay_mean_16_mass", gated, "course_sum_16", "ay_bias")
     few = FeatureSet(description="few", signals=("ax", "ay"), windows=windows)
-    three = FeatureSet(description="three", of="few", change_s=(Decimal("3.5"), 4, 5))
+    three = FeatureSet(
+        description="three", of="few", change_s=(Decimal("3.5"), Decimal(4), Decimal(5))
+    )
     monkeypatch.setitem(features().sets, "few", few)
     monkeypatch.setitem(features().sets, "three", three)
     assert features().feature_set("three").windows == windows[:3]
