@@ -16,7 +16,8 @@ from functools import partial
 import numpy as np
 from highway_env.vehicle.dynamics import BicycleVehicle
 
-from fleet_slip.simulation.track import SpeedLimits, load_track, speed_profile
+from fleet_slip.simulation.roads import load_track
+from fleet_slip.simulation.track import SpeedLimits, speed_profile
 from fleet_slip.vehicle.driver import SAMPLE_S
 from fleet_slip.vehicle.highway import FourWheelVehicle
 from fleet_slip.vehicle.lanes.lane_drives import STEPS_PER_SAMPLE, LaneDrive, simulate_blocks

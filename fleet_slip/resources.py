@@ -11,7 +11,14 @@ from fleet_slip.errors import ConfigError
 CONFIG_VARIABLE = "FLEET_SLIP_CONFIG"
 """Names a folder of configs that is laid over the shipped ones."""
 
-CONFIG_FILES = ("signals.toml", "features.toml", "monitor.toml", "publish.toml", "retention.toml")
+CONFIG_FILES = (
+    "blind.toml",
+    "signals.toml",
+    "features.toml",
+    "monitor.toml",
+    "publish.toml",
+    "retention.toml",
+)
 CONFIG_FOLDERS = ("campaigns", "mappings", "models", "scenarios", "tracks", "vehicles")
 
 ShippedFolder = Literal["configs", "jobs", "warehouse"]

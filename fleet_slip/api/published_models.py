@@ -17,6 +17,7 @@ from fleet_slip.models.versions import Registry
 if TYPE_CHECKING:
     import pyarrow as pa
 
+    from fleet_slip.comparison.evaluation.blind import BlindRow
     from fleet_slip.comparison.evaluation.evaluate import TrainRivals
     from fleet_slip.comparison.report.page import Written
     from fleet_slip.export.estimator import Estimator
@@ -193,20 +194,39 @@ class PublishedModels(Rooted):
         from fleet_slip.files.documents import Document
         from fleet_slip.simulation.scenario import load_scenario, shipped_scenarios
 
-        train_rivals: TrainRivals | None = None
-        if rivals:
-            from fleet_slip.comparison.rivals import compare  # an optional extra
-
-            train_rivals = compare.train_rivals
         chosen = tuple(map(load_scenario, scenarios)) if scenarios else shipped_scenarios()
         first, *rest = [self.resolve(one) for one in (model, *others)]
         with open_workers(self.root, threads) as executor:
             told = count_from_start(progress)
             simulate_scenarios(self.warehouse, chosen, executor, told)
-            found = evaluate(self.warehouse, chosen, first, rest, executor, train_rivals)
+            found = evaluate(self.warehouse, chosen, first, rest, executor, _rivals_if(rivals))
         content = found.as_dict()
         kept = keep(self.warehouse, content)
         return Document(kept.number, content, kept.sha256)
+
+    def evaluate_blind(
+        self,
+        model: str | ModelVersion,
+        others: Sequence[str | ModelVersion] = (),
+        *,
+        rivals: bool = False,
+        threads: int | None = None,
+    ) -> "tuple[BlindRow, ...]":
+        """Judge models, and all that `evaluate` trains beside them, on drives of the first.
+
+        Roads, cars, weather and noise are drawn from the hash of its version, so that nobody has
+        seen them before it was published (`configs/blind.toml`). Nothing is written. Returns
+        figures over all drives, by class of road, by weather and by drive.
+
+        Raises what `evaluate` raises.
+        """
+        from fleet_slip.comparison.evaluation.blind import judge_blindly
+        from fleet_slip.comparison.evaluation.evaluate import train_competitors
+
+        first, *rest = [self.resolve(one) for one in (model, *others)]
+        with open_workers(self.root, threads) as executor:
+            trained = train_competitors(self.warehouse, first, rest, executor, _rivals_if(rivals))
+        return judge_blindly(first.sha256, trained.estimators)
 
     def report(self, model: str | ModelVersion, output: Path | None = None) -> "Written":
         """Write one page that lays our figures beside the paper's, from the latest evaluation.
@@ -344,3 +364,12 @@ class PublishedModels(Rooted):
     def resolve(self, model: str | ModelVersion) -> ModelVersion:
         """Return the version that a reference names; a version is returned as it is."""
         return model if isinstance(model, ModelVersion) else self.model(model)
+
+
+def _rivals_if(wanted: bool) -> "TrainRivals | None":
+    """Return what trains the rivals, where they are wanted."""
+    if not wanted:
+        return None
+    from fleet_slip.comparison.rivals import compare  # an optional extra
+
+    return compare.train_rivals

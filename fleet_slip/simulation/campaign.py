@@ -22,9 +22,10 @@ from fleet_slip.catalogue.signals import Identifier
 from fleet_slip.config import Config, load_config, load_toml
 from fleet_slip.errors import ConfigError, UsageError
 from fleet_slip.resources import find_config
-from fleet_slip.simulation.drive_plan import FleetPlan, GridPlan, random_generator
+from fleet_slip.simulation.drive_plan import FleetPlan, GridPlan
 from fleet_slip.simulation.imperfections import NONE, Imperfections
 from fleet_slip.simulation.manoeuvres import Manoeuvre
+from fleet_slip.simulation.random_numbers import random_generator
 from fleet_slip.simulation.sensing.distortion import Distortion
 from fleet_slip.simulation.sensing.receivers import Receiver, Receivers
 from fleet_slip.simulation.sensing.sensors import SAMPLE_RATE_HZ, Sensors

@@ -1,6 +1,5 @@
 """How a campaign chooses car, road and speed for each of its drives: from a grid, or at random."""
 
-import hashlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,8 +18,9 @@ from fleet_slip.simulation.imperfections import (
     Range,
 )
 from fleet_slip.simulation.manoeuvres import Manoeuvre
+from fleet_slip.simulation.roads import load_track
 from fleet_slip.simulation.sensing.sensors import Sensors
-from fleet_slip.simulation.track import SpeedLimits, Track, load_track
+from fleet_slip.simulation.track import SpeedLimits, Track
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2, VehicleParameters, load_vehicle
 
 GOLDEN_RATIO = (1 + math.sqrt(5)) / 2
@@ -44,13 +44,6 @@ NamedTrack = Annotated[Track, load_by_name(load_track)]
 NamedVehicle = Annotated[VehicleParameters, load_by_name(load_vehicle)]
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 NotEmpty = Field(min_length=1)
-
-
-def random_generator(seed: int, *identity: str) -> np.random.Generator:
-    """Return a generator that depends on the seed and on what it is for, and on nothing else."""
-    digest = hashlib.sha256("\n".join(identity).encode()).digest()
-    words = np.frombuffer(digest, dtype="<u4").tolist()
-    return np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, *words])))
 
 
 class Uniform(Range):

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import pyarrow as pa
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.simulation.campaign import Batch, DriveSpec
 from fleet_slip.simulation.manoeuvres import road_with
@@ -116,6 +117,21 @@ def simulate_logs(specs: Sequence[DriveSpec]) -> list[DriveLog]:
                 receiver.fixes() if receiver else None,
             )
     return [logs[drive] for drive in range(len(specs))]
+
+
+MOTION = ("vx_mps", "vy_mps", "station_m", "lateral_offset_m")
+"""What of the truth an evaluation needs, as no sensor measures it."""
+
+
+def exact_motion(specs: Sequence[DriveSpec]) -> list[dict[str, FloatArray]]:
+    """Return the channels of `MOTION` of each drive at 100 Hz, not rounded to counts."""
+    blocks: list[list[dict[str, FloatArray]]] = [[] for _ in specs]
+    for block in simulate_blocks([lane_drive(spec) for spec in specs]):
+        blocks[block.drive].append({name: block.channels[name].copy() for name in MOTION})
+    return [
+        {name: np.concatenate([part[name] for part in parts]) for name in MOTION}
+        for parts in blocks
+    ]
 
 
 def tabulate(batch: Batch, logs: Sequence[DriveLog]) -> pa.Table:

@@ -17,8 +17,7 @@ from pydantic import Field, FiniteFloat, model_validator
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import Identifier
 from fleet_slip.compiling import kernel
-from fleet_slip.config import Config, load_config
-from fleet_slip.resources import find_config
+from fleet_slip.config import Config
 
 CLOSURE_TOLERANCE_M = 0.05
 """Largest gap between the ends of a closed track, in m."""
@@ -173,11 +172,6 @@ class Track(Config):
 
 def _cumulative(increments: FloatArray) -> FloatArray:
     return np.concatenate([[0.0], np.cumsum(increments)])
-
-
-def load_track(name_or_path: str) -> Track:
-    """Read a track by the name of a shipped one or by path. Raises `ConfigError`."""
-    return load_config(find_config("tracks", name_or_path), Track)
 
 
 class SpeedLimits(Config):

@@ -17,9 +17,9 @@ from fleet_slip.simulation.imperfections import (
     Range,
     RoadImperfections,
 )
+from fleet_slip.simulation.roads import load_track
 from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.simulation.surface import surface
-from fleet_slip.simulation.track import load_track
 from fleet_slip.vehicle.driver import handling
 from fleet_slip.vehicle.parameters import load_vehicle
 

@@ -10,7 +10,8 @@ from scipy.special import fresnel
 
 from fleet_slip.errors import ConfigError
 from fleet_slip.resources import config_names
-from fleet_slip.simulation.track import Segment, Track, load_track
+from fleet_slip.simulation.roads import load_track
+from fleet_slip.simulation.track import Segment, Track
 from tests.support.evidence import EVIDENCE
 
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from fleet_slip.errors import ConfigError
-from fleet_slip.simulation.track import SpeedLimits, load_track, speed_profile
+from fleet_slip.simulation.roads import load_track
+from fleet_slip.simulation.track import SpeedLimits, speed_profile
 from fleet_slip.vehicle.lanes import lane_kernel
 from fleet_slip.vehicle.lanes.lane_drives import LaneDrive, simulate_blocks
 from fleet_slip.vehicle.lanes.lane_memory import BLOCK, CHANNELS

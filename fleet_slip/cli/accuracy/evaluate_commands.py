@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from fleet_slip.catalogue.sources import ALL_DRIVES
-from fleet_slip.cli.accuracy.evaluation_tables import print_evaluation, print_summary
+from fleet_slip.cli.accuracy.evaluation_tables import print_blind, print_evaluation, print_summary
 from fleet_slip.cli.begin.run_command import DEFAULT_CAMPAIGN
 from fleet_slip.cli.completing import complete_config, complete_model
 from fleet_slip.cli.models.diff_command import score_against
@@ -15,6 +15,7 @@ from fleet_slip.cli.output import Json, print_json, print_table, say
 from fleet_slip.cli.progress_bar import progress
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.workers import Threads
+from fleet_slip.errors import UsageError
 from fleet_slip.models.score import score_statement
 from fleet_slip.words import number_of
 
@@ -94,6 +95,14 @@ def evaluate(
             "Takes minutes, and needs scikit-learn.",
         ),
     ] = False,
+    blind: Annotated[
+        bool,
+        typer.Option(
+            "--blind",
+            help="Judge on roads, cars, weather and drivers that are drawn from the hash of the "
+            "model's version, which nobody can have seen before it was published.",
+        ),
+    ] = False,
     threads: Threads = None,
     everything: Annotated[
         bool,
@@ -108,6 +117,15 @@ def evaluate(
 
     Example: **fleet-slip evaluate --one-car waterford --scenario nominal**
     """
+    if blind:
+        if scenario:
+            raise UsageError("--blind has drives of its own: leave out --scenario.")
+        rows = context.obj.evaluate_blind(one_car, fleet or (), rivals=rivals, threads=threads)
+        if json:
+            print_json({"blind": [row.as_dict() for row in rows]})
+        else:
+            print_blind(rows, everything)
+        return
     with progress("simulate scenarios", "rows") as show:
         kept = context.obj.evaluate(
             one_car,

@@ -2,13 +2,17 @@
 
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from fleet_slip.cli.output import print_table, print_text, stdout
 from fleet_slip.words import number_of
 
 PLACES = ("inside", "outside")
 """Of an unstable section."""
+
+if TYPE_CHECKING:
+    from fleet_slip.comparison.evaluation.blind import BlindRow
+    from fleet_slip.comparison.evaluation.scenario_runs import ErrorFigures
 
 
 def print_evaluation(content: dict[str, Any]) -> None:
@@ -273,3 +277,40 @@ def _requirements(checks: Sequence[Mapping[str, Any]]) -> list[str]:
     missed = sum(not check["reached"] for check in checks)
     asked = number_of(len(checks), "requirement")
     return [f"Of {asked} of the paper's scenarios, its own models miss {missed}."]
+
+
+def print_blind(rows: Sequence["BlindRow"], everything: bool) -> None:
+    """Print how far estimators are off on blind drives: published models and filters, or all."""
+    names = [
+        name
+        for name, one in rows[0].figures.items()
+        if one.rmse_deg is not None and (everything or "/" not in name)
+    ]
+    names.sort(key=lambda name: ("@" not in name, rows[0].figures[name].rmse_deg))
+    shown = names if everything else names[:BLIND_NAMES]
+    print_table(
+        "Blind drives: RMSE in deg against the exact angle",
+        ["drives", "m/s", "side-slip std", *map(_heading, shown)],
+        [
+            [
+                row.name.replace("_", " "),
+                f"{row.speed_mps[0]:.0f} to {row.speed_mps[1]:.0f}",
+                f"{row.sideslip_std_deg:.2f}",
+                *(_blind_cell(row.figures[name]) for name in shown),
+            ]
+            for row in rows
+            if everything or row.drives > 1
+        ],
+    )
+    if not everything:
+        print_text("Every drive, and all estimators: --all; for machines --json.")
+
+
+BLIND_NAMES = 5
+"""Estimators of the table that is printed first: published models, then the best of the others."""
+
+
+def _blind_cell(one: "ErrorFigures") -> str:
+    if one.rmse_deg is None:
+        return "none"
+    return f"{one.rmse_deg:.3f}" + ("" if one.coverage == 1 else f" ({one.coverage:.0%})")

@@ -23,6 +23,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import SCENARIO
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.resources import read_sql
+from fleet_slip.simulation.drives import DriveLog, exact_motion, simulate_logs
 from fleet_slip.simulation.scenario import Failure, Scenario
 from fleet_slip.simulation.sensing.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ
 from fleet_slip.vehicle.parameters import VehicleParameters, constants
@@ -103,6 +104,34 @@ def load_drives(warehouse: Warehouse, scenarios: Sequence[Scenario]) -> tuple[Ev
     ):
         rows = database.sql(statement, params={"drives": drives}).to_arrow_table()
     return tuple(_drive(scenario, rows) for scenario in scenarios)
+
+
+def simulate_drives(scenarios: Sequence[Scenario]) -> tuple[EvaluatedDrive, ...]:
+    """Simulate the drives of scenarios for this evaluation alone: nothing is written.
+
+    Estimators see what the log would hold; the truth is exact.
+    """
+    specs = [scenario.batch().drives[0] for scenario in scenarios]
+    logs, truths = simulate_logs(specs), exact_motion(specs)
+    return tuple(
+        _measured(scenario, log, truth)
+        for scenario, log, truth in zip(scenarios, logs, truths, strict=True)
+    )
+
+
+def _measured(scenario: Scenario, log: DriveLog, truth: Mapping[str, FloatArray]) -> EvaluatedDrive:
+    signals = {}
+    for name in visible_signals():
+        values = log.measurement.counts[name] * float(catalogue()[name].scale)
+        missing = name in GPS_SIGNALS and ~log.measurement.gps_fix
+        signals[catalogue()[name].column] = np.where(missing, np.nan, values)
+    return EvaluatedDrive(
+        scenario=scenario,
+        time_s=np.arange(log.rows) / SAMPLE_RATE_HZ,
+        signals=signals,
+        **truth,
+        lost_control_s=log.lost_control_s,
+    )
 
 
 def _drive(scenario: Scenario, all_rows: pa.Table) -> EvaluatedDrive:

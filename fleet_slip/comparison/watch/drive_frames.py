@@ -15,8 +15,8 @@ from fleet_slip.comparison.report.gate_strips import gates_on
 from fleet_slip.errors import DataError, QuestionError, UsageError
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.resources import config_names
+from fleet_slip.simulation.roads import load_track
 from fleet_slip.simulation.scenario import load_scenario
-from fleet_slip.simulation.track import load_track
 from fleet_slip.views import connect
 from fleet_slip.warehouse.minimum_cohort import require_single_cars
 from fleet_slip.warehouse.tables import Warehouse

@@ -40,8 +40,8 @@ from fleet_slip.selection.answer_request import answer_request
 from fleet_slip.selection.model_list import load_model_list
 from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.simulation.campaign import load_campaign
+from fleet_slip.simulation.roads import load_track
 from fleet_slip.simulation.scenario import load_scenario
-from fleet_slip.simulation.track import load_track
 from fleet_slip.vehicle.parameters import load_vehicle
 from fleet_slip.views import connect
 from fleet_slip.warehouse.read_only_sql import one_query

@@ -1,0 +1,205 @@
+"""The blind set: test drives that nobody can look at before a model is published.
+
+Roads, cars, loads, tyres, weather, drivers and noise are drawn from the hash of the version that is
+judged (`configs/blind.toml` says from what). The drives are simulated for the judgement and kept
+nowhere: whoever has the version draws them again.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from fleet_slip.catalogue.signals import Identifier
+from fleet_slip.comparison.evaluation.estimators import Estimate
+from fleet_slip.comparison.evaluation.evaluated_drives import simulate_drives
+from fleet_slip.comparison.evaluation.scenario_runs import (
+    ErrorFigures,
+    EvaluatedScenario,
+    error_figures,
+    evaluate_drive,
+)
+from fleet_slip.config import Config, load_config
+from fleet_slip.resources import config_file
+from fleet_slip.simulation.campaign import Campaign, load_campaign
+from fleet_slip.simulation.drive_plan import FleetPlan, Uniform, load_by_name
+from fleet_slip.simulation.imperfections import ImperfectionRanges, NotNegative, Range
+from fleet_slip.simulation.random_numbers import random_generator
+from fleet_slip.simulation.roads import CLASSES, WANDER_S, draw_road, driven_line
+from fleet_slip.simulation.scenario import Scenario
+from fleet_slip.simulation.track import SpeedLimits, Track
+from fleet_slip.vehicle.parameters import GRAVITY_MPS2
+
+ALL = "all"
+"""What the figures over all drives are called, beside those of a class of road or a weather."""
+
+
+class Weather(Config):
+    """Adhesion of the road, and how much of it a driver uses who sees it."""
+
+    adhesion: Uniform
+    friction_use: Uniform
+    """Planned lateral acceleration over μ g."""
+
+
+class Drivers(Config):
+    """How drivers differ: the line, how they wander about it, and their temper."""
+
+    cut: Range
+    """How far ahead and behind a bend is rounded off, over the smallest radius of the class."""
+    wander_m: Range
+    acceleration_mps2: Uniform
+    """On a road with μ = 1; less on others."""
+    braking_mps2: Uniform
+    top_speed: Uniform
+    """Over that of the road's class."""
+
+    def line(self, road: Track, kind: str, of_drive: np.random.Generator) -> Track:
+        """Draw the line that a driver takes along a road of a class."""
+        cut_m = self.cut.draw(of_drive) * CLASSES[kind].radius_m[0]
+        every_m = WANDER_S * CLASSES[kind].top_speed_mps
+        return driven_line(road, cut_m, self.wander_m.draw(of_drive), every_m, of_drive)
+
+    def limits(
+        self, kind: str, adhesion: float, friction_use: float, of_drive: np.random.Generator
+    ) -> SpeedLimits:
+        """Draw how fast a driver goes who sees the adhesion."""
+        return SpeedLimits(
+            lateral_mps2=friction_use * adhesion * GRAVITY_MPS2,
+            acceleration_mps2=self.acceleration_mps2.draw(of_drive) * adhesion,
+            braking_mps2=self.braking_mps2.draw(of_drive) * adhesion,
+            top_speed_mps=self.top_speed.draw(of_drive) * CLASSES[kind].top_speed_mps,
+        )
+
+
+class BlindSet(Config):
+    """From what blind drives are drawn: each road once in every weather."""
+
+    campaign: Annotated[Campaign, load_by_name(load_campaign)]
+    """Whose cars, tyres, sensors and surfaces of roads are drawn."""
+    roads: tuple[Identifier, ...] = Field(min_length=1)
+    """The class of each road."""
+    weather: dict[Identifier, Weather] = Field(min_length=1)
+    load_kg: Range
+    load_position_m: Range
+    tyre_stiffness: Uniform
+    """Of a new tyre, over that of the vehicle's file."""
+    tyre_wear_days: NotNegative
+    """Tyres have been driven for up to so many days."""
+    drivers: Drivers
+
+    @property
+    def _fleet(self) -> tuple[FleetPlan, ImperfectionRanges]:
+        """The plan of the campaign's cars, and what is imperfect about them."""
+        plan = self.campaign.plan
+        if not isinstance(plan, FleetPlan) or plan.imperfections is None:
+            raise ValueError(f"{self.campaign.name} is no campaign of a fleet with imperfections")
+        return plan, plan.imperfections
+
+    @model_validator(mode="after")
+    def _is_known(self) -> Self:
+        _ = self._fleet
+        if strange := [kind for kind in self.roads if kind not in CLASSES]:
+            raise ValueError(f"{strange[0]!r} is no class of roads: {', '.join(CLASSES)}")
+        return self
+
+    def scenarios(self, seed: int) -> tuple[Scenario, ...]:
+        """Draw the drives: one for each road and weather, in this order."""
+        return tuple(
+            self._scenario(seed, number, kind, weather)
+            for number, kind in enumerate(self.roads)
+            for weather in self.weather
+        )
+
+    def _scenario(self, seed: int, number: int, kind: str, weather: str) -> Scenario:
+        plan, flaws = self._fleet
+        name = f"{kind}_{number}_{weather}"
+        of_drive = random_generator(seed, "blind", name)
+        road = draw_road(kind, seed + number)
+        adhesion = self.weather[weather].adhesion.draw(of_drive)
+        use = self.weather[weather].friction_use.draw(of_drive)
+        vehicle = plan.vehicles[of_drive.integers(len(plan.vehicles))]
+        days = round(of_drive.uniform(0, self.tyre_wear_days))
+        stiffer, smaller = flaws.wear(of_drive, days)
+        content = {
+            "name": name,
+            "description": f"A {kind} road, {weather}",
+            "vehicle": vehicle,
+            "sprung_mass_kg": vehicle.body.sprung_mass_kg + self.load_kg.draw(of_drive),
+            "load_position_m": self.load_position_m.draw(of_drive),
+            "tyre_stiffness": self.tyre_stiffness.draw(of_drive) * stiffer,
+            "tyre_radius": plan.tyre_radius.draw(of_drive) * smaller,
+            "track": self.drivers.line(road, kind, of_drive),
+            "adhesion": adhesion,
+            "limits": self.drivers.limits(kind, adhesion, use, of_drive),
+            "laps": 1,
+            "seed": seed,
+            "sensors": plan.sensor_bias_std.draw(self.campaign.sensors, of_drive),
+            "imperfections": flaws.draw(of_drive, of_drive),
+        }
+        return Scenario.model_validate(content)
+
+
+def blind_scenarios(sha256: str) -> tuple[Scenario, ...]:
+    """Return the drives that the model version with this hash is judged on."""
+    return load_config(config_file("blind.toml"), BlindSet).scenarios(int(sha256[:15], 16))
+
+
+@dataclass(frozen=True)
+class BlindRow:
+    """Figures of every estimator on some blind drives: one, all of a class or weather, or all.
+
+    Attributes:
+        name: of the drive, the class, the weather, or `ALL`.
+        drives: how many.
+        speed_mps: least and largest true speed.
+        sideslip_std_deg: how much the angle varies.
+        figures: by estimator, over all rows of the drives together.
+    """
+
+    name: str
+    drives: int
+    speed_mps: tuple[float, float]
+    sideslip_std_deg: float
+    figures: Mapping[str, ErrorFigures]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what a JSON document needs."""
+        return {**vars(self), "figures": {n: one.as_dict() for n, one in self.figures.items()}}
+
+
+def judge_blindly(sha256: str, estimators: Mapping[str, Estimate]) -> tuple[BlindRow, ...]:
+    """Judge estimators on the drives that belong to a model version.
+
+    Returns a row over all drives, one for each class of road, each weather and each drive. The
+    truth is the simulator's own, not what a log would keep of it.
+    """
+    drives = simulate_drives(blind_scenarios(sha256))
+    runs = [evaluate_drive(drive, estimators) for drive in drives]
+    words = [run.scenario.name.split("_") for run in runs]
+    groups = {ALL: runs}
+    for place in (0, -1):
+        for run, parts in zip(runs, words, strict=True):
+            groups.setdefault(parts[place], []).append(run)
+    return tuple(
+        _row(name, some)
+        for name, some in [*groups.items(), *((run.scenario.name, [run]) for run in runs)]
+    )
+
+
+def _row(name: str, runs: Sequence[EvaluatedScenario]) -> BlindRow:
+    truth = np.concatenate([run.drive.sideslip_rad for run in runs])
+    among = np.concatenate([run.drive.evaluated for run in runs])
+    speed = np.concatenate([run.drive.speed_mps for run in runs])
+    return BlindRow(
+        name=name,
+        drives=len(runs),
+        speed_mps=(float(speed.min()), float(speed.max())),
+        sideslip_std_deg=float(np.degrees(truth[among].std())),
+        figures={
+            one: error_figures(np.concatenate([run.estimates[one] for run in runs]), truth, among)
+            for one in runs[0].estimates
+        },
+    )
