@@ -215,7 +215,7 @@ class PublishedModels(Rooted):
         """Judge models, and all that `evaluate` trains beside them, on drives of the first.
 
         Roads, cars, weather and noise are drawn from the hash of its version, so that nobody has
-        seen them before it was published (`configs/blind.toml`). Nothing is written. Returns
+        seen them before it was published (`configs/blind.toml`). No drive is written. Returns
         figures over all drives, by class of road, by weather and by drive.
 
         Raises what `evaluate` raises.

@@ -17,7 +17,7 @@ from fleet_slip.resources import find_config
 from fleet_slip.simulation.random_numbers import random_generator
 from fleet_slip.simulation.track import Segment, Track
 
-LINE_STEP_M = 5.0
+LINE_STEP_M = 2.0
 """Distance of the points of a driver's line."""
 
 WANDER_S = 2.0

@@ -29,8 +29,8 @@ def test_a_road_is_of_its_class(named: tuple[str, int]) -> None:
 
 
 def test_a_name_is_a_class_and_a_seed() -> None:
-    assert load_track("country_17") == draw_road("country", 17)
-    assert load_track("country_17") != load_track("country_18")
+    assert load_track("country_17").segments == draw_road("country", 17).segments
+    assert load_track("country_17").segments != load_track("country_18").segments
     assert load_track("hill_17").name == "hill_17"
 
 
@@ -46,7 +46,7 @@ def test_who_neither_cuts_nor_wanders_follows_the_road(named: tuple[str, int]) -
     road = draw_road(*named)
     line = driven_line(road, 0.0, 0.0, 30.0, random_generator(1))
     station = np.linspace(0.0, road.length_m, len(line.segments) + 1)
-    np.testing.assert_allclose(line.curvature(station), road.curvature(station), atol=1e-12)
+    np.testing.assert_allclose(line.curvature(station), road.curvature(station), atol=1e-9)
 
 
 @given(ROADS, st.floats(1.0, 8.0))
@@ -56,7 +56,7 @@ def test_who_cuts_turns_as_far_and_less_sharply(named: tuple[str, int], cut_m: f
     line = driven_line(road, cut_m, 0.0, 30.0, random_generator(1))
     assert turned_rad(line) == pytest.approx(turned_rad(road), abs=0.05)
     station = np.linspace(0.0, road.length_m, 5000)
-    assert np.abs(line.curvature(station)).max() <= np.abs(road.curvature(station)).max() + 1e-12
+    assert np.abs(line.curvature(station)).max() <= np.abs(road.curvature(station)).max() + 1e-9
 
 
 def test_who_wanders_stays_near_the_line_and_in_its_direction() -> None:
