@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 from fleet_slip.cli.output import print_table, print_text, stdout
 from fleet_slip.words import number_of
 
-PLACES = ("inside", "outside")
-"""Of an unstable section."""
-
 if TYPE_CHECKING:
     from fleet_slip.comparison.evaluation.blind import BlindRow
     from fleet_slip.comparison.evaluation.scenario_runs import ErrorFigures
+
+PLACES = ("inside", "outside")
+"""Of an unstable section."""
 
 
 def print_evaluation(content: dict[str, Any]) -> None:
