@@ -22,7 +22,7 @@ from fleet_slip.models.manifest import (
     TrainedOn,
 )
 from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.models.straight_on import straight_on
+from fleet_slip.models.straight_on import StraightOn, straight_on
 from fleet_slip.models.trained_drives import checksum_of_drives, pack_drives
 from fleet_slip.models.versions import Registry
 from fleet_slip.regression.validation.crossval import CrossValidation
@@ -97,13 +97,16 @@ def manifest_of(selection: RequestedSelection, name: str) -> Manifest:
 def with_straight_intercept(warehouse: Warehouse, manifest: Manifest) -> Manifest:
     """Return a manifest with the intercept that changes do not tell, if changes taught its model.
 
-    Raises `DataError` if the cars do not tell their sensors' offsets.
+    One through the origin keeps 0, of no cars. Raises `DataError` if the cars do not tell their
+    sensors' offsets.
     """
     name = features().name_of(manifest.trained_on.feature_set)
     change_s = features().feature_set(name).change_s
     if not change_s:
         return manifest
-    found = straight_on(warehouse, parse_condition(manifest.trained_on.cohort), manifest)
+    found = StraightOn(Fraction(0), {}, None, 0.0, 0)
+    if not manifest.through_origin:
+        found = straight_on(warehouse, parse_condition(manifest.trained_on.cohort), manifest)
     learned = LearnedFrom(
         label="course",
         change_s=float(change_s[0]) if len(change_s) == 1 else tuple(map(float, change_s)),
@@ -113,11 +116,11 @@ def with_straight_intercept(warehouse: Warehouse, manifest: Manifest) -> Manifes
         ),
         intercept_spread_deg=math.degrees(found.spread),
     )
-    told = Fraction(0) if manifest.through_origin else found.intercept
     scales = input_scales()
     terms = (_term(column, slope / scales[column]) for column, slope in found.slopes.items())
-    own = {"intercept": float(told), "intercept_exact": told, "learned_from": learned}
-    return manifest.model_copy(update={**own, "terms": (*manifest.terms, *terms)})
+    own = {"intercept": float(found.intercept), "intercept_exact": found.intercept}
+    taught = {"learned_from": learned, "terms": (*manifest.terms, *terms)}
+    return manifest.model_copy(update={**own, **taught})
 
 
 def _term(name: str, coefficient: Fraction) -> ModelTerm:

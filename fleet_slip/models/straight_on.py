@@ -92,8 +92,8 @@ def straight_on(warehouse: Warehouse, condition: Condition, manifest: Manifest) 
     if not found:
         raise DataError(
             f"no car of {condition.text!r} tells the offsets of its sensors, which the intercept "
-            f"follows from, and logs {', '.join(signals)}. Choose more drives; see fleet-slip "
-            "calibrate."
+            f"follows from, and logs {', '.join(signals)}. Choose more drives (see fleet-slip "
+            "calibrate), or a model that knows none: --no-intercept."
         )
     rows, means, variances, *offsets = np.array(found, dtype=np.float64).T
     share = rows / rows.sum()

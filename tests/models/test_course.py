@@ -55,6 +55,9 @@ def test_the_intercept_needs_the_calibration(uncalibrated: Fleet) -> None:
     selection = uncalibrated.cohort("true").select(label="course", model=COLUMNS)
     with pytest.raises(DataError, match="fleet-slip gram --features calibration"):
         uncalibrated.publish("too_early", selection)
+    through = uncalibrated.cohort("true").select(label="course", model=COLUMNS, intercept=False)
+    manifest = uncalibrated.publish("none", through, force=True).version.manifest
+    assert manifest.intercept == 0 and manifest.learned_from and manifest.learned_from.cars == 0
 
 
 def test_a_model_without_a_label_is_one_of_the_angle(fleet: Fleet) -> None:

@@ -157,12 +157,15 @@ def _origin(origin: ImportedFrom) -> str:
 
 def _teacher(learned: LearnedFrom) -> str:
     """Say what stood for a label, and where the intercept is from."""
-    unsure, times = learned.intercept_uncertainty_deg, learned.change_s
+    times = learned.change_s
     over = ", ".join(f"{one:g}" for one in (times if isinstance(times, tuple) else (times,)))
+    told = f"changes of the {learned.label} over {over} s: the figures are of changes"
+    if not learned.cars:
+        return f"{told}. No intercept: it goes through the origin"
+    unsure = learned.intercept_uncertainty_deg
     uncertain = "not known how surely" if unsure is None else f"uncertain by {unsure:.2g} deg"
     return (
-        f"changes of the {learned.label} over {over} s: the figures are of changes. "
-        f"Intercept where {number_of(learned.cars, 'car')} "
+        f"{told}. Intercept where {number_of(learned.cars, 'car')} "
         f"{'goes' if learned.cars == 1 else 'go'} straight, {uncertain}, between cars "
         f"{learned.intercept_spread_deg:.3f} deg"
     )
