@@ -43,10 +43,7 @@ class LocalThreads(ThreadPoolExecutor):
 
 
 def in_flight(executor: Executor) -> int:
-    """Return how many tasks may be under way, or done and not yet looked at.
-
-    That bounds memory, and the work that is lost if this process is killed.
-    """
+    """Return how many tasks may be under way, which bounds memory and what a kill costs."""
     return int(getattr(executor, "in_flight", IN_FLIGHT))
 
 

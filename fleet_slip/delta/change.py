@@ -58,10 +58,7 @@ def read_actions(delta: DeltaTable | None) -> pa.Table:
 
 
 def active_files(actions: pa.Table, where: object) -> tuple[TableFile, ...]:
-    """Return the active files of a Delta table, sorted by path.
-
-    Raises `StorageError`, which says where, if the log names a file as this program never does.
-    """
+    """Return the active files, by path. Raises `StorageError` if the log names one wrongly."""
     files = sorted(_table_files(actions), key=lambda file: file.path)
     for file in files:
         _require_sound(file, where)

@@ -173,10 +173,7 @@ def _object(text: Any) -> Mapping[str, Any]:
 
 
 def read_landed_units(table: Folder, version: int) -> frozenset[str]:
-    """Return the names of all units that have landed in a version of a table.
-
-    Raises `StorageError` for a log that cannot be read.
-    """
+    """Return the names of all units that have landed in a version. Raises `StorageError`."""
     log = table / LOG
     files = log.files()
     names: set[str] = set()

@@ -93,10 +93,7 @@ def require_readable(folder: Folder, schema: pa.Schema, delta: DeltaTable) -> No
 def require_writable(
     folder: Folder, schema: pa.Schema, delta: DeltaTable, unneeded: Collection[str] = ()
 ) -> None:
-    """Raise `RefusedError` if a table lacks columns of the catalogue or is being migrated.
-
-    It may lack `unneeded` ones, which what is to be written has not.
-    """
+    """Raise `RefusedError` if a table is being migrated, or lacks other than `unneeded` columns."""
     found = compare_schemas(schema, delta)
     if found.migrating:
         raise RefusedError(

@@ -74,10 +74,7 @@ class Snapshot:
         return sum(file.size_bytes for file in self.files)
 
     def renewed(self) -> "Snapshot":
-        """Return the newest version: this very snapshot, if nobody has committed since.
-
-        If somebody has, this snapshot is not to be used any more.
-        """
+        """Return the newest version: this snapshot, or another, which takes its place."""
         if self.delta is None:
             return self.table.snapshot()
         version = self.version
@@ -106,10 +103,7 @@ class Snapshot:
             return self.delta.transaction_version(unit_name)
 
     def landed_among(self, number: int) -> Callable[[str], bool]:
-        """Return what tells of a unit whether it has landed, for so many questions.
-
-        Many are answered by reading the log once.
-        """
+        """Return what tells whether a unit has landed; for many questions it reads the log once."""
         if self.version is None or number < MANY_UNITS:
             return lambda name: self.landed(name) is not None
         return self._units.__contains__
@@ -133,10 +127,7 @@ class Snapshot:
         return hashlib.sha256(content).hexdigest()
 
     def commit_or_discard(self, change: Change) -> None:
-        """Apply a change like `commit`; after a conflict delete the files that it was to add.
-
-        For who writes its files anew in the next attempt.
-        """
+        """Apply a change like `commit`; after a conflict delete the files that it was to add."""
         try:
             self.commit(change)
         except ConflictError:

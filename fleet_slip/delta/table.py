@@ -81,10 +81,7 @@ class Table:
         return f"{self.folder.uri}/{path}"
 
     def read(self, path: str, columns: Sequence[str] | None = None) -> pa.Table:
-        """Return the rows of one of the table's files, or some columns of them.
-
-        Raises `StorageError` if the file is not what its name says.
-        """
+        """Return the rows of a file, or some columns. Raises `StorageError` if it is damaged."""
         self.folder.check(path)
         with storage_errors(f"{self.folder}/{path}"), self.folder.open(path) as file:
             wanted = None if columns is None else list(columns)

@@ -212,10 +212,7 @@ class LocalFolder:
 
 @contextlib.contextmanager
 def _opened(file: Path, flags: int) -> Iterator[int]:
-    """Open a file that is nothing but a file, and yield its descriptor.
-
-    A link is not followed, since it may lead to another's file; a pipe is not waited for.
-    """
+    """Open a file, but no link, which may lead to another's, nor a pipe; yield its descriptor."""
     safe = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     try:
         descriptor = os.open(file, flags | safe, 0o666)

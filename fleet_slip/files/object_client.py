@@ -67,10 +67,7 @@ class AwsProfile:
 
 @functools.cache
 def aws_profile() -> AwsProfile | None:
-    """Return the profile in use; None if the environment has the credentials.
-
-    Raises `StorageError` if there are none, or a file or profile cannot be used.
-    """
+    """Return the profile in use, unless the environment has credentials. Raises `StorageError`."""
     if environ.get("AWS_ACCESS_KEY_ID"):
         return None
     with needed("objects", "a file of credentials"):

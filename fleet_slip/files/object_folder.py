@@ -111,10 +111,7 @@ class ObjectFolder:
         """Do nothing: what is opened is looked at."""
 
     def open(self, path: str) -> pa.NativeFile:
-        """Open a file for reading anywhere in it.
-
-        Raises `StorageError` if the answer is not what the name of a data file says.
-        """
+        """Open a file; raises `StorageError` if the answer is not what the name says."""
         file = open_object(self._store, self._key(path), f"{self}/{path}")
         return pa.PythonFile(file, "r")
 
@@ -130,10 +127,7 @@ class ObjectFolder:
         return self._put(path, content, "create")
 
     def append(self, path: str, content: bytes) -> None:
-        """Add to a history in one write: objects cannot grow, so that it is an object of its own.
-
-        Its name begins with the path and goes on with the time.
-        """
+        """Add to a history: an object of its own, whose name goes on with the time."""
         self.put(f"{path}/{time.time_ns():020d}-{uuid.uuid4().hex[:8]}.jsonl", content)
 
     def remove(self, file: StoredFile) -> bool:
@@ -164,10 +158,7 @@ class ObjectFolder:
 
     @contextlib.contextmanager
     def exclusive(self, name: str, waiting: Callable[[], None]) -> Iterator[None]:  # noqa: ARG002
-        """Hold no lock: there is none that a killed process surely releases.
-
-        What is done twice at once lands once, by the commits.
-        """
+        """Hold no lock, for a killed process may keep it: what is done twice at once lands once."""
         yield
 
     def let_read(self, database: duckdb.DuckDBPyConnection) -> None:

@@ -107,10 +107,7 @@ def object_errors(where: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def storage_errors(path: object) -> Iterator[None]:
-    """Turn failures of the file system, of an object store and of Delta into `StorageError`.
-
-    `path` says where, as text.
-    """
+    """Turn failures of files, object stores and Delta into `StorageError`; `path` says where."""
     try:
         yield
     except OSError as error:

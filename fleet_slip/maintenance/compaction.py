@@ -85,10 +85,7 @@ def _compact_day(warehouse: Warehouse, day: date, target_rows: int) -> int:
 
 
 def _packs(files: Iterable[TableFile], target_rows: int) -> Iterable[list[TableFile]]:
-    """Yield runs of two files or more that fit together.
-
-    All but the last have more than half of the rows that fit, and are never packed again.
-    """
+    """Yield runs of two files or more that fit together; only the last may be packed again."""
     pack: list[TableFile] = []
     for file in files:
         if pack and sum(f.rows for f in pack) + file.rows > target_rows:

@@ -63,10 +63,7 @@ def cars_with_rows(warehouse: Warehouse) -> set[str]:
 def drives_by_file(
     logs: Snapshot, subject: Forgettable, located: Located
 ) -> dict[str, frozenset[str]]:
-    """Return the drives concerned of each log file that has some, by the file's path.
-
-    Only files without Gram rows are opened.
-    """
+    """Return the drives concerned by log file, opening only files without Gram rows."""
     active = [file.path for file in logs.files]
     found = {path: located.drives[path] for path in active if path in located.drives}
     unknown = [path for path in active if path not in located.known]

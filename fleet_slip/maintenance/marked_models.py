@@ -80,10 +80,7 @@ class _PresentDrives:
 def _may_have_seen(
     registry: Registry, name: str, number: int, without: int | None, present: _PresentDrives
 ) -> bool:
-    """Whether a version was trained on drives that Gram rows are without since a version of them.
-
-    True if that cannot be told.
-    """
+    """Whether a version was, or may have been, trained on drives that Gram rows lack since then."""
     if without is None:
         return True
     try:
@@ -127,10 +124,7 @@ def models_trained_on(warehouse: Warehouse, drives: Collection[str]) -> list[str
 def _asked_again(
     warehouse: Warehouse, versions: Mapping[str, TrainedOn], drives: Collection[str]
 ) -> list[str]:
-    """Return the versions that were made of one of the drives, or may have been.
-
-    A version of the Gram rows, and each of its files, is read once.
-    """
+    """Return the versions that may be made of the drives; each Gram file is read once."""
     cohorts = {trained.cohort for trained in versions.values()}
     chosen = _in_cohorts(warehouse, cohorts, drives)
 

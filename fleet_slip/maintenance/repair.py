@@ -66,10 +66,7 @@ def _sum_up_again(warehouse: Warehouse) -> list[str]:
 
 
 def _find_elsewhere(warehouse: Warehouse, damaged: Collection[str]) -> list[str]:
-    """Put back the files whose very bytes are below their table under another name.
-
-    A killed job may have left them there, or a person who saved them.
-    """
+    """Put back the files whose very bytes a job or a person left under another name."""
     rebuilt = []
     for table in warehouse.tables:
         name = table.folder.name

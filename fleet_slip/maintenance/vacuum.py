@@ -28,10 +28,7 @@ class VacuumReport:
 
 
 def vacuum(warehouse: Warehouse, retention_hours: float = RETENTION_HOURS) -> VacuumReport:
-    """Remove what nothing has referred to for some hours, and gather the records of runs.
-
-    Raises `StorageError`.
-    """
+    """Remove what nothing has referred to for some hours; gather the records of runs."""
     warehouse.require()
     expired = find_expired(warehouse, retention_hours)
     removed = [file for file in expired if file.folder.remove(file)]

@@ -51,10 +51,7 @@ def control_chart(chart: Chart, size: Size) -> Figure:
 
 
 def save_chart(chart: Chart, file: Path) -> None:
-    """Draw a chart to a file, whose suffix says the format.
-
-    Raises `ConfigError` for an unknown suffix, and `StorageError` if it cannot be written.
-    """
+    """Draw to a file, whose suffix says the format. Raises `ConfigError`, `StorageError`."""
     with mpl.rc_context(STYLE), storage_errors(file):
         figure = control_chart(chart, DESK)
         figure.suptitle(f"{chart.model}: error on each day", x=0.01, ha="left")

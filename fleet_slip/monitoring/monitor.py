@@ -51,10 +51,7 @@ class Limits:
 
     @classmethod
     def above(cls, usual: Sequence[float], false_alarms: float) -> "Limits":
-        """Return the upper limit of a positive figure, made on its logarithm.
-
-        A day that is better than usual is no alarm.
-        """
+        """Return the upper limit of a positive figure, made on its logarithm: less is no alarm."""
         logarithms = cls.of([math.log(value) for value in usual], 2 * false_alarms)
         return cls(math.exp(logarithms.centre), None, math.exp(logarithms.upper))
 

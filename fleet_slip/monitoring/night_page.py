@@ -15,10 +15,7 @@ MARKS: dict[str, Mark] = {"done": "good", "attention": "miss", "failed": "miss",
 
 
 def write_summary(report: NightReport, folder: Path) -> list[Path]:
-    """Write NIGHT.txt, NIGHT.json and NIGHT.html; return them.
-
-    Each is replaced as a whole or not at all. Raises `StorageError`.
-    """
+    """Write NIGHT.txt, .json and .html, each as a whole; return them. Raises `StorageError`."""
     files = {
         f"{report.night}.txt": report.as_text() + "\n",
         f"{report.night}.json": json.dumps(report.as_dict(), indent=2, default=str) + "\n",

@@ -51,10 +51,7 @@ def find_implausible(table: GramTable, min_correlation: float) -> dict[int, Faul
 
 
 def find_stuck(table: GramTable) -> dict[int, Fault]:
-    """Return the drives in which a signal never changed while most others did.
-
-    Exact: the sum of squares about the mean is the integer zero.
-    """
+    """Return drives in which a signal, unlike most others, never changed: its variance is 0."""
     at = [row * (row + 3) // 2 for row in range(len(table.signals))]
     squares = table.products[:, at]
     # n sum(x^2) may not fit 64 bits, the difference from sum(x)^2 is right modulo 2^64.

@@ -92,10 +92,7 @@ def state_of(run: Mapping[str, Any]) -> str:
 
 
 def gather_runs(root: Folder) -> int:
-    """Make one object of the records of each month; return how many objects there were of them.
-
-    Does nothing in a folder, where a month is one file.
-    """
+    """Gather the records of each month in one object, on a store; return how many there were."""
     folder = root / FOLDER
     months: dict[str, list[StoredFile]] = defaultdict(list)
     for file in folder.files():

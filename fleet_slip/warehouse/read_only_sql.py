@@ -41,10 +41,7 @@ CATALOGUE_PREFIX = "duckdb_"
 
 
 def one_query(database: duckdb.DuckDBPyConnection, text: str) -> str:
-    """Return the text if it is one statement that only reads.
-
-    Raises `QuestionError` otherwise: a query must not write files, change settings or run text.
-    """
+    """Return the text if it is one statement that only reads. Raises `QuestionError`."""
     if len(text) > LONGEST_QUERY:
         raise QuestionError(
             f"the query has {len(text):,} characters, at most {LONGEST_QUERY:,} are read."

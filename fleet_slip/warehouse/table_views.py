@@ -27,10 +27,7 @@ SNAPSHOTS = 100
 
 
 def connect_tables(warehouse: Warehouse, query: str) -> duckdb.DuckDBPyConnection:
-    """Return a locked connection with the views of the tables that a query names.
-
-    Raises `StorageError` if there is no data root.
-    """
+    """Return a locked connection with the views that a query names. Raises `StorageError`."""
     warehouse.require()
     wanted = views_in(query)
     snapshots = table_snapshots(warehouse, wanted)
@@ -92,10 +89,7 @@ def open_tables(
     *,
     threads: int | None = None,
 ) -> duckdb.DuckDBPyConnection:
-    """Return a connection with some of the views, on snapshots of the tables that they stand on.
-
-    It is not locked yet; see `lock`.
-    """
+    """Return a connection, to be locked yet, with some views on snapshots of their tables."""
     database = open_database(threads=threads, reading=warehouse.root, spill=True)
     tables = {snapshot.table.folder.name: snapshot for snapshot in snapshots}
     if "grams" in tables:

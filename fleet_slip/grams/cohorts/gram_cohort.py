@@ -115,10 +115,7 @@ class Cohort(CohortOrigin):
         return CohortFolds.of(self.tables, assign_folds(values, by, count), self.drive_numbers)
 
     def serving(self, inputs: Sequence[str]) -> Served:
-        """Return the drives that have the label and all the inputs, one Gram row each.
-
-        Raises `DataError` if there is none.
-        """
+        """Return the drives with the label and all inputs, a Gram row each. Raises `DataError`."""
         table, mask = serving_drives(self.tables, [*inputs, catalogue().label])
         rows = np.flatnonzero(mask)
         numbers = self.drive_numbers[rows]

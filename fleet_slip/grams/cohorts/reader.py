@@ -264,10 +264,7 @@ def _require_complete(
 
 
 def cohort_files(source: Warehouse | GramReader, condition: Condition) -> set[str]:
-    """Return the log files that have a drive of a cohort, by the Gram rows of the logged signals.
-
-    Raises `DataError` if no drive satisfies the condition.
-    """
+    """Return the log files that have a drive of a cohort. Raises `DataError` without a drive."""
     with open_grams(source, PLAIN, condition) as opened:
         found = opened.files(condition)
     if not found:

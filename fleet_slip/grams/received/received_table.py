@@ -98,10 +98,7 @@ OTHER_ROW = "has a signature that is of no message of it"
 
 
 def find_unsound(rows: pa.Table) -> Iterator[tuple[str, str]]:
-    """Yield the drives whose received Gram rows cannot be true, and why.
-
-    Each is examined as it was when it came, and its name must tell its car and its day.
-    """
+    """Yield the drives whose received Gram rows cannot be true, each as it came, and why."""
     came = rows.filter(is_received(rows))
     drives, vehicles = (came[name].cast(pa.string()) for name in ("drive_id", "vehicle_id"))
     of_day = pc.binary_join_element_wise(vehicles, pc.strftime(came["day"], "%Y%m%dT"), "-")

@@ -126,10 +126,7 @@ class CarKeys(Config):
 
 
 def load_car_keys() -> CarKeys | None:
-    """Return the list of keys that the environment names; None if it names none.
-
-    Raises `ConfigError` for a list that cannot be read, or is not valid.
-    """
+    """Return the list of keys that the environment names, if any. Raises `ConfigError`."""
     configured = os.environ.get(KEYS_VARIABLE)
     if configured is None:
         return None

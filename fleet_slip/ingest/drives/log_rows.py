@@ -166,10 +166,7 @@ def _open_part(part: Path, mapping: Mapping) -> Iterator[Source]:
 
 @contextmanager
 def _open_bases(mapping: Mapping, part: Path) -> Iterator[tuple[list[Base], set[str]]]:
-    """Open a file of a log for those wanted columns that it has; yield its time bases, and these.
-
-    It may lack columns that another file has.
-    """
+    """Open a file, which may lack wanted columns; yield its time bases, and the columns it has."""
     wanted = mapping.time_bases()
     with _open_part(part, mapping) as source:
         names = {channel.name for channel in source.channels()}

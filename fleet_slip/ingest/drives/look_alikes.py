@@ -22,10 +22,7 @@ def find_look_alikes(names: Iterable[str]) -> Groups:
 def find_vehicles_like(
     warehouse: Warehouse, vehicles: Iterable[str]
 ) -> tuple[tuple[str, ...], ...]:
-    """Return the groups of vehicles of the logs that differ so, and have one of these vehicles.
-
-    Names in ASCII have one form: for these nothing is read.
-    """
+    """Return the groups of alike names in the logs with one of these; nothing is read for ASCII."""
     suspects = {name for name in vehicles if not name.isascii()}
     if not suspects:
         return ()

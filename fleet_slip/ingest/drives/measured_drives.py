@@ -244,10 +244,7 @@ class Trips:
         self._last: dict[int, tuple[str, float]] = {}
 
     def name(self, drive_id: str, group: int, start_s: float, end_s: float) -> str:
-        """Return the trip of the next drive of a group of rows, in the order of the file.
-
-        A clock that goes back begins another trip.
-        """
+        """Return the trip of a group's next drive; a clock that goes back begins another."""
         trip_id, ended_s = self._last.get(group, (drive_id, start_s))
         if not 0 <= start_s - ended_s <= LONGEST_PAUSE_S:
             trip_id = drive_id

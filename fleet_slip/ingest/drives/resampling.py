@@ -127,10 +127,7 @@ def tick_range(time_s: FloatArray, method: Method) -> tuple[float, int]:
 def interpolate(
     time_s: FloatArray, values: FloatArray, at_s: FloatArray, longest_gap_s: float
 ) -> FloatArray:
-    """Interpolate linearly at `at_s`; NaN outside and between samples too far apart.
-
-    A tick at which there is a sample keeps it, whatever the gaps around it.
-    """
+    """Interpolate at `at_s`; NaN outside, and in gaps that are too wide unless at a sample."""
     time_s, values = _present(time_s, values)
     if not time_s.size:
         return np.full(at_s.shape, np.nan)

@@ -285,10 +285,7 @@ def _identity(file: Path, mapping: Mapping) -> str:
 
 
 def _reach(blocks: list[Block]) -> int:
-    """Return how many rows there are to tell the usual time between them.
-
-    Those of several time bases are numbered base by base, so that good ones are counted.
-    """
+    """Return how many rows tell the usual time; of several bases good ones are counted."""
     if "base" in blocks[-1].rows.columns:
         return sum(block.rows.height for block in blocks)
     return blocks[-1].read

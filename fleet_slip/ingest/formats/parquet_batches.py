@@ -167,10 +167,7 @@ def plain_column(array: pa.Array, name: str, file: Path) -> pa.Array:
 
 
 def _in_calendar(array: pa.Array) -> pa.Array:
-    """Return dates or timestamps with null for those outside the years 1 to 9999.
-
-    They are no times of a drive, and Polars panics when it should show one.
-    """
+    """Return dates or timestamps, null outside the years 1 to 9999: Polars would panic."""
     kind = array.type
     if pa.types.is_date32(kind):
         counts, per_day = pc.cast(pc.cast(array, pa.int32()), pa.int64()), 1

@@ -149,10 +149,7 @@ Component = Literal["north", "east"]
 
 
 def split_components(signals: Any) -> Any:
-    """Return the signals with `course = { north = …, east = … }` as a column for each of the two.
-
-    Raises `ValueError` where a speed is given beside them.
-    """
+    """Return the signals with `course = { north, east }` as a column each. Raises `ValueError`."""
     course = signals.get(COURSE) if isinstance(signals, dict) else None
     if not isinstance(course, dict) or not {"north", "east"} & set(course):
         return signals

@@ -36,10 +36,7 @@ class VehicleFacts(Config):
 
 
 def read_vehicle_facts(file: Path) -> tuple[VehicleFacts, ...]:
-    """Read a CSV file with a header: vehicle_id, and any of the other facts.
-
-    Raises `ConfigError` with line and column of what is wrong.
-    """
+    """Read a CSV file: vehicle_id, and any other facts. Raises `ConfigError`, with the line."""
     content = read_named_file(file)
     try:
         lines = csv.DictReader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True)
