@@ -34,20 +34,6 @@ ROUNDS = 5
 
 
 @dataclass(frozen=True)
-class SensorFigures:
-    """Offset (counts), gain and log noise of signals in drives, shape (drives, signals) each."""
-
-    offset: FloatArray
-    gain: FloatArray
-    noise: FloatArray
-
-    @property
-    def stacked(self) -> FloatArray:
-        """All figures, shape (drives, signals, 3)."""
-        return np.stack([self.offset, self.gain, self.noise], axis=2)
-
-
-@dataclass(frozen=True)
 class Prediction:
     """The cohort's prediction of some signals, and how its drives keep to it.
 
@@ -78,13 +64,13 @@ class Prediction:
             used = [0, *(p for p in predictors if p != target)]
             weights[row, used] = _least_squares(total, used, target)
         bare = cls(at, weights, np.zeros((len(at), 3)), np.ones((len(at), 3)))
-        figures = reference.each(lambda batch: bare.figures(batch).stacked)
+        figures = reference.each(bare.figures)
         middle, spread = _middle_and_spread(figures)
         floors = [limits.offset_floor_counts, limits.gain_floor, limits.noise_floor]
         return cls(at, weights, middle, np.maximum(spread, floors))
 
-    def figures(self, moments: MeanMoments) -> SensorFigures:
-        """Return the figures of drives."""
+    def figures(self, moments: MeanMoments) -> FloatArray:
+        """Return offset in counts, gain and log noise of drives, shape (drives, targets, 3)."""
         m, w = moments.matrices, self.weights
         residual = -w.copy()
         residual[np.arange(len(w)), self.targets] += 1
@@ -94,14 +80,14 @@ class Prediction:
         predicted = np.maximum(_quadratic(m, w), np.finfo(np.float64).tiny)
         # A residual below a tenth of a count is rounding.
         noise = 0.5 * np.log(np.maximum(square - offset**2, 0.01))
-        return SensorFigures(offset, own / predicted, noise)
+        return np.stack([offset, own / predicted, noise], axis=2)
 
     def scores(self, moments: MeanMoments) -> FloatArray:
         """Return how many spreads each figure is from the middle, (drives, targets, 3).
 
         Noise counts upwards only: a quiet drive is no fault.
         """
-        scores = (self.figures(moments).stacked - self.middle) / self.spread
+        scores = (self.figures(moments) - self.middle) / self.spread
         scores[:, :, :2] = np.abs(scores[:, :, :2])
         return np.asarray(scores)
 
@@ -180,16 +166,16 @@ class Peers:
                 faults.append(self._kind(int(own.argmax()), drive, moments, figures))
         return faults
 
-    def _kind(self, target: int, drive: int, moments: MeanMoments, figures: SensorFigures) -> Fault:
+    def _kind(self, target: int, drive: int, moments: MeanMoments, figures: FloatArray) -> Fault:
         """Name the fault of a sensor by what would mend it: a sign, an offset, a factor."""
         name = (moments.signals[target],)
-        offset, gain = figures.offset[drive, target], figures.gain[drive, target]
-        noise = np.exp(figures.noise[drive, target] - self.full.middle[target, 2])
+        offset, gain, log_noise = figures[drive, target]
+        noise = np.exp(log_noise - self.full.middle[target, 2])
         usual = np.exp(2 * self.full.middle[target, 2])
         w = self.full.weights[target]
         m = moments.matrices[drive]
         own = m[target + 1, target + 1]
-        shifted = np.exp(2 * figures.noise[drive, target])
+        shifted = np.exp(2 * log_noise)
         scaled = own - gain**2 * (w @ m @ w)
         if gain < -0.5:
             return Fault("reversed", name, f"gain {gain:.3f}")

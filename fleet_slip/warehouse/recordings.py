@@ -10,7 +10,6 @@ and a fixed number of its parts are kept, the least ones: the same of any two.
 import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from hashlib import blake2b
 
 import numpy as np
@@ -70,43 +69,24 @@ def record_drive(
     )
 
 
-@dataclass(frozen=True)
 class KnownRecordings:
     """Recordings to be known again, each as `Recording.kept` returned it."""
 
-    kept: Sequence[str]
+    def __init__(self, kept: Sequence[str]) -> None:
+        """Take what was kept."""
+        each = [np.frombuffer(base64.b64decode(text), "<u8").astype(np.uint64) for text in kept]
+        sizes = np.array([len(one) - 1 for one in each])
+        self._wholes = frozenset(int(one[0]) for one in each)
+        self._parts = np.concatenate([one[1:] for one in each])
+        self._owners = np.repeat(np.arange(len(each)), sizes)
+        self._enough = np.maximum(1, -(-sizes // PARTS_ENOUGH))
 
     def has(self, drive: Recording) -> bool:
         """Whether a drive is one of them, or enough of one is in it."""
         if drive.whole in self._wholes:
             return True
-        there = np.isin(self._parts, drive.parts)
-        return bool(
-            (np.bincount(self._owners[there], minlength=len(self.kept)) >= self._enough).any()
-        )
-
-    @cached_property
-    def _each(self) -> list[Hashes]:
-        return [
-            np.frombuffer(base64.b64decode(text), "<u8").astype(np.uint64) for text in self.kept
-        ]
-
-    @cached_property
-    def _wholes(self) -> frozenset[int]:
-        return frozenset(int(one[0]) for one in self._each)
-
-    @cached_property
-    def _parts(self) -> Hashes:
-        return np.concatenate([one[1:] for one in self._each])
-
-    @cached_property
-    def _owners(self) -> IntArray:
-        return np.repeat(np.arange(len(self.kept)), [len(one) - 1 for one in self._each])
-
-    @cached_property
-    def _enough(self) -> IntArray:
-        sizes = [len(one) - 1 for one in self._each]
-        return np.array([max(1, -(-size // PARTS_ENOUGH)) for size in sizes])
+        there = self._owners[np.isin(self._parts, drive.parts)]
+        return bool((np.bincount(there, minlength=len(self._enough)) >= self._enough).any())
 
 
 def _hash_pieces(values: IntArray) -> Hashes:

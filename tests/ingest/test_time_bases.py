@@ -18,16 +18,14 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.drives import log_rows, stream, time_bases
 from fleet_slip.ingest.drives.time_bases import DISORDER, HELD, ROW, merge_bases
-from fleet_slip.ingest.formats.source import OWN_TIME, Base, Channel
+from fleet_slip.ingest.formats.source import OWN_TIME, Base, Channel, ClockSource
 from tests.support.measured import MeasuredLog, a_mapping, read_measured
 
 GAP_S = 1.0
 
 
-class FakeSource:
+class FakeSource(ClockSource):
     """A file with clocks that is in memory, read in batches of some rows."""
-
-    has_clock = True
 
     def __init__(self, frames: Sequence[pl.DataFrame], batch: int) -> None:
         self._frames, self._batch = frames, batch
@@ -41,10 +39,6 @@ class FakeSource:
             for i, frame in enumerate(self._frames)
             if {*columns} & {*frame.columns}
         ]
-
-    def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
-        for base in self.bases(columns):
-            yield from base.read()
 
     def _read(self, frame: pl.DataFrame, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
         some = frame.select(OWN_TIME, *(name for name in columns if name in frame.columns))

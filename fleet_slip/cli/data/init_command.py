@@ -72,7 +72,8 @@ def _mapping_of(log: Path, model: str) -> str:
     """Return the mapping that a measured log suggests."""
     from fleet_slip.ingest.drafting.draft import draft_mapping  # noqa: PLC0415 - takes a while
     from fleet_slip.ingest.drafting.draft_text import write_draft  # noqa: PLC0415
-    from fleet_slip.ingest.drafting.profile import FileFormats, profile_file  # noqa: PLC0415
+    from fleet_slip.ingest.drafting.profile import profile_file  # noqa: PLC0415
+    from fleet_slip.ingest.formats.reading import FileFormats  # noqa: PLC0415
 
     formats = FileFormats(can=None, duckdb=None)
     return write_draft(draft_mapping(log, profile_file(log, formats)), model)

@@ -12,27 +12,19 @@ import polars as pl
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.formats.can_bus import CanBus
-from fleet_slip.ingest.formats.csv_batches import CsvFormat, PlainNumbers
-from fleet_slip.ingest.formats.duckdb_table import DuckdbRows
-from fleet_slip.ingest.formats.reading import file_errors, open_source, require_unchanged_file
+from fleet_slip.ingest.formats.csv_batches import CsvFormat
+from fleet_slip.ingest.formats.reading import (
+    FileFormats,
+    file_errors,
+    open_source,
+    require_unchanged_file,
+)
 from fleet_slip.ingest.formats.source import OWN_TIME, Channel, Source
 
 MOST_ROWS = 200_000
 """Rows of each time base that are looked at."""
 _SEPARATORS = ";\t|,"
 _DECIMAL_COMMA = r"^\s*-?\d+,\d+\s*$"
-
-
-@dataclass(frozen=True)
-class FileFormats:
-    """What is known of a file's format before there is a mapping."""
-
-    csv: CsvFormat = field(default_factory=CsvFormat)
-    can: CanBus | None = None
-    duckdb: DuckdbRows | None = None
-    name: str = "mapping suggest"
-    plain_numbers: PlainNumbers = field(default_factory=PlainNumbers)
 
 
 @dataclass(frozen=True)

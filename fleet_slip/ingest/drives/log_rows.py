@@ -155,7 +155,7 @@ def _merged(bases: list[Base], mapping: Mapping) -> Iterator[pl.DataFrame]:
 @contextmanager
 def _open_part(part: Path, mapping: Mapping) -> Iterator[Source]:
     """Open a file that says times as the mapping does. Raises `InputError`."""
-    with file_errors(part), open_source(part, mapping) as source:
+    with file_errors(part), open_source(part, mapping.formats) as source:
         if source.has_clock != mapping.time.own_clock:
             raise InputError(
                 f"{shown(part)}: {_CLOCK if source.has_clock else _NO_CLOCK}, in the mapping "

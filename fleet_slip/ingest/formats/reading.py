@@ -6,8 +6,9 @@ What a file is, its first bytes say; only what is text goes by the mapping and t
 import hashlib
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import polars as pl
 import pyarrow as pa
@@ -45,33 +46,23 @@ _BINARY = {
 Told = TypeVar("Told")
 
 
-class Formats(Protocol):
-    """What must be known of a file's format beside the file, as a mapping says it."""
+@dataclass(frozen=True)
+class FileFormats:
+    """What must be known of a file's format beside the file.
 
-    @property
-    def name(self) -> str:
-        """What says it, for messages."""
-        ...
+    Attributes:
+        csv: separator and decimal sign of text.
+        can: the database of a CAN trace.
+        duckdb: the rows of a DuckDB file.
+        name: the mapping that says it, for messages.
+        plain_numbers: which columns of text are numbers, wherever they are used.
+    """
 
-    @property
-    def csv(self) -> CsvFormat:
-        """Separator and decimal sign of text."""
-        ...
-
-    @property
-    def plain_numbers(self) -> PlainNumbers:
-        """Which columns of text are numbers, wherever they are used."""
-        ...
-
-    @property
-    def can(self) -> CanBus | None:
-        """The database of a CAN trace."""
-        ...
-
-    @property
-    def duckdb(self) -> DuckdbRows | None:
-        """The rows of a DuckDB file."""
-        ...
+    csv: CsvFormat = field(default_factory=CsvFormat)
+    can: CanBus | None = None
+    duckdb: DuckdbRows | None = None
+    name: str = "mapping suggest"
+    plain_numbers: PlainNumbers = field(default_factory=PlainNumbers)
 
 
 @contextmanager
@@ -115,7 +106,7 @@ def log_digest(log: Path) -> "hashlib._Hash":
 
 
 @contextmanager
-def open_source(file: Path, formats: Formats) -> Iterator[Source]:
+def open_source(file: Path, formats: FileFormats) -> Iterator[Source]:
     """Open a file, in the format that its first bytes tell. Raises `InputError`.
 
     Each format makes sure that the file stands for itself: that no value of it is to be fetched
@@ -134,7 +125,7 @@ def open_source(file: Path, formats: Formats) -> Iterator[Source]:
 
 
 def _opened(
-    file: Path, start: bytes, formats: Formats, budget: Budget
+    file: Path, start: bytes, formats: FileFormats, budget: Budget
 ) -> AbstractContextManager[Source]:
     if start.startswith(MDF_MAGICS) and formats.can is not None:
         return open_mdf_bus(formats.can, budget)
@@ -157,7 +148,7 @@ def _opened(
     return open_csv(budget, formats.csv, formats.plain_numbers)
 
 
-def _wanted(told: Told | None, file: Path, table: str, key: str, formats: Formats) -> Told:
+def _wanted(told: Told | None, file: Path, table: str, key: str, formats: FileFormats) -> Told:
     """Return what the mapping says of a format that needs it. Raises `InputError`."""
     if told is None:
         raise InputError(

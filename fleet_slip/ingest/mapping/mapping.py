@@ -21,6 +21,7 @@ from fleet_slip.errors import ConfigError
 from fleet_slip.ingest.formats.can_bus import CanBus, read_can_database
 from fleet_slip.ingest.formats.csv_batches import CsvFormat, PlainNumbers
 from fleet_slip.ingest.formats.duckdb_table import DuckdbRows
+from fleet_slip.ingest.formats.reading import FileFormats
 from fleet_slip.ingest.formats.source import OWN_TIME, describe_unknown
 from fleet_slip.ingest.mapping.row_condition import RowCondition, text_conditions
 from fleet_slip.ingest.mapping.signal_column import (
@@ -149,16 +150,12 @@ class Mapping(Config):
         return [condition for conditions in read for condition in conditions]
 
     @model_validator(mode="after")
-    def _conditions_name_signals(self) -> "Mapping":
+    def _consistent(self) -> "Mapping":
         for condition in self.where:
             if condition.signal is not None and condition.signal not in self.signals:
                 raise ValueError(f"where: {condition.signal!r} is no signal of this mapping")
             if condition.signal is not None and self.signals[condition.signal].component:
                 raise ValueError(f"where: name the column of the file, not {condition.signal!r}")
-        return self
-
-    @model_validator(mode="after")
-    def _signals_fit_catalogue(self) -> "Mapping":
         known = catalogue().signals
         for name, column in self.signals.items():
             if name not in known:
@@ -168,22 +165,10 @@ class Mapping(Config):
             except ValueError as error:
                 raise ValueError(f"signals.{name}: {column.column} {error}") from None
         require_satellites(self.signals)
-        return self
-
-    @model_validator(mode="after")
-    def _day_is_known(self) -> "Mapping":
         if self.drive.day is None and not self.time.is_dated:
             raise ValueError("drive.day is needed: the time has no date. Give a date or a column")
-        return self
-
-    @model_validator(mode="after")
-    def _vehicle_model_is_known(self) -> "Mapping":
         if self.drive.vehicle_model is None and not self.vehicles:
             raise ValueError("drive.vehicle_model is needed, or 'vehicles', a table of the cars")
-        return self
-
-    @model_validator(mode="after")
-    def _times_are_numbers(self) -> "Mapping":
         for name, signal in self.signals.items():
             if signal.time is not None and self.time.unit is None:
                 raise ValueError(f"signals.{name}: 'time' needs [time] with 'column' and 'unit'")
@@ -217,7 +202,12 @@ class Mapping(Config):
         return list(dict.fromkeys(name for name in names if name is not None))
 
     @property
-    def plain_numbers(self) -> PlainNumbers:
+    def formats(self) -> FileFormats:
+        """What must be known of a file to open it."""
+        return FileFormats(self.csv, self.can, self.duckdb, self.name, self._plain_numbers)
+
+    @property
+    def _plain_numbers(self) -> PlainNumbers:
         """Columns of which only the number counts, not how it is written."""
         if len(self.time_bases()) > 1:
             return PlainNumbers()
