@@ -5,7 +5,7 @@ to be there: what is missing is not counted. (Exported programs clip first, whic
 """
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from fleet_slip.catalogue.definitions import Definition, features_behind, plain_column
@@ -18,8 +18,8 @@ LOGGED: Range = (-(2**15), 2**15 - 1)
 
 
 class _ClippedLast(Lowering):
-    def clip_where(self, step: int, limit: int, there: int) -> int:
-        return self.clip(self.do("where", step, there), limit)
+    def clip_where(self, step: int, limit: int, there: Callable[[], int]) -> int:
+        return self.clip(self.do("where", step, there()), limit)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ What a column is stands in `fleet_slip.catalogue.definitions`; what a step compu
 `fleet_slip.columns.operations`. Equal steps stand once.
 """
 
-from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
 from typing import Any, TypeVar
@@ -106,9 +106,9 @@ class Lowering:
         """Return a step within ±limit."""
         return self.do("clip", step, self.constant(limit))
 
-    def clip_where(self, step: int, limit: int, there: int) -> int:
-        """Return a step within ±limit, where another one is there too."""
-        return self.do("where", self.clip(step, limit), there)
+    def clip_where(self, step: int, limit: int, there: Callable[[], int]) -> int:
+        """Return a step within ±limit, where another one is there too, which comes after it."""
+        return self.do("where", self.clip(step, limit), there())
 
     def nearest(self, step: int, numerator: int, divisor: int) -> int:
         """Return a step times a constant over another step, rounded."""
@@ -143,9 +143,9 @@ class Lowering:
         limit = limit_of(one.of_bits)
         if arithmetic.guard is None:
             return self.clip(found[-1], limit)
-        least = self.constant(arithmetic.at_least)
+        guard, least = found[arithmetic.guard], arithmetic.at_least
         return self.clip_where(
-            found[-1], limit, self.do("at_least", found[arithmetic.guard], least)
+            found[-1], limit, lambda: self.do("at_least", guard, self.constant(least))
         )
 
     def column(self, one: Definition) -> int:
@@ -170,7 +170,9 @@ class Lowering:
             if one.over != "sum":
                 divisor = self.do("*", divisor, self.do("values", *window))
         found, limit = self.nearest(total, numerator, divisor), limit_of(one.bits)
-        return self.clip(found, limit) if total == now else self.clip_where(found, limit, now)
+        return (
+            self.clip(found, limit) if total == now else self.clip_where(found, limit, lambda: now)
+        )
 
     def _factor(self, one: Definition, fact: Fact) -> int:
         place = _place(self.facts, CarFact(fact.name, fact.equals))

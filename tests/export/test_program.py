@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fleet_slip.canonical import canonical_json, sha256_of
 from fleet_slip.catalogue.definitions import Definition
 from fleet_slip.columns.lowering import most_values
 from fleet_slip.errors import QuestionError
@@ -16,7 +17,7 @@ from fleet_slip.export.document import program_content
 from fleet_slip.export.program import Car
 from fleet_slip.models.manifest import Manifest
 from tests.export import plain
-from tests.export.models import DEFINITIONS, cars, drives, model_of, models
+from tests.export.models import DEFINITIONS, MODELS, cars, drives, model_of, models
 
 
 @settings(max_examples=40)
@@ -113,3 +114,14 @@ def test_the_angle_is_rounded_halves_up() -> None:
     assert np.isclose(program.angle.terms[0][1] / 2**program.angle.bits, 0.5)
     found = plain.angles(program_content(program), [], [], [[-3], [-1], [0], [1], [3]])
     assert found == [-1, 0, 0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("name", "sha256"), [("every_kind", "0d2839d120079dea"), ("features", "eab847943463cf02")]
+)
+def test_a_version_exported_again_has_the_same_steps_in_the_same_order(
+    name: str, sha256: str
+) -> None:
+    """Of programs of version 0.2.0: whoever compares two exports of a version finds no change."""
+    steps = [list(step) for step in compile_program(model_of(MODELS[name])).steps]
+    assert sha256_of(canonical_json(steps)).startswith(sha256)
