@@ -29,7 +29,7 @@ from fleet_slip.grams.cohorts.fold_sums import sum_cohort
 from fleet_slip.grams.rows.gram_files import write_rows
 from fleet_slip.regression.choice.stepwise import METHODS
 from fleet_slip.selection.model_list import Search, load_model_list
-from fleet_slip.selection.searched_models import search_models
+from fleet_slip.selection.search import search_models
 from fleet_slip.warehouse.tables import Warehouse
 
 MODELS = load_model_list("estimator")

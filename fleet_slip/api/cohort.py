@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from fleet_slip.regression.inference.drive_moments import ClusterUnit
     from fleet_slip.selection.diagnostics import Diagnosis
     from fleet_slip.selection.regimes import RegimeComparison
-    from fleet_slip.selection.requested_selection import RequestedSelection
+    from fleet_slip.selection.select_models import RequestedSelection
     from fleet_slip.selection.shrinkage import Shrunk
     from fleet_slip.selection.what_if import WhatIf
 
@@ -151,9 +151,9 @@ class FleetCohort(Rooted):
 
         Raises `DataError` for a feature set without such regimes.
         """
-        from fleet_slip.selection.named_inputs import WHOLE_SET, inputs_of
+        from fleet_slip.selection.model_list import WHOLE_SET, inputs_of
         from fleet_slip.selection.regimes import compare_regimes
-        from fleet_slip.selection.worth import parse_worth
+        from fleet_slip.selection.request import parse_worth
 
         gain = parse_worth(worth)
         folding, cohort = _folding(by, folds), self._load(features)
@@ -176,7 +176,7 @@ class FleetCohort(Rooted):
         the feature set `features` separated by commas, by default all; with `naive` rows are
         independent evidence, else what `cluster` says, as in `select`.
         """
-        from fleet_slip.selection.named_inputs import WHOLE_SET, inputs_of
+        from fleet_slip.selection.model_list import WHOLE_SET, inputs_of
         from fleet_slip.selection.shrinkage import compare_shrinkage
 
         folding, cohort = _folding(by, folds), self._load(features)

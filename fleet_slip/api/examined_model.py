@@ -8,7 +8,7 @@ from fleet_slip.errors import QuestionError, UsageError
 from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.versions import Registry
-from fleet_slip.selection.named_inputs import WHOLE_SET, inputs_of
+from fleet_slip.selection.model_list import WHOLE_SET, inputs_of
 
 
 @dataclass(frozen=True)

@@ -114,7 +114,7 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
         from fleet_slip.api.run_report import RunReport, Training
         from fleet_slip.catalogue.features import features
         from fleet_slip.selection.model_list import load_model_list
-        from fleet_slip.selection.worth import parse_worth
+        from fleet_slip.selection.request import parse_worth
         from fleet_slip.simulation.campaign import load_campaign
 
         begun = time.monotonic()
@@ -200,7 +200,7 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
         """
         from fleet_slip.api.nightly import Night
         from fleet_slip.api.run_report import Training
-        from fleet_slip.selection.worth import parse_worth
+        from fleet_slip.selection.request import parse_worth
 
         parse_worth(worth)
         training = Training(require_model_name(name), cohort, models, worth, sign_key)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from fleet_slip.models.diff import Difference
     from fleet_slip.models.publish import Publication
     from fleet_slip.models.score import Score
-    from fleet_slip.selection.requested_selection import RequestedSelection
+    from fleet_slip.selection.select_models import RequestedSelection
 
 
 class PublishedModels(Rooted):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from fleet_slip.errors import RefusedError
 from fleet_slip.grams.rows.gram_job import GramReport
 from fleet_slip.models.publish import Publication
-from fleet_slip.selection.requested_selection import RequestedSelection
+from fleet_slip.selection.select_models import RequestedSelection
 
 if TYPE_CHECKING:
     from fleet_slip.api.fleet import Fleet

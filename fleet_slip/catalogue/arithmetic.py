@@ -15,6 +15,8 @@ from fleet_slip.errors import QuestionError
 LARGEST_INPUT = 2**15
 """Largest size of a logged count, int16."""
 
+_TEXT = re.compile(r"(?!.*--|.*/\*)[A-Za-z0-9_+*/()<>=: -]{1,5000}")
+"""What can stand in it, of a manifest that may come from anywhere."""
 _CAST = re.compile(r"::BIGINT\b")
 _GUARDED = re.compile(r"CASE WHEN (.+) >= ([0-9]+) THEN (.+) END", re.DOTALL)
 _OVERFLOW = 2**63
@@ -64,6 +66,8 @@ def parse(sql: str) -> Arithmetic:
 
     Also if it could need more than 64 bits, where SQL would end with an error.
     """
+    if not _TEXT.fullmatch(sql):
+        raise QuestionError(f"{sql[:200]!r} is not integer arithmetic on counts.")
     builder = _Builder()
     text = _CAST.sub("", sql.strip())
     guarded = _GUARDED.fullmatch(text)

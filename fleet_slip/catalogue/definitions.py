@@ -72,7 +72,7 @@ def _ratio(value: Fraction) -> Fraction:
     return value
 
 
-def _integer_arithmetic(sql: str) -> str:
+def integer_arithmetic(sql: str) -> str:
     """Return the SQL of a feature. Raises `ValueError` if it is more than integer arithmetic."""
     if not sql:
         return sql
@@ -92,6 +92,9 @@ def _not_unknowable(name: str) -> str:
 
 
 Ratio = Annotated[Fraction, AfterValidator(_ratio)]
+
+
+_LEFT_OUT = Field(exclude_if=lambda one: one is None)
 
 
 class Fact(Config):
@@ -191,15 +194,15 @@ class Definition(Config):
     """
 
     of: Identifier
-    sql: Annotated[str, Field(max_length=5000), AfterValidator(_integer_arithmetic)] = ""
+    sql: Annotated[str, AfterValidator(integer_arithmetic)] = ""
     of_bits: Bits = COUNT_BITS
     over: Over | None = None
     ticks: int = Field(default=0, ge=0, le=LONGEST_TICKS)
     ratio: Ratio = Fraction(1)
     bits: Bits = 20
     fact: Fact | None = None
-    gate: Annotated[Gate | None, Field(exclude_if=lambda gate: gate is None)] = None
-    number: Annotated[Number | None, Field(exclude_if=lambda one: one is None)] = None
+    gate: Annotated[Gate | None, _LEFT_OUT] = None
+    number: Annotated[Number | None, _LEFT_OUT] = None
 
     @model_validator(mode="after")
     def _ticks_fit(self) -> "Definition":

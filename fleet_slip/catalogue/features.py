@@ -17,16 +17,17 @@ from fleet_slip.canonical import canonical_json, sha256_of
 from fleet_slip.catalogue.course_change import BESIDE, YAW_RATE, course_units
 from fleet_slip.catalogue.definitions import COUNT_BITS, Definition, plain_column
 from fleet_slip.catalogue.feature_sets import PLAIN, FeatureSet, Regime
-from fleet_slip.catalogue.gates import GateFamily, gated_columns
 from fleet_slip.catalogue.row_features import Feature
 from fleet_slip.catalogue.signals import Identifier, Signal, catalogue
 from fleet_slip.catalogue.windows import (
     Calibrated,
     Factor,
+    GateFamily,
     TimeColumn,
     Window,
     calibrated_column,
     factor_column,
+    gated_columns,
     window_column,
 )
 from fleet_slip.config import Config, faults_of, load_config, load_toml

@@ -1,5 +1,6 @@
 """Features of `configs/features.toml` as types: integer functions of the counts of one row."""
 
+import re
 from decimal import Decimal
 from fractions import Fraction
 from functools import cached_property
@@ -7,11 +8,14 @@ from functools import cached_property
 from pydantic import Field, model_validator
 
 from fleet_slip.catalogue.arithmetic import parse
-from fleet_slip.catalogue.definitions import COUNT_BITS, Bits, limit_of
-from fleet_slip.catalogue.feature_sql import integer_sql, names_in, require_integer_sql
+from fleet_slip.catalogue.definitions import COUNT_BITS, Bits, integer_arithmetic, limit_of
 from fleet_slip.catalogue.signals import Identifier, SIUnit, catalogue
 from fleet_slip.config import Config
-from fleet_slip.errors import QuestionError
+
+_DECLARED = re.compile(r"(?:[a-z0-9_+\-*() ]|// [1-9][0-9]*(?![0-9]))+")
+"""What `configs/features.toml` may say; division that rounds comes of `divided_by`."""
+
+_WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
 class Feature(Config):
@@ -33,22 +37,18 @@ class Feature(Config):
             raise ValueError("at_least is for a divisor that varies, which must have it")
         if self._divisor_is_number and int(self.divided_by or 0) == 0:
             raise ValueError("divided_by is zero")
-        try:
-            # What a manifest takes, and every target computes: see `columns/lowering.py`.
-            arithmetic = parse(require_integer_sql(self.sql))
-        except QuestionError as error:
-            raise ValueError(str(error)) from None
-        if not arithmetic.inputs:
+        # What a manifest takes, and every target computes: see `columns/lowering.py`.
+        if not parse(integer_arithmetic(self.sql)).inputs:
             raise ValueError("it is of no signal")
         return self
 
     @cached_property
     def sql(self) -> str:
         """The count before it is clipped, as SQL over the view `log_counts`."""
-        counts = integer_sql(self.counts)
+        counts = _widened(self.counts)
         if self.divided_by is None:
             return counts
-        divisor = integer_sql(self.divided_by)
+        divisor = _widened(self.divided_by)
         # `//` truncates, so half a divisor with the sign of the dividend rounds to the nearest.
         quotient = f"(2 * ({counts}) + sign({counts}) * ({divisor})) // (2 * ({divisor}))"
         if self._divisor_is_number:
@@ -62,7 +62,7 @@ class Feature(Config):
     @property
     def inputs(self) -> tuple[str, ...]:
         """The signals that it is computed from, in catalogue order."""
-        used = names_in(self.counts) | names_in(self.divided_by or "")
+        used = parse(self.sql).inputs
         return tuple(name for name in catalogue().feature_inputs if name in used)
 
     @property
@@ -74,3 +74,10 @@ class Feature(Config):
     def limit(self) -> int:
         """Largest count."""
         return limit_of(self.bits)
+
+
+def _widened(text: str) -> str:
+    """Return a declared expression over counts with every signal widened to 64 bits."""
+    if not _DECLARED.fullmatch(text):
+        raise ValueError(f"{text!r} is not integer arithmetic of + - * ( ) and // NUMBER")
+    return _WORD.sub(lambda m: m[0] if m[0] in ("abs", "sign") else f"{m[0]}::BIGINT", text)

@@ -11,8 +11,7 @@ from fleet_slip.catalogue.features import FeatureCatalogue
 from fleet_slip.catalogue.signals import COUNT_MAX, catalogue
 from fleet_slip.columns.counted_columns import CountedColumns, rows_of
 from fleet_slip.columns.operations import plain_of, size_of
-from fleet_slip.columns.sql_layers import SqlLayers
-from fleet_slip.columns.sql_operations import DUCKDB_SQL, fact_sql
+from fleet_slip.columns.sql_operations import DUCKDB_SQL, SqlLayers, fact_sql
 from fleet_slip.errors import QuestionError
 
 _SEPARATOR = ",\n            "

@@ -5,8 +5,11 @@ The angles come from the columns as the warehouse's kernel computes them, which 
 programs, and from exact integers.
 """
 
+import csv
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from decimal import Decimal
+from io import StringIO
 
 import numpy as np
 import pyarrow as pa
@@ -178,3 +181,46 @@ def _standstill(program: Program, random: np.random.Generator) -> Iterable[Sampl
             int(random.integers(-2, 3)) + one.max_count * tick // (8 * HOSTILE_TICKS)
             for one in program.signals
         )
+
+
+def checks_csv(program: Program, checks: Sequence[Check]) -> str:
+    """Return CSV with a row a tick: columns as the statement of SQL reads them, and the angle.
+
+    An empty cell is a missing value, or no angle.
+    """
+    facts = tuple(dict.fromkeys(one.name for one in program.facts))
+    text = StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    columns = [one.column for one in program.signals]
+    numbers = [one.name for one in program.numbers]
+    writer.writerow(["drive_id", "tick", *columns, *facts, *numbers, "expected_angle"])
+    for check in checks:
+        known = [_fact(program, check, name) for name in facts]
+        known += [
+            _physical(count, one.grain)
+            for count, one in zip(check.numbers, program.numbers, strict=True)
+        ]
+        for tick, (sample, angle) in enumerate(zip(check.samples, check.angles, strict=True)):
+            values = [
+                _physical(count, one.scale)
+                for count, one in zip(sample, program.signals, strict=True)
+            ]
+            writer.writerow([check.name, tick, *values, *known, angle])
+    return text.getvalue()
+
+
+def _physical(count: int | None, scale: Decimal) -> str | None:
+    return None if count is None else f"{count * scale:f}"
+
+
+def _fact(program: Program, check: Check, name: str) -> object:
+    """Return a fact as the logs have it; `another` is a text that no fact of the program is."""
+    found: object = None
+    for one, count in zip(program.facts, check.facts, strict=True):
+        if one.name == name and count is not None:
+            if one.equals is None:
+                return count
+            found = one.equals if count else found or "another"
+            if count:
+                return found
+    return found

@@ -49,13 +49,9 @@ def write_program(manifest: Manifest) -> Program:
         column=label.column,
         unit=label.unit,
         scale=label.scale / Decimal(OUTPUT_COUNTS),
-        bits=fixed.bits,
-        low_bits=fixed.low_bits,
-        intercept=fixed.intercept,
-        terms=tuple(zip(places, fixed.coefficients, strict=True)),
-        error=fixed.error,
-        largest=fixed.largest,
+        places=tuple(places),
         limit=LARGEST_ANGLE,
+        **vars(fixed),
     )
     return Program(signals, facts, numbers, steps, angle)
 

@@ -12,8 +12,7 @@ from typing import Any
 
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.export.c.c_source import step_lines
-from fleet_slip.export.c.c_state import state_bytes
-from fleet_slip.export.c.c_steps import StepWriter
+from fleet_slip.export.c.c_steps import StepWriter, state_bytes
 from fleet_slip.export.compile import write_program
 from fleet_slip.export.program import Program
 from fleet_slip.models.manifest import Manifest

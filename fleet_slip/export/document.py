@@ -6,6 +6,7 @@ Whole numbers that may need more than 53 bits are texts.
 import base64
 import hashlib
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 from fleet_slip.canonical import canonical_json, sha256_of
@@ -41,7 +42,7 @@ def document_of(
         },
         "program": program_content(program),
         "costs": count_costs(program).as_dict(),
-        "checks": [_check(one) for one in checks],
+        "checks": [asdict(one) for one in checks],
     }
     return {**content, "sha256": sha256_of(canonical_json(content))}
 
@@ -114,14 +115,4 @@ def manifest_of(
         },
         "costs": count_costs(program).as_dict(),
         "files": {name: hashlib.sha256(content).hexdigest() for name, content in files.items()},
-    }
-
-
-def _check(check: Check) -> dict[str, Any]:
-    return {
-        "name": check.name,
-        "facts": list(check.facts),
-        "numbers": list(check.numbers),
-        "samples": [list(sample) for sample in check.samples],
-        "angles": list(check.angles),
     }

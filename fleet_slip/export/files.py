@@ -10,8 +10,7 @@ from fleet_slip.export.c.c_checks import c_fuzz_target, c_self_test
 from fleet_slip.export.c.c_gram import c_gram_header, c_gram_source
 from fleet_slip.export.c.c_names import c_prefix, file_prefix
 from fleet_slip.export.c.c_source import c_header, c_source
-from fleet_slip.export.checks import Check, make_checks
-from fleet_slip.export.checks_table import checks_csv
+from fleet_slip.export.checks import Check, checks_csv, make_checks
 from fleet_slip.export.compile import compile_program
 from fleet_slip.export.dbc import dbc_text
 from fleet_slip.export.document import document_of, manifest_of
@@ -167,8 +166,8 @@ def render(content: Mapping[str, Any]) -> str:
 def _rendered(value: Any, depth: int) -> str:
     """Return JSON text; what is made of numbers and texts alone stands on one line."""
     items = value.values() if isinstance(value, Mapping) else value
-    if not isinstance(value, Mapping | list) or not any(
-        isinstance(one, Mapping | list) for one in items
+    if not isinstance(value, Mapping | list | tuple) or not any(
+        isinstance(one, Mapping | list | tuple) for one in items
     ):
         return json.dumps(value, ensure_ascii=False, allow_nan=False)
     indent, close = "\n" + " " * (depth + 1), "\n" + " " * depth

@@ -9,11 +9,11 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from decimal import Decimal
-from fractions import Fraction
 from functools import cached_property
 
 from fleet_slip.columns.lowering import CarCount, CarFact, given_ranges
 from fleet_slip.columns.operations import Range, Step, plain_of, ranges_of, rings_of, roots_of
+from fleet_slip.export.fixed_point import FixedPoint
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Input:
 
 
 @dataclass(frozen=True)
-class Angle:
+class Angle(FixedPoint):
     """The dot product: `(intercept + sum(coefficient * step)) / 2^bits`, in counts of `scale`.
 
     Rounded to the nearest integer, halves up, and clipped to 32 bits. How far it is from the exact
@@ -38,12 +38,7 @@ class Angle:
     Attributes:
         name, column, unit: what is estimated.
         scale: physical value of one count.
-        bits: of the fraction.
-        low_bits: of the lower part of each coefficient, where two words hold it.
-        intercept: over 2^bits.
-        terms: a step and its coefficient over 2^bits, for each term of the model.
-        error: bound of the distance from the exact model, rounding included, in counts.
-        largest: bound of the size before it is clipped, in counts.
+        places: the step of each coefficient.
         limit: to which it is clipped.
     """
 
@@ -51,19 +46,13 @@ class Angle:
     column: str
     unit: str
     scale: Decimal
-    bits: int
-    low_bits: int
-    intercept: int
-    terms: tuple[tuple[int, int], ...]
-    error: Fraction
-    largest: int
+    places: tuple[int, ...]
     limit: int
 
     @property
-    def parts(self) -> tuple[tuple[int, int], ...]:
-        """The upper and lower part of the intercept, then of each coefficient."""
-        whole = (self.intercept, *(coefficient for _, coefficient in self.terms))
-        return tuple(divmod(one, 1 << self.low_bits) for one in whole)
+    def terms(self) -> tuple[tuple[int, int], ...]:
+        """A step and its coefficient over 2^bits, for each term of the model."""
+        return tuple(zip(self.places, self.coefficients, strict=True))
 
 
 @dataclass(frozen=True)

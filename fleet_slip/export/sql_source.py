@@ -4,8 +4,7 @@ DuckDB, SQLite and PostgreSQL do. What is used more than once is a column of a l
 """
 
 from fleet_slip.catalogue.signals import COUNT_MAX
-from fleet_slip.columns.sql_layers import SqlLayers
-from fleet_slip.columns.sql_operations import PLAIN_SQL, fact_sql
+from fleet_slip.columns.sql_operations import PLAIN_SQL, SqlLayers, fact_sql
 from fleet_slip.export.program import Program
 from fleet_slip.models.model_version import ModelVersion
 

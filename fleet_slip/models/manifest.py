@@ -16,13 +16,10 @@ from pydantic import (
     FiniteFloat,
     PlainSerializer,
     PlainValidator,
-    SerializerFunctionWrapHandler,
-    model_serializer,
     model_validator,
 )
 
-from fleet_slip.catalogue.definitions import Definition, plain_column
-from fleet_slip.catalogue.feature_sql import names_in, require_integer_sql
+from fleet_slip.catalogue.definitions import Definition, integer_arithmetic, plain_column
 from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN, Identifier, catalogue
 from fleet_slip.config import Config
 from fleet_slip.errors import RefusedError, UsageError
@@ -75,6 +72,10 @@ Correlation = Annotated[FiniteFloat, Field(ge=-1 - 1e-9, le=1 + 1e-9)]
 """A little more than there can be: rounding may take it there."""
 
 
+_LEFT_OUT = Field(exclude_if=lambda one: one is None)
+"""Where there is none, so that a manifest is what it was before there was any."""
+
+
 def _require_rounded(value: float, exact: Fraction) -> None:
     """Raise `ValueError` if a number is not its exact fraction, rounded once."""
     try:
@@ -98,31 +99,18 @@ class ModelTerm(Config):
     column: Identifier
     unit: str
     scale: Scale
-    sql: Annotated[str, AfterValidator(require_integer_sql)] = ""
-    definition: Definition | None = None
-    signal_scales: dict[Identifier, Scale] | None = None
+    sql: Annotated[str, AfterValidator(integer_arithmetic)] = ""
+    definition: Annotated[Definition | None, _LEFT_OUT] = None
+    signal_scales: Annotated[dict[Identifier, Scale] | None, _LEFT_OUT] = None
     coefficient: FiniteFloat
     coefficient_exact: ExactFraction
 
     @model_validator(mode="after")
-    def _defined_once(self) -> "ModelTerm":
+    def _agrees(self) -> "ModelTerm":
         if self.sql and self.definition:
             raise ValueError("a term has sql or a definition, not both")
-        return self
-
-    @model_validator(mode="after")
-    def _agrees(self) -> "ModelTerm":
         _require_rounded(self.coefficient, self.coefficient_exact)
         return self
-
-    @model_serializer(mode="wrap")
-    def _without_nothing(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out what a term has not, so that a manifest is what it was before there was any."""
-        content: dict[str, Any] = handler(self)
-        for name in ("definition", "signal_scales"):
-            if getattr(self, name) is None:
-                del content[name]
-        return content
 
     @property
     def logged(self) -> bool:
@@ -143,12 +131,10 @@ class ModelTerm(Config):
     @property
     def inputs(self) -> tuple[str, ...]:
         """The logged signals that it is computed from: itself, or what its SQL names."""
-        if self.definition is not None:
-            return self.definition.signals
+        one = self.definition or plain_column(self.signal, self.sql)
         if not self.sql:
-            return (self.signal,)
-        words = names_in(self.sql)
-        return tuple(name for name in catalogue().signals if name in words)
+            return one.signals
+        return tuple(name for name in catalogue().signals if name in one.signals)
 
 
 class ModelLabel(Config):
@@ -191,7 +177,7 @@ class TrainedOn(Config):
     feature_set: str = "signals"
     drives: Count
     vehicles: Count | None = None
-    drives_without_log: Count | None = None
+    drives_without_log: Annotated[Count | None, _LEFT_OUT] = None
     rows: Count
     logs_version: Count
     grams_version: Count
@@ -202,14 +188,6 @@ class TrainedOn(Config):
         if not max(self.vehicles or 0, self.drives_without_log or 0) <= self.drives <= self.rows:
             raise ValueError("says that there are more cars than drives, or more drives than rows")
         return self
-
-    @model_serializer(mode="wrap")
-    def _without_nothing(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out what there is none of, so that a manifest is what it was before."""
-        content: dict[str, Any] = handler(self)
-        if self.drives_without_log is None:
-            del content["drives_without_log"]
-        return content
 
 
 Seconds = Annotated[FiniteFloat, Field(gt=0)]
@@ -264,11 +242,9 @@ class Manifest(Config):
     trained_on: TrainedOn
     selected_by: SelectedBy
     package_version: str
-    learned_from: Annotated[LearnedFrom | None, Field(exclude_if=lambda one: one is None)] = None
+    learned_from: Annotated[LearnedFrom | None, _LEFT_OUT] = None
     """None where it was a reference sensor."""
-    imported_from: Annotated[
-        ImportedFrom | None, Field(exclude_if=lambda origin: origin is None)
-    ] = None
+    imported_from: Annotated[ImportedFrom | None, _LEFT_OUT] = None
 
     @model_validator(mode="after")
     def _agrees(self) -> "Manifest":

@@ -26,8 +26,7 @@ from fleet_slip.models.straight_on import StraightOn, straight_on
 from fleet_slip.models.trained_drives import checksum_of_drives, pack_drives
 from fleet_slip.models.versions import Registry
 from fleet_slip.regression.validation.crossval import CrossValidation
-from fleet_slip.selection.requested_selection import RequestedSelection
-from fleet_slip.selection.select_models import Selection
+from fleet_slip.selection.select_models import RequestedSelection, Selection
 from fleet_slip.warehouse.condition import parse_condition
 from fleet_slip.warehouse.tables import Warehouse
 

@@ -1,7 +1,10 @@
 """Answers a request: reads the Gram rows it needs, and selects among models."""
 
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import Any
+
+import numpy as np
 
 from fleet_slip.canonical import canonical_json, sha256_of
 from fleet_slip.catalogue.feature_sets import PLAIN
@@ -11,28 +14,37 @@ from fleet_slip.errors import QuestionError, UsageError
 from fleet_slip.grams.cohorts.fold_sums import SummedCohort, sum_cohort
 from fleet_slip.grams.cohorts.folding import EACH, ROW_FOLDS, Folding, make_folding
 from fleet_slip.grams.cohorts.gram_cohort import Cohort, load_cohort
+from fleet_slip.grams.cohorts.training_folds import clustered_moments
 from fleet_slip.regression.choice.nested_choice import Rule
 from fleet_slip.regression.choice.stepwise import METHODS
-from fleet_slip.selection.influential_cars import influential_cars, without_vehicles
+from fleet_slip.regression.inference.influential import find_influential
 from fleet_slip.selection.model_list import (
+    WHOLE_SET,
     CandidateModel,
     ModelList,
     Search,
+    inputs_of,
     load_model_list,
     nested_candidates,
+    require_inputs,
 )
-from fleet_slip.selection.named_inputs import WHOLE_SET, inputs_of, require_inputs
-from fleet_slip.selection.request import COURSE, DEFAULT_MODELS, SelectionRequest
-from fleet_slip.selection.requested_selection import RequestedSelection
+from fleet_slip.selection.request import (
+    COURSE,
+    DEFAULT_MODELS,
+    WORTH,
+    SelectionRequest,
+    parse_worth,
+)
 from fleet_slip.selection.search import (
+    ALL_SUBSETS,
     require_criterion,
-    select_ranked,
-    select_subsets,
+    select_inputs,
     try_distances,
 )
-from fleet_slip.selection.select_models import Selection, select
+from fleet_slip.selection.select_models import RequestedSelection, Selection, select
 from fleet_slip.selection.uncertainty import estimate_uncertainty
-from fleet_slip.selection.worth import WORTH, parse_worth
+from fleet_slip.warehouse.condition import Condition, parse_condition
+from fleet_slip.warehouse.minimum_cohort import tells_single_cars
 from fleet_slip.warehouse.tables import Warehouse
 
 GIVEN = "given"
@@ -209,9 +221,9 @@ def _search(cohort: Cohort, request: SelectionRequest, folds: Folding) -> Reques
     nested = request.nested or WHOLE_SET
     inputs = inputs_of(cohort, nested)
     criterion = require_criterion(request.criterion or "cv")
-    rule = Rule(request.rank or "declared", criterion, parse_worth(request.worth))
-    choose = select_subsets if request.all_subsets else select_ranked
-    found = choose(
+    ranking = ALL_SUBSETS if request.all_subsets else request.rank or "declared"
+    rule = Rule(ranking, criterion, parse_worth(request.worth))
+    found = select_inputs(
         cohort,
         inputs,
         folds,
@@ -220,7 +232,6 @@ def _search(cohort: Cohort, request: SelectionRequest, folds: Folding) -> Reques
         cluster=request.cluster,
         intercept=request.intercept,
     )
-    rule = found.choice.rule
     described = ModelList(
         description="Inputs to choose from",
         features=cohort.feature_set,
@@ -241,3 +252,36 @@ def _search(cohort: Cohort, request: SelectionRequest, folds: Folding) -> Reques
     label = f"nested:{nested} {rule.ranking} {rule.criterion}"
     checksum = _checksum(sha256_of(canonical_json(content)), WORTH, request.intercept)
     return RequestedSelection.of(selection, label, checksum)
+
+
+HASH_CHARACTERS = 16
+"""Of the SHA-256 of a car's name."""
+
+
+def influential_cars(cohort: Cohort, inputs: Sequence[str]) -> dict[str, float]:
+    """Return the cars of unusual influence, and how many times the median influence theirs is.
+
+    Drives that name no car are never left out. Raises `DataError` if no drive has all inputs, and
+    for fewer cars than tell what is usual.
+    """
+    served = cohort.serving(inputs)
+    owners = np.array([name or "" for name in served.drives["vehicle_id"].to_pylist()])
+    names, cars = np.unique(owners, return_inverse=True)
+    found = find_influential(clustered_moments(served, "drive"), cars.astype(np.int64))
+    return {str(names[one.car]): one.times for one in found if names[one.car]}
+
+
+def without_vehicles(condition: Condition, vehicles: Collection[str]) -> Condition:
+    """Return a condition on drives that leaves out some cars.
+
+    It names them, or their hashes where a minimum cohort is asked for, since versions keep it.
+    """
+    if not vehicles:
+        return condition
+    tell, names = "vehicle_id", sorted(vehicles)
+    if not tells_single_cars():
+        tell = f"left(sha256(vehicle_id), {HASH_CHARACTERS})"
+        names = sorted(sha256_of(name)[:HASH_CHARACTERS] for name in vehicles)
+    quoted = ", ".join("'" + name.replace("'", "''") + "'" for name in names)
+    others = f"(vehicle_id IS NULL OR {tell} NOT IN ({quoted}))"
+    return parse_condition(f"{condition.sql} AND {others}")

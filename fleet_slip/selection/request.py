@@ -1,12 +1,14 @@
 """How to select: the one definition of what `FleetCohort.select` and `fleet-slip select` take."""
 
+import math
+import re
 from dataclasses import dataclass
 from typing import Literal
 
 from fleet_slip.errors import UsageError
 from fleet_slip.grams.cohorts.folding import FoldKey
+from fleet_slip.regression.choice.winner import Worth
 from fleet_slip.regression.inference.drive_moments import ClusterUnit
-from fleet_slip.selection.worth import WORTH, parse_worth
 
 DEFAULT_MODELS = "table1"
 
@@ -15,6 +17,11 @@ Label = Literal["course"]
 
 COURSE: Label = "course"
 """Also the name of the feature set, and of the model list, that are taken for it."""
+
+WORTH = "0.005deg"
+"""`fleet_slip.regression.choice.winner.DEFAULT_WORTH` as it is asked for."""
+
+_WORTH = re.compile(r"(\d+(?:\.\d*)?|\.\d+) ?(deg|%)")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,3 +114,15 @@ class SelectionRequest:
                 "a search is made again in every fold, and looks at folds alone: leave out rank, "
                 "criterion, all_subsets and naive."
             )
+
+
+def parse_worth(text: str) -> Worth:
+    """Return a gain in RMSE from text such as `0.005deg` or `2%`. Raises `UsageError`."""
+    found = _WORTH.fullmatch(text.strip())
+    if found is None:
+        raise UsageError(
+            f"worth = {text}: write an angle such as {WORTH}, or a share of the best RMSE such as "
+            "2%."
+        )
+    amount = float(found[1])
+    return Worth(amount / 100, relative=True) if found[2] == "%" else Worth(math.radians(amount))

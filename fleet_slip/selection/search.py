@@ -1,13 +1,15 @@
 """Which signals of a set: the nested models of a ranking, or the best subset of every size."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.grams.cohorts.fold_sums import SummedCohort
 from fleet_slip.grams.cohorts.folding import ROW_FOLDS, Folding
 from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.grams.cohorts.training_folds import drive_folds, row_training
@@ -20,15 +22,22 @@ from fleet_slip.regression.choice.nested_choice import (
     cross_validate_nested,
     cross_validate_selection,
     measure_distances,
+    nested_fits,
     select_nested,
 )
 from fleet_slip.regression.choice.nested_choice import NestedChoice as NestedSelection
+from fleet_slip.regression.choice.stepwise import stepwise_order
 from fleet_slip.regression.choice.subsets import SizeResult, best_subsets, pick_sizes
-from fleet_slip.regression.choice.winner import Winner, choose
+from fleet_slip.regression.choice.winner import DEFAULT_WORTH, Winner, Worth, choose
+from fleet_slip.regression.exact.figures import ErrorSums
+from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.regression.exact.least_squares import Fit, fit
 from fleet_slip.regression.inference.drive_moments import ClusterUnit
 from fleet_slip.regression.inference.evidence import Evidence
-from fleet_slip.regression.validation.crossval import CrossValidation
-from fleet_slip.selection.told_figures import told_figures
+from fleet_slip.regression.validation.crossval import CrossValidation, assemble, held_out_errors
+from fleet_slip.regression.validation.folds import Folds
+from fleet_slip.selection.model_list import Search
+from fleet_slip.warehouse.minimum_cohort import tells_single_cars
 
 ALL_SUBSETS = "all-subsets"
 """Instead of a ranking: the best subset of every size."""
@@ -95,7 +104,7 @@ def require_criterion(name: str) -> str:
     return name
 
 
-def select_ranked(
+def select_inputs(
     cohort: Cohort,
     inputs: Sequence[str],
     folding: Folding,
@@ -105,10 +114,11 @@ def select_ranked(
     cluster: ClusterUnit | None = None,
     intercept: bool = True,
 ) -> SearchResult:
-    """Rank the inputs and choose one of the nested models, on the drives that have them all.
+    """Choose some of the inputs, on the drives that have them all.
 
-    Raises `DataError` if no drive has them all, if they are linearly dependent, or if the criterion
-    keeps none of them, and `QuestionError` for an unknown rule.
+    By the ranking of the rule one of the nested models; by `ALL_SUBSETS` one of the best subsets of
+    every size. Raises `DataError` if no drive has them all, if they are linearly dependent, or if
+    the criterion keeps none of them, and `QuestionError` for an unknown rule.
     """
     label = catalogue().label
     if folding.by == ROW_FOLDS:
@@ -119,53 +129,30 @@ def select_ranked(
             cohort, inputs, folding, naive=naive, cluster=cluster, intercept=intercept
         )
         training, fold = ready.training, ready.fold
-    chosen = select_nested(training, inputs, label, rule)
-    models = cross_validate_nested(training, chosen.order, label)[1:]
-    honest = None
-    if len(training.folds.grams) >= FEWEST_FOLDS:
-        honest = cross_validate_selection("the choice itself", training, fold, inputs, label, rule)
+    if rule.ranking == ALL_SUBSETS:
+        results = best_subsets(training.total, inputs, label)
+        evidence = training.evidence(training.nested_fits(inputs, label))
+        picks = pick_sizes(results, evidence)
+        models = [
+            training.cross_validate(f"best {result.best.size}", result.best.model.signals, label)
+            for result in results[1:]
+        ]
+        choice = SearchChoice(rule, evidence, subsets=tuple(results), picks=picks)
+        size = picks.get(rule.criterion, 0)
+    else:
+        chosen = select_nested(training, inputs, label, rule)
+        models = cross_validate_nested(training, chosen.order, label)[1:]
+        honest = None
+        if len(training.folds.grams) >= FEWEST_FOLDS:
+            honest = cross_validate_selection(
+                "the choice itself", training, fold, inputs, label, rule
+            )
+        choice = SearchChoice(rule, chosen.evidence, nested=chosen, honest=honest)
+        size = chosen.size
     if rule.criterion == CROSS_VALIDATION:
         winner = choose(models, rule.worth)
     else:
-        winner = _winner(models, chosen.size, rule, chosen.evidence)
-    choice = SearchChoice(rule, chosen.evidence, nested=chosen, honest=honest)
-    return SearchResult(tuple(models), winner, choice)
-
-
-def select_subsets(
-    cohort: Cohort,
-    inputs: Sequence[str],
-    folding: Folding,
-    rule: Rule,
-    *,
-    naive: bool = False,
-    cluster: ClusterUnit | None = None,
-    intercept: bool = True,
-) -> SearchResult:
-    """Find the best subset of every size and choose one of them.
-
-    Raises `DataError` as `select_ranked` does.
-    """
-    label = catalogue().label
-    if folding.by == ROW_FOLDS:
-        training = row_training(cohort, inputs, folding, intercept=intercept)
-    else:
-        training = drive_folds(
-            cohort, inputs, folding, naive=naive, cluster=cluster, intercept=intercept
-        ).training
-    results = best_subsets(training.total, inputs, label)
-    evidence = training.evidence(training.nested_fits(inputs, label))
-    picks = pick_sizes(results, evidence)
-    models = [
-        training.cross_validate(f"best {result.best.size}", result.best.model.signals, label)
-        for result in results[1:]
-    ]
-    rule = replace(rule, ranking=ALL_SUBSETS)
-    if rule.criterion == CROSS_VALIDATION:
-        winner = choose(models, rule.worth)
-    else:
-        winner = _winner(models, picks[rule.criterion], rule, evidence)
-    choice = SearchChoice(rule, evidence, subsets=tuple(results), picks=picks)
+        winner = _winner(models, size, rule, choice.evidence)
     return SearchResult(tuple(models), winner, choice)
 
 
@@ -202,3 +189,92 @@ def _winner(models: Sequence[CrossValidation], size: int, rule: Rule, evidence: 
         f"{evidence.kind} for independent."
     )
     return Winner(models[size - 1], best, reason)
+
+
+def told_figures(model: CrossValidation) -> dict[str, Any]:
+    """Return a model's figures for a JSON document, without those of folds: one may be one car."""
+    return model.as_dict() if tells_single_cars() else {**model.as_dict(), "folds": []}
+
+
+@dataclass(frozen=True)
+class SearchedModels:
+    """The models of a search: one of each size, cross-validated with the search made again.
+
+    Attributes:
+        search: how it was searched.
+        inputs: how many inputs there were to choose among.
+        models: of sizes 1, 2, ...
+    """
+
+    search: Search
+    inputs: int
+    models: tuple[CrossValidation, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what a JSON document needs."""
+        return {**self.search.model_dump(), "inputs": self.inputs, "sizes": len(self.models)}
+
+
+def search_models(
+    cohort: Cohort | SummedCohort,
+    inputs: Sequence[str],
+    folding: Folding,
+    search: Search,
+    *,
+    intercept: bool = True,
+) -> SearchedModels:
+    """Search among the inputs on the drives that have them all.
+
+    Raises `DataError` if no drive has them all, or if no column tells anything.
+    """
+    label = catalogue().label
+    folds = cohort.folds(folding.by, folding.count).serving(inputs, label)
+
+    def fits(gram: Gram) -> list[Fit]:
+        return _fits(gram if intercept else gram.about_origin(), inputs, label, search)
+
+    chosen = fits(folds.total)
+    tests: list[list[ErrorSums]] = [[] for _ in chosen]
+    for fold in folds.grams:
+        training = folds.total - fold
+        for sums, fitted in zip(tests, fits(training), strict=False):
+            sums.append(held_out_errors(fitted.model, training, fold))
+    models = tuple(
+        _model(folds, sums, fitted, search)
+        for sums, fitted in zip(tests, chosen, strict=True)
+        if len(sums) == len(folds.grams)
+    )
+    if not models:
+        raise DataError("every input is constant or depends on others: there is nothing to choose.")
+    return SearchedModels(search, len(inputs), models)
+
+
+def _model(folds: Folds, sums: Sequence[ErrorSums], fitted: Fit, search: Search) -> CrossValidation:
+    name = f"{search.method} {fitted.size}"
+    return assemble(name, folds, sums, fitted.model, input_scales())
+
+
+def _fits(gram: Gram, inputs: Sequence[str], label: str, search: Search) -> list[Fit]:
+    """Return the exact fits of the sets that a search chooses, of sizes 1, 2, ..."""
+    sets = stepwise_order(gram, inputs, label, search.method, search.most)
+    nested = all(sets[size][:-1] == sets[size - 1] for size in range(1, len(sets)))
+    if sets and nested:
+        return nested_fits(gram, sets[-1], label)[1:]
+    return [fit(gram, chosen, label) for chosen in sets]
+
+
+def choose_by(
+    search: Search | None, models: Sequence[CrossValidation], worth: Worth = DEFAULT_WORTH
+) -> Winner:
+    """Return the winner of cross-validated models by the rule of a search.
+
+    The rule `best` gives way to a worth that was asked for.
+    """
+    if search is None or search.rule != "best" or worth != DEFAULT_WORTH:
+        return choose(models, worth)
+    best = max(models, key=lambda model: model.sums.signed_r_squared)
+    reason = (
+        f"Model {best.name} has the best cross-validated correlation, {best.correlation:.6f}, "
+        f"which is the rule of its list; the columns of each size were chosen again in every fold."
+    )
+    return Winner(best, best, reason)

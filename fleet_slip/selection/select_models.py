@@ -1,7 +1,7 @@
 """Compares candidate models on a cohort by cross-validation and chooses one; no log row is read."""
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from typing import Any, Generic
 
 from typing_extensions import TypeVar
@@ -18,9 +18,13 @@ from fleet_slip.regression.choice.winner import DEFAULT_WORTH, Winner, Worth
 from fleet_slip.regression.validation.crossval import CrossValidation, cross_validate_inputs
 from fleet_slip.regression.validation.folds import CohortFolds
 from fleet_slip.selection.model_list import CandidateModel, Search
-from fleet_slip.selection.search import SearchChoice
-from fleet_slip.selection.searched_models import SearchedModels, choose_by, search_models
-from fleet_slip.selection.told_figures import told_figures
+from fleet_slip.selection.search import (
+    SearchChoice,
+    SearchedModels,
+    choose_by,
+    search_models,
+    told_figures,
+)
 from fleet_slip.selection.uncertainty import Uncertainty
 from fleet_slip.warehouse.minimum_cohort import tells_single_cars
 
@@ -150,3 +154,30 @@ def validate(
         input_scales(),
         intercept=intercept,
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RequestedSelection(Selection[Any]):
+    """A selection that can be published: it tells what it was made from.
+
+    Attributes:
+        model_list: what was compared, such as `table1`.
+        config_sha256: checksum of all that says what to compare.
+        left_out: the cars that `robust` left out, and their influence as a multiple of the median.
+    """
+
+    model_list: str
+    config_sha256: str
+    left_out: Mapping[str, float] = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `select --json` prints."""
+        named = dict(self.left_out) if tells_single_cars() else {}
+        return {**super().as_dict(), "vehicles_left_out": named}
+
+    @classmethod
+    def of(
+        cls, selection: Selection[Any], model_list: str, config_sha256: str
+    ) -> "RequestedSelection":
+        """Return a selection with what it was made from."""
+        return cls(**vars(selection), model_list=model_list, config_sha256=config_sha256)

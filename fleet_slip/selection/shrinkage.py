@@ -27,7 +27,7 @@ from fleet_slip.regression.validation.crossval import (
     least_squares,
 )
 from fleet_slip.regression.validation.folds import Folds
-from fleet_slip.selection.told_figures import told_figures
+from fleet_slip.selection.search import told_figures
 
 PENALTIES = tuple(float(10.0**exponent) for exponent in np.arange(-6, 0.01, 0.5))
 """Penalties on the correlation matrix that ridge and lasso choose from."""

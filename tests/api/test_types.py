@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 import fleet_slip
 from fleet_slip import Fleet, FleetCohort, ModelVersion
-from fleet_slip.selection.requested_selection import RequestedSelection
+from fleet_slip.selection.select_models import RequestedSelection
 
 
 def test_a_users_lines_are_typed(fleet: Fleet) -> None:

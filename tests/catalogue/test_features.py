@@ -181,7 +181,7 @@ def test_every_feature_is_its_physical_definition_rounded_and_clipped() -> None:
         ('counts = "ay * abs(ay)"', 'counts = "ay * sideslip"', "sideslip: not an input signal"),
         ('counts = "ay * abs(ay)"', 'counts = "ay * vx"', "vx: not an input signal"),
         ('counts = "ay * abs(ay)"', 'counts = "ay / 2.5"', "not integer arithmetic"),
-        ('counts = "ay * abs(ay)"', 'counts = "ay) FROM x; DROP TABLE y; --"', "not an input"),
+        ('counts = "ay * abs(ay)"', 'counts = "ay) FROM x; DROP TABLE y; --"', "not integer"),
         ('counts = "ay * abs(ay)"', 'counts = "ay ** 2"', "not integer arithmetic"),
         ('counts = "ay * abs(ay)"', 'counts = "ay -- 3"', "not integer arithmetic"),
         ('counts = "ay * abs(ay)"', 'counts = "5"', "is of no signal"),

@@ -14,7 +14,7 @@ from fleet_slip.models.counts_model import counts_model
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.regression.exact.figures import error_sums
 from fleet_slip.regression.exact.gram import Gram, packed_position
-from fleet_slip.selection.requested_selection import RequestedSelection
+from fleet_slip.selection.select_models import RequestedSelection
 from tests.support.cars import counts, drive
 from tests.support.messages import START_S, message_of
 

@@ -9,7 +9,7 @@ from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli.options import By, Cohort, FoldCount, Signals, Worth
 from fleet_slip.cli.output import Json, print_json, print_table, stdout
 from fleet_slip.selection.regimes import RegimeComparison
-from fleet_slip.selection.worth import WORTH
+from fleet_slip.selection.request import WORTH
 from fleet_slip.words import number_of
 
 

@@ -19,7 +19,7 @@ from fleet_slip.cli.output import Json, print_json, say
 from fleet_slip.cli.progress_bar import progress_of_steps
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.workers import Cluster, Threads
-from fleet_slip.selection.worth import WORTH
+from fleet_slip.selection.request import WORTH
 from fleet_slip.words import number_of
 
 DEFAULT_CAMPAIGN = "waterford"

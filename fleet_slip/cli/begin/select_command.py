@@ -26,9 +26,8 @@ from fleet_slip.regression.inference.evidence import Evidence
 from fleet_slip.regression.validation.crossval import CrossValidation
 from fleet_slip.selection.answer_request import answer_request
 from fleet_slip.selection.request import SelectionRequest
-from fleet_slip.selection.requested_selection import RequestedSelection
 from fleet_slip.selection.search import SearchChoice
-from fleet_slip.selection.select_models import Selection
+from fleet_slip.selection.select_models import RequestedSelection, Selection
 from fleet_slip.selection.uncertainty import Uncertainty
 from fleet_slip.warehouse.minimum_cohort import tells_single_cars
 from fleet_slip.words import number_of

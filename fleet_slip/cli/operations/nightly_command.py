@@ -18,7 +18,7 @@ from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.workers import Cluster, Threads
 from fleet_slip.errors import UsageError
 from fleet_slip.extras import needed
-from fleet_slip.selection.worth import WORTH
+from fleet_slip.selection.request import WORTH
 
 
 @record_run

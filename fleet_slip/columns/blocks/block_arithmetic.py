@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.columns.blocks import block_operations as op
-from fleet_slip.columns.blocks.quotients import clip, nearest, nearest_integer, truncated
-from fleet_slip.compiling import inner_loop
+from fleet_slip.compiling import equation, inner_loop
 
 
 @inner_loop
@@ -142,3 +141,35 @@ def compute_integers(  # noqa: PLR0912 - one loop for each operation
         for i in range(size):
             divisor = max(b[i], 1)
             out[i] = nearest_integer(a[i], divisor) if rounds else truncated(a[i], divisor)
+
+
+@equation
+def nearest(value: float, numerator: float, divisor: float) -> Any:
+    """Return value * numerator / divisor to the nearest integer, halves away from zero.
+
+    All are integers, the divisor positive, and 2 |value| numerator + divisor below 2^53.
+    """
+    size = np.floor((2.0 * abs(value) * numerator + divisor) / (2.0 * divisor))
+    return -size if value < 0.0 else size
+
+
+@equation
+def nearest_integer(value: int, divisor: int) -> Any:
+    """Return value / divisor to the nearest, halves away from zero, where twice that is int64."""
+    size = (2 * abs(value) + divisor) // (2 * divisor)
+    return -size if value < 0 else size
+
+
+@equation
+def truncated(value: int, divisor: int) -> Any:
+    """Return value / divisor, truncated, of int64."""
+    size = abs(value) // divisor
+    return -size if value < 0 else size
+
+
+@equation
+def clip(value: float, limit: float) -> Any:
+    """Return a value clipped to +-limit; NaN stays."""
+    # No `min` and `max`: with NaN, theirs depends on the order of operands.
+    below = limit if value > limit else value
+    return -limit if below < -limit else below

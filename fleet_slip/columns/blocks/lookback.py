@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from fleet_slip.columns.blocks.block_arithmetic import clip, nearest
 from fleet_slip.columns.blocks.block_operations import EACH, FIXED, LIMIT, NUMERATOR
-from fleet_slip.columns.blocks.quotients import clip, nearest
 from fleet_slip.compiling import inner_loop
 
 

@@ -26,7 +26,7 @@ from fleet_slip.regression.validation.crossval import (
 )
 from fleet_slip.regression.validation.folds import CohortFolds
 from fleet_slip.selection.model_list import Search
-from fleet_slip.selection.searched_models import SearchedModels, search_models
+from fleet_slip.selection.search import SearchedModels, search_models
 from fleet_slip.simulation.sensing.sensors import SAMPLE_RATE_HZ
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse

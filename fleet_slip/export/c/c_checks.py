@@ -1,8 +1,9 @@
 """The self-test of an exported estimator in C: its checks as tables, and what runs them."""
 
 from collections.abc import Sequence
+from string import Template
 
-from fleet_slip.export.c.c_names import c_prefix, field_names, plain_text
+from fleet_slip.export.c.c_names import TEMPLATES, c_prefix, field_names, plain_text
 from fleet_slip.export.checks import Check
 from fleet_slip.export.program import Program
 from fleet_slip.models.model_version import ModelVersion
@@ -73,26 +74,14 @@ def _run(prefix: str, program: Program, number: int, check: Check) -> str:
 
 def c_fuzz_target(version: ModelVersion, program: Program) -> str:
     """Return a fuzz target for libFuzzer: a car, then samples, of any bytes."""
-    prefix = c_prefix(version)
-    known, given = "", ""
-    if program.facts or program.numbers:
-        known = (
-            f"    {prefix}_car car;\n    if (size < sizeof car) {{ return 0; }}\n"
-            "    (void)memcpy(&car, data, sizeof car);\n    at = sizeof car;\n"
-        )
-        given = ", &car"
-    return (
-        f"/* Fuzz target of {version.reference}: clang -fsanitize=fuzzer,address,undefined */\n"
-        "#include <stddef.h>\n#include <stdlib.h>\n#include <string.h>\n\n"
-        f'#include "{prefix}.h"\n\n'
-        "int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);\n\n"
-        "int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)\n{\n"
-        f"    static {prefix}_state state;\n    {prefix}_sample sample;\n"
-        f"    size_t at = 0U;\n{known}"
-        f"    {prefix}_start(&state{given});\n"
-        "    for (; (size - at) >= sizeof sample; at += sizeof sample) {\n"
-        "        int32_t angle;\n        (void)memcpy(&sample, &data[at], sizeof sample);\n"
-        f"        if ((!{prefix}_step(&state, &sample, &angle)) && (angle != 0)) {{\n"
-        "            abort(); /* where there is none, 0 is written */\n        }\n"
-        "    }\n    return 0;\n}\n"
+    prefix, knows = c_prefix(version), program.facts or program.numbers
+    known = (
+        f"    {prefix}_car car;\n    if (size < sizeof car) {{ return 0; }}\n"
+        "    (void)memcpy(&car, data, sizeof car);\n    at = sizeof car;\n"
+    )
+    return Template((TEMPLATES / "fuzz.c").read_text(encoding="utf-8")).substitute(
+        model=version.reference,
+        prefix=prefix,
+        known=known if knows else "",
+        given=", &car" if knows else "",
     )

@@ -2,10 +2,13 @@
 
 import re
 from collections.abc import Sequence
+from importlib.resources import files
 
 from fleet_slip.canonical import sha256_of
 from fleet_slip.export.program import Program
 from fleet_slip.models.model_version import ModelVersion
+
+TEMPLATES = files("fleet_slip.export.c") / "templates"
 
 LARGEST_32 = 2**31 - 1
 

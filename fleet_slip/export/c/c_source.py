@@ -1,15 +1,24 @@
 """A program in C99: a header and a source, in integers alone, without allocation or recursion."""
 
+import re
 from collections.abc import Mapping, Sequence
 
-from fleet_slip.export.c.c_helpers import HELPERS
-from fleet_slip.export.c.c_names import c_prefix, field_names, integer_type, literal, plain_text
-from fleet_slip.export.c.c_state import state_fields
-from fleet_slip.export.c.c_steps import StepWriter, ring_width, sum_key
+from fleet_slip.export.c.c_names import (
+    TEMPLATES,
+    c_prefix,
+    field_names,
+    integer_type,
+    literal,
+    plain_text,
+)
+from fleet_slip.export.c.c_steps import StepWriter, ring_width, state_fields, sum_key
 from fleet_slip.export.program import Program
 from fleet_slip.models.model_version import ModelVersion
 
 INDENT = "    "
+
+_HELPER = re.compile(r"^//: (\w+)\n", re.MULTILINE)
+"""What stands before each function in `helpers.c`: what writes it, if it was done."""
 
 
 def c_header(version: ModelVersion, program: Program) -> str:
@@ -87,7 +96,9 @@ def c_source(version: ModelVersion, program: Program) -> str:
     """Return the source that goes with the header."""
     prefix, writer = c_prefix(version), StepWriter(program)
     start, step = _start(prefix, program, writer), _step(prefix, program, writer)
-    helpers = [text.strip("\n") + "\n" for name, text in HELPERS.items() if writer.done[name]]
+    _, *named = _HELPER.split((TEMPLATES / "helpers.c").read_text(encoding="utf-8"))
+    texts = zip(named[::2], named[1::2], strict=True)
+    helpers = [text.strip("\n") + "\n" for name, text in texts if writer.done[name]]
     return "\n".join(
         [
             _preamble(version, program),

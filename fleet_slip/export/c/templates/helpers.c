@@ -1,21 +1,20 @@
-"""The functions that an exported estimator in C is made of; each is written where it is called."""
+/* The functions that an exported estimator is made of; each is written where it is called. */
 
-HELPERS = {
-    "within": """
+//: within
 /* A value of a range; MISSING beyond it. */
 static int32_t within(int32_t value, int32_t least, int32_t most)
 {
     return ((value < least) || (value > most)) ? MISSING : value;
 }
-""",
-    "clip": """
+
+//: clip
 static int32_t clip(int64_t value, int32_t limit)
 {
     const int64_t most = limit;
     return (value > most) ? limit : ((value < -most) ? -limit : (int32_t)value);
 }
-""",
-    "sign": """
+
+//: sign
 static int32_t sign(int64_t value)
 {
     int32_t found = 0;
@@ -28,20 +27,20 @@ static int32_t sign(int64_t value)
     }
     return found;
 }
-""",
-    "min": """
+
+//: min
 static int32_t smaller(int32_t one, int32_t other)
 {
     return (one < other) ? one : other;
 }
-""",
-    "max": """
+
+//: max
 static int32_t larger(int32_t one, int32_t other)
 {
     return (one > other) ? one : other;
 }
-""",
-    "nearest_64": """
+
+//: nearest_64
 /* value / divisor to the nearest, halves away from zero. */
 static int64_t nearest_64(int64_t value, int64_t divisor)
 {
@@ -49,8 +48,8 @@ static int64_t nearest_64(int64_t value, int64_t divisor)
     const int64_t found = ((2 * size) + divisor) / (2 * divisor);
     return (value < 0) ? -found : found;
 }
-""",
-    "nearest_32": """
+
+//: nearest_32
 /* The same for what fits into 32 bits. */
 static int32_t nearest_32(int32_t value, uint32_t divisor)
 {
@@ -58,8 +57,8 @@ static int32_t nearest_32(int32_t value, uint32_t divisor)
     const uint32_t found = ((2U * size) + divisor) / (2U * divisor);
     return (value < 0) ? -(int32_t)found : (int32_t)found;
 }
-""",
-    "ago_16": """
+
+//: ago_16
 /* The value of so many ticks ago; at is where the next one will be written. */
 static int32_t ago_16(const int16_t *ring, uint32_t at, uint32_t length, uint32_t ticks)
 {
@@ -67,30 +66,30 @@ static int32_t ago_16(const int16_t *ring, uint32_t at, uint32_t length, uint32_
     const int16_t value = ring[(at + turn) - ticks];
     return (value == INT16_MIN) ? MISSING : (int32_t)value;
 }
-""",
-    "ago_32": """
+
+//: ago_32
 /* The value of so many ticks ago; at is where the next one will be written. */
 static int32_t ago_32(const int32_t *ring, uint32_t at, uint32_t length, uint32_t ticks)
 {
     const uint32_t turn = (at >= ticks) ? 0U : length;
     return ring[(at + turn) - ticks];
 }
-""",
-    "keep_16": """
+
+//: keep_16
 static void keep_16(int16_t *ring, uint32_t *at, uint32_t length, int32_t value)
 {
     ring[*at] = (value == MISSING) ? INT16_MIN : (int16_t)value;
     *at = ((*at + 1U) == length) ? 0U : (*at + 1U);
 }
-""",
-    "keep_32": """
+
+//: keep_32
 static void keep_32(int32_t *ring, uint32_t *at, uint32_t length, int32_t value)
 {
     ring[*at] = value;
     *at = ((*at + 1U) == length) ? 0U : (*at + 1U);
 }
-""",
-    "slide_32": """
+
+//: slide_32
 /* The oldest value leaves a window, the newest comes. */
 static void slide_32(int32_t *sum, uint32_t *values, int32_t oldest, int32_t newest)
 {
@@ -103,8 +102,8 @@ static void slide_32(int32_t *sum, uint32_t *values, int32_t oldest, int32_t new
         *values += 1U;
     }
 }
-""",
-    "slide_64": """
+
+//: slide_64
 /* The oldest value leaves a window, the newest comes. */
 static void slide_64(int64_t *sum, uint32_t *values, int32_t oldest, int32_t newest)
 {
@@ -117,8 +116,8 @@ static void slide_64(int64_t *sum, uint32_t *values, int32_t oldest, int32_t new
         *values += 1U;
     }
 }
-""",
-    "gather": """
+
+//: gather
 /* A value comes to all since the drive began, unless its sum could overflow. */
 static void gather(int64_t *sum, uint32_t *values, uint32_t most, int32_t value)
 {
@@ -127,14 +126,11 @@ static void gather(int64_t *sum, uint32_t *values, uint32_t most, int32_t value)
         *values += 1U;
     }
 }
-""",
-    "floor_shift": """
+
+//: floor_shift
 /* value / 2^bits, rounded down: a negative number is not shifted, which C leaves open. */
 static int64_t floor_shift(int64_t value, uint32_t bits)
 {
     const uint64_t size = (uint64_t)((value >= 0) ? value : (-1 - value)) >> bits;
     return (value >= 0) ? (int64_t)size : (-1 - (int64_t)size);
 }
-""",
-}
-"""By name, in the order in which they are written."""

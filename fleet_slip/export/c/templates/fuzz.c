@@ -1,0 +1,24 @@
+/* Fuzz target of ${model}: clang -fsanitize=fuzzer,address,undefined */
+#include <stddef.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "${prefix}.h"
+
+int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
+
+int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
+{
+    static ${prefix}_state state;
+    ${prefix}_sample sample;
+    size_t at = 0U;
+${known}    ${prefix}_start(&state${given});
+    for (; (size - at) >= sizeof sample; at += sizeof sample) {
+        int32_t angle;
+        (void)memcpy(&sample, &data[at], sizeof sample);
+        if ((!${prefix}_step(&state, &sample, &angle)) && (angle != 0)) {
+            abort(); /* where there is none, 0 is written */
+        }
+    }
+    return 0;
+}
