@@ -44,7 +44,8 @@ LARGEST_CHANGE_BITS = 21
 LATE_PARTS = 4
 """A course's delay is a whole number of these parts of a tick, 2.5 ms: the yaw rate does not change
 by enough in half of it to matter."""
-MOST_LATE = LATE_PARTS * 50
+MOST_LATE, MOST_EARLY = 50, -10
+"""Ticks. A course is early where the accelerometer and gyroscope are later than it."""
 COURSE_LATE = "course_late"
 """Column of `grams`: by how many parts of a tick the course was taken to be late. And the variable
 of the SQL statement that tells it of each car."""
@@ -53,7 +54,11 @@ OVER = "hidden_over"
 """Column of changes: the place of their time among those of the set."""
 HIDDEN = ("hidden_course", "hidden_turned", "hidden_rest", "hidden_rate")
 HIDDEN_LATE = "hidden_late"
-WHOLE_TICKS = f"(({HIDDEN_LATE} + {LATE_PARTS // 2}) // {LATE_PARTS})"
+WHOLE_TICKS = (
+    f"(({HIDDEN_LATE} + {LATE_PARTS // 2 - LATE_PARTS * MOST_EARLY}) // {LATE_PARTS} "
+    f"+ {MOST_EARLY})"
+)
+"""Whole ticks in SQL, whose division is towards zero."""
 
 
 @dataclass(frozen=True)
@@ -106,9 +111,12 @@ def _in_time(rows: str) -> str:
 
     The variable `course_late` is a map from cars to the delays of their receivers.
     """
+    after, before = f"greatest({WHOLE_TICKS}, 0)", f"greatest(-{WHOLE_TICKS}, 0)"
+    course = f"max({COURSE}) OVER (PARTITION BY drive_id ORDER BY tick RANGE BETWEEN "
     return f"""(
-            SELECT * REPLACE (max({COURSE}) OVER (PARTITION BY drive_id ORDER BY tick
-                RANGE BETWEEN {WHOLE_TICKS} FOLLOWING AND {WHOLE_TICKS} FOLLOWING) AS {COURSE})
+            SELECT * REPLACE (CASE WHEN {HIDDEN_LATE} < 0
+                THEN {course}{before} PRECEDING AND {before} PRECEDING)
+                ELSE {course}{after} FOLLOWING AND {after} FOLLOWING) END AS {COURSE})
             FROM (
                 SELECT *, coalesce(getvariable('{COURSE_LATE}')[vehicle_id], 0) AS {HIDDEN_LATE}
                 FROM {rows}

@@ -47,6 +47,7 @@ TINY = {
     "poisoned": "--root {root} --campaign smoke --draws 1",
     "quality": "{root}",
     "realism": "",
+    "receiver_delay": "--cars 2 --drives 2",
     "receive": "--cars 3 --drives 1",
     "refit": "{root} true",
     "reliability": "--writers 2 --commits 2 --bits 2",

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.catalogue.car_numbers import DELAY
-from fleet_slip.catalogue.course_change import COURSE_LATE, LATE_PARTS, MOST_LATE
+from fleet_slip.catalogue.course_change import COURSE_LATE, LATE_PARTS, MOST_EARLY, MOST_LATE
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 from fleet_slip.catalogue.sources import RECEIVED_FILES
@@ -31,8 +31,9 @@ def course_delays(grams: Snapshot, active: frozenset[str]) -> dict[str, int]:
 
 
 def in_parts(one: ReceiverDelay) -> int:
-    """Return a delay as Gram rows are corrected by it: none below zero by more than half a tick."""
-    return min(max(round(one.value / GRAIN_S), -LATE_PARTS // 2), MOST_LATE)
+    """Return a delay as Gram rows are corrected by it."""
+    least, most = LATE_PARTS * MOST_EARLY, LATE_PARTS * MOST_LATE
+    return min(max(round(one.value / GRAIN_S), least), most)
 
 
 def _of_delay(grams: Snapshot, active: frozenset[str]) -> Iterator[pa.RecordBatch]:

@@ -1,11 +1,12 @@
 """How late the satellite receiver of each car is, from Gram rows: its speed against acceleration.
 
-A receiver's speed is as late as its course. The change of speed over half a second is the integral
-of the longitudinal acceleration, whatever wheels do, and so are the changes of both over half a
-second more, in which an offset of the accelerometer is no more. The lag of the integral with the
-smallest sum of squares, by a parabola through its neighbours, is the delay. An integral that is k
-ticks late is that of the last 50 + k ticks less that of the last k, so that Gram rows have what all
-lags need. What the lag would be without each drive in turn tells how sure it is (jackknife).
+A receiver's speed is as late as its course. The change of speed over 0.4 s is the integral of the
+longitudinal acceleration, whatever wheels do, and so are the changes of both over 0.4 s more, in
+which an offset of the accelerometer is no more. The lag of the integral with the smallest sum of
+squares, by a parabola through its neighbours, is the delay. An integral that is k ticks late is
+that of the last 40 + k ticks less that of the last k, so that Gram rows have what all lags need.
+What the lag would be without each drive in turn tells how much drives differ (jackknife); to that
+comes what is the same in all.
 """
 
 import math
@@ -23,9 +24,14 @@ from fleet_slip.regression.exact.gram_table import GramTable
 RECEIVER_DELAY = "receiver_delay"
 """What the view `calibration` calls it."""
 
-SPAN, STEP, STEPS = 50, 5, 8
-"""Ticks of the integral, between two lags, and how many lags there are beside none."""
-SPEEDS = ("satellite_speed", f"satellite_speed_late_{SPAN}")
+SPAN, STEP, STEPS = 40, 5, 12
+"""Ticks of the integral, between two lags, and how many lags there are beside the first. Receivers
+of 5 Hz have fixes that are so far apart."""
+EARLY = 20
+"""So many ticks before its fix a speed may be of: an accelerometer may be later than a receiver."""
+SPEEDS = (f"satellite_speed_late_{EARLY}", f"satellite_speed_late_{EARLY + SPAN}")
+LASTING_S = 0.0025
+"""Standard error that is the same in all drives: tilt and low-pass of the accelerometer."""
 FEWEST_DRIVES = 3
 """Of fewer the uncertainty is that of a usual drive of other cars."""
 
@@ -48,19 +54,20 @@ class ReceiverDelay:
 
 def _columns() -> tuple[str, ...]:
     """Return the columns of the Gram rows: both speeds, then the sums of the acceleration."""
-    lags = range(STEP, STEP * STEPS + 1, STEP)
-    ticks = (*lags, SPAN, *(SPAN + lag for lag in lags))
+    lags = range(0, STEP * STEPS + 1, STEP)
+    ticks = sorted({*lags[1:], *(SPAN + lag for lag in lags)})
     return (*SPEEDS, *(f"ax_sum_{n}" for n in ticks))
 
 
 def _weights() -> FloatArray:
     """Return what the change of speed, and its integrals that are late, are of the columns."""
-    weights = np.zeros((2 + STEPS, len(_columns())))
+    columns = _columns()
+    weights = np.zeros((2 + STEPS, len(columns)))
     weights[0, :2] = 1, -1
     for late in range(STEPS + 1):
-        weights[1 + late, 2 + STEPS + late] = 1
+        weights[1 + late, columns.index(f"ax_sum_{SPAN + STEP * late}")] = 1
         if late:
-            weights[1 + late, 1 + late] = -1
+            weights[1 + late, columns.index(f"ax_sum_{STEP * late}")] = -1
     return weights
 
 
@@ -103,19 +110,21 @@ def _about_means(table: GramTable) -> FloatArray:
 
 
 def with_pooled(delays: dict[str, ReceiverDelay]) -> dict[str, ReceiverDelay]:
-    """Return the delays with the uncertainty of cars of few drives, as drives of others differ."""
+    """Return the delays with the uncertainty of cars of few drives, as drives of others differ.
+
+    None if all cars together have too few.
+    """
     known = [one for one in delays.values() if one.uncertainty is not None]
-    if not known:
-        return delays
     free = sum(one.drives - 1 for one in known)
-    of_drive = (
-        math.fsum((one.drives - 1) * one.drives * (one.uncertainty or 0.0) ** 2 for one in known)
-        / free
-    )
+    scatters = ((one, (one.uncertainty or 0.0) ** 2 - LASTING_S**2) for one in known)
+    total = math.fsum((one.drives - 1) * one.drives * square for one, square in scatters)
+    usual = total / free if free >= FEWEST_DRIVES - 1 else None
     return {
         car: one
-        if one.uncertainty is not None
-        else replace(one, uncertainty=math.sqrt(of_drive / one.drives))
+        if one.drives >= FEWEST_DRIVES and one.uncertainty is not None
+        else replace(
+            one, uncertainty=None if usual is None else math.sqrt(usual / one.drives + LASTING_S**2)
+        )
         for car, one in delays.items()
     }
 
@@ -128,10 +137,11 @@ def _delay(products: FloatArray, rows: int) -> ReceiverDelay | None:
         return None
     without = [found for one in products if (found := _best_lag(total - one)) is not None]
     uncertainty = None
-    if len(without) == drives >= FEWEST_DRIVES:
+    if len(without) == drives > 1:
         mean = math.fsum(without) / drives
         square = math.fsum((one - mean) ** 2 for one in without)
-        uncertainty = math.sqrt(square * (drives - 1) / drives) * float(SAMPLE_TIME_S)
+        scatter = math.sqrt(square * (drives - 1) / drives) * float(SAMPLE_TIME_S)
+        uncertainty = math.hypot(scatter, LASTING_S)
     return ReceiverDelay(lag * float(SAMPLE_TIME_S), uncertainty, drives, rows)
 
 
@@ -147,4 +157,4 @@ def _best_lag(products: FloatArray) -> float | None:
     if bend <= 0:
         return None
     # A sum of ticks is the integral up to half a tick after the last one.
-    return STEP * (middle + 0.5 * float(after - before) / float(bend)) - 0.5
+    return STEP * (middle + 0.5 * float(after - before) / float(bend)) - 0.5 - EARLY

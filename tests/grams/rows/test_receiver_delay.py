@@ -1,5 +1,6 @@
 """The delay of a receiver is found in Gram rows, and a model that a late course taught refused."""
 
+import math
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -53,11 +54,13 @@ def test_the_delay_is_found_with_its_uncertainty(tmp_path: Path, delay_s: float)
 
 
 def test_a_car_of_few_drives_is_as_sure_as_usual_drives_make_it() -> None:
-    known, few = ReceiverDelay(0.1, 0.002, 4, 9000), ReceiverDelay(0.09, None, 1, 2000)
+    known, few = ReceiverDelay(0.1, 0.004, 4, 9000), ReceiverDelay(0.09, None, 1, 2000)
     assert with_pooled({"a": few}) == {"a": few}
     found = with_pooled({"a": few, "b": known})
     assert found["b"] == known
-    assert found["a"].uncertainty == pytest.approx(0.004)
+    assert found["a"].uncertainty == pytest.approx(
+        math.sqrt(4 * (0.004**2 - 0.0025**2) + 0.0025**2)
+    )
 
 
 MODEL = "steering_mean_16,ay_mean_16,ay_square_mean_8,yaw_rate_speed_mean_8"

@@ -1,0 +1,121 @@
+"""How well the delay of a receiver is told, and whether the uncertainty that is stated holds.
+
+    python -m benchmarks.receiver_delay [--root FOLDER] [--cars 40] [--drives 30] [--seed 1]
+        [--base fleet_realistic]
+
+Simulates cars of a campaign with receivers that are 0 to 300 ms late, and asks for the delay after
+the first few drives of each, and after all. What is told is the delay behind the accelerometer, of
+which the latency and the low-pass are known here. A folder that is there is used again.
+"""
+
+import argparse
+import json
+import math
+import tempfile
+from datetime import timedelta
+from pathlib import Path
+
+import numpy as np
+
+import fleet_slip
+from fleet_slip.catalogue.car_numbers import DELAY
+from fleet_slip.grams.cohorts.reader import open_grams
+from fleet_slip.grams.rows.receiver_delay import receiver_delays
+from fleet_slip.simulation.campaign import Campaign, load_campaign
+from fleet_slip.simulation.drive_plan import FleetPlan
+from fleet_slip.simulation.imperfections import Range
+from fleet_slip.simulation.sensing.receivers import Receiver, Receivers
+from fleet_slip.warehouse.condition import parse_condition
+
+STEPS = (1, 3, 10, 30)
+"""Drives of each car that are asked."""
+NINETY = 1.645
+"""Standard errors that 90 % of normal errors are within."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--root", type=Path, help="folder to simulate in; kept")
+    parser.add_argument("--cars", type=int, default=40)
+    parser.add_argument("--drives", type=int, default=30)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--base", default="fleet_realistic")
+    given = parser.parse_args()
+    campaign = late_campaign(given.base, given.cars, given.drives, given.seed)
+    with tempfile.TemporaryDirectory() as folder:
+        fleet = fleet_slip.open(given.root or folder)
+        fleet.simulate(campaign)
+        for name in ("signals", DELAY):
+            fleet.gram(name)
+        for drives in (*(step for step in STEPS if step < given.drives), given.drives):
+            print(json.dumps(measure(fleet, campaign, drives)), flush=True)
+
+
+def late_campaign(base: str, cars: int, drives: int, seed: int) -> Campaign:
+    """Return a campaign in which each car drives once a day."""
+    one = load_campaign(base)
+    if not isinstance(one.plan, FleetPlan):
+        raise SystemExit(f"{base} is no campaign of many cars")
+    types = tuple(
+        Receiver(
+            rate_hz=rate_hz,
+            velocity_std_mps=std_mps,
+            wander_std_mps=std_mps,
+            time_between_outages_s=60.0,
+            outage_duration_s=5.0,
+        )
+        for rate_hz, std_mps in ((20, 0.02), (10, 0.05), (5, 0.1))
+    )
+    tenth = Range(min=-0.1, max=0.1)
+    late = Range(min=0.0, max=0.3)
+    return one.model_copy(
+        update={
+            "name": "receiver_delay",
+            "seed": seed,
+            "plan": one.plan.model_copy(update={"cars": cars}),
+            "drives_per_day": cars,
+            "number_of_days": drives,
+            "receivers": Receivers(types=types, delay_error_s=late, antenna_error_m=tenth),
+        }
+    )
+
+
+def measure(fleet: fleet_slip.Fleet, campaign: Campaign, drives: int) -> dict[str, object]:
+    """Return how far what the first drives of each car tell is from what was injected."""
+    last = campaign.first_day + timedelta(days=drives - 1)
+    condition = parse_condition(f"day <= '{last}'")
+    with open_grams(fleet.warehouse, DELAY, condition) as opened:
+        told = receiver_delays(opened.batches(condition))
+    true = injected_s(campaign)
+    cars = sorted(told)
+    errors = np.array([told[car].value - true[car] for car in cars])
+    stated = np.array([told[car].uncertainty or math.nan for car in cars])
+    within = np.abs(errors) <= NINETY * stated
+    return {
+        "drives": drives,
+        "cars": len(cars),
+        "untold": campaign.drives_per_day - len(cars),
+        "mean_ms": round(1000 * float(errors.mean()), 2),
+        "rmse_ms": round(1000 * float(np.sqrt((errors**2).mean())), 2),
+        "largest_ms": round(1000 * float(np.abs(errors).max()), 2),
+        "within_5_ms": round(float((np.abs(errors) <= 0.005).mean()), 3),
+        "stated_median_ms": round(1000 * float(np.median(stated)), 2),
+        "within_1.645_stated": round(float(within.mean()), 3),
+        "within_2_stated": round(float((np.abs(errors) <= 2 * stated).mean()), 3),
+    }
+
+
+def injected_s(campaign: Campaign) -> dict[str, float]:
+    """Return the delay of each car's receiver behind its accelerometer, s."""
+    found = {}
+    for one in campaign.drives(campaign.first_day):
+        sensors = one.flaws.sensors if one.flaws else None
+        behind = sensors.inertial_latency_s if sensors else 0.0
+        if sensors and sensors.inertial_bandwidth_hz:
+            behind += 1 / (2 * math.pi * sensors.inertial_bandwidth_hz)
+        found[one.vehicle_id] = (one.receiver.delay_s if one.receiver else 0.0) - behind
+    return found
+
+
+if __name__ == "__main__":
+    main()
