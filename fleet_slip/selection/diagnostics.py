@@ -13,8 +13,7 @@ from fleet_slip.grams.cohorts.training_folds import clustered_moments
 from fleet_slip.regression.choice.nested_choice import nested_fits
 from fleet_slip.regression.exact.least_squares import Fit, LinearModel, condition_number, fit
 from fleet_slip.regression.inference.coefficient_tests import (
-    ChowTest,
-    WaldTest,
+    FTest,
     chow_test,
     wald_test,
 )
@@ -67,8 +66,8 @@ class CohortComparison:
 
     condition: str
     other: Inference
-    rows: ChowTest
-    drives: WaldTest | None
+    rows: FTest
+    drives: FTest | None
 
 
 @dataclass(frozen=True)

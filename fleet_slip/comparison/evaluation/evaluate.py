@@ -20,8 +20,6 @@ from fleet_slip.comparison.evaluation.ranking import FleetComparison, Ranking, c
 from fleet_slip.comparison.evaluation.scenario_runs import (
     ErrorFigures,
     EvaluatedScenario,
-    Result,
-    Section,
     run_all,
 )
 from fleet_slip.comparison.evaluation.targets import (
@@ -69,8 +67,23 @@ def _run(one: EvaluatedScenario) -> dict[str, Any]:
         "track": scenario.track.name,
         "failures": [failure.model_dump() for failure in scenario.failures],
         "truth": _truth(drive),
-        "sections": [_section(drive, section) for section in one.sections],
-        "results": {name: _result(result) for name, result in one.results.items()},
+        "sections": [
+            {
+                "name": section.name,
+                "criterion": section.criterion,
+                "rows": int(section.rows.sum()),
+                "stretches": [asdict(one) for one in find_stretches(drive, section.rows)],
+            }
+            for section in one.sections
+        ],
+        "results": {
+            name: {
+                **result.whole.as_dict(),
+                "inside": {part: figures.as_dict() for part, figures in result.inside.items()},
+                "outside": {part: figures.as_dict() for part, figures in result.outside.items()},
+            }
+            for name, result in one.results.items()
+        },
     }
 
 
@@ -88,23 +101,6 @@ def _truth(drive: EvaluatedDrive) -> dict[str, Any]:
         "lateral_offset_max_m": float(np.abs(drive.lateral_offset_m).max()),
         "lateral_acceleration_p99_mps2": float(np.nanquantile(np.abs(ay), 0.99)),
         "rear_slip_per_lateral_acceleration_deg_s2pm": float(np.degrees(rear_compliance(drive))),
-    }
-
-
-def _section(drive: EvaluatedDrive, section: Section) -> dict[str, Any]:
-    return {
-        "name": section.name,
-        "criterion": section.criterion,
-        "rows": int(section.rows.sum()),
-        "stretches": [asdict(stretch) for stretch in find_stretches(drive, section.rows)],
-    }
-
-
-def _result(result: Result) -> dict[str, Any]:
-    return {
-        **result.whole.as_dict(),
-        "inside": {name: figures.as_dict() for name, figures in result.inside.items()},
-        "outside": {name: figures.as_dict() for name, figures in result.outside.items()},
     }
 
 

@@ -140,23 +140,24 @@ def _drive(scenario: Scenario, all_rows: pa.Table) -> EvaluatedDrive:
         raise DataError(
             f"the drive {scenario.drive_id} is not in the logs. Run: fleet-slip evaluate"
         )
-    time_s = _column(rows, "time_s")
-    measured = {name: _column(rows, catalogue()[name].column) for name in visible_signals()}
+    time_s = float_column(rows, "time_s")
+    measured = {name: float_column(rows, catalogue()[name].column) for name in visible_signals()}
     for failure in scenario.failures:
         measured = apply_failure(measured, time_s, failure)
     return EvaluatedDrive(
         scenario=scenario,
         time_s=time_s,
         signals={catalogue()[name].column: values for name, values in measured.items()},
-        vx_mps=_column(rows, "vx_mps"),
-        vy_mps=_column(rows, "vy_mps"),
-        station_m=_column(rows, "station_m"),
-        lateral_offset_m=_column(rows, "lateral_offset_m"),
+        vx_mps=float_column(rows, "vx_mps"),
+        vy_mps=float_column(rows, "vy_mps"),
+        station_m=float_column(rows, "station_m"),
+        lateral_offset_m=float_column(rows, "lateral_offset_m"),
         lost_control_s=rows["lost_control_s"][0].as_py(),
     )
 
 
-def _column(rows: pa.Table, name: str) -> FloatArray:
+def float_column(rows: pa.Table, name: str) -> FloatArray:
+    """Return a column of rows in float64, NaN where null."""
     values: FloatArray = rows[name].to_numpy().astype(np.float64)
     return values
 

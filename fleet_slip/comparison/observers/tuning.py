@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from functools import partial
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -68,7 +67,7 @@ def tune(
     """
 
     def cost(parameters: P) -> float:
-        return rmse_rad(partial(_bound, estimator, parameters, car), drives, executor)
+        return rmse_rad(lambda drive: estimator(drive, car, parameters), drives, executor)
 
     best, lowest, evaluations = start, cost(start), 1
     factor = FIRST_FACTOR
@@ -84,12 +83,6 @@ def tune(
         if not improved:
             factor **= 0.5
     return Tuned(best, lowest, evaluations)
-
-
-def _bound(
-    estimator: Estimator[P], parameters: P, car: VehicleParameters, drive: DriveSignals
-) -> FloatArray:
-    return estimator(drive, car, parameters)
 
 
 def _neighbours(parameters: P, name: str, factor: float) -> list[P]:

@@ -117,13 +117,11 @@ def by_length(manifest: Manifest) -> dict[str, list[str]]:
         one = term.definition
         ticks = one.ticks or np.inf if one and one.over else 0
         found.setdefault(ticks, []).append(term.signal)
-    return {_length(ticks): found[ticks] for ticks in sorted(found)}
-
-
-def _length(ticks: float) -> str:
-    if not ticks:
-        return THIS_SAMPLE
-    return SINCE_START if np.isinf(ticks) else f"{ticks / SAMPLE_RATE_HZ:.2f} s"
+    lengths = {0: THIS_SAMPLE, np.inf: SINCE_START}
+    return {
+        lengths.get(ticks, f"{ticks / SAMPLE_RATE_HZ:.2f} s"): found[ticks]
+        for ticks in sorted(found)
+    }
 
 
 def _without(

@@ -184,10 +184,11 @@ def left_out(memory: Memory, size: Size) -> Figure:
 
 def _bars(axes: Axes, title: str, bars: Sequence[Without], whole_deg: float) -> None:
     places = np.arange(len(bars))
+    names = [f"{b.name} ({b.columns} columns)" if b.columns > 1 else b.name for b in bars]
     rises = [bar.rmse_deg - whole_deg for bar in bars]
     axes.barh(places, rises, left=whole_deg, height=0.62, color=colour("model_4"), linewidth=0)
     axes.axvline(whole_deg, color=colour("ink"), linewidth=0.9)
-    axes.set_yticks(places, [_name(bar) for bar in bars], color=colour("ink"))
+    axes.set_yticks(places, names, color=colour("ink"))
     axes.invert_yaxis()
     axes.set_ylim(len(bars) - 0.5, -0.5)
     axes.grid(visible=False, axis="y")
@@ -205,10 +206,6 @@ def _bars(axes: Axes, title: str, bars: Sequence[Without], whole_deg: float) -> 
         )
     axes.set_title(title, color=colour("muted"))
     axes.set_xlabel("cross-validated RMSE (deg)", labelpad=2)
-
-
-def _name(bar: Without) -> str:
-    return bar.name if bar.columns == 1 else f"{bar.name} ({bar.columns} columns)"
 
 
 BIN_MPS2 = 0.5

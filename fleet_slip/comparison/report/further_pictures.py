@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.comparison.evaluation.ranking import LEAST_COVERAGE
-from fleet_slip.comparison.report.column_worth import Memory, Without
+from fleet_slip.comparison.report.column_worth import Memory
 from fleet_slip.comparison.report.error_charts import (
     Series,
     car_by_car,
@@ -226,7 +226,8 @@ def memory_pictures(data: ReportData) -> Iterator[Picture]:
 
 
 def _by_columns(data: ReportData, memory: Memory) -> Picture:
-    filter_deg = _rmse(data, FILTER)
+    known = data.evaluated.figures("nominal", FILTER)
+    filter_deg = known.rmse_deg if known else None
     lines = [Series("cross-validated", "ink", memory.cross_validated_deg)]
     for name, errors in memory.on_drives.items():
         mark = filter_deg if name == "nominal" else None
@@ -266,11 +267,15 @@ def _smallest(memory: Memory, filter_deg: float | None) -> str:
 
 def _left_out(data: ReportData, memory: Memory) -> Picture:
     dearest = memory.columns[0]
+    window = max(memory.windows, key=lambda one: one.rmse_deg, default=None)
+    of_lengths = (
+        f"Of the lengths it is {window.name}: {degrees(window.rmse_deg, 4)}. " if window else ""
+    )
     caption = (
         f"Cross-validated RMSE of the columns of {data.version.reference} as they stand, "
         f"{degrees(memory.rmse_deg, 4)}, and what it rises to when a column, or all windows of one "
         f"length, is left out and the rest is fitted again. The dearest column is {dearest.name}: "
-        f"{degrees(dearest.rmse_deg, 4)} without it. {_dearest_window(memory)}A column "
+        f"{degrees(dearest.rmse_deg, 4)} without it. {of_lengths}A column "
         "that costs little may still be the best of several that say nearly the same."
     )
     return Picture(
@@ -280,13 +285,6 @@ def _left_out(data: ReportData, memory: Memory) -> Picture:
         "Bars.",
         lambda size: left_out(memory, size),
     )
-
-
-def _dearest_window(memory: Memory) -> str:
-    if not memory.windows:
-        return ""
-    dearest: Without = max(memory.windows, key=lambda one: one.rmse_deg)
-    return f"Of the lengths it is {dearest.name}: {degrees(dearest.rmse_deg, 4)}. "
 
 
 def _on_the_track(data: ReportData) -> Picture:
@@ -309,8 +307,3 @@ def _on_the_track(data: ReportData) -> Picture:
         "Two maps of the track, coloured by the error.",
         lambda size: error_map(maps, size, FINE_EDGES_DEG),
     )
-
-
-def _rmse(data: ReportData, estimator: str) -> float | None:
-    found = data.evaluated.figures("nominal", estimator)
-    return None if found is None else found.rmse_deg

@@ -16,7 +16,7 @@ from fleet_slip.grams.cohorts.training_folds import clustered_moments
 from fleet_slip.regression.choice.nested_choice import nested_fits
 from fleet_slip.regression.choice.signal_orders import RANKINGS, rank
 from fleet_slip.regression.choice.subsets import best_subsets
-from fleet_slip.regression.exact.least_squares import LinearModel, fit
+from fleet_slip.regression.exact.least_squares import fit
 from fleet_slip.regression.inference.drive_moments import ClusterUnit
 from fleet_slip.regression.inference.standard_errors import (
     INTERCEPT,
@@ -211,9 +211,8 @@ def held_out_coefficients(selection: Selection, model: CrossValidation) -> pa.Ta
     models = [fit(training).physical(scales) for training, _ in folds.splits()]
     fold_of = dict(zip(drives["drive_id"].to_pylist(), assignment.fold.tolist(), strict=True))
     return pa.Table.from_pylist(
-        [{"drive_id": drive, **_numbers(models[fold])} for drive, fold in fold_of.items()]
+        [
+            {"drive_id": drive, "intercept": models[fold].offset, **models[fold].weights}
+            for drive, fold in fold_of.items()
+        ]
     )
-
-
-def _numbers(model: LinearModel) -> dict[str, float]:
-    return {"intercept": model.offset, **model.weights}

@@ -9,7 +9,7 @@ import pyarrow as pa
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
-from fleet_slip.comparison.evaluation.evaluated_drives import load_drives
+from fleet_slip.comparison.evaluation.evaluated_drives import float_column, load_drives
 from fleet_slip.comparison.evaluation.scenario_runs import simulate_scenarios
 from fleet_slip.comparison.report.gate_strips import gates_on
 from fleet_slip.errors import DataError, QuestionError, UsageError
@@ -114,15 +114,10 @@ def drive_frames(warehouse: Warehouse, drive_id: str, version: ModelVersion) -> 
             f"{drive_id!r} is no drive of the logs, and no scenario. See: "
             'fleet-slip sql "SELECT drive_id FROM drives"'
         )
-    columns = {name: _floats(rows, name) for name in names}
+    columns = {name: float_column(rows, name) for name in names}
     facts = {name: rows[name][0].as_py() for name in (*FACTS, "track")}
     facts["drive_id"] = drive_id
-    return _frames(drive_id, columns, facts, _floats(rows, "time_s"), version)
-
-
-def _floats(rows: pa.Table, name: str) -> FloatArray:
-    values: FloatArray = rows[name].to_numpy().astype(np.float64)
-    return values
+    return _frames(drive_id, columns, facts, float_column(rows, "time_s"), version)
 
 
 def _frames(

@@ -35,7 +35,9 @@ def write_film(frames: DriveFrames, file: Path) -> None:
     if file.suffix == ".gif":
         writer: Any = PillowWriter(fps=round(rate))
     else:
-        mpl.rcParams["animation.ffmpeg_path"] = _encoder()
+        with needed("watch", "an MP4"):
+            from imageio_ffmpeg import get_ffmpeg_exe  # noqa: PLC0415 - an extra
+        mpl.rcParams["animation.ffmpeg_path"] = str(get_ffmpeg_exe())
         writer = FFMpegWriter(fps=round(rate), codec="libx264", extra_args=["-pix_fmt", "yuv420p"])
     with mpl.rc_context(STYLE), storage_errors(file):
         figure, show = _stage(frames)
@@ -43,12 +45,6 @@ def write_film(frames: DriveFrames, file: Path) -> None:
             for number in range(0, len(frames.time_s), every):
                 show(number)
                 writer.grab_frame()
-
-
-def _encoder() -> str:
-    with needed("watch", "an MP4"):
-        from imageio_ffmpeg import get_ffmpeg_exe  # noqa: PLC0415 - an extra
-    return str(get_ffmpeg_exe())
 
 
 def _stage(frames: DriveFrames) -> tuple[Figure, Callable[[int], None]]:

@@ -51,7 +51,7 @@ def lars_path(gram: Gram, inputs: Sequence[str], label: str) -> LarsPath:
     Ties to within rounding enter in the declared order. Raises `DataError` for a constant signal
     or dependent ones.
     """
-    return _follow(_Walk(*_correlations(gram, inputs, label)), inputs)
+    return lars_path_of_moments(*_correlations(gram, inputs, label), inputs)
 
 
 def lasso_path(gram: Gram, inputs: Sequence[str], label: str, *, ridge: float = 0.0) -> LarsPath:

@@ -98,7 +98,7 @@ def replacement_sets(gram: Gram, inputs: Sequence[str], label: str) -> list[froz
 
 def lars(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
     """Order of entry into the least-angle regression path (Efron et al. 2004)."""
-    _require_independent(gram, inputs, label)
+    _moments(gram, inputs, label)  # which requires that they are independent
     return lars_path(gram, inputs, label).order
 
 
@@ -129,10 +129,6 @@ def _moments(gram: Gram, inputs: Sequence[str], label: str) -> Matrix:
     if eliminate(matrix).singular is not None:
         raise DataError(dependence(gram, inputs))
     return matrix
-
-
-def _require_independent(gram: Gram, inputs: Sequence[str], label: str) -> None:
-    _moments(gram, inputs, label)
 
 
 def _full_model(matrix: Matrix) -> tuple[Matrix, int]:

@@ -13,7 +13,7 @@ out of the search.
 
 from collections.abc import Callable, Sequence
 from fractions import Fraction
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,7 +77,10 @@ class _Search:
     def __init__(self, gram: Gram) -> None:
         self.exact = moments(gram)
         size = len(self.exact)
-        matrix = np.array([[_long(x) for x in row] for row in self.exact], dtype=np.longdouble)
+        # An integer to 64 bits or more: its float, and what that leaves.
+        high = np.array([[float(x) for x in row] for row in self.exact])
+        low = np.array([[float(x - int(float(x))) for x in row] for row in self.exact])
+        matrix = high.astype(np.longdouble) + low.astype(np.longdouble)
         length = np.sqrt(np.diag(matrix))
         length[length == 0] = 1
         self.matrix: LongArray = matrix / np.outer(length, length)
@@ -182,9 +185,3 @@ class _Search:
         at = [*chosen, self.inputs]
         found = eliminate([[self.exact[i][j] for j in at] for i in at])
         return found.residual(len(found.rows))
-
-
-def _long(value: int) -> Any:
-    """Return an integer to 64 bits or more."""
-    high = float(value)
-    return np.longdouble(high) + np.longdouble(float(value - int(high)))

@@ -23,7 +23,7 @@ from statistics import median
 from typing import Any
 
 from fleet_slip.errors import QuestionError
-from fleet_slip.regression.validation.crossval import CrossValidation
+from fleet_slip.regression.validation.crossval import CrossValidation, error_of_mean
 
 
 @dataclass(frozen=True)
@@ -129,14 +129,8 @@ def _standard_error(one: CrossValidation, other: CrossValidation) -> float:
     first, second = ([fold.rmse for fold in model.folds] for model in (one, other))
     rows = [[fold.rows for fold in model.folds] for model in (one, other)]
     if one.fold_names == other.fold_names and rows[0] == rows[1]:
-        return _error_of_mean([a - b for a, b in zip(first, second, strict=True)])
-    return math.hypot(_error_of_mean(first), _error_of_mean(second))
-
-
-def _error_of_mean(values: Sequence[float]) -> float:
-    mean = math.fsum(values) / len(values)
-    square = math.fsum((value - mean) ** 2 for value in values)
-    return math.sqrt(square / (len(values) - 1) / len(values))
+        return error_of_mean([a - b for a, b in zip(first, second, strict=True)])
+    return math.hypot(error_of_mean(first), error_of_mean(second))
 
 
 def _reason(winner: Shortfall, best: CrossValidation, near: int, total: int, worth: Worth) -> str:

@@ -49,7 +49,8 @@ class GramTable:
 
     def row(self, index: int) -> Gram:
         """Return one drive's Gram."""
-        return self._gram(self.n[index], self.sums[index], self.products[index])
+        sums, products = self.sums[index].tolist(), self.products[index].tolist()
+        return Gram(self.signals, int(self.n[index]), tuple(sums), tuple(products))
 
     def take(self, rows: NDArray[Any]) -> "GramTable":
         """Return the drives at an index array or a boolean mask."""
@@ -103,9 +104,6 @@ class GramTable:
             tuple(exact_sum(self.sums)),
             tuple(exact_sum(self.products)),
         )
-
-    def _gram(self, n: Any, sums: IntArray, products: IntArray) -> Gram:
-        return Gram(self.signals, int(n), tuple(sums.tolist()), tuple(products.tolist()))
 
 
 def exact_sum(values: IntArray) -> list[int]:

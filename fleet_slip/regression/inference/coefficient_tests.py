@@ -16,13 +16,13 @@ from fleet_slip.regression.inference.standard_errors import cluster_influences
 
 
 @dataclass(frozen=True)
-class ChowTest:
-    """Test that several groups of drives share one model (Chow 1960).
+class FTest:
+    """Test that sets of drives have the same coefficients.
 
     Attributes:
         f: the statistic.
         numerator, denominator: its degrees of freedom.
-        p: probability of a larger f if they do share it, were the rows independent.
+        p: probability of a larger f if the coefficients are the same.
     """
 
     f: float
@@ -33,7 +33,7 @@ class ChowTest:
 
 def chow_test(
     groups: Sequence[Gram], inputs: Sequence[str], label: str, *, intercept: bool = True
-) -> ChowTest:
+) -> FTest:
     """F = ((RSS_pool - sum RSS_p) / ((P-1)(k+1))) / (sum RSS_p / (n - P(k+1))), or `DataError`."""
     count, size = len(groups), len(inputs) + intercept
     if count < 2:
@@ -48,28 +48,10 @@ def chow_test(
     if denominator <= 0 or apart == 0:
         raise DataError("a Chow test needs noise and more rows than coefficients.")
     f = float((together - apart) / numerator / (apart / denominator))
-    return ChowTest(f, numerator, denominator, special.f_upper(f, numerator, denominator))
+    return FTest(f, numerator, denominator, special.f_upper(f, numerator, denominator))
 
 
-@dataclass(frozen=True)
-class WaldTest:
-    """Test that two models have the same coefficients, drives counting as independent.
-
-    Attributes:
-        f: the statistic, Wald's over its number of coefficients.
-        numerator, denominator: degrees of freedom of the F distribution.
-        p: probability of a larger f if the coefficients are the same.
-    """
-
-    f: float
-    numerator: int
-    denominator: int
-    p: float
-
-
-def wald_test(
-    one: Fit, one_drives: DriveMoments, other: Fit, other_drives: DriveMoments
-) -> WaldTest:
+def wald_test(one: Fit, one_drives: DriveMoments, other: Fit, other_drives: DriveMoments) -> FTest:
     """Compare the coefficients of the same model fitted to two sets of drives.
 
     F = d'V^-1 d / (k + 1), d the difference and V its cluster-robust covariance, the sum of both
@@ -95,7 +77,7 @@ def wald_test(
     spread = np.sqrt(np.diag(covariance))
     d = np.array([float(x) for x in gap]) / spread
     f = float(d @ np.linalg.solve(covariance / np.outer(spread, spread), d)) / size
-    return WaldTest(f, size, drives - 2, special.f_upper(f, size, drives - 2))
+    return FTest(f, size, drives - 2, special.f_upper(f, size, drives - 2))
 
 
 def _side_by_side(

@@ -12,7 +12,6 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.errors import DataError
-from fleet_slip.regression.exact.gram import packed_position
 from fleet_slip.regression.inference.drive_moments import DriveMoments
 
 FALSE_ALARMS = 0.001
@@ -52,7 +51,7 @@ def find_influential(moments: DriveMoments, cars: IntArray) -> list[Influential]
             f"{number}. Select without leaving cars out, or widen the cohort."
         )
     each = np.zeros((number, moments.size, moments.size))
-    np.add.at(each, cars, _square(moments.packed, moments.size))
+    np.add.at(each, cars, moments.matrix(moments.packed))
     rest = np.arange(number)
     found: list[Influential] = []
     limit = NormalDist().inv_cdf(1 - FALSE_ALARMS)
@@ -83,9 +82,3 @@ def _solve(moments: FloatArray) -> FloatArray:
     """Return the coefficients of each; inputs that depend on others share theirs."""
     inverse = np.linalg.pinv(moments[:, :-1, :-1], rcond=1e-13, hermitian=True)
     return np.asarray((inverse @ moments[:, :-1, -1:])[..., 0], dtype=np.float64)
-
-
-def _square(packed: FloatArray, size: int) -> FloatArray:
-    """Return symmetric matrices from their packed lower triangles, shape (drives, size, size)."""
-    at = [[packed_position(max(i, j), min(i, j)) for j in range(size)] for i in range(size)]
-    return np.asarray(packed[:, at], dtype=np.float64)

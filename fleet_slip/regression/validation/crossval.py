@@ -55,10 +55,7 @@ class CrossValidation:
     @property
     def standard_error(self) -> float:
         """Standard error of the correlation over folds: std of the folds' / sqrt(folds)."""
-        values = [fold.correlation for fold in self.folds]
-        mean = math.fsum(values) / len(values)
-        square = math.fsum((value - mean) ** 2 for value in values)
-        return math.sqrt(square / (len(values) - 1) / len(values))
+        return error_of_mean([fold.correlation for fold in self.folds])
 
     def as_dict(self) -> dict[str, Any]:
         """Return what a JSON document needs."""
@@ -76,6 +73,13 @@ class CrossValidation:
                 for name, figures in zip(self.fold_names, self.folds, strict=True)
             ],
         }
+
+
+def error_of_mean(values: Sequence[float]) -> float:
+    """Return the standard error of the mean of independent values."""
+    mean = math.fsum(values) / len(values)
+    square = math.fsum((value - mean) ** 2 for value in values)
+    return math.sqrt(square / (len(values) - 1) / len(values))
 
 
 def least_squares(inputs: Sequence[str], label: str, *, intercept: bool = True) -> Procedure:
