@@ -4,6 +4,7 @@ import functools
 import inspect
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import fields
+from datetime import date
 from typing import Annotated, Any, TypeVar
 
 import typer
@@ -184,6 +185,14 @@ FeatureSetOption = Annotated[
         "--features", help="Feature set that --signals are of. Default: the logged signals."
     ),
 ]
+
+
+def date_of(text: str | None, option: str) -> date | None:
+    """Return the day that an option names. Raises `UsageError` for what is none."""
+    try:
+        return None if text is None else date.fromisoformat(text)
+    except ValueError:
+        raise UsageError(f"{option} {text}: not a date; write it as 2024-05-01.") from None
 
 
 def quantities(values: Sequence[str] | None, option: str) -> dict[str, float]:

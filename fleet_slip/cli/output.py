@@ -68,6 +68,11 @@ def print_text(text: str) -> None:
     _print_lines(wrapped(text, stdout().width) if sys.stdout.isatty() else text)
 
 
+def print_line(text: str) -> None:
+    """Print a line on stdout, as wide as the console is, without markup."""
+    stdout().print(text, markup=False)
+
+
 def _print_lines(text: str) -> None:
     print(text, flush=True)  # noqa: T201 - this is the one place that prints
 

@@ -8,7 +8,7 @@ from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli.options import Cluster, Cohort, FeatureSetOption, Model, Signals, quantities
-from fleet_slip.cli.output import Json, print_json, print_table, say, stdout
+from fleet_slip.cli.output import Json, print_json, print_line, print_table, say
 from fleet_slip.regression.inference.standard_errors import INTERCEPT, Estimate
 from fleet_slip.selection.diagnostics import CohortComparison, Diagnosis
 from fleet_slip.words import number_of
@@ -80,11 +80,10 @@ def _print_diagnosis(result: Diagnosis) -> None:
         )
     if result.serial is not None:
         found = result.serial
-        stdout().print(
+        print_line(
             f"residuals: correlation {found.correlation.rho:.4f} with the row before, "
             f"Durbin-Watson {found.correlation.durbin_watson:.4f} (2 if independent); AR(1) with "
-            f"rho {found.autoregressive.rho:.4f}.",
-            markup=False,
+            f"rho {found.autoregressive.rho:.4f}."
         )
     if result.comparison is not None:
         _print_comparison(result, result.comparison)
@@ -152,10 +151,9 @@ def _print_comparison(result: Diagnosis, found: CohortComparison) -> None:
     for test, kind in tests:
         if test is None:
             continue
-        stdout().print(
+        print_line(
             f"the same coefficients? {kind}: F({test.numerator}, {test.denominator}) = "
-            f"{test.f:,.2f}, p = {test.p:.2g}.",
-            markup=False,
+            f"{test.f:,.2f}, p = {test.p:.2g}."
         )
     if found.drives is None:
         say(

@@ -4,7 +4,7 @@ import shlex
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from fleet_slip.cli.output import print_table, print_text, stdout
+from fleet_slip.cli.output import print_line, print_table, print_text, stdout
 from fleet_slip.words import number_of
 
 if TYPE_CHECKING:
@@ -127,7 +127,7 @@ def _print_gps_noise(sweep: dict[str, Any] | None) -> None:
         told = (
             f"which the filters reach at {reached} m/s" if reached else "reached at no such noise"
         )
-        stdout().print(f"{regression}: {error:.3f}, {told}", markup=False)
+        print_line(f"{regression}: {error:.3f}, {told}")
 
 
 def _print_sections(content: dict[str, Any]) -> None:
@@ -182,9 +182,8 @@ def _print_checks(checks: Sequence[dict[str, Any]]) -> None:
     )
     for check in checks:
         if not check["reached"]:
-            stdout().print(
-                f"missed: {check['requirement']}, {check['estimator']}. {check['explanation']}",
-                markup=False,
+            print_line(
+                f"missed: {check['requirement']}, {check['estimator']}. {check['explanation']}"
             )
 
 

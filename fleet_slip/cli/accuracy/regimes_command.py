@@ -7,7 +7,7 @@ import typer
 
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli.options import By, Cohort, FoldCount, Signals, Worth
-from fleet_slip.cli.output import Json, print_json, print_table, stdout
+from fleet_slip.cli.output import Json, print_json, print_line, print_table
 from fleet_slip.selection.regimes import RegimeComparison
 from fleet_slip.selection.request import WORTH
 from fleet_slip.words import number_of
@@ -70,12 +70,11 @@ def _print_regimes(result: RegimeComparison, by: str) -> None:
     )
     one, own = result.pooled, result.split
     better = "a model for each regime" if result.split_wins else "one model for all"
-    stdout().print(
+    print_line(
         f"one model: correlation {one.correlation:.4f}, RMSE {one.rmse_deg:.4f} deg; one for each "
         f"regime: {own.correlation:.4f}, {own.rmse_deg:.4f} deg. Over the folds, splitting adds "
         f"{result.gain:+.4f} +- {result.gain_standard_error:.4f} to the correlation and takes "
         f"{math.degrees(result.rmse_gain):.4f} +- "
         f"{math.degrees(result.rmse_gain_standard_error):.4f} deg from the RMSE; worth having is "
-        f"{result.worth}. Choose {better}.",
-        markup=False,
+        f"{result.worth}. Choose {better}."
     )

@@ -14,12 +14,11 @@ from fleet_slip.cli.left_out import (
     say_without_log,
 )
 from fleet_slip.cli.options import Cohort, selection_options
-from fleet_slip.cli.output import Json, figures_cells, print_json, print_table, say, stdout
+from fleet_slip.cli.output import Json, figures_cells, print_json, print_line, print_table, say
 from fleet_slip.grams.cohorts.folding import BANDS, PARTS, ROW_FOLDS
 from fleet_slip.grams.cohorts.outweighing import drives_by_car
 from fleet_slip.regression.choice.nested_choice import (
     CROSS_VALIDATION,
-    NestedChoice,
     NestedDistances,
 )
 from fleet_slip.regression.inference.evidence import Evidence
@@ -81,7 +80,13 @@ def print_selection(selection: Selection[Any]) -> None:
         + ("" if selection.intercept else "; no intercept"),
         ["model", *(["signals"] if listed else []), *FIGURES],
         [
-            [model.name, *([_columns_of(model, selection)] if listed else []), *_figures(model)]
+            [
+                model.name,
+                *([_columns_of(model, selection)] if listed else []),
+                f"{model.drives:,}",
+                *figures_cells(model.pooled),
+                f"{model.condition_number:.3g}",
+            ]
             for model in selection.models
         ],
         left=1 + listed,
@@ -103,11 +108,12 @@ def print_selection(selection: Selection[Any]) -> None:
         say(f"the distances of the nested models cannot be told: {selection.distances}")
     for name, reason in selection.skipped.items():
         say(f"model {name} was left out: {reason}")
-    stdout().print(
-        f"winner: {selection.winner.model.name}. {selection.winner.reason}", markup=False
-    )
-    if selection.choice is not None and selection.choice.honest is not None:
-        _print_honest(selection.choice.honest)
+    print_line(f"winner: {selection.winner.model.name}. {selection.winner.reason}")
+    if selection.choice is not None and (honest := selection.choice.honest) is not None:
+        print_line(
+            "made again inside every training fold, the whole choice has a correlation of "
+            f"{honest.correlation:.4f} and an RMSE of {honest.pooled.rmse_deg:.4f} deg."
+        )
     if selection.uncertainty is not None:
         _print_uncertainty(selection.uncertainty)
 
@@ -134,11 +140,7 @@ def _print_folds(model: CrossValidation) -> None:
         f"\nmodel {model.name}, each fold left out in turn",
         ["fold", "rows", "correlation", "RMSE deg", "mean deg", "std deg"],
         [
-            [
-                name,
-                f"{found.rows:,}",
-                *figures_cells(found),
-            ]
+            [name, f"{found.rows:,}", *figures_cells(found)]
             for name, found in zip(model.fold_names, model.folds, strict=True)
         ],
     )
@@ -168,14 +170,6 @@ def in_families(signals: Sequence[str]) -> str:
     return f"{len(signals)}: " + " ".join(dict.fromkeys(shown.values()))
 
 
-def _figures(model: CrossValidation) -> list[str]:
-    return [
-        f"{model.drives:,}",
-        *figures_cells(model.pooled),
-        f"{model.condition_number:.3g}",
-    ]
-
-
 def _worth(evidence: Evidence) -> str:
     return f"taking {evidence.kind} for independent, the cohort is worth {evidence.rows:,.0f} rows"
 
@@ -187,19 +181,23 @@ def _print_distances(found: NestedDistances) -> None:
         _distance_rows(found.order, found.evidence),
         left=2,
     )
-    stdout().print(
-        f"without any signal: RMSE {found.null.pooled.rmse_deg:.4f} deg.\n", markup=False
-    )
+    print_line(f"without any signal: RMSE {found.null.pooled.rmse_deg:.4f} deg.\n")
 
 
 def _print_choice(choice: SearchChoice) -> None:
     worth = _worth(choice.evidence)
     if choice.nested is not None:
-        nested = choice.nested
+        nested, by_folds = choice.nested, choice.rule.criterion == CROSS_VALIDATION
+        criterion = "minus correlation" if by_folds else choice.rule.criterion
         print_table(
             f"order by {choice.rule.ranking}; {worth}",
-            ["", "added", *DISTANCES, _criterion_name(choice)],
-            _order_rows(nested),
+            ["", "added", *DISTANCES, criterion],
+            (
+                [*line, f"{value:,.4f}{' <' if j == nested.size else '  '}"]
+                for j, (line, value) in enumerate(
+                    zip(_distance_rows(nested.order, nested.evidence), nested.values, strict=True)
+                )
+            ),
             left=2,
         )
     if choice.subsets is not None and choice.picks is not None:
@@ -220,20 +218,6 @@ def _print_choice(choice: SearchChoice) -> None:
         )
 
 
-def _criterion_name(choice: SearchChoice) -> str:
-    if choice.rule.criterion == CROSS_VALIDATION:
-        return "minus correlation"
-    return choice.rule.criterion
-
-
-def _order_rows(nested: NestedChoice) -> Iterator[list[str]]:
-    """Return a line for each of the k+1 models, with the criterion's value."""
-    lines = _distance_rows(nested.order, nested.evidence)
-    for j, (line, value) in enumerate(zip(lines, nested.values, strict=True)):
-        mark = " <" if j == nested.size else "  "
-        yield [*line, f"{value:,.4f}{mark}"]
-
-
 def _distance_rows(order: Sequence[str], evidence: Evidence) -> Iterator[list[str]]:
     """Return a line for each of the k+1 models of an order, the empty one first.
 
@@ -247,25 +231,15 @@ def _distance_rows(order: Sequence[str], evidence: Evidence) -> Iterator[list[st
         yield [str(j), added, contribution, f"{to_full:,.1f}", f"{expected:,.1f}"]
 
 
-def _print_honest(honest: CrossValidation) -> None:
-    stdout().print(
-        "made again inside every training fold, the whole choice has a correlation of "
-        f"{honest.correlation:.4f} and an RMSE of {honest.pooled.rmse_deg:.4f} deg.",
-        markup=False,
-    )
-
-
 def _print_uncertainty(found: Uncertainty) -> None:
     if found.interval is not None:
-        stdout().print(
+        print_line(
             f"{found.interval.level:.0%} interval of the winner's correlation, drawing its "
             f"{found.drawn}s {found.interval.replicates:,} times: {found.interval.low:.4f} to "
-            f"{found.interval.high:.4f}.",
-            markup=False,
+            f"{found.interval.high:.4f}."
         )
     if found.repeated_mean is not None and found.repeated_spread is not None:
-        stdout().print(
+        print_line(
             f"{found.repeats} other deals of the drives into folds: correlation "
-            f"{found.repeated_mean:.5f} +- {found.repeated_spread:.5f}.",
-            markup=False,
+            f"{found.repeated_mean:.5f} +- {found.repeated_spread:.5f}."
         )

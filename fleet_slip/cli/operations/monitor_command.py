@@ -1,6 +1,5 @@
 """The command that charts a model's error by day: monitor."""
 
-from datetime import date
 from pathlib import Path
 from typing import Annotated
 
@@ -9,8 +8,9 @@ import typer
 from fleet_slip.cli.begin.run_command import DEFAULT_CAMPAIGN
 from fleet_slip.cli.left_out import say_revoked, say_untold, say_without_log
 from fleet_slip.cli.models.version_commands import Reference
+from fleet_slip.cli.options import date_of
 from fleet_slip.cli.output import Json, print_json, print_table
-from fleet_slip.errors import AlarmError, UsageError
+from fleet_slip.errors import AlarmError
 from fleet_slip.extras import needed
 from fleet_slip.monitoring.monitor import Chart
 
@@ -41,7 +41,7 @@ def monitor(
 
     Example: **fleet-slip monitor waterford --since 2024-05-03**
     """
-    chart: Chart = context.obj.monitor(reference, cohort, since=_first_new_day(since))
+    chart: Chart = context.obj.monitor(reference, cohort, since=date_of(since, "--since"))
     if plot:
         with needed("report", "a chart"):
             from fleet_slip.monitoring.control_chart import save_chart  # noqa: PLC0415
@@ -56,13 +56,6 @@ def monitor(
     if chart.alarms:
         days = ", ".join(f"{day.day} ({' and '.join(day.alarms)})" for day in chart.alarms)
         raise AlarmError(f"the error of {chart.model} is beyond its limits on {days}")
-
-
-def _first_new_day(text: str | None) -> date | None:
-    try:
-        return None if text is None else date.fromisoformat(text)
-    except ValueError:
-        raise UsageError(f"--since {text}: not a date; write it as 2024-05-01.") from None
 
 
 def _print_chart(chart: Chart) -> None:

@@ -1,6 +1,5 @@
 """The command of every night with real cars."""
 
-from datetime import date
 from pathlib import Path
 from typing import Annotated
 
@@ -11,12 +10,11 @@ from fleet_slip.api.fleet import RUN_MODELS, Fleet
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli.completing import complete_config, complete_model
 from fleet_slip.cli.models.signing_commands import SignKey, signing_key
-from fleet_slip.cli.options import Worth
+from fleet_slip.cli.options import Worth, date_of
 from fleet_slip.cli.output import Json, print_json, print_text, say
 from fleet_slip.cli.progress_bar import progress_of_steps
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.workers import Cluster, Threads
-from fleet_slip.errors import UsageError
 from fleet_slip.extras import needed
 from fleet_slip.selection.request import WORTH
 
@@ -95,7 +93,7 @@ def nightly(
             worth=worth,
             candidate=candidate,
             retention=retention,
-            night=_date_of(night),
+            night=date_of(night, "--night"),
             sign_key=signing_key(sign_key),
             workers=executor,
             progress=show,
@@ -112,10 +110,3 @@ def nightly(
         print_text(report.as_text())
     if problem := report.problem:
         raise problem
-
-
-def _date_of(text: str | None) -> date | None:
-    try:
-        return None if text is None else date.fromisoformat(text)
-    except ValueError:
-        raise UsageError(f"--night {text}: not a date; write it as 2024-05-01.") from None
