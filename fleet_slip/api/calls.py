@@ -39,6 +39,9 @@ class Rooted:
 ShowProgress = Callable[[int, int], None]
 """Called now and then with the units done so far and the units to do in all: rows, bytes, files."""
 
+ShowStep = Callable[[str, int, int], None]
+"""Like `ShowProgress`, with the name of the step first."""
+
 Workers = int | str | Executor | None
 """Where the tasks of a call run; the result is the same. A number of threads of this process (None
 is one for each core), the address of a Dask scheduler such as `tcp://10.0.0.1:8786`, or an
@@ -119,6 +122,11 @@ def count_from_start(show: ShowProgress | None) -> Progress:
     return progress
 
 
+def of_step(show: ShowStep | None, name: str) -> ShowProgress | None:
+    """Return what shows the progress of a step."""
+    return None if show is None else lambda done, total: show(name, done, total)
+
+
 @contextmanager
 def open_workers(root: Folder, workers: Workers) -> Iterator[Executor]:
     """Yield the executor that `workers` means; a given one stays open. Raises `ExtraError`."""
@@ -126,17 +134,13 @@ def open_workers(root: Folder, workers: Workers) -> Iterator[Executor]:
     if isinstance(workers, Executor):
         context = nullcontext(workers)
     elif isinstance(workers, str):
-        context = _cluster(workers, root)
+        with needed("cluster", "a cluster"):
+            from fleet_slip.compute.cluster import cluster_executor  # slow
+        context = cluster_executor(workers, absolute(root))
     else:
         context = LocalThreads(workers or os.cpu_count() or 1)
     with context as executor:
         yield executor
-
-
-def _cluster(address: str, root: Folder) -> Any:
-    with needed("cluster", "a cluster"):
-        from fleet_slip.compute.cluster import cluster_executor  # slow
-    return cluster_executor(address, absolute(root))
 
 
 def absolute(root: Folder) -> Folder:

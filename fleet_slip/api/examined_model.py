@@ -42,18 +42,12 @@ def subject_of(
         if model is not None:
             raise UsageError("name a published model or signals (of a feature set), not both.")
         return ExaminedModel(feature_set or PLAIN, signals, None)
-    version = (
-        model
-        if isinstance(model, ModelVersion)
-        else registry.resolve(model or _only_model(registry))
-    )
+    if model is None:
+        names = registry.names()
+        if len(names) != 1:
+            known = ", ".join(names) or "none"
+            raise QuestionError(f"name a published model, or signals. Published: {known}.")
+        (model,) = names
+    version = model if isinstance(model, ModelVersion) else registry.resolve(model)
     identity = version.manifest.trained_on.feature_set
     return ExaminedModel(features().name_of(identity), None, version)
-
-
-def _only_model(registry: Registry) -> str:
-    names = registry.names()
-    if len(names) == 1:
-        return names[0]
-    known = ", ".join(names) or "none"
-    raise QuestionError(f"name a published model, or signals. Published: {known}.")

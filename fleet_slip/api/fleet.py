@@ -6,7 +6,7 @@ from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fleet_slip.api.calls import Workers, open_workers, record_call
+from fleet_slip.api.calls import ShowStep, Workers, of_step, open_workers, record_call
 from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.health_and_upkeep import HealthAndUpkeep
 from fleet_slip.api.logs_and_grams import LogsAndGrams
@@ -26,9 +26,6 @@ if TYPE_CHECKING:
 
 RUN_MODELS = "estimator"
 """The model list that a run chooses from."""
-
-ShowStep = Callable[[str, int, int], None]
-"""Like `ShowProgress`, with the name of the step first."""
 
 
 class Fleet(LogsAndGrams, HealthAndUpkeep):
@@ -129,9 +126,9 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
                     days=days,
                     through=through,
                     workers=executor,
-                    progress=_of_step(progress, "simulate"),
+                    progress=of_step(progress, "simulate"),
                 )
-                gram = self.gram(workers=executor, progress=_of_step(progress, "gram"))
+                gram = self.gram(workers=executor, progress=of_step(progress, "gram"))
                 feature_set = load_model_list(models).features
                 wide = None
                 if feature_set != PLAIN:
@@ -139,7 +136,7 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
                         feature_set,
                         cohort=condition,
                         workers=executor,
-                        progress=_of_step(progress, f"gram {feature_set}"),
+                        progress=of_step(progress, f"gram {feature_set}"),
                     )
                 if features().feature_set(feature_set).change_ticks:
                     # What the intercept follows from, and whether the course came in time.
@@ -216,9 +213,3 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
                 workers=workers,
                 progress=progress,
             ).run()
-
-
-def _of_step(progress: ShowStep | None, name: str) -> Callable[[int, int], None] | None:
-    if progress is None:
-        return None
-    return lambda done, total: progress(name, done, total)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from datetime import date
+from functools import partial
 from typing import TYPE_CHECKING
 
 from fleet_slip.api.calls import (
@@ -206,14 +207,11 @@ class HealthAndUpkeep(PublishedModels):
             raise UsageError("give one of vehicle, drive, drive_name and source_file.")
         told = count_from_start(progress)
         with step("forget") as figures:
+            called = partial(forget_called, self.warehouse, now=now, progress=told)
             if drive_name is not None:
-                report = forget_called(
-                    self.warehouse, "drive_name", drive_name, now=now, progress=told
-                )
+                report = called("drive_name", drive_name)
             elif source_file is not None:
-                report = forget_called(
-                    self.warehouse, "source_file", source_file, now=now, progress=told
-                )
+                report = called("source_file", source_file)
             else:
                 subject = _forgettable(vehicle, drive)
                 report = forget(self.warehouse, subject, now=now, progress=told)

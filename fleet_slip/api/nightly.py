@@ -9,7 +9,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fleet_slip.api.calls import ShowProgress, Workers
+from fleet_slip.api.calls import ShowStep, Workers, of_step
 from fleet_slip.api.run_report import Training
 from fleet_slip.catalogue.car_numbers import CALIBRATION, DELAY
 from fleet_slip.catalogue.feature_sets import PLAIN
@@ -29,7 +29,7 @@ from fleet_slip.warehouse.tables import Warehouse
 from fleet_slip.words import number_of
 
 if TYPE_CHECKING:
-    from fleet_slip.api.fleet import Fleet, ShowStep
+    from fleet_slip.api.fleet import Fleet
     from fleet_slip.grams.cohorts.outweighing import Outweighing
     from fleet_slip.monitoring.monitor import Chart
     from fleet_slip.monitoring.quality import SensorFault
@@ -68,7 +68,7 @@ class Night:
     candidate: bool = False
     retention: str | None = None
     workers: Workers = None
-    progress: "ShowStep | None" = None
+    progress: ShowStep | None = None
     before: Beginning = field(init=False)
     steps: list[NightStep] = field(default_factory=list)
     faults: "tuple[SensorFault, ...]" = ()
@@ -155,10 +155,6 @@ class Night:
         waits = pointed and (champion is None or pointed > champion.version)
         return f"{name}@{pointed}" if waits else None
 
-    def _shown(self, name: str) -> ShowProgress | None:
-        show = self.progress
-        return None if show is None else lambda done, total: show(name, done, total)
-
     def _ingest(self) -> Told:
         mapping = load_mapping(self.mapping)
         if not is_url(self.landing) and not Path(self.landing).is_dir():
@@ -171,7 +167,7 @@ class Night:
             never = not self.before.drives
             return ("attention" if never else "done"), "No log is in the folder."
         reports = self.fleet.ingest(
-            self.landing, mapping, workers=self.workers, progress=self._shown("ingest")
+            self.landing, mapping, workers=self.workers, progress=of_step(self.progress, "ingest")
         )
         rows = self.fleet.warehouse.logs.snapshot().rows - self.before.rows
         told = f"{number_of(rows, 'new row')}."
@@ -193,7 +189,7 @@ class Night:
                 name,
                 cohort=None if name == PLAIN else self.training.cohort,
                 workers=self.workers,
-                progress=self._shown(f"gram {name}"),
+                progress=of_step(self.progress, f"gram {name}"),
             )
         return "done", f"Of {number_of(self._now().drives, 'drive')}."
 
@@ -249,9 +245,7 @@ class Night:
 
     def _verify(self) -> Told:
         checked = self.fleet.check(
-            SAMPLE_FILES,
-            begin=self.night.toordinal(),
-            progress=self._shown("verify"),
+            SAMPLE_FILES, begin=self.night.toordinal(), progress=of_step(self.progress, "verify")
         )
         return "done", (
             f"{number_of(checked.rows, 'row')} of {number_of(checked.files, 'file')} are what was "
@@ -259,7 +253,7 @@ class Night:
         )
 
     def _retain(self) -> Told:
-        report = self.fleet.retain(self.retention, progress=self._shown("retain"))
+        report = self.fleet.retain(self.retention, progress=of_step(self.progress, "retain"))
         forgotten, removed = report.forgotten.drives, len(report.vacuumed.files)
         return "done", (
             f"{number_of(forgotten, 'drive')} before {report.before} forgotten, "

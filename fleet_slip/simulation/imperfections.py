@@ -135,7 +135,11 @@ class ImperfectionRanges(Config):
     @model_validator(mode="after")
     def _both_ends_can_be(self) -> "ImperfectionRanges":
         for end in ("min", "max"):
-            for kind, ranges in self._kinds():
+            for kind, ranges in (
+                (CarImperfections, self.car),
+                (SensorImperfections, self.sensors),
+                (RoadImperfections, self.road),
+            ):
                 kind.model_validate({name: _end(kind, name, r, end) for name, r in ranges.items()})
         return self
 
@@ -151,13 +155,6 @@ class ImperfectionRanges(Config):
             return 1.0, 1.0
         worn = self.tread_wear_per_100_days.draw(of_car) * days / 100 % 1.0
         return 1.0 + (WORN_STIFFNESS - 1.0) * worn, 1.0 + (WORN_RADIUS - 1.0) * worn
-
-    def _kinds(self) -> list[tuple[type[Config], dict[str, Range]]]:
-        return [
-            (CarImperfections, self.car),
-            (SensorImperfections, self.sensors),
-            (RoadImperfections, self.road),
-        ]
 
     def draw(self, of_car: np.random.Generator, of_drive: np.random.Generator) -> Imperfections:
         """Draw the imperfections of a car from one generator, of a drive's road from another."""

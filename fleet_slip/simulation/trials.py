@@ -6,12 +6,7 @@ import numpy as np
 from pydantic import Field
 
 from fleet_slip.config import Config
-from fleet_slip.simulation.drive_plan import (
-    CarOnRoad,
-    Plan,
-    SensorBiases,
-    Uniform,
-)
+from fleet_slip.simulation.drive_plan import CarOnRoad, Plan, SensorBiases, Uniform
 from fleet_slip.simulation.imperfections import NotNegative
 from fleet_slip.simulation.manoeuvres import KINDS, Manoeuvre
 from fleet_slip.simulation.sensing.sensors import Sensors

@@ -240,8 +240,12 @@ def print_summary(content: Mapping[str, Any], model: str) -> None:
     print_ranking(content["ranking"])
     print_text("")
     ours = content["ranking"]["estimator"]
-    for line in (*_extremes(content["scenarios"], ours), *_requirements(content["checks"])):
+    for line in _extremes(content["scenarios"], ours):
         print_text(line)
+    if checks := content["checks"]:
+        missed = sum(not check["reached"] for check in checks)
+        asked = number_of(len(checks), "requirement")
+        print_text(f"Of {asked} of the paper's scenarios, its own models miss {missed}.")
     print_text(
         f"All estimators, sections and requirements: fleet-slip evaluate --one-car "
         f"{shlex.quote(model)} --all; for machines --json."
@@ -268,14 +272,6 @@ def _extremes(scenarios: Sequence[Mapping[str, Any]], ours: str) -> list[str]:
     if partial:
         lines.append(f"A sensor fails it on part of the rows; estimated: {', '.join(partial)}.")
     return lines
-
-
-def _requirements(checks: Sequence[Mapping[str, Any]]) -> list[str]:
-    if not checks:
-        return []
-    missed = sum(not check["reached"] for check in checks)
-    asked = number_of(len(checks), "requirement")
-    return [f"Of {asked} of the paper's scenarios, its own models miss {missed}."]
 
 
 def print_blind(rows: Sequence["BlindRow"], everything: bool) -> None:

@@ -202,19 +202,16 @@ class Remarks:
         if not self._quiet:
             say(_ingested(report.as_dict()))
         for names in report.look_alikes:
-            say(_look_alike(report.file, names), logging.WARNING)
+            say(
+                f"{report.file}: the names {' and '.join(map(ascii, names))} look the same and "
+                "count as several: they differ in their Unicode form. Write such names in one form "
+                "in the files or the mapping, normally NFC.",
+                logging.WARNING,
+            )
         for one in report.suspicions:
             if (one.kind, one.signals) not in self._told:
                 self._told.add((one.kind, one.signals))
                 say(f"{report.file}: looks wrong: {one}", logging.WARNING)
-
-
-def _look_alike(file: str, names: tuple[str, ...]) -> str:
-    return (
-        f"{file}: the names {' and '.join(map(ascii, names))} look the same and count as several: "
-        "they differ in their Unicode form. Write such names in one form in the files or the "
-        "mapping, normally NFC."
-    )
 
 
 def _ingested(report: dict[str, Any]) -> str:

@@ -13,7 +13,7 @@ from fleet_slip.cli.recorded import record_run
 from fleet_slip.errors import UsageError
 from fleet_slip.export.costs import costs_content, describe_costs
 from fleet_slip.models.aliases import CHAMPION
-from fleet_slip.models.manifest import ImportedFrom, LearnedFrom, ModelTerm
+from fleet_slip.models.manifest import LearnedFrom, ModelTerm
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.words import number_of
 
@@ -151,10 +151,6 @@ def _definition_row(term: ModelTerm) -> list[str]:
     ]
 
 
-def _origin(origin: ImportedFrom) -> str:
-    return f"from {origin.reference} of another data root, sha256 {origin.sha256}"
-
-
 def _teacher(learned: LearnedFrom) -> str:
     """Say what stood for a label, and where the intercept is from."""
     times = learned.change_s
@@ -240,7 +236,16 @@ def _print_version(version: ModelVersion) -> None:
             ],
             ["why", manifest.selected_by.reason],
             *([["learned from", _teacher(one)]] if (one := manifest.learned_from) else []),
-            *([["imported", _origin(origin)]] if (origin := manifest.imported_from) else []),
+            *(
+                [
+                    [
+                        "imported",
+                        f"from {origin.reference} of another data root, sha256 {origin.sha256}",
+                    ]
+                ]
+                if (origin := manifest.imported_from)
+                else []
+            ),
             ["sha256", version.sha256],
         ],
         left=2,

@@ -18,7 +18,7 @@ from fleet_slip.errors import DamageError, PendingError
 from fleet_slip.maintenance.compaction import TARGET_ROWS
 from fleet_slip.maintenance.forget import ForgetReport
 from fleet_slip.maintenance.vacuum import RETENTION_HOURS, VacuumReport
-from fleet_slip.maintenance.verify_files import Damage, Verification
+from fleet_slip.maintenance.verify_files import Verification
 from fleet_slip.runs.log import recording
 from fleet_slip.words import number_of
 
@@ -95,7 +95,8 @@ def _print_verification(report: Verification, rebuilt: list[str]) -> None:
     remarks = [finding for finding in report.findings if not finding.damage]
     for title, findings in (("damage", report.damage), ("remarks", remarks)):
         if findings:
-            print_table(title, ["where", "problem"], map(_row, findings), left=2)
+            rows = ([finding.path, finding.problem] for finding in findings)
+            print_table(title, ["where", "problem"], rows, left=2)
     say(
         f"{number_of(report.files, 'file')} with {report.size_bytes:,} bytes and "
         f"{number_of(report.documents, 'document')} "
@@ -109,10 +110,6 @@ def _signatures(report: Verification) -> str:
     if not report.signatures_checked:
         return ""
     return f", {report.signatures_checked:,} of {number_of(report.signatures, 'signature')} checked"
-
-
-def _row(finding: Damage) -> list[str]:
-    return [finding.path, finding.problem]
 
 
 @record_run

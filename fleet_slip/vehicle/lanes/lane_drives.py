@@ -92,7 +92,11 @@ def simulate_blocks(
     usable.
     """
     for drive in drives:
-        _require_usable(drive)
+        require_usable(drive.road)
+        if not 0 < drive.adhesion < math.inf or not 0 < drive.laps < math.inf:
+            raise ConfigError(
+                f"adhesion {drive.adhesion} and laps {drive.laps}: give positive numbers."
+            )
     for imperfect in (False, True):
         numbers = [i for i, drive in enumerate(drives) if drive.imperfect == imperfect]
         alike = [drives[number] for number in numbers]
@@ -108,7 +112,10 @@ def _simulate_alike(
         return
     simulate = lane_kernel.simulate_imperfect if imperfect else lane_kernel.simulate
     routes, roads = _routes(drives)
-    surfaces = _surfaces(drives) if imperfect else np.zeros((0, len(Surface._fields)))
+    surfaces = np.zeros((0, len(Surface._fields)))
+    if imperfect:  # in the order of the table of all roads
+        distinct = {id(drive.road): drive.road for drive in drives}
+        surfaces = np.concatenate([surface_table(road) for road in distinct.values()])
     cars = np.array([_car(drive) for drive in drives])
     waiting = np.argsort(routes["samples"], kind="stable").tolist()
     ended = np.full((len(drives), 2), NOBODY)
@@ -145,12 +152,6 @@ def _car(drive: LaneDrive) -> tuple[float, ...]:
     )
 
 
-def _surfaces(drives: Sequence[LaneDrive]) -> FloatArray:
-    """Return the table of all surfaces, in the order of the table of all roads."""
-    roads = {id(drive.road): drive.road for drive in drives}
-    return np.concatenate([surface_table(road) for road in roads.values()])
-
-
 def _routes(drives: Sequence[LaneDrive]) -> tuple[NDArray[np.void], FloatArray]:
     """Return what the kernel knows of the drives, `ROUTE`, and the table of all roads."""
     roads = {id(drive.road): drive.road for drive in drives}
@@ -169,11 +170,3 @@ def _route(
     distance_m = (drive.laps if road.closed else min(drive.laps, 1.0)) * road.length_m
     samples = math.ceil((PATIENCE * planned_time_s(road, distance_m) + GRACE_S) / SAMPLE_S)
     return first, last, 1 / road.spacing_m, road.length_m, road.closed, distance_m, samples
-
-
-def _require_usable(drive: LaneDrive) -> None:
-    require_usable(drive.road)
-    if not 0 < drive.adhesion < math.inf or not 0 < drive.laps < math.inf:
-        raise ConfigError(
-            f"adhesion {drive.adhesion} and laps {drive.laps}: give positive numbers."
-        )

@@ -71,13 +71,9 @@ def road_table(road: Road) -> FloatArray:
 
 def surface_table(road: Road) -> FloatArray:
     """Return what the kernel looks up of a road's surface."""
-    return _continued(road, *(road.surface or _flat(road)))
-
-
-def _flat(road: Road) -> Surface:
-    """Return the surface of a road that is flat, even and calm."""
     zero, one = np.zeros(len(road.curvature_1pm)), np.ones(len(road.curvature_1pm))
-    return Surface(zero, zero, one, one, zero)
+    flat_even_and_calm = Surface(zero, zero, one, one, zero)
+    return _continued(road, *(road.surface or flat_even_and_calm))
 
 
 def _continued(road: Road, *columns_of_road: FloatArray) -> FloatArray:
