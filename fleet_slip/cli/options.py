@@ -187,12 +187,12 @@ FeatureSetOption = Annotated[
 ]
 
 
-def date_of(text: str | None, option: str) -> date | None:
-    """Return the day that an option names. Raises `UsageError` for what is none."""
+def date_of(text: str | None, option: str, example: str = "2024-05-01") -> date | None:
+    """Return the day that an option names. Raises `UsageError` for anything but a date."""
     try:
         return None if text is None else date.fromisoformat(text)
     except ValueError:
-        raise UsageError(f"{option} {text}: not a date; write it as 2024-05-01.") from None
+        raise UsageError(f"{option} {text}: not a date; write it as {example}.") from None
 
 
 def quantities(values: Sequence[str] | None, option: str) -> dict[str, float]:

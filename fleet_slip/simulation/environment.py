@@ -99,7 +99,7 @@ class SideSlipEnv(gymnasium.Env[Observation, Observation]):
 
         `speed_mps` in m/s, `steering_rad` the amplitude at the steering wheel in rad. Without
         `sensors` the signals are true. Raises `ConfigError` for an unknown car and `UsageError`
-        for a range that is none.
+        for an invalid range.
         """
         for name, (least, most) in {
             "speed_mps": speed_mps,

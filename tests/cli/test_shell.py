@@ -11,7 +11,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.api.session import Session
-from fleet_slip.cli.data.shell_command import Completer, Typed
+from fleet_slip.cli.data.shell_command import Typed, complete
 from tests.support.commands import COMMAND, PATIENCE_S, Finished, RunCommand
 
 
@@ -62,12 +62,12 @@ def test_a_name_of_a_view_is_no_sql(
 
 
 def test_tab_completes_views_columns_and_commands(session: Session) -> None:
-    complete = Completer(Typed(session).words()).complete
-    found = [complete("sidesl", number) for number in range(3)]
+    words = Typed(session).words()
+    found = [complete(words, "sidesl", number) for number in range(3)]
     assert found == ["sideslip", "sideslip_rad", None]
-    assert complete("log_c", 0) == "log_counts"
-    assert complete(".sch", 0) == ".schema"
-    assert complete("SIDESLIP_", 0) == "sideslip_rad"
+    assert complete(words, "log_c", 0) == "log_counts"
+    assert complete(words, ".sch", 0) == ".schema"
+    assert complete(words, "SIDESLIP_", 0) == "sideslip_rad"
 
 
 def at_a_terminal(root: Path, typed: str, **environment: str) -> str:

@@ -11,6 +11,7 @@ import typer
 from fleet_slip.api.calls import open_workers
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.cli.completing import complete_config
+from fleet_slip.cli.options import date_of
 from fleet_slip.cli.output import Json, print_json, say
 from fleet_slip.cli.progress_bar import progress
 from fleet_slip.cli.recorded import record_run
@@ -40,15 +41,10 @@ Days = Annotated[
 
 
 def last_day(through: str | None) -> date | None:
-    """Return the day that --through names. Raises `UsageError` for what is none."""
-    if through is None or through == "today":
-        return None if through is None else date.today()
-    try:
-        return date.fromisoformat(through)
-    except ValueError:
-        raise UsageError(
-            f"--through {through}: not a date; write it as 2024-05-01, or today."
-        ) from None
+    """Return the day that --through names. Raises `UsageError` for anything but a date or today."""
+    if through == "today":
+        return date.today()
+    return date_of(through, "--through", "2024-05-01, or today")
 
 
 @record_run

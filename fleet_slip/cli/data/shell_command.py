@@ -6,6 +6,7 @@ import os
 import readline
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 
 import typer
@@ -31,7 +32,7 @@ def shell(context: typer.Context) -> None:
     limit_memory()
     with context.obj.session() as session, _kept_history(), _stdin_as_it_is():
         typed = Typed(session)
-        readline.set_completer(Completer(typed.words()).complete)
+        readline.set_completer(partial(complete, typed.words()))
         readline.set_completer_delims(" \t\n,();=<>'\"")
         readline.parse_and_bind("tab: complete")
         say(f"Views: {', '.join(typed.views())}. Commands: .help")
@@ -55,10 +56,7 @@ class Typed:
         self._session, self._form = session, Form.TABLE
         self._commands: Mapping[str, tuple[str, Callable[[str], bool]]] = {
             ".tables": ("lists the views", self._tables),
-            ".schema": (
-                "VIEW: its columns, units and what they mean",
-                self._schema,
-            ),
+            ".schema": ("VIEW: its columns, units and what they mean", self._schema),
             ".mode": (f"{'|'.join(Form)}: how answers are printed", self._mode),
             ".help": ("lists the commands", self._help),
             ".quit": ("ends; so do .exit and Ctrl-D", lambda _: False),
@@ -115,17 +113,10 @@ class Typed:
         return True
 
 
-class Completer:
-    """Completes a word from a list, as readline asks for it: one candidate after the other."""
-
-    def __init__(self, words: list[str]) -> None:
-        """Take the words."""
-        self._words = words
-
-    def complete(self, begun: str, number: int) -> str | None:
-        """Return a candidate by its number; None after the last."""
-        found = [word for word in self._words if word.startswith(begun.lower())]
-        return found[number] if number < len(found) else None
+def complete(words: list[str], begun: str, number: int) -> str | None:
+    """Return what completes a word, one candidate after the other; None after the last."""
+    found = [word for word in words if word.startswith(begun.lower())]
+    return found[number] if number < len(found) else None
 
 
 @contextlib.contextmanager

@@ -11,9 +11,8 @@ from fleet_slip.catalogue.definitions import Definition
 from fleet_slip.columns.blocks.column_plan import ColumnPlan
 from fleet_slip.columns.blocks.drive_columns import DriveColumns
 from fleet_slip.comparison.evaluation.estimators import as_counts
-from fleet_slip.comparison.evaluation.evaluated_drives import find_stretches
 from fleet_slip.comparison.evaluation.scenario_runs import EvaluatedScenario
-from fleet_slip.comparison.report.time_series import Line, band
+from fleet_slip.comparison.report.time_series import Line, band, hide_time, shade
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.pages.drawing import Size, colour
 
@@ -78,12 +77,7 @@ def angle_and_gates(
         panels.append(figure.add_axes((across[0], top / height, across[1], GATE_IN / height)))
     for axes in panels:
         axes.set_xlim(time_s[0], time_s[-1])
-        for section in run.sections:
-            if section.name == "unstable":
-                for stretch in find_stretches(run.drive, section.rows):
-                    axes.axvspan(
-                        stretch.from_s, stretch.until_s, color=colour("unstable"), alpha=0.16, lw=0
-                    )
+        shade(axes, run, "unstable")
     angle, *strips = panels
     for tone, values in (
         ("truth", run.drive.sideslip_rad),
@@ -104,7 +98,6 @@ def angle_and_gates(
         axes.set_yticks([0, 1])
         axes.set_title(f"gate by {name}", color=colour("muted"))
     for axes in panels[:-1]:
-        axes.tick_params(labelbottom=False, bottom=False)
-        axes.spines["bottom"].set_visible(False)
+        hide_time(axes)
     panels[-1].set_xlabel("time (s)", labelpad=2)
     return figure

@@ -122,7 +122,7 @@ def _draw(figure: Figure, block: DriveBlock, top_in: float, reach: float, size: 
     truth_deg = np.degrees(block.run.drive.sideslip_rad)
     for axes in (angle, *strips):
         axes.set_xlim(time_s[0], time_s[-1])
-        _shade(axes, block)
+        shade(axes, block.run, block.shaded)
     for line in block.lines:
         _plot(axes=angle, x=time_s, y=_estimate_deg(block, line), line=line, size=size)
     truth = band(time_s, truth_deg, size.bins)
@@ -135,8 +135,7 @@ def _draw(figure: Figure, block: DriveBlock, top_in: float, reach: float, size: 
         axes.set_yticks([-reach / 2, 0, reach / 2])
         _caption(axes, block, line, size)
     for axes in (angle, *strips[:-1]):
-        axes.tick_params(labelbottom=False, bottom=False)
-        axes.spines["bottom"].set_visible(False)
+        hide_time(axes)
     last = strips[-1] if strips else angle
     last.set_xlabel("time (s)", labelpad=2)
 
@@ -181,14 +180,19 @@ def _reach(block: DriveBlock) -> float:
     return next(reach for reach in REACHES_DEG if largest < reach)
 
 
-def _shade(axes: Axes, block: DriveBlock) -> None:
-    for section in block.run.sections:
-        if section.name == block.shaded:
-            name = "unstable" if section.name == "unstable" else "outage"
-            for stretch in find_stretches(block.run.drive, section.rows):
-                axes.axvspan(
-                    stretch.from_s, stretch.until_s, color=colour(name), alpha=0.16, linewidth=0
-                )
+def shade(axes: Axes, run: EvaluatedScenario, shaded: str | None) -> None:
+    """Mark the stretches of a section of a drive."""
+    for section in run.sections:
+        if section.name == shaded:
+            tone = colour("unstable" if shaded == "unstable" else "outage")
+            for one in find_stretches(run.drive, section.rows):
+                axes.axvspan(one.from_s, one.until_s, color=tone, alpha=0.16, linewidth=0)
+
+
+def hide_time(axes: Axes) -> None:
+    """Leave out the axis of time, which stands beneath another strip."""
+    axes.tick_params(labelbottom=False, bottom=False)
+    axes.spines["bottom"].set_visible(False)
 
 
 def _legend(figure: Figure, axes: Axes, block: DriveBlock, top_in: float) -> None:

@@ -69,12 +69,12 @@ def lasso_path_of_moments(
     matrix: FloatArray, target: FloatArray, inputs: Sequence[str]
 ) -> LarsPath:
     """Return the path for moments X'X, shape (k, k), and X'y, shape (k,), in their own units."""
-    return _follow(_LassoWalk(matrix, target), inputs)
+    return _follow(_Walk(matrix, target, drops=True), inputs)
 
 
 def lars_path_of_moments(matrix: FloatArray, target: FloatArray, inputs: Sequence[str]) -> LarsPath:
     """Return the least-angle path for moments X'X, shape (k, k), and X'y, shape (k,)."""
-    return _follow(_Walk(matrix, target), inputs)
+    return _follow(_Walk(matrix, target, drops=False), inputs)
 
 
 def _correlations(gram: Gram, inputs: Sequence[str], label: str) -> tuple[FloatArray, FloatArray]:
@@ -111,10 +111,13 @@ def fit_lasso(
 
 
 class _Walk:
-    """State of the path: all active signals keep the same absolute residual correlation."""
+    """State of the path: all active signals keep the same absolute residual correlation.
 
-    def __init__(self, matrix: FloatArray, target: FloatArray) -> None:
-        self.matrix, self.target = matrix, target
+    The lasso `drops` every signal whose coefficient reaches zero; least angles never do.
+    """
+
+    def __init__(self, matrix: FloatArray, target: FloatArray, *, drops: bool) -> None:
+        self.matrix, self.target, self.drops = matrix, target, drops
         self.beta = np.zeros(len(target))
         self.active: list[int] = []
         self.entered: list[int] = []
@@ -135,7 +138,8 @@ class _Walk:
         direction[self.active] = np.linalg.solve(inner, signs)
         length = min(penalty, self._until_entry(residual, penalty, direction))
         self.dropped = None
-        length = self._until_zero(direction, length)
+        if self.drops:
+            length = self._until_zero(direction, length)
         self.beta = self.beta + length * direction
         if self.dropped is not None:
             self.beta[self.dropped] = 0.0
@@ -170,15 +174,7 @@ class _Walk:
         return min(lengths)
 
     def _until_zero(self, direction: FloatArray, length: float) -> float:
-        """Return how far to go before an active coefficient must be dropped: never, in LARS."""
-        _ = direction
-        return length
-
-
-class _LassoWalk(_Walk):
-    """The same, with every signal dropped whose coefficient reaches zero."""
-
-    def _until_zero(self, direction: FloatArray, length: float) -> float:
+        """Return how far to go before an active coefficient must be dropped, and note which."""
         for i in self.active:
             if self.beta[i] * direction[i] < 0:
                 until = float(-self.beta[i] / direction[i])

@@ -5,7 +5,6 @@ the empirical mass of intervals around them (Wang 2000, Wang and Witten 2002): l
 w >= 0 and no constraint on the sum, so that a few far points are not absorbed by the many.
 """
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -63,50 +62,30 @@ class Mixture:
     weights: FloatArray
 
 
-class Kernel(ABC):
-    """How data scatter around a point of the mixing distribution."""
-
-    @abstractmethod
-    def position(self, x: FloatArray) -> FloatArray:
-        """Return where a datum is on a scale of unit noise."""
-
-    @abstractmethod
-    def support(self, data: FloatArray) -> FloatArray:
-        """Return the candidate points of the mixing distribution, for sorted data."""
-
-    @abstractmethod
-    def intervals(self, data: FloatArray) -> FloatArray:
-        """Return the intervals to match, shape (r, 2)."""
-
-    @abstractmethod
-    def cdf(self, x: FloatArray, points: FloatArray) -> FloatArray:
-        """Return P(X <= x | point), for x of shape (r, 1) and points of shape (m,)."""
-
-
-class NormalKernel(Kernel):
+class NormalKernel:
     """X ~ N(point, 1): signed effects."""
 
     def position(self, x: FloatArray) -> FloatArray:
-        """Return the datum itself."""
+        """Return where a datum is on a scale of unit noise: itself."""
         return x
 
     def support(self, data: FloatArray) -> FloatArray:
-        """Return the data."""
+        """Return the candidate points of the mixing distribution, for sorted data: the data."""
         return data
 
     def intervals(self, data: FloatArray) -> FloatArray:
-        """Return three standard deviations to either side of each datum."""
+        """Return the intervals to match, (r, 2): three deviations to either side of each datum."""
         return np.concatenate(
             [np.column_stack([data, data + 3]), np.column_stack([data - 3, data])]
         )
 
     def cdf(self, x: FloatArray, points: FloatArray) -> FloatArray:
-        """Return Phi(x - point)."""
+        """Return P(X <= x | point) = Phi(x - point), x of shape (r, 1), points of shape (m,)."""
         return normal_cdf(x - points)
 
 
 @dataclass(frozen=True)
-class ChiSquareKernel(Kernel):
+class ChiSquareKernel:
     """X ~ noncentral chi-square with one degree of freedom and noncentrality `point`.
 
     `reach` is how far the intervals above the data go, on the scale of roots: as far as those below
@@ -137,6 +116,10 @@ class ChiSquareKernel(Kernel):
         """Return Phi(a - m) - Phi(-a - m), with a and m the roots of x and the point."""
         a, m = np.sqrt(x), np.sqrt(points)
         return normal_cdf(a - m) - normal_cdf(-a - m)
+
+
+Kernel = NormalKernel | ChiSquareKernel
+"""How data scatter around a point of the mixing distribution."""
 
 
 def fit_mixture(data: FloatArray, kernel: Kernel) -> Mixture:
