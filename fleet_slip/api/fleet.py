@@ -192,8 +192,8 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
         waits for the first; `waiting` is called once before.
 
         What goes wrong in a step is in the report, whose `problem` is what a command fails with;
-        later steps go on where they can. Raises `UsageError` for a name that no model may have or an
-        invalid worth, and `StorageError` if the night cannot be recorded.
+        later steps go on where they can. Raises `UsageError` for an invalid name or worth, and
+        `StorageError` if the night cannot be recorded.
         """
         from fleet_slip.api.nightly import Night
         from fleet_slip.api.run_report import Training

@@ -4,7 +4,6 @@ import functools
 import inspect
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import fields
-from datetime import date
 from typing import Annotated, Any, TypeVar
 
 import typer
@@ -185,14 +184,6 @@ FeatureSetOption = Annotated[
         "--features", help="Feature set that --signals are of. Default: the logged signals."
     ),
 ]
-
-
-def date_of(text: str | None, option: str, example: str = "2024-05-01") -> date | None:
-    """Return the day that an option names. Raises `UsageError` for anything but a date."""
-    try:
-        return None if text is None else date.fromisoformat(text)
-    except ValueError:
-        raise UsageError(f"{option} {text}: not a date; write it as {example}.") from None
 
 
 def quantities(values: Sequence[str] | None, option: str) -> dict[str, float]:

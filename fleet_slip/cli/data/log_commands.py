@@ -11,7 +11,7 @@ import typer
 from fleet_slip.api.calls import open_workers
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.cli.completing import complete_config
-from fleet_slip.cli.options import date_of
+from fleet_slip.cli.dates import date_of
 from fleet_slip.cli.output import Json, print_json, say
 from fleet_slip.cli.progress_bar import progress
 from fleet_slip.cli.recorded import record_run

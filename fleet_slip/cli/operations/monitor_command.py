@@ -6,9 +6,9 @@ from typing import Annotated
 import typer
 
 from fleet_slip.cli.begin.run_command import DEFAULT_CAMPAIGN
+from fleet_slip.cli.dates import date_of
 from fleet_slip.cli.left_out import say_revoked, say_untold, say_without_log
 from fleet_slip.cli.models.version_commands import Reference
-from fleet_slip.cli.options import date_of
 from fleet_slip.cli.output import Json, print_json, print_table
 from fleet_slip.errors import AlarmError
 from fleet_slip.extras import needed

@@ -9,8 +9,9 @@ from fleet_slip.api.calls import open_workers
 from fleet_slip.api.fleet import RUN_MODELS, Fleet
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli.completing import complete_config, complete_model
+from fleet_slip.cli.dates import date_of
 from fleet_slip.cli.models.signing_commands import SignKey, signing_key
-from fleet_slip.cli.options import Worth, date_of
+from fleet_slip.cli.options import Worth
 from fleet_slip.cli.output import Json, print_json, print_text, say
 from fleet_slip.cli.progress_bar import progress_of_steps
 from fleet_slip.cli.recorded import record_run

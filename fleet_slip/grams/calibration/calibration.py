@@ -138,7 +138,8 @@ def calibrate(
 ) -> Calibration:
     """Return the numbers of every car that has drives of a cohort, from their Gram rows.
 
-    Drives without a label count as others do. Raises `QuestionError` for an invalid condition, and `DataError` if no drive satisfies it or the Gram rows of `calibration` are missing.
+    Drives without a label count as others do. Raises `QuestionError` for an invalid condition,
+    and `DataError` if no drive satisfies it or the Gram rows of `calibration` are missing.
     """
     condition = parse_condition(condition)
     with open_grams(source, CALIBRATION, condition) as opened:
