@@ -91,11 +91,7 @@ class HealthAndUpkeep(PublishedModels):
         return calibrate(self.warehouse, cohort)
 
     def monitor(
-        self,
-        model: "str | ModelVersion",
-        cohort: str | None = None,
-        *,
-        since: date | None = None,
+        self, model: "str | ModelVersion", cohort: str | None = None, *, since: date | None = None
     ) -> "Chart":
         """Chart a model's error on each day since it was trained, with control limits, in degrees.
 
@@ -109,11 +105,7 @@ class HealthAndUpkeep(PublishedModels):
         return monitor(self.warehouse, self.resolve(model), cohort, since)
 
     def verify(
-        self,
-        *,
-        full: bool = False,
-        workers: Workers = None,
-        progress: ShowProgress | None = None,
+        self, *, full: bool = False, workers: Workers = None, progress: ShowProgress | None = None
     ) -> "Verification":
         """Verify every byte against its checksum, and everything against everything else.
 

@@ -317,12 +317,7 @@ class PublishedModels(Rooted):
         return Estimator(self.resolve(model).manifest, car)
 
     def export(
-        self,
-        model: str | ModelVersion,
-        to: "Target",
-        output: Path,
-        *,
-        with_gram: bool = False,
+        self, model: str | ModelVersion, to: "Target", output: Path, *, with_gram: bool = False
     ) -> list[Path]:
         """Write a version as a program for elsewhere into a folder; return the files.
 

@@ -10,11 +10,7 @@ import pyarrow as pa
 
 from fleet_slip.errors import QueryGoesOnError, QuestionError
 from fleet_slip.views import VIEWS, add_calibration
-from fleet_slip.warehouse.database import (
-    database_errors,
-    interruptible,
-    reading_files,
-)
+from fleet_slip.warehouse.database import database_errors, interruptible, reading_files
 from fleet_slip.warehouse.minimum_cohort import VIEWS_WITHOUT_CARS, require_single_cars
 from fleet_slip.warehouse.read_only_sql import one_query
 from fleet_slip.warehouse.table_views import views_in

@@ -76,11 +76,7 @@ def driven_body(x: State, _u: Controls, force: WheelForces, c: Constants) -> Acc
         + c.half_track_rear * (force.rr.x - force.rl.x)
     )
     return Acceleration(
-        ax,
-        ay,
-        ax + x.yaw_rate * x.vy,
-        ay - x.yaw_rate * x.vx,
-        moment * c.inverse_yaw_inertia,
+        ax, ay, ax + x.yaw_rate * x.vy, ay - x.yaw_rate * x.vx, moment * c.inverse_yaw_inertia
     )
 
 

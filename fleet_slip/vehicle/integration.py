@@ -172,10 +172,7 @@ def pose_slopes(x: State, pose: Pose, path: Path) -> PoseSlopes:
     station = (x.vx * pose.cosine - x.vy * pose.sine) / shrink
     turning = x.yaw_rate - curvature * station
     return PoseSlopes(
-        station,
-        x.vx * pose.sine + x.vy * pose.cosine,
-        -turning * pose.sine,
-        turning * pose.cosine,
+        station, x.vx * pose.sine + x.vy * pose.cosine, -turning * pose.sine, turning * pose.cosine
     )
 
 

@@ -65,13 +65,7 @@ def brush_force(
 
 @equation
 def brush_force_on(
-    along: float,
-    across: float,
-    rolling: float,
-    load: float,
-    peak: float,
-    grip: float,
-    c: Constants,
+    along: float, across: float, rolling: float, load: float, peak: float, grip: float, c: Constants
 ) -> TyreForce:
     """Return the force of a brush tyre where the road has `grip` times the drive's adhesion."""
     slide_x = rolling - along

@@ -163,13 +163,7 @@ def build_wheel_forces(brush: bool, spinning: bool) -> Callable[..., WheelForces
 
     @equation
     def brush_wheel(
-        vx: float,
-        vy: float,
-        to: Direction,
-        spin: float,
-        load: float,
-        peak: float,
-        c: Constants,
+        vx: float, vy: float, to: Direction, spin: float, load: float, peak: float, c: Constants
     ) -> WheelForce:
         cosine, sine = to
         along = cosine * vx + sine * vy
@@ -194,13 +188,7 @@ def build_wheel_forces(brush: bool, spinning: bool) -> Callable[..., WheelForces
 
     @equation
     def linear_wheel(
-        vx: float,
-        vy: float,
-        to: Direction,
-        spin: float,
-        load: float,
-        peak: float,
-        c: Constants,
+        vx: float, vy: float, to: Direction, spin: float, load: float, peak: float, c: Constants
     ) -> WheelForce:
         slip_angle = math.atan2(to.sine, to.cosine) - math.atan2(vy, vx)
         rolling = c.radius * spin if spinning else vx
@@ -228,14 +216,8 @@ def build_wheel_forces(brush: bool, spinning: bool) -> Callable[..., WheelForces
         if abs(x.vx) < HIGHWAY_ENV_SLOW_MPS:
             sliding = -c.mass * x.vy
             turning = c.yaw_inertia / c.front * x.yaw_rate
-            fl, fr = (
-                damped(fl, (sliding - turning) / 2.0),
-                damped(fr, (sliding - turning) / 2.0),
-            )
-            rl, rr = (
-                damped(rl, (sliding + turning) / 2.0),
-                damped(rr, (sliding + turning) / 2.0),
-            )
+            fl, fr = (damped(fl, (sliding - turning) / 2.0), damped(fr, (sliding - turning) / 2.0))
+            rl, rr = (damped(rl, (sliding + turning) / 2.0), damped(rr, (sliding + turning) / 2.0))
         return WheelForces(fl, fr, rl, rr)
 
     return brush_forces if brush else linear_forces
@@ -257,8 +239,7 @@ def spin_rate(
     gain = c.radius * c.inverse_spin_inertia
     held = force.damping + fading * (drive + brake)
     return WheelRate(
-        gain * (left * drive - force.along - friction * spin),
-        gain * (c.radius * held + friction),
+        gain * (left * drive - force.along - friction * spin), gain * (c.radius * held + friction)
     )
 
 

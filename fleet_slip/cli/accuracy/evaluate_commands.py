@@ -105,8 +105,7 @@ def evaluate(
     ] = False,
     threads: Threads = None,
     everything: Annotated[
-        bool,
-        typer.Option("--all", help="Print all estimators, sections and requirements."),
+        bool, typer.Option("--all", help="Print all estimators, sections and requirements.")
     ] = False,
     json: Json = False,
 ) -> None:

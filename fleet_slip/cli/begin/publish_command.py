@@ -39,8 +39,7 @@ def publish(
     ] = False,
     sign_key: SignKey = None,
     mlflow: Annotated[
-        str | None,
-        typer.Option(help="Also register the version in the MLflow server of this URI."),
+        str | None, typer.Option(help="Also register the version in the MLflow server of this URI.")
     ] = None,
     json: Json = False,
 ) -> None:

@@ -7,20 +7,12 @@ import typer
 
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.cli.left_out import (
-    say_outweighing,
-    say_revoked,
-    say_untold,
-    say_without_log,
-)
+from fleet_slip.cli.left_out import say_outweighing, say_revoked, say_untold, say_without_log
 from fleet_slip.cli.options import Cohort, selection_options
 from fleet_slip.cli.output import Json, figures_cells, print_json, print_line, print_table, say
 from fleet_slip.grams.cohorts.folding import BANDS, PARTS, ROW_FOLDS
 from fleet_slip.grams.cohorts.outweighing import drives_by_car
-from fleet_slip.regression.choice.nested_choice import (
-    CROSS_VALIDATION,
-    NestedDistances,
-)
+from fleet_slip.regression.choice.nested_choice import CROSS_VALIDATION, NestedDistances
 from fleet_slip.regression.inference.evidence import Evidence
 from fleet_slip.regression.validation.crossval import CrossValidation
 from fleet_slip.selection.answer_request import answer_request

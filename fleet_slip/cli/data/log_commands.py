@@ -32,8 +32,7 @@ CampaignName = Annotated[
     ),
 ]
 Through = Annotated[
-    str | None,
-    typer.Option(help="Last day to simulate, YYYY-MM-DD or today. Default: all days."),
+    str | None, typer.Option(help="Last day to simulate, YYYY-MM-DD or today. Default: all days.")
 ]
 Days = Annotated[
     int | None, typer.Option(min=1, help="Simulate the first N days only. Default: all.")
@@ -135,8 +134,7 @@ def ingest(
         typer.Option(help="With --dry-run and one file, draw its longest drive: .png, .svg, .pdf."),
     ] = None,
     as_one: Annotated[
-        bool,
-        typer.Option("--as-one", help="The files of each folder are parts of one log."),
+        bool, typer.Option("--as-one", help="The files of each folder are parts of one log.")
     ] = False,
     cluster: Cluster = None,
     json: Json = False,

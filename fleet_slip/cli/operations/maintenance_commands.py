@@ -184,12 +184,10 @@ def forget(
         str | None, typer.Option(help="The source_file whose drives are to be forgotten.")
     ] = None,
     now: Annotated[
-        bool,
-        typer.Option("--now", help="Delete the old files at once, not when vacuum is due."),
+        bool, typer.Option("--now", help="Delete the old files at once, not when vacuum is due.")
     ] = False,
     allow: Annotated[
-        bool,
-        typer.Option("--allow", help="Let it come back: land its new rows again from now on."),
+        bool, typer.Option("--allow", help="Let it come back: land its new rows again from now on.")
     ] = False,
     json: Json = False,
 ) -> None:

@@ -24,8 +24,7 @@ from fleet_slip.selection.request import WORTH
 def nightly(
     context: typer.Context,
     landing: Annotated[
-        str,
-        typer.Option(help="The folder where logs land, or s3://…; what is new in it is taken."),
+        str, typer.Option(help="The folder where logs land, or s3://…; what is new in it is taken.")
     ],
     mapping: Annotated[
         str,

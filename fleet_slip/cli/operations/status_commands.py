@@ -17,8 +17,7 @@ from fleet_slip.words import number_of
 def status(
     context: typer.Context,
     max_age_hours: Annotated[
-        float | None,
-        typer.Option(min=0, help="Data, or a backlog, older than this is a problem."),
+        float | None, typer.Option(min=0, help="Data, or a backlog, older than this is a problem.")
     ] = None,
     prometheus: Annotated[
         bool,

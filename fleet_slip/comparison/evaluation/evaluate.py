@@ -17,11 +17,7 @@ from fleet_slip.comparison.evaluation.evaluated_drives import (
 from fleet_slip.comparison.evaluation.filters import Bank, FilterEstimate, filter_bank
 from fleet_slip.comparison.evaluation.gps_noise import GpsSweep, sweep_gps_noise
 from fleet_slip.comparison.evaluation.ranking import FleetComparison, Ranking, compare_fleets, rank
-from fleet_slip.comparison.evaluation.scenario_runs import (
-    ErrorFigures,
-    EvaluatedScenario,
-    run_all,
-)
+from fleet_slip.comparison.evaluation.scenario_runs import ErrorFigures, EvaluatedScenario, run_all
 from fleet_slip.comparison.evaluation.targets import (
     TargetCheck,
     check_filter_targets,

@@ -64,10 +64,7 @@ class EvaluatedDrive:
     def facts(self) -> dict[str, Any]:
         """What the car knows of itself: its model and its stated mass, by drive column."""
         scenario = self.scenario
-        return {
-            "vehicle_model": scenario.vehicle.name,
-            "mass_kg": scenario.car.body.sprung_mass_kg,
-        }
+        return {"vehicle_model": scenario.vehicle.name, "mass_kg": scenario.car.body.sprung_mass_kg}
 
     @cached_property
     def sideslip_rad(self) -> FloatArray:

@@ -84,10 +84,7 @@ def looks_back(manifest: Manifest) -> bool:
 
 
 def weigh_memory(
-    cohort: Cohort,
-    manifest: Manifest,
-    folding: Folding,
-    runs: Mapping[str, EvaluatedScenario],
+    cohort: Cohort, manifest: Manifest, folding: Folding, runs: Mapping[str, EvaluatedScenario]
 ) -> Memory:
     """Weigh the columns of a published model, given the cohort with the Gram rows of its set."""
     search = Search(method="exchange", most=len(manifest.terms))  # as configs/models/estimator.toml
@@ -135,12 +132,7 @@ def _without(
 
 def _refit(folds: CohortFolds, manifest: Manifest, signals: Sequence[str]) -> CrossValidation:
     return cross_validate_inputs(
-        "",
-        folds,
-        signals,
-        catalogue().label,
-        input_scales(),
-        intercept=not manifest.through_origin,
+        "", folds, signals, catalogue().label, input_scales(), intercept=not manifest.through_origin
     )
 
 

@@ -164,11 +164,7 @@ class Histogram:
         half = round(reach_deg / ANGLE_DEG)
         shown = (np.abs(self.truth + 0.5) < half) & (np.abs(self.estimate + 0.5) < half)
         cells = np.zeros((2 * half, 2 * half))
-        np.add.at(
-            cells,
-            (self.estimate[shown] + half, self.truth[shown] + half),
-            self.rows[shown],
-        )
+        np.add.at(cells, (self.estimate[shown] + half, self.truth[shown] + half), self.rows[shown])
         return cells
 
 
@@ -191,10 +187,7 @@ def held_out_histogram(
         complete=" AND ".join(f"{signals[name].column} IS NOT NULL" for name in (*names, "ay")),
     )
     widths = {"angle_deg": ANGLE_DEG, "acceleration_mps2": ACCELERATION_MPS2}
-    with (
-        connect(warehouse.root) as database,
-        reading_files(database, "estimating held-out drives"),
-    ):
+    with connect(warehouse.root) as database, reading_files(database, "estimating held-out drives"):
         database.register("held_out", held_out_coefficients(selection, model))
         found = database.sql(statement, params=widths).to_arrow_table()
     return Histogram(**{name: found[name].to_numpy() for name in found.column_names})

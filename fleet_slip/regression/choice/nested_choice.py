@@ -116,11 +116,7 @@ class NestedDistances:
 
     def as_dict(self) -> dict[str, Any]:
         """Return what a JSON document needs."""
-        return {
-            "order": list(self.order),
-            **self.evidence.as_dict(),
-            "null": self.null.as_dict(),
-        }
+        return {"order": list(self.order), **self.evidence.as_dict(), "null": self.null.as_dict()}
 
 
 @dataclass(frozen=True)

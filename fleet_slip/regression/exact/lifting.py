@@ -50,11 +50,7 @@ class _Lifting:
     """The digits of one solution, lowest first."""
 
     def __init__(
-        self,
-        matrix: Sequence[Sequence[int]],
-        right: Sequence[int],
-        prime: int,
-        inverse: Integers,
+        self, matrix: Sequence[Sequence[int]], right: Sequence[int], prime: int, inverse: Integers
     ) -> None:
         self.matrix, self.right = matrix, right
         self.prime, self.inverse = prime, inverse

@@ -152,10 +152,7 @@ class CohortFolds:
 
     @classmethod
     def of(
-        cls,
-        tables: Sequence[GramTable],
-        assignment: FoldAssignment,
-        drives: IntArray | None = None,
+        cls, tables: Sequence[GramTable], assignment: FoldAssignment, drives: IntArray | None = None
     ) -> "CohortFolds":
         """Add up the Gram rows of each fold. The assignment lists the rows table after table.
 

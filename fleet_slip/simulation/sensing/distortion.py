@@ -27,10 +27,7 @@ class Distortion:
     """The sensors of one car in one drive."""
 
     def __init__(
-        self,
-        flaws: Imperfections,
-        of_car: np.random.Generator,
-        of_drive: np.random.Generator,
+        self, flaws: Imperfections, of_car: np.random.Generator, of_drive: np.random.Generator
     ) -> None:
         """Begin a drive. The pulses' places come from the car's generator, all else from the
         drive's.
@@ -154,10 +151,7 @@ def _feel(
 
 @kernel
 def _turned_velocity(
-    vx: FloatArray,
-    vy: FloatArray,
-    errors: FloatArray,
-    std: tuple[float, float],
+    vx: FloatArray, vy: FloatArray, errors: FloatArray, std: tuple[float, float]
 ) -> tuple[FloatArray, FloatArray]:
     """Return velocity with errors of heading and of both components, given their deviations."""
     heading, error_x, error_y = errors

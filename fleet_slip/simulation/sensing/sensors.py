@@ -99,10 +99,7 @@ class Recorder:
     """
 
     def __init__(
-        self,
-        sensors: Sensors,
-        generator: np.random.Generator,
-        distortion: Distortion | None = None,
+        self, sensors: Sensors, generator: np.random.Generator, distortion: Distortion | None = None
     ) -> None:
         """Begin a drive. Without a distortion the sensors see the truth."""
         self._distortion = distortion

@@ -37,11 +37,7 @@ class Wander:
 
 @kernel
 def _wander(
-    drawn: FloatArray,
-    ends: FloatArray,
-    phase: int,
-    step: tuple[float, float],
-    values: FloatArray,
+    drawn: FloatArray, ends: FloatArray, phase: int, step: tuple[float, float], values: FloatArray
 ) -> int:
     """Fill in values, and return the samples since the last knot.
 

@@ -144,12 +144,7 @@ def empty_lanes() -> tuple[FloatArray, IntArray]:
 
 
 def begin(
-    memory: FloatArray,
-    book: IntArray,
-    lane: int,
-    drive: int,
-    car: FloatArray,
-    speed_mps: float,
+    memory: FloatArray, book: IntArray, lane: int, drive: int, car: FloatArray, speed_mps: float
 ) -> None:
     """Put a drive on a lane: rolling straight along the line at a speed, on cold tyres."""
     book[:, lane] = drive, 0, 0, 0
