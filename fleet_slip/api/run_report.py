@@ -56,15 +56,7 @@ class RunReport:
 
 @dataclass(frozen=True)
 class Training:
-    """What a model is trained on, and how it is chosen: the same from night to night.
-
-    Attributes:
-        name: of the model.
-        cohort: an SQL condition on the view `drives`.
-        models: the model list that is compared.
-        worth: the smallest gain in RMSE that is worth a signal.
-        sign_key: the private key that signs versions.
-    """
+    """What trains a model every night: cohort, model list, `worth` of a signal, key that signs."""
 
     name: str
     cohort: str

@@ -36,11 +36,7 @@ FORMAT = 1
 def document(
     runs: Sequence[EvaluatedScenario], estimators: Mapping[str, Mapping[str, Any]], **further: Any
 ) -> dict[str, Any]:
-    """Return the document of an evaluation.
-
-    `estimators` describes each estimator by its name. It is a function of the logs, the models and
-    the program: no time, no machine; `further` keys stand beside.
-    """
+    """Return an evaluation's document: of logs, models and program alone, `further` keys beside."""
     return {
         "format": FORMAT,
         "package_version": package_version("fleet-slip"),

@@ -39,14 +39,7 @@ class GpsLevel:
 
 @dataclass(frozen=True)
 class GpsSweep:
-    """Filters with GPS against regressions without.
-
-    Attributes:
-        scenario: name of the test drive.
-        rate_hz: fixes a second.
-        levels: by rising noise.
-        regressions: RMSE in degrees of each regression on the drive.
-    """
+    """Filters by rising GPS noise on a test drive, and RMSE in deg of regressions without GPS."""
 
     scenario: str
     rate_hz: int

@@ -46,10 +46,7 @@ INITIAL_STD = (1.0, 1.0, 0.1)
 
 
 class EkfNoise(Config):
-    """Standard deviations of the filter.
-
-    Those of the sensors are the paper's initial noise; how far the model errs is judgement.
-    """
+    """Standard deviations: the paper's initial noise; how far the model errs is judgement."""
 
     ax_std_mps2: FiniteFloat = Field(default=0.1, ge=0)
     lateral_model_std_mps2: FiniteFloat = Field(default=0.3, ge=0)
@@ -190,11 +187,7 @@ def estimate(
     noise: EkfNoise,
     model_noise: FloatArray | None = None,
 ) -> FloatArray:
-    """Estimate side-slip in rad at every row. Gaps of a sensor are bridged by the value before.
-
-    `model_noise`, shape (rows,), multiplies the variances of the model's errors in each row.
-    Raises `DataError` if a sensor is absent.
-    """
+    """Estimate side-slip in rad by row; `model_noise`, (rows,), scales the model's variances."""
     turning = yaw_rate.estimate(drive, car, noise.yaw_rate).yaw_rate_rad_s
     vx_mps = measured_speed_mps(drive, car)
     ax_mps2, ay_mps2 = hold_last(drive.ax_mps2, "ax"), hold_last(drive.ay_mps2, "ay")

@@ -40,13 +40,7 @@ SINCE_START = "since the start"
 
 @dataclass(frozen=True)
 class Without:
-    """The cross-validated RMSE of a model refitted without some of its columns.
-
-    Attributes:
-        name: what is left out.
-        columns: how many columns that is.
-        rmse_deg: without them.
-    """
+    """The cross-validated RMSE of a model refitted without some columns, and how many they are."""
 
     name: str
     columns: int
@@ -192,11 +186,7 @@ class Cars:
 
 
 def weigh_cars(warehouse: Warehouse) -> Cars | None:
-    """Weigh the numbers of the campaign with most cars; None without a fleet and its Gram rows.
-
-    Before: signals and windows with running means of the offsets, which a new car has, too. What
-    a car knows of its model and load is left out.
-    """
+    """Weigh the numbers of the campaign with most cars; None without a fleet's Gram rows."""
     campaign = largest_fleet(warehouse)
     if campaign is None:
         return None

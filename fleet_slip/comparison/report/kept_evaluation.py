@@ -23,12 +23,7 @@ Side = Literal["inside", "outside"]
 
 @dataclass(frozen=True)
 class Evaluated:
-    """One evaluation of a model version.
-
-    Attributes:
-        document: the evaluation as it was kept.
-        group: the model version that it is about, `NAME@VERSION`.
-    """
+    """An evaluation as it was kept, and the model version `NAME@VERSION` that it is about."""
 
     document: Document
     group: str
@@ -121,13 +116,7 @@ BLOCK_S = 5.0
 
 @dataclass(frozen=True)
 class ErrorDifference:
-    """Whether one estimator's squared error is smaller than another's.
-
-    Attributes:
-        t: mean difference over its standard error; positive where the first is better.
-        blocks: number of blocks.
-        p: two-sided probability of a larger |t| if both were as good.
-    """
+    """A paired t test of squared errors over blocks; t > 0 where the first is better."""
 
     t: float
     blocks: int

@@ -158,11 +158,7 @@ class Written:
 
 
 def write_report(warehouse: Warehouse, version: ModelVersion, output: Folder) -> Written:
-    """Write the report about a model version into a folder.
-
-    A file is replaced as a whole or not at all; the page comes last. Raises `DataError` if the
-    version has not been evaluated, or not on today's data.
-    """
+    """Write the report into a folder, the page last. Raises `DataError` if not evaluated."""
     data = gather(warehouse, version)
     shown = draw_pictures(data)
     page = render(data, shown).encode("utf-8")

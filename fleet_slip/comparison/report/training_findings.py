@@ -95,14 +95,7 @@ CLOSE = 0.001
 
 @dataclass(frozen=True)
 class Ordering:
-    """How many signals each order needs to explain nearly as much as all of them.
-
-    Attributes:
-        signals: all of them.
-        needed: by ranking algorithm.
-        best: by the best subset.
-        subsets: number of subsets that were compared.
-    """
+    """How many signals each ranking, and the best of all subsets, needs to explain nearly all."""
 
     signals: tuple[str, ...]
     needed: dict[str, int]

@@ -95,13 +95,7 @@ def _name(column: Definition, taken: Mapping[str, float]) -> str:
 
 @dataclass(frozen=True)
 class LearnedEstimate:
-    """A fitted learner as an estimator of a drive's signals.
-
-    Attributes:
-        inputs: what it sees.
-        fitted: what computes side-slip from them.
-        facts: what the car knows of itself.
-    """
+    """A fitted learner with its inputs, in a car that knows its `facts`."""
 
     inputs: Inputs
     fitted: Fitted
@@ -129,14 +123,7 @@ SAMPLE_ROWS = 60_000
 
 @dataclass(frozen=True)
 class RowSample:
-    """Rows evenly spaced in time over all drives.
-
-    Attributes:
-        names: of the inputs.
-        inputs: physical values, shape (rows, inputs).
-        sideslip_rad: shape (rows,).
-        trip: the trip of each row, called by its first drive.
-    """
+    """Rows evenly spaced over all drives: inputs in SI units, label, and the trip of each row."""
 
     names: tuple[str, ...]
     inputs: FloatArray
@@ -159,11 +146,7 @@ def draw_sample(
     rows: int = SAMPLE_ROWS,
     numbers: CarCounts | None = None,
 ) -> RowSample:
-    """Draw about so many rows of a cohort that have all inputs and the label.
-
-    The columns are those of the cohort's Gram rows, computed over whole drives by the same code;
-    `numbers` are what the cars' drives told of them. Raises `DataError` if there is no such row.
-    """
+    """Draw about so many rows with all inputs and the label, or raise `DataError`."""
     with_label = inputs.beside(catalogue().label)
     plan = with_label.plan
     trips = dict(zip(*(cohort.drives[n].to_pylist() for n in ("drive_id", "trip")), strict=True))

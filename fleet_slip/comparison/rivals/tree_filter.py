@@ -75,14 +75,7 @@ def kinds(drive: DriveSignals, car: VehicleParameters) -> FloatArray:
 
 @dataclass(frozen=True)
 class TreeFilter:
-    """The filter with its tree, in a car.
-
-    Attributes:
-        base: the filter whose noise the tree changes.
-        tree: scikit-learn's regression tree on `kinds`.
-        leaves: number of the node of each leaf, in order.
-        noise: factor of each leaf.
-    """
+    """The filter `base` with scikit-learn's tree on `kinds`: nodes of its leaves, noise of each."""
 
     base: FilterEstimate
     tree: Any

@@ -91,10 +91,7 @@ TABLE = pa.schema(
 
 
 def calibration_of(opened: OpenedGrams, condition: Condition) -> Calibration:
-    """Return the numbers of every car that the Gram rows of a cohort tell; none, if there are none.
-
-    `opened` are the Gram rows of the feature set `calibration`.
-    """
+    """Return the numbers that Gram rows of `calibration` tell of every car of a cohort."""
     evidence = CarEvidence(collect_sums(opened.batches(condition), KINDS))
     cars = {car: evidence.calibrated(car) for car in evidence.cars}
     return Calibration(cars, opened.logs_version, opened.grams_version, evidence)

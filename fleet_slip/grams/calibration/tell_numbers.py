@@ -146,10 +146,7 @@ def _tell_steering(found: dict[NumberName, Telling], gram: Gram | None) -> None:
 
 
 def gradient_about(telling: Telling, signals: tuple[str, ...], origin: FloatArray) -> FloatArray:
-    """Return the gradient by the coefficients of the plane in columns less an origin, in counts.
-
-    The intercept there is larger by what the slopes make of the origin, less that of y.
-    """
+    """Return the gradient by the coefficients of a plane in counts less an origin."""
     intercept, first, second = telling.gradient
     at = dict(zip(signals, origin.tolist(), strict=True))
     x1 = sum(float(w) * at[name] for name, w in telling.shape.x1.items())

@@ -20,14 +20,7 @@ from fleet_slip.regression.inference.evidence import Evidence
 
 @dataclass(frozen=True)
 class Problem:
-    """What a criterion may look at.
-
-    Attributes:
-        excess: x of each model.
-        size: j of each model.
-        rows: n, the number of (effective) rows.
-        inputs: k.
-    """
+    """What a criterion looks at: x and j of each model, n (effective) rows, k inputs."""
 
     excess: FloatArray
     size: FloatArray

@@ -102,13 +102,7 @@ class NestedChoice:
 
 @dataclass(frozen=True)
 class NestedDistances:
-    """How far the k+1 nested models of a given order are from the full and from the true one.
-
-    Attributes:
-        order: the signals.
-        evidence: their contributions, and with these the distance D of equation (2).
-        null: the model without any signal, cross-validated.
-    """
+    """Distances D of the nested models of an order; `null` is the model without any signal."""
 
     order: tuple[str, ...]
     evidence: Evidence

@@ -34,12 +34,7 @@ _SPARE = 3
 
 @dataclass(frozen=True)
 class SizeResult:
-    """The best models of one size.
-
-    Attributes:
-        fits: exact fits, best first; signals in declared order.
-        gap: (RSS of the second best - RSS of the best) / RSS of the best; None without a second.
-    """
+    """Exact fits of the best models of one size, best first; signals in declared order."""
 
     fits: tuple[Fit, ...]
 
@@ -120,10 +115,7 @@ def subset_sizes(k: int) -> NDArray[np.uint8]:
 
 
 def all_rss(matrix: FloatArray) -> FloatArray:
-    """Return the RSS of all 2^k subsets of a (k+1) x (k+1) moment matrix, the label last.
-
-    Element m is the RSS of the signals whose bit is set in m, in units of the matrix.
-    """
+    """Return the RSS of all 2^k subsets of moments, label last; element m has the bits of m."""
     work: FloatArray = np.asarray(matrix, dtype=np.float64)[:, :, None]
     # Signals are taken from the last to the first, so that the first ends in the lowest bit.
     # The label moves to the front, out of the way.

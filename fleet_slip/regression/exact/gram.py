@@ -97,11 +97,7 @@ class Gram:
         )
 
     def __sub__(self, other: "Gram") -> "Gram":
-        """Return the Gram of the rows that are not in `other`.
-
-        Raises `DataError` if the signals differ, or if a row count or a sum of squares would
-        go negative: then `other` was not a part of this Gram.
-        """
+        """Return the Gram of the other rows. Raises `DataError` if `other` was no part of it."""
         self._require_same_signals(other)
         rest = Gram(
             self.signals,

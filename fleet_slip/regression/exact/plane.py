@@ -30,13 +30,7 @@ class PlaneShape:
 
 @dataclass(frozen=True)
 class Plane:
-    """A fit, exactly.
-
-    Attributes:
-        intercept, first, second: the coefficients.
-        means: of y, x1 and x2.
-        variances: of y, x1 and x2.
-    """
+    """An exact fit: its coefficients, and means and variances of y, x1 and x2."""
 
     intercept: Fraction
     first: Fraction
@@ -77,12 +71,7 @@ def fit_plane(gram: Gram, shape: PlaneShape) -> Plane | None:
 
 @dataclass(frozen=True)
 class Influence:
-    """How a combination of a plane's coefficients depends on the drives that made it.
-
-    Attributes:
-        shifts: by how much each drive moves it, in its unit, shape (drives,).
-        shares: variance that each drive adds to it, if a row's residual has variance 1.
-    """
+    """By drive, how far it moves a combination of coefficients, and its share of the variance."""
 
     shifts: FloatArray
     shares: FloatArray

@@ -22,13 +22,7 @@ _BATCH_BYTES = 2**26
 
 @dataclass(frozen=True)
 class Interval:
-    """A percentile interval of resampled figures.
-
-    Attributes:
-        low, high: its ends.
-        level: share of the resampled figures inside, such as 0.95.
-        replicates: how many there were.
-    """
+    """A percentile interval of so many resampled figures, of which the share `level` is inside."""
 
     low: float
     high: float
@@ -66,11 +60,7 @@ def held_out_products(
 
 
 def bootstrap_correlations(products: FloatArray, replicates: int, seed: int) -> FloatArray:
-    """Return pooled correlations of cohorts drawn from the drives with replacement.
-
-    `products` is from `held_out_products`; the models stay as they were cross-validated. Raises
-    `DataError` for fewer than two drives.
-    """
+    """Return pooled correlations of resampled `held_out_products`. Raises `DataError`."""
     totals = _resampled_totals(products, replicates, seed)
     n, e, ee, y, ye, yy = totals.T
     # The prediction is the label plus the error.
@@ -99,12 +89,7 @@ def solve(totals: FloatArray, *, intercept: bool = True) -> FloatArray:
 
 @dataclass(frozen=True)
 class RepeatedCrossValidation:
-    """Pooled figures of k-fold cross-validation, repeated with different folds.
-
-    Attributes:
-        correlations: one a repeat.
-        rmse: one a repeat, in counts of the label.
-    """
+    """Pooled figures of k-fold cross-validation, one a repeat; the RMSE in counts of the label."""
 
     correlations: FloatArray
     rmse: FloatArray
@@ -123,11 +108,7 @@ class RepeatedCrossValidation:
 def repeated_cross_validation(
     drives: DriveMoments, folds: int, repeats: int, seed: int, *, intercept: bool = True
 ) -> RepeatedCrossValidation:
-    """Cross-validate least squares on all inputs with `repeats` random deals into folds.
-
-    Without an intercept the moments must be about zero, as `DriveMoments.of` makes them if it is
-    not to centre. Raises `DataError` if there are fewer drives than folds.
-    """
+    """Cross-validate least squares with `repeats` random deals into folds. Raises `DataError`."""
     if len(drives) < folds:
         raise DataError(
             f"{number_of(len(drives), 'drive')} cannot fill {number_of(folds, 'fold')}."

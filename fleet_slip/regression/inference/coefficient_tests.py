@@ -17,13 +17,7 @@ from fleet_slip.regression.inference.standard_errors import cluster_influences
 
 @dataclass(frozen=True)
 class FTest:
-    """Test that sets of drives have the same coefficients.
-
-    Attributes:
-        f: the statistic.
-        numerator, denominator: its degrees of freedom.
-        p: probability of a larger f if the coefficients are the same.
-    """
+    """An F test that sets of drives share coefficients; p is of a larger f if they do."""
 
     f: float
     numerator: int

@@ -38,11 +38,7 @@ def require_serving_drives(tables: Sequence[GramTable], signals: Sequence[str]) 
 def serving_drives(
     tables: Sequence[GramTable], signals: Sequence[str]
 ) -> tuple[GramTable, BoolArray]:
-    """Return one table of the drives that have all the signals, and which drives those are.
-
-    The mask lists the drives of all tables one after another. Raises `DataError` if no
-    drive has all the signals.
-    """
+    """Return one table of drives with all signals, and their mask. Raises `DataError` for none."""
     require_serving_drives(tables, signals)
     served = [set(signals) <= set(table.signals) for table in tables]
     parts = [table.restrict(signals) for table, yes in zip(tables, served, strict=True) if yes]

@@ -25,12 +25,7 @@ LEAST_CARS = 20
 
 @dataclass(frozen=True)
 class Influential:
-    """A car of unusual influence.
-
-    Attributes:
-        car: its number.
-        times: its influence as a multiple of the median one.
-    """
+    """The number of a car of unusual influence, which is so many `times` the median one."""
 
     car: int
     times: float

@@ -20,12 +20,7 @@ _ROUNDS = 50
 
 @dataclass(frozen=True)
 class LagGram:
-    """A Gram of signals and their previous values.
-
-    Attributes:
-        gram: its signals are `x` and `x + suffix` for each signal `x`.
-        suffix: what the name of a previous value ends in.
-    """
+    """A Gram of signals `x` and of their previous values, `x` with the suffix."""
 
     gram: Gram
     suffix: str
@@ -37,23 +32,14 @@ class LagGram:
 
 @dataclass(frozen=True)
 class SerialCorrelation:
-    """First-order correlation of a model's residuals.
-
-    Attributes:
-        rho: correlation of a residual with the one before.
-        durbin_watson: sum (e_t - e_{t-1})^2 / sum e_t^2; 2 if there is none, 0 if complete.
-    """
+    """Correlation rho of a residual with the one before, and sum (e_t - e_{t-1})^2 / sum e_t^2."""
 
     rho: float
     durbin_watson: float
 
 
 def serial_correlation(model: LinearModel, gram: Gram, lagged: LagGram) -> SerialCorrelation:
-    """Return the serial correlation of a model of counts.
-
-    `gram` has all rows; `lagged` those with a predecessor. The residual is that of the model, its
-    intercept included. Raises `DataError` if there is no residual, or a lag is missing.
-    """
+    """Return the serial correlation of a model of counts. Raises `DataError` without residuals."""
     now_before, before = _residual_products(model, lagged)
     steps = error_sums(_difference(model), _with_differences(model, lagged)).squared_error
     total = error_sums(model, gram).squared_error
@@ -74,13 +60,7 @@ def quasi_difference(lagged: LagGram, signals: Sequence[str], rho: Fraction) -> 
 
 @dataclass(frozen=True)
 class AutoregressiveFit:
-    """Feasible generalised least squares with AR(1) residuals.
-
-    Attributes:
-        model: of counts, for the levels of the signals.
-        rho: the estimated autocorrelation.
-        differenced: the fit of the quasi-differenced signals; its errors are independent.
-    """
+    """The AR(1) model of counts for levels, its rho, and the fit of the differenced signals."""
 
     model: LinearModel
     rho: float
@@ -88,11 +68,7 @@ class AutoregressiveFit:
 
 
 def fit_autoregressive(lagged: LagGram, inputs: Sequence[str], label: str) -> AutoregressiveFit:
-    """Return the AR(1) fit by iterated Cochrane-Orcutt (1949) from a lag Gram.
-
-    rho is kept on a grid of 2^-20, so that each step is exact; it stops when rho does not change.
-    Raises `DataError` for dependent signals, or residuals that a random walk explains.
-    """
+    """Fit AR(1) by Cochrane-Orcutt (1949), rho on a grid of 2^-20, exactly. Raises `DataError`."""
     signals = [*inputs, label]
     rho = Fraction(0)
     for _ in range(_ROUNDS):

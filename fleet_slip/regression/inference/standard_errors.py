@@ -25,15 +25,7 @@ INTERCEPT = "intercept"
 
 @dataclass(frozen=True)
 class Estimate:
-    """One coefficient in physical units.
-
-    Attributes:
-        name: signal, or "intercept".
-        value: coefficient.
-        standard_error: of the value.
-        t: value / standard_error.
-        p: two-sided probability of a larger |t| if the true coefficient were zero.
-    """
+    """A coefficient or the "intercept" in physical units; p is two-sided, by t = value / error."""
 
     name: str
     value: float

@@ -36,14 +36,7 @@ from fleet_slip.regression.shrinkage.mixture import (
 
 @dataclass(frozen=True)
 class OrthogonalResponses:
-    """Signed lengths of the label along the orthogonal directions, in units of the noise.
-
-    Attributes:
-        order: the k signals.
-        responses: a_0 of the constant, then a_1..a_k; A_j = a_j^2. Shape (k+1,).
-        gram: of the order and the label.
-        triangle: its elimination.
-    """
+    """Signed lengths a_0 of the constant, a_1..a_k along an order, in noise; A_j = a_j^2."""
 
     order: tuple[str, ...]
     responses: FloatArray
@@ -105,11 +98,7 @@ _CERTAIN = 10.0
 
 
 def shrink(gram: Gram, inputs: Sequence[str], label: str, estimator: Estimator) -> LinearModel:
-    """Return the model of counts whose orthogonal responses an estimator has changed.
-
-    The order is that of backward elimination. The constant is estimated as it is. Raises
-    `DataError` for dependent signals or a label without noise.
-    """
+    """Return the model whose responses, in backward order, are shrunk. Raises `DataError`."""
     basis = OrthogonalResponses.of(gram, backward(gram, inputs, label), label)
     a = basis.responses
     return basis.model(np.concatenate([a[:1], estimator(a[1:])]))

@@ -69,11 +69,7 @@ def fit_errors_in_variables(
 
 
 def fit_ridge(gram: Gram, inputs: Sequence[str], label: str, penalty: float) -> LinearModel:
-    """Return the ridge model of counts at one penalty, added to the correlation matrix.
-
-    From the eigendecomposition of that matrix, C = Q diag(l) Q'. `cross_validate` with this for a
-    procedure gives the figures at a penalty.
-    """
+    """Return the ridge model of counts, the penalty added to the correlations C = Q diag(l) Q'."""
     k = len(inputs)
     matrix = correlation_matrix(gram.restrict([*inputs, label]))
     eigenvalues, vectors = np.linalg.eigh(matrix[:k, :k])

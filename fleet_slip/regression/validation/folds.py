@@ -34,12 +34,7 @@ def hash_fold(key: str, count: int) -> int:
 
 @dataclass(frozen=True)
 class FoldAssignment:
-    """The fold of each drive of a cohort.
-
-    Attributes:
-        fold: fold 0..len(names)-1 of each drive, shape (drives,).
-        names: what each fold is called.
-    """
+    """The fold 0..len(names)-1 of each drive, shape (drives,), and what each fold is called."""
 
     fold: IntArray
     names: tuple[str, ...]
@@ -105,13 +100,7 @@ def by_band(values: Sequence[Any], count: int) -> FoldAssignment:
 
 @dataclass(frozen=True)
 class Folds:
-    """One Gram a fold, all of the same signals: what cross-validation needs.
-
-    Attributes:
-        grams: the rows of each fold.
-        names: what the folds are called.
-        drives: number of drives in all folds together.
-    """
+    """One Gram a fold, all of the same signals, their names, and how many drives they are of."""
 
     grams: tuple[Gram, ...]
     names: tuple[str, ...]
