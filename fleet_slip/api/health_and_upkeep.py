@@ -43,8 +43,7 @@ class HealthAndUpkeep(PublishedModels):
     def status(self, max_age_hours: float | None = None) -> "WarehouseStatus":
         """Return the warehouse's health: freshness, backlog, last runs, disk, champions.
 
-        Data, or a backlog, older than `max_age_hours` is among its `problems`. Raises
-        `StorageError` without a data root.
+        Data, or a backlog, older than `max_age_hours` is among its `problems`.
         """
         from fleet_slip.monitoring.status import status_of
 

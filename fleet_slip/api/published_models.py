@@ -33,11 +33,10 @@ class PublishedModels(Rooted):
     """Published models. A reference is `NAME@VERSION`, `NAME@ALIAS`, or `NAME` for its champion."""
 
     def models(self, name: str | None = None) -> "pa.Table":
-        """Return all published versions, or those of one model, one row each.
+        """Return all published versions, or those of one model, as the view `models` has them.
 
-        The columns are those of the view `models`, and `trained_on_forgotten`: whether the version
-        was trained on drives that were forgotten since. Raises `QuestionError` for an unknown model
-        and `StorageError` without a data root.
+        `trained_on_forgotten` tells whether drives were forgotten since. Raises `QuestionError` for
+        an unknown model and `StorageError` without a data root.
         """
         from fleet_slip.maintenance.marked_models import marked_models
 
@@ -97,10 +96,7 @@ class PublishedModels(Rooted):
 
     @record_call
     def promote(self, reference: str, alias: str = CHAMPION) -> ModelVersion:
-        """Point an alias, the champion unless told otherwise, at a version; return the version.
-
-        Raises `UsageError` for a name that no alias may have, and what `model` raises.
-        """
+        """Point an alias at a version; return the version. Raises `UsageError`, and as `model`."""
         require_model_name(alias)
         version = self.model(reference)
         self.registry().promote(version.manifest.name, version.version, alias)
@@ -119,27 +115,18 @@ class PublishedModels(Rooted):
 
     @record_call
     def pin(self, name: str, alias: str = CHAMPION) -> ModelVersion:
-        """Keep an alias where it is; return its version.
-
-        Publications become candidates, until `promote` or `unpin`. Raises what `model` raises.
-        """
+        """Keep an alias where it is until `promote` or `unpin`; return its version, as `model`."""
         registry = self.registry()
         return registry.load(name, registry.hold(name, alias, "pin"))
 
     @record_call
     def unpin(self, name: str, alias: str = CHAMPION) -> ModelVersion:
-        """Let publications move an alias again, after `pin` or `rollback`; return its version.
-
-        Raises what `model` raises.
-        """
+        """Let publications move an alias again; return its version. Raises as `model`."""
         registry = self.registry()
         return registry.load(name, registry.hold(name, alias, "unpin"))
 
     def diff(self, one: str | ModelVersion, other: str | ModelVersion) -> "Difference":
-        """Tell two model versions apart: their data, signals, coefficients and figures.
-
-        Raises what `model` raises.
-        """
+        """Tell two versions apart: data, signals, coefficients, figures. Raises as `model`."""
         from fleet_slip.models.diff import compare_versions
 
         return compare_versions(self.registry(), self.resolve(one), self.resolve(other))

@@ -7,7 +7,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.comparison.evaluation.ranking import LEAST_COVERAGE
 from fleet_slip.comparison.evaluation.scenario_runs import ErrorFigures
 from fleet_slip.comparison.report.report_data import ReportData
-from fleet_slip.comparison.report.training_findings import Coefficient, Coefficients
+from fleet_slip.comparison.report.training_findings import Coefficient
 from fleet_slip.pages.page_parts import (
     Cell,
     ReportTable,
@@ -44,7 +44,13 @@ def coefficient_tables(data: ReportData) -> Iterator[ReportTable]:
             ],
             [_coefficient(row) for row in found.rows],
             left=2,
-            note=_evidence(found),
+            note=(
+                f"{count(found.log_rows)} rows of {number_of(found.drives, 'drive')}. Rows at "
+                "100 Hz are not independent: the cluster-robust standard errors take each "
+                f"{found.cluster} as one piece of evidence; those by rows, which are far too "
+                "small, stand beside. Effect of one std: degrees of estimate for one standard "
+                "deviation of the signal."
+            ),
         )
 
 
@@ -61,15 +67,6 @@ def _coefficient(row: Coefficient) -> list[str]:
         degrees(row.share_deg, 2, sign=True),
         number(row.inflation, 0),
     ]
-
-
-def _evidence(found: Coefficients) -> str:
-    return (
-        f"{count(found.log_rows)} rows of {number_of(found.drives, 'drive')}. Rows at 100 Hz are "
-        "not independent: the cluster-robust standard errors take each "
-        f"{found.cluster} as one piece of evidence; those by rows, which are far too small, stand "
-        "beside. Effect of one std: degrees of estimate for one standard deviation of the signal."
-    )
 
 
 def scenarios(data: ReportData) -> ReportTable:

@@ -12,58 +12,48 @@ from fleet_slip.comparison.report.report_data import ReportData, gather
 from fleet_slip.files.folder import Folder
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.pages.drawing import Picture, draw, png_file, svg_file
-from fleet_slip.pages.page_parts import ReportTable, Tile, count, degrees, fill_in, size
+from fleet_slip.pages.page_parts import Tile, count, degrees, fill_in, size
 from fleet_slip.warehouse.tables import Warehouse
 from fleet_slip.words import number_of
 
-SECTIONS = ("figure-", "memory-", "road-", "fleet-")
-"""What the keys of pictures begin with that have sections of their own."""
+SECTIONS = {"paper": "figure-", "memory": "memory-", "roads": "road-", "fleet": "fleet-"}
+"""What the keys of a section's pictures begin with."""
 
 
 def render(data: ReportData, shown: Sequence[Picture]) -> str:
     """Return the page."""
     drawn = [draw(one) for one in shown]
-    claims = judge_claims(data)
+    claims, learned = judge_claims(data), further_tables.rivals(data)
     return fill_in(
         "report.html.j2",
         version=data.version,
         evaluation=data.evaluated.document,
-        paper=[one for one in drawn if one.picture.key.startswith("figure-")],
-        beyond=[one for one in drawn if not one.picture.key.startswith(SECTIONS)],
-        memory=[one for one in drawn if one.picture.key.startswith("memory-")],
-        roads=[one for one in drawn if one.picture.key.startswith("road-")],
-        fleet=[one for one in drawn if one.picture.key.startswith("fleet-")],
+        **{
+            section: [one for one in drawn if one.picture.key.startswith(prefix)]
+            for section, prefix in SECTIONS.items()
+        },
+        beyond=[one for one in drawn if not one.picture.key.startswith((*SECTIONS.values(),))],
         table_one=paper_tables.table_one(data),
         table_two=paper_tables.table_two(data),
         distances=paper_tables.distances(data),
         targets=list(paper_tables.targets(data)),
-        further=_further(data),
+        further=[
+            further_tables.scenarios(data),
+            further_tables.standings(data),
+            *further_tables.fleets(data),
+            *([learned] if learned else []),
+        ],
         coefficients=list(further_tables.coefficient_tables(data)),
         storage=further_tables.storage(data),
         tiles=_tiles(data, claims),
         claims=claims,
         tally=_tally(claims),
         statuses=list(Status),
-        missing=missing_scenarios(data),
+        missing=[one for one in data.shipped if one not in data.evaluated.scenarios],
         provenance=_provenance(data),
         configs=data.configs,
         commands=_commands(data),
     )
-
-
-def missing_scenarios(data: ReportData) -> list[str]:
-    """Return the names of the shipped scenarios that the evaluation left out."""
-    return [one for one in data.shipped if one not in data.evaluated.scenarios]
-
-
-def _further(data: ReportData) -> list[ReportTable]:
-    learned = further_tables.rivals(data)
-    return [
-        further_tables.scenarios(data),
-        further_tables.standings(data),
-        *further_tables.fleets(data),
-        *([learned] if learned else []),
-    ]
 
 
 def _tally(claims: Sequence[Judged]) -> dict[Status, int]:

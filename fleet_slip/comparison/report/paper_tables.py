@@ -130,6 +130,12 @@ def targets(data: ReportData) -> Iterator[ReportTable]:
     plain = [one for one in paper if "below that of" not in one["requirement"]]
     against = [one for one in checks if "below that of" in one["requirement"]]
     if plain:
+        found = {
+            (one["requirement"], one["estimator"]): Cell(
+                number(one["found"], 4), "good" if one["reached"] else "miss"
+            )
+            for one in plain
+        }
         yield table(
             "targets",
             "What the paper's scenarios ask for, by model of Table I",
@@ -137,7 +143,7 @@ def targets(data: ReportData) -> Iterator[ReportTable]:
             [
                 [
                     requirement.replace("_", " "),
-                    *(_found(plain, requirement, name) for name in models),
+                    *(found.get((requirement, name), Cell(number(None))) for name in models),
                 ]
                 for requirement in dict.fromkeys(one["requirement"] for one in plain)
             ],
@@ -158,13 +164,6 @@ def targets(data: ReportData) -> Iterator[ReportTable]:
             ],
             note=_misses(against),
         )
-
-
-def _found(checks: Sequence[Mapping[str, Any]], requirement: str, name: str) -> Cell:
-    for one in checks:
-        if one["requirement"] == requirement and one["estimator"] == name:
-            return Cell(number(one["found"], 4), "good" if one["reached"] else "miss")
-    return Cell(number(None))
 
 
 def _misses(checks: Sequence[Mapping[str, Any]]) -> str:

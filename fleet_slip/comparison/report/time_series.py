@@ -167,17 +167,14 @@ def _plot(axes: Axes, x: FloatArray, y: FloatArray, line: Line, size: Size) -> N
 
 def _reaches(blocks: Sequence[DriveBlock]) -> list[float]:
     """Return the half-height of each block's strips: the same for all where that can be read."""
-    reaches = [_reach(block) for block in blocks]
+    reaches = []
+    for block in blocks:
+        truth = np.degrees(block.run.drive.sideslip_rad)
+        sizes = [np.abs(_estimate_deg(block, line) - truth) for line in block.all_strips]
+        largest = max(float(np.nanmax(values)) for values in sizes)
+        reaches.append(next(reach for reach in REACHES_DEG if largest < reach))
     comparable = max(reaches) <= COMPARABLE * min(reaches)
     return [max(reaches)] * len(reaches) if comparable else reaches
-
-
-def _reach(block: DriveBlock) -> float:
-    """Return a round number that is larger than all differences of a block, in deg."""
-    truth = np.degrees(block.run.drive.sideslip_rad)
-    sizes = [np.abs(_estimate_deg(block, line) - truth) for line in block.all_strips]
-    largest = max(float(np.nanmax(values)) for values in sizes)
-    return next(reach for reach in REACHES_DEG if largest < reach)
 
 
 def shade(axes: Axes, run: EvaluatedScenario, shaded: str | None) -> None:
