@@ -204,7 +204,11 @@ def _complete(content: Mapping[str, Any], derived: tuple[str, ...]) -> dict[str,
         return {**content, "drive": name}
     if base == name or base in derived:
         raise ValueError(f"the base {base!r} leads back to this scenario")
-    inherited = _complete(_settings(str(base)), (*derived, str(name)))
+    try:
+        settings = load_toml(find_config("scenarios", str(base)))
+    except ConfigError as error:
+        raise ValueError(str(error)) from None
+    inherited = _complete(settings, (*derived, str(name)))
     changes = sorted(set(content) - NOT_INHERITED)
     if "failures" in content and changes:
         raise ValueError(
@@ -214,13 +218,6 @@ def _complete(content: Mapping[str, Any], derived: tuple[str, ...]) -> dict[str,
     drive = inherited["drive"] if "failures" in content else name
     kept = {key: value for key, value in inherited.items() if key not in NOT_INHERITED}
     return {**_merged(kept, content), "drive": drive}
-
-
-def _settings(name: str) -> dict[str, Any]:
-    try:
-        return load_toml(find_config("scenarios", name))
-    except ConfigError as error:
-        raise ValueError(str(error)) from None
 
 
 def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -239,9 +236,9 @@ def load_scenario(name_or_path: str) -> Scenario:
 
 def shipped_scenarios() -> tuple[Scenario, ...]:
     """Return all shipped scenarios: the paper's first, in the order of its figures."""
-    return tuple(sorted(map(load_scenario, config_names("scenarios")), key=_place_in_paper))
 
+    def place_in_paper(scenario: Scenario) -> tuple[bool, list[int], str]:
+        numbers = [int(number) for number in re.findall(r"\d+", scenario.paper or "")]
+        return scenario.paper is None, numbers, scenario.name
 
-def _place_in_paper(scenario: Scenario) -> tuple[bool, list[int], str]:
-    numbers = [int(number) for number in re.findall(r"\d+", scenario.paper or "")]
-    return scenario.paper is None, numbers, scenario.name
+    return tuple(sorted(map(load_scenario, config_names("scenarios")), key=place_in_paper))

@@ -96,12 +96,8 @@ def _left_out(drives: int) -> str:
 def _where_the_time_went(report: "SimulationReport") -> str:
     seconds = report.seconds
     shares = ", ".join(
-        f"{name} {spent / seconds.tasks:.0%}"
-        for name, spent in (
-            ("simulate", seconds.simulate),
-            ("encode", seconds.encode),
-            ("write", seconds.write),
-        )
+        f"{name} {getattr(seconds, name) / seconds.tasks:.0%}"
+        for name in ("simulate", "encode", "write")
     )
     return (
         f"{seconds.elapsed:.1f} s, {report.rows / seconds.elapsed:,.0f} rows/s: "

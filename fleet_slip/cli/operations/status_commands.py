@@ -87,6 +87,10 @@ def _print_status(found: WarehouseStatus) -> None:
         ],
         left=2,
     )
+    disk = []
+    if found.disk_free_bytes is not None and found.disk_free_fraction is not None:
+        free = f"{found.disk_free_bytes / 1e9:,.1f} GB free, {found.disk_free_fraction:.0%}"
+        disk = [["disk", free]]
     print_table(
         "",
         ["", ""],
@@ -96,7 +100,7 @@ def _print_status(found: WarehouseStatus) -> None:
                 "waiting for the Gram job",
                 f"{number_of(found.backlog_files, 'file')}, {number_of(found.backlog_rows, 'row')}",
             ],
-            *_disk(found),
+            *disk,
         ],
         left=2,
     )
@@ -117,12 +121,6 @@ def _print_status(found: WarehouseStatus) -> None:
             ],
             left=2,
         )
-
-
-def _disk(found: WarehouseStatus) -> list[list[str]]:
-    if found.disk_free_bytes is None or found.disk_free_fraction is None:
-        return []
-    return [["disk", f"{found.disk_free_bytes / 1e9:,.1f} GB free, {found.disk_free_fraction:.0%}"]]
 
 
 def _print_runs(found: WarehouseStatus) -> None:

@@ -126,23 +126,17 @@ class TrainedModels:
     @property
     def table_one(self) -> dict[str, str]:
         """Return the estimator's name of each model of Table I that the cohort can serve."""
-        return {
-            model.name: f"{self.version.reference}/{model.name}" for model in self.selection.models
-        }
+        return {one.name: f"{self.version.reference}/{one.name}" for one in self.selection.models}
 
     def linear_estimators(self) -> dict[str, LinearEstimate]:
         """Return the models of Table I by name."""
-        return {
-            self.table_one[model.name]: LinearEstimate.of(model.model)
-            for model in self.selection.models
-        }
+        models = zip(self.table_one.values(), self.selection.models, strict=True)
+        return {name: LinearEstimate.of(one.model) for name, one in models}
 
     def estimators(self) -> dict[str, LinearEstimate | ColumnEstimate]:
         """Return the models of Table I, then the published one, by name."""
-        return {
-            **self.linear_estimators(),
-            self.version.reference: published_estimate(self.version.manifest),
-        }
+        published = published_estimate(self.version.manifest)
+        return {**self.linear_estimators(), self.version.reference: published}
 
     def descriptions(self) -> dict[str, dict[str, Any]]:
         """Return what a JSON document says of each estimator."""

@@ -178,11 +178,8 @@ class Competitors:
     @property
     def gps_filters(self) -> dict[str, FilterEstimate]:
         """The filters that need satellite navigation, by name."""
-        return {
-            name: one
-            for name, one in self.estimators.items()
-            if isinstance(one, FilterEstimate) and one.filter.gps
-        }
+        filters = {n: one for n, one in self.estimators.items() if isinstance(one, FilterEstimate)}
+        return {name: one for name, one in filters.items() if one.filter.gps}
 
 
 @dataclass(frozen=True)

@@ -133,11 +133,20 @@ def filter_bank(
     bank = Bank(chosen, {}, {})
     for one in FILTERS:
         key = _key(one, chosen, car)
-        found = _kept(warehouse, one, key)
+        kept = DocumentFolder(warehouse.root / "tuned" / one.module)
+        documents = (kept.read(number).content for number in reversed(kept.numbers()))
+        found = next((content for content in documents if content["key"] == key), None)
         if found is None:
             drives = drives or read_labelled(warehouse, chosen)
             try:
-                found = _tune(warehouse, one, key, drives, car, executor)
+                best = tune(one.estimate, one.parameters, one.tunable, drives, car, executor)
+                found = {
+                    "key": key,
+                    "parameters": best.parameters.model_dump(mode="json"),
+                    "rmse_deg": float(np.degrees(best.rmse_rad)),
+                    "evaluations": best.evaluations,
+                }
+                kept.append(found)
             except DataError as error:  # its drives have no fix, no wheel speeds, no steering
                 LOGGER.warning("%s competes as it is, for it cannot be tuned: %s", one.name, error)
         on = list(chosen) if found else []
@@ -170,38 +179,6 @@ def _key(one: Filter, drives: Sequence[str], car: VehicleParameters) -> dict[str
         "car": car.model_dump(mode="json"),
         "package_version": package_version("fleet-slip"),
     }
-
-
-def _folder(warehouse: Warehouse, one: Filter) -> DocumentFolder:
-    return DocumentFolder(warehouse.root / "tuned" / one.module)
-
-
-def _kept(warehouse: Warehouse, one: Filter, key: dict[str, Any]) -> dict[str, Any] | None:
-    folder = _folder(warehouse, one)
-    for number in reversed(folder.numbers()):
-        content = dict(folder.read(number).content)
-        if content["key"] == key:
-            return content
-    return None
-
-
-def _tune(
-    warehouse: Warehouse,
-    one: Filter,
-    key: dict[str, Any],
-    drives: Sequence[LabelledDrive],
-    car: VehicleParameters,
-    executor: Executor,
-) -> dict[str, Any]:
-    found = tune(one.estimate, one.parameters, one.tunable, drives, car, executor)
-    content = {
-        "key": key,
-        "parameters": found.parameters.model_dump(mode="json"),
-        "rmse_deg": float(np.degrees(found.rmse_rad)),
-        "evaluations": found.evaluations,
-    }
-    _folder(warehouse, one).append(content)
-    return content
 
 
 def read_labelled(warehouse: Warehouse, names: Sequence[str]) -> list[LabelledDrive]:

@@ -177,6 +177,7 @@ def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
     manifest = version.manifest
     choice = _paper_choice(models)
     signals = tuple(dict.fromkeys(models[-1].signals))
+    signals_toml = config_file("signals.toml").read_bytes()
     return ReportData(
         version=version,
         evaluated=evaluated,
@@ -193,7 +194,11 @@ def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
         cars=weigh_cars(warehouse),
         tables=_tables(warehouse),
         campaigns=tuple(sorted(set(cohort.drives["campaign"].to_pylist()))),
-        configs=_configs(scenarios),
+        configs=(
+            ConfigHash("configs/signals.toml", hashlib.sha256(signals_toml).hexdigest()),
+            ConfigHash(f"configs/models/{TABLE_ONE}.toml", load_model_list(TABLE_ONE).sha256),
+            *(_of_scenario(one) for one in scenarios),
+        ),
         shipped=tuple(one.name for one in shipped),
     )
 
@@ -289,15 +294,6 @@ def _tables(warehouse: Warehouse) -> tuple[TableSize, ...]:
             )
         )
     return tuple(sizes)
-
-
-def _configs(scenarios: list[Scenario]) -> tuple[ConfigHash, ...]:
-    signals = config_file("signals.toml").read_bytes()
-    hashes = [
-        ConfigHash("configs/signals.toml", hashlib.sha256(signals).hexdigest()),
-        ConfigHash(f"configs/models/{TABLE_ONE}.toml", load_model_list(TABLE_ONE).sha256),
-    ]
-    return (*hashes, *(_of_scenario(one) for one in scenarios))
 
 
 def _of_scenario(scenario: Scenario) -> ConfigHash:
