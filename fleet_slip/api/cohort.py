@@ -151,14 +151,11 @@ class FleetCohort(Rooted):
 
         Raises `DataError` for a feature set without such regimes.
         """
-        from fleet_slip.selection.model_list import WHOLE_SET, inputs_of
         from fleet_slip.selection.regimes import compare_regimes
         from fleet_slip.selection.request import parse_worth
 
         gain = parse_worth(worth)
-        folding, cohort = _folding(by, folds), self._load(features)
-        inputs = inputs_of(cohort, signals or WHOLE_SET)
-        return compare_regimes(cohort, inputs, folding, over, gain)
+        return compare_regimes(*self._dealt(signals, features, by, folds), over, gain)
 
     def shrink(
         self,
@@ -176,17 +173,25 @@ class FleetCohort(Rooted):
         the feature set `features` separated by commas, by default all; with `naive` rows are
         independent evidence, else what `cluster` says, as in `select`.
         """
-        from fleet_slip.selection.model_list import WHOLE_SET, inputs_of
         from fleet_slip.selection.shrinkage import compare_shrinkage
 
-        folding, cohort = _folding(by, folds), self._load(features)
-        inputs = inputs_of(cohort, signals or WHOLE_SET)
-        return compare_shrinkage(cohort, inputs, folding, naive=naive, cluster=cluster)
+        dealt = self._dealt(signals, features, by, folds)
+        return compare_shrinkage(*dealt, naive=naive, cluster=cluster)
 
     def _load(self, feature_set: str, condition: str | None = None) -> "Cohort":
         from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 
         return load_cohort(self.warehouse, condition or self.condition, feature_set)
+
+    def _dealt(
+        self, signals: str | None, features: str, by: "FoldKey", folds: int | str | None
+    ) -> "tuple[Cohort, tuple[str, ...], Folding]":
+        """Return the cohort, the inputs that are asked for, and how it is dealt into folds."""
+        from fleet_slip.grams.cohorts.folding import Folding, make_folding
+        from fleet_slip.selection.model_list import WHOLE_SET, inputs_of
+
+        folding, cohort = make_folding(by, folds, Folding().count), self._load(features)
+        return cohort, inputs_of(cohort, signals or WHOLE_SET), folding
 
     def _examined(
         self, model: "str | ModelVersion | None", signals: str | None, features: str | None
@@ -195,9 +200,3 @@ class FleetCohort(Rooted):
         from fleet_slip.models.versions import Registry
 
         return subject_of(Registry(self.root / "models"), model, signals, features)
-
-
-def _folding(by: "FoldKey", count: int | str | None) -> "Folding":
-    from fleet_slip.grams.cohorts.folding import Folding, make_folding
-
-    return make_folding(by, count, Folding().count)

@@ -116,6 +116,13 @@ TEXTS = {"folds": str | None}
 RESAMPLING = ("repeat", "bootstrap")
 """Fields that tell more of a winner and choose none."""
 
+Models = Annotated[
+    str,
+    typer.Option(
+        help="A model list of configs/models, or a TOML file.",
+        autocompletion=complete_config("models"),
+    ),
+]
 Cohort = Annotated[
     str,
     typer.Option(help="SQL condition on the view drives, such as \"track = 'waterford_hills'\"."),

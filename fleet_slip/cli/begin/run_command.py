@@ -14,7 +14,7 @@ from fleet_slip.cli.completing import complete_config
 from fleet_slip.cli.data.log_commands import Days, Through, last_day
 from fleet_slip.cli.models.signing_commands import signing_key
 from fleet_slip.cli.next_steps import next_steps
-from fleet_slip.cli.options import Worth
+from fleet_slip.cli.options import Models, Worth
 from fleet_slip.cli.output import Json, print_json, say
 from fleet_slip.cli.progress_bar import progress_of_steps
 from fleet_slip.cli.recorded import record_run
@@ -40,13 +40,7 @@ def run(
     name: Annotated[
         str | None, typer.Option(help="Name of the model. Default: the campaign's.")
     ] = None,
-    models: Annotated[
-        str,
-        typer.Option(
-            help="A model list of configs/models, or a TOML file.",
-            autocompletion=complete_config("models"),
-        ),
-    ] = RUN_MODELS,
+    models: Models = RUN_MODELS,
     worth: Worth = WORTH,
     threads: Threads = None,
     cluster: Cluster = None,

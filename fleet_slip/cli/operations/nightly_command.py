@@ -11,7 +11,7 @@ from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli.completing import complete_config, complete_model
 from fleet_slip.cli.dates import date_of
 from fleet_slip.cli.models.signing_commands import SignKey, signing_key
-from fleet_slip.cli.options import Worth
+from fleet_slip.cli.options import Models, Worth
 from fleet_slip.cli.output import Json, print_json, print_text, say
 from fleet_slip.cli.progress_bar import progress_of_steps
 from fleet_slip.cli.recorded import record_run
@@ -37,13 +37,7 @@ def nightly(
     cohort: Annotated[
         str, typer.Option(help="SQL condition on the view drives: which drives train it.")
     ] = TRAINING_DRIVES,
-    models: Annotated[
-        str,
-        typer.Option(
-            help="A model list of configs/models, or a TOML file.",
-            autocompletion=complete_config("models"),
-        ),
-    ] = RUN_MODELS,
+    models: Models = RUN_MODELS,
     worth: Worth = WORTH,
     candidate: Annotated[
         bool, typer.Option("--candidate", help="Publish as a candidate, even what is not worse.")

@@ -13,6 +13,7 @@ out of the search.
 
 from collections.abc import Callable, Sequence
 from fractions import Fraction
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -51,7 +52,7 @@ def stepwise_order(
     steps: dict[str, Callable[[int], list[list[int]]]] = {
         "forward": search.forward,
         "backward": search.backward,
-        "exchange": search.exchange,
+        "exchange": partial(search.forward, exchanging=True),
         "lars": search.lars,
     }
     return tuple(tuple(inputs[i] for i in chosen) for chosen in steps[method](most))
@@ -100,15 +101,19 @@ class _Search:
             left.remove(best)
         return sorted(taken)
 
-    def forward(self, most: int) -> list[list[int]]:
+    def forward(self, most: int, *, exchanging: bool = False) -> list[list[int]]:
         work, chosen = self.matrix.copy(), list[int]()
+        sets = []
         for _ in range(most):
             best = self._best_entry(work, chosen)
             if best is None:
                 break
             work = sweep(work, best)
             chosen.append(best)
-        return [chosen[:size] for size in range(1, len(chosen) + 1)]
+            if exchanging:
+                work = self._exchanged(work, chosen)
+            sets.append(list(chosen))
+        return sets
 
     def backward(self, most: int) -> list[list[int]]:
         work, chosen = self.matrix.copy(), list(self.usable)
@@ -122,19 +127,6 @@ class _Search:
             removed.append(worst)
         order = removed[::-1]
         return [order[:size] for size in range(1, most + 1)]
-
-    def exchange(self, most: int) -> list[list[int]]:
-        work, chosen = self.matrix.copy(), list[int]()
-        sets = []
-        for _ in range(most):
-            best = self._best_entry(work, chosen)
-            if best is None:
-                break
-            work = sweep(work, best)
-            chosen.append(best)
-            work = self._exchanged(work, chosen)
-            sets.append(list(chosen))
-        return sets
 
     def lars(self, most: int) -> list[list[int]]:
         at = self.usable
