@@ -170,26 +170,16 @@ def _teacher(learned: LearnedFrom) -> str:
 def _print_version(version: ModelVersion) -> None:
     manifest = version.manifest
     figures, trained = manifest.cross_validation, manifest.trained_on
-    label = manifest.label
-    constant = [["intercept", label.unit, repr(manifest.intercept), ""]]
+    label, origin = manifest.label, manifest.through_origin
+    terms = [] if origin else [["intercept", label.unit, repr(manifest.intercept), ""]]
+    for term in manifest.terms:
+        per_count = f"{float(term.coefficient_exact * term.scale_exact):.9g}"
+        terms.append([term.column, term.unit, repr(term.coefficient), per_count])
     print_table(
-        f"{version.reference}: {label.column} = "
-        + ("" if manifest.through_origin else "intercept + ")
-        + "sum of coefficient * signal"
-        + (", through the origin" if manifest.through_origin else ""),
+        f"{version.reference}: {label.column} = {'' if origin else 'intercept + '}"
+        f"sum of coefficient * signal{', through the origin' if origin else ''}",
         ["signal", "unit", "coefficient", "per count"],
-        [
-            *([] if manifest.through_origin else constant),
-            *(
-                [
-                    term.column,
-                    term.unit,
-                    repr(term.coefficient),
-                    f"{float(term.coefficient_exact * term.scale_exact):.9g}",
-                ]
-                for term in manifest.terms
-            ),
-        ],
+        terms,
         left=2,
     )
     if manifest.features:
@@ -206,50 +196,27 @@ def _print_version(version: ModelVersion) -> None:
             [_definition_row(term) for term in manifest.terms if term.definition],
             left=4,
         )
-    print_table(
-        "",
-        ["", ""],
-        [
-            [
-                "correlation",
-                f"{figures.correlation:.4f} (s.e. {figures.correlation_standard_error:.2g})",
-            ],
-            ["RMSE", f"{figures.rmse_deg:.4f} deg"],
-            ["error std", f"{figures.error_std_deg:.4f} deg"],
-            ["error mean", f"{figures.error_mean_deg:+.4f} deg"],
-            ["on board", describe_costs(manifest)],
-            ["cross-validation", f"{number_of(figures.folds, 'fold')} by {figures.folds_by}"],
-            [
-                "cohort",
-                f"{trained.cohort}: {number_of(trained.drives, 'drive')}"
-                + (
-                    f" of {number_of(trained.vehicles, 'car')}"
-                    if trained.vehicles is not None
-                    else ""
-                )
-                + f", {number_of(trained.rows, 'row')}",
-            ],
-            ["tables", f"logs version {trained.logs_version}, grams {trained.grams_version}"],
-            [
-                "selected",
-                f"model {manifest.selected_by.model} of {manifest.selected_by.model_list}",
-            ],
-            ["why", manifest.selected_by.reason],
-            *([["learned from", _teacher(one)]] if (one := manifest.learned_from) else []),
-            *(
-                [
-                    [
-                        "imported",
-                        f"from {origin.reference} of another data root, sha256 {origin.sha256}",
-                    ]
-                ]
-                if (origin := manifest.imported_from)
-                else []
-            ),
-            ["sha256", version.sha256],
-        ],
-        left=2,
-    )
+    cars = "" if trained.vehicles is None else f" of {number_of(trained.vehicles, 'car')}"
+    drives = f"{number_of(trained.drives, 'drive')}{cars}, {number_of(trained.rows, 'row')}"
+    chosen = manifest.selected_by
+    facts = {
+        "correlation": f"{figures.correlation:.4f} (s.e. {figures.correlation_standard_error:.2g})",
+        "RMSE": f"{figures.rmse_deg:.4f} deg",
+        "error std": f"{figures.error_std_deg:.4f} deg",
+        "error mean": f"{figures.error_mean_deg:+.4f} deg",
+        "on board": describe_costs(manifest),
+        "cross-validation": f"{number_of(figures.folds, 'fold')} by {figures.folds_by}",
+        "cohort": f"{trained.cohort}: {drives}",
+        "tables": f"logs version {trained.logs_version}, grams {trained.grams_version}",
+        "selected": f"model {chosen.model} of {chosen.model_list}",
+        "why": chosen.reason,
+    }
+    if learned := manifest.learned_from:
+        facts["learned from"] = _teacher(learned)
+    if one := manifest.imported_from:
+        facts["imported"] = f"from {one.reference} of another data root, sha256 {one.sha256}"
+    facts["sha256"] = version.sha256
+    print_table("", ["", ""], facts.items(), left=2)
 
 
 @record_run
