@@ -65,12 +65,13 @@ def diagnose(
 
 
 def _print_diagnosis(result: Diagnosis) -> None:
+    coefficients = _coefficients(result)
     print_table(
         f"{number_of(result.drives, 'drive')}, {number_of(result.fitted.gram.n, 'row')}, worth "
         f"{result.evidence.rows:,.0f} independent ones; R squared {result.fitted.r_squared:.4f}, "
         f"condition {result.condition_number:.3g}",
-        _coefficient_header(result),
-        _coefficient_rows(result),
+        list(coefficients[0]),
+        [list(row.values()) for row in coefficients],
         left=2,
     )
     if result.cluster == "row":
@@ -89,45 +90,27 @@ def _print_diagnosis(result: Diagnosis) -> None:
         _print_comparison(result, result.comparison)
 
 
-def _coefficient_header(result: Diagnosis) -> list[str]:
-    header = [
-        "signal",
-        "unit",
-        "coefficient",
-        f"s.e. by {result.cluster}s",
-        "t",
-        "s.e. by rows",
-        "VIF",
-    ]
-    if result.serial is not None:
-        header += ["AR(1)", "s.e. AR(1)"]
-    if result.noise_free is not None:
-        header += ["without noise"]
-    return header
-
-
-def _coefficient_rows(result: Diagnosis) -> list[list[str]]:
+def _coefficients(result: Diagnosis) -> list[dict[str, str]]:
+    """Return what is told of each coefficient, by heading."""
     rows = []
-    for i, (robust, naive) in enumerate(
-        zip(result.robust.estimates, result.naive.estimates, strict=True)
-    ):
-        constant = robust.name == INTERCEPT
-        row = [
-            robust.name,
-            catalogue()[catalogue().label].unit if constant else features().of(robust.name).unit,
-            f"{robust.value:.6g}",
-            f"{robust.standard_error:.2g}",
-            f"{robust.t:.1f}",
-            f"{naive.standard_error:.2g}",
-            "" if constant else f"{result.inflation[robust.name]:.3g}",
-        ]
+    both = zip(result.robust.estimates, result.naive.estimates, strict=True)
+    for i, (robust, naive) in enumerate(both):
+        name, constant = robust.name, robust.name == INTERCEPT
+        row = {
+            "signal": name,
+            "unit": (catalogue()[catalogue().label] if constant else features().of(name)).unit,
+            "coefficient": f"{robust.value:.6g}",
+            f"s.e. by {result.cluster}s": f"{robust.standard_error:.2g}",
+            "t": f"{robust.t:.1f}",
+            "s.e. by rows": f"{naive.standard_error:.2g}",
+            "VIF": "" if constant else f"{result.inflation[name]:.3g}",
+        }
         if result.serial is not None:
-            estimate = result.serial.inference.estimates[i]
-            slope = [f"{estimate.value:.6g}", f"{estimate.standard_error:.2g}"]
-            row += ["", ""] if constant else slope
-        if result.noise_free is not None:
-            free = result.noise_free
-            row += [f"{free.offset if constant else free.weights[robust.name]:.6g}"]
+            slope = result.serial.inference.estimates[i]
+            row["AR(1)"] = "" if constant else f"{slope.value:.6g}"
+            row["s.e. AR(1)"] = "" if constant else f"{slope.standard_error:.2g}"
+        if (free := result.noise_free) is not None:
+            row["without noise"] = f"{free.offset if constant else free.weights[name]:.6g}"
         rows.append(row)
     return rows
 
@@ -147,14 +130,12 @@ def _print_comparison(result: Diagnosis, found: CohortComparison) -> None:
             for here, there in zip(result.robust.estimates, found.other.estimates, strict=True)
         ],
     )
-    tests = [(found.drives, f"Wald, by {result.cluster}s"), (found.rows, "Chow, by rows")]
-    for test, kind in tests:
-        if test is None:
-            continue
-        print_line(
-            f"the same coefficients? {kind}: F({test.numerator}, {test.denominator}) = "
-            f"{test.f:,.2f}, p = {test.p:.2g}."
-        )
+    for test, kind in (found.drives, f"Wald, by {result.cluster}s"), (found.rows, "Chow, by rows"):
+        if test is not None:
+            print_line(
+                f"the same coefficients? {kind}: F({test.numerator}, {test.denominator}) = "
+                f"{test.f:,.2f}, p = {test.p:.2g}."
+            )
     if found.drives is None:
         say(
             f"there are too few {result.cluster}s to compare so many coefficients by them. Chow's "

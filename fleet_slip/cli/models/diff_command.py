@@ -32,9 +32,11 @@ def _print_difference(found: Difference) -> None:
     if not found.facts and all(term.same for term in found.terms):
         say(f"{one} and {other} are the same estimator from the same data")
         return
-    print_table(
-        "", ["signal", "unit", one, other], [_coefficients(term) for term in found.terms], left=2
-    )
+    terms = []
+    for term in found.terms:
+        here, there = ("" if value is None else repr(value) for value in (term.one, term.other))
+        terms.append([term.signal, term.unit, here, "the same" if term.same else there])
+    print_table("", ["signal", "unit", one, other], terms, left=2)
     if found.drives is not None:
         shared = found.drives
         say(
@@ -43,11 +45,6 @@ def _print_difference(found: Difference) -> None:
         )
     rows = [[name, _shown(a), _shown(b)] for name, (a, b) in found.facts.items()]
     print_table("", ["what differs", one, other], rows, left=3)
-
-
-def _coefficients(term: Any) -> list[str]:
-    shown = ["" if value is None else repr(value) for value in (term.one, term.other)]
-    return [term.signal, term.unit, shown[0], "the same" if term.same else shown[1]]
 
 
 def _shown(value: Any) -> str:
