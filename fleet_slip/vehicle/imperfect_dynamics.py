@@ -13,7 +13,7 @@ from fleet_slip.vehicle.dynamics import Derivative, driven_body, rates_of
 from fleet_slip.vehicle.integration import extrapolate
 from fleet_slip.vehicle.parameters import Constants
 from fleet_slip.vehicle.state import Controls, State
-from fleet_slip.vehicle.tyre import CREEP_SPEED_MPS, brush_force_on
+from fleet_slip.vehicle.tyre import CREEP_SPEED_MPS, brush_force
 from fleet_slip.vehicle.wheels import (
     Acceleration,
     Direction,
@@ -109,7 +109,7 @@ def _imperfect_wheel(
     along = cosine * vx + sine * vy
     across = cosine * vy - sine * vx
     felt = across + t.relaxes * (followed_side - across)
-    force = brush_force_on(along, felt, rolling, load, peak, grip, c)
+    force = brush_force(along, felt, rolling, load, peak, c, grip)
     speed = max(abs(rolling), CREEP_SPEED_MPS)
     return _Wheel(in_car_frame(force, to), speed * t.inverse_relaxation * (across - followed_side))
 

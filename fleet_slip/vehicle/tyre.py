@@ -45,9 +45,15 @@ def cornering_stiffness(load: float, peak: float, c: Constants) -> float:
 
 @equation
 def brush_force(
-    along: float, across: float, rolling: float, load: float, peak: float, c: Constants
+    along: float,
+    across: float,
+    rolling: float,
+    load: float,
+    peak: float,
+    c: Constants,
+    grip: float = 1.0,
 ) -> TyreForce:
-    """Return the force of a brush tyre.
+    """Return the force of a brush tyre where the road has `grip` times the drive's adhesion.
 
     `along` and `across` are the velocity of the wheel's centre in the wheel's frame and `rolling`
     is spin times radius, all in m/s; `load` > 0 is in N and `peak` the largest cornering stiffness.
@@ -60,14 +66,6 @@ def brush_force(
 
     where v_s points against the sliding and μ(v_s) = μ0 / (1 + |v_s| / V).
     """
-    return brush_force_on(along, across, rolling, load, peak, 1.0, c)
-
-
-@equation
-def brush_force_on(
-    along: float, across: float, rolling: float, load: float, peak: float, grip: float, c: Constants
-) -> TyreForce:
-    """Return the force of a brush tyre where the road has `grip` times the drive's adhesion."""
     slide_x = rolling - along
     slide_y = -across
     limit = (c.friction - c.friction_per_load * load) * load * grip

@@ -6,7 +6,7 @@ that all models share are left out. With nu = n - k - 1, RSS / RSS_full = 1 + x 
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -33,69 +33,50 @@ class Problem:
         return np.asarray(np.log1p(self.excess / (self.rows - self.inputs - 1)))
 
 
-def cp(problem: Problem) -> FloatArray:
-    """C_p = RSS / sigma^2 - n + 2(j + 1) = x + 2j - k + 1 (Mallows 1973)."""
-    return problem.excess + 2 * problem.size - problem.inputs + 1
+@cache
+def expected_squares(k: int) -> tuple[float, ...]:
+    """Return E[Z_(l:k)^2] for l = 1..k, the expected order statistics of k squared normals.
 
-
-def aic(problem: Problem) -> FloatArray:
-    """AIC, sigma known: x + 2j (Akaike 1973). The same order as C_p."""
-    return problem.excess + 2 * problem.size
-
-
-def aic_likelihood(problem: Problem) -> FloatArray:
-    """AIC, sigma unknown: n ln(RSS / n) + 2(j + 1) (Akaike 1973)."""
-    return problem.rows * problem.log_rss + 2 * (problem.size + 1)
-
-
-def bic(problem: Problem) -> FloatArray:
-    """BIC, sigma known: x + j ln n (Schwarz 1978)."""
-    return problem.excess + problem.size * math.log(problem.rows)
-
-
-def bic_likelihood(problem: Problem) -> FloatArray:
-    """BIC, sigma unknown: n ln(RSS / n) + (j + 1) ln n (Schwarz 1978)."""
-    return problem.rows * problem.log_rss + (problem.size + 1) * math.log(problem.rows)
-
-
-def ric(problem: Problem) -> FloatArray:
-    """Risk inflation criterion: x + 2 j ln k (Foster and George 1994)."""
-    return problem.excess + 2 * problem.size * math.log(max(problem.inputs, 1))
-
-
-def cic(problem: Problem) -> FloatArray:
-    """Covariance inflation criterion: x + 2 sum_{l<=j} E[Z_(l:k)^2] (Tibshirani and Knight 1999).
-
-    Z_(l:k)^2 is the l-th largest of k squares of standard normal variables.
+    Integral of z^2 k! / ((l-1)! (k-l)!) (1-F)^(l-1) F^(k-l) dF with F = 2 Phi(z) - 1, by the
+    trapezoidal rule, which converges geometrically for this integrand.
     """
-    return problem.excess + 2 * _cumulative(expected_squares(problem.inputs))[_index(problem)]
+    z = np.linspace(0.0, 12.0, 6001)
+    inside = normal_cdf(z) - normal_cdf(-z)
+    outside = 2 * normal_cdf(-z)
+    weight = 2 * normal_density(z) * z**2 * (z[1] - z[0])
+    result = []
+    factor = float(k)
+    for rank in range(1, k + 1):
+        result.append(float(np.sum(factor * weight * outside ** (rank - 1) * inside ** (k - rank))))
+        factor *= (k - rank) / rank
+    return tuple(result)
 
 
-def cic_log(problem: Problem) -> FloatArray:
-    """CIC with the approximation E[Z_(l:k)^2] = 2 ln(k / l), about twice the exact penalty."""
-    k = problem.inputs
-    logs = tuple(2 * math.log(k / rank) for rank in range(1, k + 1))
-    return problem.excess + 2 * _cumulative(logs)[_index(problem)]
-
-
-def adjusted_r2(problem: Problem) -> FloatArray:
-    """Adjusted R^2, to be maximised: -(RSS / (n - j - 1)) up to a factor (Theil 1961).
-
-    Returned is ln(RSS / RSS_full) - ln(n - j - 1), whose minimum is its maximum.
-    """
-    return problem.log_rss - np.log(problem.rows - problem.size - 1)
+def _cic(problem: Problem, squares: Sequence[float]) -> FloatArray:
+    """Return x + 2 sum_{l<=j} of squares, which are those that k chance effects have in order."""
+    penalties = np.cumsum([0.0, *squares])[problem.size.astype(np.intp)]
+    return np.asarray(problem.excess + 2 * penalties)
 
 
 CRITERIA: dict[str, Callable[[Problem], FloatArray]] = {
-    "cp": cp,
-    "aic": aic,
-    "aic-likelihood": aic_likelihood,
-    "bic": bic,
-    "bic-likelihood": bic_likelihood,
-    "ric": ric,
-    "cic": cic,
-    "cic-log": cic_log,
-    "adjusted-r2": adjusted_r2,
+    # C_p = RSS / sigma^2 - n + 2(j + 1) = x + 2j - k + 1 (Mallows 1973)
+    "cp": lambda p: p.excess + 2 * p.size - p.inputs + 1,
+    # Sigma known: x + 2j (Akaike 1973). The same order as C_p.
+    "aic": lambda p: p.excess + 2 * p.size,
+    # Sigma unknown: n ln(RSS / n) + 2(j + 1)
+    "aic-likelihood": lambda p: p.rows * p.log_rss + 2 * (p.size + 1),
+    # Sigma known: x + j ln n (Schwarz 1978)
+    "bic": lambda p: p.excess + p.size * math.log(p.rows),
+    # Sigma unknown: n ln(RSS / n) + (j + 1) ln n
+    "bic-likelihood": lambda p: p.rows * p.log_rss + (p.size + 1) * math.log(p.rows),
+    # Risk inflation: x + 2 j ln k (Foster and George 1994)
+    "ric": lambda p: p.excess + 2 * p.size * math.log(max(p.inputs, 1)),
+    # Covariance inflation: x + 2 sum_{l<=j} E[Z_(l:k)^2] (Tibshirani and Knight 1999)
+    "cic": lambda p: _cic(p, expected_squares(p.inputs)),
+    # The same with E[Z_(l:k)^2] = 2 ln(k / l), about twice the exact penalty
+    "cic-log": lambda p: _cic(p, [2 * math.log(p.inputs / i) for i in range(1, p.inputs + 1)]),
+    # Adjusted R^2, to be maximised: ln(RSS / RSS_full) - ln(n - j - 1) (Theil 1961)
+    "adjusted-r2": lambda p: p.log_rss - np.log(p.rows - p.size - 1),
 }
 
 
@@ -116,36 +97,9 @@ def best_size(name: str, evidence: Evidence) -> int:
     return int(np.argmin(criterion_values(name, evidence)))
 
 
-@cache
-def expected_squares(k: int) -> tuple[float, ...]:
-    """Return E[Z_(l:k)^2] for l = 1..k, the expected order statistics of k squared normals.
-
-    Integral of z^2 k! / ((l-1)! (k-l)!) (1-F)^(l-1) F^(k-l) dF with F = 2 Phi(z) - 1, by the
-    trapezoidal rule, which converges geometrically for this integrand.
-    """
-    z = np.linspace(0.0, 12.0, 6001)
-    inside = normal_cdf(z) - normal_cdf(-z)
-    outside = 2 * normal_cdf(-z)
-    weight = 2 * normal_density(z) * z**2 * (z[1] - z[0])
-    result = []
-    factor = float(k)
-    for rank in range(1, k + 1):
-        result.append(float(np.sum(factor * weight * outside ** (rank - 1) * inside ** (k - rank))))
-        factor *= (k - rank) / rank
-    return tuple(result)
-
-
 def _criterion(name: str) -> Callable[[Problem], FloatArray]:
     try:
         return CRITERIA[name]
     except KeyError:
         known = ", ".join(CRITERIA)
         raise QuestionError(f"unknown criterion {name!r}. Known criteria: {known}.") from None
-
-
-def _cumulative(values: tuple[float, ...]) -> FloatArray:
-    return np.cumsum([0.0, *values])
-
-
-def _index(problem: Problem) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-    return problem.size.astype(np.intp)
