@@ -62,7 +62,9 @@ def road_with(road: Road, script: Sequence[Manoeuvre]) -> Road:
         passed: FloatArray = ahead / (one.duration_s * planned)
         inside = (passed >= 0) & (passed < 1)
         curvature[inside] += _bend(one, passed[inside]) / planned**2
-        speed[inside] *= _slowing(one, passed[inside], planned)
+        if one.kind == "braking":
+            dip = min(DEEPEST_DIP, abs(one.strength_mps2) * one.duration_s / 2 / planned)
+            speed[inside] *= 1.0 - dip * (1.0 - np.abs(2 * passed[inside] - 1))
     return road._replace(curvature_1pm=curvature, speed_mps=np.maximum(speed, SLOWEST_MPS))
 
 
@@ -74,11 +76,3 @@ def _bend(one: Manoeuvre, passed: FloatArray) -> FloatArray:
         swings = max(1, round(one.duration_s / one.period_s))
         return one.strength_mps2 * np.sin(2 * math.pi * swings * passed)
     return np.zeros(len(passed))
-
-
-def _slowing(one: Manoeuvre, passed: FloatArray, planned_mps: float) -> FloatArray:
-    """Return the factor of the speed at the shares of the manoeuvre that have passed."""
-    if one.kind != "braking":
-        return np.ones(len(passed))
-    dip = min(DEEPEST_DIP, abs(one.strength_mps2) * one.duration_s / 2 / planned_mps)
-    return 1.0 - dip * (1.0 - np.abs(2 * passed - 1))

@@ -14,7 +14,6 @@ from typing import Any, Literal, Self
 import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
-from fleet_slip.arrays import FloatArray
 from fleet_slip.canonical import sha256_of
 from fleet_slip.catalogue.signals import Identifier, catalogue
 from fleet_slip.catalogue.sources import SCENARIO
@@ -76,15 +75,13 @@ class ScenarioDrive(DriveSpec):
     def profile(self) -> SpeedProfile:
         """The speed profile of the track within the limits, times the pace."""
         planned = super().profile
-        return replace(planned, speed_mps=planned.speed_mps * self._factor(planned.station_m))
-
-    def _factor(self, station_m: FloatArray) -> FloatArray:
         if not self.pace:
-            return np.ones(len(station_m))
+            return planned
         stations = [point.station_m for point in self.pace]
         factors = [point.factor for point in self.pace]
         period = self.track.length_m if self.track.closed else None
-        return np.interp(station_m, stations, factors, period=period)
+        factor = np.interp(planned.station_m, stations, factors, period=period)
+        return replace(planned, speed_mps=planned.speed_mps * factor)
 
 
 @dataclass(frozen=True)

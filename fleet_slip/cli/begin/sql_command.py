@@ -59,7 +59,10 @@ def sql(
     Example: **fleet-slip sql "SELECT vehicle_id, count(*) AS drives FROM drives GROUP BY ALL"**
     """
     fleet: Fleet = context.obj
-    text = _read_stdin() if query == "-" else query
+    try:
+        text = sys.stdin.read() if query == "-" else query
+    except UnicodeDecodeError:
+        raise QuestionError("the query on stdin is not UTF-8 text.") from None
     if not unsafe:
         limit_memory()
     opened = (fleet.unlocked_session if unsafe else fleet.session)(text)
@@ -87,13 +90,6 @@ def answer(session: Session, text: str, form: Form, *, exact: bool = False) -> N
             sys.stdout.flush()
             write_csv(rows if exact else _mark_formulas(rows), sys.stdout.buffer)
             sys.stdout.buffer.flush()
-
-
-def _read_stdin() -> str:
-    try:
-        return sys.stdin.read()
-    except UnicodeDecodeError:
-        raise QuestionError("the query on stdin is not UTF-8 text.") from None
 
 
 def _show(session: Session, text: str) -> None:

@@ -183,19 +183,15 @@ def _result(drive: EvaluatedDrive, parts: Sequence[Section], estimate_rad: Float
 
 def sections(drive: EvaluatedDrive) -> tuple[Section, ...]:
     """Return the sections of a drive that have any rows."""
+    ticks = np.arange(len(drive.time_s))
+    fixes = np.isfinite(drive.signals["gps_vx_mps"])
+    latest = np.maximum.accumulate(np.where(fixes, ticks, 0))
     found = (
         Section("unstable", CRITERION, find_unstable(drive)),
         Section(
             "gps_outage",
             f"more than {GPS_OUTAGE_S:g} s since the last fix of satellite navigation",
-            _without_gps(drive),
+            (ticks - latest) > GPS_OUTAGE_S * SAMPLE_RATE_HZ,
         ),
     )
     return tuple(section for section in found if section.rows.any())
-
-
-def _without_gps(drive: EvaluatedDrive) -> BoolArray:
-    fixes = np.isfinite(drive.signals["gps_vx_mps"])
-    ticks = np.arange(len(fixes))
-    latest = np.maximum.accumulate(np.where(fixes, ticks, 0))
-    return (ticks - latest) > GPS_OUTAGE_S * SAMPLE_RATE_HZ

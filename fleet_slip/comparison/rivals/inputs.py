@@ -62,7 +62,10 @@ class Inputs:
                 continue
             for part in one.parts:
                 if part not in definitions.values():
-                    name = term.signal if part == one else _name(part, scales)
+                    behind = f"{part.of}_{part.over or 'now'}_{part.ticks}"  # a gate only
+                    if behind in scales:
+                        behind = f"{behind}_{len(scales)}"
+                    name = term.signal if part == one else behind
                     definitions[name] = part
                     scales[name] = 1.0 if one.gate and part == one.gate.by else scale
         return cls(scales, manifest.features, definitions)
@@ -85,12 +88,6 @@ class Inputs:
         """Return physical values, shape (rows, columns), NaN where missing. Raises `DataError`."""
         scales = np.array(list(self.scales.values()))
         return np.asarray((DriveColumns(self.plan, drive).compute() * scales[:, None]).T)
-
-
-def _name(column: Definition, taken: Mapping[str, float]) -> str:
-    """Return a name for a column that a model has behind a gate only."""
-    name = f"{column.of}_{column.over or 'now'}_{column.ticks}"
-    return name if name not in taken else f"{name}_{len(taken)}"
 
 
 @dataclass(frozen=True)

@@ -128,7 +128,10 @@ def _frames(
     version: ModelVersion,
 ) -> DriveFrames:
     seen = np.flatnonzero(np.diff(np.floor((time_s - time_s[0]) * FRAMES_PER_S + 1e-6), prepend=-1))
-    estimate = version.predict(_as_table(columns, facts, time_s))
+    # The drive as the view `log` has it; NaN is null there.
+    arrays = {name: pa.array(values, from_pandas=True) for name, values in columns.items()}
+    known = {name: pa.array([value] * len(time_s)) for name, value in facts.items()}
+    estimate = version.predict(pa.table({**known, "time_s": time_s, **arrays}))
     vx, vy = _velocity(columns)
     x, y, heading, track = _places(columns, facts, time_s, vx, vy)
     gates = gates_on(version.manifest, columns, facts)
@@ -147,15 +150,6 @@ def _frames(
         gates={name: values[seen] for name, values in gates.items()},
         track=track,
     )
-
-
-def _as_table(
-    columns: Mapping[str, FloatArray], facts: Mapping[str, Any], time_s: FloatArray
-) -> pa.Table:
-    """Return the drive as the view `log` has it; NaN is null there."""
-    arrays = {name: pa.array(values, from_pandas=True) for name, values in columns.items()}
-    known = {name: pa.array([value] * len(time_s)) for name, value in facts.items()}
-    return pa.table({**known, "time_s": time_s, **arrays})
 
 
 def _velocity(columns: Mapping[str, FloatArray]) -> tuple[FloatArray, FloatArray]:

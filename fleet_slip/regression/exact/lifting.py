@@ -65,8 +65,13 @@ class _Lifting:
             self._lift(wanted)
             modulus = self.prime ** len(self.digits)
             found = _fractions(_joined(self.digits, self.prime), modulus)
-            if found is not None and self._solves(*found):
-                return found
+            if found is not None:
+                numerators, denominator = found
+                if all(
+                    sum(a * x for a, x in zip(row, numerators, strict=True)) == denominator * b
+                    for row, b in zip(self.matrix, self.right, strict=True)
+                ):
+                    return found
             wanted = int(wanted * GROWTH)
 
     def _lift(self, wanted: int) -> None:
@@ -80,12 +85,6 @@ class _Lifting:
                 total = (total << LIMB_BITS) + limb
             self.rest = (self.rest - total) // self.prime
             self.digits.append(digit)
-
-    def _solves(self, numerators: list[int], denominator: int) -> bool:
-        return all(
-            sum(a * x for a, x in zip(row, numerators, strict=True)) == denominator * b
-            for row, b in zip(self.matrix, self.right, strict=True)
-        )
 
 
 def _inverse(matrix: Sequence[Sequence[int]], prime: int) -> Integers | None:

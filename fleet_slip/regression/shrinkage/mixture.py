@@ -152,15 +152,10 @@ def _fit_group(data: FloatArray, kernel: Kernel) -> tuple[FloatArray, FloatArray
     support, intervals = kernel.support(data), kernel.intervals(data)
     low, high = intervals[:, :1], intervals[:, 1:]
     mass = kernel.cdf(high, support) - kernel.cdf(low, support)
-    weights = nonnegative_least_squares(mass, _empirical(data, low, high))
+    # The share of the data in each interval; a point on an end counts half.
+    inside, on_end = (data > low) & (data < high), (data == low) | (data == high)
+    weights = nonnegative_least_squares(mass, (inside + 0.5 * on_end).mean(axis=1))
     return support, weights / weights.sum()
-
-
-def _empirical(data: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """Return the share of the data in each interval; a point on an end counts half."""
-    inside = (data > low) & (data < high)
-    on_end = (data == low) | (data == high)
-    return np.asarray((inside + 0.5 * on_end).mean(axis=1))
 
 
 Moment = Callable[[FloatArray, FloatArray], FloatArray]
