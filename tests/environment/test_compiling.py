@@ -135,7 +135,7 @@ def test_code_is_kept_no_longer_where_what_it_calls_in_another_folder_has_change
     """Brakes and receivers, of the simulation, call equations of the vehicle."""
     package = tmp_path / "fleet_slip"
     for name, text in {
-        "simulation/braking.py": "from fleet_slip.vehicle import (\n    tyre,\n)\n",
+        "simulation/environment.py": "from fleet_slip.vehicle import (\n    tyre,\n)\n",
         "vehicle/tyre.py": "from fleet_slip.vehicle.pose import turn\n",
         "vehicle/pose.py": "one",
         "vehicle/driver.py": "",

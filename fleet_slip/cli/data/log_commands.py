@@ -12,15 +12,16 @@ from fleet_slip.api.calls import open_workers
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.cli.completing import complete_config
 from fleet_slip.cli.dates import date_of
-from fleet_slip.cli.output import Json, print_json, say
+from fleet_slip.cli.output import Json, print_json, print_table, print_text, say
 from fleet_slip.cli.progress_bar import progress
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.workers import Cluster, Threads
-from fleet_slip.errors import UsageError
+from fleet_slip.errors import AlarmError, UsageError
 from fleet_slip.runs.log import recording
 from fleet_slip.words import number_of
 
 if TYPE_CHECKING:
+    from fleet_slip.ingest.drafting.preview import Preview
     from fleet_slip.ingest.landing.ingest_job import IngestReport
     from fleet_slip.simulation.job import SimulationReport
 
@@ -147,9 +148,7 @@ def ingest(
     if plot is not None and not (dry_run and len(files) == 1):
         raise UsageError("--plot draws one file, with --dry-run.")
     if dry_run:
-        from fleet_slip.cli.data.previews import show_previews  # noqa: PLC0415 - draws, takes a while
-
-        show_previews(fleet.preview(files, mapping, as_one=as_one), plot, json)
+        _show_previews(fleet.preview(files, mapping, as_one=as_one), plot, json)
         return
     folders = any(map(names_several, files)) and not as_one
     each = Remarks(quiet=json or folders)
@@ -220,3 +219,41 @@ def _ingested(report: dict[str, Any]) -> str:
         + (f"; in quarantine: {number_of(held, 'row')} ({reasons})" if reasons else "")
         + _left_out(report["drives_forgotten"])
     )
+
+
+def _show_previews(previews: "list[Preview]", plot: Path | None, json: bool) -> None:
+    """Print previews, and draw the only one. Raises `AlarmError` if anything looks wrong."""
+    if plot is not None:
+        from fleet_slip.ingest.drafting.preview import draw_preview  # noqa: PLC0415 - draws
+
+        draw_preview(previews[0], plot)
+        say(f"drawn to {plot}")
+    if json:
+        print_json(previews)
+    else:
+        for preview in previews:
+            _show_preview(preview)
+    suspicions = sum(len(preview.suspicions) for preview in previews)
+    if suspicions:
+        raise AlarmError(
+            f"{number_of(suspicions, 'thing')} to look at before ingesting. Nothing was stored."
+        )
+
+
+def _show_preview(preview: "Preview") -> None:
+    counts = preview.counts
+    rejected = ", ".join(f"{n:,} {reason}" for reason, n in counts.quarantined.items())
+    print_table(
+        f"{preview.file}: {number_of(counts.rows_read, 'row')}; left out by conditions "
+        f"{counts.rows_left_out:,}; rejected {sum(counts.quarantined.values()):,}"
+        f"{f' ({rejected})' if rejected else ''}; {number_of(counts.drives, 'drive')} of "
+        f"{number_of(counts.ticks, 'tick')}",
+        ["signal", "unit", "least", "most", "missing"],
+        [
+            [one.signal, one.unit, f"{one.low:.4g}", f"{one.high:.4g}", f"{one.missing:.1%}"]
+            for one in preview.ranges
+        ],
+        left=2,
+    )
+    for suspicion in preview.suspicions:
+        print_text(f"looks wrong: {suspicion}")

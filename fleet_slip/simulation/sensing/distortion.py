@@ -11,9 +11,8 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.compiling import equation, kernel
 from fleet_slip.simulation.imperfections import Imperfections
-from fleet_slip.simulation.sensing.lags import Delay, LowPass
+from fleet_slip.simulation.sensing.lags import Delay, LowPass, Wander
 from fleet_slip.simulation.sensing.pulses import Pulses
-from fleet_slip.simulation.sensing.wander import Wander
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2
 
 WHEELS = ("wheel_fl_rad_s", "wheel_fr_rad_s", "wheel_rl_rad_s", "wheel_rr_rad_s")

@@ -11,9 +11,8 @@ from fleet_slip.catalogue.signals import HALF_TURN, catalogue
 from fleet_slip.compiling import equation, kernel
 from fleet_slip.config import Config
 from fleet_slip.simulation.imperfections import Latency, NotNegative, Range
-from fleet_slip.simulation.sensing.lags import Delay
+from fleet_slip.simulation.sensing.lags import Delay, Wander
 from fleet_slip.simulation.sensing.sensors import Gps, Outages
-from fleet_slip.simulation.sensing.wander import Wander
 from fleet_slip.vehicle.arctangent import arctan2
 from fleet_slip.vehicle.driver import SAMPLE_S
 
