@@ -117,7 +117,7 @@ def learn(
     rows: tuple[FloatArray, FloatArray, FloatArray],
     judge: tuple[FloatArray, FloatArray, FloatArray],
 ) -> Premises:
-    """Return the learned premises that estimate `judge` best; both (premises, inputs, 1; label)."""
+    """Return the learned premises that estimate `judge` best; rows are premises, inputs, label."""
     z, x, label = rows
     best, now, length = start, start, FIRST_STEP
     least, before = np.inf, np.inf

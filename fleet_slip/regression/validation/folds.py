@@ -71,7 +71,7 @@ def by_hash(keys: Sequence[str], count: int) -> FoldAssignment:
 
 
 def by_value(values: Sequence[Any]) -> FoldAssignment:
-    """Make one fold of each distinct value. Raises `DataError` for none, or one alone."""
+    """Make one fold of each distinct value. Raises `DataError` if one is missing or all agree."""
     if any(value is None for value in values):
         raise DataError(
             "a drive has no value of the column to fold by: fold by another, or leave such drives "
