@@ -13,6 +13,7 @@ from itertools import pairwise
 from pathlib import Path
 from platform import machine
 from shutil import which
+from string import Template
 from tempfile import TemporaryDirectory
 from typing import Literal
 from xml.sax.saxutils import quoteattr
@@ -26,6 +27,7 @@ from fleet_slip.models.model_version import ModelVersion
 
 FmiVersion = Literal[2, 3]
 
+SOURCES = files("fleet_slip.export") / "fmu_sources"
 COMPILER = "cc"
 LONGEST_COMPILATION_S = 120
 BINARIES = {2: "binaries/linux64", 3: "binaries/x86_64-linux"}
@@ -39,13 +41,12 @@ def fmu(version: ModelVersion, program: Program, checks: str, fmi: FmiVersion) -
     Raises `ConfigError` without a C compiler, or on a machine that is no x86-64.
     """
     prefix = c_prefix(version)
-    own = files("fleet_slip.export") / "fmu_sources"
     sources = {
         f"{prefix}.h": c_header(version, program),
         f"{prefix}.c": c_source(version, program),
         "fmi_model.h": _model_header(version, program),
-        "fmi_instance.h": (own / "fmi_instance.h").read_text("utf-8"),
-        f"fmi{fmi}.c": (own / f"fmi{fmi}.c").read_text("utf-8"),
+        "fmi_instance.h": (SOURCES / "fmi_instance.h").read_text("utf-8"),
+        f"fmi{fmi}.c": (SOURCES / f"fmi{fmi}.c").read_text("utf-8"),
     }
     content: dict[str, str | bytes] = {
         "modelDescription.xml": _description_2(version, program)
@@ -56,7 +57,7 @@ def fmu(version: ModelVersion, program: Program, checks: str, fmi: FmiVersion) -
         "resources/checks.csv": checks,
     }
     if fmi == 3:
-        content["sources/buildDescription.xml"] = _build_description(prefix)
+        content["sources/buildDescription.xml"] = _filled("buildDescription.xml", version)
         content["terminalsAndIcons/terminalsAndIcons.xml"] = _terminals(program)
     return _archive(content)
 
@@ -106,16 +107,22 @@ def _model_header(version: ModelVersion, program: Program) -> str:
         begins = f"    {prefix}_car car;\n{told}\n    {prefix}_start(state, &car);"
     else:
         begins = f"    (void)told;\n    {prefix}_start(state);"
-    return (
-        f'#include "{prefix}.h"\n\n#define TOKEN "{_token(version)}"\n'
-        f"#define SIGNALS {len(program.signals)}U\n#define TOLD {len(known)}U\n"
-        f"#define TICK_S {float(SAMPLE_TIME_S)}\n"
-        f"#define ANGLE_SCALE {program.angle.scale:f}\n#define model_step {prefix}_step\n"
-        f"typedef {prefix}_state model_state;\ntypedef {prefix}_sample model_sample;\n\n"
-        f"static const double scales[SIGNALS] = {{ {scales} }};\n\n"
-        f"static void fill_sample(model_sample *to, const int16_t counts[])\n{{\n{fills}\n}}\n\n"
-        f"static void begin_drive(model_state *state, const int32_t told[])\n{{\n{begins}\n}}\n"
+    return _filled(
+        "fmi_model.h",
+        version,
+        signals=len(program.signals),
+        told=len(known),
+        scale=f"{program.angle.scale:f}",
+        scales=scales,
+        fills=fills,
+        begins=begins,
     )
+
+
+def _filled(file: str, version: ModelVersion, **more: object) -> str:
+    """Return a file of `fmu_sources` with what stands for its names."""
+    known = {"prefix": c_prefix(version), "token": _token(version), "tick": float(SAMPLE_TIME_S)}
+    return Template((SOURCES / file).read_text("utf-8")).substitute(known, **more)
 
 
 def _token(version: ModelVersion) -> str:
@@ -145,7 +152,6 @@ def _told(program: Program) -> list[tuple[str, str]]:
 
 
 _VALID = "whether there is an angle; where there is none, the angle is 0"
-_TICK = f"{float(SAMPLE_TIME_S)}"
 
 
 def _units(program: Program) -> str:
@@ -162,7 +168,7 @@ def _units(program: Program) -> str:
 
 
 def _description_2(version: ModelVersion, program: Program) -> str:
-    prefix, angle = c_prefix(version), program.angle
+    angle = program.angle
     given = 'causality="input" variability="discrete"'
     variables = [
         (one.column, "", given, f'<Real unit={quoteattr(one.unit)} start="0"/>')
@@ -183,26 +189,18 @@ def _description_2(version: ModelVersion, program: Program) -> str:
         for place, (name, said, kind, value) in enumerate(variables)
     )
     unknowns = "".join(f'<Unknown index="{len(variables) - i}"/>' for i in (1, 0))
-    sources = "".join(f'<File name="{name}"/>' for name in (f"{prefix}.c", "fmi2.c"))
-    return (
-        '<?xml version="1.0" encoding="UTF-8"?>\n'
-        f'<fmiModelDescription fmiVersion="2.0" modelName="{prefix}" guid="{_token(version)}" '
-        f'description={_about(version)} generationTool="fleet-slip" '
-        'variableNamingConvention="flat" numberOfEventIndicators="0">\n'
-        f'  <CoSimulation modelIdentifier="{prefix}" canHandleVariableCommunicationStepSize="true" '
-        'canGetAndSetFMUstate="true" canSerializeFMUstate="true" '
-        'canNotUseMemoryManagementFunctions="true">\n'
-        f"    <SourceFiles>{sources}</SourceFiles>\n  </CoSimulation>\n{_units(program)}"
-        f'  <DefaultExperiment startTime="0" stepSize="{_TICK}"/>\n'
-        f"  <ModelVariables>\n{listed}  </ModelVariables>\n"
-        f"  <ModelStructure>\n    <Outputs>{unknowns}</Outputs>\n"
-        f"    <InitialUnknowns>{unknowns}</InitialUnknowns>\n  </ModelStructure>\n"
-        "</fmiModelDescription>\n"
+    return _filled(
+        "modelDescription2.xml",
+        version,
+        about=_about(version),
+        units=_units(program),
+        variables=listed,
+        unknowns=unknowns,
     )
 
 
 def _description_3(version: ModelVersion, program: Program) -> str:
-    prefix, angle = c_prefix(version), program.angle
+    angle = program.angle
     variables = [
         f'<Float64 name={quoteattr(one.column)} valueReference="{place}" causality="input" '
         f'variability="discrete" unit={quoteattr(one.unit)} start="0"/>'
@@ -229,27 +227,13 @@ def _description_3(version: ModelVersion, program: Program) -> str:
         for kind in ("Output", "InitialUnknown")
         for place in (first, first + 1)
     )
-    return (
-        '<?xml version="1.0" encoding="UTF-8"?>\n'
-        f'<fmiModelDescription fmiVersion="3.0" modelName="{prefix}" '
-        f'instantiationToken="{_token(version)}" description={_about(version)} '
-        'generationTool="fleet-slip" variableNamingConvention="flat">\n'
-        f'  <CoSimulation modelIdentifier="{prefix}" '
-        'canHandleVariableCommunicationStepSize="true" canGetAndSetFMUState="true" '
-        f'canSerializeFMUState="true" fixedInternalStepSize="{_TICK}"/>\n{_units(program)}'
-        f'  <DefaultExperiment startTime="0" stepSize="{_TICK}"/>\n'
-        f"  <ModelVariables>\n{listed}  </ModelVariables>\n"
-        f"  <ModelStructure>\n{structure}  </ModelStructure>\n</fmiModelDescription>\n"
-    )
-
-
-def _build_description(prefix: str) -> str:
-    listed = "".join(f'<SourceFile name="{name}"/>' for name in (f"{prefix}.c", "fmi3.c"))
-    return (
-        '<?xml version="1.0" encoding="UTF-8"?>\n<fmiBuildDescription fmiVersion="3.0">\n'
-        f'  <BuildConfiguration modelIdentifier="{prefix}">\n'
-        f'    <SourceFileSet language="C99">{listed}</SourceFileSet>\n'
-        "  </BuildConfiguration>\n</fmiBuildDescription>\n"
+    return _filled(
+        "modelDescription3.xml",
+        version,
+        about=_about(version),
+        units=_units(program),
+        variables=listed,
+        unknowns=structure,
     )
 
 

@@ -220,23 +220,15 @@ class Registry:
         for number in self.versions(name):
             version = self._read(name, number)
             manifest = version.manifest
-            rows.append(
-                {
-                    "name": name,
-                    "version": number,
-                    "aliases": ",".join(aliases.get(number, [])),
-                    "signals": ",".join(manifest.signals),
-                    "correlation": manifest.cross_validation.correlation,
-                    "rmse_deg": manifest.cross_validation.rmse_deg,
-                    "error_mean_deg": manifest.cross_validation.error_mean_deg,
-                    "error_std_deg": manifest.cross_validation.error_std_deg,
-                    "cohort": manifest.trained_on.cohort,
-                    "drives": manifest.trained_on.drives,
-                    "rows": manifest.trained_on.rows,
-                    "published_at": published.get(number),
-                    "sha256": version.sha256,
-                }
-            )
+            figures, trained = manifest.cross_validation, manifest.trained_on
+            own = {
+                "version": number,
+                "aliases": ",".join(aliases.get(number, [])),
+                "signals": ",".join(manifest.signals),
+                "published_at": published.get(number),
+                "sha256": version.sha256,
+            }
+            rows.append({**vars(trained), **vars(figures), "name": name, **own})
         return rows
 
     def _versions(self, name: str) -> DocumentFolder:

@@ -13,24 +13,11 @@ from fleet_slip.compiling import equation, inner_loop
 
 
 @inner_loop
-def compute(  # noqa: PLR0912, PLR0915 - one loop for each operation
-    operation: int,
-    memory: Any,
-    places: Any,
-    size: int,
-    numerator: float,
-    divisor: float,
-    limit: float,
-    times: float,
+def _calculate(  # noqa: PLR0912 - one loop for each operation
+    operation: int, out: Any, a: Any, b: Any
 ) -> None:
-    """Do an operation that writes binary64.
-
-    `places` are where what is written and read begins: out, a and b. What is clipped counts so
-    many `times` in the first rows of the memory.
-    """
-    at, of_a, of_b = places
-    out, a = memory[at : at + size], memory[of_a : of_a + size]
-    b = memory[of_b : of_b + size]
+    """Do an operation that is the same for binary64 and int64."""
+    size = len(out)
     if operation == op.COPY:
         for i in range(size):
             out[i] = a[i]
@@ -49,9 +36,32 @@ def compute(  # noqa: PLR0912, PLR0915 - one loop for each operation
     elif operation == op.ABSOLUTE:
         for i in range(size):
             out[i] = abs(a[i])
-    elif operation == op.SIGN:
-        for i in range(size):
-            out[i] = 1.0 if a[i] > 0.0 else (-1.0 if a[i] < 0.0 else a[i])
+    else:
+        for i in range(size):  # NaN stays
+            out[i] = 1 if a[i] > 0 else (-1 if a[i] < 0 else a[i])
+
+
+@inner_loop
+def compute(  # noqa: PLR0912 - one loop for each operation
+    operation: int,
+    memory: Any,
+    places: Any,
+    size: int,
+    numerator: float,
+    divisor: float,
+    limit: float,
+    times: float,
+) -> None:
+    """Do an operation that writes binary64.
+
+    `places` are where what is written and read begins: out, a and b. What is clipped counts so
+    many `times` in the first rows of the memory.
+    """
+    at, of_a, of_b = places
+    out, a = memory[at : at + size], memory[of_a : of_a + size]
+    b = memory[of_b : of_b + size]
+    if operation <= op.SIGN:
+        _calculate(operation, out, a, b)
     elif operation == op.DIVIDE:
         for i in range(size):
             out[i] = np.trunc(a[i] / b[i])
@@ -91,6 +101,9 @@ def compute(  # noqa: PLR0912, PLR0915 - one loop for each operation
         if outside:
             for i in range(size):
                 memory[i] += times if abs(a[i]) > limit else 0.0
+    elif operation == op.SHARE:
+        for i in range(size):
+            out[i] = nearest(a[i] * b[i], 1.0, divisor)
     else:
         outside = 0
         for i in range(size):
@@ -104,9 +117,7 @@ def compute(  # noqa: PLR0912, PLR0915 - one loop for each operation
 
 
 @inner_loop
-def compute_integers(  # noqa: PLR0912 - one loop for each operation
-    operation: int, memory: Any, places: Any, size: int, number: int
-) -> None:
+def compute_integers(operation: int, memory: Any, places: Any, size: int, number: int) -> None:
     """Do an operation that writes int64; `COPY` is from binary64."""
     at, of_a, of_b = places
     whole = memory.view(np.int64)
@@ -115,24 +126,8 @@ def compute_integers(  # noqa: PLR0912 - one loop for each operation
     if operation == op.COPY:
         for i in range(size):
             out[i] = np.int64(given[i] if given[i] == given[i] else 0.0)
-    elif operation == op.ADD:
-        for i in range(size):
-            out[i] = a[i] + b[i]
-    elif operation == op.SUBTRACT:
-        for i in range(size):
-            out[i] = a[i] - b[i]
-    elif operation == op.MULTIPLY:
-        for i in range(size):
-            out[i] = a[i] * b[i]
-    elif operation == op.NEGATE:
-        for i in range(size):
-            out[i] = -a[i]
-    elif operation == op.ABSOLUTE:
-        for i in range(size):
-            out[i] = abs(a[i])
-    elif operation == op.SIGN:
-        for i in range(size):
-            out[i] = (1 if a[i] > 0 else 0) - (1 if a[i] < 0 else 0)
+    elif operation <= op.SIGN:
+        _calculate(operation, out, a, b)
     elif operation == op.FILL:
         for i in range(size):
             out[i] = number

@@ -4,28 +4,8 @@ from typing import Any
 
 import numpy as np
 
+from fleet_slip.columns.blocks import block_operations as op
 from fleet_slip.columns.blocks.block_arithmetic import compute, compute_integers
-from fleet_slip.columns.blocks.block_operations import (
-    ADD_UP,
-    AGO,
-    BLOCK_ROWS,
-    FIXED,
-    INTEGERS,
-    KEEP,
-    KIND,
-    LIMIT,
-    MOVES,
-    NUMBER,
-    NUMERATOR,
-    OPERATION,
-    OUT,
-    SLOT,
-    TICKS,
-    A,
-    B,
-    C,
-    D,
-)
 from fleet_slip.columns.blocks.lookback import add_up, divide_sums, find_begins, values_ago
 from fleet_slip.columns.blocks.product_sums import add_products, add_sums
 from fleet_slip.compiling import inner_loop, kernel
@@ -66,7 +46,7 @@ def run(
     added, clipped, waiting = 0, 0.0, 0
     lacks = False
     while first < rows:
-        size = min(BLOCK_ROWS, rows - first)
+        size = min(op.BLOCK_ROWS, rows - first)
         memory[:size] = 0.0
         for number in range(len(steps)):
             _do(steps[number], ratios[number], memory, flags, rows, ticks, first, size)
@@ -93,38 +73,38 @@ def _do(
     step: Any, ratio: Any, memory: Any, flags: Any, rows: int, ticks: int, first: int, size: int
 ) -> None:
     """Do a step for some rows."""
-    operation, slot, kind = step[OPERATION], step[SLOT], step[KIND]
-    out = step[OUT] + step[MOVES + OUT] * first
-    a, b = step[A] + step[MOVES + A] * first, step[B] + step[MOVES + B] * first
-    c, d = step[C] + step[MOVES + C] * first, step[D] + step[MOVES + D] * first
-    if operation >= INTEGERS:
-        compute_integers(operation - INTEGERS, memory, (out, a, b), size, step[NUMBER])
-    elif operation < ADD_UP:
+    operation, slot, kind = step[op.OPERATION], step[op.SLOT], step[op.KIND]
+    out = step[op.OUT] + step[op.MOVES + op.OUT] * first
+    a, b = step[op.A] + step[op.MOVES + op.A] * first, step[op.B] + step[op.MOVES + op.B] * first
+    c, d = step[op.C] + step[op.MOVES + op.C] * first, step[op.D] + step[op.MOVES + op.D] * first
+    if operation >= op.INTEGERS:
+        compute_integers(operation - op.INTEGERS, memory, (out, a, b), size, step[op.NUMBER])
+    elif operation < op.ADD_UP:
         compute(
             operation,
             memory,
             (out, a, b),
             size,
-            ratio[NUMERATOR],
-            ratio[FIXED],
-            ratio[LIMIT],
-            np.float64(step[NUMBER]),
+            ratio[op.NUMERATOR],
+            ratio[op.FIXED],
+            ratio[op.LIMIT],
+            np.float64(step[op.NUMBER]),
         )
-    elif operation == ADD_UP:
+    elif operation == op.ADD_UP:
         flags[GAPS, slot] = add_up(memory, a, b, c, first, size, flags[GAPS, slot])
-    elif operation == KEEP:
+    elif operation == op.KEEP:
         for i in range(size):
             memory[b + first + i] = memory[a + i]
     else:
-        if (operation == AGO or flags[GAPS, slot]) and not flags[FOUND, kind]:
-            find_begins(memory, ticks, rows, step[TICKS] + (1 if operation == AGO else 0), c)
+        if (operation == op.AGO or flags[GAPS, slot]) and not flags[FOUND, kind]:
+            find_begins(memory, ticks, rows, step[op.TICKS] + (1 if operation == op.AGO else 0), c)
             flags[FOUND, kind] = True
-        if operation == AGO:
-            values_ago(memory, (out, a, ticks, c), first, size, step[TICKS])
+        if operation == op.AGO:
+            values_ago(memory, (out, a, ticks, c), first, size, step[op.TICKS])
         else:
             places, gaps = (out, b, d, c, a), flags[GAPS, slot]
-            times = np.float64(step[NUMBER])
-            divide_sums(memory, places, first, size, step[TICKS], ratio, times, gaps)
+            times = np.float64(step[op.NUMBER])
+            divide_sums(memory, places, first, size, step[op.TICKS], ratio, times, gaps)
 
 
 @inner_loop

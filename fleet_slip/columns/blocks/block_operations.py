@@ -12,9 +12,10 @@ BLOCK_ROWS = 2**10
 TILE = 4
 """Columns are padded to a multiple of this; see `product_sums`."""
 
-COPY, ADD, SUBTRACT, MULTIPLY, NEGATE, ABSOLUTE, SIGN, LEAST, MOST = 0, 1, 2, 3, 4, 5, 6, 7, 8
-DIVIDE, NEAREST, FILL, BROADCAST, AT_LEAST, WHERE, ELSE = 9, 10, 11, 12, 13, 14, 15
-TO_BINARY64, CLIP, SCALE = 16, 17, 18
+COPY, ADD, SUBTRACT, MULTIPLY, NEGATE, ABSOLUTE, SIGN = 0, 1, 2, 3, 4, 5, 6
+"""The same for binary64 and int64."""
+LEAST, MOST, DIVIDE, NEAREST, FILL, BROADCAST, AT_LEAST = 7, 8, 9, 10, 11, 12, 13
+WHERE, ELSE, TO_BINARY64, CLIP, SHARE, SCALE = 14, 15, 16, 17, 18, 19
 
 ADD_UP, KEEP, QUOTIENT, AGO = 20, 21, 22, 23
 """Operations on the rows of before."""
@@ -32,8 +33,6 @@ SLOT, KIND, TICKS, NUMBER = 11, 12, 13, 14
 """Further columns of a step: what is summed up, a kind of window, its ticks, and a constant, or how
 often a value that is clipped counts."""
 
-STEP_SIZE = 15
-
 NUMERATOR, FIXED, EACH, LIMIT = 0, 1, 2, 3
 """Ratios and limits of a step. A sum over n rows is multiplied by the first and divided by the
 second plus the third times n."""
@@ -43,8 +42,8 @@ class Region(IntEnum):
     """Parts of the memory of a program.
 
     The first counts how many columns of each row of the block were clipped; `TOLD` is what is known
-    of the car. Signals, sums, counts,
-    values, begins and ticks are of all rows of a drive; see `lookback`.
+    of the car. Signals, sums, counts, values, begins and ticks are of all rows of a drive; see
+    `lookback`.
     """
 
     CLIPPED = 0

@@ -263,6 +263,11 @@ class _Writer:
         times = self._counted.times.get(number, 0)
         return self._do(op.CLIP, value, ratio=(0.0, 1.0, 0.0, float(limit)), number=times)
 
+    def _share(self, _: int, found: Found, guard: int | None) -> Value:
+        """Write x * y / fixed, rounded."""
+        factors = (self.value(found[one], guard) for one in "xy")
+        return self._do(op.SHARE, *factors, ratio=(1.0, float(found["#fixed"]), 0.0, inf))
+
     def _round(self, _: int, found: Found, guard: int | None) -> Value:
         quotient = self._do(op.NEAREST, *(self.value(found[one], guard) for one in "cd"))
         return self._divided(quotient, found["d"], guard)
@@ -300,7 +305,8 @@ class _Writer:
 _FUSED: Sequence[tuple[Pattern, Callable[[_Writer, int, Found, int | None], Value]]] = [
     *((one, _Writer._quotient) for one in _QUOTIENTS),
     *((("clip", one, "#limit"), _Writer._scale) for one in _SCALED),
-    *((one, _Writer._scale) for one in _SCALED),
+    *((one, _Writer._scale) for one in _SCALED if one[1] != "x"),
+    (("nearest", ("*", "x", "y"), "#fixed"), _Writer._share),
     (_ROUNDED, _Writer._round),
 ]
 """What one loop does: several steps, and what writes them."""

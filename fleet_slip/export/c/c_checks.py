@@ -1,9 +1,8 @@
 """The self-test of an exported estimator in C: its checks as tables, and what runs them."""
 
 from collections.abc import Sequence
-from string import Template
 
-from fleet_slip.export.c.c_names import TEMPLATES, c_prefix, field_names, plain_text
+from fleet_slip.export.c.c_names import c_prefix, field_names, plain_text, read_template
 from fleet_slip.export.checks import Check
 from fleet_slip.export.program import Program
 from fleet_slip.models.model_version import ModelVersion
@@ -56,19 +55,8 @@ def _run(prefix: str, program: Program, number: int, check: Check) -> str:
         f"        sample.{field} = samples_{number}[i][{place}];"
         for place, field in enumerate(fields["signals"])
     )
-    return (
-        f"static uint32_t run_{number}(void)\n{{\n"
-        f"    static {prefix}_state state;\n    {prefix}_sample sample;\n{car}"
-        "    uint32_t wrong = 0U;\n"
-        f"    {prefix}_start(&state{given});\n"
-        f"    for (uint32_t i = 0U; i < {len(check.angles)}U; i++) {{\n"
-        f"        int32_t angle;\n{takes}\n"
-        f"        const bool valid = {prefix}_step(&state, &sample, &angle);\n"
-        f"        const int32_t expected = angles_{number}[i];\n"
-        "        if (valid != (expected != NO_ANGLE)) {\n            wrong += 1U;\n"
-        "        } else if (valid && (angle != expected)) {\n            wrong += 1U;\n"
-        "        } else {\n            /* right */\n        }\n"
-        "    }\n    return wrong;\n}\n"
+    return read_template("run_check.c").substitute(
+        number=number, prefix=prefix, car=car, given=given, ticks=len(check.angles), takes=takes
     )
 
 
@@ -79,7 +67,7 @@ def c_fuzz_target(version: ModelVersion, program: Program) -> str:
         f"    {prefix}_car car;\n    if (size < sizeof car) {{ return 0; }}\n"
         "    (void)memcpy(&car, data, sizeof car);\n    at = sizeof car;\n"
     )
-    return Template((TEMPLATES / "fuzz.c").read_text(encoding="utf-8")).substitute(
+    return read_template("fuzz.c").substitute(
         model=version.reference,
         prefix=prefix,
         known=known if knows else "",

@@ -5,10 +5,8 @@ that a product is at most 2^30 and a sum of `MOST_ROWS` of them below 2^61: noth
 The C stands in `templates/`.
 """
 
-from string import Template
-
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.export.c.c_names import TEMPLATES, literal
+from fleet_slip.export.c.c_names import literal, read_template
 from fleet_slip.grams.received.messages import (
     HEADER_BYTES,
     LAYOUT,
@@ -45,7 +43,7 @@ def _filled(template: str, prefix: str) -> str:
         for i, (name, one) in enumerate(signals.items())
     )
     magic = (f"    message[{i}] = {byte}U; /* {chr(byte)} */" for i, byte in enumerate(MAGIC))
-    return Template((TEMPLATES / template).read_text(encoding="utf-8")).substitute(
+    return read_template(template).substitute(
         prefix=prefix,
         upper=prefix.upper(),
         names=", ".join(signals),

@@ -3,18 +3,22 @@
 import re
 from collections.abc import Sequence
 from importlib.resources import files
+from string import Template
 
 from fleet_slip.canonical import sha256_of
 from fleet_slip.export.program import Program
 from fleet_slip.models.model_version import ModelVersion
-
-TEMPLATES = files("fleet_slip.export.c") / "templates"
 
 LARGEST_32 = 2**31 - 1
 
 LONGEST_PREFIX = 24
 """C99 tells external names apart by 31 characters, and so does rule 5.1 of MISRA C:2012. After the
 prefix `_gram_` and one more do."""
+
+
+def read_template(name: str) -> Template:
+    """Return a file of C with names to be filled in."""
+    return Template((files("fleet_slip.export.c") / "templates" / name).read_text("utf-8"))
 
 
 def file_prefix(version: ModelVersion) -> str:

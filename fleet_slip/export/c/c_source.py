@@ -4,12 +4,12 @@ import re
 from collections.abc import Mapping, Sequence
 
 from fleet_slip.export.c.c_names import (
-    TEMPLATES,
     c_prefix,
     field_names,
     integer_type,
     literal,
     plain_text,
+    read_template,
 )
 from fleet_slip.export.c.c_steps import StepWriter, ring_width, state_fields, sum_key
 from fleet_slip.export.program import Program
@@ -96,7 +96,7 @@ def c_source(version: ModelVersion, program: Program) -> str:
     """Return the source that goes with the header."""
     prefix, writer = c_prefix(version), StepWriter(program)
     start, step = _start(prefix, program, writer), _step(prefix, program, writer)
-    _, *named = _HELPER.split((TEMPLATES / "helpers.c").read_text(encoding="utf-8"))
+    _, *named = _HELPER.split(read_template("helpers.c").template)
     texts = zip(named[::2], named[1::2], strict=True)
     helpers = [text.strip("\n") + "\n" for name, text in texts if writer.done[name]]
     return "\n".join(

@@ -239,7 +239,7 @@ def ring_width(program: Program, of: int) -> int:
 
 
 @dataclass(frozen=True)
-class Field:
+class StateField:
     """A field of a struct: words of a type such as `int16_t`; an array if there are several."""
 
     type: str
@@ -261,21 +261,21 @@ class Field:
         return f"{self.type} {self.name}{size};{comment}"
 
 
-def state_fields(program: Program) -> list[Field]:
+def state_fields(program: Program) -> list[StateField]:
     """Return the fields of the state: rings of steps, sums, what the car knows."""
     names, found = field_names(program), []
     for of, ticks in program.rings.items():
         if ticks:
             kind = f"int{ring_width(program, of)}_t"
             found += [
-                Field(kind, f"ring_{of}", ticks, array=True, comment=f"step {of}"),
-                Field("uint32_t", f"at_{of}"),
+                StateField(kind, f"ring_{of}", ticks, array=True, comment=f"step {of}"),
+                StateField("uint32_t", f"at_{of}"),
             ]
     for of, ticks, most in program.sums:
         key, kind = sum_key(of, ticks, most), sum_type(program, of, most)
-        found += [Field(kind, f"sum_{key}"), Field("uint32_t", f"values_{key}")]
-    found += [Field("int32_t", name) for name in (*names["facts"], *names["numbers"])]
-    nothing = Field("uint8_t", "nothing", comment="this model looks back on nothing")
+        found += [StateField(kind, f"sum_{key}"), StateField("uint32_t", f"values_{key}")]
+    found += [StateField("int32_t", name) for name in (*names["facts"], *names["numbers"])]
+    nothing = StateField("uint8_t", "nothing", comment="this model looks back on nothing")
     return found or [nothing]
 
 
