@@ -1,5 +1,6 @@
 """The course of measured logs: of the centre of gravity, at its fixes' ticks, whatever tells it."""
 
+import json
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -162,6 +163,62 @@ def test_a_course_that_turns_the_other_way_is_suspicious() -> None:
     assert "hardly goes with the yaw rate" in other.figure
 
 
+def suggested(tmp_path: Path, columns: Columns) -> str:
+    file, written = tmp_path / "log.csv", tmp_path / "draft.toml"
+    pl.DataFrame({"time_s": time_s(), "YawRate_rad_s": on_time()["r"], **columns}).write_csv(file)
+    call(tmp_path / "root", "mapping", "suggest", str(file), "--output", str(written))
+    return written.read_text()
+
+
+@pytest.mark.parametrize("name", ["Heading", "True Heading", "Track", "gps_hdg", "Bearing"])
+def test_a_heading_is_a_question_and_no_line(tmp_path: Path, name: str) -> None:
+    columns = on_time()
+    text = suggested(tmp_path, {name: columns["cog"], "GPS_Speed": columns["sog"]})
+    assert "course" not in tomllib.loads(text)["signals"]
+    (asked,) = (line for line in text.splitlines() if line.startswith("# Look at this"))
+    assert f"column = {json.dumps(name)}" in asked and "antenna_x_m" in asked
+
+
+@pytest.mark.parametrize(
+    ("north", "east"),
+    [
+        ("vel_north", "vel_east"),
+        ("Vn", "Ve"),
+        ("Geschwindigkeit Nord", "Geschwindigkeit Ost"),
+        ("GpsVelN", "GpsVelE"),
+    ],
+)
+def test_strangers_call_velocities_otherwise(tmp_path: Path, north: str, east: str) -> None:
+    columns = on_time()
+    text = suggested(tmp_path, {east: columns["ve"], north: columns["vn"]})
+    course = tomllib.loads(text)["signals"]["course"]
+    assert (course["north"], course["east"]) == (north, east)
+
+
+@pytest.mark.parametrize(
+    ("course", "speed"),
+    [
+        ("GPS_Course", "GPS_Speed"),
+        ("Kurs über Grund", "GPS Geschwindigkeit"),
+        ("headMot", "gSpeed"),
+    ],
+)
+def test_strangers_call_a_course_otherwise(tmp_path: Path, course: str, speed: str) -> None:
+    columns = on_time()
+    found = tomllib.loads(suggested(tmp_path, {course: columns["cog"], speed: columns["sog"]}))
+    assert found["signals"]["course"]["column"] == course
+    assert found["signals"]["satellite_speed"]["column"] == speed
+
+
+def test_the_unit_of_a_speed_does_not_turn_the_course(tmp_path: Path) -> None:
+    columns = on_time()
+    turning = 15 / 0.31 + 0.05 * np.sin(time_s())
+    wheels = {f"wheel_{corner}": turning for corner in ("fl", "fr", "rl", "rr")}
+    text = suggested(tmp_path, {"COG": columns["cog"], "SOG": columns["sog"], **wheels})
+    found = tomllib.loads(text)["signals"]
+    assert (found["course"]["unit"], found["satellite_speed"]["unit"]) == ("deg", "km/h")
+
+
 @pytest.mark.parametrize(
     ("names", "expected"),
     [
@@ -234,7 +291,8 @@ def suspected(change: Callable[[Signals], None], slip: float = 1.0) -> list[tupl
     rng = np.random.default_rng(3)
     signals = with_course(drive(rng, gentleness=2), rng, slip)
     change(signals)
-    found = [s for s in find_suspicions(signals) if "course" in s.signals]
+    satellites = {"course", "satellite_speed"}
+    found = [s for s in find_suspicions(signals) if satellites & set(s.signals)]
     return [(s.kind, s.remedy) for s in found]
 
 

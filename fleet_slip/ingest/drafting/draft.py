@@ -4,6 +4,7 @@ The draft is read as any mapping is, and what looks wrong in the drives that com
 where there is one way to do so: a sign, or left for right. The rest is left to a person.
 """
 
+import json
 from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime
 from pathlib import Path
@@ -18,6 +19,7 @@ from fleet_slip.ingest.drafting.guessing import (
     Guess,
     guess_signals,
     guess_unnamed_wheels,
+    headings,
     parts_of,
 )
 from fleet_slip.ingest.drafting.preview import preview_log
@@ -102,7 +104,20 @@ def draft_mapping(file: Path, profile: FileProfile) -> Draft:
             suspicions = find_suspicions(_drive(file, profile, time, guesses))
     except FleetSlipError as error:
         return Draft(file, profile, time, guesses, (str(error),))
-    return Draft(file, profile, time, guesses, tuple(map(str, suspicions)))
+    asked = () if COURSE in guesses else _ask_of_headings(profile, guesses)
+    return Draft(file, profile, time, guesses, (*map(str, suspicions), *asked))
+
+
+def _ask_of_headings(profile: FileProfile, guesses: dict[str, Guess]) -> tuple[str, ...]:
+    """Return what only a person knows: whether a direction is the car's, or that of its way."""
+    taken = {guess.profile.channel.name for guess in guesses.values()}
+    return tuple(
+        f"{shown(name)}: is it where the car points, or where it goes? If a satellite receiver "
+        f"tells it from motion: course = {{ column = {json.dumps(name, ensure_ascii=False)}, "
+        'unit = "deg", clockwise_from_north = true, antenna_x_m = ..., antenna_y_m = ... }, with '
+        "satellite_speed beside it. A heading says nothing of side-slip."
+        for name in headings(profile.profiles, taken)
+    )
 
 
 def as_mapping(profile: FileProfile, time: TimeGuess, guesses: dict[str, Guess]) -> Mapping:

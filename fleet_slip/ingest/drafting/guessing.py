@@ -32,27 +32,35 @@ NAMES: dict[str, tuple[str, ...]] = {
     "brake_pressure": ("brake press", "brk press", "brake pres", "master cylinder", "brems druck"),
     "throttle": ("throttle", "accel pedal", "gas pedal", "fahrpedal", "drosselklappe"),
     "gear": ("gear", "gang"),
-    "course": ("course", "cog", "track angle", "heading motion", "kurs"),
+    "course": ("course", "cog", "track angle", "heading motion", "head mot", "kurs"),
     "satellite_speed": (
         "gps speed", "gnss speed", "gps vel", "gnss vel", "ground speed", "speed over ground",
-        "sog", "speed 2d",
+        "sog", "speed 2d", "gspeed", "g speed", "gps geschw",
     ),
-    "north": ("vel north", "speed north", "v north", "vn", "vel n", "north vel", "north speed"),
-    "east": ("vel east", "speed east", "v east", "ve", "vel e", "east vel", "east speed"),
+    "north": (
+        "vel north", "speed north", "v north", "vn", "vel n", "north vel", "north speed",
+        "geschw nord",
+    ),
+    "east": (
+        "vel east", "speed east", "v east", "ve", "vel e", "east vel", "east speed", "geschw ost",
+    ),
 }  # fmt: skip
 """Words by which a signal is called, each at the beginning of a part of the name."""
+HEADINGS = ("heading", "hdg", "track", "bearing", "yaw ang", "azimuth", "fahrt richtung")
+"""Words for where a car points, or goes: which of the two, people must say."""
 _NOT_NAMES = {
-    "vx": ("angular",),
-    "vy": ("angular",),
+    "vx": ("angular", "ned", "enu"),
+    "vy": ("angular", "ned", "enu"),
     "vehicle_speed": (
         "wheel", "whl", "engine", "motor", "wind", "fan", "turbo", "rad", "x", "y", "z", "east",
-        "north", "up", "down", "lateral", "vertical", "limit",
+        "north", "up", "down", "nord", "ost", "n", "e", "lateral", "vertical", "limit",
     ),
     "gear": ("ratio", "box", "torque", "temp"),
     "steer": ("rear", "rate", "vel", "speed"),
     "course": ("std", "acc", "accuracy", "error", "rate"),
     "satellite_speed": (
         "std", "acc", "accuracy", "error", "x", "y", "z", "east", "north", "up", "down",
+        "n", "e", "d", "nord", "ost",
     ),
     "north": ("std", "acc", "accuracy", "error"),
     "east": ("std", "acc", "accuracy", "error"),
@@ -161,6 +169,18 @@ def _satellites(guesses: dict[str, Guess]) -> dict[str, Guess]:
         if alone and not alone.component:
             found.setdefault("vehicle_speed", replace(alone, signal="vehicle_speed"))
     return found
+
+
+def headings(profiles: tuple[Profile, ...], taken: set[str]) -> list[str]:
+    """Return the channels that are a heading or a course, whichever."""
+    return [
+        p.channel.name
+        for p in profiles
+        if p.is_number
+        and p.channel.name not in taken
+        and any(_score(words, p.channel.name) for words in HEADINGS)
+        and not set(_NOT_NAMES["course"]) & set(parts_of(p.channel.name))
+    ]
 
 
 def guess_unnamed_wheels(profiles: tuple[Profile, ...], taken: set[str]) -> list[Guess]:

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.course_change import LARGEST_RAD
+from fleet_slip.catalogue.course_change import COURSE, LARGEST_RAD
 from fleet_slip.catalogue.course_relation import CourseRelation, relate
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 from fleet_slip.ingest.drives.relations import slope_of
@@ -18,9 +18,10 @@ SOUND = (0.8, 1.25)
 LEAST_OF_THEIR_OWN = 0.9
 MOST_SCALE_ERROR = 0.02
 LEAST_SPEED_MPS = 3.0
+SPEED = "satellite_speed"
 
-Found = tuple[str, str, str]
-"""A kind of fault, the figure that shows it, and a remedy."""
+Found = tuple[str, str, str, str]
+"""A kind of fault, the signal, the figure that shows it, and a remedy."""
 
 
 def course_fault(
@@ -37,12 +38,17 @@ def course_fault(
     if (slope, correlation) != (1.0, 0.0):  # else it is too little to tell
         figure = f"over a second it changes by {slope:+.2f} times what the yaw rate adds up to"
         if correlation < -LEAST_CORRELATION:
-            return "sign", figure, "Turn clockwise_from_north round, or swap north and east."
+            return (
+                "sign",
+                COURSE,
+                figure,
+                "Turn clockwise_from_north, or swap north and east.",
+            )
         if correlation < LEAST_CORRELATION:
             figure = f"over a second its change hardly goes with the yaw rate ({correlation:+.2f})"
-            return "values", figure, "Is it a course over ground, and of this car?"
+            return "values", COURSE, figure, "Is it a course over ground, and of this car?"
         if not SOUND[0] <= slope <= SOUND[1]:
-            return "unit", figure, "Check its unit, and that of the yaw rate."
+            return "unit", COURSE, figure, "Check its unit, and that of the yaw rate."
     return _of_fixes(signals, speed) or _of_relation(_relation(signals, turned))
 
 
@@ -55,13 +61,18 @@ def _of_fixes(signals: Mapping[str, FloatArray], speed: FloatArray | None) -> Fo
     own = float(np.isfinite(signals["course"][fast]).mean()) if fast.any() else 1.0
     if own < LEAST_OF_THEIR_OWN:
         figure = f"{1 - own:.0%} of its fixes repeat it while the car turns, or are of backwards"
-        return "values", figure, "They are left out. Map the course as the receiver tells it."
+        return (
+            "values",
+            COURSE,
+            figure,
+            "They are left out. Map it as the receiver tells it.",
+        )
     both = fast & (speed > LEAST_SPEED_MPS) if speed is not None else fast
     if speed is not None and both.sum() >= SECOND:
         ratio = float(np.median(told[both] / speed[both]))
         if not SOUND[0] <= ratio <= SOUND[1]:
-            figure = f"satellite_speed is {ratio:.2f} times the speed of the wheels"
-            return "unit", figure, "Check both units: the antenna's place is taken off by it."
+            figure = f"it is {ratio:.2f} times the speed of the wheels"
+            return "unit", SPEED, figure, "Check both units: the antenna's place is by it."
     return None
 
 
@@ -69,10 +80,15 @@ def _of_relation(relation: CourseRelation | None) -> Found | None:
     if relation is None:
         return None
     if fault := relation.fault or relation.misplaced:
-        return fault.kind, fault.figure, fault.remedy
+        return fault.kind, COURSE, fault.figure, fault.remedy
     if abs(relation.scale - 1) > MOST_SCALE_ERROR:
         figure = f"it turns {relation.scale:.3f} times as the yaw rate adds up to"
-        return "scale", figure, "The gyroscope's is off: learning from the course allows for it."
+        return (
+            "scale",
+            COURSE,
+            figure,
+            "The gyroscope's is off, which learning allows for.",
+        )
     return None
 
 

@@ -74,8 +74,8 @@ def find_suspicions(signals: Signals) -> list[Suspicion]:
     if not any({"ay", "yaw_rate"} & set(one.signals) for one in found):
         found += _label(usual, speed)  # which is judged by them
     if fault := course_fault(usual, speed):
-        kind, figure, remedy = fault
-        found.append(Suspicion(kind, ("course",), figure, remedy))
+        kind, signal, figure, remedy = fault
+        found.append(Suspicion(kind, (signal,), figure, remedy))
     return found
 
 
