@@ -18,6 +18,7 @@ from fleet_slip.columns.blocks.block_program import (
     Value,
     VectorOperation,
 )
+from fleet_slip.columns.blocks.fused_steps import QUOTIENTS, ROUNDED, SCALED, Pattern
 from fleet_slip.columns.counted_columns import CountedColumns
 from fleet_slip.columns.operations import (
     GIVEN,
@@ -40,28 +41,6 @@ _LOOPS = {
 
 _INTEGERS = ("+", "-", "*", "//", "nearest", "negative", "abs", "sign")
 """Those that there are for int64, too."""
-
-Pattern = Any
-"""A step: its operation and patterns of what it works on. A name stands for any step, and for the
-same one again; a name after # for the value of a constant, a number for that constant."""
-
-_ROUNDED = ("//", ("+", ("*", 2, "c"), ("*", ("sign", "c"), "d")), ("*", 2, "d"))
-"""A quotient to the nearest, as the SQL of a feature says it."""
-
-
-def _times(step: Pattern) -> list[Pattern]:
-    return [("*", step, "#numerator"), step]
-
-
-_TOTAL = ("sum", "row", "ticks", "most")
-_SHARED = ("#fixed", ("*", "#each", ("values", "row", "ticks", "most")))
-_SCALED: list[Pattern] = [("nearest", x, "#fixed") for x in _times("x")]
-_SCALED.append(("//", ("+", ("*", 2, "x"), ("*", ("sign", "x"), "#fixed")), ("*", 2, "#fixed")))
-_QUOTIENTS = [
-    ("clip", ("where", ("nearest", total, divisor), "row"), "#limit")
-    for total in _times(_TOTAL)
-    for divisor in _SHARED
-]
 
 Found = Mapping[str, int]
 
@@ -207,7 +186,7 @@ class _Writer:
             return self._do(op.INTEGERS + op.COPY, self.value(number, guard))
         found: dict[str, int] = {}
         name, of = operation_of(self._steps[number]), operands_of(self._steps[number])
-        if self._matches(_ROUNDED, number, found):
+        if self._matches(ROUNDED, number, found):
             name, of = "nearest", (found["c"], found["d"])
         if name in ("//", "nearest"):
             self._is_positive(of[1], guard)
@@ -303,11 +282,11 @@ class _Writer:
 
 
 _FUSED: Sequence[tuple[Pattern, Callable[[_Writer, int, Found, int | None], Value]]] = [
-    *((one, _Writer._quotient) for one in _QUOTIENTS),
-    *((("clip", one, "#limit"), _Writer._scale) for one in _SCALED),
-    *((one, _Writer._scale) for one in _SCALED if one[1] != "x"),
+    *((one, _Writer._quotient) for one in QUOTIENTS),
+    *((("clip", one, "#limit"), _Writer._scale) for one in SCALED),
+    *((one, _Writer._scale) for one in SCALED if one[1] != "x"),
     (("nearest", ("*", "x", "y"), "#fixed"), _Writer._share),
-    (_ROUNDED, _Writer._round),
+    (ROUNDED, _Writer._round),
 ]
 """What one loop does: several steps, and what writes them."""
 

@@ -1,0 +1,28 @@
+"""Patterns of steps that one loop over a block does together, for speed."""
+
+from typing import Any
+
+Pattern = Any
+"""A step: its operation and patterns of what it works on. A name stands for any step, and for the
+same one again; a name after # for the value of a constant, a number for that constant."""
+
+ROUNDED = ("//", ("+", ("*", 2, "c"), ("*", ("sign", "c"), "d")), ("*", 2, "d"))
+"""A quotient to the nearest, as the SQL of a feature says it."""
+
+
+def _times(step: Pattern) -> list[Pattern]:
+    return [("*", step, "#numerator"), step]
+
+
+_TOTAL = ("sum", "row", "ticks", "most")
+_SHARED = ("#fixed", ("*", "#each", ("values", "row", "ticks", "most")))
+SCALED: list[Pattern] = [("nearest", x, "#fixed") for x in _times("x")]
+SCALED.append(("//", ("+", ("*", 2, "x"), ("*", ("sign", "x"), "#fixed")), ("*", 2, "#fixed")))
+"""A value times a ratio of constants, rounded."""
+
+QUOTIENTS = [
+    ("clip", ("where", ("nearest", total, divisor), "row"), "#limit")
+    for total in _times(_TOTAL)
+    for divisor in _SHARED
+]
+"""A sum or mean over a window, times a ratio, rounded and clipped."""
