@@ -87,7 +87,7 @@ class PublishedModels(Rooted):
 
         require_model_name(name)
         selection = choice.select() if isinstance(choice, FleetCohort) else choice
-        manifest = with_straight_intercept(self.warehouse, manifest_of(selection, name))
+        manifest = with_straight_intercept(self.warehouse, manifest_of(selection, name), selection)
         if manifest.learned_from and not force:
             delays_s = require_in_time(self.warehouse, manifest)
             require_sound_course(self.warehouse, manifest, delays_s)

@@ -42,8 +42,9 @@ SELECTION: dict[str, Any] = {
         autocompletion=complete_feature_set,
     ),
     "label": typer.Option(
-        help="course: learn without a reference sensor, from changes of the course over ground. "
-        "Feature set and model list are then those called course, unless others are named.",
+        help="course: learn without a reference sensor, from changes of the course over ground; "
+        "course+sideslip: from these, and the label of the cars that have it. Feature set and "
+        "model list are then those called course, unless others are named.",
         show_default=False,
     ),
     "by": typer.Option(

@@ -197,10 +197,12 @@ class LearnedFrom(Config):
     """What stood for a label: changes of the course over so many seconds.
 
     The intercept is that of `cars`, where they go straight, with its uncertainty and the standard
-    deviation between them; the uncertainty is None where drives do not tell it.
+    deviation between them; the uncertainty is None where drives do not tell it. Beside drives with
+    the label a change of the course has a `weight`, where a row of these has 1.
     """
 
-    label: Literal["course"]
+    label: Literal["course", "course+sideslip"]
+    weight: Annotated[ExactFraction | None, Field(exclude_if=lambda one: one is None)] = None
     change_s: Seconds | Annotated[tuple[Seconds, ...], Field(min_length=2)]
     cars: Count
     intercept_uncertainty_deg: FiniteFloat | None

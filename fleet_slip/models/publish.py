@@ -10,6 +10,7 @@ from typing import Any
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError, RefusedError
+from fleet_slip.grams.cohorts.taught_cohort import TaughtCohort
 from fleet_slip.models.aliases import CANDIDATE, CHAMPION, AliasMove
 from fleet_slip.models.gate import compare, faults
 from fleet_slip.models.manifest import (
@@ -59,6 +60,9 @@ def manifest_of(selection: RequestedSelection, name: str) -> Manifest:
     winner = selection.winner.model
     label = signals[signals.label]
     wanted = (*winner.signals, signals.label)
+    beside = rows_beside = 0
+    if isinstance(selection.cohort, TaughtCohort):
+        beside, rows_beside = selection.cohort.count_others(wanted)
     return Manifest(
         name=name,
         label=ModelLabel(
@@ -75,10 +79,10 @@ def manifest_of(selection: RequestedSelection, name: str) -> Manifest:
         trained_on=TrainedOn(
             cohort=selection.cohort.condition.text,
             feature_set=features().identity(selection.cohort.feature_set),
-            drives=winner.drives,
+            drives=winner.drives + beside,
             vehicles=selection.cohort.members.count_vehicles_with(wanted),
             drives_without_log=selection.cohort.members.count_received_with(wanted) or None,
-            rows=winner.pooled.rows,
+            rows=winner.pooled.rows + rows_beside,
             logs_version=selection.cohort.logs_version,
             grams_version=selection.cohort.grams_version,
             drives_sha256=checksum_of_drives(drives_of(selection, name)),
@@ -93,7 +97,9 @@ def manifest_of(selection: RequestedSelection, name: str) -> Manifest:
     )
 
 
-def with_straight_intercept(warehouse: Warehouse, manifest: Manifest) -> Manifest:
+def with_straight_intercept(
+    warehouse: Warehouse, manifest: Manifest, selection: Selection[Any]
+) -> Manifest:
     """Return a manifest with the intercept that changes do not tell, if changes taught its model.
 
     One through the origin keeps 0, of no cars. Raises `DataError` if the cars do not tell their
@@ -106,8 +112,10 @@ def with_straight_intercept(warehouse: Warehouse, manifest: Manifest) -> Manifes
     found = StraightOn(Fraction(0), {}, None, 0.0, 0)
     if not manifest.through_origin:
         found = straight_on(warehouse, parse_condition(manifest.trained_on.cohort), manifest)
+    weight = selection.cohort.weight if isinstance(selection.cohort, TaughtCohort) else None
     learned = LearnedFrom(
-        label="course",
+        label="course" if weight is None else "course+sideslip",
+        weight=weight,
         change_s=float(change_s[0]) if len(change_s) == 1 else tuple(map(float, change_s)),
         cars=found.cars,
         intercept_uncertainty_deg=(

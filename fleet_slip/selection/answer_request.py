@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -14,10 +15,14 @@ from fleet_slip.errors import QuestionError, UsageError
 from fleet_slip.grams.cohorts.fold_sums import SummedCohort, sum_cohort
 from fleet_slip.grams.cohorts.folding import EACH, ROW_FOLDS, Folding, make_folding
 from fleet_slip.grams.cohorts.gram_cohort import Cohort, load_cohort
+from fleet_slip.grams.cohorts.taught_cohort import load_taught
 from fleet_slip.grams.cohorts.training_folds import clustered_moments
 from fleet_slip.regression.choice.nested_choice import Rule
 from fleet_slip.regression.choice.stepwise import METHODS
+from fleet_slip.regression.choice.winner import Worth, fall_short
+from fleet_slip.regression.exact.special import student_t_two_sided
 from fleet_slip.regression.inference.influential import find_influential
+from fleet_slip.regression.validation.crossval import CrossValidation
 from fleet_slip.selection.model_list import (
     WHOLE_SET,
     CandidateModel,
@@ -29,6 +34,7 @@ from fleet_slip.selection.model_list import (
     require_inputs,
 )
 from fleet_slip.selection.request import (
+    BOTH,
     COURSE,
     DEFAULT_MODELS,
     WORTH,
@@ -60,11 +66,17 @@ def answer_request(
     """
     request.check()
     named = request.nested or request.ordered or request.search
-    usual = COURSE if request.label == COURSE else DEFAULT_MODELS
+    usual = COURSE if request.label else DEFAULT_MODELS
     name = request.models or (None if named else usual)
     model_list = _given(request) or (load_model_list(name) if name else None)
+    if model_list and model_list.label and not request.label:
+        request = replace(request, label=model_list.label)
+        request.check()
     folds = _folding(request, model_list)
     feature_set = _feature_set(request, model_list)
+    if request.label == BOTH:
+        folds = folds if request.by else folds.model_copy(update={"by": "vehicle"})
+        return _weigh(warehouse, request, condition, model_list, folds, feature_set)
     if request.robust:
         return _answer_without(warehouse, request, condition, model_list, feature_set)
     distances = bool(request.nested and not request.ordered and not _search_of(request, model_list))
@@ -98,6 +110,40 @@ def answer_request(
     return replace(answer, uncertainty=figures)
 
 
+WEIGHTS = tuple(Fraction(4) ** power for power in range(4, -5, -1))
+"""Weights of a change of the course that are tried, where a row with the label has 1."""
+
+
+def _weigh(
+    warehouse: Warehouse,
+    request: SelectionRequest,
+    condition: str,
+    model_list: ModelList | None,
+    folds: Folding,
+    feature_set: str,
+) -> RequestedSelection:
+    """Select with the weight of the course that serves held-out drives with the label best.
+
+    Of weights whose error is not larger for sure, by Student's t over the folds, the largest: few
+    cars with a label say little about it, and the course is of all.
+    """
+    cohort = load_taught(warehouse, condition, feature_set, folds.by)
+    found = [
+        _compare_listed(replace(cohort, weight=weight), request, model_list, folds)
+        for weight in WEIGHTS
+    ]
+    best = min((one.winner.model for one in found), key=lambda model: model.pooled.rmse)
+    return next(one for one in found if _may_be_as_good(one.winner.model, best))
+
+
+def _may_be_as_good(model: CrossValidation, best: CrossValidation) -> bool:
+    """Whether a model's error is not larger than that of the best, with 95 %."""
+    short = fall_short(model, best, Worth(0.0))
+    if not short.rmse > 0 or not short.standard_error:
+        return not short.rmse > 0
+    return student_t_two_sided(short.rmse / short.standard_error, len(best.folds) - 1) > 0.05
+
+
 def _answer_without(
     warehouse: Warehouse,
     request: SelectionRequest,
@@ -121,7 +167,7 @@ def _given(request: SelectionRequest) -> ModelList | None:
     """Return the one model that was asked for, if there is one, as a list."""
     if request.model is None:
         return None
-    feature_set = request.features or (COURSE if request.label == COURSE else PLAIN)
+    feature_set = request.features or (COURSE if request.label else PLAIN)
     signals = require_inputs(request.model.split(","), feature_set)
     model = CandidateModel(name=GIVEN, signals=signals)
     return ModelList(description="One model", features=feature_set, model=(model,))
@@ -136,9 +182,9 @@ def _folding(request: SelectionRequest, model_list: ModelList | None) -> Folding
 
 
 def _feature_set(request: SelectionRequest, model_list: ModelList | None) -> str:
-    usual = COURSE if request.label == COURSE else PLAIN
+    usual = COURSE if request.label else PLAIN
     named = request.features or (model_list.features if model_list else usual)
-    if request.label == COURSE and not features().feature_set(named).change_ticks:
+    if request.label and not features().feature_set(named).change_ticks:
         known = ", ".join(name for name, one in features().sets.items() if one.change_ticks)
         raise QuestionError(
             f"the feature set {named} has no changes of the course. Feature sets that have: "
@@ -210,7 +256,7 @@ def _search_of(request: SelectionRequest, model_list: ModelList | None) -> Searc
         if request.search not in METHODS:
             raise QuestionError(f"unknown search {request.search!r}. Known: {', '.join(METHODS)}.")
         asked = {"method": request.search, **({"most": request.most} if request.most else {})}
-        if request.label == COURSE:
+        if request.label:
             # The noise of the course hides in the error what a column is worth to the angle.
             asked["rule"] = "best"
         return Search.model_validate(asked)

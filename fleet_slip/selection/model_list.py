@@ -15,6 +15,7 @@ from fleet_slip.grams.cohorts.fold_sums import SummedCohort
 from fleet_slip.grams.cohorts.folding import Folding
 from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.resources import find_config
+from fleet_slip.selection.request import Label
 
 
 class CandidateModel(Config):
@@ -65,11 +66,13 @@ class Search(Config):
 class ModelList(Config):
     """Candidates in their declared order, the feature set and the folds to compare them on.
 
-    With a `search`, the models that it finds among the inputs of the feature set are candidates
+    `label` is what may stand for the label of a reference sensor, if it is not that alone. With a
+    `search`, the models that it finds among the inputs of the feature set are candidates
     too, and its rule decides.
     """
 
     description: str = Field(min_length=1)
+    label: Label | None = None
     features: Identifier = PLAIN
     folds: Folding = Folding()
     model: tuple[CandidateModel, ...] = Field(min_length=1)

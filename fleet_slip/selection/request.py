@@ -12,11 +12,13 @@ from fleet_slip.regression.inference.drive_moments import ClusterUnit
 
 DEFAULT_MODELS = "table1"
 
-Label = Literal["course"]
-"""What may stand for the label of a reference sensor."""
+Label = Literal["course", "course+sideslip"]
+"""What may stand for the label of a reference sensor, or beside it where few cars have one."""
 
-COURSE: Label = "course"
+COURSE = "course"
 """Also the name of the feature set, and of the model list, that are taken for it."""
+BOTH: Label = "course+sideslip"
+"""The course of most cars, and the label of those that have it."""
 
 WORTH = "0.005deg"
 """`fleet_slip.regression.choice.winner.DEFAULT_WORTH` as it is asked for."""
@@ -35,8 +37,9 @@ class SelectionRequest:
         nested: an order of inputs, separated by commas, or `catalogue` for all inputs; adds the
             nested models of its first 1, 2 ... inputs.
         features: a feature set; by default what the list says, else the logged signals.
-        label: `course` to learn without a reference sensor, from changes of the course; the
-            feature set and the list are then those called `course` unless others are named.
+        label: `course` to learn without a reference sensor, from changes of the course, or
+            `course+sideslip` from these and the label of the cars that have it; the feature set and
+            the list are then those called `course` unless others are named.
         by: what a fold is made of; by default what the list says. By `row` leaks.
         folds: how many folds, or `each`: every drive, or whatever folds are made of, is one.
         rank: ranks the inputs of `nested` first, such as `backward`.
@@ -108,6 +111,11 @@ class SelectionRequest:
             raise UsageError(
                 "cluster says what is independent evidence for nested, rank, criterion, "
                 "all_subsets and bootstrap: leave it out, or naive."
+            )
+        if self.label == BOTH and (self.ordered or self.nested or self.resampled or self.robust):
+            raise UsageError(
+                "course+sideslip compares a list of models, one model or a search: leave out "
+                "nested, rank, criterion, all_subsets, naive, robust, bootstrap and repeat."
             )
         if self.search and self.ordered:
             raise UsageError(

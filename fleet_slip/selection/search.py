@@ -235,8 +235,7 @@ def search_models(
 
     chosen = fits(folds.total)
     tests: list[list[ErrorSums]] = [[] for _ in chosen]
-    for fold in folds.grams:
-        training = folds.total - fold
+    for training, fold in folds.splits():
         for sums, fitted in zip(tests, fits(training), strict=False):
             sums.append(held_out_errors(fitted.model, training, fold))
     models = tuple(

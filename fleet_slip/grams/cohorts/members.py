@@ -55,6 +55,16 @@ class Members:
     vehicles: Mapping[str, Hashed]
     received: Mapping[str, Hashed] = field(default_factory=dict)
 
+    def __add__(self, other: "Members") -> "Members":
+        """Return the drives and cars of both."""
+        found = []
+        for own, more in zip(vars(self).values(), vars(other).values(), strict=True):
+            both = dict(own)
+            for signals, hashed in more.items():
+                add_hashed(both, signals, Hashed(hashed.parts))
+            found.append(both)
+        return Members(*found)
+
     def drives_with(self, signals: Collection[str]) -> Hashes:
         """Return the hashes of the drives that have all of some signals, each once, sorted."""
         return _union([self.drives[kind] for kind in _kinds_with(self.drives, signals)])

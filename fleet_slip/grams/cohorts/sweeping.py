@@ -18,6 +18,15 @@ from fleet_slip.regression.exact.gram import packed_position, packed_positions
 from fleet_slip.regression.exact.gram_table import GramTable
 
 
+def about_mean(table: GramTable) -> GramTable:
+    """Return the table of what the columns differ by from their mean in each row."""
+    left, right = np.tril_indices(len(table.signals))
+    sums = table.sums.astype(np.float64)
+    taken = sums[:, left] * sums[:, right] / table.n[:, None]
+    products = table.products - np.rint(taken).astype(np.int64)
+    return GramTable(table.signals, table.n, np.zeros_like(table.sums), products)
+
+
 def swept(table: GramTable) -> GramTable:
     """Return the table without `BESIDE`, nor what goes with the angle turned, nor what is constant.
 

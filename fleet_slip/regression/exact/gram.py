@@ -113,6 +113,15 @@ class Gram:
             )
         return rest
 
+    def times(self, count: int) -> "Gram":
+        """Return the Gram in which each row counts so many times."""
+        return Gram(
+            self.signals,
+            self.n * count,
+            tuple(total * count for total in self.sums),
+            tuple(total * count for total in self.products),
+        )
+
     def restrict(self, signals: Sequence[str]) -> "Gram":
         """Return the Gram of some signals, in this order. Raises `DataError` if one is missing."""
         at = positions(self.signals, signals)

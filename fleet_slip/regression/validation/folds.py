@@ -10,6 +10,7 @@ fewer than about five drives a fold, one may be empty, which is an error and not
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import cached_property
 from typing import Any
 
@@ -100,21 +101,28 @@ def by_band(values: Sequence[Any], count: int) -> FoldAssignment:
 
 @dataclass(frozen=True)
 class Folds:
-    """One Gram a fold, all of the same signals, their names, and how many drives they are of."""
+    """One Gram a fold, all of the same signals, their names, and how many drives they are of.
+
+    Always trained on, and in no fold, are the rows `beside`, each of which has a `weight` where one
+    of a fold has 1.
+    """
 
     grams: tuple[Gram, ...]
     names: tuple[str, ...]
     drives: int
+    beside: Gram | None = None
+    weight: Fraction = Fraction(1)
 
     @cached_property
     def total(self) -> Gram:
-        """The Gram of all folds."""
-        return sum(self.grams[1:], self.grams[0])
+        """The Gram of all that a model is trained on, in whole parts of a row's weight."""
+        own = sum(self.grams[1:], self.grams[0]).times(self.weight.denominator)
+        return own if self.beside is None else own + self.beside.times(self.weight.numerator)
 
     def splits(self) -> Iterator[tuple[Gram, Gram]]:
         """Yield for each fold the Gram of all others, to train on, and its own, to test on."""
         for fold in self.grams:
-            yield self.total - fold, fold
+            yield self.total - fold.times(self.weight.denominator), fold
 
     def without(self, number: int, drives: int) -> "Folds":
         """Return the other folds, which hold so many drives."""
@@ -122,6 +130,8 @@ class Folds:
             self.grams[:number] + self.grams[number + 1 :],
             self.names[:number] + self.names[number + 1 :],
             drives,
+            self.beside,
+            self.weight,
         )
 
 
@@ -133,11 +143,14 @@ class CohortFolds:
         names: what the folds are called.
         tables: for each signal set, one Gram a fold.
         count_drives: tells how many drives have a Gram row in some of the tables, by their places.
+        beside, weight: see `Folds`; one Gram for each signal set.
     """
 
     names: tuple[str, ...]
     tables: tuple[tuple[Gram, ...], ...]
     count_drives: Callable[[Sequence[int]], int]
+    beside: tuple[Gram, ...] = ()
+    weight: Fraction = Fraction(1)
 
     @classmethod
     def of(
@@ -194,4 +207,6 @@ class CohortFolds:
                 f"fold {', '.join(empty)} has no rows with all of {', '.join(signals)}. Choose "
                 "fewer folds, another key to fold by, or fewer signals."
             )
-        return Folds(folds, names, self.count_drives(served))
+        others = [one.restrict(signals) for one in self.beside if set(signals) <= set(one.signals)]
+        beside = sum(others[1:], others[0]) if others else None
+        return Folds(folds, names, self.count_drives(served), beside, self.weight)
