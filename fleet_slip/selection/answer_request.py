@@ -15,7 +15,7 @@ from fleet_slip.errors import QuestionError, UsageError
 from fleet_slip.grams.cohorts.fold_sums import SummedCohort, sum_cohort
 from fleet_slip.grams.cohorts.folding import EACH, ROW_FOLDS, Folding, make_folding
 from fleet_slip.grams.cohorts.gram_cohort import Cohort, load_cohort
-from fleet_slip.grams.cohorts.taught_cohort import load_taught
+from fleet_slip.grams.cohorts.taught_cohort import TaughtCohort, load_taught
 from fleet_slip.grams.cohorts.training_folds import clustered_moments
 from fleet_slip.regression.choice.nested_choice import Rule
 from fleet_slip.regression.choice.stepwise import METHODS
@@ -49,6 +49,7 @@ from fleet_slip.selection.search import (
 )
 from fleet_slip.selection.select_models import RequestedSelection, Selection, select
 from fleet_slip.selection.uncertainty import estimate_uncertainty
+from fleet_slip.selection.without_label import without_label
 from fleet_slip.warehouse.condition import Condition, parse_condition
 from fleet_slip.warehouse.minimum_cohort import tells_single_cars
 from fleet_slip.warehouse.tables import Warehouse
@@ -64,6 +65,14 @@ def answer_request(
 
     Raises `UsageError` for options that do not go together.
     """
+    answer = _answer(warehouse, request, condition)
+    if isinstance(answer.cohort, TaughtCohort):  # its figures are of the angle
+        return answer
+    told = without_label(warehouse, answer.cohort, answer.winner.model.pooled.rmse_deg)
+    return replace(answer, without_label=told)
+
+
+def _answer(warehouse: Warehouse, request: SelectionRequest, condition: str) -> RequestedSelection:
     request.check()
     named = request.nested or request.ordered or request.search
     usual = COURSE if request.label else DEFAULT_MODELS
@@ -159,7 +168,7 @@ def _answer_without(
         inputs = tuple(name for name in cohort.inputs if name in listed)
     left_out = influential_cars(cohort, inputs)
     others = without_vehicles(cohort.condition, left_out)
-    answer = answer_request(warehouse, replace(request, robust=False), others.text)
+    answer = _answer(warehouse, replace(request, robust=False), others.text)
     return replace(answer, left_out=left_out)
 
 

@@ -26,6 +26,7 @@ from fleet_slip.selection.search import (
     told_figures,
 )
 from fleet_slip.selection.uncertainty import Uncertainty
+from fleet_slip.selection.without_label import WithoutLabel
 from fleet_slip.warehouse.minimum_cohort import tells_single_cars
 
 AnyCohort = TypeVar("AnyCohort", bound=Cohort | SummedCohort, default=Cohort)
@@ -164,16 +165,20 @@ class RequestedSelection(Selection[Any]):
         model_list: what was compared, such as `table1`.
         config_sha256: checksum of all that says what to compare.
         left_out: the cars that `robust` left out, and their influence as a multiple of the median.
+        without_label: what changes of the course tell of the winner, if they taught it alone.
     """
 
     model_list: str
     config_sha256: str
     left_out: Mapping[str, float] = field(default_factory=dict)
+    without_label: WithoutLabel | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `select --json` prints."""
         named = dict(self.left_out) if tells_single_cars() else {}
-        return {**super().as_dict(), "vehicles_left_out": named}
+        document = {**super().as_dict(), "vehicles_left_out": named}
+        told = {"without_label": self.without_label.as_dict()} if self.without_label else {}
+        return {**document, **told}
 
     @classmethod
     def of(

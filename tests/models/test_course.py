@@ -104,6 +104,12 @@ def test_columns_are_searched_for(fleet: Fleet) -> None:
     assert found is not None and len(selection.winner.model.signals) <= 6
     assert math.isclose(selection.winner.model.pooled.error_mean_deg, 0, abs_tol=1e-9)
     assert selection.model_list == "course"
+    told = selection.without_label
+    assert told is not None and told.noise is not None and told.angle_at_most is not None
+    # The noise of two fixes of 0.03 m/s each, at 15 to 45 m/s.
+    assert 0.05 < told.noise < 0.2 < told.error and told.noise_uncertainty is not None
+    assert 0.02 < told.angle_at_most < told.error / math.sqrt(2)
+    assert told.late is not None and 0.02 < told.late < 0.3
 
 
 def test_a_set_without_changes_has_no_course(fleet: Fleet) -> None:

@@ -12,6 +12,7 @@ from fleet_slip.cli.options import Cohort, selection_options
 from fleet_slip.cli.output import Json, figures_cells, print_json, print_line, print_table, say
 from fleet_slip.grams.cohorts.folding import BANDS, PARTS, ROW_FOLDS
 from fleet_slip.grams.cohorts.outweighing import drives_by_car
+from fleet_slip.grams.cohorts.taught_cohort import TaughtCohort
 from fleet_slip.regression.choice.nested_choice import CROSS_VALIDATION, NestedDistances
 from fleet_slip.regression.inference.evidence import Evidence
 from fleet_slip.regression.validation.crossval import CrossValidation
@@ -20,6 +21,7 @@ from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.selection.search import SearchChoice
 from fleet_slip.selection.select_models import RequestedSelection, Selection
 from fleet_slip.selection.uncertainty import Uncertainty
+from fleet_slip.selection.without_label import WithoutLabel
 from fleet_slip.warehouse.minimum_cohort import tells_single_cars
 from fleet_slip.words import number_of
 
@@ -84,10 +86,12 @@ def print_selection(selection: Selection[Any]) -> None:
         left=1 + listed,
     )
     _say_left_out(selection)
-    if (one := features().feature_set(selection.cohort.feature_set)).change_s:
+    if isinstance(selection, RequestedSelection) and selection.without_label is not None:
+        _say_without_label(selection.without_label)
+    if isinstance(selection.cohort, TaughtCohort):
         say(
-            f"learned from changes of the course over {one.change_text}: the figures are of "
-            "changes, with the noise of two fixes in them, and not of the angle."
+            f"a change of the course has {selection.cohort.weight} times the weight of a row with "
+            "the label; the figures are of the angle about its mean in each drive with the label."
         )
     if selection.folds.by in (PARTS, BANDS) and tells_single_cars():
         _print_folds(selection.winner.model)
@@ -108,6 +112,27 @@ def print_selection(selection: Selection[Any]) -> None:
         )
     if selection.uncertainty is not None:
         _print_uncertainty(selection.uncertainty)
+
+
+def _say_without_label(told: WithoutLabel) -> None:
+    """Say what changes of the course tell of the angle, and what they do not."""
+    over = ", ".join(f"{one:g}" for one in told.change_s)
+    say(
+        f"learned from changes of the course over {over} s: the figures are of changes, with the "
+        "noise of two fixes in them, and not of the angle."
+    )
+    if told.noise is None:
+        say("cars hardly go straight on: what of the error is the noise of the course is not told.")
+    else:
+        say(
+            f"where cars go straight on, the course changes by {told.noise:.4f} +- "
+            f"{2 * (told.noise_uncertainty or 0):.4f} deg beyond the heading, and by more where "
+            f"they are slower: the angle's own error over so long is at most "
+            f"{told.angle_at_most:.3f} deg."
+        )
+    late = "" if told.late is None else f"; a course 10 ms late adds {told.late:.3f} deg"
+    away = "" if told.away is None else f"; an antenna 0.1 m elsewhere {told.away:.3f} deg"
+    say(f"no change tells: the constant, which show says of a published version{late}{away}.")
 
 
 def _say_left_out(selection: Selection[Any]) -> None:
