@@ -144,10 +144,7 @@ def read_ahead(items: Iterator[Item], ahead: int = AHEAD) -> Generator[Item, Non
 def map_ahead(
     function: Callable[[Item], Result], items: Iterator[Item]
 ) -> Generator[Result, None, None]:
-    """Yield a function's results in the order of the items, while threads work on the next ones.
-
-    Errors, of the function and of the items, come in their place.
-    """
+    """Yield results in the order of the items while threads work on the next; errors too."""
     held = _take(items)
     failure: Exception | None = None
     with ThreadPoolExecutor(WORKERS, thread_name_prefix="map-ahead") as threads:

@@ -189,10 +189,7 @@ class LocalFolder:
         database: "duckdb.DuckDBPyConnection",  # noqa: ARG002
         wanted: Callable[[str], bool],
     ) -> list[str]:
-        """Return the URIs of the files whose paths are wanted: a connection can read them.
-
-        A link is left out: it may lead anywhere.
-        """
+        """Return the URIs of the wanted files but links, which may lead anywhere."""
         paths = [self.path / file.path for file in self.files() if wanted(file.path)]
         return [f"{self.uri}/{p.relative_to(self.path)}" for p in paths if not p.is_symlink()]
 

@@ -149,10 +149,7 @@ _fetching = threading.Lock()
 
 
 class _ReadOnlyFilesystem(fsspec.AbstractFileSystem):  # type: ignore[misc]
-    """Files that never change, for `duckdb.DuckDBPyConnection.register_filesystem`.
-
-    fsspec makes text of all that a filesystem is made with, which not every object survives.
-    """
+    """Files that never change, for DuckDB. fsspec makes text of all that one is made with."""
 
     cachable = False
 

@@ -161,10 +161,7 @@ def _copy_once(file: StoredFile, copy: Path) -> str:
 
 
 def _is_of_parts(copy: Path, tag: str) -> bool:
-    """Whether the tag of an upload in N parts is that of a file: the MD5 of the parts' MD5s.
-
-    The size of a part is not told; it is tried as uploaders choose it, in whole MiB or MB.
-    """
+    """Whether a tag is the MD5 of the MD5s of N parts, of any size that uploaders choose."""
     stated, _, number = tag.partition("-")
     size, parts = copy.stat().st_size, int(number or 0)
     if not parts:

@@ -49,10 +49,7 @@ def remove_old_files(warehouse: Warehouse, subject: Forgettable, *, replaced: bo
 
 
 def find_old_files(warehouse: Warehouse, subject: Forgettable) -> list["OldFile"]:
-    """Return the files with the drives that no version refers to, in the order of deletion.
-
-    The logs come last: their old files may be all that tells the drives of a car in the quarantine.
-    """
+    """Return unreferenced files with the drives; logs last, which may alone tell a car's drives."""
     logs = list(_with_subject(warehouse.logs.snapshot(), subject))
     drives = {drive for one in logs for drive in one.drives}
     old = [

@@ -136,10 +136,7 @@ def _candidates(
 def _aggregate_again(
     warehouse: Warehouse, damaged: Collection[str], wrong: set[str], lost: Collection[str]
 ) -> list[str]:
-    """Drop the Gram files that are damaged or have wrong rows, and compute what is missing.
-
-    That of `lost` log files cannot be, nor what cars sent: its files stay.
-    """
+    """Drop wrong Gram files, and compute what logs that are not `lost` can tell again."""
     removed: list[str] = []
 
     def attempt() -> None:

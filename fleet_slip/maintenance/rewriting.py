@@ -77,10 +77,7 @@ def rewrite(
 def read_kept_drives(
     table: Table, files: Sequence[TableFile], without: Collection[str] = ()
 ) -> pa.Table:
-    """Return the rows of log files, but for some drives, in the order and types of a new file.
-
-    Columns that the catalogue no longer has are kept, after the others.
-    """
+    """Return the rows of log files but for some drives, ordered and typed for a new file."""
     parts = [_read(table, file, without) for file in files]
     rows = pa.concat_tables(parts, promote_options="default").combine_chunks()
     order = _order(rows)

@@ -180,10 +180,7 @@ def _null_counts(metadata: pq.FileMetaData) -> dict[str, int]:
 def verify_names(
     warehouse: Warehouse, read: Mapping[str, Sequence[ReadFile]], report: Verification, full: bool
 ) -> None:
-    """Look for forgotten cars, and for forgotten drives too with `full`: 40 ms for each name.
-
-    Names in a dictionary that no row of the file has are few, and all compared.
-    """
+    """Look for forgotten cars; for forgotten drives too with `full`, 40 ms for each name."""
     unused = frozenset(name for one in _all(read) for name in _unused(one))
     cars, drives = (_used(_all(read), column) for column in ("vehicle_id", "drive_id"))
     audit = Audit(warehouse.root)

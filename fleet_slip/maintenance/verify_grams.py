@@ -122,10 +122,7 @@ def _verify_each(warehouse: Warehouse, grams: Sequence[TableFile], report: Verif
 def _verify_signatures(
     warehouse: Warehouse, grams: Sequence[TableFile], report: Verification, full: bool
 ) -> None:
-    """Look for received Gram rows that the key of their car did not sign; say what was not checked.
-
-    Those of a sample of each file are checked; with `full`, all.
-    """
+    """Look for received rows that no key of their car signed: of a sample, or with `full`."""
     files = list(filter(is_of_received, grams))
     keys = load_car_keys() if files else None
     for file in files:

@@ -83,10 +83,7 @@ class Prediction:
         return np.stack([offset, own / predicted, noise], axis=2)
 
     def scores(self, moments: MeanMoments) -> FloatArray:
-        """Return how many spreads each figure is from the middle, (drives, targets, 3).
-
-        Noise counts upwards only: a quiet drive is no fault.
-        """
+        """Return the spreads from the middle, (drives, targets, 3); of noise upwards only."""
         scores = (self.figures(moments) - self.middle) / self.spread
         scores[:, :, :2] = np.abs(scores[:, :, :2])
         return np.asarray(scores)
@@ -204,10 +201,7 @@ def settle(
 
 
 def _middle_and_spread(figures: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return median and scaled median absolute deviation of each figure; the first axis is drives.
-
-    One figure after another: a median takes a copy of what it looks at.
-    """
+    """Return median and scaled MAD of each figure over the drives, one by one: each is copied."""
     middle, spread = np.empty(figures.shape[1:]), np.empty(figures.shape[1:])
     for at in np.ndindex(*figures.shape[1:]):
         column = figures[(slice(None), *at)]

@@ -38,20 +38,13 @@ KILLED = "killed"
 
 
 def lend_runs(root: Folder, database: duckdb.DuckDBPyConnection, since: str = "") -> list[str]:
-    """Let a connection read the history's files; return their URIs, none if there is no history.
-
-    `since` is the first month that is wanted, as YYYY-MM. Raises `StorageError` for a line that was
-    changed.
-    """
+    """Let a connection read the history since a month; return its URIs. Raises `StorageError`."""
     require_unchanged(root, since)
     return (root / FOLDER).lend(database, lambda path: _is_record(path) and path >= since)
 
 
 def runs_under_way(root: Folder) -> list[str]:
-    """Return the names of other runs that began within a day and may not have ended.
-
-    Of this machine, a run whose process is gone is over; of another machine nothing is known.
-    """
+    """Return other runs of the last day that have no end, but for dead ones of this machine."""
     since = datetime.now(UTC) - timedelta(days=1)
     begun: dict[str, Mapping[str, Any]] = {}
     folder = root / FOLDER

@@ -91,10 +91,7 @@ def changed_lines(content: bytes) -> list[int]:
 
 
 def find_changed_lines(root: Folder, since: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the files of the history that have changed lines, below the root, and which.
-
-    `since` is the first month that is looked at, as YYYY-MM. What is no file is passed over.
-    """
+    """Yield the files, from a month YYYY-MM on, that have changed lines, and which."""
     folder = root / FOLDER
     for file in folder.files():
         if not file.path.endswith(".jsonl") or file.path < since:
@@ -167,10 +164,7 @@ def newest_documents(root: Folder) -> dict[str, tuple[int, str]]:
 
 
 def find_missing_documents(root: Folder, since: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the folders that have lost documents that a run had seen, and what is wrong.
-
-    `since` is the first month whose records are looked at, as YYYY-MM.
-    """
+    """Yield the folders that lost documents that a run since YYYY-MM had seen, and what."""
     for path, (number, sha256) in sorted(_kept_anchors(root, since).items()):
         documents = DocumentFolder(root / path)
         newest = max(documents.numbers(), default=0)

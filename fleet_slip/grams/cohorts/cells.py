@@ -98,10 +98,7 @@ NO_CELLS = Cells(pa.table({"key": pa.array([], pa.string())}))
 
 
 def dealt_folds(folding: Folding) -> int | None:
-    """Return the number of folds into which drives or cars are dealt, if there are more of these.
-
-    None for folds that are told from other columns, or are of one drive or car each.
-    """
+    """Return the folds that drives or cars are dealt into, None if no bucket tells them."""
     return None if folding.by not in BUCKET_KEYS or folding.count == EACH else folding.count
 
 

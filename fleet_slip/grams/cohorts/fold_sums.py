@@ -64,10 +64,7 @@ class SummedCohort(CohortOrigin):
         return self.inputs_among(name for grams in self.sums.tables for name in grams[0].signals)
 
     def folds(self, by: FoldKey, count: FoldCount) -> CohortFolds:
-        """Return the folds; any division other than its own reads the Gram rows again.
-
-        Raises what `sum_cohort` raises.
-        """
+        """Return the folds; another division reads the Gram rows again, like `sum_cohort`."""
         if (by, count) == (self.folding.by, self.folding.count):
             return self.sums
         folding = Folding(by=by, count=count)

@@ -111,10 +111,7 @@ class OpenedGrams:
             return {file for (file,) in self.database.sql(statement).fetchall()}
 
     def course_delays(self, condition: Condition) -> Iterator[tuple[str, tuple[int, int]]]:
-        """Yield each car of a cohort with a course, least and largest delay of its Gram rows.
-
-        In parts of a tick, as they were corrected by.
-        """
+        """Yield cars with a course, and the least and largest delay of their Gram rows in ticks."""
         statement = self.statement("course_delays.sql", condition, turned=TURNED)
         with asking(self.database, condition):
             for car, least, largest in self.database.execute(statement).fetchall():

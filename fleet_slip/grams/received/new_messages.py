@@ -54,10 +54,7 @@ def choose_new(
     *,
     signed: bool = False,
 ) -> NewMessages:
-    """Return what of some rows is new, and what contradicts what is there.
-
-    Rows of which it was checked that they are `signed` take the place of unsigned ones.
-    """
+    """Return what of some rows is new, or contradicts what is there; `signed` ones win."""
     grams = warehouse.grams.snapshot()
     # Asked after the snapshot: who forgets a car from now on makes this commit a conflict.
     screened = screen(warehouse.root, rows, refused)

@@ -147,10 +147,7 @@ def _has_other_pivots(n: IntArray, sums: IntArray, products: IntArray, added: fl
 
 
 def _scaled(n: IntArray, sums: IntArray, products: IntArray) -> Any:
-    """Return the lower triangles of matrices of n, sums and products, shape (k + 1, k + 1, m).
-
-    They are scaled to a unit diagonal.
-    """
+    """Return lower triangles of n, sums and products, (k+1, k+1, m), of a unit diagonal."""
     k = sums.shape[1]
     row, column = np.tril_indices(k)
     matrix = np.empty((k + 1, k + 1, len(n)))

@@ -66,10 +66,7 @@ def _signed_column(kept: Messages) -> pa.Array:
 
 
 def messages_again(signals: str, rows: pa.RecordBatch) -> tuple[Messages, BoolArray]:
-    """Rebuild the signed messages behind rows of the same signals, without their checksums.
-
-    And which of them the column fits: where it does not, it was not this row's.
-    """
+    """Rebuild signed messages of rows, without checksums; and tell whose signature fits."""
     count = len(signals.split(",")) if signals else 0
     content = rows[SIGNED].to_pylist()
     fits = np.array([len(one) == KEPT.itemsize for one in content], dtype=np.bool_)

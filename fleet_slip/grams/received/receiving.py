@@ -188,10 +188,7 @@ def receive_files(
 
 
 def find_messages(given: Iterable[Path]) -> list[Path]:
-    """Return the given files and all files in the given folders, at any depth, sorted by name.
-
-    Raises `InputError` for what is neither, and for a folder without files.
-    """
+    """Return files, and all below folders, sorted by name. Raises `InputError` without any."""
     found: list[Path] = []
     for path in given:
         inside = sorted(one for one in path.rglob("*") if one.is_file()) if path.is_dir() else []

@@ -114,10 +114,7 @@ def _range(name: str, found: _Found) -> SignalRange:
 
 
 def draw_preview(preview: Preview, file: Path) -> None:
-    """Draw the signals over time. The suffix of the file says the format.
-
-    Raises `ConfigError` for an unknown suffix, and `StorageError` if it cannot be written.
-    """
+    """Draw the signals to a file of any format. Raises `ConfigError`, `StorageError`."""
     with needed("report", "a picture of a measured log"):
         from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 - takes a while
         from matplotlib.figure import Figure  # noqa: PLC0415

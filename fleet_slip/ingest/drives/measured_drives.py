@@ -216,10 +216,7 @@ def _metadata(name: str, told: dict[str, Any], start_s: float, mapping: Mapping)
 
 
 def _facts_of(mapping: Mapping, known: dict[str, Any]) -> dict[str, Any]:
-    """Return what the mapping's table says of a drive's car and nobody said before.
-
-    Raises `InputError` if the car is not in the table, or nobody says its model.
-    """
+    """Return what the mapping's table adds to what is known of a car. Raises `InputError`."""
     vehicles = mapping.vehicle_facts()
     if not vehicles:
         return {}

@@ -87,10 +87,7 @@ class Resampler:
         return held
 
     def place(self, values: FloatArray, delay_s: float = 0.0) -> FloatArray:
-        """Return a signal with each sample at the tick nearest to it, NaN at the other ticks.
-
-        Of several samples nearest to one tick the last stays.
-        """
+        """Return a signal with each sample at its nearest tick, the last of several, else NaN."""
         present = np.flatnonzero(~np.isnan(values))
         nearest = np.rint((self.time_s[present] - delay_s - self.at_s[0]) / STEP_S)
         place = np.searchsorted(self.ticks, nearest)
@@ -191,10 +188,7 @@ class Antenna:
 def course_and_speed(
     column: SignalColumn, first: FloatArray, second: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return counterclockwise course from east and speed of what a mapping's two columns tell.
-
-    They are north and east velocity, or course and speed. NaN where one is missing.
-    """
+    """Return course from east and speed of two columns: north and east, or course and speed."""
     if column.component:
         return np.arctan2(first, second), np.hypot(first, second)
     course = np.pi / 2 - first if column.clockwise_from_north else first

@@ -94,10 +94,7 @@ class _Clock:
             yield self._judge(waiting, None)
 
     def _judge(self, rows: pl.DataFrame, after_s: float | None) -> pl.DataFrame:
-        """Judge rows before a time.
-
-        One far ahead of those around it is `isolated`, or it would make all that follow backwards.
-        """
+        """Judge rows before a time. One far ahead is `isolated`, or all after it would be late."""
         time_s = rows[self._time].to_numpy()
         before_s = np.concatenate([[self._before_s], time_s[:-1]])
         after_s = np.nan if after_s is None else after_s

@@ -160,10 +160,7 @@ class CanFrames:
         return sizes
 
     def take(self, bus: str | None, size: int) -> Iterator[tuple[FloatArray, Bytes]]:
-        """Yield times, and the first bytes of each payload, shape (frames, size), piece by piece.
-
-        Frames are those on a bus, or all; none of their payloads may be shorter.
-        """
+        """Yield times and first bytes of the payloads on a bus, or on all, piece by piece."""
         for some in self._pieces():
             sizes = some.sizes.astype(np.int64)
             starts, times_s = np.cumsum(sizes) - sizes, some.times_s

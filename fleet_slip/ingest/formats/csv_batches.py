@@ -95,10 +95,7 @@ class CsvSource:
         return [Channel(name) for name in names if names.count(name) == 1]
 
     def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
-        """Yield the named columns, and `EXTRA_FIELDS`. Raises `InputError`.
-
-        All are text, but for plain numbers.
-        """
+        """Yield the named columns as text or plain numbers, and `EXTRA_FIELDS`."""
         with self.file.open("rb") as stream:
             plain = _decompressed(stream)
             names = _csv_header(plain, self.file, self.csv_format)

@@ -201,10 +201,7 @@ class McapSource(ClockSource):
         ]
 
     def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
-        """Yield the rows of each topic that has one of the columns, topic by topic.
-
-        If columns are asked for topic by topic, the file is not read again for each.
-        """
+        """Yield the rows of each topic with one of the columns; all topics are read at once."""
         if not self._kept:
             self._keep({t: {f"{t}.{name}": name for name in of} for t, of in self._topics.items()})
         yield from super().batches(columns)

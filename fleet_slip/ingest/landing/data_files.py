@@ -93,10 +93,7 @@ class DataFiles:
         self._of_this.append(self._begin(name, rows))
 
     def end_file(self, digest: str, rest: Rows) -> None:
-        """End the file that is being read: the rest of its rows wait for those of others.
-
-        These are the rows of a small file, or the last of a large one.
-        """
+        """End the file that is being read: the rest of its rows wait for those of others."""
         if self._of_this or rest:
             self._digests.append(digest)
         self._of_one += self._of_this

@@ -186,10 +186,7 @@ AT_ONCE = 16
 
 
 class LocalCopies:
-    """Copies of some logs, which are fetched at once and last as long as this is entered.
-
-    Files of this machine are no copies.
-    """
+    """Copies of those logs that are on a store, fetched at once, as long as this is entered."""
 
     def __init__(self, logs: Iterable[Log]) -> None:
         """Take the logs."""
@@ -220,11 +217,7 @@ class LocalCopies:
 
     @contextmanager
     def of(self, log: Log) -> Iterator[Path]:
-        """Give the file to read a log from; what is raised meanwhile names the log.
-
-        Raises `InputError` for a log that is not there, or changed since it was found, and
-        `StorageError`.
-        """
+        """Give the file to read a log from, whose errors name the log. Raises `InputError`."""
         if isinstance(log, Path):
             require_inside(log)
             yield log

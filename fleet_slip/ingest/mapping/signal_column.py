@@ -192,10 +192,7 @@ def require_satellites(signals: Named[str, SignalColumn]) -> None:
 
 
 def count_range(name: str, column: SignalColumn) -> tuple[Signal, int, int]:
-    """Return the signal as which a column is checked, and its smallest and largest count.
-
-    A course may be told from 0 to a turn, or on from there; a component may be negative.
-    """
+    """Return the signal as which a column is checked, a course in any turn, and its counts."""
     if column.component:
         speed = catalogue()[SPEED]
         return speed, -speed.max_count, speed.max_count
