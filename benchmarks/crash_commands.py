@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from fleet_slip.delta.commits import NOTE, SEAL, seal_of
+from fleet_slip.delta.commits import CHECKSUM_KEY, NOTE, checksum_of_actions
 from fleet_slip.files.folder import TEMPORARY_PREFIX
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.resources import find_config
@@ -95,7 +95,7 @@ def _removed_long_ago(log: str) -> str:
     ):
         note = json.loads(info[NOTE])
         stated = [action for action in actions if action.keys() & {"add", "remove", "txn"}]
-        info[NOTE] = json.dumps({**note, SEAL: seal_of(note, stated)})
+        info[NOTE] = json.dumps({**note, CHECKSUM_KEY: checksum_of_actions(note, stated)})
     return "\n".join(map(json.dumps, actions))
 
 

@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 
 from benchmarks.flips_commands import Ended, command, in_a_child
 from fleet_slip.delta import Change
-from fleet_slip.delta.checkpoints import seal_checkpoints
+from fleet_slip.delta.checkpoints import keep_checksums
 from fleet_slip.files.documents import DocumentFolder
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.resources import CONFIG_VARIABLE, find_config, folder
@@ -149,7 +149,7 @@ def _add_what_is_rare(root: Path) -> None:
         delta = table.open_delta()
         assert delta is not None
         delta.create_checkpoint()
-        seal_checkpoints(table.folder)
+        keep_checksums(table.folder)
 
 
 def digest(root: Path) -> str:

@@ -107,7 +107,7 @@ def sizes(warehouse: Warehouse) -> dict[str, int]:
     parts = dict.fromkeys((CELLS, VEHICLES, DRIVES), 0)
     for file in grams.files:
         for part in parts:
-            parts[part] += len(grams.table.read_preface(file.path, part) or b"")
+            parts[part] += len(grams.table.read_leading_part(file.path, part) or b"")
     return {
         "gram_rows": grams.rows,
         "gram_files": len(grams.files),

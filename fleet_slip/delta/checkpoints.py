@@ -27,7 +27,7 @@ _CHECKPOINT = re.compile(r"(\d{20})\.checkpoint.*\.parquet")
 COMMIT_FILE = re.compile(r"\d{20}\.json")
 
 
-def seal_new_checkpoint(table: Folder, before: int | None) -> None:
+def keep_checksum_of_new(table: Folder, before: int | None) -> None:
     """Keep the checksums of the checkpoints of a table if one has come since version `before`.
 
     Also those of earlier ones that a killed job has left without. The commit has landed: what
@@ -38,19 +38,19 @@ def seal_new_checkpoint(table: Folder, before: int | None) -> None:
         latest = int(json.loads((table / LOG).read(LATEST))["version"])
     if latest is not None and (before is None or latest > before):
         with contextlib.suppress(StorageError, ConflictError):
-            seal_checkpoints(table)
+            keep_checksums(table)
 
 
-def seal_checkpoints(table: Folder, *, again: str | None = None) -> None:
+def keep_checksums(table: Folder, *, again: str | None = None) -> None:
     """Keep the checksums of all checkpoints that have none, and of the one written `again`."""
     documents = DocumentFolder(table / FOLDER)
-    known = sealed_checkpoints(table)
+    known = kept_checksums(table)
     for name in _checkpoints(table):
         if name not in known or name == again:
             documents.append({"checkpoint": name, "sha256": _digest(table, name)})
 
 
-def sealed_checkpoints(table: Folder) -> dict[str, str]:
+def kept_checksums(table: Folder) -> dict[str, str]:
     """Return the checksums that are kept, by checkpoint. Raises `StorageError` if damaged."""
     documents = DocumentFolder(table / FOLDER)
     kept = (documents.read(number).content for number in documents.numbers())
@@ -59,7 +59,7 @@ def sealed_checkpoints(table: Folder) -> dict[str, str]:
 
 def checkpoint_faults(table: Folder) -> Iterator[tuple[str, str]]:
     """Yield the damaged checkpoints of a table, in the order of their versions, and the problem."""
-    known = sealed_checkpoints(table)
+    known = kept_checksums(table)
     for name in _checkpoints(table):
         try:
             if name in known and _digest(table, name) != known[name]:
@@ -74,9 +74,9 @@ def newest_checkpoint(files: Iterable[StoredFile], version: int) -> StoredFile |
     return max(found, key=lambda file: file.name, default=None)
 
 
-def require_sealed(table: Folder, name: str) -> None:
+def require_kept_checksum(table: Folder, name: str) -> None:
     """Raise `StorageError` for a checkpoint that is not what its checksum tells, if one is kept."""
-    expected = sealed_checkpoints(table).get(name)
+    expected = kept_checksums(table).get(name)
     if expected is not None and _digest(table, name) != expected:
         raise StorageError(
             f"{table}/{LOG}/{name}: its bytes do not match the checksum kept of it: it was "
@@ -84,9 +84,9 @@ def require_sealed(table: Folder, name: str) -> None:
         )
 
 
-def unsealed_checkpoints(table: Folder) -> list[str]:
+def checkpoints_without_checksum(table: Folder) -> list[str]:
     """Return the checkpoints of which no checksum is kept."""
-    known = sealed_checkpoints(table)
+    known = kept_checksums(table)
     return [name for name in _checkpoints(table) if name not in known]
 
 

@@ -24,14 +24,14 @@ from fleet_slip.files.folder import Folder
 NOTE = "fleet_slip"
 """Key of the note in a commit's own metadata."""
 
-SEAL = "sha256"
+CHECKSUM_KEY = "sha256"
 """Key of the checksum in the note."""
 
 Action = Mapping[str, Any]
 """One action as the log has it: `{"add": {...}}`, `{"remove": {...}}`, `{"txn": {...}}`."""
 
 
-def seal_note(
+def checked_note(
     note: Mapping[str, Any],
     actions: Sequence[AddAction | RemoveAction],
     units: Mapping[str, int],
@@ -39,12 +39,12 @@ def seal_note(
     """Return a commit's note as text, with the checksum of itself, its actions and its units."""
     stated = [_added(a) if isinstance(a, AddAction) else _removed(a) for a in actions]
     stated += [{"txn": {"appId": name, "version": number}} for name, number in units.items()]
-    return json.dumps({**note, SEAL: seal_of(note, stated)})
+    return json.dumps({**note, CHECKSUM_KEY: checksum_of_actions(note, stated)})
 
 
-def seal_of(note: Mapping[str, Any], actions: Sequence[Action]) -> str:
+def checksum_of_actions(note: Mapping[str, Any], actions: Sequence[Action]) -> str:
     """Return the checksum of a note and of actions as the log has them, in any order."""
-    rest = {key: value for key, value in note.items() if key != SEAL}
+    rest = {key: value for key, value in note.items() if key != CHECKSUM_KEY}
     texts = [canonical_json({k: _stated(k, v) for k, v in action.items()}) for action in actions]
     text = "\n".join([canonical_json(rest), *sorted(texts)])
     return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
@@ -83,8 +83,8 @@ def _stated(kind: str, content: Any) -> Any:
     return {k: v for k, v in content.items() if v is not None and k not in added}
 
 
-_SEALED_KINDS = frozenset({"add", "remove", "txn"})
-_KINDS = _SEALED_KINDS | {"commitInfo", "metaData", "protocol"}
+_CHECKED_KINDS = frozenset({"add", "remove", "txn"})
+_KINDS = _CHECKED_KINDS | {"commitInfo", "metaData", "protocol"}
 
 
 @dataclass(frozen=True)
@@ -105,10 +105,10 @@ class Commit:
         return _object(self.info.get(NOTE, "{}"))
 
     @property
-    def sealed_actions(self) -> list[Action]:
+    def checked_actions(self) -> list[Action]:
         """The actions that the commit's checksum is of; overwriting, Delta removes by itself."""
         overwriting = _parameters(self).get("mode") == "Overwrite"
-        kinds = _SEALED_KINDS - {"remove"} if overwriting else _SEALED_KINDS
+        kinds = _CHECKED_KINDS - {"remove"} if overwriting else _CHECKED_KINDS
         return [action for action in self.actions if kinds & action.keys()]
 
 
@@ -129,21 +129,21 @@ def read_commit(log: Folder, name: str) -> Commit:
     return Commit(name, actions)
 
 
-def problem_of_commit(commit: Commit, must_be_sealed: bool) -> str | None:
+def problem_of_commit(commit: Commit, must_state_checksum: bool) -> str | None:
     """Return what is wrong with a commit, or None."""
-    stated = commit.note.get(SEAL)
-    if stated is not None and not _has_seal(commit, stated):
+    stated = commit.note.get(CHECKSUM_KEY)
+    if stated is not None and not _matches_checksum(commit, stated):
         return "its content does not match the checksum that it states"
-    if stated is None and must_be_sealed and commit.sealed_actions:
+    if stated is None and must_state_checksum and commit.checked_actions:
         return "states no checksum, although earlier commits do: damage, or another program's"
     if version_of(commit.name) == 0 and not _made_as_stated(commit):
         return "states in two ways what the table is"
     return None
 
 
-def _has_seal(commit: Commit, stated: Any) -> bool:
+def _matches_checksum(commit: Commit, stated: Any) -> bool:
     try:
-        return bool(stated == seal_of(commit.note, commit.sealed_actions))
+        return bool(stated == checksum_of_actions(commit.note, commit.checked_actions))
     except ValueError:  # a number that is none, which only damage puts there
         return False
 

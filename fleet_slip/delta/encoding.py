@@ -65,12 +65,12 @@ class Encoding:
         }
 
     def encode(
-        self, rows: pa.Table, omitted: Sequence[str] = (), preface: Sequence[bytes] = ()
+        self, rows: pa.Table, omitted: Sequence[str] = (), leading: Sequence[bytes] = ()
     ) -> Encoded:
         """Return the content of a file with these rows, without some of their columns.
 
-        A dictionary is stored as far as the rows have its values. The parts of a `preface` stand
-        before the rows; see `fleet_slip.delta.encoding`.
+        A dictionary is stored as far as the rows have its values. `leading` parts stand before the
+        rows.
         """
         kept = rows.drop_columns([name for name in omitted if name in rows.schema.names])
         # A dictionary that is shared with rows of another file, or of a drive that was forgotten,
@@ -84,8 +84,8 @@ class Encoding:
         with pq.ParquetWriter(
             sink, stored.schema, write_batch_size=WRITE_BATCH_ROWS, **self.options()
         ) as writer:
-            if preface:
-                sink.write(pack_preface(preface))
+            if leading:
+                sink.write(pack_leading_parts(leading))
             writer.write_table(stored, row_group_size=ROW_GROUP_ROWS)
         content = sink.getvalue()
         statistics = json.dumps(_statistics(rows, stored.column_names))
@@ -127,17 +127,17 @@ FIRST_BYTES = 2**17
 """So much of a file is read at first: with it, mostly, the part that is wanted."""
 
 
-def pack_preface(parts: Sequence[bytes]) -> bytes:
+def pack_leading_parts(parts: Sequence[bytes]) -> bytes:
     """Return what stands before the rows of a file that has some parts."""
     told = [_PART.pack(len(part), xxhash.xxh3_64_intdigest(part)) for part in parts]
     head = _HEAD.pack(_MAGIC, _LAYOUT, len(parts)) + b"".join(told)
     return head + _CHECKSUM.pack(xxhash.xxh3_64_intdigest(head)) + b"".join(parts)
 
 
-def read_preface(folder: Folder, path: str, wanted: int) -> bytes | None:
+def read_leading_part(folder: Folder, path: str, wanted: int) -> bytes | None:
     """Return one of the parts, from 0, before the rows of a file; None for a file without any.
 
-    A preface of a layout that is not known is none. Raises `StorageError` if the part is not what
+    Of a layout that is not known there are none. Raises `StorageError` if the part is not what
     was written.
     """
     content = folder.read(path, FIRST_BYTES)

@@ -13,11 +13,11 @@ from fleet_slip.delta.checkpoints import (
     COMMIT_FILE,
     LOG,
     newest_checkpoint,
-    require_sealed,
+    require_kept_checksum,
     version_of,
 )
 from fleet_slip.delta.commits import (
-    SEAL,
+    CHECKSUM_KEY,
     Commit,
     problem_of_commit,
     read_commit,
@@ -40,12 +40,12 @@ def require_sound_log(table: Folder, version: int) -> None:
     files = (table / LOG).files()
     checkpoint = newest_checkpoint(files, version)
     if checkpoint is not None:
-        require_sealed(table, checkpoint.name)
+        require_kept_checksum(table, checkpoint.name)
     after = version_of(checkpoint.name) if checkpoint else -1
     commits = [file for file in files if COMMIT_FILE.fullmatch(file.name)]
-    sealed = bool(commits) and _is_sealed(commits[0])
+    checked = bool(commits) and _states_checksum(commits[0])
     for file in commits:
-        if after < version_of(file.name) <= version and (problem := _problem(file, sealed)):
+        if after < version_of(file.name) <= version and (problem := _problem(file, checked)):
             raise StorageError(
                 f"{file}: {problem}. See what can be repaired with: fleet-slip verify --repair; or "
                 "restore the log from a backup."
@@ -53,18 +53,18 @@ def require_sound_log(table: Folder, version: int) -> None:
 
 
 @functools.lru_cache(maxsize=REMEMBERED_COMMITS)
-def _problem(file: StoredFile, must_be_sealed: bool) -> str | None:
+def _problem(file: StoredFile, must_state_checksum: bool) -> str | None:
     try:
-        return problem_of_commit(read_commit(file.folder, file.name), must_be_sealed)
+        return problem_of_commit(read_commit(file.folder, file.name), must_state_checksum)
     except ValueError as error:
         return str(error)
 
 
 @functools.lru_cache(maxsize=REMEMBERED_COMMITS)
-def _is_sealed(file: StoredFile) -> bool:
+def _states_checksum(file: StoredFile) -> bool:
     """Whether a commit states its checksum, after which all later ones do."""
     try:
-        return SEAL in read_commit(file.folder, file.name).note
+        return CHECKSUM_KEY in read_commit(file.folder, file.name).note
     except ValueError:
         return False
 
@@ -74,7 +74,7 @@ def find_commit_faults(snapshot: Snapshot) -> Iterator[tuple[str, str]]:
     if snapshot.version is None:
         return
     commits = []
-    must_be_sealed = False
+    must_state_checksum = False
     log, last = snapshot.table.folder / LOG, f"{snapshot.version:020}.json"
     there = {name for name in log.names() if COMMIT_FILE.fullmatch(name) and name <= last}
     # Earlier ones were cleaned away.
@@ -88,8 +88,8 @@ def find_commit_faults(snapshot: Snapshot) -> Iterator[tuple[str, str]]:
         except ValueError as error:
             yield name, str(error)
             continue
-        must_be_sealed |= SEAL in commit.note
-        if problem := problem_of_commit(commit, must_be_sealed):
+        must_state_checksum |= CHECKSUM_KEY in commit.note
+        if problem := problem_of_commit(commit, must_state_checksum):
             yield name, problem
         commits.append(commit)
     if len(commits) == snapshot.version + 1:

@@ -12,8 +12,8 @@ from deltalake import CommitProperties, DeltaTable, Transaction
 from deltalake.exceptions import CommitFailedError
 
 from fleet_slip.delta.change import Change, TableFile, active_files, have_same_columns, read_actions
-from fleet_slip.delta.checkpoints import seal_new_checkpoint
-from fleet_slip.delta.commits import NOTE, read_landed_units, seal_note
+from fleet_slip.delta.checkpoints import keep_checksum_of_new
+from fleet_slip.delta.commits import NOTE, checked_note, read_landed_units
 from fleet_slip.delta.schema import require_writable
 from fleet_slip.errors import ConflictError, StorageError
 from fleet_slip.files.storage_errors import storage_errors
@@ -141,7 +141,7 @@ class Snapshot:
         a file; and `StorageError` if the log cannot be written.
         """
         table, actions = self.table, change.actions()
-        note = seal_note(change.note, actions, {u.name: u.version for u in change.units})
+        note = checked_note(change.note, actions, {u.name: u.version for u in change.units})
         with storage_errors(table.folder):
             try:
                 delta = self.delta or table.create()
@@ -159,4 +159,4 @@ class Snapshot:
             except CommitFailedError as error:
                 raise table.conflict_of(error) from None
             table.folder.settle_commits(self.version)
-            seal_new_checkpoint(table.folder, self.version)
+            keep_checksum_of_new(table.folder, self.version)

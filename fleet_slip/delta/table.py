@@ -12,9 +12,9 @@ from deltalake.exceptions import CommitFailedError, TableNotFoundError
 from deltalake.transaction import AddAction
 
 from fleet_slip.delta.change import TableFile, addition, columns_in
-from fleet_slip.delta.commits import NOTE, seal_note
+from fleet_slip.delta.commits import NOTE, checked_note
 from fleet_slip.delta.conflicts import is_conflict, retry_conflicts
-from fleet_slip.delta.encoding import Encoded, Encoding, Names, read_names, read_preface
+from fleet_slip.delta.encoding import Encoded, Encoding, Names, read_leading_part, read_names
 from fleet_slip.delta.log_check import require_sound_log
 from fleet_slip.delta.schema import require_readable, require_writable
 from fleet_slip.delta.snapshot import Snapshot
@@ -97,9 +97,9 @@ class Table:
         with storage_errors(f"{self.folder}/{path}"), self.folder.open(path) as file:
             return pq.read_metadata(file)
 
-    def read_preface(self, path: str, part: int) -> bytes | None:
+    def read_leading_part(self, path: str, part: int) -> bytes | None:
         """Return a part of what stands before a file's rows; see `fleet_slip.delta.encoding`."""
-        return read_preface(self.folder, path, part)
+        return read_leading_part(self.folder, path, part)
 
     def read_names(self, path: str) -> dict[str, Names]:
         """Return the names in the dictionaries of one of the table's files, by column."""
@@ -111,10 +111,10 @@ class Table:
         return any(names.unused for names in self.read_names(path).values())
 
     def write_file(
-        self, name: str, rows: pa.Table, day: date | None = None, preface: Sequence[bytes] = ()
+        self, name: str, rows: pa.Table, day: date | None = None, leading: Sequence[bytes] = ()
     ) -> AddAction:
         """Write rows to the file NAME-CHECKSUMS.parquet, durably; see `put`."""
-        return self.put(name, self.encode(rows, preface), day)
+        return self.put(name, self.encode(rows, leading), day)
 
     def put(self, name: str, encoded: Encoded, day: date | None = None) -> AddAction:
         """Write a file's content to the file NAME-CHECKSUMS.parquet, durably.
@@ -148,9 +148,9 @@ class Table:
         self.folder.put(file.path, encoded.content)
         return True
 
-    def encode(self, rows: pa.Table, preface: Sequence[bytes] = ()) -> Encoded:
+    def encode(self, rows: pa.Table, leading: Sequence[bytes] = ()) -> Encoded:
         """Return the content of a file with these rows."""
-        return self.encoding.encode(rows, self.partition_by, preface)
+        return self.encoding.encode(rows, self.partition_by, leading)
 
     def require_writable(self, columns: Iterable[str]) -> None:
         """Raise `RefusedError` if rows with some of the optional columns cannot be committed."""
@@ -170,22 +170,20 @@ class Table:
         metadata. So who commits after this has looked at the table, and at whatever it looks at
         after that, since now. Raises `ConflictError` if others keep changing the table.
         """
-        retry_conflicts(self._fence_once)
+        note = CommitProperties(custom_metadata={NOTE: checked_note({"job": "fence"}, [], {})})
 
-    def _fence_once(self) -> None:
-        with storage_errors(self.folder):
-            try:
-                delta = self.open_delta() or self.create()
-                delta.alter.set_table_properties(
-                    {FENCE: uuid.uuid4().hex},
-                    raise_if_not_exists=False,
-                    commit_properties=CommitProperties(
-                        custom_metadata={NOTE: seal_note({"job": "fence"}, [], {})}
-                    ),
-                )
-            except CommitFailedError as error:
-                raise self.conflict_of(error) from None
-            self.folder.settle_commits(delta.version() - 1)
+        def attempt() -> None:
+            with storage_errors(self.folder):
+                try:
+                    delta = self.open_delta() or self.create()
+                    delta.alter.set_table_properties(
+                        {FENCE: uuid.uuid4().hex}, raise_if_not_exists=False, commit_properties=note
+                    )
+                except CommitFailedError as error:
+                    raise self.conflict_of(error) from None
+                self.folder.settle_commits(delta.version() - 1)
+
+        retry_conflicts(attempt)
 
     def conflict_of(self, error: CommitFailedError) -> Exception:
         """Return what a failed commit is to be raised as: a conflict, or the fault that it is."""
@@ -210,6 +208,6 @@ class Table:
             description=self.description,
             configuration=ALL_STATISTICS,
             storage_options=self.folder.delta_options,
-            commit_properties=CommitProperties(custom_metadata={NOTE: seal_note({}, [], {})}),
+            commit_properties=CommitProperties(custom_metadata={NOTE: checked_note({}, [], {})}),
         )
         return (self.open_delta(version=0) if delta.version() else delta) or delta

@@ -11,7 +11,7 @@ import functools
 import hashlib
 import os
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -90,9 +90,11 @@ def _check_once(path: str, _size: int, _modified_ns: int, _inode: int) -> None:
 
 
 def _require(path: str, chunks: "Iterable[Any]", where: object) -> None:
-    hashed, expected = _hash_of(path)
+    fast = _FAST.search(path)
+    expected = fast[1] if fast else checksum_in(path)
     if expected is None:
         return
+    hashed: _Hash = xxhash.xxh3_64() if fast else hashlib.sha256()
     for chunk in chunks:
         hashed.update(chunk)
     if hashed.hexdigest()[: len(expected)] != expected:
@@ -100,10 +102,3 @@ def _require(path: str, chunks: "Iterable[Any]", where: object) -> None:
             f"{where}: its bytes do not match the checksum in its name: it was damaged. See what "
             "can be repaired with: fleet-slip verify --repair; or restore it from a backup."
         )
-
-
-def _hash_of(path: str) -> tuple[_Hash, str | None]:
-    """Return how to compute the checksum of a file, and what it must be."""
-    fast = _FAST.search(path)
-    make: Callable[[], _Hash] = xxhash.xxh3_64 if fast else hashlib.sha256
-    return make(), fast[1] if fast else checksum_in(path)

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.signals import COUNT_MAX
 from fleet_slip.delta import Snapshot, Table, TableFile
-from fleet_slip.delta.commits import NOTE, seal_note
+from fleet_slip.delta.commits import NOTE, checked_note
 from fleet_slip.delta.schema import SCALE, TARGET, Evolution, compare_schemas, scales_of
 from fleet_slip.delta.table import ALL_STATISTICS
 from fleet_slip.errors import ConflictError, RefusedError, StorageError
@@ -155,7 +155,7 @@ def _rescale(warehouse: Warehouse, found: Evolution, progress: Progress) -> tupl
                 schema=table.schema,
                 partition_by=list(table.partition_by),
                 commit_properties=CommitProperties(
-                    custom_metadata={NOTE: seal_note({"job": "migrate"}, actions, {})}
+                    custom_metadata={NOTE: checked_note({"job": "migrate"}, actions, {})}
                 ),
             )
     except (ConflictError, RefusedError):

@@ -14,9 +14,9 @@ import pyarrow.compute as pc
 from fleet_slip.delta import Change, TableFile, checksum_in, checksum_of, retry_conflicts
 from fleet_slip.delta.checkpoints import (
     checkpoint_faults,
+    keep_checksums,
     list_dispensable,
     remove_checkpoint,
-    seal_checkpoints,
 )
 from fleet_slip.errors import FleetSlipError, StorageError
 from fleet_slip.files.storage_errors import storage_errors
@@ -60,7 +60,7 @@ def _sum_up_again(warehouse: Warehouse) -> list[str]:
             if delta is not None:
                 with storage_errors(table.folder):
                     delta.create_checkpoint()
-                seal_checkpoints(table.folder, again=f"{delta.version():020}.checkpoint.parquet")
+                keep_checksums(table.folder, again=f"{delta.version():020}.checkpoint.parquet")
             rebuilt.append(f"{table.folder.name}/_delta_log/{name}")
     return rebuilt
 

@@ -14,14 +14,14 @@ from functools import partial
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.delta import Snapshot, Table, TableFile, on_newest
 from fleet_slip.delta.checkpoints import FOLDER as CHECKSUMS
-from fleet_slip.delta.checkpoints import checkpoint_faults, unsealed_checkpoints
+from fleet_slip.delta.checkpoints import checkpoint_faults, checkpoints_without_checksum
 from fleet_slip.delta.log_check import find_commit_faults
 from fleet_slip.errors import DataError, FleetSlipError, QuestionError, RefusedError, StorageError
 from fleet_slip.files.documents import DocumentFolder
 from fleet_slip.files.folder import Folder, StoredFile
 from fleet_slip.grams.rows.backlog import named_files
 from fleet_slip.maintenance.vacuum import find_temporary_files, find_unreferenced
-from fleet_slip.maintenance.verify_files import Damage, Verification, verify_files, verify_names
+from fleet_slip.maintenance.verify_files import Verification, verify_files, verify_names
 from fleet_slip.maintenance.verify_grams import SoundFiles, verify_drives, verify_grams
 from fleet_slip.models.trained_drives import read_trained_drives
 from fleet_slip.models.versions import Registry
@@ -36,11 +36,11 @@ def verify_documents(root: Folder, report: Verification) -> None:
     for folder in _document_folders(root):
         report.documents += len(folder.numbers())
         for file, problem in folder.faults().items():
-            report.findings.append(Damage("document", file.removeprefix(f"{root}/"), problem))
+            report.note("document", file.removeprefix(f"{root}/"), problem)
     for path, problem in find_missing_documents(root):
-        report.findings.append(Damage("document", path, problem))
+        report.note("document", path, problem)
     for path, problem in find_changed_lines(root):
-        report.findings.append(Damage("document", path, problem))
+        report.note("document", path, problem)
 
 
 def _document_folders(root: Folder) -> list[DocumentFolder]:
@@ -65,11 +65,11 @@ def verify_models(
                 manifest = registry.load(name, number).manifest
                 read_trained_drives(registry.folder_of(name), manifest)
             except RefusedError as error:  # its signature
-                report.findings.append(Damage("model", f"{name}@{number}", str(error)))
+                report.note("model", f"{name}@{number}", str(error))
                 continue
             except (StorageError, DataError, QuestionError) as error:
                 if "drives-" in str(error):  # anything else is told as a document
-                    report.findings.append(Damage("model", f"{name}@{number}", str(error)))
+                    report.note("model", f"{name}@{number}", str(error))
                 continue
             trained = manifest.trained_on
             if manifest.imported_from is not None:  # the tables that made it are elsewhere
@@ -81,7 +81,7 @@ def verify_models(
                 latest = snapshots[table].version if table in snapshots else None
                 if latest is None or version > latest:
                     problem = f"was made of version {version} of {table}, which does not exist"
-                    report.findings.append(Damage("model", f"{name}@{number}", problem))
+                    report.note("model", f"{name}@{number}", problem)
         try:
             aliases = registry.history(name).aliases()
         except (FleetSlipError, ValueError):
@@ -89,7 +89,7 @@ def verify_models(
         for alias, version in aliases.items():
             if version not in numbers:
                 problem = f"points at version {version}, which does not exist"
-                report.findings.append(Damage("model", f"{name}@{alias}", problem))
+                report.note("model", f"{name}@{alias}", problem)
 
 
 def verify(
@@ -144,12 +144,12 @@ def _open_tables(warehouse: Warehouse, report: Verification) -> dict[str, Snapsh
             snapshot = table.unchecked_snapshot()
             _ = snapshot.files
         except FleetSlipError as error:
-            report.findings.append(Damage("log", table.folder.name, str(error)))
+            report.note("log", table.folder.name, str(error))
         else:
             found[table.folder.name] = snapshot
             for file, problem in find_commit_faults(snapshot):
                 path = f"{table.folder.name}/_delta_log/{file}"
-                report.findings.append(Damage("log", path, problem))
+                report.note("log", path, problem)
     return found
 
 
@@ -160,13 +160,13 @@ def _verify_checkpoints(table: Table, report: Verification) -> None:
     if faults := documents.faults():
         for file, problem in faults.items():
             where = f"{name}/{CHECKSUMS}/{file.rpartition('/')[2]}"
-            report.findings.append(Damage("document", where, problem))
+            report.note("document", where, problem)
         return
     for checkpoint, problem in checkpoint_faults(table.folder):
-        report.findings.append(Damage("log", f"{name}/_delta_log/{checkpoint}", problem))
-    for checkpoint in unsealed_checkpoints(table.folder):
+        report.note("log", f"{name}/_delta_log/{checkpoint}", problem)
+    for checkpoint in checkpoints_without_checksum(table.folder):
         problem = "no checksum was kept of this checkpoint; the next one comes with both"
-        report.findings.append(Damage("backlog", f"{name}/_delta_log/{checkpoint}", problem))
+        report.note("backlog", f"{name}/_delta_log/{checkpoint}", problem)
 
 
 def _report_missing_logs(
@@ -179,7 +179,7 @@ def _report_missing_logs(
     damaged = frozenset(file.path for file in grams.files).difference(file.path for file in sound)
     if gone := named_files(replace(grams, without=damaged), PLAIN)[1]:
         problem = f"the table is gone that the Gram rows of {number_of(len(gone), 'file')} are of"
-        report.findings.append(Damage("log", "logs", problem))
+        report.note("log", "logs", problem)
 
 
 def _list_unreferenced(
@@ -202,4 +202,4 @@ def _list_unreferenced(
 
 def _remark(warehouse: Warehouse, file: StoredFile, problem: str, report: Verification) -> None:
     where = str(file).removeprefix(f"{warehouse.root}/")
-    report.findings.append(Damage("unreferenced", where, problem))
+    report.note("unreferenced", where, problem)

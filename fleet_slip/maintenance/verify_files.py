@@ -5,7 +5,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -21,6 +21,19 @@ from fleet_slip.warehouse.cleared_cars import ClearedCars
 from fleet_slip.warehouse.tables import Warehouse
 from fleet_slip.words import number_of
 
+DamageKind: TypeAlias = Literal[
+    "file",
+    "drive",
+    "gram",
+    "document",
+    "model",
+    "log",
+    "name",
+    "unreferenced",
+    "backlog",
+    "unchecked",
+]
+
 
 @dataclass(frozen=True)
 class Damage:
@@ -34,18 +47,7 @@ class Damage:
         problem: what is wrong.
     """
 
-    kind: Literal[
-        "file",
-        "drive",
-        "gram",
-        "document",
-        "model",
-        "log",
-        "name",
-        "unreferenced",
-        "backlog",
-        "unchecked",
-    ]
+    kind: DamageKind
     path: str
     problem: str
 
@@ -68,6 +70,10 @@ class Verification:
     """Messages of cars whose signature was kept."""
     signatures_checked: int = 0
     findings: list[Damage] = field(default_factory=list)
+
+    def note(self, kind: DamageKind, path: str, problem: str) -> None:
+        """Add a finding."""
+        self.findings.append(Damage(kind, path, problem))
 
     @property
     def damage(self) -> list[Damage]:
@@ -106,7 +112,7 @@ def verify_files(
     for one in read:
         if one.problem:
             told = f"{one.problem} (it held {one.file.rows:,} rows)"
-            report.findings.append(Damage("file", f"{table.folder.name}/{one.file.path}", told))
+            report.note("file", f"{table.folder.name}/{one.file.path}", told)
     report.files += len(snapshot.files)
     report.size_bytes += snapshot.size_bytes
     report.rows += snapshot.rows if table.folder.name == "logs" else 0
@@ -198,12 +204,12 @@ def verify_names(
                 )
             else:
                 continue
-            report.findings.append(Damage("name", f"{table}/{one.file.path}", problem))
+            report.note("name", f"{table}/{one.file.path}", problem)
         if many := sum(bool(_unused(one)) for one in files):
             problem = (
                 f"{number_of(many, 'file')} with names that no row has; run: fleet-slip migrate"
             )
-            report.findings.append(Damage("backlog", table, problem))
+            report.note("backlog", table, problem)
 
 
 def _all(read: Mapping[str, Sequence[ReadFile]]) -> Iterator[ReadFile]:

@@ -19,7 +19,7 @@ from fleet_slip.grams.rows.check_grams import (
 )
 from fleet_slip.grams.rows.gram_files import is_of_received
 from fleet_slip.grams.rows.rollup import is_rollup_of, read_rollup
-from fleet_slip.maintenance.verify_files import Damage, Verification
+from fleet_slip.maintenance.verify_files import Verification
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.database import database_errors, open_database
 from fleet_slip.warehouse.tables import Warehouse
@@ -44,7 +44,7 @@ def verify_drives(warehouse: Warehouse, files: Sequence[TableFile], report: Veri
             f"{n:,} rows in {number_of(in_files, 'file')} with {number_of(beginnings, 'row')} of "
             f"tick 0; one is {file}"
         )
-        report.findings.append(Damage("drive", drive, problem))
+        report.note("drive", drive, problem)
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def verify_grams(
         for file, computed in run_tasks(executor, task, files, _name_task):
             for drive in differing_drives(stored[file.path], computed):
                 problem = f"the stored Gram row of drive {drive} is not that of its rows"
-                report.findings.append(Damage("gram", f"logs/{file.path}", problem))
+                report.note("gram", f"logs/{file.path}", problem)
             report.log_files_recomputed += 1
     missing = len(sound.logs) - len(covered)
     stale = where.keys() - set(sound.active)
@@ -92,7 +92,7 @@ def verify_grams(
             f"no Gram rows of {number_of(missing, 'log file')}, Gram rows of {len(stale)} that "
             "are gone"
         )
-        report.findings.append(Damage("backlog", "grams", f"{problem}; run: fleet-slip gram"))
+        report.note("backlog", "grams", f"{problem}; run: fleet-slip gram")
 
 
 def _verify_unique(warehouse: Warehouse, grams: Sequence[TableFile], report: Verification) -> None:
@@ -103,7 +103,7 @@ def _verify_unique(warehouse: Warehouse, grams: Sequence[TableFile], report: Ver
         twice = database.execute(read_sql("jobs", "verify_grams.sql")).fetchall()
     for identity, file, drive, n in twice:
         problem = f"the Gram row {identity} of drive {drive} stands {n} times"
-        report.findings.append(Damage("gram", f"logs/{file}", problem))
+        report.note("gram", f"logs/{file}", problem)
 
 
 def _verify_each(warehouse: Warehouse, grams: Sequence[TableFile], report: Verification) -> None:
@@ -112,11 +112,11 @@ def _verify_each(warehouse: Warehouse, grams: Sequence[TableFile], report: Verif
         rows = warehouse.grams.read(file.path)
         for drive, problem in find_unsound(rows):
             told = f"the Gram row that a car sent of drive {drive} {problem}"
-            report.findings.append(Damage("gram", f"grams/{file.path}", told))
+            report.note("gram", f"grams/{file.path}", told)
         rollup = read_rollup(warehouse.grams, file.path)
         if rollup and not is_rollup_of(rollup, rows):
             told = "its rollup is not that of its Gram rows"
-            report.findings.append(Damage("gram", f"grams/{file.path}", told))
+            report.note("gram", f"grams/{file.path}", told)
 
 
 def _verify_signatures(
@@ -132,9 +132,9 @@ def _verify_signatures(
         report.signatures_checked += found.checked
         for drive, problem in found.forged:
             told = f"the Gram row that a car sent of drive {drive} {problem}"
-            report.findings.append(Damage("gram", f"grams/{file.path}", told))
+            report.note("gram", f"grams/{file.path}", told)
         for problem in found.unchecked:
-            report.findings.append(Damage("unchecked", f"grams/{file.path}", problem))
+            report.note("unchecked", f"grams/{file.path}", problem)
 
 
 def _compute_grams(warehouse: Warehouse, file: TableFile) -> DriveGrams:

@@ -25,7 +25,13 @@ from typing import Any
 
 from fleet_slip.errors import HIDDEN, StorageError, hide_passwords
 from fleet_slip.files.folder import Folder
-from fleet_slip.runs.records import ANCHORS, FOLDER, newest_documents, process_began, write_line
+from fleet_slip.runs.records import (
+    FOLDER,
+    NEWEST_DOCUMENTS,
+    newest_documents,
+    process_began,
+    write_line,
+)
 
 LOGGER = logging.getLogger("fleet_slip")
 INTERRUPTED = 130
@@ -150,7 +156,7 @@ def recording(root: Folder, command: str, arguments: Sequence[str]) -> Iterator[
         log_event("run ended", **{key: end[key] for key in ("outcome", "exit_code", "seconds")})
         if _exists(root):
             with contextlib.suppress(StorageError):
-                end[ANCHORS] = newest_documents(root)
+                end[NEWEST_DOCUMENTS] = newest_documents(root)
             _append(root, file, *([] if told else [run.beginning()]), end)
         _current.reset(token)
 

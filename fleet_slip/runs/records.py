@@ -6,7 +6,7 @@ The checksum is of the line's bytes before it. So a line that was changed is tol
 full disk or a power cut tore, which lacks its end and is skipped, and from one of an earlier
 version, which has no checksum. Lines are no chain: processes add them at once, without a lock.
 
-Every run keeps the number and the checksum of the newest document of each folder, its anchors.
+Every run keeps the number and the checksum of the newest document of each folder.
 Numbered documents tell a gap among them, but not that the last ones are gone: a version, a move of
 an alias, an entry of `forgotten/`. Whoever deletes one would have to rewrite the records of all
 runs since as well. Who can do that, and owns every copy of the history, leaves no trace:
@@ -45,8 +45,8 @@ def process_began(number: int) -> str | None:
 
 
 FOLDER = "runs"
-ANCHORS = "documents"
-"""Name of the anchors in the record of a run (`fleet_slip.runs.records`)."""
+NEWEST_DOCUMENTS = "documents"
+"""Name of the newest documents in the record of a run."""
 
 RECORD_COLUMNS = {
     "run_id": "VARCHAR",
@@ -70,7 +70,7 @@ _DOCUMENT_FOLDER = re.compile(r"forgotten|models/(?!\.\./)[^/]*/(?:versions|hist
 
 _DIGITS = 32
 _END = b',"sha256":"' + b"0" * _DIGITS + b'"}'
-_SEALED = re.compile(rb'(.*),"sha256":"([0-9a-f]{%d})"\}' % _DIGITS)
+_WITH_CHECKSUM = re.compile(rb'(.*),"sha256":"([0-9a-f]{%d})"\}' % _DIGITS)
 
 
 def write_line(record: Mapping[str, Any]) -> bytes:
@@ -119,7 +119,7 @@ def _is_torn(line: bytes) -> bool:
 
 
 def _ends(line: bytes) -> bool:
-    """Whether a line ends as sealed lines do, but for one byte."""
+    """Whether a line ends as a line with a checksum does, but for one byte."""
     there = line[-len(_END) :]
     if len(there) < len(_END):
         return False
@@ -129,11 +129,11 @@ def _ends(line: bytes) -> bool:
 
 
 def _is_changed(line: bytes) -> bool:
-    if found := _SEALED.fullmatch(line):
+    if found := _WITH_CHECKSUM.fullmatch(line):
         return _checksum(found[1]) != found[2]
     record = _parsed(line)
     # An earlier version wrote no checksum, but no other keys either.
-    return record is None or not record.keys() <= {*RECORD_COLUMNS, ANCHORS}
+    return record is None or not record.keys() <= {*RECORD_COLUMNS, NEWEST_DOCUMENTS}
 
 
 def _parsed(line: bytes) -> dict[str, Any] | None:
@@ -148,12 +148,12 @@ def _checksum(body: bytes) -> bytes:
     return hashlib.sha256(body).hexdigest()[:_DIGITS].encode()
 
 
-Anchors = Mapping[str, tuple[int, str]]
+NewestDocuments = Mapping[str, tuple[int, str]]
 """Number and SHA-256 of the newest document of each folder, by its path below the data root."""
 
 
 def newest_documents(root: Folder) -> dict[str, tuple[int, str]]:
-    """Return the anchors as they are now; nothing of a folder that cannot be read."""
+    """Return the newest documents as they are now; nothing of a folder that cannot be read."""
     found = {}
     for path in _document_folders(root):
         documents = DocumentFolder(root / path)
@@ -165,7 +165,7 @@ def newest_documents(root: Folder) -> dict[str, tuple[int, str]]:
 
 def find_missing_documents(root: Folder, since: str = "") -> Iterator[tuple[str, str]]:
     """Yield the folders that lost documents that a run since YYYY-MM had seen, and what."""
-    for path, (number, sha256) in sorted(_kept_anchors(root, since).items()):
+    for path, (number, sha256) in sorted(_newest_seen(root, since).items()):
         documents = DocumentFolder(root / path)
         newest = max(documents.numbers(), default=0)
         if newest < number:
@@ -176,25 +176,25 @@ def find_missing_documents(root: Folder, since: str = "") -> Iterator[tuple[str,
                 yield path, f"{number}.json is not the document that a run had seen"
 
 
-def _kept_anchors(root: Folder, since: str) -> dict[str, tuple[int, str]]:
+def _newest_seen(root: Folder, since: str) -> dict[str, tuple[int, str]]:
     folder = root / FOLDER
     paths = [f.path for f in folder.files() if f.path.endswith(".jsonl") and f.path >= since]
     kept: dict[str, tuple[int, str]] = {}
     for content in folder.read_many(paths):
         for line in (content or b"").splitlines():
-            for path, number, sha256 in _anchors_in(line):
+            for path, number, sha256 in _newest_in(line):
                 if number >= kept.get(path, (0, ""))[0]:
                     kept[path] = (number, sha256)
     return kept
 
 
-def _anchors_in(line: bytes) -> Iterator[tuple[str, int, str]]:
-    """Yield the anchors of a record; none of a line that is torn, changed, or without them."""
+def _newest_in(line: bytes) -> Iterator[tuple[str, int, str]]:
+    """Yield the newest documents that a line tells, none if it is torn, changed or without them."""
     if not is_intact(line):
         return
     try:
         record: Any = json.loads(line)
-        found = record.get(ANCHORS) or {}
+        found = record.get(NEWEST_DOCUMENTS) or {}
         for path, (number, sha256) in found.items():
             if _DOCUMENT_FOLDER.fullmatch(str(path)):
                 yield str(path), int(number), str(sha256)

@@ -8,7 +8,11 @@ import pytest
 from deltalake import DeltaTable
 
 from fleet_slip.delta import Change, Unit
-from fleet_slip.delta.checkpoints import checkpoint_faults, sealed_checkpoints, unsealed_checkpoints
+from fleet_slip.delta.checkpoints import (
+    checkpoint_faults,
+    checkpoints_without_checksum,
+    kept_checksums,
+)
 from fleet_slip.maintenance.repair import repair
 from fleet_slip.maintenance.verify import verify
 from fleet_slip.warehouse.tables import Warehouse
@@ -51,7 +55,7 @@ def damage(warehouse: Warehouse) -> set[str]:
 
 
 def test_every_flipped_bit_is_found_without_the_commits(warehouse: Warehouse, log: Path) -> None:
-    assert sealed_checkpoints(warehouse.logs.folder).keys() == {checkpoint_in(log).name}
+    assert kept_checksums(warehouse.logs.folder).keys() == {checkpoint_in(log).name}
     warehouse.logs.snapshot().commit(Change(units=[Unit("later", 1)]))
     clean(log)
     assert not damage(warehouse)
@@ -85,7 +89,7 @@ def test_a_checkpoint_of_another_program_is_told_and_sealed_with_the_next(
     land(warehouse, "one", log_rows("one", COUNTS))
     folder = warehouse.logs.folder
     DeltaTable(folder.uri).create_checkpoint()
-    (name,) = unsealed_checkpoints(folder)
+    (name,) = checkpoints_without_checksum(folder)
     told = {finding.path for finding in verify(warehouse).findings}
     assert f"logs/_delta_log/{name}" in told
     assert not damage(warehouse)
@@ -93,4 +97,4 @@ def test_a_checkpoint_of_another_program_is_told_and_sealed_with_the_next(
     warehouse.logs.snapshot().commit(Change(units=[Unit("a", 1)]))
     DeltaTable(folder.uri).create_checkpoint()
     before.commit(Change(units=[Unit("b", 1)]))
-    assert unsealed_checkpoints(folder) == []
+    assert checkpoints_without_checksum(folder) == []

@@ -5,7 +5,7 @@ import shlex
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Self
+from typing import Any, Self
 
 import duckdb
 import pyarrow as pa
@@ -74,8 +74,7 @@ class OpenedGrams:
             return {}
         sql = f"{condition.sql} AND ({' OR '.join(some)})"
         statement = read_sql("jobs", "count_revoked.sql").format(condition=sql)
-        with asking(self.database, condition):
-            found: dict[str, int] = dict(self.database.execute(statement).fetchall())
+        found: dict[str, int] = dict(self._rows(statement, condition))
         return found if tells_single_cars() or not found else {UNNAMED: sum(found.values())}
 
     def origin(self, condition: Condition) -> CohortOrigin:
@@ -100,15 +99,16 @@ class OpenedGrams:
         """Return how many drives of a cohort have no Gram rows, since their cars sent no log."""
         if self.identity == features().identity(PLAIN):
             return 0
-        statement = self.statement("count_without_log.sql", condition)
-        with asking(self.database, condition):
-            return int(self.database.execute(statement).fetchall()[0][0])
+        [(count,)] = self._rows(self.statement("count_without_log.sql", condition), condition)
+        return int(count)
 
     def files(self, condition: Condition) -> set[str]:
         """Return the log files that have a drive of a cohort."""
-        statement = self.statement("cohort_files.sql", condition)
+        return {f for (f,) in self._rows(self.statement("cohort_files.sql", condition), condition)}
+
+    def _rows(self, statement: str, condition: Condition) -> list[tuple[Any, ...]]:
         with asking(self.database, condition):
-            return {file for (file,) in self.database.sql(statement).fetchall()}
+            return self.database.execute(statement).fetchall()
 
     def course_delays(self, condition: Condition) -> Iterator[tuple[str, tuple[int, int]]]:
         """Yield cars with a course, and the least and largest delay of their Gram rows in ticks."""

@@ -59,7 +59,7 @@ def _write_files(warehouse: Warehouse, rows: pa.Table) -> list[AddAction]:
             empty = [name for name in warehouse.grams.optional if _is_empty(part, name)]
             part = part.drop_columns(empty)
             name = f"{prefix}{identity}"
-            actions.append(warehouse.grams.write_file(name, part, preface=make_rollup(part)))
+            actions.append(warehouse.grams.write_file(name, part, leading=make_rollup(part)))
     return actions
 
 

@@ -130,7 +130,7 @@ class Rollup:
         return self._hashes(DRIVES, cells["first_drive"], cells["gram_rows"])
 
     def _hashes(self, part: int, first: pa.ChunkedArray, many: pa.ChunkedArray) -> Hashes:
-        content = self.table.read_preface(self.path, part) or b""
+        content = self.table.read_leading_part(self.path, part) or b""
         every = np.frombuffer(content, dtype="<u8").astype(np.uint64)
         begin, size = first.to_numpy(), many.to_numpy()
         if size.sum() == len(every):
@@ -143,7 +143,7 @@ def read_rollup(table: Table, path: str) -> Rollup | None:
 
     Raises `StorageError` if it is damaged.
     """
-    content = table.read_preface(path, CELLS)
+    content = table.read_leading_part(path, CELLS)
     if content is None:
         return None
     cells, about = _unpacked(content)
@@ -162,7 +162,7 @@ def is_rollup_of(rollup: Rollup, rows: pa.Table) -> bool:
     if not parts:
         return False
     cells, about = _unpacked(parts[CELLS])
-    stored = [rollup.table.read_preface(rollup.path, part) for part in (VEHICLES, DRIVES)]
+    stored = [rollup.table.read_leading_part(rollup.path, part) for part in (VEHICLES, DRIVES)]
     same = cells.equals(rollup.cells.drop_columns(["first_car", "first_drive"]))
     known = {"feature_set": rollup.feature_set, "files": sorted(rollup.files)}
     return same and about == {"layout": LAYOUT, **known} and parts[VEHICLES:] == stored

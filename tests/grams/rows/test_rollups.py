@@ -236,7 +236,7 @@ def test_a_rollup_of_other_rows_is_found(tmp_path: Path) -> None:
     grams = fleet.warehouse.grams.snapshot()
     one, other = grams.files
     foreign = make_rollup(grams.table.read(other.path))
-    action = grams.table.write_file("received-signals", grams.table.read(one.path), preface=foreign)
+    action = grams.table.write_file("received-signals", grams.table.read(one.path), leading=foreign)
     grams.commit(Change(add=[action], remove=[one]))
     (found,) = fleet.verify().damage
     assert (found.kind, "its rollup is not" in found.problem) == ("gram", True)

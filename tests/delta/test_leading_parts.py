@@ -8,7 +8,7 @@ import pyarrow.parquet
 import pytest
 
 from fleet_slip.delta import Encoding
-from fleet_slip.delta.encoding import FIRST_BYTES, pack_preface, read_preface
+from fleet_slip.delta.encoding import FIRST_BYTES, pack_leading_parts, read_leading_part
 from fleet_slip.errors import StorageError
 from fleet_slip.files.local_folder import LocalFolder
 
@@ -19,12 +19,12 @@ ROWS = pa.table({"a": list(range(1000)), "b": [[i, -i] for i in range(1000)]})
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
     path = tmp_path / "rows.parquet"
-    path.write_bytes(Encoding(compression="zstd").encode(ROWS, preface=PARTS).content)
+    path.write_bytes(Encoding(compression="zstd").encode(ROWS, leading=PARTS).content)
     return path
 
 
 def part_of(file: Path, number: int) -> bytes | None:
-    return read_preface(LocalFolder(file.parent), file.name, number)
+    return read_leading_part(LocalFolder(file.parent), file.name, number)
 
 
 def test_every_part_is_found_and_every_reader_finds_the_rows(file: Path) -> None:
@@ -58,7 +58,7 @@ def test_a_file_that_ends_early_has_none(tmp_path: Path, name: str) -> None:
 
 
 def test_a_part_that_is_cut_off_is_damage(file: Path) -> None:
-    for size in (20, 40, len(pack_preface(PARTS))):
+    for size in (20, 40, len(pack_leading_parts(PARTS))):
         file.write_bytes(file.read_bytes()[:size])
         with pytest.raises(StorageError, match="does not match its checksum"):
             part_of(file, 3)
@@ -66,7 +66,7 @@ def test_a_part_that_is_cut_off_is_damage(file: Path) -> None:
 
 def test_no_flipped_bit_passes_unseen(file: Path) -> None:
     """Either the part is the same, or there seems to be none, or the file is called damaged."""
-    sound, places = file.read_bytes(), len(pack_preface(PARTS)) + 4
+    sound, places = file.read_bytes(), len(pack_leading_parts(PARTS)) + 4
     unnoticed = []
     for at in [*range(100), *range(100, places, 9973), places - 1]:
         for bit in (0, 5):
