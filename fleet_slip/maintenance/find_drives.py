@@ -1,7 +1,8 @@
-"""Finds the drives of a car, or of a time, in the log files."""
+"""Finds the drives of a car, or of a time: in log files, and in files that no version refers to."""
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, replace
+from datetime import date
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -10,12 +11,151 @@ from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.delta import Snapshot
-from fleet_slip.maintenance.old_files import rows_of
+from fleet_slip.errors import FleetSlipError
+from fleet_slip.files.folder import StoredFile
+from fleet_slip.grams.rows.backlog import BEING_WRITTEN_HOURS
+from fleet_slip.maintenance.vacuum import find_temporary_files, find_unreferenced
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.audit import Forgettable
 from fleet_slip.warehouse.database import open_database, reading_files
 from fleet_slip.warehouse.recordings import Recording, record_drive
 from fleet_slip.warehouse.tables import Warehouse
+
+
+@dataclass(frozen=True)
+class OldFiles:
+    """What became of the files that no version refers to and that have some drives."""
+
+    deleted: int
+    kept: int
+    """Replaced files, which readers of the last week may need."""
+    pending: tuple[str, ...]
+    """Files that may be being written, and may have the drives: they are left alone."""
+
+
+def remove_old_files(warehouse: Warehouse, subject: Forgettable, *, replaced: bool) -> OldFiles:
+    """Delete the files with the drives that no version refers to; `replaced` ones if asked to.
+
+    What was never committed is deleted at once: since the fence no commit can land a row of a
+    forgotten car or drive, so that whoever wrote the file will be told. Drives before a day are not
+    barred; there a file younger than an hour is left to its writer.
+    """
+    deleted = kept = 0
+    pending: list[str] = []
+    for one in find_old_files(warehouse, subject):
+        if one.replaced and not replaced:
+            kept += 1
+        elif (one.is_young and subject.kind == "before") or not one.file.folder.remove(one.file):
+            pending.append(str(one.file))
+        else:
+            deleted += 1
+    gone, left = _remove_half_written(warehouse)
+    names = [name.removeprefix(f"{warehouse.root}/") for name in (*pending, *left)]
+    return OldFiles(deleted + gone, kept, tuple(names))
+
+
+def find_old_files(warehouse: Warehouse, subject: Forgettable) -> list["OldFile"]:
+    """Return unreferenced files with the drives; logs last, which may alone tell a car's drives."""
+    logs = list(_with_subject(warehouse.logs.snapshot(), subject))
+    drives = {drive for one in logs for drive in one.drives}
+    old = [
+        one
+        for one in read_old_files(warehouse.quarantine.snapshot())
+        if pc.any(quarantined_of(one.rows, subject, drives)).as_py()
+    ]
+    return [*old, *_with_subject(warehouse.grams.snapshot(), subject), *logs]
+
+
+def _remove_half_written(warehouse: Warehouse) -> tuple[int, list[str]]:
+    """Delete what killed writers left under temporary names, but for what may be being written."""
+    gone, left = 0, []
+    tables = {table.folder.name for table in warehouse.tables}
+    for file in find_temporary_files(warehouse):
+        table, *folders, _ = file.path.split("/")
+        if table not in tables or "_delta_log" in folders:
+            continue
+        if file.age_hours < BEING_WRITTEN_HOURS:
+            left.append(str(file))
+        else:
+            gone += file.folder.remove(file)
+    return gone, left
+
+
+@dataclass(frozen=True)
+class OldFile:
+    """A file that no version refers to: whether a commit removed it, and the drives concerned."""
+
+    file: StoredFile
+    replaced: bool
+    rows: pa.Table
+    drives: frozenset[str] = frozenset()
+    has_unused_names: bool = False
+    """Whether it was replaced because of names of other files in it: they may be the subject's."""
+
+    @property
+    def is_young(self) -> bool:
+        """Whether it may belong to a job that is running."""
+        return not self.replaced and self.file.age_hours < BEING_WRITTEN_HOURS
+
+
+def read_old_files(snapshot: Snapshot) -> Iterator[OldFile]:
+    """Yield replaced files and leftovers, with what tells the drives."""
+    known = snapshot.removed()
+    wanted = {"drive_id", "drive_name", "source_file", "vehicle_id", "day"}
+    for file in find_unreferenced(snapshot.table):
+        try:
+            names = snapshot.table.read_metadata(file.path).schema.to_arrow_schema().names
+            rows = snapshot.table.read(file.path, [name for name in names if name in wanted])
+            replaced = file.path in known
+            others = replaced and snapshot.table.has_unused_names(file.path)
+        except FleetSlipError:
+            continue  # half a file, or just deleted
+        yield OldFile(file, replaced, _with_day(file, rows), has_unused_names=others)
+
+
+def _with_day(file: StoredFile, rows: pa.Table) -> pa.Table:
+    """Return the rows of a partitioned file with the day that its folder tells."""
+    key, _, day = file.path.partition("/")[0].partition("=")
+    if key != "day":
+        return rows
+    return rows.append_column("day", pa.repeat(date.fromisoformat(day), rows.num_rows))
+
+
+def _with_subject(snapshot: Snapshot, subject: Forgettable) -> Iterator[OldFile]:
+    for one in read_old_files(snapshot):
+        names = one.rows.filter(rows_of(one.rows, subject))["drive_id"].unique().to_pylist()
+        if names or one.has_unused_names:
+            yield replace(one, drives=frozenset(names))
+
+
+def rows_of(rows: pa.Table, subject: Forgettable) -> pa.ChunkedArray:
+    """Return which rows of `logs` or `grams` are of a subject."""
+    if subject.kind == "before":
+        return pc.less(rows["day"], pa.scalar(date.fromisoformat(subject.value)))
+    return pc.equal(rows[subject.column].cast(pa.string()), subject.value)
+
+
+def quarantined_of(
+    rows: pa.Table, subject: Forgettable, drives: Collection[str]
+) -> pa.ChunkedArray:
+    """Return which rows of the quarantine are of a subject, or of drives that are known to be.
+
+    A row that was refused before its drive was cut at a gap in time names the drive as a whole.
+    Rows that an earlier version of this program refused do not name the vehicle.
+    """
+    if subject.kind == "drive":
+        drives = {*drives, subject.value}
+    ids = rows["drive_id"].cast(pa.string())
+    concerned = {
+        name
+        for name in ids.unique().to_pylist()
+        if name and any(drive == name or drive.startswith(f"{name}-") for drive in drives)
+    }
+    of_drives = pc.is_in(ids, pa.array(sorted(concerned), pa.string()))
+    if subject.kind != "vehicle" or "vehicle_id" not in rows.schema.names:
+        return of_drives
+    return pc.or_(of_drives, pc.fill_null(rows_of(rows, subject), False))
+
 
 FILES_PER_QUERY = 256
 """DuckDB keeps what it read of each file of a query: some 70 KB."""

@@ -27,10 +27,12 @@ from fleet_slip.maintenance.find_drives import (
     cars_with_rows,
     drives_by_file,
     locate,
+    quarantined_of,
+    read_old_files,
     recordings_of,
+    remove_old_files,
 )
 from fleet_slip.maintenance.marked_models import models_trained_on, newest_versions
-from fleet_slip.maintenance.old_files import quarantined_of, read_old_files, remove_old_files
 from fleet_slip.maintenance.rewriting import Rewriting, drop_unused_names, forget_received, rewrite
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.runs.history import runs_under_way

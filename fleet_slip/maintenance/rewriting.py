@@ -21,7 +21,7 @@ from fleet_slip.errors import FleetSlipError
 from fleet_slip.grams.rows.gram_files import read_rows, write_rows
 from fleet_slip.grams.rows.gram_rows import is_received
 from fleet_slip.grams.rows.landing_before_logs import land_ahead
-from fleet_slip.maintenance.old_files import rows_of
+from fleet_slip.maintenance.find_drives import rows_of
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.audit import Forgettable
 from fleet_slip.warehouse.tables import Warehouse

@@ -11,7 +11,7 @@ with Student's t for m - 1 degrees of freedom: with few days the limits are as w
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import date
 from statistics import fmean, stdev
 
@@ -179,7 +179,7 @@ def _day(day: date, gram: Gram, drives: int, model: LinearModel, training: bool)
 
 def _judged(day: Day, mean: Limits, std: Limits) -> Day:
     beyond = {"mean": mean.beyond(day.error_mean_deg), "std": std.beyond(day.error_std_deg)}
-    return Day(**{**asdict(day), "alarms": tuple(name for name, yes in beyond.items() if yes)})
+    return replace(day, alarms=tuple(name for name, yes in beyond.items() if yes))
 
 
 def _last_training_day(warehouse: Warehouse, version: ModelVersion) -> date | None:

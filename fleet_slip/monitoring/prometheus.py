@@ -104,8 +104,5 @@ def _seconds(moment: datetime | date | None) -> float | None:
 
 def _told(root: str, sample: Metric) -> str:
     labels = {"root": root, **sample.labels}
-    return ",".join(f'{key}="{_escaped(text)}"' for key, text in labels.items())
-
-
-def _escaped(text: str) -> str:
-    return text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
+    escapes = str.maketrans({"\\": "\\\\", '"': '\\"', "\n": "\\n"})
+    return ",".join(f'{key}="{text.translate(escapes)}"' for key, text in labels.items())

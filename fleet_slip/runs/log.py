@@ -92,7 +92,9 @@ class Run:
     @property
     def shown_arguments(self) -> list[str]:
         """The command line without what the history must not keep."""
-        return _shortened(publishable(self.arguments))
+        kept = publishable(self.arguments)
+        more = len(kept) - ARGUMENTS_MAX
+        return [*kept[:ARGUMENTS_MAX], f"... and {more} more"] if more > 0 else kept
 
     def beginning(self) -> dict[str, Any]:
         """Return the line that is written when the run starts."""
@@ -110,6 +112,8 @@ class Run:
     def end(self, error: BaseException | None, seconds: float) -> dict[str, Any]:
         """Return the line that is written when the run ends."""
         exit_code = _exit_code(error)
+        told = _without(str(error), self.arguments, publishable(self.arguments))
+        told = hide_passwords(told)[:ERROR_MAX]
         outcome = {0: "done", INTERRUPTED: "interrupted"}.get(exit_code, "failed")
         return {
             "run_id": self.run_id,
@@ -117,13 +121,9 @@ class Run:
             "seconds": round(seconds, 6),
             "outcome": outcome,
             "exit_code": exit_code,
-            "error": self._told(error) if error is not None and exit_code else None,
+            "error": told if error is not None and exit_code else None,
             "steps": [one.as_dict() for one in self.steps],
         }
-
-    def _told(self, error: BaseException) -> str:
-        told = _without(str(error), self.arguments, publishable(self.arguments))
-        return hide_passwords(told)[:ERROR_MAX]
 
 
 def current_run_id() -> str | None:
@@ -214,11 +214,6 @@ def _without(text: str, arguments: Sequence[str], shown: Sequence[str]) -> str:
             secret = argument.partition("=")[2] if instead.endswith(f"={HIDDEN}") else argument
             text = text.replace(secret, HIDDEN) if secret else text
     return text
-
-
-def _shortened(arguments: list[str]) -> list[str]:
-    more = len(arguments) - ARGUMENTS_MAX
-    return [*arguments[:ARGUMENTS_MAX], f"... and {more} more"] if more > 0 else arguments
 
 
 def _exists(root: Folder) -> bool:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fleet_slip.ingest.drives.look_alikes import find_look_alikes
+from fleet_slip.ingest.drives.checking import find_look_alikes
 from fleet_slip.ingest.landing.ingest_job import ingest_files
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand

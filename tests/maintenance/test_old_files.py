@@ -10,7 +10,7 @@ import pytest
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.maintenance.compaction import compact
-from fleet_slip.maintenance.old_files import (
+from fleet_slip.maintenance.find_drives import (
     find_old_files,
     quarantined_of,
     remove_old_files,

@@ -136,7 +136,7 @@ class RollupReader:
             if one.feature_set == identity
             and wanted <= one.by
             and all(file in active or file.startswith(RECEIVED_FILES) for file in one.files)
-            and not _has_any(one, barred)
+            and not (len(barred) and np.isin(barred, one.vehicles()).any())
         ]
         if not serving:
             return NO_CELLS
@@ -154,11 +154,6 @@ class RollupReader:
             known = self._known | dict(zip(unread, found, strict=True))
         self._known = {path: known[path] for path in paths}
         return [one for one in self._known.values() if one]
-
-
-def _has_any(rollup: Rollup, vehicles: Hashes) -> bool:
-    """Whether a rollup has a row of any of the given cars."""
-    return bool(len(vehicles) and np.isin(vehicles, rollup.vehicles()).any())
 
 
 def _chosen(rollups: Sequence[Rollup], wanted: Sequence[str], condition: Condition) -> pa.Table:

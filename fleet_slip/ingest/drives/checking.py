@@ -1,6 +1,8 @@
 """Checks each row of a file by itself: values in SI units of good ones, the reason of bad ones."""
 
-from collections.abc import Iterator, Sequence
+import unicodedata
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -164,6 +166,14 @@ def _split(batch: pl.DataFrame, fields: list[Field]) -> tuple[pl.DataFrame, pl.D
     bad = checked.filter(pl.col(_PROBLEM).is_not_null())
     explained = [_explain(rows, fields) for rows in bad.partition_by(_PROBLEM)]
     return good, pl.concat([no_rows(), *explained])
+
+
+def find_look_alikes(names: Iterable[str]) -> tuple[tuple[str, ...], ...]:
+    """Return the groups of names that differ only in their Unicode form (NFC, NFD)."""
+    groups = defaultdict(set)
+    for name in names:
+        groups[unicodedata.normalize("NFC", name)].add(name)
+    return tuple(sorted(tuple(sorted(group)) for group in groups.values() if len(group) > 1))
 
 
 def describe_refused(rows: pl.DataFrame, which: BoolArray | None, reason: str) -> pl.DataFrame:

@@ -72,7 +72,7 @@ def fields_of(mapping: Mapping, schema: pl.Schema) -> list[Field]:
     if mapping.time.key is not None:
         fields.append(_time(mapping.time.key, schema, mapping))
         if RAW + DISORDER in schema:
-            fields.append(_disorder(mapping.time.key))
+            fields.append(_disorder(pl.col(RAW + mapping.time.key)))
     names = [name for name in catalogue().signals if name in mapping.signals]
     signals = [_signal(name, schema, mapping) for name in names]
     nothing = pl.all_horizontal([pl.col(name).is_null() for name in names])
@@ -125,11 +125,11 @@ def _condition(condition: pl.Expr, reason: str, raw: pl.Expr) -> Field:
     return Field("", "condition", raw, raw, find_problems((condition, reason)))
 
 
-def _disorder(time: str) -> Field:
+def _disorder(time: pl.Expr) -> Field:
     """What a file of several time bases says of each row's time among those of its base."""
     reasons = ("time_backwards", "time_duplicate", "isolated")
     problem = find_problems(*((pl.col(RAW + DISORDER) == reason, reason) for reason in reasons))
-    return Field("time", "condition", pl.col(RAW + time), pl.col(RAW + time), problem)
+    return Field("time", "condition", time, time, problem)
 
 
 def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> Field:

@@ -20,6 +20,7 @@ from fleet_slip.ingest.drives.checking import (
     Block,
     RowChecker,
     describe_refused,
+    find_look_alikes,
     join_refused,
     no_rows,
 )
@@ -28,7 +29,6 @@ from fleet_slip.ingest.drives.drive_cutter import (
     DriveCutter,
     sample_intervals_s,
 )
-from fleet_slip.ingest.drives.look_alikes import find_look_alikes
 from fleet_slip.ingest.drives.measured_drives import (
     IngestCounts,
     MeasuredDrive,

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import InputError
 from fleet_slip.files.folder import StoredFile
-from fleet_slip.ingest.drives.look_alikes import find_vehicles_like
+from fleet_slip.ingest.drives.checking import find_look_alikes
 from fleet_slip.ingest.drives.measured_drives import IngestCounts
 from fleet_slip.ingest.drives.suspicion import Suspicion
 from fleet_slip.ingest.landing.data_files import unit_of
@@ -24,6 +24,7 @@ from fleet_slip.ingest.landing.landing import (
 from fleet_slip.ingest.logs.log_files import Log, StoredParts
 from fleet_slip.ingest.mapping.mapping import Mapping
 from fleet_slip.progress import Progress, no_progress
+from fleet_slip.warehouse.table_views import connect_tables
 from fleet_slip.warehouse.tables import Warehouse
 from fleet_slip.words import number_of
 
@@ -149,12 +150,25 @@ def _size_of(log: Log) -> int:
 
 def _report(warehouse: Warehouse, outcome: FileOutcome, new: frozenset[str]) -> IngestReport:
     is_new = unit_of(outcome.digest).name in new
-    vehicles = find_vehicles_like(warehouse, outcome.vehicles) if is_new else ()
+    vehicles = _find_vehicles_like(warehouse, outcome.vehicles) if is_new else ()
     look_alikes = tuple(sorted({*outcome.look_alikes, *vehicles}))
     suspicions = outcome.suspicions if is_new else ()
     return IngestReport(
         str(outcome.file), is_new, outcome.counts, look_alikes, outcome.left_out, suspicions
     )
+
+
+def _find_vehicles_like(
+    warehouse: Warehouse, vehicles: Iterable[str]
+) -> tuple[tuple[str, ...], ...]:
+    """Return the groups of cars of the logs that look like one of these; names in ASCII do not."""
+    suspects = {name for name in vehicles if not name.isascii()}
+    if not suspects:
+        return ()
+    with connect_tables(warehouse, "drives") as database:
+        stored = database.sql("SELECT DISTINCT vehicle_id FROM drives").fetchall()
+    groups = find_look_alikes({name for (name,) in stored if name is not None} | suspects)
+    return tuple(group for group in groups if suspects.intersection(group))
 
 
 def _joined(failures: list[InputError]) -> InputError:

@@ -227,7 +227,8 @@ class LocalCopies:
         try:
             yield copy
         except FleetSlipError as error:
-            raise type(error)(str(error).replace(folder, _bucket_of(log))) from None
+            bucket = "/".join(str(log).split("/")[:3])
+            raise type(error)(str(error).replace(folder, bucket)) from None
 
 
 def _copy(log: StoredFile | StoredParts, folder: Path) -> Path:
@@ -239,10 +240,6 @@ def _copy(log: StoredFile | StoredParts, folder: Path) -> Path:
             raise InputError(f"{part}: its name is no path in the bucket. Give it another.")
         copy_object(part, folder / part.path)
     return folder / (log.path if isinstance(log, StoredFile) else parse_url(log.url)[1])
-
-
-def _bucket_of(log: Log) -> str:
-    return "/".join(str(log).split("/")[:3])
 
 
 @contextmanager
