@@ -28,6 +28,11 @@ NAMED_MAX = 5
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+AHEAD = 2
+"""Items that are read before they are asked for."""
+WORKERS = 2
+"""Items that are worked on at once."""
+
 
 class LostTaskError(BrokenExecutor):
     """The processes that a task ran in died, again and again."""
@@ -106,12 +111,6 @@ def _completed(
     finally:
         for future in running:
             future.cancel()
-
-
-AHEAD = 2
-"""Items that are read before they are asked for."""
-WORKERS = 2
-"""Items that are worked on at once."""
 
 
 def read_ahead(items: Iterator[Item], ahead: int = AHEAD) -> Generator[Item, None, None]:

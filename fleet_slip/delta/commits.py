@@ -30,6 +30,9 @@ CHECKSUM_KEY = "sha256"
 Action = Mapping[str, Any]
 """One action as the log has it: `{"add": {...}}`, `{"remove": {...}}`, `{"txn": {...}}`."""
 
+_CHECKED_KINDS = frozenset({"add", "remove", "txn"})
+_KINDS = _CHECKED_KINDS | {"commitInfo", "metaData", "protocol"}
+
 
 def checked_note(
     note: Mapping[str, Any],
@@ -81,10 +84,6 @@ def _stated(kind: str, content: Any) -> Any:
         return content
     added = {"extendedFileMetadata"} if kind == "remove" else set()
     return {k: v for k, v in content.items() if v is not None and k not in added}
-
-
-_CHECKED_KINDS = frozenset({"add", "remove", "txn"})
-_KINDS = _CHECKED_KINDS | {"commitInfo", "metaData", "protocol"}
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,17 @@ FRESH = timedelta(minutes=1)
 CHAIN_VARIABLE = "AWS_FORCE_CREDENTIAL_LOAD"
 """Option of the Delta library: follow Amazon's chain even where AWS_ENDPOINT_URL is set."""
 
+HTTP_VARIABLE = "AWS_ALLOW_HTTP"
+"""Environment variable, which the Delta library reads too: true lets an endpoint be http."""
+
+TIMEOUT_S = 60
+"""Longest that one request may take: a log file has up to 40 MB."""
+
+CONNECT_TIMEOUT_S = 5
+RETRIES = 5
+RETRY_S = 60
+"""No attempt begins later than so long after the first."""
+
 
 @dataclass(frozen=True)
 class AwsProfile:
@@ -100,18 +111,6 @@ def aws_profile() -> AwsProfile | None:
     endpoint = environ.get("AWS_ENDPOINT_URL_S3") or environ.get("AWS_ENDPOINT_URL")
     endpoint = endpoint or scoped.get("endpoint_url")
     return AwsProfile(credentials, region, endpoint)
-
-
-HTTP_VARIABLE = "AWS_ALLOW_HTTP"
-"""Environment variable, which the Delta library reads too: true lets an endpoint be http."""
-
-TIMEOUT_S = 60
-"""Longest that one request may take: a log file has up to 40 MB."""
-
-CONNECT_TIMEOUT_S = 5
-RETRIES = 5
-RETRY_S = 60
-"""No attempt begins later than so long after the first."""
 
 
 def profile_of(bucket: str) -> AwsProfile | None:

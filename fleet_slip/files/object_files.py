@@ -34,6 +34,9 @@ FIRST_BYTES, MOST_BYTES, LEAST_BYTES = 2**20, 2**23, 2**15
 QUICK_S = 2.0
 """After a request that took less the next asks for twice as much."""
 
+KEPT_BYTES = 2**27
+"""Of the objects that were fetched last, so many bytes are kept."""
+
 
 def fetch_parts(store: "ObjectStore", key: str, where: str) -> Iterator[tuple[Any, bytes]]:
     """Yield the parts of an object in their order, each with what the store says of the object.
@@ -139,9 +142,6 @@ def _fetch(store: "ObjectStore", key: str, where: str) -> bytes:
             del _fetched[next(iter(_fetched))]
     return content
 
-
-KEPT_BYTES = 2**27
-"""Of the objects that were fetched last, so many bytes are kept."""
 
 _fetched: dict[str, bytes] = {}
 """By URL: what a name with a checksum holds is the same wherever it is."""

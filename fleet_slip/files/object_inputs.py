@@ -23,6 +23,17 @@ from fleet_slip.files.storage_errors import (
     storage_errors,
 )
 
+ATTEMPTS = 3
+"""So often an object is fetched that does not arrive as the store says that it is."""
+
+_COMPARABLE = re.compile(r"[0-9a-f]{32}(-[1-9][0-9]{0,4})?")
+"""A tag that may be an MD5, or the MD5 of the MD5s of so many parts."""
+
+_PART_SIZES = (5, 8, 10, 15, 16, 25, 32, 50, 64, 100, 128, 256, 512)
+"""Sizes of a part that uploaders choose."""
+
+_URL = re.compile(r"(?P<bucket>(?:s3|gs|az)://[a-z0-9][a-z0-9._-]{1,62})(?:/+(?P<path>.*))?")
+
 
 def list_any_names(bucket: ObjectFolder, path: str) -> Iterator[StoredFile]:
     """Yield the objects below a folder of a bucket of S3. Raises `StorageError`."""
@@ -57,18 +68,6 @@ def list_any_names(bucket: ObjectFolder, path: str) -> Iterator[StoredFile]:
                 )
     except (BotoCoreError, ClientError) as error:
         raise StorageError(f"{bucket}/{path}: {meaning_of(error)}") from None
-
-
-ATTEMPTS = 3
-"""So often an object is fetched that does not arrive as the store says that it is."""
-
-_COMPARABLE = re.compile(r"[0-9a-f]{32}(-[1-9][0-9]{0,4})?")
-"""A tag that may be an MD5, or the MD5 of the MD5s of so many parts."""
-
-_PART_SIZES = (5, 8, 10, 15, 16, 25, 32, 50, 64, 100, 128, 256, 512)
-"""Sizes of a part that uploaders choose."""
-
-_URL = re.compile(r"(?P<bucket>(?:s3|gs|az)://[a-z0-9][a-z0-9._-]{1,62})(?:/+(?P<path>.*))?")
 
 
 def parse_url(url: str) -> tuple[ObjectFolder, str]:

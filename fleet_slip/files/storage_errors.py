@@ -70,6 +70,8 @@ _MEANINGS: tuple[tuple[str, str], ...] = (
     (r"NoSuchKey|BlobNotFound|404 Not Found|not found", "there is no such object."),
 )
 
+_COLOUR = re.compile(r"\x1b\[[0-9;]*m")
+
 
 def known_meaning(error: BaseException) -> str | None:
     """Return what a failure of an object store means, in one line; None if it is not known."""
@@ -141,9 +143,6 @@ def _reason(error: OSError) -> str:
     stated = re.search(r"\(os error (\d+)\)", str(error))
     number = error.errno or (int(stated[1]) if stated else 0)
     return advice.get(number, _on_one_line(error))
-
-
-_COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 
 
 def first_line(error: BaseException) -> str:

@@ -21,6 +21,9 @@ from fleet_slip.warehouse.database import open_database, reading_files
 from fleet_slip.warehouse.recordings import Recording, record_drive
 from fleet_slip.warehouse.tables import Warehouse
 
+FILES_PER_QUERY = 256
+"""DuckDB keeps what it read of each file of a query: some 70 KB."""
+
 
 @dataclass(frozen=True)
 class OldFiles:
@@ -155,10 +158,6 @@ def quarantined_of(
     if subject.kind != "vehicle" or "vehicle_id" not in rows.schema.names:
         return of_drives
     return pc.or_(of_drives, pc.fill_null(rows_of(rows, subject), False))
-
-
-FILES_PER_QUERY = 256
-"""DuckDB keeps what it read of each file of a query: some 70 KB."""
 
 
 @dataclass(frozen=True)

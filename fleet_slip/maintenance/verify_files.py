@@ -34,6 +34,11 @@ DamageKind: TypeAlias = Literal[
     "unchecked",
 ]
 
+TASK_BYTES = 2**27
+
+TASK_FILES = 64
+"""A task reads about so many bytes, or so many files."""
+
 
 @dataclass(frozen=True)
 class Damage:
@@ -79,12 +84,6 @@ class Verification:
     def damage(self) -> list[Damage]:
         """The findings that are damage."""
         return [finding for finding in self.findings if finding.damage]
-
-
-TASK_BYTES = 2**27
-
-TASK_FILES = 64
-"""A task reads about so many bytes, or so many files."""
 
 
 @dataclass(frozen=True)

@@ -29,21 +29,6 @@ PROC = Path("/proc")
 START = 19
 """Place of the start among the fields behind the name, proc(5): ticks since the machine booted."""
 
-
-def process_began(number: int) -> str | None:
-    """Return the boot and the start of a process of this machine; None if it is not known.
-
-    The system gives the number of a process that is gone to another one. Neither the boot nor the
-    ticks since it depend on the clock.
-    """
-    try:
-        boot = (PROC / "sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
-        status = (PROC / str(number) / "stat").read_bytes()
-    except OSError:
-        return None
-    return f"{boot}/{status.rpartition(b')')[2].split()[START].decode()}"
-
-
 FOLDER = "runs"
 NEWEST_DOCUMENTS = "documents"
 """Name of the newest documents in the record of a run."""
@@ -71,6 +56,20 @@ _DOCUMENT_FOLDER = re.compile(r"forgotten|models/(?!\.\./)[^/]*/(?:versions|hist
 _DIGITS = 32
 _END = b',"sha256":"' + b"0" * _DIGITS + b'"}'
 _WITH_CHECKSUM = re.compile(rb'(.*),"sha256":"([0-9a-f]{%d})"\}' % _DIGITS)
+
+
+def process_began(number: int) -> str | None:
+    """Return the boot and the start of a process of this machine; None if it is not known.
+
+    The system gives the number of a process that is gone to another one. Neither the boot nor the
+    ticks since it depend on the clock.
+    """
+    try:
+        boot = (PROC / "sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+        status = (PROC / str(number) / "stat").read_bytes()
+    except OSError:
+        return None
+    return f"{boot}/{status.rpartition(b')')[2].split()[START].decode()}"
 
 
 def write_line(record: Mapping[str, Any]) -> bytes:

@@ -20,13 +20,18 @@ from fleet_slip.warehouse.database import duckdb_message
 LONGEST_QUERY = 100_000
 """Characters of one query. Planning takes more than linear time in some of them."""
 
+QUERY_NODES = frozenset({"SELECT_NODE", "SET_OPERATION_NODE", "RECURSIVE_CTE_NODE", "CTE_NODE"})
+"""Parts of a statement that read. Others, such as COPY_QUERY_NODE, write."""
+
+CATALOGUE_PREFIX = "duckdb_"
+
+_SYMBOLS = frozenset({"+", "-", "*", "/", "//", "%", "||", "~~", "!~~", "~~*", "!~~*", "~~~"})
+"""Operators that are functions to DuckDB; the last ones are LIKE, ILIKE and GLOB."""
+
 
 def _words(text: str) -> frozenset[str]:
     return frozenset(text.split())
 
-
-QUERY_NODES = frozenset({"SELECT_NODE", "SET_OPERATION_NODE", "RECURSIVE_CTE_NODE", "CTE_NODE"})
-"""Parts of a statement that read. Others, such as COPY_QUERY_NODE, write."""
 
 TABLE_FUNCTIONS = _words(
     """
@@ -36,8 +41,6 @@ TABLE_FUNCTIONS = _words(
     """
 )
 """What may stand after FROM like a function, beside duckdb_tables() and its like."""
-
-CATALOGUE_PREFIX = "duckdb_"
 
 
 def one_query(database: duckdb.DuckDBPyConnection, text: str) -> str:
@@ -122,8 +125,6 @@ _OPERATORS = _words(
     "COMPARE_IN COMPARE_NOT_IN OPERATOR_COALESCE OPERATOR_IS_NOT_NULL OPERATOR_IS_NULL OPERATOR_NOT"
 )
 
-_SYMBOLS = frozenset({"+", "-", "*", "/", "//", "%", "||", "~~", "!~~", "~~*", "!~~*", "~~~"})
-"""Operators that are functions to DuckDB; the last ones are LIKE, ILIKE and GLOB."""
 
 FUNCTIONS = _words(
     """

@@ -43,6 +43,9 @@ EACH: Literal["each"] = "each"
 
 FoldCount: TypeAlias = Annotated[int, Field(ge=2, le=1000)] | Literal["each"]
 
+MOST_FOLDS = 10_000
+"""Each fold is an exact fit of every model."""
+
 
 class Folding(Config):
     """What divides a cohort, and into how many folds."""
@@ -69,10 +72,6 @@ def make_folding(by: FoldKey, count: int | str | None, usual: FoldCount) -> Fold
     except ValueError:
         each = "" if by == ROW_FOLDS else f", or each: every {by} a fold of its own"
         raise UsageError(f"folds = {count}: choose a number from 2 to 1000{each}.") from None
-
-
-MOST_FOLDS = 10_000
-"""Each fold is an exact fit of every model."""
 
 
 def require_divided(feature_set: str, by: str, count: FoldCount) -> None:

@@ -33,6 +33,9 @@ MANY = 500
 SECONDS_A_NAME = 0.02
 """On two cores. Of more names than `MANY` it is said before how long that takes."""
 
+CONTRADICTS = "contradicts another message of its drive"
+HAS_LOG = "has a drive whose log is here"
+
 
 @dataclass(frozen=True)
 class Screened:
@@ -95,10 +98,6 @@ def screen(root: Folder, rows: Sequence[ReceivedRows], refused: Sequence[Refused
 
 def _cars(rows: Sequence[ReceivedRows]) -> frozenset[str]:
     return frozenset(name for some in rows for name in some.vehicle_ids.unique().to_pylist())
-
-
-CONTRADICTS = "contradicts another message of its drive"
-HAS_LOG = "has a drive whose log is here"
 
 
 @dataclass(frozen=True)

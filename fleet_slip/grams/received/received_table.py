@@ -27,6 +27,8 @@ from fleet_slip.grams.rows.gram_rows import by_signals, gram_table, is_received,
 from fleet_slip.warehouse.tables import SIGNED
 from fleet_slip.words import number_of
 
+OTHER_ROW = "has a signature that is of no message of it"
+
 
 def received_table(rows: ReceivedRows, schema: pa.Schema, digests: Sequence[str] = ()) -> pa.Table:
     """Return rows of the same signals in the schema of `grams`, from files of these digests."""
@@ -89,9 +91,6 @@ def messages_again(signals: str, rows: pa.RecordBatch) -> tuple[Messages, BoolAr
         table = gram_table(signals, rows)
         messages["numbers"] = np.hstack([table.sums, table.products])
     return messages, fits
-
-
-OTHER_ROW = "has a signature that is of no message of it"
 
 
 def find_unsound(rows: pa.Table) -> Iterator[tuple[str, str]]:

@@ -43,6 +43,10 @@ ONE_AT_A_TIME = "receive"
 """Unit that every commit of received rows lands: two at once, which could bring the same message,
 are a conflict."""
 
+LARGEST_FILE_BYTES = 2**28
+BATCH_BYTES = 2**26
+"""Files of so many bytes together land in one commit: some 100,000 messages."""
+
 
 @dataclass(frozen=True)
 class MessageFile:
@@ -119,11 +123,6 @@ def _is_superseded(rows: pa.Table, new: NewMessages) -> BoolArray:
     if SIGNED in rows.column_names:
         out = pc.and_(out, rows[SIGNED].is_null())
     return np.asarray(out.to_numpy(zero_copy_only=False), dtype=np.bool_)
-
-
-LARGEST_FILE_BYTES = 2**28
-BATCH_BYTES = 2**26
-"""Files of so many bytes together land in one commit: some 100,000 messages."""
 
 
 @dataclass

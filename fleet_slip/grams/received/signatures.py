@@ -58,6 +58,17 @@ MOST_BYTES = 2**28
 _DER = bytes.fromhex("302a300506032b6570032100")
 """What stands before the 32 bytes of an Ed25519 public key (RFC 8410)."""
 
+DOMAIN = b"fleet-slip gram message\n"
+"""Before what is signed: the same key signs nothing else that could be taken for a message."""
+
+AT_ONCE = 256
+"""Messages that a thread checks one after the other."""
+
+UNSIGNED = "is not signed"
+NO_KEY = "is of a car that had no key on that day"
+REVOKED = "is signed by a key that was revoked"
+FORGED = "is not signed by the key of its car"
+
 
 def _require_ed25519(text: str) -> str:
     try:
@@ -161,18 +172,6 @@ def _load(path: Path, _changed_ns: int) -> CarKeys:
         return CarKeys.model_validate({"keys": told})
     except ValidationError as error:
         raise ConfigError(f"{path}: {faults_of(error)}") from None
-
-
-DOMAIN = b"fleet-slip gram message\n"
-"""Before what is signed: the same key signs nothing else that could be taken for a message."""
-
-AT_ONCE = 256
-"""Messages that a thread checks one after the other."""
-
-UNSIGNED = "is not signed"
-NO_KEY = "is of a car that had no key on that day"
-REVOKED = "is signed by a key that was revoked"
-FORGED = "is not signed by the key of its car"
 
 
 def sign_messages(content: bytes, private_key: bytes) -> bytes:

@@ -26,6 +26,9 @@ from fleet_slip.words import shown
 
 _OpenIt = Callable[[Path], AbstractContextManager[tuple[list[Base], set[str]]]]
 
+_CLOCK = "this format says when each sample was taken: write own_clock = true under [time]"
+_NO_CLOCK = "this format has no clock of its own: write column or rate_hz under [time]"
+
 
 @dataclass
 class _Opened:
@@ -120,10 +123,6 @@ def _read(opened: PartBases, stretches: list[_Stretch]) -> Iterator[pl.DataFrame
     for stretch in stretches:
         with opened.using(stretch.part) as there:
             yield from there.bases[stretch.place].read()
-
-
-_CLOCK = "this format says when each sample was taken: write own_clock = true under [time]"
-_NO_CLOCK = "this format has no clock of its own: write column or rate_hz under [time]"
 
 
 def read_batches(log: Path, mapping: Mapping) -> Iterator[pl.DataFrame]:

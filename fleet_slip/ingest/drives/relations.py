@@ -10,6 +10,22 @@ from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 FEWEST_TICKS = 200
 MOVING_MPS = 2.0
 
+MOST_TICKS = 20_000
+FEWEST_DELAY_TICKS = 1000
+MOST_LAG = 50
+"""A label is looked for this many ticks before and after its inputs."""
+HALF_CHANGE = 25
+"""The lateral velocity changes over twice so many ticks: the label's noise matters less."""
+EACH = 5
+"""Of what is that smooth, each fifth tick tells as much."""
+
+LEAST_EXPLAINED = 0.6
+"""Where accelerations explain less of the change of lateral velocity, they are no witness."""
+LEAST_KINEMATIC_LAG, LEAST_KINEMATIC_GAIN = 5, 0.1
+"""Simulated drives without a delay reach 11 ticks and .04, one of these at a time."""
+LEAST_LAG, LEAST_GAIN = 3, 0.3
+"""A delay explains away this part of a label's variance: a car's own lag of 0.1 s does 0.23."""
+
 
 def moving(speed: FloatArray | None) -> BoolArray:
     """Return where the car drives; everywhere if its speed is not known."""
@@ -44,23 +60,6 @@ def fit(y: FloatArray, inputs: FloatArray, rows: BoolArray) -> tuple[FloatArray,
     coefficients = np.linalg.lstsq(x @ x.T, x @ centred, rcond=1e-12)[0]
     left = centred - coefficients @ x
     return coefficients, 1 - float(left @ left) / total
-
-
-MOST_TICKS = 20_000
-FEWEST_DELAY_TICKS = 1000
-MOST_LAG = 50
-"""A label is looked for this many ticks before and after its inputs."""
-HALF_CHANGE = 25
-"""The lateral velocity changes over twice so many ticks: the label's noise matters less."""
-EACH = 5
-"""Of what is that smooth, each fifth tick tells as much."""
-
-LEAST_EXPLAINED = 0.6
-"""Where accelerations explain less of the change of lateral velocity, they are no witness."""
-LEAST_KINEMATIC_LAG, LEAST_KINEMATIC_GAIN = 5, 0.1
-"""Simulated drives without a delay reach 11 ticks and .04, one of these at a time."""
-LEAST_LAG, LEAST_GAIN = 3, 0.3
-"""A delay explains away this part of a label's variance: a car's own lag of 0.1 s does 0.23."""
 
 
 def find_delay(

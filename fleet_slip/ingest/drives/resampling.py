@@ -25,6 +25,9 @@ SNAP_TOLERANCE_S = 0.1 * STEP_S
 TIME_EPSILON_S = 1e-6
 """Times that differ by less are equal: a float64 of seconds since 1970 resolves 0.24 µs."""
 
+LEAST_SPEED_MPS = 2.0
+"""Below, receivers freeze the course or tell noise."""
+
 
 def choose_method(time_s: FloatArray, interval_s: float) -> Method:
     """Choose how a drive gets onto the ticks, from its times and the file's usual interval.
@@ -171,10 +174,6 @@ def average(
 def _present(time_s: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
     present = ~np.isnan(values)
     return time_s[present], values[present]
-
-
-LEAST_SPEED_MPS = 2.0
-"""Below, receivers freeze the course or tell noise."""
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,9 @@ MOST_BYTES = 64
 """Bytes of a frame of CAN FD."""
 _FLOATS = {16: np.float16, 32: np.float32, 64: np.float64}
 
+PIECE_FRAMES = 2**12
+"""Frames of one message that are in memory at once."""
+
 
 def is_possible(signal: Any) -> bool:
     """Whether a frame can have a signal: at most 64 bits in 64 bytes, floats of their sizes."""
@@ -80,10 +83,6 @@ def _bits(signal: Any) -> list[tuple[int, int]]:
     first = 8 * (signal.start // 8) + 7 - signal.start % 8
     places = range(first + signal.length - 1, first - 1, -1)
     return [(place // 8, 7 - place % 8) for place in places]
-
-
-PIECE_FRAMES = 2**12
-"""Frames of one message that are in memory at once."""
 
 
 @dataclass(frozen=True)

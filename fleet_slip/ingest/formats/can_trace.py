@@ -51,6 +51,10 @@ _CONTAINER, _CONTAINER_HEADER = 10, struct.Struct("<16xH14x")
 _COMPRESSED = 2
 _LARGEST_CONTAINER, _LARGEST_OBJECT, _LONGEST_LINE = 2**27, 2**20, 2**20
 
+SUFFIXES = {".blf", ".asc", ".log", ".trc"}
+
+_MOST_NUMBERS = 100_000
+
 
 def require_bounded(budget: Budget) -> None:
     """Raise `InputError` for a trace that is more than it seems. Raises `OSError`."""
@@ -118,9 +122,6 @@ def _damaged(budget: Budget, what: str) -> InputError:
     )
 
 
-SUFFIXES = {".blf", ".asc", ".log", ".trc"}
-
-_MOST_NUMBERS = 100_000
 _Key = tuple[int, bool]
 """Number of a message, and whether it is of 29 bits."""
 

@@ -41,6 +41,10 @@ _MOST_ITEMS, _DEEPEST = 64, 20
 
 Decode = Callable[[bytes], Any]
 
+MAGIC = b"\x89MCAP0\r\n"
+PIECE_ROWS = 2**13
+"""Messages of one topic that are in memory at once."""
+
 
 def read_records(budget: Budget) -> Iterator[Any]:
     """Yield the records of a file; those in chunks come singly. Raises `InputError`."""
@@ -144,10 +148,6 @@ def leaves_of(value: Any, path: str = "", depth: int = 0) -> Iterator[str]:
             below = f"{path}.{name}" if path else name
             yield from leaves_of(_attribute(value, name), below, depth + 1)
 
-
-MAGIC = b"\x89MCAP0\r\n"
-PIECE_ROWS = 2**13
-"""Messages of one topic that are in memory at once."""
 
 _Fields = dict[str, str]
 """Paths of fields in the messages of one topic, by column."""

@@ -27,6 +27,10 @@ OWN_TIME = "\0time"
 BASE = "\0base"
 """Column with the number of the time base that a row is of, where there are several."""
 
+MAX_COLUMNS = 10_000
+
+_SHOWN_COLUMNS = 30
+
 
 @dataclass(frozen=True)
 class Channel:
@@ -135,11 +139,6 @@ def as_column(file: Path, name: str, values: np.ndarray[Any, Any]) -> pl.Series:
             "text. Map another one."
         )
     return pl.Series(name, np.ascontiguousarray(values, dtype=np.float64))
-
-
-MAX_COLUMNS = 10_000
-
-_SHOWN_COLUMNS = 30
 
 
 def require_columns(file: Path, names: Sequence[str], wanted: Iterable[str]) -> dict[str, int]:

@@ -28,6 +28,13 @@ SUFFIXES = (
     ".blf", ".asc", ".log", ".trc", ".duckdb", ".ddb", ".mcap",
 )  # fmt: skip
 
+_HIDDEN = re.compile(r"/\.(?!\.?(/|$))")
+"""A part of a path that begins with a point, and is not `.` or `..`: those are told as faults."""
+
+_NO_LOG = f"no file in this folder has the suffix of a log: {', '.join(SUFFIXES)}."
+
+AT_ONCE = 16
+
 
 @dataclass(frozen=True)
 class StoredParts:
@@ -130,12 +137,6 @@ def stored_parts(log: StoredFile | StoredParts) -> list[StoredFile]:
     return [log] if isinstance(log, StoredFile) else _stored(log.url)
 
 
-_HIDDEN = re.compile(r"/\.(?!\.?(/|$))")
-"""A part of a path that begins with a point, and is not `.` or `..`: those are told as faults."""
-
-_NO_LOG = f"no file in this folder has the suffix of a log: {', '.join(SUFFIXES)}."
-
-
 def _stored(url: str) -> list[StoredFile]:
     with needed("objects", "a log on an object store"):
         from fleet_slip.files.object_inputs import find_below, find_object  # noqa: PLC0415
@@ -180,9 +181,6 @@ def _logs_below(folder: Path) -> Iterator[Path]:
         for name in names:
             if name.lower().endswith(SUFFIXES) and not name.startswith("."):
                 yield Path(parent, name)
-
-
-AT_ONCE = 16
 
 
 class LocalCopies:

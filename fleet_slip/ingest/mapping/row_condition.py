@@ -25,6 +25,19 @@ _BOUNDS: dict[str, Callable[[pl.Expr, float], Any]] = {
     "other_than": operator.ne,
 }
 
+_KEYS = {">=": "at_least", "<=": "at_most", ">": "above", "<": "below", "!=": "other_than"}
+_NAME = r'"(?P<quoted>[^"]{1,200})"|(?P<name>[^\W\d][\w.:@/\[\]-]*(?:\(:,\d+\))?)'
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_UNIT = r"(?!and\b)[^\W\d]\S*|°\S*|%"
+_ITEM = rf"'[^']*'|{_NUMBER}"
+_COMPARISON = re.compile(
+    rf"\s*(?:{_NAME})\s*(?:"
+    rf"(?P<sign>>=|<=|!=|==|=|>|<)\s*(?:(?P<number>{_NUMBER})(?:\s*(?P<unit>{_UNIT}))?"
+    rf"|'(?P<text>[^']*)')"
+    rf"|in\s*\((?P<items>\s*(?:{_ITEM})(?:\s*,\s*(?:{_ITEM}))*\s*)\))\s*(?P<end>and\b|$)"
+)
+_LONGEST = 2000
+
 
 def _is_none(value: object) -> bool:
     return value is None
@@ -82,20 +95,6 @@ def _text(condition: RowCondition) -> str:
     said: dict[str, Any] = condition.model_dump(exclude_defaults=True, exclude={"column", "signal"})
     parts = [f"{key.replace('_', ' ')} {value}" for key, value in said.items()]
     return f"{condition.column or condition.signal!r} is {' and '.join(parts)}"
-
-
-_KEYS = {">=": "at_least", "<=": "at_most", ">": "above", "<": "below", "!=": "other_than"}
-_NAME = r'"(?P<quoted>[^"]{1,200})"|(?P<name>[^\W\d][\w.:@/\[\]-]*(?:\(:,\d+\))?)'
-_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-_UNIT = r"(?!and\b)[^\W\d]\S*|°\S*|%"
-_ITEM = rf"'[^']*'|{_NUMBER}"
-_COMPARISON = re.compile(
-    rf"\s*(?:{_NAME})\s*(?:"
-    rf"(?P<sign>>=|<=|!=|==|=|>|<)\s*(?:(?P<number>{_NUMBER})(?:\s*(?P<unit>{_UNIT}))?"
-    rf"|'(?P<text>[^']*)')"
-    rf"|in\s*\((?P<items>\s*(?:{_ITEM})(?:\s*,\s*(?:{_ITEM}))*\s*)\))\s*(?P<end>and\b|$)"
-)
-_LONGEST = 2000
 
 
 def text_conditions(text: str, signals: Collection[str]) -> list[dict[str, Any]]:

@@ -23,6 +23,8 @@ WHEELS = "wheel_"
 VELOCITY = "m/s"
 MAX_TABLE = 10_000
 
+COURSE, SPEED = "course", "satellite_speed"
+
 
 def _increasing(table: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
     if table and len(table) < 2:
@@ -144,7 +146,6 @@ class SignalColumn(Config):
         return True
 
 
-COURSE, SPEED = "course", "satellite_speed"
 Component = Literal["north", "east"]
 
 
