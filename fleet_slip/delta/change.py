@@ -24,10 +24,7 @@ _NULLS = "null_count."
 
 @dataclass(frozen=True)
 class TableFile:
-    """One active file of a table, as the Delta log has it.
-
-    `days` are the first and the last day of its rows, where the log tells them.
-    """
+    """An active file of a table, as the Delta log has it, and the first and last of its days."""
 
     path: str
     rows: int
@@ -86,10 +83,7 @@ def _require_sound(file: TableFile, where: object) -> None:
 
 
 class _NullCounts(Mapping[str, int]):
-    """The null counts of one file, looked up among those of all files when they are asked for.
-
-    A table may have 100,000 files, and few jobs ask for more than a few of them.
-    """
+    """Null counts of a file, looked up when asked for: of 100,000 files few jobs need many."""
 
     def __init__(self, columns: Mapping[str, pa.ChunkedArray], row: int) -> None:
         self._columns = columns
@@ -142,11 +136,7 @@ class Unit:
 
 @dataclass(frozen=True)
 class Change:
-    """What one commit does to a table.
-
-    A file that is both added and removed stays. `data_change` is false where rows only move
-    between files.
-    """
+    """What a commit does; files added and removed stay. `data_change` is false if rows move."""
 
     add: Sequence[AddAction] = ()
     remove: Sequence[TableFile] = ()

@@ -69,10 +69,7 @@ def _versions(tables: Sequence["Table"]) -> list[int | None]:
 
 
 def retry_conflicts(attempt: Callable[[], Result]) -> Result:
-    """Call until it raises no `ConflictError`, waiting ever longer between, at random.
-
-    The last conflict is raised. "Full jitter": processes that met once do not meet again.
-    """
+    """Call until it raises no `ConflictError`, waiting ever longer, at random, between."""
     for number in range(ATTEMPTS - 1):
         try:
             return attempt()

@@ -83,10 +83,7 @@ class Snapshot:
         return self if self.version == version else self.table.snapshot()
 
     def removed(self, before_hours: float = 0) -> set[str]:
-        """Return the paths of files that a commit removed, so many hours ago or earlier.
-
-        Those of the last week at least; checkpoints forget what was removed before.
-        """
+        """Return the paths of files removed so many hours ago or earlier; of a week at least."""
         if self.delta is None:
             return set()
         with storage_errors(self.table.folder):

@@ -195,10 +195,7 @@ class Table:
         )
 
     def create(self) -> DeltaTable:
-        """Make the table, and return it as it was made, even if others have written to it since.
-
-        So a commit on top of it meets theirs, and is told of a unit that has landed in one.
-        """
+        """Make the table, and return it as made, so that a commit on it meets those of others."""
         delta = DeltaTable.create(
             self.folder.uri,
             schema=self.schema,

@@ -64,10 +64,7 @@ def require_content(path: str, content: "pa.Buffer | bytes", where: object) -> N
 
 
 def check_local_files(paths: Iterable[str]) -> None:
-    """Raise `StorageError` for a file of this machine that is not what its name says.
-
-    A file is read once by a process, as long as its size, time and inode stay the same.
-    """
+    """Raise `StorageError` for a file that is not what its name says; each is read once."""
     named = [path for path in paths if checksum_in(path)]
     if len(named) == 1:
         _check_local(named[0])

@@ -71,10 +71,7 @@ def list_any_names(bucket: ObjectFolder, path: str) -> Iterator[StoredFile]:
 
 
 def parse_url(url: str) -> tuple[ObjectFolder, str]:
-    """Return the bucket of a URL, and the path in it. Raises `InputError`.
-
-    A URL that is refused is not shown: what is wrong with it may be that it has a password.
-    """
+    """Return bucket and path of a URL. Raises `InputError`, which may not show a password."""
     found = _URL.fullmatch(url)
     if found is None:
         raise InputError(
@@ -97,10 +94,7 @@ def find_object(url: str) -> StoredFile | None:
 
 
 def find_below(url: str) -> list[StoredFile]:
-    """Return the objects below a folder, at any depth, or those that match a pattern, sorted.
-
-    `*` and `?` stand for characters of one name, `**` for folders. Raises `StorageError`.
-    """
+    """Return objects below a folder, or that match a pattern with `*`, `?`, `**`, sorted."""
     bucket, path = parse_url(url)
     whole = path.split("/")
     plain = [part for part in whole if not is_pattern(part)]

@@ -41,11 +41,7 @@ def compact(
     target_rows: int = TARGET_ROWS,
     progress: Progress = no_progress,
 ) -> CompactionReport:
-    """Compact every day, in a commit each, and bring the Gram rows up to date.
-
-    Running it again does nothing. `progress` counts days. Raises `StorageError`, or `ConflictError`
-    if other processes keep changing the same files.
-    """
+    """Compact each day in a commit, then reconcile Gram rows. Raises `ConflictError`."""
     warehouse.require()
     before = warehouse.logs.snapshot()
     days = sorted({file.day for file in before.files if file.day is not None})

@@ -33,10 +33,7 @@ from fleet_slip.warehouse.tables import Warehouse
 def repair(
     warehouse: Warehouse, verification: Verification, campaigns: Sequence[str] = ()
 ) -> list[str]:
-    """Rebuild what a verification found damaged; return what was rebuilt, below the root.
-
-    `campaigns` names campaign files besides those that ship. Verify again to see what is left.
-    """
+    """Rebuild what is damaged, also by files of `campaigns`; return what, below the root."""
     rebuilt = _sum_up_again(warehouse)
     damaged = {finding.path for finding in verification.damage if finding.kind == "file"}
     wrong = {f.path.removeprefix("logs/") for f in verification.damage if f.kind == "gram"}

@@ -122,11 +122,7 @@ def _order(rows: pa.Table) -> IntArray:
 
 
 def drop_unused_names(warehouse: Warehouse) -> int:
-    """Write log files anew without the names that none of their rows has; return how many.
-
-    It reads the texts of every file. Raises `StorageError`, and `ConflictError` if other processes
-    keep changing the same files.
-    """
+    """Write files anew without names that none of their rows has; return how many."""
 
     def attempt() -> int:
         logs = warehouse.logs.snapshot()

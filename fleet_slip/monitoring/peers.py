@@ -186,10 +186,7 @@ class Peers:
 def settle(
     table: GramTable, in_order: BoolArray, label: str, limits: QualityThresholds
 ) -> tuple[Peers, BoolArray]:
-    """Fit a cohort's peers on the drives in order, leaving suspects out until they stay the same.
-
-    Starts from the drives that are plausible. Returns the peers and which drives are suspect.
-    """
+    """Fit peers on plausible drives, leaving suspects out until they stay; return both."""
     suspects = ~in_order
     for _ in range(ROUNDS):
         peers = Peers(DriveBatches.of(table, ~suspects), label, limits)

@@ -134,11 +134,7 @@ def current_run_id() -> str | None:
 
 @contextlib.contextmanager
 def recording(root: Folder, command: str, arguments: Sequence[str]) -> Iterator[Run]:
-    """Record a command that may change the warehouse at `root`, whatever comes of it.
-
-    A data root that does not exist is not made: then both lines are written at the end, if the
-    command has made it.
-    """
+    """Record a command that may change a root, only at its end if it made the root itself."""
     run = Run.start(command, arguments)
     file = f"{FOLDER}/{run.started_at:%Y-%m}.jsonl"
     begun = time.monotonic()

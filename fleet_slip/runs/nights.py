@@ -50,10 +50,7 @@ class PastNight:
 
 
 def hash_drive(model: str, drive_id: str) -> str:
-    """Return what stands for a drive in the record and in conditions: 16 hexadecimal digits.
-
-    Salted with the model's name. In SQL it is `left(sha256('MODEL ' || drive_id), 16)`.
-    """
+    """Return `left(sha256('MODEL ' || drive_id), 16)`, which stands for a drive in the record."""
     return sha256(f"{model} {drive_id}".encode()).hexdigest()[:HASH_CHARACTERS]
 
 

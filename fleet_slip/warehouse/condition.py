@@ -95,10 +95,7 @@ def asking(
 
 
 def parse_condition(text: str | Condition, columns: Collection[str] | None = None) -> Condition:
-    """Return a condition on some columns, by default those that tell drives apart.
-
-    Raises `QuestionError` for what is not one expression, or asks for more than the columns.
-    """
+    """Return a condition on columns, by default of drives. Raises `QuestionError`."""
     if isinstance(text, Condition):
         return text
     return _parsed(text, frozenset(drive_columns() if columns is None else columns))

@@ -57,10 +57,7 @@ def open_database(
 
 
 def limit_memory() -> None:
-    """Have the system refuse this process more than three quarters of the memory.
-
-    DuckDB keeps to its own limit for what it buffers, not for one value: a list of 2e9 numbers.
-    """
+    """Let the process have three quarters of the memory: DuckDB bounds no single value."""
     limit = max(memory_bytes() // 4 * 3, data_needed())
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)
     if hard == resource.RLIM_INFINITY or limit < hard:

@@ -23,10 +23,7 @@ VIEWS_WITHOUT_CARS = ("models", "runs")
 
 
 def minimum_vehicles() -> int | None:
-    """Return the least number of cars of an answer; None where the rule is off.
-
-    Raises `ConfigError` for what is no whole number above 1: a wrong one does not switch it off.
-    """
+    """Return the least number of cars of an answer, None if off. Raises `ConfigError`."""
     told = os.environ.get(MINIMUM_VARIABLE)
     if told is None:
         return None

@@ -50,11 +50,7 @@ def sum_days(
     condition: str | Condition = TRAINING_DRIVES,
     feature_set: str = PLAIN,
 ) -> DailySums:
-    """Add up, day by day, the Gram rows of the drives that have the label and all the inputs.
-
-    Raises like `fleet_slip.grams.cohorts.gram_cohort.load_cohort`, and `DataError`
-    if no drive has them all.
-    """
+    """Add up a cohort's Gram rows with label and inputs, day by day. Raises like `load_cohort`."""
     signals = (*inputs, catalogue().label)
     days: dict[date, _Day] = defaultdict(_Day)
     found = False

@@ -61,10 +61,7 @@ class Folding(Config):
 
 
 def make_folding(by: FoldKey, count: int | str | None, usual: FoldCount) -> Folding:
-    """Return a folding that was asked for, with the usual count if none is. Raises `UsageError`.
-
-    Each part of drives is a fold of its own unless a number is asked for.
-    """
+    """Return a folding, by default of the usual count, or each part. Raises `UsageError`."""
     if count is None:
         count = EACH if by == PARTS else usual
     try:

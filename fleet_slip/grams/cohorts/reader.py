@@ -40,11 +40,7 @@ BATCH_NUMBERS = 2**20
 
 @dataclass(frozen=True)
 class OpenedGrams:
-    """A connection to the Gram rows of a feature set, and the table versions behind it.
-
-    Instead of the rows of some files it has their `cells`. Statements leave out what is
-    `outweighing`.
-    """
+    """A connection to Gram rows but for those in `cells`, without what is `outweighing`."""
 
     database: duckdb.DuckDBPyConnection
     identity: str

@@ -65,11 +65,7 @@ class DriveCutter:
         """Parts that the last block ended, in an order that does not depend on blocks."""
 
     def cut(self, rows: pl.DataFrame, *, last: bool) -> tuple[pl.DataFrame, pl.DataFrame]:
-        """Return the rows of a block, those of a part together, with a column `part`; and the bad.
-
-        Rows of several time bases are in the order of time, which was looked at base by base; those
-        of different bases may have the same.
-        """
+        """Return the rows of a block with their `part`, together; and the misplaced ones."""
         self.ended = []
         stretches = _stretches(rows, self._gap_s)
         found = [

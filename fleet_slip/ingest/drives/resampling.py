@@ -115,10 +115,7 @@ def snap(time_s: FloatArray) -> IntArray:
 
 
 def tick_range(time_s: FloatArray, method: Method) -> tuple[float, int]:
-    """Return the time of tick 0, and how many ticks there are, in a drive that is not snapped.
-
-    Averages need half a sample time on either side of a tick, so tick 0 is that much later.
-    """
+    """Return the time of tick 0, half a tick late for averages, and the number of ticks."""
     margin = STEP_S / 2 if method == "average" else 0.0
     span = time_s[-1] - time_s[0] - 2 * margin
     return float(time_s[0] + margin), int(np.floor((span + TIME_EPSILON_S) / STEP_S)) + 1

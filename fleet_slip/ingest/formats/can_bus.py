@@ -51,10 +51,7 @@ def read_can_database(bus: CanBus, folder: Path) -> CanBus:
 
 
 def parse_database(bus: CanBus) -> Any:
-    """Return the messages that a database describes. Raises `InputError`.
-
-    What cantools says of a text that it cannot parse quotes a line of it; only the place is told.
-    """
+    """Return the messages of a database. Raises `InputError`, which quotes no line of it."""
     database = Path(bus.database)
     if _ABSURD.search(bus.text):
         raise InputError(

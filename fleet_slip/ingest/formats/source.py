@@ -103,10 +103,7 @@ class ClockSource(ABC):
 
 @contextmanager
 def reading_with(file: Path, package: str) -> Iterator[Any]:
-    """Give a package of the extra `logs`; turn what it raises at a file into an `InputError`.
-
-    Its authors raise whatever a damaged file leads to, so that there is no list to catch.
-    """
+    """Give a package of the extra `logs`; whatever it raises at a file is an `InputError`."""
     with needed("logs", f"{shown(file)}: its format"):
         module = import_module(package)
     logging.getLogger(package.partition(".")[0]).setLevel(logging.CRITICAL)

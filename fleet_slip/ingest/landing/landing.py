@@ -132,10 +132,7 @@ def _write_file(
     audit: Audit,
     progress: Progress,
 ) -> tuple[FileOutcome, MeasuredDrive | None, dict[TableName, Rows]]:
-    """Read a file to its end, and write all but its last rows, in those tables that lack them.
-
-    Returns what it became, its longest drive if that is new, and the last rows of each table.
-    """
+    """Read a file, write all but its last rows; return what it became, its longest drive, these."""
     is_new = tables["logs"].lacks(stream.digest)
     lacking = {n for n, table in tables.items() if is_new and table.lacks(stream.digest)}
     names = (f"measured-{stream.digest[:24]}-{number}" for number in count(1))
@@ -201,10 +198,7 @@ def _groups(drives: Iterable[MeasuredDrive]) -> Iterator[list[MeasuredDrive]]:
 
 
 class _RefusedRows:
-    """Rows for the quarantine until the end of their file; of many, most are in a temporary file.
-
-    Only then is it known whether a drive that they are of was forgotten.
-    """
+    """Rows for the quarantine, spooled until it is known whether their drive was forgotten."""
 
     def __init__(self, stream: MeasuredStream) -> None:
         self._stream, self._spool = stream, Spool()

@@ -48,10 +48,7 @@ class StoredParts:
 
 
 class StrayLink(PosixPath):
-    """A file that was found in a folder, and is behind a link that leads out of it.
-
-    Whoever may put files into a folder must not choose which others of this machine are read.
-    """
+    """A file found behind a link out of a folder: who fills it may not choose what is read."""
 
 
 Log: TypeAlias = Path | StoredFile | StoredParts
