@@ -103,6 +103,11 @@ def print_table(
     _print_lines("\n".join(line.rstrip() for line in captured.get().splitlines()))
 
 
+def cell(value: Any, form: str = "") -> str:
+    """Return a value as a table shows it; nothing for None."""
+    return "" if value is None else format(value, form)
+
+
 def figures_cells(figures: "Figures") -> list[str]:
     """Return correlation, RMSE, mean and standard deviation of an error as a table shows them."""
     return [

@@ -4,7 +4,7 @@ import shlex
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from fleet_slip.cli.output import print_line, print_table, print_text, stdout
+from fleet_slip.cli.output import cell, print_line, print_table, print_text, stdout
 from fleet_slip.words import number_of
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def _print_group(
     content: dict[str, Any],
     title: str,
     names: Sequence[str],
-    cell: Callable[[dict[str, Any]], str],
+    figures: Callable[[dict[str, Any]], str],
     width: int,
 ) -> None:
     """Print a table of estimators; as many tables as the terminal's width makes of it."""
@@ -52,7 +52,7 @@ def _print_group(
                 [
                     one["name"],
                     f"{one['truth']['sideslip_std_deg']:.2f}",
-                    *(cell(one["results"][name]) for name in shown),
+                    *(figures(one["results"][name]) for name in shown),
                 ]
                 for one in content["scenarios"]
             ],
@@ -99,9 +99,9 @@ def print_ranking(ranking: dict[str, Any]) -> None:
             [
                 one["scenario"],
                 one["winner"] or "",
-                _figure(one["winner_rmse_deg"]),
-                _figure(one["rmse_deg"]),
-                _figure(one["ratio"], 2),
+                cell(one["winner_rmse_deg"], ".3f"),
+                cell(one["rmse_deg"], ".3f"),
+                cell(one["ratio"], ".2f"),
             ]
             for one in ranking["standings"]
         ],
@@ -117,7 +117,10 @@ def _print_gps_noise(sweep: dict[str, Any] | None) -> None:
         f"\n{sweep['scenario']}: RMSE in deg over the noise of GPS velocity, m/s, without outages",
         ["GPS noise", *map(_heading, names)],
         [
-            [f"{level['velocity_std_mps']:.3f}", *(_figure(level["rmse_deg"][n]) for n in names)]
+            [
+                f"{level['velocity_std_mps']:.3f}",
+                *(cell(level["rmse_deg"][n], ".3f") for n in names),
+            ]
             for level in sweep["levels"]
         ],
     )
@@ -148,7 +151,7 @@ def _print_sections(content: dict[str, Any]) -> None:
                     [
                         name,
                         *(
-                            _figure(result[place]["unstable"][figure])
+                            cell(result[place]["unstable"][figure], ".3f")
                             for figure in ("rmse_deg", "error_std_deg", "correlation")
                             for place in PLACES
                         ),
@@ -156,10 +159,6 @@ def _print_sections(content: dict[str, Any]) -> None:
                     for name, result in one["results"].items()
                 ],
             )
-
-
-def _figure(value: float | None, digits: int = 3) -> str:
-    return "" if value is None else f"{value:.{digits}f}"
 
 
 def _print_checks(checks: Sequence[dict[str, Any]]) -> None:
@@ -172,8 +171,8 @@ def _print_checks(checks: Sequence[dict[str, Any]]) -> None:
             [
                 check["requirement"],
                 check["estimator"],
-                _figure(check["found"], 4),
-                _figure(check["limit"], 4),
+                cell(check["found"], ".4f"),
+                cell(check["limit"], ".4f"),
                 "" if check["reached"] else "missed",
             ]
             for check in checks

@@ -5,7 +5,7 @@ import typer
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli.options import By, Cluster, Cohort, FeatureSetOption, FoldCount, Naive, Signals
-from fleet_slip.cli.output import Json, figures_cells, print_json, print_table
+from fleet_slip.cli.output import Json, cell, figures_cells, print_json, print_table
 from fleet_slip.selection.shrinkage import Shrunk
 from fleet_slip.words import number_of
 
@@ -43,7 +43,7 @@ def shrink(
             [
                 one.cross_validation.name,
                 f"{len(one.cross_validation.signals)} of {len(inputs)}",
-                "" if one.penalty is None else f"{one.penalty:.2g}",
+                cell(one.penalty, ".2g"),
                 *figures_cells(one.cross_validation.pooled),
             ]
             for one in found

@@ -9,7 +9,15 @@ from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli.left_out import say_outweighing, say_revoked, say_untold, say_without_log
 from fleet_slip.cli.options import Cohort, selection_options
-from fleet_slip.cli.output import Json, figures_cells, print_json, print_line, print_table, say
+from fleet_slip.cli.output import (
+    Json,
+    cell,
+    figures_cells,
+    print_json,
+    print_line,
+    print_table,
+    say,
+)
 from fleet_slip.grams.cohorts.folding import BANDS, PARTS, ROW_FOLDS
 from fleet_slip.grams.cohorts.outweighing import drives_by_car
 from fleet_slip.grams.cohorts.taught_cohort import TaughtCohort
@@ -227,7 +235,7 @@ def _print_choice(choice: SearchChoice) -> None:
                     " ".join(result.best.model.signals),
                     " ".join(c for c, size in choice.picks.items() if size == result.best.size),
                     f"{result.best.r_squared:.6f}",
-                    "" if result.gap is None else f"{result.gap:.2g}",
+                    cell(result.gap, ".2g"),
                 ]
                 for result in choice.subsets
             ],

@@ -9,7 +9,7 @@ import typer
 from fleet_slip.catalogue.car_numbers import CAR_NUMBERS, NumberName
 from fleet_slip.catalogue.sources import ALL_DRIVES
 from fleet_slip.cli.options import Cohort
-from fleet_slip.cli.output import Json, print_json, print_table, say
+from fleet_slip.cli.output import Json, cell, print_json, print_table, say
 from fleet_slip.grams.calibration.calibration import Calibration
 from fleet_slip.grams.calibration.car_evidence import CalibratedNumber
 from fleet_slip.words import number_of
@@ -54,7 +54,7 @@ def _print_car(car: str, numbers: Mapping[NumberName, CalibratedNumber]) -> None
                 name,
                 CAR_NUMBERS[name].unit,
                 f"{one.value:.6g}",
-                _error(one.uncertainty),
+                cell(one.uncertainty, ".2g"),
                 str(one.drives),
                 str(one.count),
                 str(CAR_NUMBERS[name].grain),
@@ -84,7 +84,7 @@ def _print_fleet(found: Calibration) -> None:
                 f"{len(cars):,}",
                 f"{median(one.value for one in cars):.3g}",
                 f"{pstdev(one.value for one in cars):.2g}",
-                _error(_median([one.uncertainty for one in cars])),
+                cell(_median([one.uncertainty for one in cars]), ".2g"),
             ]
             for name, cars in by_number.items()
             if cars
@@ -100,7 +100,7 @@ def _print_fleet(found: Calibration) -> None:
                 str(row.drives),
                 f"{row.cars:,}",
                 f"{row.stated:.2g}",
-                _error(row.measured),
+                cell(row.measured, ".2g"),
             ]
             for row in found.convergence()
         ],
@@ -112,7 +112,3 @@ def _print_fleet(found: Calibration) -> None:
 def _median(values: Sequence[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return median(known) if known else None
-
-
-def _error(value: float | None) -> str:
-    return "" if value is None else f"{value:.2g}"

@@ -2,11 +2,11 @@
 
 import logging
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from fleet_slip.cli.output import Json, print_json, print_table, print_text, say
+from fleet_slip.cli.output import Json, cell, print_json, print_table, print_text, say
 from fleet_slip.cli.workers import Cluster
 from fleet_slip.errors import AlarmError, UsageError
 from fleet_slip.monitoring.fitness import Fitness
@@ -78,7 +78,7 @@ def _print_status(found: WarehouseStatus) -> None:
             [
                 name,
                 f"{one.committed_at:%Y-%m-%d %H:%M}" if one.committed_at else "never",
-                "" if one.version is None else str(one.version),
+                cell(one.version),
                 f"{one.files:,}",
                 f"{one.rows:,}",
                 f"{one.size_bytes / 1e6:,.1f}",
@@ -87,24 +87,28 @@ def _print_status(found: WarehouseStatus) -> None:
         ],
         left=2,
     )
-    disk = []
+    backlog = f"{number_of(found.backlog_files, 'file')}, {number_of(found.backlog_rows, 'row')}"
+    facts = {"newest day": str(found.newest_day or "none"), "waiting for the Gram job": backlog}
     if found.disk_free_bytes is not None and found.disk_free_fraction is not None:
         free = f"{found.disk_free_bytes / 1e9:,.1f} GB free, {found.disk_free_fraction:.0%}"
-        disk = [["disk", free]]
-    print_table(
-        "",
-        ["", ""],
-        [
-            ["newest day", str(found.newest_day or "none")],
+        facts["disk"] = free
+    print_table("", ["", ""], facts.items(), left=2)
+    if found.last_runs:
+        print_table(
+            "\nlast runs",
+            ["command", "started", "state", "seconds", "rows"],
             [
-                "waiting for the Gram job",
-                f"{number_of(found.backlog_files, 'file')}, {number_of(found.backlog_rows, 'row')}",
+                [
+                    run["command"],
+                    f"{run['started_at']:%Y-%m-%d %H:%M:%S}",
+                    run["state"],
+                    cell(run["seconds"], ".1f"),
+                    cell(run["rows"], ","),
+                ]
+                for run in found.last_runs
             ],
-            *disk,
-        ],
-        left=2,
-    )
-    _print_runs(found)
+            left=3,
+        )
     if found.champions:
         print_table(
             "\nchampions",
@@ -112,8 +116,8 @@ def _print_status(found: WarehouseStatus) -> None:
             [
                 [
                     f"{one.model}@{one.version}",
-                    f"{one.published_at:%Y-%m-%d %H:%M}" if one.published_at else "",
-                    "" if one.age_hours is None else f"{one.age_hours:,.1f}",
+                    cell(one.published_at, "%Y-%m-%d %H:%M"),
+                    cell(one.age_hours, ",.1f"),
                     str(one.logs_behind),
                     str(one.grams_behind),
                 ]
@@ -121,27 +125,3 @@ def _print_status(found: WarehouseStatus) -> None:
             ],
             left=2,
         )
-
-
-def _print_runs(found: WarehouseStatus) -> None:
-    if not found.last_runs:
-        return
-    print_table(
-        "\nlast runs",
-        ["command", "started", "state", "seconds", "rows"],
-        [
-            [
-                run["command"],
-                f"{run['started_at']:%Y-%m-%d %H:%M:%S}",
-                run["state"],
-                _number(run["seconds"], ".1f"),
-                _number(run["rows"], ","),
-            ]
-            for run in found.last_runs
-        ],
-        left=3,
-    )
-
-
-def _number(value: Any, form: str) -> str:
-    return "" if value is None else format(value, form)
