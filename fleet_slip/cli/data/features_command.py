@@ -57,12 +57,7 @@ def features(
             "",
             ["set", "columns", "rows of a drive", "description"],
             [
-                [
-                    name,
-                    " ".join(known.feature_set(name).inputs),
-                    _parts(known.feature_set(name)),
-                    one.description,
-                ]
+                [name, " ".join(one.inputs), _parts(one), one.description]
                 for name, one in ((n, known.feature_set(n)) for n in (PLAIN, *known.sets))
             ],
             left=4,

@@ -120,18 +120,12 @@ def check(
     if json:
         print_json(report)
     else:
-        wide = [f"{report.wide_drives}"]
-        print_table(
-            "",
-            ["way", "drives", "equal"],
-            [
-                ["SQL against stored Gram rows", f"{report.drives}", "yes"],
-                ["SQL against float64 blocks", f"{report.drives}", "yes"],
-                ["SQL against Python integers", f"{report.drives_by_integers}", "yes"],
-                *(
-                    [[f"SQL against the kernel: {', '.join(report.wide_sets)}", *wide, "yes"]]
-                    if report.wide_sets
-                    else []
-                ),
-            ],
-        )
+        ways = {
+            "SQL against stored Gram rows": report.drives,
+            "SQL against float64 blocks": report.drives,
+            "SQL against Python integers": report.drives_by_integers,
+        }
+        if report.wide_sets:
+            ways[f"SQL against the kernel: {', '.join(report.wide_sets)}"] = report.wide_drives
+        rows = [[way, f"{drives}", "yes"] for way, drives in ways.items()]
+        print_table("", ["way", "drives", "equal"], rows)

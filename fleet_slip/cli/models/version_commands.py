@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from fleet_slip.api.fleet import Fleet
+from fleet_slip.catalogue.definitions import Definition
 from fleet_slip.cli.completing import complete_model
 from fleet_slip.cli.models.signing_commands import signing_key
 from fleet_slip.cli.output import Json, print_json, print_table, say
@@ -131,24 +132,13 @@ def show(context: typer.Context, reference: Reference, json: Json = False) -> No
         _print_version(version)
 
 
-def _definition_row(term: ModelTerm) -> list[str]:
-    one = term.definition
-    if one is None:
-        return []
-    ticks = str(one.ticks) if one.ticks else ""
+def _definition_row(term: ModelTerm, one: Definition) -> list[str]:
     times = [one.fact.name] if one.fact else []
     if gate := one.gate:
         knots = [str(knot) for knot in (gate.low, gate.peak, gate.high) if knot is not None]
         times.append(f"{gate.by.over or ''} {gate.by.of} {gate.by.ticks or ''}: {' '.join(knots)}")
-    return [
-        term.signal,
-        f"{term.scale} {term.unit}",
-        one.of,
-        one.over or "",
-        ticks,
-        str(one.bits),
-        ", ".join(times).strip(),
-    ]
+    window = [one.of, one.over or "", str(one.ticks or ""), str(one.bits)]
+    return [term.signal, f"{term.scale} {term.unit}", *window, ", ".join(times).strip()]
 
 
 def _teacher(learned: LearnedFrom) -> str:
@@ -193,7 +183,7 @@ def _print_version(version: ModelVersion) -> None:
         print_table(
             "\ncolumns over time (docs/memory.md): counts, times the scale",
             ["column", "scale", "of", "over", "ticks", "bits", "times"],
-            [_definition_row(term) for term in manifest.terms if term.definition],
+            [_definition_row(term, own) for term in manifest.terms if (own := term.definition)],
             left=4,
         )
     cars = "" if trained.vehicles is None else f" of {number_of(trained.vehicles, 'car')}"
