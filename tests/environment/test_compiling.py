@@ -144,7 +144,7 @@ def test_code_is_kept_no_longer_where_what_it_calls_in_another_folder_has_change
         (package / name).write_text(text)
     monkeypatch.setattr(kept_code, "PACKAGE", package)
     stamp = kept_code._sources_stamp.__wrapped__
-    braking = str(package / "simulation" / "braking.py")
+    braking = str(package / "simulation" / "environment.py")
     before = stamp(braking)
     (package / "vehicle" / "driver.py").write_text("not imported")
     assert stamp(braking) == before
