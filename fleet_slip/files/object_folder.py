@@ -119,11 +119,7 @@ class ObjectFolder:
         self._put(path, content, "overwrite")
 
     def create(self, path: str, content: Content) -> bool:
-        """Write a file as a whole, durably; False, and no change, if there is one of that name.
-
-        Where an answer was lost on the way, the attempt is made again, and is False for the file
-        that it has made itself.
-        """
+        """Write a file, unless there is one; after a lost answer that is the one it has made."""
         return self._put(path, content, "create")
 
     def append(self, path: str, content: bytes) -> None:

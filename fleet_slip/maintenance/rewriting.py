@@ -136,11 +136,7 @@ def drop_unused_names(warehouse: Warehouse) -> int:
 
 
 def forget_received(warehouse: Warehouse, subject: Forgettable) -> int:
-    """Commit the Gram rows without those of a subject that came without a log.
-
-    Called after the fence, so that none lands any more. Returns how many rows of drives they were
-    of. Raises `StorageError`, or `ConflictError`.
-    """
+    """Commit the Gram rows without those that came without a log; return how many rows."""
 
     def attempt() -> int:
         snapshot = warehouse.grams.snapshot()

@@ -9,13 +9,10 @@ from fleet_slip.resources import config_file
 
 
 class StatusThresholds(Config):
-    """When `status` calls for attention.
-
-    Attributes:
-        min_free_fraction: least free part of the disk that holds the data root.
-    """
+    """When `status` calls for attention."""
 
     min_free_fraction: float = Field(ge=0, lt=1)
+    """Least free part of the disk that holds the data root."""
 
 
 class QualityThresholds(Config):

@@ -118,11 +118,7 @@ class RollupReader:
         folding: Folding,
         revoked: Collection[str] = (),
     ) -> Cells:
-        """Return the cells of a cohort of a feature set; none, if its rows have to be read.
-
-        Cells of a car among the revoked ones serve nothing. Raises `StorageError` for a damaged
-        rollup, and `QuestionError` for a condition that cannot be asked.
-        """
+        """Return the cells of a cohort, but of `revoked` cars; none if its rows must be read."""
         wanted = condition.columns
         if folding.by not in BUCKET_KEYS:
             wanted |= {FOLD_KEYS[folding.by]}

@@ -42,11 +42,7 @@ INDEFINITE = "has a matrix that is not positive semidefinite"
 def find_impossible(
     rows: IntArray, sums: IntArray, products: IntArray, ranges: Sequence[tuple[int, int]]
 ) -> dict[str, IntArray]:
-    """Return which Gram rows are impossible, by the first reason of each.
-
-    `rows` has shape (m,), `sums` (m, k), `products` (m, k(k+1)/2); `ranges` are those of the counts
-    of the k signals.
-    """
+    """Return impossible Gram rows by reason, of n (m,), sums (m, k), products and k ranges."""
     found: dict[str, IntArray] = {}
     left = np.arange(len(rows))
     for reason, rule in (

@@ -46,31 +46,25 @@ _STAND_IN: dict[str, Any] = {"vehicle_id": "car", "vehicle_model": "car", "day":
 
 @dataclass(frozen=True)
 class TimeGuess:
-    """Where time is from.
-
-    Attributes:
-        day: that times tell; None if they do not.
-    """
+    """Where time is from."""
 
     keys: dict[str, Any]
     reason: str
     rate_hz: float | None
     day: date | None = None
+    """What times tell of it; None if they tell nothing."""
 
 
 @dataclass(frozen=True)
 class Draft:
-    """A draft of a mapping.
-
-    Attributes:
-        open_questions: what looks wrong in what it makes of the file, or why it makes nothing.
-    """
+    """A draft of a mapping."""
 
     file: Path
     profile: FileProfile
     time: TimeGuess
     guesses: dict[str, Guess]
     open_questions: tuple[str, ...]
+    """What looks wrong in what it makes of the file, or why it makes nothing."""
 
 
 def draft_mapping(file: Path, profile: FileProfile) -> Draft:

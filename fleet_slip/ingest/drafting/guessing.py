@@ -109,16 +109,13 @@ _SUFFIXES = (
 
 @dataclass(frozen=True)
 class Guess:
-    """A channel as a signal.
-
-    Attributes:
-        reasons: why, for people.
-    """
+    """A channel as a signal."""
 
     signal: str
     profile: Profile
     unit: str
     reasons: tuple[str, ...]
+    """Why, for people."""
     radius_m: float | None = None
     negate: bool = False
     component: Component | None = None

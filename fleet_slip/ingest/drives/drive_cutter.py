@@ -150,10 +150,7 @@ class DriveCutter:
     def _isolated(
         self, rows: pl.DataFrame, *, last: bool
     ) -> tuple[BoolArray, BoolArray, FloatArray]:
-        """Return which rows are isolated, which wait for the next, and when that is known.
-
-        What a row far from the one before is, the row after it tells: its number is when.
-        """
+        """Return which rows are isolated, which wait for the next, and which row tells that."""
         group, time = rows["group"].to_numpy(), rows["time"].to_numpy()
         first, end = _ends(group)
         before = np.concatenate([[np.nan], time[:-1]])

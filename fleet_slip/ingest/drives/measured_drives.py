@@ -251,10 +251,7 @@ class Trips:
 
 @dataclass(frozen=True)
 class IngestCounts:
-    """What became of a file's rows.
-
-    `rows_read == rows_left_out + rows_kept + sum(quarantined.values())`.
-    """
+    """What became of a file's rows: read are left out, kept or quarantined."""
 
     rows_read: int
     rows_left_out: int

@@ -30,11 +30,7 @@ LEAST_SPEED_MPS = 2.0
 
 
 def choose_method(time_s: FloatArray, interval_s: float) -> Method:
-    """Choose how a drive gets onto the ticks, from its times and the file's usual interval.
-
-    Samples at 100 Hz that lie within `SNAP_TOLERANCE_S` of a tick are snapped, so that measured
-    values stay what they are. A faster log is averaged; any other is interpolated.
-    """
+    """Snap samples of 100 Hz that are near ticks, average a faster log, interpolate others."""
     if interval_s < STEP_S - SNAP_TOLERANCE_S:
         return "average"
     if interval_s <= STEP_S + SNAP_TOLERANCE_S:

@@ -97,10 +97,7 @@ def speed_mps(signals: Signals) -> FloatArray | None:
 
 
 def speed_ratio(signals: Signals) -> float | None:
-    """Return the lateral acceleration over yaw rate times speed, None if they do not go together.
-
-    It is 1 in steady driving; where the wheels' radius or unit is another, that factor.
-    """
+    """Return ay over yaw rate times speed: 1, or how wrong the speed is; None if unrelated."""
     speed = speed_mps(signals)
     if speed is None or not {"ay", "yaw_rate"} <= set(signals):
         return None

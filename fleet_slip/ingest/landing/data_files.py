@@ -62,11 +62,7 @@ def digest_of(digests: Sequence[str]) -> str:
 
 
 class DataFiles:
-    """Data files of one table that a batch of measured files becomes, written by threads.
-
-    Measured files are read one after the other: rows are added, then their file is ended, or, if it
-    turned out not to be usable, discarded.
-    """
+    """Data files of a batch in one table. Files are read one by one, and ended or discarded."""
 
     def __init__(
         self,
