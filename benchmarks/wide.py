@@ -22,7 +22,7 @@ from fleet_slip.catalogue import features as features_module
 from fleet_slip.catalogue.feature_sets import PLAIN, FeatureSet
 from fleet_slip.catalogue.features import FeatureCatalogue, features
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.catalogue.windows import Window
+from fleet_slip.catalogue.time_columns import Window
 from fleet_slip.columns.blocks.column_plan import ColumnPlan
 from fleet_slip.columns.blocks.drive_columns import Workspace
 from fleet_slip.delta import TableFile

@@ -19,7 +19,7 @@ from fleet_slip.catalogue.definitions import COUNT_BITS, Definition, plain_colum
 from fleet_slip.catalogue.feature_sets import PLAIN, FeatureSet, Regime
 from fleet_slip.catalogue.row_features import Feature
 from fleet_slip.catalogue.signals import Identifier, Signal, catalogue
-from fleet_slip.catalogue.windows import (
+from fleet_slip.catalogue.time_columns import (
     Calibrated,
     Factor,
     GateFamily,

@@ -1,4 +1,4 @@
-"""Windows and factors of `configs/features.toml` as types: `[windows.NAME]`, `[factors.NAME]`."""
+"""Columns over time of `configs/features.toml` as types: windows, factors, gates and car numbers."""
 
 from collections.abc import Mapping
 from decimal import Decimal
