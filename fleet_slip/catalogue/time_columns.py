@@ -1,4 +1,4 @@
-"""Columns over time of `configs/features.toml` as types: windows, factors, gates and car numbers."""
+"""Columns over time of `configs/features.toml`: windows, factors, gates and car numbers."""
 
 from collections.abc import Mapping
 from decimal import Decimal
