@@ -16,11 +16,12 @@ from datetime import timedelta
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 
 import fleet_slip
 from fleet_slip.catalogue.car_numbers import DELAY
 from fleet_slip.grams.cohorts.reader import open_grams
-from fleet_slip.grams.rows.receiver_delay import receiver_delays
+from fleet_slip.grams.rows.receiver_delay import changed_delays, receiver_delays
 from fleet_slip.simulation.campaign import Campaign, load_campaign
 from fleet_slip.simulation.drive_plan import FleetPlan
 from fleet_slip.simulation.imperfections import Range
@@ -29,6 +30,8 @@ from fleet_slip.warehouse.condition import parse_condition
 
 STEPS = (1, 3, 10, 30)
 """Drives of each car that are asked."""
+LARGE_S = 0.03
+KEYS = ("vehicle_id", "day")
 NINETY = 1.645
 """Standard errors that 90 % of normal errors are within."""
 
@@ -49,6 +52,8 @@ def main() -> None:
             fleet.gram(name)
         for drives in (*(step for step in STEPS if step < given.drives), given.drives):
             print(json.dumps(measure(fleet, campaign, drives)), flush=True)
+        for drives in (10, given.drives):
+            print(json.dumps(changes(fleet, campaign, drives)), flush=True)
 
 
 def late_campaign(base: str, cars: int, drives: int, seed: int) -> Campaign:
@@ -102,6 +107,43 @@ def measure(fleet: fleet_slip.Fleet, campaign: Campaign, drives: int) -> dict[st
         "stated_median_ms": round(1000 * float(np.median(stated)), 2),
         "within_1.645_stated": round(float(within.mean()), 3),
         "within_2_stated": round(float((np.abs(errors) <= 2 * stated).mean()), 3),
+    }
+
+
+def changes(fleet: fleet_slip.Fleet, campaign: Campaign, drives: int) -> dict[str, object]:
+    """Return in how many cars a delay is said to have changed, and in how many where it has.
+
+    It has in two cars of eight, whose first halves of the drives are exchanged.
+    """
+    last, middle = (campaign.first_day + timedelta(days=n) for n in (drives - 1, drives // 2))
+    condition = parse_condition(f"day <= '{last}'")
+    with open_grams(fleet.warehouse, DELAY, condition) as opened:
+        batches = list(opened.batches(condition))
+    true, names = injected_s(campaign), sorted(injected_s(campaign))
+    following = dict(zip(names[::8], names[1::8], strict=False))
+    following |= {other: one for one, other in following.items()}
+    by = np.array([abs(true[one] - true[other]) for one, other in following.items()])
+    joined = [
+        batch.set_column(
+            batch.schema.get_field_index("vehicle_id"),
+            "vehicle_id",
+            pa.array(
+                [
+                    following.get(car, car) if day < middle else car
+                    for car, day in zip(*(batch[n].to_pylist() for n in KEYS), strict=True)
+                ]
+            ),
+        )
+        for batch in batches
+    ]
+    told = changed_delays(joined)
+    found = np.array([one in told for one in following])
+    return {
+        "drives": drives,
+        "cars": len(names),
+        "false_alarms": len(changed_delays(batches)),
+        "changed_by_30_ms": int((by >= LARGE_S).sum()),
+        "of_these_found": int(found[by >= LARGE_S].sum()),
     }
 
 

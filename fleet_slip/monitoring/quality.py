@@ -11,10 +11,12 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.arrays import BoolArray
+from fleet_slip.catalogue.car_numbers import DELAY
 from fleet_slip.catalogue.course_relation import relate
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
+from fleet_slip.errors import DataError
 from fleet_slip.grams.calibration.course_drives import course_moments
 from fleet_slip.grams.cohorts.gram_cohort import (
     Cohort,
@@ -23,6 +25,7 @@ from fleet_slip.grams.cohorts.gram_cohort import (
     require_training,
 )
 from fleet_slip.grams.cohorts.reader import GramReader
+from fleet_slip.grams.rows.receiver_delay import changed_delays
 from fleet_slip.monitoring.moments import DriveBatches
 from fleet_slip.monitoring.peers import settle
 from fleet_slip.monitoring.plausibility import Fault, find_implausible
@@ -97,7 +100,7 @@ def examine_drives(
     """
     drives = parse_condition(condition)
     with GramReader(warehouse) as reader:
-        courses = _faulty_courses(reader, drives)
+        courses = _faulty_courses(reader, drives) | _changed_delays(reader, drives)
         reports = [
             examine(load_cohort(reader, drives & of_model, training=False), limits, courses)
             for of_model in _vehicle_models(reader, drives)
@@ -123,6 +126,26 @@ def _faulty_courses(reader: GramReader, condition: Condition) -> dict[str, Fault
         drive: Fault(fault.kind, fault.signals, fault.figure)
         for drive, relation in related.items()
         if relation and (fault := relation.fault)
+    }
+
+
+def _changed_delays(reader: GramReader, condition: Condition) -> dict[str, Fault]:
+    """Return the drives of cars whose receivers' delays changed: one delay corrects them all.
+
+    If there are Gram rows of the set `delay` for all of the cohort.
+    """
+    try:
+        opened = reader.opened(DELAY, condition)
+    except DataError:
+        return {}
+    return {
+        drive: Fault(
+            "changed_delay",
+            ("course",),
+            f"{1000 * one.before:.0f} ms late before {one.since}, {1000 * one.after:.0f} ms since",
+        )
+        for one in changed_delays(opened.batches(condition)).values()
+        for drive in one.drives
     }
 
 

@@ -22,6 +22,7 @@ TINY = {
     "billion": "--root {folder} --rows 3e4",
     "checksums": "--campaign smoke --repeat 1",
     "cluster": "--days 1 --workers 1",
+    "course_rate": "{root} --seconds 0.01",
     "crash": "--kills 2 --commands gram",
     "drift": "4 --drives 2",
     "drift_days": "{root} --drives 1 --training 5 --deals 2",

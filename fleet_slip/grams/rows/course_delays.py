@@ -38,9 +38,9 @@ def in_parts(one: ReceiverDelay) -> int:
 
 def _of_delay(grams: Snapshot, active: frozenset[str]) -> Iterator[pa.RecordBatch]:
     identity = features().identity(DELAY)
-    wanted = ["feature_set", "file", "vehicle_id", "drive_id", "signals", "n", "sums", "products"]
+    wanted = ["feature_set", "file", "day", "vehicle_id", "drive_id", "signals", "n", "sums"]
     for file in _files_of(grams, identity):
-        rows = grams.table.read(file.path, wanted)
+        rows = grams.table.read(file.path, [*wanted, "products"])
         files = rows["file"].cast(pa.string())
         counts = pc.is_in(files, pa.array(sorted(active), pa.string()))
         counts = pc.or_(counts, pc.starts_with(files, RECEIVED_FILES))

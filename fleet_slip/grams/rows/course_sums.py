@@ -72,7 +72,7 @@ def find_fixes(workspace: Workspace, drive: DriveCounts, late: int = 0) -> Fixes
         yaw_rate[first : first + block.shape[1]] = block[-1]
         begin, end = np.searchsorted(at, (first, first + block.shape[1]))
         fixed = at[begin:end] - first
-        values.append(block[:-2, fixed])
+        values.append(block[:-2].take(fixed, axis=1))
         clipped.append(here[fixed])
         first_clipped = here[:1].copy() if first == 0 else first_clipped
     return Fixes(
@@ -97,17 +97,16 @@ def course_changes(fixes: Fixes, apart: int) -> Changes:
     change, sound = _change(fixes.course[now] - fixes.course[before], turned, rest)
     before, now, turned, change = before[sound], now[sound], turned[sound], change[sound]
     straight = _straight(yaw_rate[at[before]], yaw_rate[at[now]], turned)
-    columns = np.concatenate(
-        [
-            fixes.counts[:, now] - fixes.counts[:, before],
-            [_rounded(turned, COARSER), straight, straight * change],  # `BESIDE`
-            change[None],
-        ]
-    )
+    beside = [_rounded(turned, COARSER), straight, straight * change]  # `BESIDE`
     began = fixes.ticks[:1] == 0  # no change: so a drive without a course is remembered
+    first, size = int(began.sum()), len(fixes.counts)
+    columns = np.full((size + len(beside) + 1, first + len(now)), np.nan)
+    columns[:size, first:] = fixes.counts.take(now, axis=1)
+    columns[:size, first:] -= fixes.counts.take(before, axis=1)
+    columns[size:, first:] = [*beside, change]
     return Changes(
         np.concatenate([np.flatnonzero(began), at[now]]),
-        np.concatenate([np.full((len(columns), int(began.sum())), np.nan), columns], axis=1),
+        columns,
         np.concatenate([fixes.first_clipped[began], fixes.clipped[now]]),
     )
 

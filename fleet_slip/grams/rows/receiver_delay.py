@@ -32,6 +32,8 @@ EARLY = 20
 SPEEDS = (f"satellite_speed_late_{EARLY}", f"satellite_speed_late_{EARLY + SPAN}")
 LASTING_S = 0.0025
 """Standard error that is the same in all drives: tilt and low-pass of the accelerometer."""
+SURE_ERRORS = 5.0
+"""Standard errors, of a usual car and of the car itself, by which a delay has changed."""
 FEWEST_DRIVES = 3
 """Of fewer the uncertainty is that of a usual drive of other cars."""
 
@@ -50,6 +52,22 @@ class ReceiverDelay:
     uncertainty: float | None
     drives: int
     rows: int
+
+
+@dataclass(frozen=True)
+class ChangedDelay:
+    """A car's receiver that is later, or less late, than it was.
+
+    Attributes:
+        before, after: s.
+        since: the day of the first drive after the change.
+        drives: all drives of the car that tell it.
+    """
+
+    before: float
+    after: float
+    since: str
+    drives: tuple[str, ...]
 
 
 def _columns() -> tuple[str, ...]:
@@ -73,25 +91,60 @@ def _weights() -> FloatArray:
 
 def receiver_delays(rows_of_delay: Iterable[pa.RecordBatch]) -> dict[str, ReceiverDelay]:
     """Return the delay of each car that Gram rows of the feature set `delay` tell."""
+    found = {}
+    for car, (products, rows) in _by_car(rows_of_delay).items():
+        one = _delay(np.array(list(products.values())), rows)
+        if one is not None:
+            found[car] = one
+    return with_pooled(found)
+
+
+def changed_delays(rows_of_delay: Iterable[pa.RecordBatch]) -> dict[str, ChangedDelay]:
+    """Return the cars whose receivers are later from some drive on than they were before.
+
+    Of every place between two drives the one is looked at where what is told before and after
+    differs by most standard errors; these are of how much drives of a usual car differ.
+    """
+    halves = {
+        car: split
+        for car, (products, _) in _by_car(rows_of_delay).items()
+        if (split := _best_split(products)) is not None
+    }
+    squares = [
+        one.drives * ((one.uncertainty or 0.0) ** 2 - LASTING_S**2)
+        for _, *both in halves.values()
+        for one in both
+    ]
+    usual_s = math.sqrt(float(np.median(squares))) if squares else 0.0
+    found = {}
+    for car, (keys, before, after) in halves.items():
+        usual = usual_s * math.sqrt(1 / before.drives + 1 / after.drives)
+        own = math.hypot(before.uncertainty or 0.0, after.uncertainty or 0.0)
+        if abs(after.value - before.value) > SURE_ERRORS * max(usual, own):
+            names = tuple(name for _, name in keys)
+            found[car] = ChangedDelay(before.value, after.value, keys[before.drives][0], names)
+    return found
+
+
+def _by_car(
+    rows_of_delay: Iterable[pa.RecordBatch],
+) -> dict[str, tuple[dict[tuple[str, str], FloatArray], int]]:
+    """Return the products of each car's drives about their means, by day and name, and its rows."""
     columns = _columns()
-    products: dict[str, dict[str, FloatArray]] = {}
-    rows: dict[str, int] = {}
+    found: dict[str, tuple[dict[tuple[str, str], FloatArray], int]] = {}
     for batch in rows_of_delay:
         for names, some, _ in by_signals(batch.filter(batch["vehicle_id"].is_valid())):
             if not set(columns) <= set(names.split(",")):
                 continue
             table = gram_table(names, some).restrict(columns)
-            cars, drives = (some[name].to_pylist() for name in ("vehicle_id", "drive_id"))
-            about = _about_means(table)
-            for i, (car, drive) in enumerate(zip(cars, drives, strict=True)):
-                own = products.setdefault(car, {})
-                own[drive] = own.get(drive, 0.0) + about[i]
-                rows[car] = rows.get(car, 0) + int(table.n[i])
-    found = {
-        car: _delay(np.array([own[drive] for drive in sorted(own)]), rows[car])
-        for car, own in sorted(products.items())
-    }
-    return with_pooled({car: one for car, one in found.items() if one is not None})
+            keys = (some[name].to_pylist() for name in ("vehicle_id", "day", "drive_id"))
+            for (car, day, drive), about, n in zip(
+                zip(*keys, strict=True), _about_means(table), table.n.tolist(), strict=True
+            ):
+                own, rows = found.get(car, ({}, 0))
+                own[str(day), drive] = own.get((str(day), drive), 0.0) + about
+                found[car] = own, rows + n
+    return {car: (dict(sorted(own.items())), rows) for car, (own, rows) in sorted(found.items())}
 
 
 def _about_means(table: GramTable) -> FloatArray:
@@ -127,6 +180,26 @@ def with_pooled(delays: dict[str, ReceiverDelay]) -> dict[str, ReceiverDelay]:
         )
         for car, one in delays.items()
     }
+
+
+def _best_split(
+    products: dict[tuple[str, str], FloatArray],
+) -> tuple[list[tuple[str, str]], ReceiverDelay, ReceiverDelay] | None:
+    """Return a car's drives, and what those before and after one of them tell.
+
+    Where these differ most for their numbers; None for a car of too few drives.
+    """
+    values = np.array(list(products.values()))
+    so_far, count, most = np.cumsum(values, axis=0), 0, 0.0
+    for some in range(FEWEST_DRIVES, len(values) - FEWEST_DRIVES + 1):
+        before, after = _best_lag(so_far[some - 1]), _best_lag(so_far[-1] - so_far[some - 1])
+        if before is not None and after is not None:
+            errors = abs(after - before) / math.sqrt(1 / some + 1 / (len(values) - some))
+            count, most = (some, errors) if errors > most else (count, most)
+    first, then = (_delay(some, 0) if len(some) else None for some in np.split(values, [count]))
+    if first is None or then is None or not (first.uncertainty and then.uncertainty):
+        return None
+    return list(products), first, then
 
 
 def _delay(products: FloatArray, rows: int) -> ReceiverDelay | None:

@@ -193,8 +193,8 @@ def change_sums(
             sums = found.setdefault((absent, part), PartSums(len(has)))
             for first in range(0, len(rows), exact_rows):
                 some = rows[first : first + exact_rows]
-                block = changes.columns[np.ix_(np.array(has, dtype=np.int64), some)]
-                sums.add(block, changes.clipped[some])
+                block = changes.columns.take(some, axis=1)
+                sums.add(block if len(has) == len(block) else block[has], changes.clipped[some])
     return found
 
 
@@ -218,11 +218,16 @@ def _add_by_kind(
 
 def _kinds(block: FloatArray, numbers: IntArray | None) -> Iterator[tuple[Kind, NDArray[np.int64]]]:
     """Yield each kind of rows in a block, and which rows those are."""
-    packed = np.packbits(np.isnan(block), axis=0, bitorder="little")
-    patterns, pattern_of_row = np.unique(packed, axis=1, return_inverse=True)
-    part = np.zeros(block.shape[1], dtype=np.int64) if numbers is None else numbers
-    both = np.stack([pattern_of_row.reshape(-1), part])
-    kinds, kind_of_row = np.unique(both, axis=1, return_inverse=True)
-    for kind, (pattern, number) in enumerate(kinds.T.tolist()):
-        absent = int.from_bytes(patterns[:, pattern].tobytes(), "little")
-        yield (absent, number), np.flatnonzero(kind_of_row.reshape(-1) == kind)
+    lacks = np.isnan(block)
+    some = np.flatnonzero(lacks.any(axis=0))  # few, as a rule: patterns take sorting
+    pattern_of_row, absents = np.zeros(block.shape[1], dtype=np.int64), [0]
+    if len(some):
+        packed = np.packbits(lacks[:, some], axis=0, bitorder="little")
+        patterns, of_some = np.unique(packed, axis=1, return_inverse=True)
+        absents += [int.from_bytes(one.tobytes(), "little") for one in patterns.T]
+        pattern_of_row[some] = 1 + of_some.reshape(-1)
+    part = 0 if numbers is None else numbers
+    kind_of_row = part * len(absents) + pattern_of_row
+    for kind in np.unique(kind_of_row).tolist():
+        number, pattern = divmod(kind, len(absents))
+        yield (absents[pattern], number), np.flatnonzero(kind_of_row == kind)
