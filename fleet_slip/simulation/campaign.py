@@ -201,10 +201,7 @@ class Campaign(Config):
         return tuple(self._drive(day, first, i) for i in range(self.drives_per_day))
 
     def batches(self, day: date) -> tuple[Batch, ...]:
-        """Return the files of one day: whole drives, in each about `rows_per_file` rows or fewer.
-
-        Raises `ConfigError` like `drives`.
-        """
+        """Return a day's files of about `rows_per_file` rows or fewer. Raises `ConfigError`."""
         packs = pack(self.drives(day), self.rows_per_file)
         return tuple(Batch(self.name, day, i, drives) for i, drives in enumerate(packs))
 

@@ -162,10 +162,7 @@ def _counts(log: DriveLog, name: str) -> pa.Array:
 
 
 def _repeated(values: pa.Array, times: Sequence[int]) -> pa.ChunkedArray:
-    """Return each value so many times; strings as a dictionary.
-
-    Chunks of one drive share their memory, which does not grow with the length of the drive.
-    """
+    """Return each value so many times, strings as a dictionary; chunks of a drive share memory."""
     encoded = values.dictionary_encode() if pa.types.is_string(values.type) else values
     chunks = []
     for drive, count in enumerate(times):

@@ -117,10 +117,7 @@ def simulate_campaign(
 
 
 def _open_days(snapshot: Snapshot, campaign: Campaign, days: Iterable[date]) -> tuple[date, ...]:
-    """Return the days that are not recorded as complete.
-
-    Raises `RefusedError` if a day was completed by the campaign as it was before a change.
-    """
+    """Return the days not recorded as complete. Raises `RefusedError` for a changed campaign."""
     found = []
     for unit, day in day_units(campaign, days):
         landed = snapshot.landed(unit.name)

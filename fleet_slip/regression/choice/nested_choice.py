@@ -56,10 +56,7 @@ FEWEST_FOLDS = 3
 
 @dataclass(frozen=True)
 class Rule:
-    """How to choose: a name in `RANKINGS`, and one in `CRITERIA` or `CROSS_VALIDATION`.
-
-    `worth` is what a signal must gain for cross-validation to keep it.
-    """
+    """A ranking, a criterion or `CROSS_VALIDATION`, and what a signal must gain to be kept."""
 
     ranking: str
     criterion: str
@@ -172,10 +169,7 @@ def select_nested(
 
 
 def measure_distances(training: TrainingFolds, order: Sequence[str], label: str) -> NestedDistances:
-    """Return the distances of the nested models of an order as it is given.
-
-    Raises `DataError` for dependent signals or a label without noise.
-    """
+    """Return the distances of an order as it is given. Raises `DataError` as `select_nested`."""
     evidence = training.evidence(training.nested_fits(order, label))
     null = training.cross_validate("none", (), label)
     return NestedDistances(tuple(order), evidence, null)

@@ -71,10 +71,7 @@ class GramTable:
         return [self.take(rows)._sum() for rows in np.split(order, stops[:-1])]
 
     def restrict(self, signals: Sequence[str]) -> "GramTable":
-        """Return the same drives with some of the signals, in the given order.
-
-        Raises `DataError` for a signal that the table lacks.
-        """
+        """Return the drives with some of the signals. Raises `DataError` if one is missing."""
         at = positions(self.signals, signals)
         packed = list(packed_positions(tuple(at)))
         return GramTable(tuple(signals), self.n, self.sums[:, at], self.products[:, packed])
