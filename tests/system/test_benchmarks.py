@@ -23,6 +23,7 @@ TINY = {
     "checksums": "--campaign smoke --repeat 1",
     "cluster": "--days 1 --workers 1",
     "course_rate": "{root} --seconds 0.01",
+    "course_figures": "{folder}/cars --days 1 --draws 1 --output {folder}",
     "crash": "--kills 2 --commands gram",
     "drift": "4 --drives 2",
     "drift_days": "{root} --drives 1 --training 5 --deals 2",

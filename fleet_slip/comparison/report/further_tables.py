@@ -232,6 +232,33 @@ def _pair(row: Mapping[str, Any] | None) -> Cell:
     return Cell(text, "good" if row["better"] == row["fleet"] else "")
 
 
+def without_label(data: ReportData) -> ReportTable | None:
+    """Return what a model was learned from instead of a label; None if it had one."""
+    manifest = data.version.manifest
+    learned, figures = manifest.learned_from, manifest.cross_validation
+    if learned is None:
+        return None
+    times = learned.change_s if isinstance(learned.change_s, tuple) else (learned.change_s,)
+    return table(
+        "without-label",
+        "Learned without a label",
+        ["what", "figure"],
+        [
+            [f"seconds over which the {learned.label} changes", ", ".join(f"{t:g}" for t in times)],
+            ["error of changes, held out", degrees(figures.rmse_deg)],
+            ["correlation of changes, held out", number(figures.correlation, 4)],
+            ["cars that tell the intercept", count(learned.cars)],
+            ["uncertainty of the intercept", degrees(learned.intercept_uncertainty_deg)],
+            ["difference between cars", degrees(learned.intercept_spread_deg)],
+        ],
+        note=(
+            "No reference sensor taught this model: the change of the course less the integral of "
+            "the yaw rate stood for the label. Errors of changes have the noise of two fixes in "
+            "them. Where this page compares with a label, the model has never seen it."
+        ),
+    )
+
+
 def storage(data: ReportData) -> ReportTable:
     """Return what the warehouse holds."""
     return table(

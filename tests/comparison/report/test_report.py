@@ -22,7 +22,7 @@ from fleet_slip.comparison.report import paper_tables
 from fleet_slip.comparison.report.column_worth import by_length, looks_back
 from fleet_slip.comparison.report.facts import NAMES, Facts
 from fleet_slip.comparison.report.further_pictures import draw_pictures, road_pictures
-from fleet_slip.comparison.report.further_tables import standings
+from fleet_slip.comparison.report.further_tables import standings, without_label
 from fleet_slip.comparison.report.gate_strips import gates_of, opening
 from fleet_slip.comparison.report.judging import (
     CLAIMS,
@@ -40,6 +40,7 @@ from fleet_slip.errors import DataError
 from fleet_slip.files.documents import Document
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
+from fleet_slip.models.manifest import LearnedFrom
 from fleet_slip.pages.drawing import DESK, PHONE, png_file, svg_file
 from fleet_slip.pages.page_parts import degrees, number
 from fleet_slip.regression.exact.gram import Gram
@@ -422,3 +423,18 @@ def test_gates_are_found_in_a_manifest_with_all_their_knots(data: ReportData) ->
     gated = replace(data, version=replace(data.version, manifest=manifest))
     (picture,) = road_pictures(gated)
     assert picture.draw(DESK).axes[1].get_title() == f"gate by {name}"
+
+
+def test_what_no_label_taught_says_so(data: ReportData) -> None:
+    assert without_label(data) is None
+    learned = LearnedFrom(
+        label="course",
+        change_s=(2.0, 4.0),
+        cars=7,
+        intercept_uncertainty_deg=0.012,
+        intercept_spread_deg=0.034,
+    )
+    manifest = data.version.manifest.model_copy(update={"learned_from": learned})
+    page = render(replace(data, version=replace(data.version, manifest=manifest)), [])
+    assert "Learned without a label" in page and "2, 4" in page
+    assert degrees(0.012) in page and degrees(0.034) in page
