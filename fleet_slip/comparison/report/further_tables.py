@@ -232,19 +232,25 @@ def _pair(row: Mapping[str, Any] | None) -> Cell:
     return Cell(text, "good" if row["better"] == row["fleet"] else "")
 
 
-def without_label(data: ReportData) -> ReportTable | None:
-    """Return what a model was learned from instead of a label; None if it had one."""
+def without_label(data: ReportData) -> Iterator[ReportTable]:
+    """Yield what a model was learned from instead of a label, or beside it."""
     manifest = data.version.manifest
     learned, figures = manifest.learned_from, manifest.cross_validation
     if learned is None:
-        return None
+        return
+    alone = (
+        "No reference sensor taught this model: the change of the course less the integral of the "
+        "yaw rate stood for the label. Where this page compares with a label, the model has never "
+        "seen it."
+    )
+    beside = "Cars with a reference sensor taught this model, and cars with the course alone."
     times = learned.change_s if isinstance(learned.change_s, tuple) else (learned.change_s,)
-    return table(
+    yield table(
         "without-label",
-        "Learned without a label",
+        "Learned from the course",
         ["what", "figure"],
         [
-            [f"seconds over which the {learned.label} changes", ", ".join(f"{t:g}" for t in times)],
+            ["seconds over which the course changes", ", ".join(f"{t:g}" for t in times)],
             ["error of changes, held out", degrees(figures.rmse_deg)],
             ["correlation of changes, held out", number(figures.correlation, 4)],
             ["cars that tell the intercept", count(learned.cars)],
@@ -252,9 +258,8 @@ def without_label(data: ReportData) -> ReportTable | None:
             ["difference between cars", degrees(learned.intercept_spread_deg)],
         ],
         note=(
-            "No reference sensor taught this model: the change of the course less the integral of "
-            "the yaw rate stood for the label. Errors of changes have the noise of two fixes in "
-            "them. Where this page compares with a label, the model has never seen it."
+            f"{alone if learned.label == 'course' else beside} Errors of changes have the noise of "
+            "two fixes in them."
         ),
     )
 

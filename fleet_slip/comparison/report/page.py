@@ -38,6 +38,7 @@ def render(data: ReportData, shown: Sequence[Picture]) -> str:
         distances=paper_tables.distances(data),
         targets=list(paper_tables.targets(data)),
         further=[
+            *further_tables.without_label(data),
             further_tables.scenarios(data),
             further_tables.standings(data),
             *further_tables.fleets(data),
