@@ -146,6 +146,7 @@ CALLS: dict[str, Callable[[Fleet], Any]] = {
     "publish": lambda fleet: fleet.publish("other", fleet.cohort()),
     "score": lambda fleet: fleet.score("smoke"),
     "evaluate": lambda fleet: fleet.evaluate("smoke", scenarios=["nominal"]),
+    "evaluate_blind": lambda fleet: fleet.evaluate_blind("smoke"),
     "report": lambda fleet: fleet.report("smoke"),
     "watch": lambda fleet: fleet.watch(DRIVE, "smoke", Path("never.html")),
     "quality": lambda fleet: fleet.quality(),
