@@ -30,7 +30,7 @@ of 5 Hz have fixes that are so far apart."""
 EARLY = 20
 """So many ticks before its fix a speed may be of: an accelerometer may be later than a receiver."""
 SPEEDS = (f"satellite_speed_late_{EARLY}", f"satellite_speed_late_{EARLY + SPAN}")
-LASTING_S = 0.0025
+LASTING_S = 0.003
 """Standard error that is the same in all drives: tilt and low-pass of the accelerometer."""
 SURE_ERRORS = 5.0
 """Standard errors, of a usual car and of the car itself, by which a delay has changed."""

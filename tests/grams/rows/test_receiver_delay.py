@@ -58,9 +58,7 @@ def test_a_car_of_few_drives_is_as_sure_as_usual_drives_make_it() -> None:
     assert with_pooled({"a": few}) == {"a": few}
     found = with_pooled({"a": few, "b": known})
     assert found["b"] == known
-    assert found["a"].uncertainty == pytest.approx(
-        math.sqrt(4 * (0.004**2 - 0.0025**2) + 0.0025**2)
-    )
+    assert found["a"].uncertainty == pytest.approx(math.sqrt(4 * (0.004**2 - 0.003**2) + 0.003**2))
 
 
 MODEL = "steering_mean_16,ay_mean_16,ay_square_mean_8,yaw_rate_speed_mean_8"
