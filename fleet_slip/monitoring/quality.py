@@ -140,7 +140,7 @@ def _changed_delays(reader: GramReader, condition: Condition) -> dict[str, Fault
         return {}
     return {
         drive: Fault(
-            "changed_delay",
+            "changed delay",
             ("course",),
             f"{1000 * one.before:.0f} ms late before {one.since}, {1000 * one.after:.0f} ms since",
         )

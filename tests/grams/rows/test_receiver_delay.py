@@ -145,4 +145,4 @@ def test_quality_names_a_car_whose_delay_changed(tmp_path: Path) -> None:
 
 def changed(fleet: Fleet) -> list[str]:
     findings = fleet.quality("true").findings
-    return [one.fault.figure for one in findings if one.fault.kind == "changed_delay"]
+    return [one.fault.figure for one in findings if one.fault.kind == "changed delay"]
