@@ -85,7 +85,8 @@ def _answer(warehouse: Warehouse, request: SelectionRequest, condition: str) -> 
     feature_set = _feature_set(request, model_list)
     if request.label == BOTH:
         folds = folds if request.by else folds.model_copy(update={"by": "vehicle"})
-        return _weigh(warehouse, request, condition, model_list, folds, feature_set)
+        taught = load_taught(warehouse, condition, feature_set, folds.by)
+        return weigh(taught, request, model_list, folds)
     if request.robust:
         return _answer_without(warehouse, request, condition, model_list, feature_set)
     distances = bool(request.nested and not request.ordered and not _search_of(request, model_list))
@@ -123,20 +124,17 @@ WEIGHTS = tuple(Fraction(4) ** power for power in range(4, -5, -1))
 """Weights of a change of the course that are tried, where a row with the label has 1."""
 
 
-def _weigh(
-    warehouse: Warehouse,
+def weigh(
+    cohort: TaughtCohort,
     request: SelectionRequest,
-    condition: str,
     model_list: ModelList | None,
     folds: Folding,
-    feature_set: str,
 ) -> RequestedSelection:
     """Select with the weight of the course that serves held-out drives with the label best.
 
     Of weights whose error is not larger for sure, by Student's t over the folds, the largest: few
     cars with a label say little about it, and the course is of all.
     """
-    cohort = load_taught(warehouse, condition, feature_set, folds.by)
     found = [
         _compare_listed(replace(cohort, weight=weight), request, model_list, folds)
         for weight in WEIGHTS

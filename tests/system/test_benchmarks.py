@@ -22,6 +22,7 @@ TINY = {
     "billion": "--root {folder} --rows 3e4",
     "checksums": "--campaign smoke --repeat 1",
     "cluster": "--days 1 --workers 1",
+    "course": "{root} --cohort \"campaign LIKE '%course'\" --columns ay_mean_16,steering_mean_16",
     "course_rate": "{root} --seconds 0.01",
     "course_figures": "{folder}/cars --days 1 --draws 1 --output {folder}",
     "crash": "--kills 2 --commands gram",
@@ -87,7 +88,8 @@ def tiny_root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Pat
     def make(root: Path) -> None:
         shutil.copytree(smoke_root, root)
         done_on(root, "simulate", "fleet", "--days", "1")
-        for feature_set in ("signals", "calibration", "fleet", "windows"):
+        done_on(root, "simulate", "waterford_course", "--days", "1")
+        for feature_set in ("signals", "delay", "calibration", "fleet", "windows", "course"):
             done_on(root, "gram", "--features", feature_set)
 
     return made_once(tmp_path_factory, "benchmarks", make)

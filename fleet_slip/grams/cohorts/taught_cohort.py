@@ -77,7 +77,13 @@ def load_taught(
             f"the feature set {feature_set} is not of another, whose Gram rows have the label. Use "
             "one that has of in configs/features.toml, such as course."
         )
-    every, changes = (load_cohort(warehouse, condition, one) for one in (base, feature_set))
+    return taught_by(
+        load_cohort(warehouse, condition, base), load_cohort(warehouse, condition, feature_set), by
+    )
+
+
+def taught_by(every: Cohort, changes: Cohort, by: FoldKey) -> TaughtCohort:
+    """Return what the drives of a cohort with the label teach, and the changes of the others."""
     label = catalogue().label
     labelled = every.part(
         np.repeat([label in one.signals for one in every.tables], [len(t) for t in every.tables])
@@ -96,7 +102,7 @@ def load_taught(
             "alone: leave out --label."
         )
     tables = tuple(about_mean(table) for table in labelled.tables)
-    own = {**vars(labelled), "feature_set": feature_set, "tables": tables}
+    own = {**vars(labelled), "feature_set": changes.feature_set, "tables": tables}
     own = {name: own[name] for name in Cohort.__dataclass_fields__}
     return TaughtCohort(**own, others=changes.part(alone), weight=Fraction(1))
 
