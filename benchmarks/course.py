@@ -21,6 +21,7 @@ import numpy as np
 import fleet_slip
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.grams.cohorts.folding import Folding, FoldKey
 from fleet_slip.grams.cohorts.gram_cohort import Cohort, load_cohort
 from fleet_slip.grams.cohorts.taught_cohort import taught_by
@@ -43,7 +44,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("root")
     parser.add_argument("--changes", default="course", help="feature set of changes")
-    parser.add_argument("--cohort", default="true")
+    parser.add_argument("--cohort", default=TRAINING_DRIVES)
     parser.add_argument("--columns", help="separated by commas; by default what the search finds")
     parser.add_argument("--most", type=int, default=6, help="columns that a search finds")
     parser.add_argument("--labels", default="", help="numbers of cars, separated by commas")
