@@ -19,9 +19,7 @@ from fleet_slip.grams.rows.rollup import Hashes, hash_numbers
 from fleet_slip.models.manifest import TrainedOn
 from fleet_slip.models.trained_drives import hash_drives, read_trained_drives
 from fleet_slip.models.versions import Registry
-from fleet_slip.views import connect
 from fleet_slip.warehouse.audit import Audit
-from fleet_slip.warehouse.condition import asking, parse_condition
 from fleet_slip.warehouse.tables import Warehouse
 
 
@@ -153,6 +151,10 @@ def _in_cohorts(
     warehouse: Warehouse, cohorts: Collection[str], drives: Collection[str]
 ) -> dict[str, frozenset[str]]:
     """Return which of some drives each cohort has; all, of a cohort that cannot be asked for."""
+    # Who lists models need not wait for a database.
+    from fleet_slip.views import connect  # noqa: PLC0415
+    from fleet_slip.warehouse.condition import asking, parse_condition  # noqa: PLC0415
+
     found = {}
     with connect(warehouse.root, query="grams") as database:
         database.register(

@@ -91,7 +91,7 @@ def taught_by(every: Cohort, changes: Cohort, by: FoldKey) -> TaughtCohort:
     if not labelled.tables:
         raise DataError(
             f"no drive of the cohort {every.condition.text!r} has the label. Learn from the course "
-            "alone: --label course."
+            "alone: fleet-slip select --label course"
         )
     key = FOLD_KEYS["vehicle" if by == "vehicle" and _cars(labelled) > 1 else "drive"]
     known = set(labelled.drives[key].to_pylist())
@@ -99,7 +99,7 @@ def taught_by(every: Cohort, changes: Cohort, by: FoldKey) -> TaughtCohort:
     if not alone.any():
         raise DataError(
             f"all drives of the cohort {every.condition.text!r} have the label. Learn from it "
-            "alone: leave out --label."
+            "alone: fleet-slip select"
         )
     tables = tuple(about_mean(table) for table in labelled.tables)
     own = {**vars(labelled), "feature_set": changes.feature_set, "tables": tables}
