@@ -119,9 +119,15 @@ def select(
 
     Without an intercept all models go through the origin. A candidate that needs signals which no
     drive of the cohort has, or whose signals are linearly dependent, is skipped with the reason.
-    Raises `DataError` if none is left.
+    Raises `DataError` if none is left, or no drive has the label.
     """
     divided = cohort.folds(folds.by, folds.count)
+    label = catalogue().label
+    if not any(label in grams[0].signals for grams in divided.tables):
+        raise DataError(
+            f"no drive of the cohort {cohort.condition.text!r} has the label, {label}. Where cars "
+            "log their course, learn from it: fleet-slip select --label course"
+        )
     models: list[CrossValidation] = []
     skipped: dict[str, str] = {}
     for candidate in candidates:

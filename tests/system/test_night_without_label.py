@@ -40,4 +40,4 @@ def test_a_night_learns_from_the_course_and_the_next_one_again(tmp_path: Path) -
     assert re.search(r"On the same .* held out", told), "both versions, by what the course changes"
     asked = run_on(tmp_path / "fleet", "select")
     assert asked.exit_code, "there is no label to learn from"
-    assert "sideslip" in asked.stderr
+    assert "learn from it: fleet-slip select --label course" in asked.stderr
