@@ -131,7 +131,11 @@ def layouts(today: dict[str, Any]) -> dict[str, list[Layout]]:
 
 def source_rows(warehouse: Warehouse, copies: int) -> pa.Table:
     """Return the rows of the logs, copied under other names of drives, in order of drives."""
-    tables = [pq.read_table(path, partitioning=None) for path in warehouse.logs.snapshot().paths]
+    usual = warehouse.logs.usual_schema.names  # what every file has, but for the day
+    tables = [
+        pq.read_table(path, partitioning=None, columns=[name for name in usual if name != "day"])
+        for path in warehouse.logs.snapshot().paths
+    ]
     rows = pa.concat_tables(tables).unify_dictionaries().combine_chunks()
     place = rows.schema.get_field_index("drive_id")
     drives = rows.column(place).chunk(0)

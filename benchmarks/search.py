@@ -42,7 +42,8 @@ def repeat_drives(root: Path, drives: int, feature_set: str) -> Warehouse:
     grams = warehouse.grams.snapshot()
     identity = features().identity(feature_set)
     parts = [grams.table.read(file.path) for file in grams.files]
-    rows = pa.concat_tables(part.cast(grams.table.usual_schema) for part in parts)
+    usual = grams.table.usual_schema  # without what few files have
+    rows = pa.concat_tables(part.select(usual.names).cast(usual) for part in parts)
     known = rows.filter(pc.equal(rows["feature_set"], identity))
     at = known.schema.get_field_index("drive_id")
 
