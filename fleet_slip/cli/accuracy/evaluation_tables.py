@@ -275,12 +275,14 @@ def _extremes(scenarios: Sequence[Mapping[str, Any]], ours: str) -> list[str]:
 
 def print_blind(rows: Sequence["BlindRow"], everything: bool) -> None:
     """Print how far estimators are off on blind drives: published models and filters, or all."""
+    errors = {name: one.rmse_deg for name, one in rows[0].figures.items()}
     names = [
         name
-        for name, one in rows[0].figures.items()
-        if one.rmse_deg is not None and (everything or "/" not in name)
+        for name, rmse_deg in errors.items()
+        if "@" in name.rpartition("/")[2]
+        or (rmse_deg is not None and (everything or "/" not in name))
     ]
-    names.sort(key=lambda name: ("@" not in name, rows[0].figures[name].rmse_deg))
+    names.sort(key=lambda name: ("@" not in name, errors[name] is None, errors[name]))
     shown = names if everything else names[:BLIND_NAMES]
     print_table(
         "Blind drives: RMSE in deg against the exact angle",
@@ -296,6 +298,12 @@ def print_blind(rows: Sequence["BlindRow"], everything: bool) -> None:
             if everything or row.drives > 1
         ],
     )
+    for name in names:
+        if errors[name] is None:
+            print_text(
+                f"{name} has no estimate on any of them: it may need what a car's own drives tell, "
+                "and nobody knows these cars."
+            )
     if not everything:
         print_text("Every drive, and all estimators: --all; for machines --json.")
 

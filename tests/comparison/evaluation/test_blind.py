@@ -64,7 +64,10 @@ def test_who_is_right_has_no_error_and_who_says_zero_has_the_angle(
     def zero(signals: Signals) -> np.ndarray:
         return np.zeros_like(signals["ay_mps2"])
 
-    judged = judge_blindly(HASH, {"right": right, "zero": zero})
+    def silent(signals: Signals) -> np.ndarray:
+        return np.full_like(signals["ay_mps2"], np.nan)
+
+    judged = judge_blindly(HASH, {"right": right, "zero": zero, "silent@1": silent})
     rows = {row.name: row for row in judged}
     assert rows["all"].drives == 24
     assert sum(rows[name].drives for name in ("dry", "wet", "ice")) == 24
@@ -75,6 +78,7 @@ def test_who_is_right_has_no_error_and_who_says_zero_has_the_angle(
     told = capsys.readouterr().out
     assert "switchback" in told
     assert "0.000" in told
+    assert "silent@1 has no estimate on any of them" in " ".join(told.split())
 
 
 @pytest.mark.slow
