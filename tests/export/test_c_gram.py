@@ -18,7 +18,7 @@ from fleet_slip.export.files import export_files
 from fleet_slip.grams.received.messages import message_size, signals_definition
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.regression.exact.gram import Gram
-from tests.export.compiled import SANITIZED, can_sanitize, compile_c, needs_cc
+from tests.export.compiled import SANITIZED, can_sanitize, compile_c, needs_cc, run_compiled
 from tests.export.models import MODELS, model_of
 from tests.support.messages import parse_messages
 
@@ -77,7 +77,7 @@ def count_drives(counter: Path, drives: Sequence[tuple[str, int, Any]]) -> bytes
         + np.asarray(counts, np.int16).tobytes()
         for car, start_s, counts in drives
     )
-    return run([counter], input=given, capture_output=True, check=True, timeout=60).stdout
+    return run_compiled([counter], given=given)
 
 
 def parts_of(content: bytes) -> dict[tuple[str, ...], Gram]:

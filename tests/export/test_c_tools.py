@@ -10,7 +10,7 @@ import pytest
 from fleet_slip.export.costs import cost_on_board
 from fleet_slip.export.files import export_files
 from fleet_slip.models.model_version import ModelVersion
-from tests.export.compiled import STRICT
+from tests.export.compiled import STRICT, run_compiled
 from tests.export.models import MODELS, export_texts, model_of
 from tests.support.cortex_m import measure_cortex_m, run_self_test
 
@@ -93,4 +93,5 @@ def test_libfuzzer_finds_nothing(folder: Path) -> None:
     if "libclang_rt.fuzzer" in built.stderr:
         pytest.skip("clang's runtime of libFuzzer is not here: apt-get install libclang-rt-14-dev")
     assert built.returncode == 0, built.stderr
-    run(folder, "./fuzz", "-seed=1", "-runs=20000", "-max_len=4000", "-rss_limit_mb=512")
+    given = ("./fuzz", "-seed=1", "-runs=20000", "-max_len=4000", "-rss_limit_mb=512")
+    run_compiled(given, folder)
