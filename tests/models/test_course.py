@@ -23,6 +23,21 @@ velocity_std_mps = 0.03
 time_between_outages_s = 60.0
 outage_duration_s = 5.0
 """
+ROUND = """
+laps = 4
+
+[plan]
+kind = "grid"
+vehicles = ["d_class_sedan"]
+mass_kg = [1320.0]
+tracks = ["skid_pad"]
+adhesion = [1.0]
+lateral_mps2 = [4.0]
+speed_factor = [0.7, 1.0]
+acceleration_mps2 = 2.5
+braking_mps2 = 4.0
+top_speed_mps = 45.0
+"""
 COLUMNS = "steering_mean_16,ay_mean_16,ay_square_mean_8,yaw_rate_speed_mean_8"
 
 
@@ -110,6 +125,18 @@ def test_columns_are_searched_for(fleet: Fleet) -> None:
     assert 0.05 < told.noise < 0.2 < told.error and told.noise_uncertainty is not None
     assert 0.02 < told.angle_at_most < told.error / math.sqrt(2)
     assert told.late is not None and 0.02 < told.late < 0.3
+    assert told.one_way is None and -0.4 < told.to_the_left < -0.1
+
+
+def test_cars_that_turn_to_one_side_alone_are_told(tmp_path: Path) -> None:
+    file = tmp_path / "round.toml"
+    file.write_text(CAMPAIGN.replace("laps = 1", ROUND))
+    made = fleet_slip.open(tmp_path / "data")
+    made.simulate(str(file), days=1)
+    for name in ("signals", "course"):
+        made.gram(name)
+    told = made.cohort("true").select(label="course", model=COLUMNS).without_label
+    assert told is not None and told.one_way == "left" and told.to_the_left > 0.95
 
 
 def test_a_set_without_changes_has_no_course(fleet: Fleet) -> None:

@@ -138,6 +138,12 @@ def _say_without_label(told: WithoutLabel) -> None:
             f"they are slower: the angle's own error over so long is at most "
             f"{told.angle_at_most:.3f} deg."
         )
+    if (side := told.one_way) is not None:
+        say(
+            f"cars turn to the {side} nearly always: columns that differ between left and right "
+            "alone, such as ay and its square, cannot be told apart, nor can offsets. Add drives "
+            "that turn to the other side."
+        )
     late = "" if told.late is None else f"; a course 10 ms late adds {told.late:.3f} deg"
     away = "" if told.away is None else f"; an antenna 0.1 m elsewhere {told.away:.3f} deg"
     say(f"no change tells: the constant, which show says of a published version{late}{away}.")
