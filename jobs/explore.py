@@ -77,7 +77,7 @@ def _(FleetSlipError, chart, fleet, mo, number_of, pl, training):
     chosen = chart.value if len(chart.value) else training
     listed = ", ".join("'" + name.replace("'", "''") + "'" for name in chosen["drive_id"].unique())
     try:
-        compared = fleet.cohort(f"source <> 'scenario' AND drive_id IN ({listed})").select()
+        compared = fleet.cohort(f"drive_id IN ({listed})").select()
         results = pl.DataFrame(
             [
                 {
@@ -97,10 +97,10 @@ def _(FleetSlipError, chart, fleet, mo, number_of, pl, training):
 
 
 @app.cell
-def _(drives, mo, trained):
+def _(mo, trained, training):
     name = mo.ui.dropdown(trained, value=trained[0] if trained else None, label="model")
     drive = mo.ui.dropdown(
-        sorted(drives["drive_id"].unique()), value=drives["drive_id"][0], label="drive"
+        sorted(training["drive_id"].unique()), value=training["drive_id"][0], label="drive"
     )
     mo.vstack([mo.md("## Where it errs"), mo.hstack([name, drive])])
     return drive, name

@@ -27,7 +27,8 @@ class FleetCohort(Rooted):
     Nothing but Gram rows is read, of the newest commits at the time of each call. Every call raises
     `QuestionError` for a condition that is not valid SQL, an unknown feature set or input;
     `DataError` if no drive satisfies the condition or the feature set has not been computed (see
-    `Fleet.gram`); and `RefusedError` if a drive of an evaluation scenario satisfies it.
+    `Fleet.gram`); and `RefusedError` if it asks for drives of evaluation scenarios, which others
+    leave out.
     """
 
     def __init__(self, warehouse: Warehouse, condition: str) -> None:

@@ -84,10 +84,11 @@ class HealthAndUpkeep(PublishedModels):
         condition; `CohortError` where a minimum cohort is asked for.
         """
         from fleet_slip.grams.calibration.calibration import calibrate
+        from fleet_slip.warehouse.condition import parse_cohort
         from fleet_slip.warehouse.minimum_cohort import require_single_cars
 
         require_single_cars("a calibration", "Unset it to calibrate cars.")
-        return calibrate(self.warehouse, cohort)
+        return calibrate(self.warehouse, parse_cohort(cohort))
 
     def monitor(
         self, model: "str | ModelVersion", cohort: str | None = None, *, since: date | None = None

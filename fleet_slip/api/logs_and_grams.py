@@ -210,9 +210,9 @@ class LogsAndGrams(Rooted):
         """
         from fleet_slip.grams.cohorts.reader import cohort_files
         from fleet_slip.grams.rows.gram_job import update_grams
-        from fleet_slip.warehouse.condition import parse_condition
+        from fleet_slip.warehouse.condition import parse_cohort
 
-        among = cohort_files(self.warehouse, parse_condition(cohort)) if cohort else None
+        among = cohort_files(self.warehouse, parse_cohort(cohort)) if cohort else None
         with open_workers(self.root, workers) as executor, step("gram") as figures:
             report = update_grams(
                 within_reach(self.warehouse, executor),

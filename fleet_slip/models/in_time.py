@@ -10,7 +10,7 @@ from fleet_slip.grams.cohorts.reader import open_grams
 from fleet_slip.grams.rows.course_delays import GRAIN_S
 from fleet_slip.grams.rows.receiver_delay import ReceiverDelay, receiver_delays
 from fleet_slip.models.manifest import Manifest
-from fleet_slip.warehouse.condition import parse_condition
+from fleet_slip.warehouse.condition import parse_cohort, parse_condition
 from fleet_slip.warehouse.tables import Warehouse
 from fleet_slip.words import number_of
 
@@ -25,7 +25,7 @@ def require_in_time(warehouse: Warehouse, manifest: Manifest) -> dict[str, float
     Raises `RefusedError` unless it is known of all of them how late they were, and their Gram rows
     are corrected by it; `DataError` if the Gram rows that tell it are missing.
     """
-    condition = parse_condition(manifest.trained_on.cohort)
+    condition = parse_cohort(manifest.trained_on.cohort)
     with open_grams(warehouse, DELAY, condition) as opened:
         told = opened.batches(parse_condition(ALL_DRIVES))
         delays = receiver_delays(told)

@@ -28,7 +28,7 @@ from fleet_slip.models.trained_drives import checksum_of_drives, pack_drives
 from fleet_slip.models.versions import Registry
 from fleet_slip.regression.validation.crossval import CrossValidation
 from fleet_slip.selection.select_models import RequestedSelection, Selection
-from fleet_slip.warehouse.condition import parse_condition
+from fleet_slip.warehouse.condition import parse_cohort
 from fleet_slip.warehouse.tables import Warehouse
 
 
@@ -111,7 +111,7 @@ def with_straight_intercept(
         return manifest
     found = StraightOn(Fraction(0), {}, None, 0.0, 0)
     if not manifest.through_origin:
-        found = straight_on(warehouse, parse_condition(manifest.trained_on.cohort), manifest)
+        found = straight_on(warehouse, parse_cohort(manifest.trained_on.cohort), manifest)
     weight = selection.cohort.weight if isinstance(selection.cohort, TaughtCohort) else None
     learned = LearnedFrom(
         label="course" if weight is None else "course+sideslip",

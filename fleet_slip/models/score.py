@@ -24,7 +24,7 @@ from fleet_slip.warehouse.condition import (
     Condition,
     asking,
     drive_columns,
-    parse_condition,
+    parse_cohort,
     row_columns,
 )
 from fleet_slip.warehouse.minimum_cohort import (
@@ -76,7 +76,7 @@ def score_statement(manifest: Manifest, condition: str | Condition) -> str:
         estimate="\n        + ".join([repr(manifest.intercept), *terms]),
         label=manifest.label.column,
         step_rad=repr(_step_rad(manifest)),
-        **_scored_rows(manifest, parse_condition(condition, row_columns())),
+        **_scored_rows(manifest, parse_cohort(condition, row_columns())),
     )
 
 
@@ -160,7 +160,7 @@ def cohort_of_rows(condition: str | Condition) -> Condition:
     """
     if isinstance(condition, Condition):
         return condition
-    found = parse_condition(condition, row_columns())
+    found = parse_cohort(condition, row_columns())
     if parts := sorted(found.columns - set(drive_columns())):
         require_single_cars(f"a condition on {', '.join(parts)}", "Score whole drives.")
     return found

@@ -9,7 +9,7 @@ from fleet_slip.errors import RefusedError
 from fleet_slip.grams.calibration.course_drives import course_moments
 from fleet_slip.grams.cohorts.reader import GramReader
 from fleet_slip.models.manifest import Manifest
-from fleet_slip.warehouse.condition import parse_condition
+from fleet_slip.warehouse.condition import parse_cohort
 from fleet_slip.warehouse.minimum_cohort import tells_single_cars
 from fleet_slip.warehouse.tables import Warehouse
 from fleet_slip.words import number_of
@@ -24,7 +24,7 @@ def require_sound_course(
 
     `delays_s` are how late the courses of the cars are in their Gram rows.
     """
-    condition = parse_condition(manifest.trained_on.cohort)
+    condition = parse_cohort(manifest.trained_on.cohort)
     with GramReader(warehouse) as reader:
         cars = course_moments(reader, condition)
     faults: dict[str, CourseFault] = {}

@@ -28,7 +28,7 @@ from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import LinearModel
 from fleet_slip.regression.exact.special import student_t_quantile
 from fleet_slip.regression.validation.crossval import least_squares
-from fleet_slip.warehouse.condition import Condition, parse_condition
+from fleet_slip.warehouse.condition import Condition, parse_cohort
 from fleet_slip.warehouse.tables import Warehouse
 from fleet_slip.words import number_of
 
@@ -121,7 +121,7 @@ def monitor(
     """
     limits = limits or thresholds().monitor
     manifest = version.manifest
-    condition = parse_condition(condition or manifest.trained_on.cohort)
+    condition = parse_cohort(condition or manifest.trained_on.cohort)
     feature_set = features().name_of(manifest.trained_on.feature_set)
     sums = sum_days(warehouse, manifest.signals, condition, feature_set)
     days, grams = sums.days, sums.grams

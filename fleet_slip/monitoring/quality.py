@@ -33,7 +33,7 @@ from fleet_slip.monitoring.repeated import find_repeated
 from fleet_slip.monitoring.reversed_label import find_reversed_labels
 from fleet_slip.monitoring.thresholds import QualityThresholds, thresholds
 from fleet_slip.regression.exact.gram_table import GramTable
-from fleet_slip.warehouse.condition import Condition, asking, parse_condition
+from fleet_slip.warehouse.condition import Condition, asking, parse_cohort, parse_condition
 from fleet_slip.warehouse.minimum_cohort import require_vehicles, tells_single_cars
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -98,7 +98,7 @@ def examine_drives(
     Each drive is examined, whatever signals it has: the minimum cohort asks for enough cars in all.
     Raises like `fleet_slip.grams.cohorts.gram_cohort.load_cohort`.
     """
-    drives = parse_condition(condition)
+    drives = parse_cohort(condition)
     with GramReader(warehouse) as reader:
         courses = _faulty_courses(reader, drives) | _changed_delays(reader, drives)
         reports = [

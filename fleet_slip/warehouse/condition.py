@@ -18,6 +18,7 @@ from typing import Any
 import duckdb
 
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalogue.sources import SCENARIO, TRAINING_DRIVES
 from fleet_slip.errors import QuestionError, StorageError, printable
 from fleet_slip.warehouse.database import duckdb_message, reading_files
 from fleet_slip.warehouse.read_only_sql import LONGEST_QUERY, Tree, columns_of, problems
@@ -99,6 +100,17 @@ def parse_condition(text: str | Condition, columns: Collection[str] | None = Non
     if isinstance(text, Condition):
         return text
     return _parsed(text, frozenset(drive_columns() if columns is None else columns))
+
+
+def parse_cohort(text: str | Condition, columns: Collection[str] | None = None) -> Condition:
+    """Return the condition of a cohort of the fleet: without test drives, unless it asks for them.
+
+    It asks if it names the column `source`, or a scenario. Raises `QuestionError`.
+    """
+    found = parse_condition(text, columns)
+    if "source" in found.columns or SCENARIO in found.sql:
+        return found
+    return Condition(found.text, f"({found.sql} AND {TRAINING_DRIVES})")
 
 
 def drive_columns() -> tuple[str, ...]:

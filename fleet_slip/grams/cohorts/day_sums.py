@@ -20,7 +20,7 @@ from fleet_slip.grams.rows.rollup import hash_numbers
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.gram_table import GramTable
 from fleet_slip.regression.inference.drive_moments import missing_signals_error
-from fleet_slip.warehouse.condition import Condition, parse_condition
+from fleet_slip.warehouse.condition import Condition, parse_cohort
 from fleet_slip.warehouse.minimum_cohort import require_vehicles
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -54,7 +54,7 @@ def sum_days(
     signals = (*inputs, catalogue().label)
     days: dict[date, _Day] = defaultdict(_Day)
     found = False
-    condition = parse_condition(condition)
+    condition = parse_cohort(condition)
     with open_grams(source, feature_set, condition, Folding(by="day", count=EACH)) as opened:
         expansion = expansion_of(opened, feature_set)
         if len(opened.cells.table):

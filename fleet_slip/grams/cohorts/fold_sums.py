@@ -34,7 +34,7 @@ from fleet_slip.grams.rows.rollup import Hashes, hash_numbers
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.gram_table import GramTable
 from fleet_slip.regression.validation.folds import CohortFolds
-from fleet_slip.warehouse.condition import Condition, asking, parse_condition
+from fleet_slip.warehouse.condition import Condition, asking, parse_cohort
 from fleet_slip.warehouse.minimum_cohort import require_vehicles
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -82,7 +82,7 @@ def sum_cohort(
     Raises like `fleet_slip.grams.cohorts.gram_cohort.load_cohort`, and `DataError`
     if there are not two folds.
     """
-    condition = parse_condition(condition)
+    condition = parse_cohort(condition)
     require_divided(feature_set, folding.by, folding.count)
     with open_grams(warehouse, feature_set, condition, folding, training=True) as opened:
         folds = _find_folds(opened, folding, condition)

@@ -31,7 +31,7 @@ from fleet_slip.regression.inference.drive_moments import serving_drives
 from fleet_slip.regression.validation.folds import (
     CohortFolds,
 )
-from fleet_slip.warehouse.condition import Condition, asking, parse_condition
+from fleet_slip.warehouse.condition import Condition, asking, parse_cohort
 from fleet_slip.warehouse.minimum_cohort import has_enough, require_vehicles
 from fleet_slip.warehouse.tables import Warehouse
 from fleet_slip.words import number_of
@@ -155,9 +155,9 @@ def load_cohort(
 
     Raises `QuestionError` if the condition is not one SQL expression on the columns of `drives`,
     `DataError` if no drive satisfies it or the feature set has not been computed for all logs, and
-    `RefusedError` if a drive of an evaluation scenario satisfies it.
+    `RefusedError` if it asks for a drive of an evaluation scenario, which others leave out.
     """
-    condition = parse_condition(condition)
+    condition = parse_cohort(condition)
     with open_grams(warehouse, feature_set, condition, training=training) as opened:
         expansion = expansion_of(opened, feature_set)
         statement = opened.statement("cohort.sql", condition)

@@ -17,7 +17,7 @@ from fleet_slip.comparison.evaluation.filters import FILTERS, FilterEstimate
 from fleet_slip.comparison.observers import kalman
 from fleet_slip.comparison.observers.drive_signals import read_drive
 from fleet_slip.comparison.rivals.learners import LEARNERS
-from fleet_slip.errors import RefusedError
+from fleet_slip.errors import DataError, RefusedError
 from fleet_slip.files.documents import DocumentFolder
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.models.score import score
@@ -80,9 +80,23 @@ def test_no_model_is_trained_on_scenarios(root: Path) -> None:
     with pytest.raises(RefusedError, match="scenario"):
         call(root, "select", "--cohort", "source = 'scenario'")
     with pytest.raises(RefusedError, match="scenario"):
-        call(root, "publish", "leaking", "--cohort", "true")
+        call(root, "publish", "leaking", "--cohort", "source IN ('simulation', 'scenario')")
     assert call(root, "select")["drives"] == 8
     assert not call(root, "run", "--campaign", "smoke")["changed"]
+
+
+def test_a_cohort_that_does_not_ask_for_test_drives_has_none(root: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "data"
+    shutil.copytree(root, copy)
+    asked = ("--cohort", "speed_factor > 0.1")
+    assert call(copy, "select", *asked)["drives"] == 8
+    assert call(copy, "publish", "fast", *asked)["version"] == 1
+    with pytest.raises(DataError, match="trained on 2 days"):  # and not for its test drives
+        call(copy, "monitor", "fast")
+    assert call(copy, "quality", *asked)["drives"] == 8
+    every = call(copy, "score", "fast", *asked)["rows"]
+    tests = call(copy, "score", "fast", "--cohort", "source = 'scenario'")["rows"]
+    assert call(copy, "score", "fast", "--cohort", "source <> ''")["rows"] == every + tests
 
 
 def test_a_changed_scenario_is_refused(root: Path, tmp_path: Path) -> None:
