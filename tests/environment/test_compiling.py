@@ -11,6 +11,7 @@ import pytest
 import fleet_slip.vehicle.tyre
 from fleet_slip import kept_code
 from fleet_slip.vehicle.lanes import lane_kernel as lanes
+from tests.support.commands import run
 
 SOURCE = """
 from fleet_slip.compiling import kernel
@@ -50,6 +51,20 @@ def test_compiled_code_is_kept_and_found(tmp_path: Path, caplog: pytest.LogCaptu
     assert again(3.0) == 1.5
     assert sum(again.stats.cache_hits.values()) == 1
     assert not caplog.messages
+
+
+KEYS = """
+from fleet_slip.vehicle.lanes.lane_kernel import simulate, simulate_imperfect
+
+for kernel in (simulate, simulate_imperfect):
+    print(kernel._cache._index_key("signature", kernel.targetctx.codegen()))
+"""
+
+
+def test_another_process_finds_the_code_of_the_lanes_by_the_same_key() -> None:
+    one, other = (run([sys.executable, "-c", KEYS]) for _ in range(2))
+    assert len(set(one.stdout.splitlines())) == 2
+    assert other.stdout == one.stdout
 
 
 def test_where_nothing_can_be_kept_a_kernel_compiles_and_says_so_once(

@@ -50,7 +50,7 @@ from fleet_slip.vehicle.lanes.lane_memory import (
     record,
     write,
 )
-from fleet_slip.vehicle.lanes.movement import build_integrate, look_around
+from fleet_slip.vehicle.lanes.movement import integrate, integrate_imperfect, look_around
 from fleet_slip.vehicle.parameters import Constants
 from fleet_slip.vehicle.state import Controls, State
 
@@ -173,10 +173,10 @@ def build_kernel(sources: str, imperfect: bool = False) -> Callable[..., None]:
     """Return the kernel, not yet compiled: of cars as in the textbook, or with imperfections.
 
     Its closure holds a digest of the `sources`, and so does the key under which numba keeps the
-    compiled code on disk: a change of any module compiles it again.
+    compiled code on disk: a change of any module compiles it again. What else the closure holds is
+    in the key too. A compiled function has another identity in each process, so that a kernel with
+    one in its closure would never be found again.
     """
-
-    integrate = build_integrate(imperfect)
 
     def simulate(
         routes: Any,
@@ -204,7 +204,10 @@ def build_kernel(sources: str, imperfect: bool = False) -> Callable[..., None]:
                 look_around(memory, book, routes, surfaces, truth)
             _decide(memory)
             for step in range(steps):
-                integrate(memory, SAMPLE_S / steps, step == 0)
+                if imperfect:
+                    integrate_imperfect(memory, SAMPLE_S / steps, step == 0)
+                else:
+                    integrate(memory, SAMPLE_S / steps, step == 0)
             complete = _move_on(memory, book, routes, truth, ended)
         _finish(truth, book, ended, cars, imperfect)
 

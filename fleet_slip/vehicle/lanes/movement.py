@@ -90,7 +90,7 @@ def look_around(memory: Any, book: Any, routes: Any, surfaces: Any, truth: Any) 
             truth[further_at(lane, 2, sample)] = x.ay_lag
 
 
-def build_integrate(imperfect: bool) -> Callable[[Any, float, bool], None]:
+def _build_integrate(imperfect: bool) -> Callable[[Any, float, bool], None]:
     """Compile a step of all cars: of those of the textbook, or of those with imperfections."""
 
     @equation
@@ -131,3 +131,10 @@ def build_integrate(imperfect: bool) -> Callable[[Any, float, bool], None]:
             memory[ORDER * LANES + lane] = SECOND_ORDER
 
     return integrate
+
+
+integrate = _build_integrate(imperfect=False)
+"""A step of the cars of the textbook."""
+
+integrate_imperfect = _build_integrate(imperfect=True)
+"""A step of cars with imperfections."""
