@@ -1,18 +1,20 @@
 """What a model that the course taught is worth, beside one that the label taught.
 
-    fleet-slip --root data simulate fleet_course
+    fleet-slip --root data simulate fleet_course --days 7
     for s in signals delay calibration fleet course_fleet; do
         fleet-slip --root data gram --features $s; done
     python -m benchmarks.course data --changes course_fleet --labels 5,2
 
 Errors are those of the angle, against the reference sensor with its noise. The label teaches all
 but the drives (of several cars: the cars) that are tested; the course teaches from all drives, and
-what it taught has never seen the sensor. With `--labels` so many cars keep their label, and the
-course of the others stands beside them; those cars are not tested.
+what it taught has never seen the sensor. Of several cars a line more has the errors where the
+course of each half of them taught, on the cars of the other half. With `--labels` so many cars keep
+their label, and the course of the others stands beside them; those cars are not tested.
 """
 
 import argparse
 import json
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -38,6 +40,7 @@ from fleet_slip.selection.request import BOTH, SelectionRequest
 from fleet_slip.selection.select_models import RequestedSelection
 
 LABEL = catalogue().label
+FIGURES = ("rmse_deg", "error_mean_deg", "error_std_deg")
 
 
 def main() -> None:
@@ -60,6 +63,8 @@ def main() -> None:
     )
     inputs = selection.winner.model.signals
     show(taught="course", columns=len(inputs), **data.figures(selection))
+    if data.by == "vehicle":
+        show(taught="course of other cars", columns=len(inputs), **data.held_out(inputs))
     own = [name for name in OFFSETS if name in data.base.inputs]
     show(taught="label", columns=len(inputs), **data.by_label(inputs))
     show(taught="label, offsets of cars", columns=len(inputs), **data.by_label([*inputs, *own]))
@@ -97,6 +102,22 @@ class Data:
         told = told_of(sums.figures(input_scales()[LABEL]))
         return {**told, **({"weight": weight} if weight else {})}
 
+    def held_out(self, inputs: Sequence[str]) -> dict[str, Any]:
+        """Return the errors where the course of each half of the cars taught, on the other."""
+        squares, means = [], []
+        for half in (self.cars[::2], self.cars[1::2]):
+            cars = ", ".join(f"'{car}'" for car in half)
+            condition = f"({self.base.condition.text}) AND vehicle_id IN ({cars})"
+            selection = self.fleet.cohort(condition).select(
+                label="course", features=self.course.feature_set, model=",".join(inputs)
+            )
+            told = self.figures(selection, half)
+            squares.append(told["rmse_deg"] ** 2)
+            means.append(told["error_mean_deg"])
+        rmse, mean = math.sqrt(sum(squares) / 2), sum(means) / 2
+        std = math.sqrt(rmse**2 - mean**2)
+        return dict(zip(FIGURES, (round(one, 4) for one in (rmse, mean, std)), strict=True))
+
     def by_label(self, inputs: Sequence[str]) -> dict[str, Any]:
         """Return the errors where the label taught, held out."""
         folds = self.base.folds(self.by, 5).serving(inputs, LABEL)
@@ -120,8 +141,7 @@ class Data:
 
 def told_of(found: Any) -> dict[str, Any]:
     """Return errors in degrees."""
-    names = ("rmse_deg", "error_mean_deg", "error_std_deg")
-    return {name: round(getattr(found, name), 4) for name in names}
+    return {name: round(getattr(found, name), 4) for name in FIGURES}
 
 
 def show(**figures: Any) -> None:
