@@ -141,14 +141,14 @@ class FleetCohort(Rooted):
         features: str = "regimes",
         by: "FoldKey" = "drive",
         folds: int | str | None = None,
-        worth: str = "0.005deg",
+        worth: str | None = None,
     ) -> "RegimeComparison":
         """Return a model's error by speed and lateral acceleration, and whether to split it there.
 
         One model for all rows is cross-validated against one for each regime. `signals` are inputs
         separated by commas, by default all; `over` the regimes to divide by, by default all of the
         feature set `features`, whose Gram rows `fleet.gram("regimes")` makes; `worth` the smallest
-        gain in RMSE for which a split is advised, as in `select`.
+        gain for which a split is advised, as in `select`.
 
         Raises `DataError` for a feature set without such regimes.
         """

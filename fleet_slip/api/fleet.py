@@ -91,7 +91,7 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
         through: date | None = None,
         name: str | None = None,
         models: str = RUN_MODELS,
-        worth: str = "0.005deg",
+        worth: str | None = None,
         sign_key: Path | None = None,
         workers: Workers = None,
         progress: ShowStep | None = None,
@@ -102,9 +102,9 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
         It can be repeated at any time, and after any interruption: what is done is not done again.
         A second run of the campaign on this machine at the same time waits for the first; `waiting`
         is called once before. `name` is that of the model, by default the campaign's; `models` the
-        model list that is compared; `worth` the smallest gain in RMSE that is worth a signal;
-        `sign_key` the private key that signs the version. A winner that is worse than the champion
-        is no error: the report says so. Progress is in rows of each step.
+        model list that is compared; `worth` the smallest gain that is worth a signal, by default
+        what the list says; `sign_key` the private key that signs the version. A winner that is
+        worse than the champion is no error: the report says so. Progress is in rows of each step.
 
         Raises what `simulate`, `gram`, `FleetCohort.select` and `publish` raise.
         """
@@ -172,7 +172,7 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
         *,
         cohort: str = TRAINING_DRIVES,
         models: str = RUN_MODELS,
-        worth: str = "0.005deg",
+        worth: str | None = None,
         candidate: bool = False,
         retention: str | None = None,
         night: date | None = None,

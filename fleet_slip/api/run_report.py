@@ -61,7 +61,7 @@ class Training:
     name: str
     cohort: str
     models: str
-    worth: str
+    worth: str | None
     sign_key: Path | None = None
 
     def made_already(self, fleet: "Fleet") -> "Publication | None":

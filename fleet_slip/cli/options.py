@@ -67,9 +67,12 @@ SELECTION: dict[str, Any] = {
     ),
     "worth": typer.Option(
         "--worth",
-        help="The smallest gain in RMSE that is worth a signal, such as 0.005deg or 2%. Of the "
-        "models that fall less short of the best, or by no more than one standard error of the "
-        "difference, that with the fewest signals wins.",
+        help="The smallest gain that is worth a signal: as an angle such as 0.025deg, the root of "
+        "the difference of the mean squared errors, in which the label's noise cancels; or a share "
+        "of the RMSE, such as 2%. Of the models that fall less short of the best, or by no more "
+        "than one standard error of the difference, that with the fewest signals wins. "
+        "Default: 0.025deg, or the rule of the list.",
+        show_default=False,
     ),
     "all_subsets": typer.Option(
         "--all-subsets", help="Search all subsets of the inputs of --nested instead of an order."
@@ -130,7 +133,7 @@ Cohort = Annotated[
 ]
 By = Annotated[FoldKey, typer.Option(help="What a fold is made of.")]
 FoldCount = Annotated[str | None, SELECTION["folds"]]
-Worth = Annotated[str, SELECTION["worth"]]
+Worth = Annotated[str | None, SELECTION["worth"]]
 Naive = Annotated[bool, SELECTION["naive"]]
 Cluster = Annotated[ClusterUnit | None, SELECTION["cluster"]]
 

@@ -10,7 +10,7 @@ from fleet_slip.warehouse.tables import Warehouse
 
 
 def is_up_to_date(
-    manifest: Manifest, warehouse: Warehouse, cohort: str, models: str, worth: str
+    manifest: Manifest, warehouse: Warehouse, cohort: str, models: str, worth: str | None
 ) -> bool:
     """Return whether a selection from a model list has nothing to look at that is new.
 

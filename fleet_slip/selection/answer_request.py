@@ -37,7 +37,6 @@ from fleet_slip.selection.request import (
     BOTH,
     COURSE,
     DEFAULT_MODELS,
-    WORTH,
     SelectionRequest,
     parse_worth,
 )
@@ -209,7 +208,8 @@ def _compare_listed(
     folds: Folding,
 ) -> RequestedSelection:
     listed = model_list.model if model_list else ()
-    search, worth = _search_of(request, model_list), parse_worth(request.worth)
+    search = _search_of(request, model_list)
+    worth = None if request.worth is None else parse_worth(request.worth)
     inputs = inputs_of(cohort, request.nested or WHOLE_SET) if search else ()
     nested = (
         nested_candidates(inputs_of(cohort, request.nested))
@@ -239,7 +239,7 @@ def _compare_listed(
     return RequestedSelection.of(selection, label, checksum)
 
 
-def checksum_of_list(model_list: ModelList, worth: str) -> str | None:
+def checksum_of_list(model_list: ModelList, worth: str | None) -> str | None:
     """Return the `config_sha256` of a selection from a list as it stands.
 
     None for a list that is nothing but a search, whose selection depends on the cohort's inputs.
@@ -247,10 +247,10 @@ def checksum_of_list(model_list: ModelList, worth: str) -> str | None:
     return _checksum(model_list.sha256, worth, True) if model_list.model else None
 
 
-def _checksum(compared: str, worth: str, intercept: bool) -> str:
+def _checksum(compared: str, worth: str | None, intercept: bool) -> str:
     """Return the checksum of what is compared, and of what else is asked for and not usual."""
     unusual: dict[str, Any] = {}
-    if parse_worth(worth) != parse_worth(WORTH):
+    if worth is not None:
         unusual["worth"] = worth
     if not intercept:
         unusual["intercept"] = False
@@ -303,7 +303,7 @@ def _search(cohort: Cohort, request: SelectionRequest, folds: Folding) -> Reques
         intercept=request.intercept,
     )
     label = f"nested:{nested} {rule.ranking} {rule.criterion}"
-    checksum = _checksum(sha256_of(canonical_json(content)), WORTH, request.intercept)
+    checksum = _checksum(sha256_of(canonical_json(content)), request.worth, request.intercept)
     return RequestedSelection.of(selection, label, checksum)
 
 

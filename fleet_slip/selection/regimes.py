@@ -55,7 +55,7 @@ class RegimeComparison:
         gain_standard_error: of the gain, over the same folds.
         rmse_gain: what splitting takes away from the RMSE over all rows, rad.
         rmse_gain_standard_error: of that, over the same folds.
-        worth: the smallest gain in RMSE that is worth the coefficients of a split.
+        worth: the smallest gain that is worth the coefficients of a split.
     """
 
     signals: tuple[str, ...]
@@ -74,7 +74,8 @@ class RegimeComparison:
     def split_wins(self) -> bool:
         """Whether what splitting gains is worth it, and real: it costs many coefficients."""
         best = min(self.pooled.rmse, self.split.rmse)
-        return self.rmse_gain >= self.worth.of(best) and self.real
+        square = self.pooled.rmse**2 - self.split.rmse**2
+        return square >= self.worth.squared(best) and self.real
 
     @property
     def real(self) -> bool:
@@ -149,7 +150,7 @@ def compare_regimes(
 ) -> RegimeComparison:
     """Cross-validate one model for all regimes and one for each, on drives that have the inputs.
 
-    A split is advised if what it gains in RMSE is worth it, and larger than one standard error of
+    A split is advised if what it gains is worth it, and larger than one standard error of
     the gain, paired over the same folds. Raises `QuestionError` for a feature set without regimes,
     and `DataError` for absent signals or empty folds.
     """

@@ -7,7 +7,7 @@ from typing import Literal
 
 from fleet_slip.errors import UsageError
 from fleet_slip.grams.cohorts.folding import FoldKey
-from fleet_slip.regression.choice.winner import Worth
+from fleet_slip.regression.choice.winner import DEFAULT_WORTH, Worth
 from fleet_slip.regression.inference.drive_moments import ClusterUnit
 
 DEFAULT_MODELS = "table1"
@@ -19,9 +19,6 @@ COURSE = "course"
 """Also the name of the feature set, and of the model list, that are taken for it."""
 BOTH: Label = "course+sideslip"
 """The course of most cars, and the label of those that have it."""
-
-WORTH = "0.005deg"
-"""`fleet_slip.regression.choice.winner.DEFAULT_WORTH` as it is asked for."""
 
 _WORTH = re.compile(r"(\d+(?:\.\d*)?|\.\d+) ?(deg|%)")
 
@@ -44,7 +41,9 @@ class SelectionRequest:
         folds: how many folds, or `each`: every drive, or whatever folds are made of, is one.
         rank: ranks the inputs of `nested` first, such as `backward`.
         criterion: what decides how many of the ranked inputs are kept: `cv`, `bic` ...
-        worth: the smallest gain in RMSE that is worth a signal, such as `0.005deg` or `2%`.
+        worth: the smallest gain that is worth a signal: of an error that the label's noise is no
+            part of, such as `0.025deg`, or of the RMSE, such as `2%`; by default what the list
+            says, which is the former unless its rule is the best correlation.
         all_subsets: search all subsets of the inputs of `nested` instead of an order.
         robust: leave out the cars whose influence on the model no honest car has; they are
             `left_out` of the answer, and its cohort names them.
@@ -67,7 +66,7 @@ class SelectionRequest:
     folds: int | str | None = None
     rank: str | None = None
     criterion: str | None = None
-    worth: str = WORTH
+    worth: str | None = None
     all_subsets: bool = False
     robust: bool = False
     naive: bool = False
@@ -124,12 +123,14 @@ class SelectionRequest:
             )
 
 
-def parse_worth(text: str) -> Worth:
-    """Return a gain in RMSE from text such as `0.005deg` or `2%`. Raises `UsageError`."""
+def parse_worth(text: str | None) -> Worth:
+    """Return a gain from text such as `0.025deg` or `2%`, or the usual one. Raises `UsageError`."""
+    if text is None:
+        return DEFAULT_WORTH
     found = _WORTH.fullmatch(text.strip())
     if found is None:
         raise UsageError(
-            f"worth = {text}: write an angle such as {WORTH}, or a share of the best RMSE such as "
+            f"worth = {text}: write an angle such as 0.025deg, or a share of the best RMSE such as "
             "2%."
         )
     amount = float(found[1])

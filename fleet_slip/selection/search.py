@@ -263,14 +263,14 @@ def _fits(gram: Gram, inputs: Sequence[str], label: str, search: Search) -> list
 
 
 def choose_by(
-    search: Search | None, models: Sequence[CrossValidation], worth: Worth = DEFAULT_WORTH
+    search: Search | None, models: Sequence[CrossValidation], asked: Worth | None = None
 ) -> Winner:
     """Return the winner of cross-validated models by the rule of a search.
 
     The rule `best` gives way to a worth that was asked for.
     """
-    if search is None or search.rule != "best" or worth != DEFAULT_WORTH:
-        return choose(models, worth)
+    if search is None or search.rule != "best" or asked is not None:
+        return choose(models, asked or DEFAULT_WORTH)
     best = max(models, key=lambda model: model.sums.signed_r_squared)
     reason = (
         f"Model {best.name} has the best cross-validated correlation, {best.correlation:.6f}, "

@@ -14,7 +14,7 @@ from fleet_slip.grams.cohorts.folding import ROW_FOLDS, Folding
 from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.grams.cohorts.outweighing import drives_by_car
 from fleet_slip.regression.choice.nested_choice import NestedDistances
-from fleet_slip.regression.choice.winner import DEFAULT_WORTH, Winner, Worth
+from fleet_slip.regression.choice.winner import Winner, Worth
 from fleet_slip.regression.validation.crossval import CrossValidation, cross_validate_inputs
 from fleet_slip.regression.validation.folds import CohortFolds
 from fleet_slip.selection.model_list import CandidateModel, Search
@@ -109,7 +109,7 @@ def select(
     cohort: AnyCohort,
     candidates: Sequence[CandidateModel],
     folds: Folding,
-    worth: Worth = DEFAULT_WORTH,
+    worth: Worth | None = None,
     search: Search | None = None,
     inputs: Sequence[str] = (),
     *,
@@ -117,9 +117,10 @@ def select(
 ) -> Selection[AnyCohort]:
     """Cross-validate each candidate, and what a search finds among inputs; choose the winner.
 
-    Without an intercept all models go through the origin. A candidate that needs signals which no
-    drive of the cohort has, or whose signals are linearly dependent, is skipped with the reason.
-    Raises `DataError` if none is left, or no drive has the label.
+    `worth` overrides the rule of the search. Without an intercept all models go through the
+    origin. A candidate that needs signals which no drive of the cohort has, or whose signals are
+    linearly dependent, is skipped with the reason. Raises `DataError` if none is left, or no drive
+    has the label.
     """
     divided = cohort.folds(folds.by, folds.count)
     label = catalogue().label

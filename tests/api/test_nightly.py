@@ -67,7 +67,7 @@ def gate(folder: Path, old: str, new: str) -> Iterator[None]:
 def forgiving(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """A gate that lets small differences pass: of so few drives they are large."""
     own = tmp_path_factory.mktemp("forgiving") / "configs"
-    with gate(own, "worth_deg = 0.005", "worth_deg = 1.0  "):
+    with gate(own, "worth_deg = 0.025", "worth_deg = 1.0  "):
         yield
 
 

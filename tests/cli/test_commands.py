@@ -86,7 +86,7 @@ def test_select_reports_the_models_in_the_list_s_order(
     for worth, winner in (
         ((), "2"),
         (("--worth", "0.000001deg"), "5"),
-        (("--worth", "0.1deg"), "1"),
+        (("--worth", "1deg"), "1"),
     ):
         asked = run_command("select", *worth, "--json", root=smoke_root).json
         assert asked["winner"] == winner

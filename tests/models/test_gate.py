@@ -28,13 +28,13 @@ from tests.support.logs import land, log_rows
 ROWS = 200
 
 WEAK = ("ax", "steering_wheel", "steer_fl")
-"""Signals whose loss costs 0.0035 deg each, which is not worth refusing."""
+"""Signals of which each is 0.023 deg of the label, which is not worth refusing."""
 
 
 def counts(rng: np.random.Generator, label: float = 1.0, noise: float = 20.0) -> dict[str, Any]:
     """Counts of a drive whose label is a sum of two signals, times a factor, and noise."""
     ay, yaw_rate, *weak = rng.normal(0, 1000, (2 + len(WEAK), ROWS))
-    true = 0.3 * ay + 0.2 * yaw_rate + 0.005 * sum(weak)
+    true = 0.3 * ay + 0.2 * yaw_rate + 0.004 * sum(weak)
     sideslip = label * true + rng.normal(0, noise, ROWS)
     found = {"ay": ay, "yaw_rate": yaw_rate, **dict(zip(WEAK, weak, strict=True))}
     found["sideslip"] = sideslip

@@ -112,7 +112,8 @@ def test_a_split_must_be_worth_its_coefficients() -> None:
     found = compare_regimes(cohort, INPUTS, FIVE)
     assert found.rmse_gain == pytest.approx(found.pooled.rmse - found.split.rmse)
     assert found.rmse_gain > found.rmse_gain_standard_error > 0
-    worths = [Worth(found.rmse_gain * factor) for factor in (0.99, 1.01)]
+    gain = (found.pooled.rmse**2 - found.split.rmse**2) ** 0.5
+    worths = [Worth(gain * factor) for factor in (0.99, 1.01)]
     chosen = [compare_regimes(cohort, INPUTS, FIVE, worth=worth) for worth in worths]
     assert [one.split_wins for one in chosen] == [True, False]
     share = Worth(found.rmse_gain / found.split.rmse * 1.01, relative=True)

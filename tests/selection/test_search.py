@@ -1,6 +1,7 @@
 """Which signals of a set: rankings, all subsets, and what the choice is worth."""
 
 from itertools import combinations
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -13,9 +14,13 @@ from fleet_slip.grams.cohorts.training_folds import drive_folds
 from fleet_slip.regression.choice.nested_choice import CROSS_VALIDATION, Rule, select_nested
 from fleet_slip.regression.inference.drive_moments import ClusterUnit
 from fleet_slip.regression.validation.crossval import cross_validate, least_squares
+from fleet_slip.selection.model_list import Search
+from fleet_slip.selection.request import parse_worth
 from fleet_slip.selection.search import (
     ALL_SUBSETS,
+    choose_by,
     require_criterion,
+    search_models,
     select_inputs,
 )
 from tests.support.cohorts import INPUTS, LABEL, Driven, cohort_of, driven, rows_of
@@ -147,6 +152,23 @@ def test_subsets_can_be_chosen_by_cross_validation(drives: list[Driven]) -> None
     assert found.winner.best is best
     shortfall = next(s for s in found.winner.shortfalls if s.model is found.winner.model)
     assert shortfall.negligible
+
+
+@pytest.mark.parametrize("rule", ["best", "worth"])
+@pytest.mark.parametrize("around", ["0.00499deg", "0.005deg", "0.0051deg"])
+def test_a_worth_that_is_asked_for_decides_whatever_the_rule_of_the_list(
+    rule: Literal["best", "worth"], around: str
+) -> None:
+    """The usual worth asked for is asked for, too; the weak signals are 0.0029 deg each."""
+    cohort = cohort_of(driven(1, (0.00125, 0.4, 0.9, 0.00125), drives=30, noise=3))
+    search = Search(method="exchange", most=4, rule=rule)
+    models = search_models(cohort, INPUTS, FIVE, search).models
+    asked = {
+        text: len(choose_by(search, models, parse_worth(text)).model.signals)
+        for text in (around, "0.025deg", "0.0001deg")
+    }
+    assert asked == {around: 2, "0.025deg": 2, "0.0001deg": 4}
+    assert len(choose_by(search, models).model.signals) == (4 if rule == "best" else 2)
 
 
 def test_rows_can_be_the_folds() -> None:

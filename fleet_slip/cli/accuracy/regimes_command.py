@@ -9,7 +9,6 @@ from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli.options import By, Cohort, FoldCount, Signals, Worth
 from fleet_slip.cli.output import Json, print_json, print_line, print_table
 from fleet_slip.selection.regimes import RegimeComparison
-from fleet_slip.selection.request import WORTH
 from fleet_slip.words import number_of
 
 
@@ -29,7 +28,7 @@ def regimes(
     ] = "regimes",
     by: By = "drive",
     folds: FoldCount = None,
-    worth: Worth = WORTH,
+    worth: Worth = None,
     json: Json = False,
 ) -> None:
     """Show a model's error by speed and lateral acceleration, and whether to split it there.

@@ -19,7 +19,6 @@ from fleet_slip.cli.output import Json, print_json, say
 from fleet_slip.cli.progress_bar import progress_of_steps
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.workers import Cluster, Threads
-from fleet_slip.selection.request import WORTH
 from fleet_slip.words import number_of
 
 DEFAULT_CAMPAIGN = "waterford"
@@ -41,7 +40,7 @@ def run(
         str | None, typer.Option(help="Name of the model. Default: the campaign's.")
     ] = None,
     models: Models = RUN_MODELS,
-    worth: Worth = WORTH,
+    worth: Worth = None,
     threads: Threads = None,
     cluster: Cluster = None,
     json: Json = False,

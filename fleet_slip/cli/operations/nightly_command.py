@@ -17,7 +17,6 @@ from fleet_slip.cli.progress_bar import progress_of_steps
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.workers import Cluster, Threads
 from fleet_slip.extras import needed
-from fleet_slip.selection.request import WORTH
 
 
 @record_run
@@ -38,7 +37,7 @@ def nightly(
         str, typer.Option(help="SQL condition on the view drives: which drives train it.")
     ] = TRAINING_DRIVES,
     models: Models = RUN_MODELS,
-    worth: Worth = WORTH,
+    worth: Worth = None,
     candidate: Annotated[
         bool, typer.Option("--candidate", help="Publish as a candidate, even what is not worse.")
     ] = False,

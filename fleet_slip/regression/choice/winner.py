@@ -1,11 +1,14 @@
 """Which model wins: the fewest signals whose shortfall from the best is negligible.
 
 Two things are asked of a gain in error before it justifies a richer model. It must be worth having,
-which a user says; with enough rows every gain is certain, and none need matter. And it must be
-real: larger than its standard error. Models are compared on the same folds, so the error that
-counts is that of the difference, as in a paired test: the folds' difficulty is common to both and
-cancels. The one-standard-error rule of Breiman, Friedman, Olshen and Stone, Classification and
-Regression Trees (1984), section 3.4.3, takes the error of the best model's own figure instead,
+which a user says; with enough rows every gain is certain, and none need matter. What a model lacks
+is the root of the difference of the mean squared errors, sqrt(MSE - MSE of the best): the noise of
+the label adds the same to both and cancels, so that it is a figure of the models alone. Of nested
+models fitted to many rows it is the root mean square of how far their estimates lie apart. And the
+gain must be real: larger than its standard error. Models are compared on the same folds, so the
+error that counts is that of the difference, as in a paired test: the folds' difficulty is common to
+both and cancels. The one-standard-error rule of Breiman, Friedman, Olshen and Stone, Classification
+and Regression Trees (1984), section 3.4.3, takes the error of the best model's own figure instead,
 which may be ten times as large.
 
 Models are also compared on the same rows without folds. Cars differ, and rows of a car are alike.
@@ -28,14 +31,18 @@ from fleet_slip.regression.validation.crossval import CrossValidation, error_of_
 
 @dataclass(frozen=True)
 class Worth:
-    """The smallest gain in RMSE that is worth a signal: absolute in rad, or of the best's RMSE."""
+    """The smallest gain that is worth a signal.
+
+    Absolute: sqrt(MSE - MSE of the best), in rad. Relative: of RMSEs, as a part of the best's.
+    """
 
     amount: float
     relative: bool = False
 
-    def of(self, rmse: float) -> float:
-        """Return it in rad, the best model having this RMSE."""
-        return self.amount * rmse if self.relative else self.amount
+    def squared(self, rmse: float) -> float:
+        """Return the difference of mean squared errors, in rad^2, the best having this RMSE."""
+        share = self.amount * (2 + self.amount) * rmse**2  # ((1 + amount) rmse)^2 - rmse^2
+        return share if self.relative else self.amount**2
 
     def __str__(self) -> str:
         """Return it as it is asked for."""
@@ -44,8 +51,8 @@ class Worth:
         return f"{math.degrees(self.amount):.4g} deg"
 
 
-DEFAULT_WORTH = Worth(math.radians(0.005))
-"""A twentieth of what the best reference sensors are accurate to, about 0.1 deg."""
+DEFAULT_WORTH = Worth(math.radians(0.025))
+"""A quarter of what the best reference sensors are accurate to, about 0.1 deg."""
 
 
 @dataclass(frozen=True)
@@ -56,13 +63,20 @@ class Shortfall:
         model: the model.
         rmse: the difference of the pooled RMSEs, in rad; negative if the model's is smaller.
         standard_error: of it, over the folds.
+        square: the difference of the mean squared errors, in rad^2.
         worthless: whether a gain of so much is less than what is worth having.
     """
 
     model: CrossValidation
     rmse: float
     standard_error: float
+    square: float
     worthless: bool
+
+    @property
+    def lacks(self) -> float:
+        """What the model lacks, in rad, without the noise of the label; 0 if it is the better."""
+        return math.sqrt(max(self.square, 0.0))
 
     @property
     def real(self) -> bool:
@@ -79,6 +93,7 @@ class Shortfall:
         return {
             "rmse_deg": math.degrees(self.rmse),
             "standard_error_deg": math.degrees(self.standard_error),
+            "lacks_deg": math.degrees(self.lacks),
             "real": self.real,
             "negligible": self.negligible,
         }
@@ -119,9 +134,15 @@ def choose(models: Sequence[CrossValidation], worth: Worth = DEFAULT_WORTH) -> W
 
 def fall_short(model: CrossValidation, best: CrossValidation, worth: Worth) -> Shortfall:
     """Return how much larger a model's RMSE is than another's, over the same folds."""
-    difference = model.pooled.rmse - best.pooled.rmse
-    worthless = difference < worth.of(best.pooled.rmse)
-    return Shortfall(model, difference, _standard_error(model, best), worthless)
+    difference, square = _differences(model, best)
+    worthless = square < worth.squared(best.pooled.rmse)
+    return Shortfall(model, difference, _standard_error(model, best), square, worthless)
+
+
+def _differences(model: CrossValidation, other: CrossValidation) -> tuple[float, float]:
+    """Return how much larger a model's pooled RMSE is than another's, and its square."""
+    one, two = model.pooled.rmse, other.pooled.rmse
+    return one - two, (one - two) * (one + two)
 
 
 def _standard_error(one: CrossValidation, other: CrossValidation) -> float:
@@ -145,11 +166,14 @@ def _reason(winner: Shortfall, best: CrossValidation, near: int, total: int, wor
             "one standard error of the difference."
         )
     real = "real, but less than" if winner.real else "not real; worth having would be"
+    lacking = (
+        "" if worth.relative else f", which is {math.degrees(winner.lacks):.2g} deg of its own"
+    )
     return (
         f"Model {winner.model.name} has the fewest signals ({len(winner.model.signals)}) of the "
         f"{near} models whose error is negligibly larger than that of model {best.name}, the best "
-        f"({len(best.signals)} signals, {rmse}). The difference, {winner} over the same folds, is "
-        f"{real} {worth}."
+        f"({len(best.signals)} signals, {rmse}). The difference, {winner} over the same folds"
+        f"{lacking}, is {real} {worth}."
     )
 
 
@@ -164,9 +188,9 @@ def compare_paired(model: CrossValidation, other: CrossValidation, worth: Worth)
     square = math.fsum((d - ratio * n) ** 2 for d, n in zip(differences, rows, strict=True))
     error = math.sqrt(square * groups / (groups - 1)) / sum(rows)
     both = model.pooled.rmse + other.pooled.rmse
-    rmse = model.pooled.rmse - other.pooled.rmse
-    worthless = rmse < worth.of(other.pooled.rmse)
-    return Shortfall(model, rmse, error / both if both else 0.0, worthless)
+    rmse, lacking = _differences(model, other)
+    worthless = lacking < worth.squared(other.pooled.rmse)
+    return Shortfall(model, rmse, error / both if both else 0.0, lacking, worthless)
 
 
 def compare_typical(model: CrossValidation, other: CrossValidation, worth: Worth) -> Shortfall:
@@ -184,7 +208,9 @@ def compare_typical(model: CrossValidation, other: CrossValidation, worth: Worth
     middle = median(differences)
     deviation = 1.4826 * median(abs(one - middle) for one in differences)
     error = math.sqrt(math.pi / 2 / len(differences)) * deviation
-    return Shortfall(model, middle, error, middle < worth.of(other.pooled.rmse))
+    square = middle * (2 * other.pooled.rmse + middle)
+    worthless = square < worth.squared(other.pooled.rmse)
+    return Shortfall(model, middle, error, square, worthless)
 
 
 def _common_rows(model: CrossValidation, other: CrossValidation) -> list[int]:

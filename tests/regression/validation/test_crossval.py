@@ -150,18 +150,28 @@ def test_a_gain_that_is_real_and_worth_nothing_buys_no_signal() -> None:
     """Folds differ by much more than models do: unpaired, no gain would be real."""
     small = candidate("small", 3, 0.985, 1.10, 2.11)
     best = candidate("best", 5, 0.990, 1.05, 2.05)
-    assert choose([small, best], Worth(0.06)).model is small
-    chosen = choose([small, best], Worth(0.05))
+    lacks = math.sqrt(1.605**2 - 1.55**2)
+    assert choose([small, best], Worth(1.01 * lacks)).model is small
+    chosen = choose([small, best], Worth(0.99 * lacks))
     assert (chosen.model, chosen.best) == (best, best)
     shortfall = chosen.shortfalls[0]
     assert shortfall.rmse == pytest.approx(0.055)
+    assert shortfall.lacks == pytest.approx(lacks)
     assert shortfall.real
     assert not shortfall.negligible
     assert choose([small, best], Worth(0.04, relative=True)).model is small
     assert choose([small, best], Worth(0.03, relative=True)).model is best
-    reason = choose([small, best], Worth(0.06)).reason
+    reason = choose([small, best], Worth(0.5)).reason
     assert "fewest signals (3) of the 2 models whose error is negligibly larger" in reason
     assert "is real, but less than" in reason
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.5, 2.0])
+def test_what_a_model_lacks_does_not_depend_on_the_noise_of_the_label(noise: float) -> None:
+    small = candidate("small", 3, 0.985, *(math.hypot(0.5, noise) for _ in range(2)))
+    best = candidate("best", 5, 0.990, *(math.hypot(0.4, noise) for _ in range(2)))
+    assert choose([small, best], Worth(0.301)).model is small
+    assert choose([small, best], Worth(0.299)).model is best
 
 
 def test_a_gain_that_is_not_real_buys_no_signal_however_large() -> None:
@@ -194,7 +204,7 @@ def test_models_of_other_rows_are_compared_without_pairs() -> None:
 def test_a_clear_best_wins_and_ties_go_to_the_declared_order() -> None:
     clear = [candidate("first", 1, 0.90, 2.0, 3.0), candidate("best", 5, 0.990, 1.0, 2.0)]
     assert choose(clear).model.name == "best"
-    assert "error of every other model is larger by 0.005 deg or more" in choose(clear).reason
+    assert "error of every other model is larger by 0.025 deg or more" in choose(clear).reason
     tied = [candidate("b", 2, 0.9, 1.0, 1.0), candidate("a", 2, 0.9, 1.0, 1.0)]
     assert choose(tied).model.name == "b"
     twins = [candidate("twin", 2, 0.91, 1.0, 1.0), candidate("a", 2, 0.9, 1.0, 1.0)]
