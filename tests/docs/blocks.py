@@ -25,11 +25,10 @@ from sybil.parsers.markdown.lexers import RawFencedCodeBlockLexer
 import fleet_slip
 from fleet_slip.cli.app import app
 from fleet_slip.errors import FleetSlipError
+from tests.support.commands import PATIENCE_S
 
 RUN = frozenset({"console", "bash", "python", "sql"})
 SHOWN = frozenset({"text", "json", "toml", "yaml", "csv", "diff"})
-DEADLINE_S = 120
-
 _FENCES = RawFencedCodeBlockLexer(re.compile(r"(?P<language>\S*)(?P<options>[^\n]*)$\n", re.M))
 _TITLE = re.compile(r'\s*title="(?P<title>[\w.-]+)"\s*')
 _MARK = re.compile(r"<!-- (not run|long): \S.* -->\n\Z")
@@ -155,7 +154,7 @@ def printed_by_bash(script: str) -> str:
         stderr=subprocess.STDOUT,
         text=True,
         check=False,
-        timeout=DEADLINE_S,
+        timeout=PATIENCE_S,
     )
     assert done.returncode == 0, f"{script}\nended with {done.returncode} and\n{done.stdout}"
     return done.stdout

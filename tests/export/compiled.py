@@ -16,7 +16,7 @@ from fleet_slip.models.model_version import ModelVersion
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror")
 SANITIZED = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
-DEADLINE_S = 120
+DEADLINE_S = 400
 
 needs_cc = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler, cc")
 

@@ -26,6 +26,7 @@ from fleet_slip.models.trained_drives import read_trained_drives
 from fleet_slip.models.up_to_date import is_up_to_date
 from fleet_slip.monitoring.monitor import monitor
 from tests.export.models import model_of
+from tests.support.commands import PATIENCE_S
 
 Document = dict[str, Any]
 
@@ -202,7 +203,7 @@ def test_imports_at_once_are_versions_of_their_own(tmp_path: Path) -> None:
     start = threading.Barrier(len(files))
 
     def bring(file: Path) -> ModelVersion:
-        start.wait(60)
+        start.wait(PATIENCE_S)
         return fleet_slip.open(away).import_model(file)
 
     with ThreadPoolExecutor(len(files)) as pool:

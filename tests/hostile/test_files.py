@@ -38,10 +38,12 @@ def test_a_link_to_a_file_is_read_and_left_alone(warehouse: Warehouse, tmp_path:
     assert not ingest_file(warehouse, file, a_mapping()).new
 
 
-@pytest.mark.parametrize("target", ["/dev/zero", "/", "/proc/self/mem", "nowhere"])
+@pytest.mark.parametrize("target", ["/dev/zero", "folder", "/proc/self/mem", "nowhere"])
 def test_links_to_what_is_no_file_are_refused(
     warehouse: Warehouse, tmp_path: Path, target: str
 ) -> None:
+    (tmp_path / "folder" / "below").mkdir(parents=True)
+    (tmp_path / "folder" / "below" / "notes.txt").write_text("no log")
     link = tmp_path / "link.csv"
     link.symlink_to(target)
     with pytest.raises(InputError):

@@ -154,14 +154,17 @@ def test_the_index_of_a_dataset_is_no_log(tmp_path: Path) -> None:
     assert "its values are in other files" in failure(file)
 
 
-def test_columns_that_unfold_to_gigabytes_are_not_read(tmp_path: Path) -> None:
+def test_columns_that_unfold_to_many_bytes_are_not_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(budget, "FREE_BYTES", 10**7)
     file = tmp_path / "log.parquet"
-    text = pa.array(["x" * 10**6] * 1100)
-    numbers = {column: np.arange(1100) / 100 for column in COLUMNS}
+    text = pa.array(["x" * 10**6] * 11)
+    numbers = {column: np.arange(11) / 100 for column in COLUMNS}
     pq.write_table(
         pa.table({**numbers, "text": text}), file, compression="zstd", use_dictionary=False
     )
-    assert file.stat().st_size < 10**6
+    assert file.stat().st_size < 10**7 / budget.BYTES_PER_BYTE
     assert "bytes unfold to" in failure(file)
 
 
@@ -238,7 +241,7 @@ def test_equal_rows_of_a_database_are_counted_first(tmp_path: Path) -> None:
     ids=["rows", "a product", "recursion"],
 )
 def test_an_endless_query_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, query: str) -> None:
-    monkeypatch.setattr(budget, "FREE_S", 0.5)
+    monkeypatch.setattr(budget, "FREE_S", 0.1)
     file = database(tmp_path / "log.duckdb")
     told = failure(file, a_mapping(duckdb={"query": query}))
     assert "did not suffice to decode" in told or "rows or more in" in told

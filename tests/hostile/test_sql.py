@@ -236,8 +236,8 @@ ENDLESS = (
 def test_an_endless_query_can_be_interrupted(root: Path, endless: str) -> None:
     with connect(root) as database:
         timer = threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT))
-        timer.start()
         with pytest.raises(KeyboardInterrupt), database_errors("the query"):
+            timer.start()  # here, for it may come before the query on a busy machine
             interruptible(database, database.sql(endless).fetchall)
         timer.join()
 

@@ -23,6 +23,7 @@ from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.csv_batches import CsvFormat, PlainNumbers, open_csv
 from fleet_slip.ingest.landing import data_files
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.commands import PATIENCE_S
 from tests.support.measured import (
     a_mapping,
     csv_text,
@@ -250,7 +251,7 @@ def test_results_come_in_the_order_of_their_items_whoever_is_faster() -> None:
 
     def work(item: int) -> int:
         if item == 0:
-            assert second_is_done.wait(10)  # so the first is done last
+            assert second_is_done.wait(PATIENCE_S)  # so the first is done last
         if item == 1:
             second_is_done.set()
         if item == 5:

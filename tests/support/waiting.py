@@ -22,7 +22,7 @@ class LateError(BaseException):
 
 
 @contextmanager
-def within(seconds: int = 60) -> Iterator[None]:
+def within(seconds: int = int(PATIENCE_S)) -> Iterator[None]:
     """Raise `LateError` in what hangs; of the main thread."""
 
     def stop(*_: Any) -> None:
