@@ -79,7 +79,8 @@ SELECTION: dict[str, Any] = {
     ),
     "robust": typer.Option(
         "--robust",
-        help="Leave out the cars whose influence on the model no honest car has, and say which.",
+        help="Leave out the cars whose influence on the model no honest car of their rows has, and "
+        "say which; diagnose says it before.",
     ),
     "naive": typer.Option(
         "--naive",

@@ -1,11 +1,8 @@
 """Answers a request: reads the Gram rows it needs, and selects among models."""
 
-from collections.abc import Collection, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from typing import Any
-
-import numpy as np
 
 from fleet_slip.canonical import canonical_json, sha256_of
 from fleet_slip.catalogue.feature_sets import PLAIN
@@ -21,8 +18,8 @@ from fleet_slip.regression.choice.nested_choice import Rule
 from fleet_slip.regression.choice.stepwise import METHODS
 from fleet_slip.regression.choice.winner import Worth, fall_short
 from fleet_slip.regression.exact.special import student_t_two_sided
-from fleet_slip.regression.inference.influential import find_influential
 from fleet_slip.regression.validation.crossval import CrossValidation
+from fleet_slip.selection.influence import influential_cars, without_vehicles
 from fleet_slip.selection.model_list import (
     WHOLE_SET,
     CandidateModel,
@@ -49,8 +46,6 @@ from fleet_slip.selection.search import (
 from fleet_slip.selection.select_models import RequestedSelection, Selection, select
 from fleet_slip.selection.uncertainty import estimate_uncertainty
 from fleet_slip.selection.without_label import without_label
-from fleet_slip.warehouse.condition import Condition, parse_condition
-from fleet_slip.warehouse.minimum_cohort import tells_single_cars
 from fleet_slip.warehouse.tables import Warehouse
 
 GIVEN = "given"
@@ -163,7 +158,8 @@ def _answer_without(
     if model_list and model_list.model and not (request.nested or request.search):
         listed = {name for one in model_list.model for name in one.signals}
         inputs = tuple(name for name in cohort.inputs if name in listed)
-    left_out = influential_cars(cohort, inputs)
+    served = cohort.serving(inputs)
+    left_out = influential_cars(served, clustered_moments(served, "drive"))
     others = without_vehicles(cohort.condition, left_out)
     answer = _answer(warehouse, replace(request, robust=False), others.text)
     return replace(answer, left_out=left_out)
@@ -305,36 +301,3 @@ def _search(cohort: Cohort, request: SelectionRequest, folds: Folding) -> Reques
     label = f"nested:{nested} {rule.ranking} {rule.criterion}"
     checksum = _checksum(sha256_of(canonical_json(content)), request.worth, request.intercept)
     return RequestedSelection.of(selection, label, checksum)
-
-
-HASH_CHARACTERS = 16
-"""Of the SHA-256 of a car's name."""
-
-
-def influential_cars(cohort: Cohort, inputs: Sequence[str]) -> dict[str, float]:
-    """Return the cars of unusual influence, and how many times the median influence theirs is.
-
-    Drives that name no car are never left out. Raises `DataError` if no drive has all inputs, and
-    for fewer cars than tell what is usual.
-    """
-    served = cohort.serving(inputs)
-    owners = np.array([name or "" for name in served.drives["vehicle_id"].to_pylist()])
-    names, cars = np.unique(owners, return_inverse=True)
-    found = find_influential(clustered_moments(served, "drive"), cars.astype(np.int64))
-    return {str(names[one.car]): one.times for one in found if names[one.car]}
-
-
-def without_vehicles(condition: Condition, vehicles: Collection[str]) -> Condition:
-    """Return a condition on drives that leaves out some cars.
-
-    It names them, or their hashes where a minimum cohort is asked for, since versions keep it.
-    """
-    if not vehicles:
-        return condition
-    tell, names = "vehicle_id", sorted(vehicles)
-    if not tells_single_cars():
-        tell = f"left(sha256(vehicle_id), {HASH_CHARACTERS})"
-        names = sorted(sha256_of(name)[:HASH_CHARACTERS] for name in vehicles)
-    quoted = ", ".join("'" + name.replace("'", "''") + "'" for name in names)
-    others = f"(vehicle_id IS NULL OR {tell} NOT IN ({quoted}))"
-    return parse_condition(f"{condition.sql} AND {others}")

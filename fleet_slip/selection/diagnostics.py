@@ -1,7 +1,7 @@
 """What there is to know about a model's fit to a cohort: errors, collinearity, stability."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from fleet_slip.catalogue.feature_sets import LAG, lag_signals
@@ -19,6 +19,7 @@ from fleet_slip.regression.inference.coefficient_tests import (
 )
 from fleet_slip.regression.inference.drive_moments import ClusterUnit, DriveMoments, serving_drives
 from fleet_slip.regression.inference.evidence import Evidence
+from fleet_slip.regression.inference.influential import LEAST_CARS, Influential
 from fleet_slip.regression.inference.serial import (
     AutoregressiveFit,
     LagGram,
@@ -33,6 +34,7 @@ from fleet_slip.regression.inference.standard_errors import (
     variance_inflation,
 )
 from fleet_slip.regression.shrinkage.ridge import fit_errors_in_variables
+from fleet_slip.selection.influence import influential_cars
 from fleet_slip.warehouse.minimum_cohort import tells_single_cars
 from fleet_slip.words import number_of
 
@@ -86,6 +88,8 @@ class Diagnosis:
         serial: from lagged Gram rows; None if they were not given.
         comparison: with another cohort; None without one.
         noise_free: the model, in SI units, for signals without the noise they were logged with.
+        influential: the cars that `robust` would leave out of a selection, by name; none where
+            cars are too few to tell what is usual.
     """
 
     fitted: Fit
@@ -99,6 +103,7 @@ class Diagnosis:
     serial: SerialDiagnosis | None = None
     comparison: CohortComparison | None = None
     noise_free: LinearModel | None = None
+    influential: Mapping[str, Influential] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `diagnose --json` prints."""
@@ -117,6 +122,10 @@ class Diagnosis:
             "by_rows": [asdict(estimate) for estimate in self.naive.estimates],
             "by_clusters": [asdict(estimate) for estimate in self.robust.estimates],
         }
+        if self.influential and tells_single_cars():
+            document["influential"] = {
+                car: {"times": one.times, "rows": one.rows} for car, one in self.influential.items()
+            }
         if self.serial is not None:
             document["serial"] = {
                 **asdict(self.serial.correlation),
@@ -183,6 +192,9 @@ def diagnose(
         if against and there
         else None,
         noise_free=free,
+        influential=influential_cars(served, moments)
+        if len(set(_cars(served))) >= LEAST_CARS
+        else {},
     )
 
 

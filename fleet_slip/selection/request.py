@@ -45,8 +45,8 @@ class SelectionRequest:
             part of, such as `0.025deg`, or of the RMSE, such as `2%`; by default what the list
             says, which is the former unless its rule is the best correlation.
         all_subsets: search all subsets of the inputs of `nested` instead of an order.
-        robust: leave out the cars whose influence on the model no honest car has; they are
-            `left_out` of the answer, and its cohort names them.
+        robust: leave out the cars whose influence on the model no honest car of their rows has;
+            they are `left_out` of the answer, and its cohort names them.
         naive: take rows for independent evidence, not drives or cars.
         cluster: what is independent evidence, `vehicle` or `drive`; by default cars where there
             are several.

@@ -15,6 +15,7 @@ from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.grams.cohorts.outweighing import drives_by_car
 from fleet_slip.regression.choice.nested_choice import NestedDistances
 from fleet_slip.regression.choice.winner import Winner, Worth
+from fleet_slip.regression.inference.influential import Influential
 from fleet_slip.regression.validation.crossval import CrossValidation, cross_validate_inputs
 from fleet_slip.regression.validation.folds import CohortFolds
 from fleet_slip.selection.model_list import CandidateModel, Search
@@ -171,21 +172,22 @@ class RequestedSelection(Selection[Any]):
     Attributes:
         model_list: what was compared, such as `table1`.
         config_sha256: checksum of all that says what to compare.
-        left_out: the cars that `robust` left out, and their influence as a multiple of the median.
+        left_out: the cars that `robust` left out, and what influence they had.
         without_label: what changes of the course tell of the winner, if they taught it alone.
     """
 
     model_list: str
     config_sha256: str
-    left_out: Mapping[str, float] = field(default_factory=dict)
+    left_out: Mapping[str, Influential] = field(default_factory=dict)
     without_label: WithoutLabel | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `select --json` prints."""
-        named = dict(self.left_out) if tells_single_cars() else {}
+        told = self.left_out.items() if tells_single_cars() else ()
+        named = {car: one.times for car, one in told}
         document = {**super().as_dict(), "vehicles_left_out": named}
-        told = {"without_label": self.without_label.as_dict()} if self.without_label else {}
-        return {**document, **told}
+        course = {"without_label": self.without_label.as_dict()} if self.without_label else {}
+        return {**document, **course}
 
     @classmethod
     def of(

@@ -41,7 +41,8 @@ def fleet(tmp_path: Path) -> Fleet:
 def test_the_liar_is_left_out_and_the_model_is_that_of_the_others(fleet: Fleet) -> None:
     robust = fleet.cohort().select(nested=INPUTS, robust=True)
     assert list(robust.left_out) == [LIAR]
-    assert robust.left_out[LIAR] > 5
+    assert robust.left_out[LIAR].times > 5
+    assert robust.left_out[LIAR].rows == 1 / 25
     others = fleet.cohort("vehicle_id <> 'it''s me'").select(nested=INPUTS)
     assert robust.winner.model.model == others.winner.model.model
     plain = fleet.cohort().select(nested=INPUTS)
@@ -55,6 +56,9 @@ def test_the_command_names_them_and_the_version_tells_its_cohort(
     told = run_command("select", "--nested", INPUTS, "--robust")
     assert told.exit_code == 0
     assert f"{LIAR} left out: its influence on the model is " in told.stderr
+    before = run_command("diagnose", "--signals", INPUTS)
+    assert f"{LIAR} would be left out by select --robust: its influence" in before.stderr
+    assert [*run_command("diagnose", "--signals", INPUTS, "--json").json["influential"]] == [LIAR]
     assert list(
         run_command("select", "--nested", INPUTS, "--robust", "--json").json["vehicles_left_out"]
     ) == [LIAR]

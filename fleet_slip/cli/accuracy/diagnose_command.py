@@ -7,6 +7,7 @@ import typer
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
+from fleet_slip.cli.left_out import say_influential
 from fleet_slip.cli.options import Cluster, Cohort, FeatureSetOption, Model, Signals, quantities
 from fleet_slip.cli.output import Json, print_json, print_line, print_table, say
 from fleet_slip.regression.inference.standard_errors import INTERCEPT, Estimate
@@ -79,6 +80,7 @@ def _print_diagnosis(result: Diagnosis) -> None:
             "there is one drive only: its rows are taken for independent evidence, which they are "
             "not at 100 Hz, so that the standard errors are far too small."
         )
+    say_influential(result.influential, "would be left out by select --robust")
     if result.serial is not None:
         found = result.serial
         print_line(

@@ -7,7 +7,13 @@ import typer
 
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.cli.left_out import say_outweighing, say_revoked, say_untold, say_without_log
+from fleet_slip.cli.left_out import (
+    say_influential,
+    say_outweighing,
+    say_revoked,
+    say_untold,
+    say_without_log,
+)
 from fleet_slip.cli.options import Cohort, selection_options
 from fleet_slip.cli.output import (
     Json,
@@ -159,11 +165,7 @@ def _say_left_out(selection: Selection[Any]) -> None:
     say_untold(selection.cohort.untold, "signal set")
     if not isinstance(selection, RequestedSelection):
         return
-    if selection.left_out and not tells_single_cars():
-        say(f"{number_of(len(selection.left_out), 'car')} of unusual influence left out.")
-        return
-    for car, times in selection.left_out.items():
-        say(f"{car} left out: its influence on the model is {times:.0f} times the median one.")
+    say_influential(selection.left_out, "left out")
 
 
 def _print_folds(model: CrossValidation) -> None:

@@ -15,7 +15,7 @@ from fleet_slip.errors import CohortError, ConfigError, QuestionError
 from fleet_slip.monitoring.plausibility import Fault
 from fleet_slip.monitoring.quality import QualityReport, SensorFault
 from fleet_slip.regression.exact.gram import Gram
-from fleet_slip.selection.answer_request import without_vehicles
+from fleet_slip.selection.influence import without_vehicles
 from fleet_slip.warehouse.condition import parse_condition
 from fleet_slip.warehouse.minimum_cohort import MINIMUM_VARIABLE
 from tests.support.messages import START_S, gram_of, message_of

@@ -1,0 +1,43 @@
+"""The cars of a cohort whose influence no honest car has, by name, and a cohort without them."""
+
+from collections.abc import Collection
+
+import numpy as np
+
+from fleet_slip.canonical import sha256_of
+from fleet_slip.grams.cohorts.gram_cohort import Served
+from fleet_slip.regression.inference.drive_moments import DriveMoments
+from fleet_slip.regression.inference.influential import Influential, find_influential
+from fleet_slip.warehouse.condition import Condition, parse_condition
+from fleet_slip.warehouse.minimum_cohort import tells_single_cars
+
+HASH_CHARACTERS = 16
+"""Of the SHA-256 of a car's name."""
+
+
+def influential_cars(served: Served, moments: DriveMoments) -> dict[str, Influential]:
+    """Return the cars of unusual influence by name, the most unusual first.
+
+    `moments` are those of the drives. Drives that name no car are never left out. Raises
+    `DataError` for fewer cars than tell what is usual.
+    """
+    owners = np.array([name or "" for name in served.drives["vehicle_id"].to_pylist()])
+    names, cars = np.unique(owners, return_inverse=True)
+    found = find_influential(moments, cars.astype(np.int64))
+    return {str(names[one.car]): one for one in found if names[one.car]}
+
+
+def without_vehicles(condition: Condition, vehicles: Collection[str]) -> Condition:
+    """Return a condition on drives that leaves out some cars.
+
+    It names them, or their hashes where a minimum cohort is asked for, since versions keep it.
+    """
+    if not vehicles:
+        return condition
+    tell, names = "vehicle_id", sorted(vehicles)
+    if not tells_single_cars():
+        tell = f"left(sha256(vehicle_id), {HASH_CHARACTERS})"
+        names = sorted(sha256_of(name)[:HASH_CHARACTERS] for name in vehicles)
+    quoted = ", ".join("'" + name.replace("'", "''") + "'" for name in names)
+    others = f"(vehicle_id IS NULL OR {tell} NOT IN ({quoted}))"
+    return parse_condition(f"{condition.sql} AND {others}")
