@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,9 @@ from tests.support.commands import Finished, RunCommand, done_on, run_on
 from tests.support.once import made_once, require_unchanged
 
 os.environ["FLEET_SLIP_LOG"] = "text"  # a test reads what a person would
+
+# A shell ignores interrupts for what it starts in the background, and so would all that is started.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # The same examples in every run, half as many as usual, and none that fails because the machine is
 # busy. The option --hypothesis-profile=search looks for new ones.

@@ -33,8 +33,9 @@ from fleet_slip.ingest.mapping.units import require_unit
 READ_LATE = (
     *("AWS_", "FLEET_SLIP_", "XDG_CACHE_HOME", "CACHE_DIRECTORY", "TMPDIR"),
     *("_FLEET_SLIP_COMPLETE", "COMP_"),
+    *("KMP_", "PYGAME_"),  # scikit-learn and highway-env set them where they are imported
 )
-"""How variables begin that nothing reads while importing."""
+"""How variables begin that nothing of the program reads while importing."""
 
 LATE = ("pandas", "matplotlib.figure")
 """What libraries import at their first use."""
