@@ -10,6 +10,7 @@ from fleet_slip.export.c.c_checks import c_fuzz_target, c_self_test
 from fleet_slip.export.c.c_gram import c_gram_header, c_gram_source
 from fleet_slip.export.c.c_names import c_prefix, file_prefix
 from fleet_slip.export.c.c_source import c_header, c_source
+from fleet_slip.export.c.on_board import sets_on_board
 from fleet_slip.export.checks import Check, checks_csv, make_checks
 from fleet_slip.export.compile import compile_program
 from fleet_slip.export.dbc import dbc_text
@@ -102,16 +103,21 @@ def _json(subject: Subject) -> dict[str, str]:
 def _c(subject: Subject) -> dict[str, str]:
     version, program = subject.version, subject.program
     prefix = c_prefix(version)
-    gram = {
-        f"{prefix}_gram.h": c_gram_header(prefix),
-        f"{prefix}_gram.c": c_gram_source(prefix),
-    }
+    sets = sets_on_board(version.manifest) if subject.with_gram else ()
+    gram = (
+        {
+            f"{prefix}_gram.h": c_gram_header(prefix, sets),
+            f"{prefix}_gram.c": c_gram_source(prefix, sets),
+        }
+        if sets
+        else {}
+    )
     return {
         f"{prefix}.h": c_header(version, program),
         f"{prefix}.c": c_source(version, program),
         f"{prefix}_test.c": c_self_test(version, program, subject.checks),
         f"{prefix}_fuzz.c": c_fuzz_target(version, program),
-        **(gram if subject.with_gram else {}),
+        **gram,
     }
 
 

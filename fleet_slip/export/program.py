@@ -56,14 +56,13 @@ class Angle(FixedPoint):
 
 
 @dataclass(frozen=True)
-class Program:
-    """A published estimator, complete: steps, and what they are given."""
+class Steps:
+    """What columns are computed by at each tick: steps, and what they are given."""
 
     signals: tuple[Input, ...]
     facts: tuple[CarFact, ...]
     numbers: tuple[CarCount, ...]
     steps: tuple[Step, ...]
-    angle: Angle
 
     @cached_property
     def given(self) -> dict[str, list[Range]]:
@@ -95,6 +94,13 @@ class Program:
     def longest_ticks(self) -> int:
         """How far it looks back; a running mean looks back on all."""
         return max(self.rings.values(), default=0)
+
+
+@dataclass(frozen=True)
+class Program(Steps):
+    """A published estimator, complete."""
+
+    angle: Angle
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from fleet_slip.export.c.on_board import sets_on_board
 from fleet_slip.export.costs import cost_on_board
 from fleet_slip.export.files import export_files
 from fleet_slip.models.model_version import ModelVersion
 from tests.export.compiled import STRICT, run_compiled
+from tests.export.course import learned, write_counter
 from tests.export.models import MODELS, export_texts, model_of
 from tests.support.cortex_m import measure_cortex_m, run_self_test
 
@@ -26,6 +28,16 @@ def folder(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     for name, text in export_files(version, None, "c", with_gram=True).items():
         (tmp_path / name).write_bytes(text)
     return tmp_path
+
+
+@pytest.mark.tools("clang", "cppcheck")
+def test_what_counts_changes_of_the_course_keeps_the_same_rules(tmp_path: Path) -> None:
+    write_counter(tmp_path, sets_on_board(learned()))
+    run(tmp_path, "clang", *STRICT, "-c", "any_gram.c")
+    checks = ("--std=c99", "--addon=misra", "--enable=warning,style,portability", "-q")
+    told = run(tmp_path, "cppcheck", *checks, "any_gram.c")
+    broken = set(re.findall(r"\[(\S+)\]$", told, re.M))
+    assert broken <= DEVIATIONS, told
 
 
 def run(folder: Path, *words: str) -> str:

@@ -6,10 +6,12 @@ from importlib.resources import files
 from string import Template
 
 from fleet_slip.canonical import sha256_of
-from fleet_slip.export.program import Program
+from fleet_slip.export.program import Steps
 from fleet_slip.models.model_version import ModelVersion
 
 LARGEST_32 = 2**31 - 1
+
+INDENT = "    "
 
 LONGEST_PREFIX = 24
 """C99 tells external names apart by 31 characters, and so does rule 5.1 of MISRA C:2012. After the
@@ -34,7 +36,7 @@ def c_prefix(version: ModelVersion) -> str:
     return f"{prefix[: LONGEST_PREFIX - 7]}_{sha256_of(prefix)[:6]}"
 
 
-def field_names(program: Program) -> dict[str, tuple[str, ...]]:
+def field_names(program: Steps) -> dict[str, tuple[str, ...]]:
     """Return the fields of a sample and of a car, none of which is a keyword of C."""
     return {
         "signals": tuple(f"{one.name}_count" for one in program.signals),
@@ -72,3 +74,24 @@ def literal(value: int) -> str:
 def plain_text(text: str) -> str:
     """Return a text that may stand in a string and in a comment: it may come from anywhere."""
     return re.sub(r"[^A-Za-z0-9 @_.:,^-]", "_", text)
+
+
+def indented(lines: Sequence[str]) -> str:
+    """Return lines of a body."""
+    return "".join(f"{INDENT}{line}\n" for line in lines)
+
+
+def table_of(rows: Sequence[Sequence[str]]) -> str:
+    """Return the structs of an array."""
+    return ",\n".join(f"{INDENT}{{{', '.join(row)}}}" for row in rows)
+
+
+def array_of(name: str, values: Sequence[str], kind: str = "int32_t") -> list[str]:
+    """Return the lines of an array of numbers."""
+    *most, last = values
+    return [
+        f"{kind} {name}[{len(values)}] = {{",
+        *(f"{INDENT}{value}," for value in most),
+        f"{INDENT}{last}",
+        "};",
+    ]

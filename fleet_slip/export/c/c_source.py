@@ -1,9 +1,10 @@
 """A program in C99: a header and a source, in integers alone, without allocation or recursion."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 from fleet_slip.export.c.c_names import (
+    INDENT,
     c_prefix,
     field_names,
     integer_type,
@@ -12,10 +13,8 @@ from fleet_slip.export.c.c_names import (
     read_template,
 )
 from fleet_slip.export.c.c_steps import StepWriter, ring_width, state_fields, sum_key
-from fleet_slip.export.program import Program
+from fleet_slip.export.program import Program, Steps
 from fleet_slip.models.model_version import ModelVersion
-
-INDENT = "    "
 
 _HELPER = re.compile(r"^//: (\w+)\n", re.MULTILINE)
 """What stands before each function in `helpers.c`: what writes it, if it was done."""
@@ -74,8 +73,13 @@ def _step_line(prefix: str) -> str:
 
 
 def _sample(program: Program) -> list[str]:
+    return sample_lines(program, "int16_t")
+
+
+def sample_lines(program: Steps, kind: str) -> list[str]:
+    """Return the fields of a sample: a count of each signal."""
     return [
-        f"int16_t {field}; /* {one.scale:f} {plain_unit(one.unit)}, "
+        f"{kind} {field}; /* {one.scale:f} {plain_unit(one.unit)}, "
         f"{one.min_count} to {one.max_count} */"
         for one, field in zip(program.signals, field_names(program)["signals"], strict=True)
     ]
@@ -96,19 +100,23 @@ def c_source(version: ModelVersion, program: Program) -> str:
     """Return the source that goes with the header."""
     prefix, writer = c_prefix(version), StepWriter(program)
     start, step = _start(prefix, program, writer), _step(prefix, program, writer)
-    _, *named = _HELPER.split(read_template("helpers.c").template)
-    texts = zip(named[::2], named[1::2], strict=True)
-    helpers = [text.strip("\n") + "\n" for name, text in texts if writer.done[name]]
     return "\n".join(
         [
             _preamble(version, program),
             f'#include "{prefix}.h"\n',
             "#define MISSING INT32_MIN\n",
-            *helpers,
+            *helper_texts(writer),
             start,
             step,
         ]
     )
+
+
+def helper_texts(writer: StepWriter) -> list[str]:
+    """Return the functions that what was written calls."""
+    _, *named = _HELPER.split(read_template("helpers.c").template)
+    texts = zip(named[::2], named[1::2], strict=True)
+    return [text.strip("\n") + "\n" for name, text in texts if writer.done[name]]
 
 
 def plain_unit(unit: str) -> str:
@@ -136,6 +144,13 @@ def _state(program: Program) -> list[str]:
 
 
 def _start(prefix: str, program: Program, writer: StepWriter) -> str:
+    lines = start_lines(program, writer) or ["state->nothing = 0U;"]
+    body = "\n".join(INDENT + line for line in lines)
+    return f"{_start_line(prefix, program)}\n{{\n{body}\n}}\n"
+
+
+def start_lines(program: Steps, writer: StepWriter) -> list[str]:
+    """Return the statements that begin a drive."""
     fields, lines = field_names(program), []
     for of, ticks in program.rings.items():
         if ticks:
@@ -153,8 +168,7 @@ def _start(prefix: str, program: Program, writer: StepWriter) -> str:
     for field, (least, most) in zip((*fields["facts"], *fields["numbers"]), ranges, strict=True):
         writer.done["within"] += 1
         lines.append(f"state->{field} = within(car->{field}, {literal(least)}, {most});")
-    body = "\n".join(INDENT + line for line in lines or ["state->nothing = 0U;"])
-    return f"{_start_line(prefix, program)}\n{{\n{body}\n}}\n"
+    return lines
 
 
 def _tables(program: Program) -> list[str]:
@@ -184,15 +198,16 @@ def step_lines(program: Program, writer: StepWriter) -> list[str]:
     """Return the statements of a tick; the writer counts what they do."""
     places = [place for place, _ in program.angle.terms]
     terms, valid = [writer.value(place) for place in places], writer.there(*places)
-    kept = {of: writer.kept(of) for of, ticks in program.rings.items() if ticks}
-    lines = [*writer.lines, *_keeps(program, writer, kept), *_dot(program, writer, terms, valid)]
+    keeps = keep_lines(program, writer)
+    lines = [*writer.lines, *keeps, *_dot(program, writer, terms, valid)]
     if not any("state->" in line for line in lines):
         lines.insert(-1, "(void)state;")
     return lines
 
 
-def _keeps(program: Program, writer: StepWriter, kept: Mapping[int, str]) -> list[str]:
-    """Return statements that write this tick into the rings."""
+def keep_lines(program: Steps, writer: StepWriter) -> list[str]:
+    """Return the statements that write this tick into the rings, after all that is computed."""
+    kept = {of: writer.kept(of) for of, ticks in program.rings.items() if ticks}
     found = []
     for of, value in kept.items():
         width = ring_width(program, of)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from fleet_slip.columns.operations import operation_of, plain_of, size_of
 from fleet_slip.export.c.c_names import LARGEST_32, field_names, integer_type, literal
-from fleet_slip.export.program import Program
+from fleet_slip.export.program import Steps
 
 LARGEST_UNSIGNED = 2**32 - 1
 
@@ -25,7 +25,7 @@ class StepWriter:
             that needs 64 bits.
     """
 
-    def __init__(self, program: Program) -> None:
+    def __init__(self, program: Steps) -> None:
         """Take a program."""
         self.program = program
         self.lines: list[str] = []
@@ -228,12 +228,12 @@ def sum_key(of: int, ticks: int, most: int) -> str:
     return f"{of}_over_{ticks}" if ticks else f"{of}_of_{most}"
 
 
-def sum_type(program: Program, of: int, most: int) -> str:
+def sum_type(program: Steps, of: int, most: int) -> str:
     """Return the type of a sum of so many values."""
     return integer_type(size_of(program.ranges[of]) * most)
 
 
-def ring_width(program: Program, of: int) -> int:
+def ring_width(program: Steps, of: int) -> int:
     """Return the bits of a word of a ring: of its largest value, and one that is missing."""
     return 16 if size_of(program.ranges[of]) < 2**15 else 32
 
@@ -261,7 +261,7 @@ class StateField:
         return f"{self.type} {self.name}{size};{comment}"
 
 
-def state_fields(program: Program) -> list[StateField]:
+def state_fields(program: Steps) -> list[StateField]:
     """Return the fields of the state: rings of steps, sums, what the car knows."""
     names, found = field_names(program), []
     for of, ticks in program.rings.items():
@@ -279,7 +279,7 @@ def state_fields(program: Program) -> list[StateField]:
     return found or [nothing]
 
 
-def state_bytes(program: Program) -> int:
+def state_bytes(program: Steps) -> int:
     """Return the size of the state where a word of n bytes lies at a multiple of n, as on ARM."""
     fields, at = state_fields(program), 0
     for one in fields:

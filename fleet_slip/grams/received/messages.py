@@ -14,11 +14,21 @@ All numbers are little-endian. A message is
 A drive has a message for each set of signals that its rows have. What the signals mean are the
 first 8 bytes of the SHA-256 of the canonical JSON of name, scale and range of each.
 
+A message of another feature set has the layout 3, signed 4. It differs from byte 44 on:
+
+    44  2   over which time, from 0         52  4   rows that are in none of them
+    46  2   delay of the course, signed,    56  64  which columns of the set it is of, a bit for
+            in quarters of a tick                   each, the first the lowest
+    48  4   n, rows                         120 ..  sums, products and checksum, as above
+
+and says by its definition which set it is of (`counted_sets`).
+
 A signed message has its signature, 64 bytes, before the checksum (`signatures`).
 Messages of one length that stand one behind the other are read at once, as an array.
 """
 
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
@@ -32,7 +42,9 @@ from fleet_slip.regression.exact.gram import packed_size
 
 MAGIC = b"FSGR"
 LAYOUT = 1
-SIGNED_LAYOUT = 2
+SET_LAYOUT = 3
+SIGNED_LAYOUTS = {LAYOUT: 2, SET_LAYOUT: 4}
+"""The layout of a signed message, by that of one which is not."""
 SIGNATURE_BYTES = 64
 HEADER_BYTES = 56
 CHECKSUM_BYTES = 4
@@ -44,7 +56,10 @@ MOST_ROWS = 2**31 - 1
 """Rows of a drive: 248 days. No sum of so many products of int16 counts reaches 2^61."""
 
 MOST_SIGNALS = 32
-"""There is a bit for each."""
+"""Of a message: the logged signals have a bit for each."""
+
+MOST_COLUMNS = 512
+"""Of a feature set that cars count: there is a bit for each."""
 
 MOST_AT_ONCE = 8192
 """Messages that are looked at as an array: one, two, four, ... while they are of one length."""
@@ -94,19 +109,19 @@ class Found:
     count: int = 0
 
 
-@cache
-def message_size(signals: int) -> int:
-    """Return the bytes of a message of so many signals."""
-    return HEADER_BYTES + 8 * (signals + packed_size(signals)) + CHECKSUM_BYTES
+def message_size(signals: int, *, of_set: bool = False) -> int:
+    """Return the bytes of a message of so many signals, or columns of a set."""
+    return message_type(signals, of_set=of_set).itemsize
 
 
 @cache
-def message_type(signals: int, *, signed: bool = False) -> np.dtype[Any]:
-    """Return the fields of a message of so many signals.
+def message_type(signals: int, *, signed: bool = False, of_set: bool = False) -> np.dtype[Any]:
+    """Return the fields of a message of so many signals, or columns of a set.
 
     `rows` are n, `lost` rows of the drive that none of its messages has; `numbers` are sums, then
     products.
     """
+    which = [("part", "<u2"), ("late", "<i2")] if of_set else [("mask", "<u4")]
     return np.dtype(
         [
             ("magic", "S4"),
@@ -117,9 +132,10 @@ def message_type(signals: int, *, signed: bool = False) -> np.dtype[Any]:
             ("place", "<u2"),
             ("parts", "<u2"),
             ("start_s", "<u8"),
-            ("mask", "<u4"),
+            *which,
             ("rows", "<u4"),
             ("lost", "<u4"),
+            *([("columns", "<u8", (MOST_COLUMNS // 64,))] if of_set else []),
             ("numbers", "<i8", (signals + packed_size(signals),)),
             *([("signature", "V64")] if signed else []),
             ("checksum", "<u4"),
@@ -130,13 +146,27 @@ def message_type(signals: int, *, signed: bool = False) -> np.dtype[Any]:
 @cache
 def signals_definition() -> int:
     """Return what the signals of today's catalogue mean, as messages say it."""
-    signals = catalogue()
+    return definition_of(catalogue().gram_signals)
+
+
+def definition_of(signals: Sequence[str], identity: str | None = None) -> int:
+    """Return what messages call some signals, or a feature set that is made of them."""
     known = [
         [name, f"{s.scale:f}", s.min_count, s.max_count]
-        for name in signals.gram_signals
-        for s in [signals[name]]
+        for name in signals
+        for s in [catalogue()[name]]
     ]
-    return int.from_bytes(bytes.fromhex(sha256_of(canonical_json(known))[:16]), "little")
+    content = canonical_json(known if identity is None else [identity, known])
+    return int.from_bytes(bytes.fromhex(sha256_of(content)[:16]), "little")
+
+
+def count_columns(messages: Messages) -> NDArray[np.int64]:
+    """Return of how many signals or columns messages say that they are."""
+    if "mask" in (messages.dtype.names or ()):
+        found: NDArray[np.int64] = np.bitwise_count(messages["mask"]).astype(np.int64)
+    else:
+        found = np.bitwise_count(messages["columns"]).sum(axis=1, dtype=np.int64)
+    return found
 
 
 def read_messages(content: bytes) -> Found:
@@ -187,9 +217,10 @@ def _types() -> dict[tuple[int, int], tuple[int, np.dtype[Any]]]:
     """Return the number of signals and the fields of a message, by its layout and its length."""
     return {
         (layout, kind.itemsize): (signals, kind)
-        for layout in (LAYOUT, SIGNED_LAYOUT)
+        for plain, signed in SIGNED_LAYOUTS.items()
+        for layout in (plain, signed)
         for signals in range(MOST_SIGNALS + 1)
-        for kind in [message_type(signals, signed=layout == SIGNED_LAYOUT)]
+        for kind in [message_type(signals, signed=layout == signed, of_set=plain == SET_LAYOUT)]
     }
 
 
@@ -205,7 +236,7 @@ def _read_run(content: bytes, at: int, most: int) -> Messages:
         (messages["magic"] == MAGIC)
         & (messages["layout"] == layout)
         & (messages["length"] == size)
-        & (np.bitwise_count(messages["mask"]) == signals)
+        & (count_columns(messages) == signals)
     )
     messages = messages[: _leading(right)]
     view = memoryview(content)
@@ -232,11 +263,11 @@ def _why_none(content: bytes, at: int) -> str:
     if size < HEADER_BYTES + CHECKSUM_BYTES:
         return WRONG_LENGTH
     layout = int.from_bytes(content[at + 4 : at + 6], "little")
-    if layout not in (LAYOUT, SIGNED_LAYOUT):
+    if not any(layout == kind for kind, _ in _types()):
         return OTHER_LAYOUT
-    mask = int.from_bytes(content[at + 44 : at + 48], "little")
-    fitting = message_type(mask.bit_count(), signed=layout == SIGNED_LAYOUT).itemsize
-    return WRONG_LENGTH if size != fitting else WRONG_CHECKSUM
+    signals, kind = _types().get((layout, size), (-1, message_type(0)))
+    fits = signals >= 0 and count_columns(np.frombuffer(content, kind, 1, at))[0] == signals
+    return WRONG_CHECKSUM if fits else WRONG_LENGTH
 
 
 def without_signatures(messages: Messages) -> Messages:
@@ -255,6 +286,6 @@ def keep_signatures(messages: Messages) -> Messages:
     """Return what is kept of some messages: an array of `KEPT`."""
     kept = np.zeros(len(messages), KEPT)
     if "signature" in (messages.dtype.names or ()):
-        for name in KEPT.names or ():
+        for name in set(KEPT.names or ()).intersection(messages.dtype.names or ()):
             kept[name] = messages[name]
     return kept

@@ -5,7 +5,7 @@ to be cleared (`fleet_slip.warehouse.cleared_cars`); single drives only of cars 
 forgotten.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,8 +18,8 @@ from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.delta import Snapshot, TableFile
 from fleet_slip.files.folder import Folder
-from fleet_slip.grams.received.received_rows import ReceivedRows, Refused, signals_of
-from fleet_slip.grams.received.received_table import received_table
+from fleet_slip.grams.received.received_rows import ReceivedRows, Refused
+from fleet_slip.grams.received.received_table import of_part, received_table
 from fleet_slip.grams.rows.gram_files import is_of_received
 from fleet_slip.grams.rows.gram_rows import by_signals, gram_table, is_received
 from fleet_slip.grams.rows.same_drives import content_keys
@@ -167,7 +167,7 @@ def choose_new(
 
 @dataclass
 class _Drives:
-    """Messages of the same signals by drive, and what the table already has of each drive.
+    """Messages of one kind by drive, and what the table already has of each drive.
 
     Attributes:
         rows: the messages.
@@ -233,18 +233,21 @@ def _look_up(grams: Snapshot, drives: Sequence[_Drives]) -> None:
     """Note for each drive what a snapshot of the Gram rows already has."""
     if not drives:
         return
-    by_name = {signals_of(one.rows.mask): one for one in drives}
     wanted = pa.concat_arrays([one.ids for one in drives]).unique()
-    for rows in _rows_with(grams, "drive_id", wanted, _files_of_days(grams, drives)):
+    identities = {features().identity(PLAIN), *(one.rows.of.identity for one in drives)}
+    files = _files_of_days(grams, drives)
+    for identity, rows in _rows_with(grams, "drive_id", wanted, files, identities):
         came = is_received(rows)
         logged = rows.filter(pc.invert(came))["drive_id"].cast(pa.string()).unique()
         for one in drives:
             one.logged |= pc.is_in(one.ids, logged).to_numpy(zero_copy_only=False)
-            one.signed |= pc.is_in(one.ids, _signed(rows)).to_numpy(zero_copy_only=False)
+            if one.rows.of.identity == identity:
+                one.signed |= pc.is_in(one.ids, _signed(rows)).to_numpy(zero_copy_only=False)
         for batch in rows.filter(came).combine_chunks().to_batches():
-            for signals, some, _ in by_signals(batch):
-                if mine := by_name.get(signals):
-                    mine.known += _known(mine, signals, some)
+            for signals, alike, _ in by_signals(batch):
+                for one in drives:
+                    if one.rows.kind == (identity, signals):
+                        one.known += _known(one, signals, of_part(alike, one.rows))
 
 
 def _signed(rows: pa.Table) -> pa.Array:
@@ -267,18 +270,26 @@ def _files_of_days(grams: Snapshot, drives: Sequence[_Drives]) -> list[TableFile
 
 
 def _mark_logged(grams: Snapshot, drives: Sequence[_Drives]) -> None:
-    """Note the drives whose car has a log of the same day with the very same Gram row."""
+    """Note the drives whose car has a log of the same day with the very same Gram row.
+
+    What they sent of other sets is of the same drives.
+    """
     if not drives:
         return
     cars = pa.concat_arrays([one.rows.vehicle_ids for one in drives]).unique()
     contents: set[bytes] = set()
     of_logs = [file for file in grams.files if not is_of_received(file)]
-    for rows in _rows_with(grams, "vehicle_id", cars, of_logs):
+    for _, rows in _rows_with(grams, "vehicle_id", cars, of_logs, {features().identity(PLAIN)}):
         contents.update(content_keys(rows.filter(pc.invert(is_received(rows)))))
+    found = [pa.array([], pa.string())]
     for one in drives if contents else ():
-        keys = list(content_keys(received_table(one.rows, gram_schema(catalogue()))))
-        same = [key in contents for key in keys]
-        one.logged[one.drive[np.array(same, dtype=np.bool_)]] = True
+        if one.rows.is_plain:
+            keys = list(content_keys(received_table(one.rows, gram_schema(catalogue()))))
+            same = np.array([key in contents for key in keys], dtype=np.bool_)
+            found.append(one.ids.take(pa.array(one.drive[same])))
+    logged = pa.concat_arrays(found).unique()
+    for one in drives if len(logged) else ():
+        one.logged |= pc.is_in(one.ids, logged).to_numpy(zero_copy_only=False)
 
 
 def _known(
@@ -299,13 +310,17 @@ def _known(
 
 
 def _rows_with(
-    grams: Snapshot, column: str, names: pa.StringArray, files: Sequence[TableFile]
-) -> Iterator[pa.Table]:
-    """Yield the Gram rows of the logged signals that some files have of some drives or cars."""
-    identity = features().identity(PLAIN)
+    grams: Snapshot,
+    column: str,
+    names: pa.StringArray,
+    files: Sequence[TableFile],
+    identities: Collection[str],
+) -> Iterator[tuple[str, pa.Table]]:
+    """Yield the Gram rows that some files have of some sets, and of some drives or cars."""
     for file in files:
         rows = grams.table.read(file.path, ["feature_set", column])
-        plain = pc.equal(rows["feature_set"], identity)
-        mine = pc.and_(plain, pc.is_in(rows[column].cast(pa.string()), names))
-        if pc.any(mine).as_py():
-            yield grams.table.read(file.path).filter(mine)
+        there = pc.is_in(rows[column].cast(pa.string()), names)
+        for identity in identities:
+            mine = pc.and_(pc.equal(rows["feature_set"], identity), there)
+            if pc.any(mine).as_py():
+                yield identity, grams.table.read(file.path).filter(mine)

@@ -9,7 +9,8 @@ squares d, and c the sum of products of two signals x and y,
     d >= (2 a + 1) s - n a (a + 1), a = floor(s/n)  (x - a) (x - a - 1) >= 0, for any whole a
     |c| <= n max|x| max|y|
 
-are exact and in 64 bits: ranges are within 15 bits and n below 2^31, so that nothing reaches 2^63.
+are exact and in 64 bits: ranges are within 15 bits and n below 2^31, or n is below as much less as
+ranges are wider (`most_rows`), so that nothing reaches 2^63.
 And the matrix of n, sums and products is positive semidefinite. That is decided in binary64 where
 it can be: on the matrix scaled to a diagonal of ones, by whether all pivots are positive. With
 `NEAR` taken from the diagonal, they are only if the matrix is positive definite; with `NEAR` added,
@@ -30,6 +31,7 @@ from fleet_slip.grams.received.messages import MOST_ROWS
 from fleet_slip.regression.exact.elimination import is_semidefinite
 
 NEAR = 1e-12
+LARGEST_SUM = 2**61
 CHUNK = 512
 """Matrices that are worked on at once."""
 
@@ -46,7 +48,7 @@ def find_impossible(
     found: dict[str, IntArray] = {}
     left = np.arange(len(rows))
     for reason, rule in (
-        (NO_ROWS, lambda n, _s, _p: (n < 1) | (n > MOST_ROWS)),
+        (NO_ROWS, lambda n, _s, _p: (n < 1) | (n > most_rows(ranges))),
         (SUMS, lambda n, s, _p: _bad_sums(n, s, ranges)),
         (PRODUCTS, lambda n, s, p: _bad_products(n, s, p, ranges)),
         (INDEFINITE, _indefinite),
@@ -58,6 +60,12 @@ def find_impossible(
             found[reason] = left[bad]
             left = left[~bad]
     return found
+
+
+def most_rows(ranges: Sequence[tuple[int, int]]) -> int:
+    """Return of how many rows a message can be: no sum of their products reaches 2^61."""
+    largest = max((abs(end) for one in ranges for end in one), default=1)
+    return min(MOST_ROWS, (LARGEST_SUM - 1) // largest**2)
 
 
 def _by_chunks(

@@ -4,7 +4,7 @@ import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,13 +12,15 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.arrays import BoolArray, IntArray
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
+from fleet_slip.catalogue.course_change import LATE_PARTS, MOST_EARLY, MOST_LATE
+from fleet_slip.catalogue.feature_sets import PLAIN
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S
+from fleet_slip.grams.received.counted_sets import CountedSet, counted_sets
 from fleet_slip.grams.received.messages import (
     LONGEST_VEHICLE,
     Found,
     Messages,
     keep_signatures,
-    signals_definition,
     without_signatures,
 )
 from fleet_slip.grams.received.plausible import find_impossible
@@ -34,6 +36,7 @@ LONGEST_ROWS = 86_400 * round(1 / SAMPLE_TIME_S)
 
 OTHER_SIGNALS = "is of signals that mean something else here"
 NO_PARTS = "is of signals or parts that there are not"
+NO_DELAY = "is corrected by a delay that no course has"
 NO_VEHICLE = "has no name of a car"
 NO_MOMENT = "begins before 2000, or ends in the future"
 TOO_LONG = "is of a drive longer than a day"
@@ -55,7 +58,7 @@ class Refused:
 
 @dataclass(frozen=True)
 class ReceivedRows:
-    """Messages of the same signals, in the order in which they came.
+    """Messages of the same signals, or columns and part of a set, in the order in which they came.
 
     Attributes:
         file: which of some files each is from, shape (m,).
@@ -91,10 +94,36 @@ class ReceivedRows:
         each = zip(*(run._arrays for run in runs), strict=True)
         return cls(*(np.concatenate(arrays) for arrays in each))
 
+    @cached_property
+    def of(self) -> CountedSet:
+        """The feature set that they are of."""
+        return counted_sets()[int(self.messages["definition"][0])]
+
     @property
-    def mask(self) -> int:
-        """Which signals they are of, a bit for each."""
-        return int(self.messages["mask"][0])
+    def is_plain(self) -> bool:
+        """Whether they are of the logged signals."""
+        return self.of.name == PLAIN
+
+    @cached_property
+    def signals(self) -> tuple[str, ...]:
+        """What they are of: signals, or columns of the set."""
+        bits = columns_of(self.messages[:1])[0].tolist()
+        return tuple(name for name, there in zip(self.of.columns, bits, strict=False) if there)
+
+    @property
+    def kind(self) -> tuple[str, str]:
+        """Their set and their signals, as `grams` has them."""
+        return self.of.identity, ",".join(self.signals)
+
+    @property
+    def part(self) -> int:
+        """Which part of their drives they are of, 0 where these are not divided."""
+        return 0 if self.is_plain else int(self.messages["part"][0])
+
+    @property
+    def late(self) -> IntArray:
+        """By how many parts of a tick the course was taken to be late, shape (m,)."""
+        return self.messages["late"].astype(np.int64)
 
     @property
     def n(self) -> IntArray:
@@ -109,12 +138,12 @@ class ReceivedRows:
     @property
     def sums(self) -> IntArray:
         """Sums, shape (m, k)."""
-        return self.numbers[:, : self.mask.bit_count()]
+        return self.numbers[:, : len(self.signals)]
 
     @property
     def products(self) -> IntArray:
         """Packed lower triangles, shape (m, k(k+1)/2)."""
-        return self.numbers[:, self.mask.bit_count() :]
+        return self.numbers[:, len(self.signals) :]
 
     @cached_property
     def vehicle_ids(self) -> pa.StringArray:
@@ -150,10 +179,21 @@ class ReceivedRows:
         return self.take(left), refused
 
 
-@cache
-def signals_of(mask: int) -> str:
-    """Return the names of a message's signals, as the table `grams` has them."""
-    return ",".join(n for i, n in enumerate(catalogue().gram_signals) if mask >> i & 1)
+def columns_of(messages: Messages) -> BoolArray:
+    """Return which signals or columns messages are of, a bit for each, shape (m, bits)."""
+    words = messages["mask" if "mask" in (messages.dtype.names or ()) else "columns"]
+    content = np.ascontiguousarray(words).view(np.uint8).reshape(len(messages), -1)
+    found: BoolArray = np.unpackbits(content, axis=1, bitorder="little").astype(np.bool_)
+    return found
+
+
+def _kinds(messages: Messages) -> IntArray:
+    """Return what tells which messages stand together, shape (m, numbers)."""
+    some = messages["definition"].view(np.int64)[:, None]
+    if "mask" in (messages.dtype.names or ()):
+        return np.column_stack([some, messages["mask"].astype(np.int64)])
+    words = messages["columns"].astype(np.int64)
+    return np.hstack([some, messages["part"].astype(np.int64)[:, None], words])
 
 
 Judge = Callable[["ReceivedRows"], Iterable[str | None]]
@@ -165,7 +205,7 @@ def sort_out(
 ) -> tuple[list[ReceivedRows], list[Refused]]:
     """Divide the messages of files into those that may land, by their signals, and others."""
     refused: list[Refused] = []
-    runs: dict[int, list[ReceivedRows]] = {}
+    runs: dict[tuple[int, ...], list[ReceivedRows]] = {}
     for file, one in found:
         refused += [Refused(file, number, reason) for number, reason in one.refused]
         for run in _by_layout(file, one):
@@ -177,11 +217,13 @@ def sort_out(
                 told, forged = told.without({reason: reasons == reason for reason in named})
                 refused += forged
             told = replace(told, messages=without_signatures(told.messages))
-            for mask in np.unique(told.messages["mask"]).tolist():
-                runs.setdefault(mask, []).append(told.take(told.messages["mask"] == mask))
+            kinds = _kinds(told.messages)
+            for kind in np.unique(kinds, axis=0):
+                some = told.take((kinds == kind).all(axis=1))
+                runs.setdefault(tuple(kind.tolist()), []).append(some)
     kept: list[ReceivedRows] = []
-    for mask in sorted(runs):
-        rows, impossible = _possible(ReceivedRows.joined(runs[mask]))
+    for key in sorted(runs):
+        rows, impossible = _possible(ReceivedRows.joined(runs[key]))
         refused += impossible
         kept += [rows] if len(rows) else []
     return kept, refused
@@ -210,12 +252,11 @@ def _without_name(run: ReceivedRows) -> tuple[ReceivedRows, list[Refused]]:
     ends_s = np.minimum(start_s, latest_s) + said["rows"] * float(SAMPLE_TIME_S)
     left = np.ones(len(said), dtype=np.bool_)
     refused: list[Refused] = []
+    other, no_parts, no_delay = _of_no_set(said)
     for reason, wrong in (
-        (OTHER_SIGNALS, said["definition"] != signals_definition()),
-        (
-            NO_PARTS,
-            (said["mask"] >> len(catalogue().gram_signals) != 0) | (said["place"] >= said["parts"]),
-        ),
+        (OTHER_SIGNALS, other),
+        (NO_PARTS, no_parts | (said["place"] >= said["parts"])),
+        (NO_DELAY, no_delay),
         (NO_VEHICLE, ~_is_name(said["vehicle"])),
         (NO_MOMENT, (start_s < FIRST_START_S) | (start_s > latest_s) | (ends_s > latest_s)),
     ):
@@ -224,6 +265,24 @@ def _without_name(run: ReceivedRows) -> tuple[ReceivedRows, list[Refused]]:
         places = zip(run.file[bad].tolist(), run.number[bad].tolist(), strict=True)
         refused += [Refused(file, number, reason) for file, number in places]
     return run.take(left), refused
+
+
+def _of_no_set(said: Messages) -> tuple[BoolArray, BoolArray, BoolArray]:
+    """Return which messages are of no set, of no columns or part of theirs, of no delay in it."""
+    other, no_parts, no_delay = np.zeros((3, len(said)), dtype=np.bool_)
+    plain = "mask" in (said.dtype.names or ())
+    for definition in np.unique(said["definition"]).tolist():
+        mine = said["definition"] == definition
+        one = counted_sets().get(definition)
+        if one is None or plain != (one.name == PLAIN):
+            other |= mine
+            continue
+        no_parts |= mine & columns_of(said)[:, len(one.columns) :].any(axis=1)
+        if not plain:
+            no_parts |= mine & (said["part"] >= max(1, len(one.times)))
+            least, most = (LATE_PARTS * ticks * one.in_time for ticks in (MOST_EARLY, MOST_LATE))
+            no_delay |= mine & ((said["late"] < least) | (said["late"] > most))
+    return other, no_parts, no_delay
 
 
 def _is_name(vehicles: Messages) -> BoolArray:
@@ -240,9 +299,7 @@ def _possible(rows: ReceivedRows) -> tuple[ReceivedRows, list[Refused]]:
     """Divide messages of the same signals into those that counts can have, and the others."""
     lacking, long = rows.messages["lost"] != 0, rows.n > LONGEST_ROWS
     whole, refused = rows.without({LACKS_ROWS: lacking, TOO_LONG: long})
-    signals = catalogue()
-    names = [name for name in signals_of(rows.mask).split(",") if name]
-    ranges = [(signals[name].min_count, signals[name].max_count) for name in names]
+    ranges = rows.of.ranges_of(rows.signals)
     why = find_impossible(whole.n, whole.sums, whole.products, ranges) if len(whole) else {}
     places = np.arange(len(whole))
     kept, impossible = whole.without({reason: np.isin(places, at) for reason, at in why.items()})

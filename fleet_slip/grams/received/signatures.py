@@ -1,7 +1,8 @@
 """Signatures of messages, and the list of keys that cars sign with.
 
-A signed message has the layout 2: it is 64 bytes longer, which stand before its checksum. The
-Ed25519 signature, made by the car's gateway, is over `DOMAIN` and all bytes before it.
+A signed message has the layout 2, of a feature set 4: it is 64 bytes longer, which stand before
+its checksum. The Ed25519 signature, made by the car's gateway, is over `DOMAIN` and all bytes
+before it.
 
 The list is a CSV file with a line a key; the last three may be empty, and `valid_until` is the last
 day:
@@ -39,7 +40,7 @@ from fleet_slip.extras import needed
 from fleet_slip.grams.received.messages import (
     CHECKSUM_BYTES,
     SIGNATURE_BYTES,
-    SIGNED_LAYOUT,
+    SIGNED_LAYOUTS,
     Messages,
     read_messages,
 )
@@ -196,12 +197,13 @@ def sign_messages(content: bytes, private_key: bytes) -> bytes:
         raise InputError(f"message {number} {reason}: nothing is signed.")
     signed = []
     for first, messages in found.runs:
-        if messages["layout"][0] == SIGNED_LAYOUT:
+        layout = SIGNED_LAYOUTS.get(int(messages["layout"][0]))
+        if layout is None:
             raise InputError(f"message {first} is signed already.")
         for message in messages:
             body = bytearray(message.tobytes()[:-CHECKSUM_BYTES])
             size = len(body) + SIGNATURE_BYTES + CHECKSUM_BYTES
-            body[4:8] = SIGNED_LAYOUT.to_bytes(2, "little") + size.to_bytes(2, "little")
+            body[4:8] = layout.to_bytes(2, "little") + size.to_bytes(2, "little")
             body += key.sign(DOMAIN + body)
             signed.append(bytes(body) + zlib.crc32(body).to_bytes(CHECKSUM_BYTES, "little"))
     return b"".join(signed)
@@ -257,7 +259,7 @@ def _is_signed(key: "Ed25519PublicKey", signature: bytes, content: bytes) -> boo
 
 
 def _without_looking(layout: int, key: CarKey | None) -> str | None:
-    if layout != SIGNED_LAYOUT:
+    if layout not in SIGNED_LAYOUTS.values():
         return UNSIGNED
     if key is None:
         return NO_KEY

@@ -1,7 +1,8 @@
 """Which received Gram rows are of drives whose logs are here: the logs count, the rows go.
 
 A drive is the same if it has the same name; or the same car, day and signals, and exactly the same
-n, sums and products: what a car counts is, bit for bit, what its log comes to.
+n, sums and products: what a car counts is, bit for bit, what its log comes to. The rows of the
+logged signals tell; those of other sets that the car sent of the same drive go with them.
 """
 
 import hashlib
@@ -10,11 +11,9 @@ from dataclasses import dataclass, field
 from datetime import date
 from itertools import pairwise
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from fleet_slip.arrays import BoolArray
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.delta import Snapshot, TableFile
@@ -35,42 +34,40 @@ class LoggedDrives:
     def add(self, rows: pa.Table) -> None:
         """Add the drives of Gram rows."""
         self.names.update(rows["drive_id"].cast(pa.string()).to_pylist())
-        self.contents.update(content_keys(rows))
-        self.days.update(rows["day"].unique().to_pylist())
+        plain = rows.filter(pc.equal(rows["feature_set"], features().identity(PLAIN)))
+        self.contents.update(content_keys(plain))
+        self.days.update(plain["day"].unique().to_pylist())
 
     def files_with_received(self, grams: Snapshot) -> list[TableFile]:
         """Return the files that have received Gram rows of these drives."""
+        files = [file for file in grams.files if is_of_received(file)]
+        for file in files:
+            self.names.update(self._sent(file, grams))
         names = pa.array(sorted(self.names), pa.string())
-        return [
-            file for file in grams.files if is_of_received(file) and self._in(file, names, grams)
-        ]
+        return [file for file in files if pc.any(pc.is_in(_drives(file, grams), names)).as_py()]
 
-    def _in(self, file: TableFile, names: pa.StringArray, grams: Snapshot) -> bool:
-        """Whether a file has received Gram rows of these drives.
+    def _sent(self, file: TableFile, grams: Snapshot) -> Iterator[str]:
+        """Yield the received drives of a file that are these under another name.
 
-        The same content is of the same day: rows of other days are told by their names alone.
+        The same content is of the same day.
         """
-        drives = grams.table.read(file.path, ["drive_id"])["drive_id"].cast(pa.string())
-        if pc.any(pc.is_in(drives, names)).as_py():
-            return True
         first, last = file.days or (date.min, date.max)
-        if not any(first <= day <= last for day in self.days):
-            return False
-        return bool(self._mine(grams.table.read(file.path)).any())
+        if any(first <= day <= last for day in self.days):
+            rows = grams.table.read(file.path)
+            for drive, key in zip(rows["drive_id"].to_pylist(), content_keys(rows), strict=True):
+                if key in self.contents:
+                    yield drive
 
     def without_received(self, rows: pa.Table) -> pa.Table:
         """Return rows of `grams` without the received ones of these drives; count those."""
-        came = np.asarray(is_received(rows).to_numpy(zero_copy_only=False), dtype=np.bool_)
-        mine = came.copy()
-        mine[came] = self._mine(rows.filter(pa.array(came)))
-        self.found += int(mine.sum())
-        return rows.filter(pa.array(~mine))
+        names = pa.array(sorted(self.names), pa.string())
+        mine = pc.and_(is_received(rows), pc.is_in(rows["drive_id"].cast(pa.string()), names))
+        self.found += pc.sum(mine).as_py() or 0
+        return rows.filter(pc.invert(mine))
 
-    def _mine(self, rows: pa.Table) -> BoolArray:
-        drives = rows["drive_id"].cast(pa.string()).to_pylist()
-        known = [drive in self.names for drive in drives]
-        same = [key in self.contents for key in content_keys(rows)]
-        return np.array(known, dtype=np.bool_) | np.array(same, dtype=np.bool_)
+
+def _drives(file: TableFile, grams: Snapshot) -> pa.ChunkedArray:
+    return grams.table.read(file.path, ["drive_id"])["drive_id"].cast(pa.string())
 
 
 def has_received(grams: Snapshot) -> bool:

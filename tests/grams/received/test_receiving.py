@@ -124,7 +124,7 @@ INDEFINITE = message_of(broken(GRAM, products=(FIRST, FIRST * 5, *REST)))
         (message_of(GRAM)[:40], "is cut off"),
         (message_of(GRAM)[:-1] + b"\x00", "has a wrong checksum"),
         (b"nonsense", "does not begin as a message does"),
-        (message_of(GRAM, layout=3), "has another layout"),
+        (message_of(GRAM, layout=5), "has another layout"),
         (message_of(GRAM, layout=2), "has a length that does not fit its signals"),
         (message_of(GRAM, size=60), "has a length that does not fit its signals"),
         (message_of(GRAM, size=3), "has a length that does not fit its signals"),

@@ -1,72 +1,87 @@
 /* Gram rows of a drive, exported by fleet-slip. Do not edit.
- * Signals, a bit of a mask each, the first the lowest: ${names}. */
+ * Columns of rows by feature set, a bit of a mask each, the first the lowest:
+${comment}
 #include "${prefix}_gram.h"
 
-#define SIGNALS ${signals}U
+#define SETS ${sets}U
 #define MISSING INT32_MIN
 
-static int32_t in_range(int32_t value, int32_t least, int32_t most)
+/* What is counted of a feature set. */
+typedef struct {
+    uint32_t columns;
+    uint32_t parts;
+    uint32_t first_part;
+    uint32_t first_number;
+    uint32_t most_rows;
+    uint64_t definition;
+} counted_set;
+
+static const counted_set counted[SETS] = {
+${counted}
+};
+
+${helpers}
+/* Sums and products of so many columns. */
+static uint32_t numbers_of(uint32_t columns)
 {
-    return ((value < least) || (value > most)) ? MISSING : value;
+    return columns + ((columns * (columns + 1U)) / 2U);
 }
 
-/* The part of a set of signals, begun if it is new; the number of parts if none is left. */
-static uint32_t part_of(${prefix}_gram *gram, uint32_t mask)
+/* Counts a row of a feature set, over one of the times that it changes over. */
+static void count_row(${prefix}_gram *gram, uint32_t set, uint32_t over, int32_t *row)
 {
-    uint32_t found = 0U;
-    while ((found < gram->used) && (gram->parts[found].mask != mask)) {
-        found++;
-    }
-    if ((found == gram->used) && (found < ${most_parts}U)) {
-        ${prefix}_gram_part *const part = &gram->parts[found];
-        part->mask = mask;
-        part->rows = 0U;
-        for (uint32_t i = 0U; i < SIGNALS; i++) {
-            part->sums[i] = 0;
-        }
-        for (uint32_t i = 0U; i < ${products}U; i++) {
-            part->products[i] = 0;
-        }
-        gram->used++;
-    }
-    return found;
-}
-
-void ${prefix}_gram_start(${prefix}_gram *gram)
-{
-    gram->used = 0U;
-    gram->lost = 0U;
-}
-
-void ${prefix}_gram_add(${prefix}_gram *gram, const ${prefix}_gram_sample *sample)
-{
-    int32_t counts[SIGNALS];
-${takes}
+    const counted_set *const of = &counted[set];
     uint32_t mask = 0U;
-    for (uint32_t i = 0U; i < SIGNALS; i++) {
-        if (counts[i] == MISSING) {
-            counts[i] = 0; /* adds nothing */
+    for (uint32_t i = 0U; i < of->columns; i++) {
+        if (row[i] == MISSING) {
+            row[i] = 0; /* adds nothing */
         } else {
             mask |= ((uint32_t)1U << i);
         }
     }
-    const uint32_t found = part_of(gram, mask);
-    if ((found == ${most_parts}U) || (gram->parts[found].rows == ${most_rows}U)) {
-        gram->lost += (gram->lost < ${most_rows}U) ? 1U : 0U;
+    uint32_t found = 0U;
+    while ((found < gram->used[set]) && ((gram->parts[of->first_part + found].mask != mask) ||
+                                         (gram->parts[of->first_part + found].over != over))) {
+        found++;
+    }
+    const bool is_new = (found == gram->used[set]) && (found < of->parts);
+    const uint32_t size = numbers_of(of->columns);
+    if (is_new) {
+        ${prefix}_gram_part *const part = &gram->parts[of->first_part + found];
+        part->mask = mask;
+        part->over = over;
+        part->rows = 0U;
+        for (uint32_t i = 0U; i < size; i++) {
+            gram->numbers[of->first_number + (found * size) + i] = 0;
+        }
+        gram->used[set]++;
+    }
+    if ((found == of->parts) || (gram->parts[of->first_part + found].rows == of->most_rows)) {
+        gram->lost[set] += (gram->lost[set] < ${most_rows}U) ? 1U : 0U;
     } else {
-        ${prefix}_gram_part *const part = &gram->parts[found];
-        uint32_t at = 0U;
-        part->rows++;
-        for (uint32_t i = 0U; i < SIGNALS; i++) {
-            part->sums[i] += counts[i];
+        uint32_t at = of->first_number + (found * size);
+        gram->parts[of->first_part + found].rows++;
+        for (uint32_t i = 0U; i < of->columns; i++) {
+            gram->numbers[at] += row[i];
+            at++;
+        }
+        for (uint32_t i = 0U; i < of->columns; i++) {
             for (uint32_t j = 0U; j <= i; j++) {
-                part->products[at] += counts[i] * counts[j];
+                gram->numbers[at] += (int64_t)row[i] * row[j];
                 at++;
             }
         }
     }
 }
-
+${changes}
+void ${prefix}_gram_start(${prefix}_gram *gram${late})
+{
+    for (uint32_t i = 0U; i < SETS; i++) {
+        gram->used[i] = 0U;
+        gram->lost[i] = 0U;
+    }
+${start}}
+${tick}
 /* Writes the lowest bytes of a number, the lowest first; returns where the next one goes. */
 static uint32_t put(uint8_t *message, uint32_t at, uint64_t value, uint32_t bytes)
 {
@@ -90,39 +105,47 @@ static uint32_t crc_32(const uint8_t *bytes, uint32_t size)
     }
     return ~crc;
 }
-
+${columns_bits}
 uint32_t ${prefix}_gram_message(const ${prefix}_gram *gram, uint32_t part, const uint8_t *vehicle,
                                uint64_t start_s, uint8_t *message)
 {
-    if (part >= gram->used) {
+    uint32_t set = 0U;
+    uint32_t place = part;
+    while ((set < SETS) && (place >= gram->used[set])) {
+        place -= gram->used[set];
+        set++;
+    }
+    if (set == SETS) {
         return 0U;
     }
-    const ${prefix}_gram_part *const from = &gram->parts[part];
+    const counted_set *const of = &counted[set];
+    const ${prefix}_gram_part *const from = &gram->parts[of->first_part + place];
 ${magic}
-    uint32_t at = put(message, ${magic_bytes}U, ${layout}U, 2U);
+    uint32_t at = put(message, ${magic_bytes}U, ${layout}, 2U);
     at = put(message, at, 0U, 2U); /* the length, below */
-    at = put(message, at, UINT64_C(0x${definition}), 8U);
+    at = put(message, at, of->definition, 8U);
     for (uint32_t i = 0U; i < ${longest_vehicle}U; i++) {
         at = put(message, at, vehicle[i], 1U);
     }
-    at = put(message, at, part, 2U);
-    at = put(message, at, gram->used, 2U);
+    at = put(message, at, place, 2U);
+    at = put(message, at, gram->used[set], 2U);
     at = put(message, at, start_s, 8U);
-    at = put(message, at, from->mask, 4U);
+    at = put(message, at, ${which}, 4U);
     at = put(message, at, from->rows, 4U);
-    at = put(message, at, gram->lost, 4U); /* byte ${header_bytes} is next */
-    for (uint32_t i = 0U; i < SIGNALS; i++) {
+    at = put(message, at, gram->lost[set], 4U); /* byte ${header_bytes} is next */
+${columns}    uint32_t number = of->first_number + (place * numbers_of(of->columns));
+    for (uint32_t i = 0U; i < of->columns; i++) {
         if (((from->mask >> i) & 1U) != 0U) {
-            at = put(message, at, (uint64_t)from->sums[i], 8U);
+            at = put(message, at, (uint64_t)gram->numbers[number], 8U);
         }
+        number++;
     }
-    uint32_t product = 0U;
-    for (uint32_t i = 0U; i < SIGNALS; i++) {
+    for (uint32_t i = 0U; i < of->columns; i++) {
         for (uint32_t j = 0U; j <= i; j++) {
             if ((((from->mask >> i) & (from->mask >> j)) & 1U) != 0U) {
-                at = put(message, at, (uint64_t)from->products[product], 8U);
+                at = put(message, at, (uint64_t)gram->numbers[number], 8U);
             }
-            product++;
+            number++;
         }
     }
     (void)put(message, 6U, (uint64_t)at + 4U, 2U);
