@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
 from pathlib import Path
-from subprocess import run
 
 import numpy as np
 import pyarrow as pa
@@ -15,7 +14,7 @@ from fleet_slip.catalogue.features import features
 from fleet_slip.export.c.c_gram import c_gram_header, c_gram_source
 from fleet_slip.export.c.on_board import OnBoard, lower
 from fleet_slip.models.manifest import LearnedFrom, Manifest, ModelTerm
-from tests.export.compiled import compile_c
+from tests.export.compiled import compile_c, run_compiled
 from tests.export.models import MODELS, model_of
 
 MISSING = -(2**31)
@@ -104,8 +103,7 @@ class Counter:
         car = table["vehicle_id"][0].as_py()
         head = struct.pack("<16sQqQ", car.encode(), start_s, late, len(samples))
         given = head + samples.tobytes()
-        done = run([self.program], input=given, capture_output=True, check=True, timeout=60)
-        return done.stdout
+        return run_compiled([self.program], given=given)
 
 
 def write_counter(folder: Path, sets: tuple[OnBoard, ...]) -> None:

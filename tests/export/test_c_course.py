@@ -4,7 +4,6 @@ import struct
 from collections.abc import Iterator, Sequence
 from decimal import Decimal
 from pathlib import Path
-from subprocess import run
 from typing import Any
 
 import numpy as np
@@ -27,7 +26,7 @@ from fleet_slip.grams.rows.aggregation import aggregate
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.warehouse.tables import Warehouse
-from tests.export.compiled import SANITIZED, can_sanitize, needs_cc
+from tests.export.compiled import SANITIZED, can_sanitize, needs_cc, run_compiled
 from tests.export.course import COLUMNS, Counter, build, learned
 from tests.grams.rows.test_course_sums import hostile_drive
 from tests.support.logs import land
@@ -145,7 +144,7 @@ def test_nothing_overflows(tmp_path: Path, counter: Counter) -> None:
     samples[:, 0] = random.random(rows) < 0.99
     for late in (-(2**31), 2**31 - 1, 7):
         given = struct.pack("<16sQqQ", b"VIN", 2**64 - 1, late, rows) + samples.tobytes()
-        assert run([sanitized.program], input=given, capture_output=True, check=True, timeout=60)
+        assert run_compiled([sanitized.program], given=given)
 
 
 def test_an_export_counts_what_teaches_the_model_again() -> None:
