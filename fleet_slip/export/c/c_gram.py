@@ -27,7 +27,6 @@ from fleet_slip.grams.received.messages import (
 from fleet_slip.grams.received.plausible import most_rows
 from fleet_slip.regression.exact.gram import packed_size
 
-
 _HELPER = re.compile(r"^static \w+ (\w+)\(", re.MULTILINE)
 
 
