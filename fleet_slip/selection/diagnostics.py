@@ -7,7 +7,7 @@ from typing import Any, Literal
 from fleet_slip.catalogue.feature_sets import LAG, lag_signals
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.errors import QuestionError
+from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.cohorts.gram_cohort import Cohort, Served
 from fleet_slip.grams.cohorts.training_folds import clustered_moments
 from fleet_slip.regression.choice.nested_choice import nested_fits
@@ -62,8 +62,8 @@ class CohortComparison:
         condition: the other cohort.
         other: the coefficients there.
         rows: Chow's test, which takes rows for independent.
-        drives: Wald's test, which takes drives or cars for independent; None with fewer of them
-            than coefficients.
+        drives: Wald's test, which takes drives or cars for independent; None with too few of
+            them for so many coefficients.
     """
 
     condition: str
@@ -241,10 +241,14 @@ def _compare(
     intercept = fitted.has_intercept
     other_moments = clustered_moments(there, moments.unit, _cars(here, there), intercept=intercept)
     other = fit(there.table.total(), inputs, label, intercept=intercept)
-    enough = min(len(one.clusters) for one in (moments, other_moments)) > len(inputs) + intercept
+    by_rows = chow_test([fitted.gram, other.gram], inputs, label, intercept=intercept)
+    try:
+        by_clusters = wald_test(fitted, moments, other, other_moments)
+    except DataError:  # too few of them
+        by_clusters = None
     return CohortComparison(
         condition,
         _infer(other, other_moments),
-        chow_test([fitted.gram, other.gram], inputs, label, intercept=intercept),
-        wald_test(fitted, moments, other, other_moments) if enough else None,
+        by_rows,
+        by_clusters,
     )

@@ -16,6 +16,7 @@ from fleet_slip.regression.inference.drive_moments import ClusterUnit
 from fleet_slip.selection.diagnostics import diagnose
 from tests.support.cohorts import INPUTS, LABEL, Driven, cohort_of, driven, rows_of
 from tests.support.counts import dense_fit
+from tests.support.few_cars import compared
 
 COEFFICIENTS = (0.1, 0.4, 0.9, 0.2)
 
@@ -165,10 +166,7 @@ def test_offsets_of_cars_are_seen_by_cars_alone() -> None:
 
 
 def test_cars_in_both_cohorts_are_not_counted_twice() -> None:
-    """The difference of two fits is one fit on all rows with each column once more for one cohort.
-
-    Its cluster-robust F test by statsmodels, with another small-sample factor.
-    """
+    """Which cars they are is told to the test, whose figures are compared with those of rows."""
     inputs = INPUTS[:1]
     parts = [driven(seed, (0.3,), drives=40, name=name) for seed, name in ((12, "a"), (13, "b"))]
     parts = [[replace(one, signals=(*inputs, LABEL)) for one in part] for part in parts]
@@ -176,18 +174,14 @@ def test_cars_in_both_cohorts_are_not_counted_twice() -> None:
     comparison = diagnose(here, inputs, against=there).comparison
     assert comparison is not None
     assert comparison.drives is not None
-    rows = [np.concatenate([one.counts for one in part]).astype(float) for part in parts]
-    cars = np.concatenate([np.repeat(np.arange(40) % 4, 80)] * 2)
-    alone = np.concatenate([np.zeros(len(rows[0])), np.ones(len(rows[1]))])
-    x, y = np.concatenate(rows).T
-    design = np.column_stack([np.ones(len(x)), x, alone, alone * x])
-    kind = {"groups": cars, "use_correction": False}
-    fitted = sm.OLS(y, design).fit(cov_type="cluster", cov_kwds=kind, use_t=True)
-    size = len(rows[0])
-    factor = 4 / 3 * (size - 1) / (size - 2)
-    expected = float(fitted.f_test(np.eye(4)[2:]).statistic) / factor
-    assert comparison.drives.f == pytest.approx(expected, rel=1e-6)
-    assert comparison.drives.denominator == 4 - 2
+    cars = [i % 4 for i in range(40)]
+    counts = [[one.counts for one in part] for part in parts]
+    expected, apart = (
+        compared(counts[0], counts[1], (cars, others)) for others in (cars, [n + 4 for n in cars])
+    )
+    assert comparison.drives.f == pytest.approx(expected.f, rel=1e-9)
+    assert comparison.drives.denominator == pytest.approx(expected.denominator, rel=1e-9)
+    assert expected.denominator < 4 < apart.denominator
 
 
 def test_too_few_cars_leave_the_rows_to_tell() -> None:

@@ -134,9 +134,9 @@ def _print_comparison(result: Diagnosis, found: CohortComparison) -> None:
     )
     for test, kind in (found.drives, f"Wald, by {result.cluster}s"), (found.rows, "Chow, by rows"):
         if test is not None:
+            degrees = f"{test.numerator}, {_degrees(test.denominator)}"
             print_line(
-                f"the same coefficients? {kind}: F({test.numerator}, {test.denominator}) = "
-                f"{test.f:,.2f}, p = {test.p:.2g}."
+                f"the same coefficients? {kind}: F({degrees}) = {test.f:,.2f}, p = {test.p:.2g}."
             )
     if found.drives is None:
         say(
@@ -149,6 +149,10 @@ def _print_comparison(result: Diagnosis, found: CohortComparison) -> None:
             f"by {result.cluster}s, the difference is no more than chance: the rows only look like "
             "evidence."
         )
+
+
+def _degrees(many: float) -> str:
+    return f"{many:.0f}" if many == round(many) else f"{many:.1f}"
 
 
 def _standardised(here: Estimate, there: Estimate) -> float:

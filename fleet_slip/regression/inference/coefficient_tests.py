@@ -1,18 +1,18 @@
 """Do two sets of drives have the same coefficients? Chow's test by rows, Wald's by clusters."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
 
-from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
 from fleet_slip.regression.exact import special
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import Fit, fit
 from fleet_slip.regression.inference.drive_moments import DriveMoments
-from fleet_slip.regression.inference.standard_errors import cluster_influences
+from fleet_slip.regression.inference.few_clusters import hotelling
+from fleet_slip.regression.inference.standard_errors import clustered_fit
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class FTest:
 
     f: float
     numerator: int
-    denominator: int
+    denominator: float
     p: float
 
 
@@ -48,46 +48,25 @@ def chow_test(
 def wald_test(one: Fit, one_drives: DriveMoments, other: Fit, other_drives: DriveMoments) -> FTest:
     """Compare the coefficients of the same model fitted to two sets of drives.
 
-    F = d'V^-1 d / (k + 1), d the difference and V its cluster-robust covariance, the sum of both
-    models' where no car is in both sets; its denominator is the number of clusters minus two
-    (Cameron and Miller 2015). Unlike `chow_test`, it does not take neighbouring rows for
-    independent. Clusters of the same number are the same car. Raises `DataError` with fewer
-    clusters than coefficients.
+    Wald's statistic d'V^-1 d of their difference d, V being its covariance by clusters with the
+    correction for few of them, judged as Hotelling's T^2 with the degrees of freedom that their
+    leverages leave (`few_clusters`). Unlike `chow_test`, it does not take neighbouring rows for
+    independent. Clusters of the same number are the same car; drives are in one set only. Raises
+    `DataError` where clusters are too few.
     """
     unit, first = one_drives.unit, int(not one.has_intercept)
     size = one.size + 1 - first
-    here, there = (
-        cluster_influences(fitted, drives)[first:]
-        for fitted, drives in ((one, one_drives), (other, other_drives))
-    )
-    if min(here.shape[1], there.shape[1]) <= size:
+    if min(len(one_drives.clusters), len(other_drives.clusters)) <= size:
         raise DataError(
             f"comparing {size} coefficients by {unit}s needs more than {size} {unit}s in each "
             "cohort."
         )
     gap = [a - b for a, b in zip(_numbers(one)[first:], _numbers(other)[first:], strict=True)]
-    moved = _side_by_side((here, one_drives), (there, other_drives))
-    covariance, drives = moved @ moved.T, moved.shape[1]
-    spread = np.sqrt(np.diag(covariance))
-    d = np.array([float(x) for x in gap]) / spread
-    f = float(d @ np.linalg.solve(covariance / np.outer(spread, spread), d)) / size
-    return FTest(f, size, drives - 2, special.f_upper(f, size, drives - 2))
-
-
-def _side_by_side(
-    one: tuple[FloatArray, DriveMoments], other: tuple[FloatArray, DriveMoments]
-) -> FloatArray:
-    """Return how each cluster moves the difference of two models; a car may be in both."""
-    (here, one_drives), (there, other_drives) = one, other
-    clusters = [drives.cluster for drives in (one_drives, other_drives)]
-    numbers = [np.unique(cluster) for cluster in clusters if cluster is not None]
-    if len(numbers) < len(clusters):  # drives, of which none is in both
-        return np.concatenate([here, -there], axis=1)
-    every = np.union1d(*numbers)
-    moved = np.zeros((len(here), len(every)))
-    moved[:, np.searchsorted(every, numbers[0])] += here
-    moved[:, np.searchsorted(every, numbers[1])] -= there
-    return moved
+    fits = clustered_fit(one, one_drives), clustered_fit(other, other_drives)
+    if unit == "drive":  # none is in both
+        fits = fits[0], replace(fits[1], cluster=fits[1].cluster + 1 + fits[0].cluster.max())
+    f, degrees = hotelling(np.array([float(x) for x in gap]), fits)
+    return FTest(f, size, degrees, special.f_upper(f, size, degrees))
 
 
 def _numbers(fitted: Fit) -> list[Fraction]:

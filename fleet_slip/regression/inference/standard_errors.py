@@ -19,6 +19,7 @@ from fleet_slip.regression.exact.elimination import inverse_matrix
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import Fit, Scales, dependence, moments
 from fleet_slip.regression.inference.drive_moments import DriveMoments
+from fleet_slip.regression.inference.few_clusters import ClusteredFit
 
 INTERCEPT = "intercept"
 
@@ -133,12 +134,34 @@ def cluster_influences(fitted: Fit, drives: DriveMoments) -> FloatArray:
     total = drives.matrix(drives.packed.sum(axis=0))[np.ix_(at, at)]
     factor = small_sample_factor(fitted, len(scores), drives.unit)
     half = math.sqrt(factor) * np.linalg.solve(total, scores.T)
-    # From (1, (c - centre)/spread) in spreads of the label back to (1, c) in its counts.
+    return np.asarray(_to_counts(drives, at) @ half, dtype=np.float64)
+
+
+def _to_counts(drives: DriveMoments, at: Sequence[int]) -> FloatArray:
+    """Return what takes coefficients from (1, (c - centre)/spread), in spreads, to counts."""
     spread = drives.spread[[i - 1 for i in at[1:]]]
     centre = np.array([drives.centre[i - 1] for i in at[1:]], dtype=np.float64)
     back = np.diag([1.0, *(1 / spread)])
     back[0, 1:] = -centre / spread
-    return np.asarray(drives.spread[-1] * back @ half, dtype=np.float64)
+    return np.asarray(drives.spread[-1] * back, dtype=np.float64)
+
+
+def clustered_fit(fitted: Fit, drives: DriveMoments) -> ClusteredFit:
+    """Return a fit by its clusters; the coefficients that are compared are those in counts.
+
+    Raises `DataError` for too few rows to tell the noise.
+    """
+    at, first = _columns(fitted, drives), int(not fitted.has_intercept)
+    each = drives.clusters
+    numbers = np.arange(len(each)) if each.cluster is None else each.cluster
+    chosen = at[first:]
+    return ClusteredFit(
+        moments=drives.matrix(each.packed)[:, chosen][:, :, chosen],
+        scores=cluster_scores(fitted, drives)[:, first:],
+        cluster=numbers,
+        to_common=_to_counts(drives, at)[first:, first:],
+        noise=math.sqrt(noise_variance(fitted)) / float(drives.spread[-1]),
+    )
 
 
 def cluster_scores(fitted: Fit, drives: DriveMoments) -> FloatArray:
