@@ -8,8 +8,12 @@ import pytest
 
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError, RefusedError
+from fleet_slip.export.c.on_board import sets_on_board
 from fleet_slip.models.manifest import Manifest
+from tests.export.compiled import needs_cc
+from tests.export.course import START_S, build
 
 CAMPAIGN = """
 name = "received"
@@ -91,6 +95,35 @@ def test_a_model_without_a_label_is_one_of_the_angle(fleet: Fleet) -> None:
     # The label's noise, 0.0286 deg, is in it.
     assert score.error_std_deg < 0.06 and abs(score.error_mean_deg) < 0.06
     assert manifest.intercept != 0 and manifest.cross_validation.error_mean_deg == 0
+
+
+@needs_cc
+def test_cars_without_a_log_or_a_label_teach_the_very_same_model(
+    fleet: Fleet, tmp_path: Path
+) -> None:
+    """What they count on board, and nothing else; a drive is told in some kilobytes."""
+    taught = without_label(fleet)
+    counter = build(tmp_path, sets_on_board(taught), "-O2")
+    logged = fleet.sql(
+        "SELECT drive_id, any_value(course_late) FROM grams "
+        "WHERE course_late IS NOT NULL GROUP BY drive_id ORDER BY drive_id"
+    ).fetchall()
+    columns = ", ".join(name for name in counter.signals if name != catalogue().label)
+    sent = []
+    for number, (drive, late) in enumerate(logged):
+        rows = fleet.sql(
+            f"SELECT tick, vehicle_id, {columns}, NULL::SMALLINT AS {catalogue().label} "
+            f"FROM log_counts WHERE drive_id = '{drive}' ORDER BY tick"
+        )
+        sent.append(counter.messages(rows.to_arrow_table(), late, START_S + 86_400 * number))
+    (tmp_path / "messages").write_bytes(b"".join(sent))
+    edge = fleet_slip.open(tmp_path / "edge")
+    assert not edge.receive(tmp_path / "messages")[0].refused
+    found = without_label(edge)
+    assert found.trained_on.drives_without_log == found.trained_on.drives == len(logged)
+    assert (found.intercept, found.terms) == (taught.intercept, taught.terms)
+    assert found.learned_from == taught.learned_from
+    assert max(map(len, sent)) < 12_000
 
 
 def test_a_course_of_another_place_is_refused(

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.grams.received.counted_sets import counted_sets
 from fleet_slip.grams.received.messages import signals_definition
 from fleet_slip.regression.exact.gram import Gram
 
@@ -30,6 +31,28 @@ def message_of(gram: Gram, vehicle: str = "VIN1", start_s: int = START_S, **othe
     head += struct.pack("<HHQ", known["place"], known["parts"], start_s)
     head += struct.pack("<III", known["mask"], known["rows"], known["lost"])
     body = head + numbers
+    return body + zlib.crc32(body).to_bytes(4, "little")
+
+
+def set_message_of(
+    gram: Gram,
+    feature_set: str = "course",
+    vehicle: str = "VIN1",
+    start_s: int = START_S,
+    **other: int,
+) -> bytes:
+    """The message of a Gram row of a feature set; `other` fields are as they should not be."""
+    (one,) = (one for one in counted_sets().values() if one.name == feature_set)
+    numbers = np.array([*gram.sums, *gram.products], "<i8").tobytes()
+    mask = sum(1 << one.columns.index(name) for name in gram.signals)
+    known = {"size": 124 + len(numbers), "definition": one.definition, "mask": mask}
+    known |= {"part": 0, "late": 0, "rows": gram.n, "lost": 0} | other
+    head = struct.pack(
+        "<4sHHQ16s", b"FSGR", 3, known["size"], known["definition"], vehicle.encode()
+    )
+    head += struct.pack("<HHQ", 0, 1, start_s)
+    head += struct.pack("<HhII", *(known[k] for k in ("part", "late", "rows", "lost")))
+    body = head + known["mask"].to_bytes(64, "little") + numbers
     return body + zlib.crc32(body).to_bytes(4, "little")
 
 

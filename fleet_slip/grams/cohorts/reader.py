@@ -181,7 +181,8 @@ class GramReader:
             revoked = {key.vehicle_id for key in _revoked_keys()}
             cells = self._rollups.cells(grams, logs, identity, condition, folding, revoked)
         opened = self._opened(grams, logs, feature_set, cells)
-        if not (training and feature_set == PLAIN and has_received(grams)):
+        sent = feature_set == PLAIN or one.change_ticks
+        if not (training and sent and has_received(grams)):
             return opened
         outweighing = find_outweighing(opened, condition)
         if outweighing is None:
