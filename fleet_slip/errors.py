@@ -87,6 +87,10 @@ class DataError(FleetSlipError):
     exit_code = 5
 
 
+class NotComputedError(DataError):
+    """A cohort has drives, and none has the Gram rows of a feature set, or not all have them."""
+
+
 class QuestionError(FleetSlipError):
     """The question has no answer: bad SQL, an unknown model, signal, feature set or ranking."""
 

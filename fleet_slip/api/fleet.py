@@ -15,6 +15,7 @@ from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.models.manifest import require_model_name
 from fleet_slip.runs.log import step
+from fleet_slip.selection.request import DEFAULT_MODELS
 
 if TYPE_CHECKING:
     import duckdb
@@ -23,9 +24,6 @@ if TYPE_CHECKING:
     from fleet_slip.api.session import Session
     from fleet_slip.monitoring.night_report import NightReport
     from fleet_slip.simulation.campaign import Campaign
-
-RUN_MODELS = "estimator"
-"""The model list that a run chooses from."""
 
 
 class Fleet(LogsAndGrams, HealthAndUpkeep):
@@ -90,7 +88,7 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
         days: int | None = None,
         through: date | None = None,
         name: str | None = None,
-        models: str = RUN_MODELS,
+        models: str = DEFAULT_MODELS,
         worth: str | None = None,
         sign_key: Path | None = None,
         workers: Workers = None,
@@ -171,7 +169,7 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
         name: str,
         *,
         cohort: str = TRAINING_DRIVES,
-        models: str = RUN_MODELS,
+        models: str = DEFAULT_MODELS,
         worth: str | None = None,
         candidate: bool = False,
         retention: str | None = None,

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from fleet_slip.export.files import Target
     from fleet_slip.files.documents import Document
     from fleet_slip.models.diff import Difference
-    from fleet_slip.models.publish import Publication
+    from fleet_slip.models.publish import DryRun, Publication
     from fleet_slip.models.score import Score
     from fleet_slip.selection.select_models import RequestedSelection
 
@@ -63,7 +63,7 @@ class PublishedModels(Rooted):
     def publish(
         self,
         name: str,
-        choice: "RequestedSelection | FleetCohort",
+        choice: "RequestedSelection | FleetCohort | None" = None,
         *,
         force: bool = False,
         candidate: bool = False,
@@ -71,8 +71,9 @@ class PublishedModels(Rooted):
     ) -> "Publication":
         """Make a selection's winner the next version of a model, and its champion.
 
-        `choice` is what `FleetCohort.select` returned, or a cohort, on which the models of Table I
-        are then compared. A winner that is worse than the champion on the same cohort and folds is
+        `choice` is what `FleetCohort.select` returned, or a cohort, on which the model is trained
+        again as it was before, a new one from the usual list; None for the cohort of before, too. A
+        winner that is worse than the champion on the same cohort and folds is
         published only with `force`. A `candidate` waits for somebody to `promote` it, and so does
         whatever is published while the champion is held by `rollback` or `pin`. `sign_key` is the
         private key that signs the version.
@@ -86,13 +87,37 @@ class PublishedModels(Rooted):
         from fleet_slip.models.sound_course import require_sound_course
 
         require_model_name(name)
-        selection = choice.select() if isinstance(choice, FleetCohort) else choice
+        selection = self._chosen(name, choice)
         manifest = with_straight_intercept(self.warehouse, manifest_of(selection, name), selection)
         if manifest.learned_from and not force:
             delays_s = require_in_time(self.warehouse, manifest)
             require_sound_course(self.warehouse, manifest, delays_s)
         registry = self.registry(sign_key)
         return publish(registry, manifest, selection, force=force, candidate=candidate)
+
+    def would_publish(
+        self, name: str, choice: "RequestedSelection | FleetCohort | None" = None
+    ) -> "DryRun":
+        """Tell what `publish` of the same would come to, without force; nothing is written."""
+        from fleet_slip.models.publish import judge_only, manifest_of, with_straight_intercept
+
+        require_model_name(name)
+        selection = self._chosen(name, choice)
+        manifest = with_straight_intercept(self.warehouse, manifest_of(selection, name), selection)
+        return judge_only(self.registry(), manifest, selection)
+
+    def _chosen(
+        self, name: str, choice: "RequestedSelection | FleetCohort | None"
+    ) -> "RequestedSelection":
+        from fleet_slip.models.recipe import recipe_for
+        from fleet_slip.selection.answer_request import answer_request
+        from fleet_slip.selection.request import SelectionRequest
+
+        if choice is not None and not isinstance(choice, FleetCohort):
+            return choice
+        condition = choice.condition if choice else None
+        recipe = recipe_for(self.registry(), name, SelectionRequest(), condition)
+        return answer_request(self.warehouse, recipe.request, recipe.cohort)
 
     @record_call
     def promote(self, reference: str, alias: str = CHAMPION) -> ModelVersion:

@@ -16,14 +16,14 @@ from fleet_slip.regression.choice.signal_orders import RANKINGS
 from fleet_slip.regression.choice.stepwise import METHODS
 from fleet_slip.regression.inference.drive_moments import ClusterUnit
 from fleet_slip.selection.model_list import DEFAULT_MOST
-from fleet_slip.selection.request import DEFAULT_MODELS, SelectionRequest
+from fleet_slip.selection.request import DEFAULT_MODELS, LOGGED_MODELS, SelectionRequest
 
 R = TypeVar("R")
 
 SELECTION: dict[str, Any] = {
     "models": typer.Option(
-        help=f"A model list of configs/models, or a TOML file. Default: {DEFAULT_MODELS}, unless "
-        "--nested or an option that searches is given.",
+        help=f"A model list of configs/models, or a TOML file. Default: {DEFAULT_MODELS}, or "
+        f"{LOGGED_MODELS} with --features, unless --nested or an option that searches is given.",
         autocompletion=complete_config("models"),
         show_default=False,
     ),

@@ -209,13 +209,21 @@ class LearnedFrom(Config):
     intercept_spread_deg: FiniteFloat
 
 
+Asked = bool | int | Annotated[str, Field(max_length=100_000)]
+
+
 class SelectedBy(Config):
-    """Why this model: the list it came from, its name there, and the rule that chose it."""
+    """Why this model: the list it came from, its name there, and the rule that chose it.
+
+    `asked` are the options of the selection by name where there were others than a list
+    (`fleet_slip.models.recipe`).
+    """
 
     model_list: str
     model: str
     reason: str
     config_sha256: str
+    asked: Annotated[dict[Identifier, Asked] | None, _LEFT_OUT] = None
 
 
 class ImportedFrom(Config):

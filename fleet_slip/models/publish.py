@@ -23,6 +23,7 @@ from fleet_slip.models.manifest import (
     TrainedOn,
 )
 from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.models.recipe import asked_of
 from fleet_slip.models.straight_on import StraightOn, straight_on
 from fleet_slip.models.trained_drives import checksum_of_drives, pack_drives
 from fleet_slip.models.versions import Registry
@@ -92,6 +93,7 @@ def manifest_of(selection: RequestedSelection, name: str) -> Manifest:
             model=winner.name,
             reason=selection.winner.reason,
             config_sha256=selection.config_sha256,
+            asked=asked_of(selection),
         ),
         package_version=package_version("fleet-slip"),
     )
@@ -189,6 +191,24 @@ def publish(
         return Publication(version, True, judgement.reason) if published else None
 
     return history.decide(decision)
+
+
+@dataclass(frozen=True)
+class DryRun:
+    """What publishing would come to."""
+
+    model: str
+    publishes: bool
+    reason: str
+
+
+def judge_only(registry: Registry, manifest: Manifest, selection: Selection[Any]) -> DryRun:
+    """Tell what publishing a winner would come to; nothing is written."""
+    champion = registry.champion(manifest.name)
+    if champion and champion.manifest.same_estimator(manifest):
+        return DryRun(manifest.name, False, "The champion is this very model.")
+    judgement = _judge(registry, champion, manifest, selection)
+    return DryRun(manifest.name, not judgement.problems, judgement.reason)
 
 
 def _wait(

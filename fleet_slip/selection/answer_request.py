@@ -8,9 +8,9 @@ from fleet_slip.canonical import canonical_json, sha256_of
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.errors import QuestionError, UsageError
+from fleet_slip.errors import NotComputedError, QuestionError, UsageError
 from fleet_slip.grams.cohorts.fold_sums import SummedCohort, sum_cohort
-from fleet_slip.grams.cohorts.folding import EACH, ROW_FOLDS, Folding, make_folding
+from fleet_slip.grams.cohorts.folding import EACH, PARTS, ROW_FOLDS, Folding, make_folding
 from fleet_slip.grams.cohorts.gram_cohort import Cohort, load_cohort
 from fleet_slip.grams.cohorts.taught_cohort import TaughtCohort, load_taught
 from fleet_slip.grams.cohorts.training_folds import clustered_moments
@@ -34,6 +34,7 @@ from fleet_slip.selection.request import (
     BOTH,
     COURSE,
     DEFAULT_MODELS,
+    LOGGED_MODELS,
     SelectionRequest,
     parse_worth,
 )
@@ -59,18 +60,32 @@ def answer_request(
 
     Raises `UsageError` for options that do not go together.
     """
-    answer = _answer(warehouse, request, condition)
+    usual = not (request.models or request.model or request.label or request.chosen_by_inputs)
+    find = _answer_usual if usual else _answer
+    answer = replace(find(warehouse, request, condition), request=request, asked=condition)
     if isinstance(answer.cohort, TaughtCohort):  # its figures are of the angle
         return answer
     told = without_label(warehouse, answer.cohort, answer.winner.model.pooled.rmse_deg)
     return replace(answer, without_label=told)
 
 
+def _answer_usual(
+    warehouse: Warehouse, request: SelectionRequest, condition: str
+) -> RequestedSelection:
+    """Select from the usual list, or from that of logged signals where it cannot be had."""
+    logged = replace(request, models=LOGGED_MODELS)
+    if request.features or request.by in (ROW_FOLDS, PARTS):
+        return _answer(warehouse, logged, condition)
+    try:
+        return _answer(warehouse, replace(request, models=DEFAULT_MODELS), condition)
+    except NotComputedError as error:
+        remark = f"compared {LOGGED_MODELS}, not the usual list {DEFAULT_MODELS}: {error}"
+        return replace(_answer(warehouse, logged, condition), remark=remark)
+
+
 def _answer(warehouse: Warehouse, request: SelectionRequest, condition: str) -> RequestedSelection:
     request.check()
-    named = request.nested or request.ordered or request.search
-    usual = COURSE if request.label else DEFAULT_MODELS
-    name = request.models or (None if named else usual)
+    name = request.models or (COURSE if request.label and not request.chosen_by_inputs else None)
     model_list = _given(request) or (load_model_list(name) if name else None)
     if model_list and model_list.label and not request.label:
         request = replace(request, label=model_list.label)
@@ -225,7 +240,7 @@ def _compare_listed(
         model=(*listed, *nested),
         search=search,
     )
-    usual = GIVEN if request.model else request.label or DEFAULT_MODELS
+    usual = GIVEN if request.model else request.label
     name = request.models or (usual if listed else None)
     label = "+".join(filter(None, [name, f"nested:{request.nested}" if nested else None]))
     selection = select(

@@ -10,7 +10,12 @@ from fleet_slip.grams.cohorts.folding import FoldKey
 from fleet_slip.regression.choice.winner import DEFAULT_WORTH, Worth
 from fleet_slip.regression.inference.drive_moments import ClusterUnit
 
-DEFAULT_MODELS = "table1"
+DEFAULT_MODELS = "estimator"
+"""The model list that is compared unless another is named, by `run` and every night too."""
+
+LOGGED_MODELS = "table1"
+"""That of logged signals alone, which every data root has: where another feature set is named, or
+the columns of the default list have not been computed."""
 
 Label = Literal["course", "course+sideslip"]
 """What may stand for the label of a reference sensor, or beside it where few cars have one."""
@@ -28,8 +33,9 @@ class SelectionRequest:
     """How models are compared and one is chosen; without options, those of Table I.
 
     Attributes:
-        models: a model list of `configs/models`, or the path of a TOML file; by default `table1`,
-            unless inputs are named or searched.
+        models: a model list of `configs/models`, or the path of a TOML file; by default `estimator`
+            unless inputs are named or searched, and `table1` where a feature set is named or the
+            Gram rows of `estimator` are not there, which `remark` of the answer says.
         model: the inputs of the one model to take, separated by commas, instead of a list.
         nested: an order of inputs, separated by commas, or `catalogue` for all inputs; adds the
             nested models of its first 1, 2 ... inputs.
@@ -81,6 +87,11 @@ class SelectionRequest:
     def ordered(self) -> bool:
         """Whether inputs are ranked or searched, rather than given models compared."""
         return bool(self.rank or self.criterion or self.all_subsets or self.naive)
+
+    @property
+    def chosen_by_inputs(self) -> bool:
+        """Whether models are made of an order or a search of inputs, and not of a list alone."""
+        return bool(self.nested or self.ordered or self.search)
 
     @property
     def resampled(self) -> bool:

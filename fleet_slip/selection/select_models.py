@@ -8,6 +8,7 @@ from typing_extensions import TypeVar
 
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.cohorts.fold_sums import SummedCohort
 from fleet_slip.grams.cohorts.folding import ROW_FOLDS, Folding
@@ -19,6 +20,7 @@ from fleet_slip.regression.inference.influential import Influential
 from fleet_slip.regression.validation.crossval import CrossValidation, cross_validate_inputs
 from fleet_slip.regression.validation.folds import CohortFolds
 from fleet_slip.selection.model_list import CandidateModel, Search
+from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.selection.search import (
     SearchChoice,
     SearchedModels,
@@ -174,12 +176,17 @@ class RequestedSelection(Selection[Any]):
         config_sha256: checksum of all that says what to compare.
         left_out: the cars that `robust` left out, and what influence they had.
         without_label: what changes of the course tell of the winner, if they taught it alone.
+        request, asked: what was asked for, and of which drives.
+        remark: why another list than the usual one was compared.
     """
 
     model_list: str
     config_sha256: str
     left_out: Mapping[str, Influential] = field(default_factory=dict)
     without_label: WithoutLabel | None = None
+    request: SelectionRequest = field(default_factory=SelectionRequest)
+    asked: str = TRAINING_DRIVES
+    remark: str = ""
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `select --json` prints."""
@@ -187,7 +194,8 @@ class RequestedSelection(Selection[Any]):
         named = {car: one.times for car, one in told}
         document = {**super().as_dict(), "vehicles_left_out": named}
         course = {"without_label": self.without_label.as_dict()} if self.without_label else {}
-        return {**document, **course}
+        remark = {"remark": self.remark} if self.remark else {}
+        return {**document, **course, **remark}
 
     @classmethod
     def of(

@@ -4,18 +4,19 @@ from typing import Annotated
 
 import typer
 
-from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli.begin.select_command import print_selection
 from fleet_slip.cli.completing import complete_model
 from fleet_slip.cli.models.signing_commands import SignKey, signing_key
-from fleet_slip.cli.options import RESAMPLING, Cohort, selection_options
+from fleet_slip.cli.options import RESAMPLING, selection_options
 from fleet_slip.cli.output import Json, print_json, say
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.models.manifest import require_model_name
-from fleet_slip.models.publish import Publication
+from fleet_slip.models.publish import DryRun, Publication
+from fleet_slip.models.recipe import recipe_for
 from fleet_slip.runs.log import step
 from fleet_slip.selection.answer_request import answer_request
 from fleet_slip.selection.request import SelectionRequest
+from fleet_slip.selection.select_models import RequestedSelection
 
 
 @record_run
@@ -27,7 +28,13 @@ def publish(
         typer.Argument(help="Name of the model, such as sideslip.", autocompletion=complete_model),
     ],
     request: SelectionRequest,
-    cohort: Cohort = TRAINING_DRIVES,
+    cohort: Annotated[
+        str | None,
+        typer.Option(
+            help="SQL condition on the view drives. Default: that of the model's champion; all "
+            "drives, of a new model."
+        ),
+    ] = None,
     force: Annotated[
         bool, typer.Option("--force", help="Publish even what is worse than the champion.")
     ] = False,
@@ -37,6 +44,9 @@ def publish(
             "--candidate", help="Publish as a candidate, which becomes champion by promote."
         ),
     ] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say what would be published, and publish nothing.")
+    ] = False,
     sign_key: SignKey = None,
     mlflow: Annotated[
         str | None, typer.Option(help="Also register the version in the MLflow server of this URI.")
@@ -45,13 +55,22 @@ def publish(
 ) -> None:
     """Select on a cohort and make the winner the next version of a model, and its champion.
 
-    The options are those of select.
+    The options are those of select. A model that is there is trained again as its champion was, but
+    for what is asked for.
+
+    Try it first: **fleet-slip publish waterford --dry-run**
 
     Example: **fleet-slip publish wet --cohort "adhesion < 0.8"**
     """
     require_model_name(name)
+    recipe = recipe_for(context.obj.registry(), name, request, cohort)
+    if recipe.told:
+        say(f"{name}: {recipe.told}")
     with step("select"):
-        selection = answer_request(context.obj.warehouse, request, cohort)
+        selection = answer_request(context.obj.warehouse, recipe.request, recipe.cohort)
+    if dry_run:
+        _print_dry_run(context.obj.would_publish(name, selection), selection, json)
+        return
     publication = context.obj.publish(
         name, selection, force=force, candidate=candidate, sign_key=signing_key(sign_key)
     )
@@ -63,6 +82,15 @@ def publish(
         print_publication(publication)
         if number:
             say(f"in MLflow: {publication.version.manifest.name}, version {number}")
+
+
+def _print_dry_run(told: DryRun, selection: RequestedSelection, json: bool) -> None:
+    if json:
+        print_json(told)
+        return
+    print_selection(selection)
+    would = "would be published" if told.publishes else "would not be published"
+    say(f"{told.model} {would}. {told.reason}")
 
 
 def print_publication(publication: Publication) -> None:

@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from fleet_slip.api.calls import open_workers
-from fleet_slip.api.fleet import RUN_MODELS, Fleet
+from fleet_slip.api.fleet import Fleet
 from fleet_slip.api.run_report import RunReport
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.cli.begin.publish_command import print_publication
@@ -19,6 +19,7 @@ from fleet_slip.cli.output import Json, print_json, say
 from fleet_slip.cli.progress_bar import progress_of_steps
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.workers import Cluster, Threads
+from fleet_slip.selection.request import DEFAULT_MODELS
 from fleet_slip.words import number_of
 
 DEFAULT_CAMPAIGN = "waterford"
@@ -39,7 +40,7 @@ def run(
     name: Annotated[
         str | None, typer.Option(help="Name of the model. Default: the campaign's.")
     ] = None,
-    models: Models = RUN_MODELS,
+    models: Models = DEFAULT_MODELS,
     worth: Worth = None,
     threads: Threads = None,
     cluster: Cluster = None,

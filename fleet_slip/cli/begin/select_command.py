@@ -100,6 +100,8 @@ def print_selection(selection: Selection[Any]) -> None:
         left=1 + listed,
     )
     _say_left_out(selection)
+    if isinstance(selection, RequestedSelection) and selection.remark:
+        say(selection.remark)
     if isinstance(selection, RequestedSelection) and selection.without_label is not None:
         _say_without_label(selection.without_label)
     if isinstance(selection.cohort, TaughtCohort):

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from fleet_slip.api.calls import open_workers
-from fleet_slip.api.fleet import RUN_MODELS, Fleet
+from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli.completing import complete_config, complete_model
 from fleet_slip.cli.dates import date_of
@@ -17,6 +17,7 @@ from fleet_slip.cli.progress_bar import progress_of_steps
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.workers import Cluster, Threads
 from fleet_slip.extras import needed
+from fleet_slip.selection.request import DEFAULT_MODELS
 
 
 @record_run
@@ -36,7 +37,7 @@ def nightly(
     cohort: Annotated[
         str, typer.Option(help="SQL condition on the view drives: which drives train it.")
     ] = TRAINING_DRIVES,
-    models: Models = RUN_MODELS,
+    models: Models = DEFAULT_MODELS,
     worth: Worth = None,
     candidate: Annotated[
         bool, typer.Option("--candidate", help="Publish as a candidate, even what is not worse.")

@@ -13,7 +13,7 @@ from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import SCENARIO, TRAINING_DRIVES
-from fleet_slip.errors import DataError, RefusedError
+from fleet_slip.errors import DataError, NotComputedError, RefusedError
 from fleet_slip.grams.cohorts.cohort_origin import CohortOrigin
 from fleet_slip.grams.cohorts.expansion import expansion_of
 from fleet_slip.grams.cohorts.folding import (
@@ -212,7 +212,7 @@ def empty_cohort_error(opened: OpenedGrams, condition: Condition) -> DataError:
             f"{number_of(len(revoked), 'car')} a key of which was revoked. Choose another cohort."
         )
     if left_out := opened.count_left_out(condition):
-        return DataError(
+        return NotComputedError(
             f"all {number_of(left_out, 'drive')} of the cohort {condition.text!r} are of cars that "
             "sent Gram rows of the logged signals and no log. Select with features = signals."
         )

@@ -16,7 +16,7 @@ from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import ALL_DRIVES, LONGEST_PAUSE_S, TRAINING_DRIVES
 from fleet_slip.delta import Snapshot
-from fleet_slip.errors import DataError
+from fleet_slip.errors import DataError, NotComputedError
 from fleet_slip.grams.cohorts.cells import NO_CELLS, Cells, RollupReader
 from fleet_slip.grams.cohorts.cohort_origin import CohortOrigin
 from fleet_slip.grams.cohorts.folding import Folding
@@ -250,7 +250,7 @@ def _require_complete(
     if missing or backlog.stale & files:
         everything = condition.text in {ALL_DRIVES, TRAINING_DRIVES}
         cohort = "" if everything else f" --cohort {shlex.quote(condition.text)}"
-        raise DataError(
+        raise NotComputedError(
             f"the feature set {feature_set}, as it is defined now, has not been computed for "
             f"{len(missing)} of {len(files)} log files of the cohort. Run: fleet-slip gram "
             f"--features {feature_set}{cohort}"

@@ -1,0 +1,102 @@
+"""How a model is trained again: as its champion was, unless something else is asked for."""
+
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
+
+from fleet_slip.catalogue.features import features
+from fleet_slip.catalogue.sources import TRAINING_DRIVES
+from fleet_slip.errors import ConfigError, QuestionError
+from fleet_slip.models.manifest import Manifest
+from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.models.versions import Registry
+from fleet_slip.selection.answer_request import GIVEN
+from fleet_slip.selection.model_list import load_model_list
+from fleet_slip.selection.request import SelectionRequest
+from fleet_slip.selection.select_models import RequestedSelection
+
+COHORT = "cohort"
+"""Key of the condition that was asked, where cars were left out of it."""
+
+_WHAT = {"models", "model", "nested", "features", "label", "rank", "criterion", "all_subsets"}
+_WHAT |= {"search", "most"}
+"""What says which models are compared: who asks for one of these asks for all anew."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What is asked for, of which drives, and in words whose it is and what is new in it."""
+
+    request: SelectionRequest
+    cohort: str
+    told: str = ""
+
+
+def asked_of(selection: RequestedSelection) -> dict[str, Any] | None:
+    """Return what a manifest keeps of what was asked for; None if its list says it all."""
+    asked = _asked(selection.request)
+    if asked.keys() <= {"models"}:
+        return None
+    whole = selection.asked == selection.cohort.condition.text
+    return asked if whole else {**asked, COHORT: selection.asked}
+
+
+def recipe_for(
+    registry: Registry, name: str, request: SelectionRequest, cohort: str | None = None
+) -> Recipe:
+    """Return how to train a model again: as its champion, or newest version, but for what is asked.
+
+    Raises `QuestionError` if nothing tells how the version was chosen, and none is asked for.
+    """
+    before = _newest(registry, name)
+    asked = _asked(request)
+    if before is None:
+        return Recipe(request, cohort or TRAINING_DRIVES)
+    was, chosen_from = before.manifest.trained_on.cohort, before.manifest.selected_by.model_list
+    if asked.keys() & _WHAT:
+        wanted = request
+        told = f"not as {before.reference}, chosen from {chosen_from}"
+    else:
+        kept, was = _kept(before)
+        wanted = replace(kept, **asked)
+        told = f"trained as {before.reference}, chosen from {chosen_from}"
+    if cohort is None or cohort == was:
+        return Recipe(wanted, was, f"{told}, on drives where {was}")
+    return Recipe(wanted, cohort, f"{told}, but not on drives where {was}: this is where {cohort}")
+
+
+def _asked(request: SelectionRequest) -> dict[str, Any]:
+    usual = asdict(SelectionRequest())
+    return {name: value for name, value in asdict(request).items() if value != usual[name]}
+
+
+def _newest(registry: Registry, name: str) -> ModelVersion | None:
+    if name not in registry.names():
+        return None
+    numbers = registry.versions(name)
+    return registry.champion(name) or (registry.load(name, numbers[-1]) if numbers else None)
+
+
+def _kept(version: ModelVersion) -> tuple[SelectionRequest, str]:
+    """Return what a version was asked for, and of which drives. Raises `QuestionError`."""
+    manifest = version.manifest
+    chosen = manifest.selected_by
+    if chosen.asked is None:
+        return _of_list(manifest, version.reference), manifest.trained_on.cohort
+    known = {field.name for field in fields(SelectionRequest)}
+    asked: dict[str, Any] = {name: one for name, one in chosen.asked.items() if name in known}
+    return SelectionRequest(**asked), str(chosen.asked.get(COHORT, manifest.trained_on.cohort))
+
+
+def _of_list(manifest: Manifest, reference: str) -> SelectionRequest:
+    name = manifest.selected_by.model_list
+    if name == GIVEN:
+        feature_set = features().name_of(manifest.trained_on.feature_set)
+        return SelectionRequest(model=",".join(manifest.signals), features=feature_set)
+    try:
+        load_model_list(name)
+    except ConfigError:
+        raise QuestionError(
+            f"{reference} was chosen from {name!r}, which is no model list here. Say what to "
+            "compare, such as models = estimator."
+        ) from None
+    return SelectionRequest(models=name)

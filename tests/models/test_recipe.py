@@ -1,0 +1,101 @@
+"""A model is trained again as it was, unless something else is asked for."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from fleet_slip.cli.app import app
+from fleet_slip.errors import QuestionError
+from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.grams.rows.gram_job import update_grams
+from fleet_slip.models.manifest import SelectedBy
+from fleet_slip.models.recipe import recipe_for
+from fleet_slip.models.versions import Registry
+from fleet_slip.selection.answer_request import answer_request
+from fleet_slip.selection.request import SelectionRequest
+from fleet_slip.warehouse.tables import Warehouse
+from tests.support.logs import land, log_rows, random_counts
+from tests.support.manifests import manifest
+
+FASTER = "speed_factor > 0.1"
+
+
+def call(root: Path, *words: str) -> Any:
+    result = CliRunner().invoke(app, ["--root", str(root), *words, "--json"])
+    if result.exception is not None:
+        raise result.exception
+    return json.loads(result.stdout)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Path:
+    folder = tmp_path_factory.mktemp("recipes") / "data"
+    shutil.copytree(smoke_root, folder)
+    call(folder, "publish", "plain", "--cohort", FASTER)
+    options = ("--nested", "ax,ay,yaw_rate", "--rank", "forward", "--folds", "4", "--no-intercept")
+    call(folder, "publish", "ranked", "--cohort", FASTER, *options)
+    return folder
+
+
+@pytest.mark.parametrize("name", ["plain", "ranked"])
+def test_publishing_again_without_options_is_the_same_model(root: Path, name: str) -> None:
+    again = call(root, "publish", name)
+    assert (again["version"], again["new"]) == (1, False)
+
+
+def test_what_is_asked_for_is_changed_alone_and_said(root: Path) -> None:
+    registry = Registry(LocalFolder(root / "models"))
+    kept = recipe_for(registry, "ranked", SelectionRequest())
+    assert (kept.request.rank, kept.request.folds, kept.request.intercept) == (
+        "forward",
+        "4",
+        False,
+    )
+    assert kept.cohort == FASTER
+    wider = recipe_for(registry, "ranked", SelectionRequest(folds=3), "true")
+    assert (wider.request.rank, wider.request.folds, wider.cohort) == ("forward", 3, "true")
+    assert FASTER in wider.told
+    assert "ranked@1" in wider.told
+    other = recipe_for(registry, "ranked", SelectionRequest(models="table1"))
+    assert other.request == SelectionRequest(models="table1")
+    assert other.cohort == FASTER
+    new = recipe_for(registry, "new", SelectionRequest())
+    assert (new.request, new.told) == (SelectionRequest(), "")
+
+
+def test_a_version_from_before_that_no_list_chose_needs_to_be_told(tmp_path: Path) -> None:
+    registry = Registry(LocalFolder(tmp_path))
+    chosen = SelectedBy(
+        model_list="nested:catalogue backward cv", model="5", reason="best", config_sha256="0"
+    )
+    registry.add(manifest(name="old").model_copy(update={"selected_by": chosen}))
+    with pytest.raises(QuestionError, match="old@1 was chosen from 'nested"):
+        recipe_for(registry, "old", SelectionRequest())
+
+
+def test_a_dry_run_publishes_nothing(root: Path) -> None:
+    before = call(root, "models")
+    assert call(root, "publish", "unborn", "--dry-run")["publishes"]
+    told = call(root, "publish", "plain", "--cohort", "day > '2024-05-01'", "--dry-run")
+    assert told["model"] == "plain"
+    assert call(root, "models") == before
+
+
+def test_select_and_publish_compare_what_run_does(root: Path) -> None:
+    listed = {call(root, "show", name)["selected_by"]["model_list"] for name in ("plain", "smoke")}
+    assert listed == {"estimator"}
+
+
+def test_without_the_columns_of_the_usual_list_logged_signals_are_compared(tmp_path: Path) -> None:
+    warehouse = Warehouse(LocalFolder(tmp_path))
+    rng = np.random.default_rng(3)
+    land(warehouse, "a.parquet", *(log_rows(f"d{n}", random_counts(rng, 300)) for n in range(6)))
+    update_grams(warehouse)
+    answer = answer_request(warehouse, SelectionRequest(), "true")
+    assert answer.model_list == "table1"
+    assert "fleet-slip gram --features windows" in answer.remark
