@@ -22,8 +22,8 @@ run: setup
 	$(BIN)/fleet-slip --root $(ROOT) run --campaign $(CAMPAIGN)
 
 report: run $(filter gated,$(MODEL))
-	$(BIN)/fleet-slip --root $(ROOT) evaluate --one-car $(MODEL)
-	$(BIN)/fleet-slip --root $(ROOT) report --model $(MODEL)
+	$(BIN)/fleet-slip --root $(ROOT) evaluate $(MODEL)
+	$(BIN)/fleet-slip --root $(ROOT) report $(MODEL)
 
 gated: run
 	$(BIN)/fleet-slip --root $(ROOT) simulate proving_ground

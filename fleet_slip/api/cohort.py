@@ -137,6 +137,7 @@ class FleetCohort(Rooted):
         self,
         signals: str | None = None,
         *,
+        model: "str | ModelVersion | None" = None,
         over: Sequence[str] = (),
         features: str = "regimes",
         by: "FoldKey" = "drive",
@@ -146,9 +147,10 @@ class FleetCohort(Rooted):
         """Return a model's error by speed and lateral acceleration, and whether to split it there.
 
         One model for all rows is cross-validated against one for each regime. `signals` are inputs
-        separated by commas, by default all; `over` the regimes to divide by, by default all of the
-        feature set `features`, whose Gram rows `fleet.gram("regimes")` makes; `worth` the smallest
-        gain for which a split is advised, as in `select`.
+        separated by commas, by default those of a published `model`, or all; `over` the regimes to
+        divide by, by default all of the feature set `features`, whose Gram rows
+        `fleet.gram("regimes")` makes; `worth` the smallest gain for which a split is
+        advised, as in `select`.
 
         Raises `DataError` for a feature set without such regimes.
         """
@@ -156,6 +158,11 @@ class FleetCohort(Rooted):
         from fleet_slip.selection.request import parse_worth
 
         gain = parse_worth(worth)
+        if model is not None:
+            if signals is not None:
+                raise UsageError("name a published model or signals, not both.")
+            version = self._examined(model, None, None).version
+            signals = ",".join(version.manifest.signals) if version else None
         return compare_regimes(*self._dealt(signals, features, by, folds), over, gain)
 
     def shrink(

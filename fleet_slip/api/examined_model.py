@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
-from fleet_slip.errors import QuestionError, UsageError
+from fleet_slip.errors import UsageError
 from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.versions import Registry
@@ -43,11 +43,7 @@ def subject_of(
             raise UsageError("name a published model or signals (of a feature set), not both.")
         return ExaminedModel(feature_set or PLAIN, signals, None)
     if model is None:
-        names = registry.names()
-        if len(names) != 1:
-            known = ", ".join(names) or "none"
-            raise QuestionError(f"name a published model, or signals. Published: {known}.")
-        (model,) = names
+        model = registry.only(", or signals")
     version = model if isinstance(model, ModelVersion) else registry.resolve(model)
     identity = version.manifest.trained_on.feature_set
     return ExaminedModel(features().name_of(identity), None, version)

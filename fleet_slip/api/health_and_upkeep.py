@@ -91,7 +91,11 @@ class HealthAndUpkeep(PublishedModels):
         return calibrate(self.warehouse, parse_cohort(cohort))
 
     def monitor(
-        self, model: "str | ModelVersion", cohort: str | None = None, *, since: date | None = None
+        self,
+        model: "str | ModelVersion | None" = None,
+        cohort: str | None = None,
+        *,
+        since: date | None = None,
     ) -> "Chart":
         """Chart a model's error on each day since it was trained, with control limits, in degrees.
 

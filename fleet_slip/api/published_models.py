@@ -1,6 +1,7 @@
 """The part of a `Fleet` that publishes models, serves them and evaluates them."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +31,10 @@ if TYPE_CHECKING:
 
 
 class PublishedModels(Rooted):
-    """Published models. A reference is `NAME@VERSION`, `NAME@ALIAS`, or `NAME` for its champion."""
+    """Published models. A reference is `NAME@VERSION`, `NAME@ALIAS`, or `NAME` for its champion.
+
+    Where one is asked for and None given, it is the only model that there is.
+    """
 
     def models(self, name: str | None = None) -> "pa.Table":
         """Return all published versions, or those of one model, as the view `models` has them.
@@ -51,8 +55,8 @@ class PublishedModels(Rooted):
             "trained_on_forgotten", [[f"{name}@{version}" in marked for name, version in pairs]]
         )
 
-    def model(self, reference: str) -> ModelVersion:
-        """Return the version that a reference names.
+    def model(self, reference: str | None = None) -> ModelVersion:
+        """Return the version that a reference names, by default the only model.
 
         Raises `QuestionError` for an unknown one, `StorageError` for one that was changed after it
         was published, and `RefusedError` for one without the signature that is asked for.
@@ -169,21 +173,30 @@ class PublishedModels(Rooted):
         registry.sign(name, int(version))
         return registry.load(name, int(version))
 
-    def score(self, model: str | ModelVersion, cohort: str = ALL_DRIVES) -> "Score":
+    def score(self, model: str | ModelVersion | None = None, cohort: str | None = None) -> "Score":
         """Evaluate a model on the rows of a cohort; angles are in degrees.
 
-        `cohort` is an SQL condition on the view `drives`. Raises `DataError` if no row of the
+        `cohort` is an SQL condition on the view `drives`, by default all drives that the model was
+        not trained on, or all if there are no others. Raises `DataError` if no row of the
         cohort has the model's signals, `QuestionError` for a condition that is not valid, and what
         `model` raises.
         """
         from fleet_slip.models.score import score
+        from fleet_slip.models.seen_drives import find_seen
 
-        return score(self.warehouse, self.resolve(model).manifest, cohort)
+        manifest = self.resolve(model).manifest
+        asked = ALL_DRIVES if cohort is None else cohort
+        seen = find_seen(self.warehouse, self.registry(), manifest, asked)
+        found = score(self.warehouse, manifest, asked if cohort else seen.others)
+        without = 0 if cohort or seen.trained == seen.drives else seen.trained or 0
+        return replace(
+            found, drives=seen.drives, drives_trained=seen.trained, drives_left_out=without
+        )
 
     @record_call
     def evaluate(
         self,
-        model: str | ModelVersion,
+        model: str | ModelVersion | None = None,
         others: Sequence[str | ModelVersion] = (),
         *,
         scenarios: Sequence[str] = (),
@@ -218,7 +231,7 @@ class PublishedModels(Rooted):
 
     def evaluate_blind(
         self,
-        model: str | ModelVersion,
+        model: str | ModelVersion | None = None,
         others: Sequence[str | ModelVersion] = (),
         *,
         rivals: bool = False,
@@ -240,7 +253,9 @@ class PublishedModels(Rooted):
             trained = train_competitors(self.warehouse, first, rest, executor, _rivals_if(rivals))
         return judge_blindly(first.sha256, trained.estimators)
 
-    def report(self, model: str | ModelVersion, output: Path | None = None) -> "Written":
+    def report(
+        self, model: str | ModelVersion | None = None, output: Path | None = None
+    ) -> "Written":
         """Write one page that lays our figures beside the paper's, from the latest evaluation.
 
         `output` is a folder, by default `report` in the data root. Raises `DataError` if the model
@@ -262,7 +277,7 @@ class PublishedModels(Rooted):
     def watch(
         self,
         what: str,
-        model: str | ModelVersion,
+        model: str | ModelVersion | None,
         output: Path,
         *,
         from_s: float = 0.0,
@@ -329,7 +344,12 @@ class PublishedModels(Rooted):
         return Estimator(self.resolve(model).manifest, car)
 
     def export(
-        self, model: str | ModelVersion, to: "Target", output: Path, *, with_gram: bool = False
+        self,
+        model: str | ModelVersion | None,
+        to: "Target",
+        output: Path,
+        *,
+        with_gram: bool = False,
     ) -> list[Path]:
         """Write a version as a program for elsewhere into a folder; return the files.
 
@@ -368,7 +388,7 @@ class PublishedModels(Rooted):
         """Return the registry of models; it signs new versions with a private key, if given one."""
         return Registry(self.root / "models", sign_key)
 
-    def resolve(self, model: str | ModelVersion) -> ModelVersion:
+    def resolve(self, model: str | ModelVersion | None) -> ModelVersion:
         """Return the version that a reference names; a version is returned as it is."""
         return model if isinstance(model, ModelVersion) else self.model(model)
 

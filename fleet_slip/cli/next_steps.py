@@ -19,7 +19,7 @@ def next_steps(fleet: Fleet, campaign: str, model: str) -> list[str]:
     lines = [f'{begin} sql "{query}"', f"{begin} show {model}"]
     if cohort := _faster_half(fleet, campaign):
         lines.append(f'{begin} select --cohort "{cohort}"')
-    lines.append(f"{begin} evaluate --one-car {model} && {begin} report --model {model}")
+    lines.append(f"{begin} evaluate {model} && {begin} report {model}")
     return lines
 
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any, TypeVar
 
 import typer
 
-from fleet_slip.cli.completing import complete_config, complete_feature_set
+from fleet_slip.cli.completing import complete_config, complete_feature_set, complete_model
 from fleet_slip.errors import UsageError
 from fleet_slip.grams.cohorts.folding import FoldKey
 from fleet_slip.regression.choice.criteria import CRITERIA
@@ -178,8 +178,20 @@ def selection_options(
 Model = Annotated[
     str | None,
     typer.Argument(
+        metavar="[MODEL]",
         help="NAME, NAME@VERSION or NAME@ALIAS of a published model. Default: the only one that "
         "there is, unless --signals is given.",
+        autocompletion=complete_model,
+        show_default=False,
+    ),
+]
+OnlyModel = Annotated[
+    str | None,
+    typer.Argument(
+        metavar="[MODEL]",
+        help="NAME, NAME@VERSION or NAME@ALIAS of a published model; NAME alone is its champion. "
+        "Default: the only one that there is.",
+        autocompletion=complete_model,
         show_default=False,
     ),
 ]

@@ -53,6 +53,11 @@ class Score:
     error_p95_deg: float
     error_p99_deg: float
     error_max_deg: float
+    drives: int | None = None
+    """Of the cohort, where they were counted; `drives_trained` of them made the model."""
+    drives_trained: int | None = None
+    drives_left_out: int = 0
+    """How many of these are not scored, since no cohort was asked for."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `score --json` prints."""

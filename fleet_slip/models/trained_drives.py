@@ -64,10 +64,11 @@ def read_drives_file(versions: Folder, manifest: Manifest) -> bytes | None:
 
 def hash_drives(name: str, drives: Hashes) -> Hashes:
     """Return the salted hashes of drives, as the versions of a model keep them, sorted."""
-    return np.sort(_salted(name, drives))
+    return np.sort(salt_drives(name, drives))
 
 
-def _salted(name: str, drives: Hashes) -> Hashes:
+def salt_drives(name: str, drives: Hashes) -> Hashes:
+    """Return the salted hash of each drive, in the order of the drives."""
     salt, numbers = _SALT + name.encode(), drives.astype("<u8")
     hashed = np.empty(len(drives), dtype=np.uint64)
     for first in range(0, len(drives), _AT_ONCE):

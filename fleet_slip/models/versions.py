@@ -89,12 +89,21 @@ class Registry:
             )
         return ModelVersion(version, manifest, document.sha256)
 
-    def resolve(self, reference: str) -> ModelVersion:
+    def only(self, or_else: str = "") -> str:
+        """Return the name of the only model. Raises `QuestionError` if there is not one."""
+        names = self.names()
+        if len(names) != 1:
+            known = ", ".join(names) or "none yet; publish one with: fleet-slip publish NAME"
+            raise QuestionError(f"name a published model{or_else}. Models: {known}.")
+        return names[0]
+
+    def resolve(self, reference: str | None) -> ModelVersion:
         """Return the version that `NAME`, `NAME@VERSION` or `NAME@ALIAS` names.
 
-        `NAME` alone is its champion. Raises `QuestionError` for an unknown one.
+        `NAME` alone is its champion, and None the only model. Raises `QuestionError` for an unknown
+        one.
         """
-        name, _, which = reference.partition("@")
+        name, _, which = (reference or self.only()).partition("@")
         self.require(name)
         which = which or CHAMPION
         if which.isascii() and which.isdigit() and len(which) <= MAX_DIGITS:

@@ -133,4 +133,4 @@ def test_an_evaluation_is_a_screen(shown: Shown) -> None:
     assert "furthest from it on nominal: 0.200 deg, where the side-slip varies by 0.70 deg" in text
     assert "on part of the rows; estimated: nominal 35%." in text
     assert "Of 2 requirements of the paper's scenarios, its own models miss 1." in text
-    assert "fleet-slip evaluate --one-car ours --all" in text
+    assert "fleet-slip evaluate ours --all" in text

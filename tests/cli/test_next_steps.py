@@ -31,8 +31,8 @@ def test_each_command_can_be_typed(told: tuple[Path, list[str]]) -> None:
 def test_the_last_draws_the_report_of_the_model(told: tuple[Path, list[str]]) -> None:
     _, lines = told
     evaluate, report = lines[-1].split(" && ")
-    assert evaluate.endswith("evaluate --one-car smoke")
-    assert report.endswith("report --model smoke")
+    assert evaluate.endswith("evaluate smoke")
+    assert report.endswith("report smoke")
 
 
 def test_another_root_stands_in_them(run_command: RunCommand, tmp_path: Path) -> None:

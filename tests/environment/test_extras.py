@@ -92,7 +92,7 @@ def test_querying_and_selecting_need_the_core_alone(root: Path) -> None:
     [
         ("compiled", ["simulate", "smoke"]),
         ("compiled", ["export", "smoke", "--to", "c"]),
-        ("report", ["report", "--model", "smoke"]),
+        ("report", ["report", "smoke"]),
         ("objects", ["--root", "s3://bucket/data", "status"]),
         ("signing", ["keygen", "key.pem"]),
     ],

@@ -96,7 +96,7 @@ def test_score_finds_the_error_that_the_gram_rows_say(root: Path) -> None:
 @pytest.mark.slow
 def test_evaluate_ranks_it_among_the_filters(root: Path, tmp_path: Path) -> None:
     copy = shutil.copytree(root, tmp_path / "data")
-    found = call(copy, "evaluate", "--one-car", "roads", "--scenario", "nominal")
+    found = call(copy, "evaluate", "roads", "--scenario", "nominal")
     ours = found["scenarios"][0]["results"]["roads@1"]
     assert ours["coverage"] == 1.0
     assert ours["rmse_deg"] < found["scenarios"][0]["results"]["roads@1/4"]["rmse_deg"]

@@ -99,3 +99,24 @@ def test_without_the_columns_of_the_usual_list_logged_signals_are_compared(tmp_p
     answer = answer_request(warehouse, SelectionRequest(), "true")
     assert answer.model_list == "table1"
     assert "fleet-slip gram --features windows" in answer.remark
+
+
+def test_a_score_leaves_out_what_the_model_was_trained_on(root: Path) -> None:
+    first = "day = '2024-05-01'"
+    call(root, "publish", "early", "--cohort", first, "--models", "table1", "--force")
+    whole, new = call(root, "score", "smoke"), call(root, "score", "early")
+    assert (whole["drives"], whole["drives_trained"], whole["drives_left_out"]) == (8, 8, 0)
+    assert (new["drives"], new["drives_trained"], new["drives_left_out"]) == (8, 4, 4)
+    old = call(root, "score", "early", "--cohort", first)
+    assert (old["drives"], old["drives_trained"], old["drives_left_out"]) == (4, 4, 0)
+    assert old["rows"] + new["rows"] == whole["rows"]
+    told = CliRunner().invoke(app, ["--root", str(root), "score", "early"])
+    assert "left out: 4 drives of 8 that early@1 was trained on" in told.output
+
+
+def test_the_only_model_need_not_be_named(tmp_path: Path, smoke_root: Path, root: Path) -> None:
+    assert call(smoke_root, "show")["name"] == "smoke"
+    with pytest.raises(QuestionError, match=r"Models: .*plain, .*smoke"):
+        call(root, "show")
+    with pytest.raises(QuestionError, match="name a published model"):
+        call(root, "report")

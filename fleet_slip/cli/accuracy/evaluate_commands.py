@@ -6,27 +6,17 @@ import typer
 
 from fleet_slip.catalogue.sources import ALL_DRIVES
 from fleet_slip.cli.accuracy.evaluation_tables import print_blind, print_evaluation, print_summary
-from fleet_slip.cli.begin.run_command import DEFAULT_CAMPAIGN
-from fleet_slip.cli.completing import complete_config, complete_model
+from fleet_slip.cli.completing import complete_config
 from fleet_slip.cli.models.diff_command import score_against
-from fleet_slip.cli.models.version_commands import Reference
-from fleet_slip.cli.options import Cohort
+from fleet_slip.cli.options import OnlyModel
 from fleet_slip.cli.output import Json, print_json, print_table, say
 from fleet_slip.cli.progress_bar import progress
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.workers import Threads
 from fleet_slip.errors import UsageError
-from fleet_slip.models.score import score_statement
+from fleet_slip.models.score import Score, score_statement
 from fleet_slip.words import number_of
 
-OneCar = Annotated[
-    str,
-    typer.Option(
-        help="NAME, NAME@VERSION or NAME@ALIAS of a model. It is evaluated, and the models of "
-        "Table I on the cohort that it was trained on.",
-        autocompletion=complete_model,
-    ),
-]
 FleetModels = Annotated[
     list[str] | None,
     typer.Option(help="Another model, to be compared with the first. May be repeated."),
@@ -44,8 +34,14 @@ Scenarios = Annotated[
 
 def score(
     context: typer.Context,
-    reference: Reference,
-    cohort: Cohort = ALL_DRIVES,
+    model: OnlyModel = None,
+    cohort: Annotated[
+        str | None,
+        typer.Option(
+            help="SQL condition on the view drives. Default: what the model was not trained on, or "
+            "all if there is nothing else."
+        ),
+    ] = None,
     sql: Annotated[bool, typer.Option("--sql", help="Print the statement and do nothing.")] = False,
     against: Annotated[
         str | None,
@@ -57,18 +53,19 @@ def score(
 
     Example: **fleet-slip score waterford --cohort "speed_factor > 0.9"**
     """
-    version = context.obj.model(reference)
+    version = context.obj.model(model)
     if sql:
-        typer.echo(score_statement(version.manifest, cohort))
+        typer.echo(score_statement(version.manifest, cohort or ALL_DRIVES))
         return
     if against is not None:
         name = against if "@" in against else f"{version.manifest.name}@{against}"
         other = context.obj.model(name)
-        score_against(context.obj.warehouse, version, other, cohort, json)
+        score_against(context.obj.warehouse, version, other, cohort or ALL_DRIVES, json)
         return
-    result = context.obj.score(version, cohort).as_dict()
+    found: Score = context.obj.score(version, cohort)
+    result = found.as_dict()
     if json:
-        print_json({"model": version.reference, "cohort": cohort, **result})
+        print_json({"model": version.reference, "cohort": cohort or ALL_DRIVES, **result})
         return
     print_table(
         f"{version.reference} on {number_of(result['rows'], 'row')}",
@@ -76,15 +73,31 @@ def score(
         [
             [name.replace("_deg", ", deg").replace("_", " "), f"{value:.4f}"]
             for name, value in result.items()
-            if name != "rows" and value is not None
+            if name.startswith(("error", "rmse", "correlation")) and value is not None
         ],
     )
+    _say_trained(found, version.reference)
+
+
+def _say_trained(found: Score, reference: str) -> None:
+    """Say which drives made the model: on these its error is that of a fit."""
+    if found.drives_trained is None:
+        say(f"{reference} does not tell which drives made it: some of these may have.")
+    elif found.drives_left_out:
+        left = number_of(found.drives_left_out, "drive")
+        say(f"left out: {left} of {found.drives:,} that {reference} was trained on.")
+    elif found.drives_trained:
+        say(
+            f"{reference} was trained on {found.drives_trained:,} of these "
+            f"{number_of(found.drives or 0, 'drive')}: there the error is that of the fit. New "
+            f"drives: fleet-slip evaluate {reference}"
+        )
 
 
 @record_run
 def evaluate(
     context: typer.Context,
-    one_car: OneCar = DEFAULT_CAMPAIGN,
+    model: OnlyModel = None,
     fleet: FleetModels = None,
     scenario: Scenarios = None,
     rivals: Annotated[
@@ -111,15 +124,18 @@ def evaluate(
 ) -> None:
     """Evaluate models on the paper's test drives and on others; simulates those that are missing.
 
+    Beside the model, those of Table I are evaluated, trained on its cohort.
+
     Prints who wins each test drive; all of it with --all. The results are kept as a JSON document
     below evaluations/ in the data root.
 
-    Example: **fleet-slip evaluate --one-car waterford --scenario nominal**
+    Example: **fleet-slip evaluate waterford --scenario nominal**
     """
+    model = model or context.obj.registry().only()
     if blind:
         if scenario:
             raise UsageError("--blind has drives of its own: leave out --scenario.")
-        rows = context.obj.evaluate_blind(one_car, fleet or (), rivals=rivals, threads=threads)
+        rows = context.obj.evaluate_blind(model, fleet or (), rivals=rivals, threads=threads)
         if json:
             print_json({"blind": [row.as_dict() for row in rows]})
         else:
@@ -127,7 +143,7 @@ def evaluate(
         return
     with progress("simulate scenarios", "rows") as show:
         kept = context.obj.evaluate(
-            one_car,
+            model,
             fleet or (),
             scenarios=scenario or (),
             rivals=rivals,
@@ -141,5 +157,5 @@ def evaluate(
         if everything:
             print_evaluation(content)
         else:
-            print_summary(content, one_car)
+            print_summary(content, model)
         say(f"kept as evaluations/{kept.number}.json")

@@ -246,10 +246,10 @@ def print_summary(content: Mapping[str, Any], model: str) -> None:
         asked = number_of(len(checks), "requirement")
         print_text(f"Of {asked} of the paper's scenarios, its own models miss {missed}.")
     print_text(
-        f"All estimators, sections and requirements: fleet-slip evaluate --one-car "
+        f"All estimators, sections and requirements: fleet-slip evaluate "
         f"{shlex.quote(model)} --all; for machines --json."
     )
-    print_text(f"Pictures: fleet-slip report --model {shlex.quote(model)}")
+    print_text(f"Pictures: fleet-slip report {shlex.quote(model)}")
 
 
 def _extremes(scenarios: Sequence[Mapping[str, Any]], ours: str) -> list[str]:

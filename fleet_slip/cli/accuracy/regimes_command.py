@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
+from fleet_slip.cli.completing import complete_model
 from fleet_slip.cli.options import By, Cohort, FoldCount, Signals, Worth
 from fleet_slip.cli.output import Json, print_json, print_line, print_table
 from fleet_slip.selection.regimes import RegimeComparison
@@ -14,6 +15,16 @@ from fleet_slip.words import number_of
 
 def regimes(
     context: typer.Context,
+    model: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[MODEL]",
+            help="NAME, NAME@VERSION or NAME@ALIAS of a published model, whose signals are taken. "
+            "Default: all signals, unless --signals is given.",
+            autocompletion=complete_model,
+            show_default=False,
+        ),
+    ] = None,
     signals: Signals = None,
     over: Annotated[
         str | None,
@@ -40,7 +51,13 @@ def regimes(
     """
     divided_by = [name.strip() for name in over.split(",")] if over else []
     result: RegimeComparison = context.obj.cohort(cohort).regimes(
-        signals, over=divided_by, features=feature_set, by=by, folds=folds, worth=worth
+        signals,
+        model=model,
+        over=divided_by,
+        features=feature_set,
+        by=by,
+        folds=folds,
+        worth=worth,
     )
     if json:
         print_json({"cohort": cohort, **result.as_dict()})

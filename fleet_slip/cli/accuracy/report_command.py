@@ -5,15 +5,13 @@ from typing import Annotated
 
 import typer
 
-from fleet_slip.cli.begin.run_command import DEFAULT_CAMPAIGN
+from fleet_slip.cli.options import OnlyModel
 from fleet_slip.cli.output import Json, print_json, say
 
 
 def report(
     context: typer.Context,
-    model: Annotated[
-        str, typer.Option(help="NAME, NAME@VERSION or NAME@ALIAS of a model that was evaluated.")
-    ] = DEFAULT_CAMPAIGN,
+    model: OnlyModel = None,
     output: Annotated[
         Path | None,
         typer.Option(help="Folder. Default: report/ in the data root.", show_default=False),
@@ -24,7 +22,7 @@ def report(
 
     The page needs nothing but itself; the same figures stand beside it as SVG and PNG files.
 
-    Example: **fleet-slip report --model waterford**
+    Example: **fleet-slip report waterford**
     """
     written = context.obj.report(model, output)
     if json:

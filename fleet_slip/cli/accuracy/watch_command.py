@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
-from fleet_slip.cli.begin.run_command import DEFAULT_CAMPAIGN
-from fleet_slip.cli.completing import complete_config, complete_model
+from fleet_slip.cli.completing import complete_config
+from fleet_slip.cli.options import OnlyModel
 from fleet_slip.cli.output import say
 from fleet_slip.cli.workers import Threads
 
@@ -22,13 +22,7 @@ def watch(
             show_default=False,
         ),
     ],
-    model: Annotated[
-        str,
-        typer.Option(
-            help="NAME, NAME@VERSION or NAME@ALIAS of the model that estimates.",
-            autocompletion=complete_model,
-        ),
-    ] = DEFAULT_CAMPAIGN,
+    model: OnlyModel = None,
     output: Annotated[
         Path, typer.Option(help="File: .html plays in a browser, .mp4 and .gif are films.")
     ] = Path("watch.html"),

@@ -5,15 +5,15 @@ from typing import Annotated
 
 import typer
 
-from fleet_slip.cli.models.version_commands import Reference
+from fleet_slip.cli.options import OnlyModel
 from fleet_slip.cli.output import Json, print_json, say
 from fleet_slip.export.files import Target
 
 
 def export(
     context: typer.Context,
-    reference: Reference,
     to: Annotated[Target, typer.Option(help="What to export to.")],
+    model: OnlyModel = None,
     output: Annotated[
         Path, typer.Option(help="Folder to write into; files of the same names are replaced.")
     ] = Path(),
@@ -27,7 +27,7 @@ def export(
 
     Example: **fleet-slip export waterford --to c --output export**
     """
-    written = context.obj.export(reference, to, output, with_gram=with_gram)
+    written = context.obj.export(model, to, output, with_gram=with_gram)
     if json:
         print_json({"files": [str(path) for path in written]})
         return

@@ -9,6 +9,7 @@ from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalogue.definitions import Definition
 from fleet_slip.cli.completing import complete_model
 from fleet_slip.cli.models.signing_commands import signing_key
+from fleet_slip.cli.options import OnlyModel
 from fleet_slip.cli.output import Json, print_json, print_table, say
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.errors import UsageError
@@ -114,12 +115,12 @@ def _import_model(fleet: Fleet, word: str | None, file: Path, json: bool) -> Non
     say(f"{version.reference}: {came}. To use it: fleet-slip promote {version.reference}")
 
 
-def show(context: typer.Context, reference: Reference, json: Json = False) -> None:
+def show(context: typer.Context, model: OnlyModel = None, json: Json = False) -> None:
     """Show one model version: coefficients, figures, and the data that made it.
 
     Example: **fleet-slip show waterford**
     """
-    version: ModelVersion = context.obj.model(reference)
+    version: ModelVersion = context.obj.model(model)
     if json:
         content = version.manifest.model_dump(mode="json")
         facts = {

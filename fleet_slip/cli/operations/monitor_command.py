@@ -5,10 +5,9 @@ from typing import Annotated
 
 import typer
 
-from fleet_slip.cli.begin.run_command import DEFAULT_CAMPAIGN
 from fleet_slip.cli.dates import date_of
 from fleet_slip.cli.left_out import say_revoked, say_untold, say_without_log
-from fleet_slip.cli.models.version_commands import Reference
+from fleet_slip.cli.options import OnlyModel
 from fleet_slip.cli.output import Json, print_json, print_table
 from fleet_slip.errors import AlarmError
 from fleet_slip.extras import needed
@@ -17,7 +16,7 @@ from fleet_slip.monitoring.monitor import Chart
 
 def monitor(
     context: typer.Context,
-    reference: Reference = DEFAULT_CAMPAIGN,
+    model: OnlyModel = None,
     cohort: Annotated[
         str | None,
         typer.Option(
@@ -41,7 +40,7 @@ def monitor(
 
     Example: **fleet-slip monitor waterford --since 2024-05-03**
     """
-    chart: Chart = context.obj.monitor(reference, cohort, since=date_of(since, "--since"))
+    chart: Chart = context.obj.monitor(model, cohort, since=date_of(since, "--since"))
     if plot:
         with needed("report", "a chart"):
             from fleet_slip.monitoring.control_chart import save_chart  # noqa: PLC0415

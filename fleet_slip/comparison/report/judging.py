@@ -86,7 +86,7 @@ def judge(claim: Claim, facts: Facts) -> Judged:
         figure, why = _filled(claim.figure, facts), _filled(claim.why, facts)
     except NotEvaluatedError as lacking:
         return not_testable(
-            f"The evaluation has no {lacking}. Run: fleet-slip evaluate --one-car "
+            f"The evaluation has no {lacking}. Run: fleet-slip evaluate "
             f"{evaluated.group} --fleet NAME --rivals"
         )
     status = Status.REPRODUCED if held else Status.NOT_REPRODUCED

@@ -105,8 +105,7 @@ def latest_of(warehouse: Warehouse, version: ModelVersion) -> Evaluated:
         if first["group"] == version.reference:
             return Evaluated(document, version.reference)
     raise DataError(
-        f"{version.reference} has not been evaluated. Run: fleet-slip evaluate --one-car "
-        f"{version.reference}"
+        f"{version.reference} has not been evaluated. Run: fleet-slip evaluate {version.reference}"
     )
 
 

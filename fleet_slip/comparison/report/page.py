@@ -125,8 +125,8 @@ def _commands(data: ReportData) -> list[str]:
     options += " --rivals" if data.evaluated.rows("rivals") else ""
     return [
         *(f"fleet-slip run --campaign {name}" for name in data.campaigns),
-        f"fleet-slip evaluate --one-car {reference}{options}",
-        f"fleet-slip report --model {reference}",
+        f"fleet-slip evaluate {reference}{options}",
+        f"fleet-slip report {reference}",
     ]
 
 

@@ -242,7 +242,7 @@ def _same(first: float | None, second: float | None) -> bool:
 def _changed(evaluated: Evaluated, what: str) -> str:
     return (
         f"{what} has changed since evaluation {evaluated.document.number}. Run: fleet-slip "
-        f"evaluate --one-car {evaluated.group}"
+        f"evaluate {evaluated.group}"
     )
 
 

@@ -85,7 +85,7 @@ def test_who_is_right_has_no_error_and_who_says_zero_has_the_angle(
 def test_the_command_judges_and_writes_nothing(smoke_root: Path, tmp_path: Path) -> None:
     root = shutil.copytree(smoke_root, tmp_path / "data")
     before = {path for path in root.rglob("*") if not {"runs", "tuned"} & set(path.parts)}
-    done = run_on(root, "evaluate", "--one-car", "smoke", "--blind", "--json")
+    done = run_on(root, "evaluate", "smoke", "--blind", "--json")
     assert done.exit_code == 0, done.stderr
     rows = {row["name"]: row["figures"] for row in json.loads(done.stdout)["blind"]}
     assert rows["all"]["smoke@1"]["coverage"] > 0.95
@@ -95,6 +95,6 @@ def test_the_command_judges_and_writes_nothing(smoke_root: Path, tmp_path: Path)
 
 def test_it_has_drives_of_its_own(smoke_root: Path, tmp_path: Path) -> None:
     root = shutil.copytree(smoke_root, tmp_path / "data")
-    done = run_on(root, "evaluate", "--one-car", "smoke", "--blind", "--scenario", "nominal")
+    done = run_on(root, "evaluate", "smoke", "--blind", "--scenario", "nominal")
     assert done.exit_code == UsageError.exit_code
     assert "leave out --scenario" in done.stderr

@@ -40,7 +40,7 @@ def call(root: Path, *words: str) -> Any:
 
 def evaluate(root: Path, *scenarios: str) -> Any:
     options = [word for name in scenarios for word in ("--scenario", name)]
-    return call(root, "evaluate", "--one-car", "smoke", *options)
+    return call(root, "evaluate", "smoke", *options)
 
 
 @pytest.fixture(scope="module")
@@ -181,7 +181,7 @@ def test_rivals_run_on_the_same_drives(
     monkeypatch.setattr("fleet_slip.comparison.observers.tuning.LAST_FACTOR", 4.0)
     copy = tmp_path / "data"
     shutil.copytree(root, copy)
-    content = call(copy, "evaluate", "--one-car", "smoke", "--scenario", "nominal", "--rivals")
+    content = call(copy, "evaluate", "smoke", "--scenario", "nominal", "--rivals")
     rivals = {rival["name"]: rival for rival in content["rivals"]}
     results = content["scenarios"][0]["results"]
     assert set(rivals) <= set(results)

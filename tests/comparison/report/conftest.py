@@ -28,8 +28,8 @@ def reported(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Repo
     def make(root: Path) -> None:
         shutil.copytree(smoke_root, root)
         options = [word for name in SCENARIOS for word in ("--scenario", name)]
-        call(root, "evaluate", "--one-car", "smoke", *options)
-        call(root, "report", "--model", "smoke")
+        call(root, "evaluate", "smoke", *options)
+        call(root, "report", "smoke")
 
     return Reported(made_once(tmp_path_factory, "reported", make))
 

@@ -56,7 +56,7 @@ def evaluated(
     done_on(root, "ingest", folder / "log.csv", "--mapping", folder / "own.toml")
     done_on(root, "gram")
     done_on(root, "publish", "own", "--cohort", "source = 'measured'")
-    return root, done_on(root, "evaluate", "--one-car", "own", "--scenario", "nominal")
+    return root, done_on(root, "evaluate", "own", "--scenario", "nominal")
 
 
 def test_who_cannot_be_tuned_says_so_in_a_line_and_competes(
@@ -70,7 +70,7 @@ def test_who_cannot_be_tuned_says_so_in_a_line_and_competes(
 
 def test_the_report_has_what_is_left(evaluated: tuple[Path, Finished]) -> None:
     root, _ = evaluated
-    done_on(root, "report", "--model", "own")
+    done_on(root, "report", "own")
     page = (root / "report" / "report.html").read_text()
     assert "error std of model 1 on the nominal drive" in page
     assert "lack signals of model 2, 3, 4 and 5 of Table I" in page

@@ -278,16 +278,16 @@ def test_an_evaluation_of_other_data_is_refused(reported: Reported, data: Report
         place[path[-1]] += 0.001
         keep(Warehouse(LocalFolder(copy)), content)
         with pytest.raises(DataError, match=f"{told}.* has changed since evaluation 2"):
-            call(copy, "report", "--model", "smoke")
+            call(copy, "report", "smoke")
 
 
 def test_a_model_that_was_not_evaluated_is_told(
     reported: Reported, run_command: RunCommand, tmp_path: Path
 ) -> None:
     shutil.copytree(reported.root / "models", tmp_path / "data" / "models")
-    done = run_command("report", "--model", "smoke")
+    done = run_command("report", "smoke")
     assert done.exit_code == 5
-    assert "fleet-slip evaluate --one-car smoke@1" in done.stderr
+    assert "fleet-slip evaluate smoke@1" in done.stderr
 
 
 def test_the_path_of_columns_ends_at_the_published_model(data: ReportData) -> None:

@@ -1,0 +1,50 @@
+"""Which drives of a cohort a version was trained on, and those that it was not."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fleet_slip.grams.rows.rollup import hash_numbers
+from fleet_slip.models.manifest import Manifest
+from fleet_slip.models.score import cohort_of_rows
+from fleet_slip.models.trained_drives import read_trained_drives, salt_drives
+from fleet_slip.models.versions import Registry
+from fleet_slip.warehouse.condition import Condition, asking, drive_columns
+from fleet_slip.warehouse.table_views import connect_tables
+from fleet_slip.warehouse.tables import Warehouse
+
+
+@dataclass(frozen=True)
+class SeenDrives:
+    """A cohort's drives, and among them those that made a version.
+
+    Attributes:
+        drives: how many there are.
+        trained: how many of them made it; None for a version from before they were kept.
+        others: the condition of those that did not.
+    """
+
+    drives: int
+    trained: int | None
+    others: Condition
+
+
+def find_seen(
+    warehouse: Warehouse, registry: Registry, manifest: Manifest, condition: str | Condition
+) -> SeenDrives:
+    """Return which drives of a cohort of rows made a version. Raises as `score`."""
+    cohort = cohort_of_rows(condition)
+    view = "log" if cohort.columns - set(drive_columns()) else "drives"
+    query = f"SELECT DISTINCT drive_id FROM {view} WHERE {cohort.sql} ORDER BY 1"
+    with connect_tables(warehouse, query) as database, asking(database, cohort):
+        names = database.sql(query).to_arrow_table()["drive_id"]
+    made = read_trained_drives(registry.folder_of(manifest.name), manifest)
+    if made is None:
+        return SeenDrives(len(names), None, cohort)
+    seen = np.isin(salt_drives(manifest.name, hash_numbers(names)), made)
+    if not seen.any() or seen.all():
+        return SeenDrives(len(names), int(seen.sum()), cohort)
+    kept = [name for name, old in zip(names.to_pylist(), seen, strict=True) if not old]
+    listed = ", ".join("'" + name.replace("'", "''") + "'" for name in kept)
+    others = Condition(cohort.text, f"({cohort.sql} AND drive_id IN ({listed}))")
+    return SeenDrives(len(names), int(seen.sum()), others)
