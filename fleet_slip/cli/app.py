@@ -64,8 +64,8 @@ def options(
         LogFormat,
         typer.Option(
             envvar=LOG_VARIABLE,
-            help="Remarks on stderr: text, json (one object a line), or auto: text on a terminal, "
-            "json elsewhere.",
+            help="Remarks on stderr: text, json (one object a line), or auto: json in a systemd "
+            "journal and, unless on a terminal, with --json; else text.",
         ),
     ] = LogFormat.AUTO,
     config: Annotated[

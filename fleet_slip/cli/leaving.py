@@ -12,10 +12,21 @@ from fleet_slip.errors import INTERRUPTED
 LOG_VARIABLE = "FLEET_SLIP_LOG"
 
 
+def for_machines(wanted: str) -> bool:
+    """Whether stderr is JSON: where it is asked for, beside `--json`, and in a systemd journal."""
+    if wanted != "auto" or sys.stderr is None or sys.stderr.isatty():
+        return wanted == "json"
+    if "--json" in sys.argv:
+        return True
+    with contextlib.suppress(OSError):
+        here = os.fstat(2)
+        return os.environ.get("JOURNAL_STREAM") == f"{here.st_dev}:{here.st_ino}"
+    return False
+
+
 def tell(text: str, level: str) -> None:
-    """Print a remark on stderr: for people on a terminal, else one JSON object."""
-    wanted = os.environ.get(LOG_VARIABLE, "auto")
-    if wanted == "text" or (wanted != "json" and sys.stderr is not None and sys.stderr.isatty()):
+    """Print a remark on stderr, for people or as one JSON object."""
+    if not for_machines(os.environ.get(LOG_VARIABLE, "auto")):
         line = text
     else:
         time = datetime.now(UTC).isoformat(timespec="milliseconds")

@@ -12,12 +12,13 @@ from typing import Any
 
 from rich.console import Console
 
+from fleet_slip.cli.leaving import for_machines
 from fleet_slip.errors import hide_passwords, printable
 from fleet_slip.runs.log import LOGGER, current_run_id
 
 
 class LogFormat(StrEnum):
-    """How remarks are written: `auto` is text on a terminal and JSON elsewhere."""
+    """How remarks are written: `auto` is text, but JSON with `--json` and in journals."""
 
     AUTO = "auto"
     TEXT = "text"
@@ -93,9 +94,7 @@ def json_line(record: logging.LogRecord) -> str:
 
 def configure_logs(chosen: LogFormat) -> None:
     """Send the program's log to stderr in a format."""
-    if chosen is LogFormat.AUTO:
-        chosen = LogFormat.TEXT if sys.stderr.isatty() else LogFormat.JSON
-    handler = JsonHandler() if chosen is LogFormat.JSON else PeopleHandler()
+    handler = JsonHandler() if for_machines(chosen) else PeopleHandler()
     LOGGER.handlers[:] = [handler]
     LOGGER.setLevel(logging.INFO)
     LOGGER.propagate = False

@@ -178,7 +178,7 @@ def selection_options(
 Model = Annotated[
     str | None,
     typer.Argument(
-        metavar="[MODEL]",
+        metavar="MODEL",
         help="NAME, NAME@VERSION or NAME@ALIAS of a published model. Default: the only one that "
         "there is, unless --signals is given.",
         autocompletion=complete_model,
@@ -188,7 +188,7 @@ Model = Annotated[
 OnlyModel = Annotated[
     str | None,
     typer.Argument(
-        metavar="[MODEL]",
+        metavar="MODEL",
         help="NAME, NAME@VERSION or NAME@ALIAS of a published model; NAME alone is its champion. "
         "Default: the only one that there is.",
         autocompletion=complete_model,

@@ -103,6 +103,9 @@ def print_table(
     _print_lines("\n".join(line.rstrip() for line in captured.get().splitlines()))
 
 
+All = Annotated[bool, typer.Option("--all", help="Print all of it, not a screen alone.")]
+
+
 def cell(value: Any, form: str = "") -> str:
     """Return a value as a table shows it; nothing for None."""
     return "" if value is None else format(value, form)

@@ -134,3 +134,27 @@ def test_an_evaluation_is_a_screen(shown: Shown) -> None:
     assert "on part of the rows; estimated: nominal 35%." in text
     assert "Of 2 requirements of the paper's scenarios, its own models miss 1." in text
     assert "fleet-slip evaluate ours --all" in text
+
+
+@pytest.mark.parametrize("command", ["select", "models", "show smoke"])
+def test_what_a_newcomer_asks_first_is_a_screen_of_80_columns(
+    smoke_root: Path, shown: Shown, command: str
+) -> None:
+    def give() -> None:
+        app(["--root", str(smoke_root), *command.split()], standalone_mode=False)
+
+    lines = shown(give, 80)
+    assert max(map(len, lines)) <= 80
+    assert len(lines) < 50
+    whole = shown(
+        lambda: app(["--root", str(smoke_root), *command.split(), "--all"], standalone_mode=False),
+        200,
+    )
+    assert sum(map(len, whole)) > sum(map(len, lines))
+
+
+def test_the_winner_stands_first(smoke_root: Path, shown: Shown) -> None:
+    lines = shown(lambda: app(["--root", str(smoke_root), "select"], standalone_mode=False), 80)
+    assert lines[0].startswith("winner: exchange")
+    at = next(i for i, line in enumerate(lines) if "(--all)" in line)
+    assert len(lines) - at - 2 == 10

@@ -164,10 +164,10 @@ def test_commands_are_recorded_and_questions_are_not(run_command: RunCommand) ->
     assert (failed["command"], failed["exit_code"], failed["outcome"]) == ("gram", 5, "failed")
 
 
-def test_the_log_is_json_where_no_person_reads_it(tmp_path: Path) -> None:
+def test_the_log_is_json_where_a_machine_reads_it(tmp_path: Path) -> None:
     command = [COMMAND, "--root", str(tmp_path / "data"), "gram", "--features", "unknown"]
     environment = {k: v for k, v in os.environ.items() if k != "FLEET_SLIP_LOG"}
-    done = run(command, env=environment)
+    done = run([*command, "--json"], env=environment)
     lines = [json.loads(line) for line in done.stderr.splitlines()]
     assert [line["event"] for line in lines] == [
         "run started",
@@ -179,5 +179,6 @@ def test_the_log_is_json_where_no_person_reads_it(tmp_path: Path) -> None:
     assert lines[2]["exit_code"] == done.exit_code == 5
     assert lines[3]["level"] == "error"
     assert lines[3]["message"].startswith("error: no feature set is called 'unknown'")
-    text = run([COMMAND, "--log", "text", *command[1:]], env=environment)
-    assert text.stderr.startswith("error: no feature set")
+    for words in ([*command[1:], "--json"], ["--log", "text", *command[1:], "--json"]):
+        text = run([COMMAND, *words[: None if "--log" in words else -1]], env=environment)
+        assert text.stderr.startswith("error: no feature set")

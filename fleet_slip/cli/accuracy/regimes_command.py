@@ -18,7 +18,7 @@ def regimes(
     model: Annotated[
         str | None,
         typer.Argument(
-            metavar="[MODEL]",
+            metavar="MODEL",
             help="NAME, NAME@VERSION or NAME@ALIAS of a published model, whose signals are taken. "
             "Default: all signals, unless --signals is given.",
             autocompletion=complete_model,

@@ -8,7 +8,7 @@ from fleet_slip.cli.begin.select_command import print_selection
 from fleet_slip.cli.completing import complete_model
 from fleet_slip.cli.models.signing_commands import SignKey, signing_key
 from fleet_slip.cli.options import RESAMPLING, selection_options
-from fleet_slip.cli.output import Json, print_json, say
+from fleet_slip.cli.output import All, Json, print_json, say
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.publish import DryRun, Publication
@@ -16,7 +16,6 @@ from fleet_slip.models.recipe import recipe_for
 from fleet_slip.runs.log import step
 from fleet_slip.selection.answer_request import answer_request
 from fleet_slip.selection.request import SelectionRequest
-from fleet_slip.selection.select_models import RequestedSelection
 
 
 @record_run
@@ -51,6 +50,7 @@ def publish(
     mlflow: Annotated[
         str | None, typer.Option(help="Also register the version in the MLflow server of this URI.")
     ] = None,
+    everything: All = False,
     json: Json = False,
 ) -> None:
     """Select on a cohort and make the winner the next version of a model, and its champion.
@@ -69,7 +69,12 @@ def publish(
     with step("select"):
         selection = answer_request(context.obj.warehouse, recipe.request, recipe.cohort)
     if dry_run:
-        _print_dry_run(context.obj.would_publish(name, selection), selection, json)
+        told = context.obj.would_publish(name, selection)
+        if json:
+            print_json(told)
+        else:
+            print_selection(selection, everything)
+            _print_dry_run(told)
         return
     publication = context.obj.publish(
         name, selection, force=force, candidate=candidate, sign_key=signing_key(sign_key)
@@ -78,17 +83,13 @@ def publish(
     if json:
         print_json(publication)
     else:
-        print_selection(selection)
+        print_selection(selection, everything)
         print_publication(publication)
         if number:
             say(f"in MLflow: {publication.version.manifest.name}, version {number}")
 
 
-def _print_dry_run(told: DryRun, selection: RequestedSelection, json: bool) -> None:
-    if json:
-        print_json(told)
-        return
-    print_selection(selection)
+def _print_dry_run(told: DryRun) -> None:
     would = "would be published" if told.publishes else "would not be published"
     say(f"{told.model} {would}. {told.reason}")
 

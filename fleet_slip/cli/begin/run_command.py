@@ -15,7 +15,7 @@ from fleet_slip.cli.data.log_commands import Days, Through, last_day
 from fleet_slip.cli.models.signing_commands import signing_key
 from fleet_slip.cli.next_steps import next_steps
 from fleet_slip.cli.options import Models, Worth
-from fleet_slip.cli.output import Json, print_json, say
+from fleet_slip.cli.output import All, Json, print_json, say
 from fleet_slip.cli.progress_bar import progress_of_steps
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.workers import Cluster, Threads
@@ -44,6 +44,7 @@ def run(
     worth: Worth = None,
     threads: Threads = None,
     cluster: Cluster = None,
+    everything: All = False,
     json: Json = False,
 ) -> None:
     """Do the whole job: simulate what is missing, gram, select, publish if it is not worse.
@@ -78,7 +79,7 @@ def run(
     if json:
         print_json(report)
     else:
-        _print_report(report)
+        _print_report(report, everything)
         if (made := report.publication) and made.new and made.version.version == 1:
             model = made.version.reference.partition("@")[0]
             say("next:")
@@ -86,7 +87,7 @@ def run(
                 say(f"  {line}")
 
 
-def _print_report(report: RunReport) -> None:
+def _print_report(report: RunReport, everything: bool) -> None:
     simulated, gram, publication = report.simulation, report.gram, report.publication
     if not report.changed:
         kept = publication.version.reference if publication else report.refusal
@@ -100,7 +101,7 @@ def _print_report(report: RunReport) -> None:
             f"{number_of(wide.gram_rows, 'Gram row')}"
         )
     if report.selection:
-        print_selection(report.selection)
+        print_selection(report.selection, everything)
     if publication:
         print_publication(publication)
     else:

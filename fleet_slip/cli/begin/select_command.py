@@ -16,12 +16,14 @@ from fleet_slip.cli.left_out import (
 )
 from fleet_slip.cli.options import Cohort, selection_options
 from fleet_slip.cli.output import (
+    All,
     Json,
     cell,
     figures_cells,
     print_json,
     print_line,
     print_table,
+    print_text,
     say,
 )
 from fleet_slip.grams.cohorts.folding import BANDS, PARTS, ROW_FOLDS
@@ -44,7 +46,10 @@ MANY_SIGNALS = 30
 
 DISTANCES = ("contribution A", "D to full", "expected D")
 
-FIGURES = ("drives", "correlation", "RMSE deg", "mean deg", "std deg", "condition")
+ERROR = ("correlation", "RMSE deg", "error mean deg", "error std deg")
+
+BEST = 10
+"""So many models are shown unless all are asked for."""
 
 
 @selection_options()
@@ -52,6 +57,7 @@ def select(
     context: typer.Context,
     request: SelectionRequest,
     cohort: Cohort = TRAINING_DRIVES,
+    everything: All = False,
     json: Json = False,
 ) -> None:
     """Compare models on a cohort by cross-validation and choose one. Reads Gram rows only.
@@ -68,37 +74,17 @@ def select(
     if json:
         print_json(selection)
     else:
-        print_selection(selection)
+        print_selection(selection, everything)
 
 
-def print_selection(selection: Selection[Any]) -> None:
-    """Print the table of a selection, the winner and why, and how sure that is."""
-    where = selection.cohort.condition
-    # The signals of an order or of subsets stand in the table above it.
-    listed = selection.choice is None
+def print_selection(selection: Selection[Any], everything: bool = False) -> None:
+    """Print the winner and why, the best models or all, and how sure that is."""
+    _print_winner(selection)
     if selection.choice is not None:
         _print_choice(selection.choice)
     if isinstance(selection.distances, NestedDistances):
         _print_distances(selection.distances)
-    print_table(
-        f"{number_of(selection.cohort.drive_count, 'drive')}, "
-        f"{number_of(selection.cohort.rows, 'row')}"
-        + ("" if where == TRAINING_DRIVES else f" where {where}")
-        + f"; {number_of(len(selection.models[0].folds), 'fold')} by {selection.folds.by}"
-        + ("" if selection.intercept else "; no intercept"),
-        ["model", *(["signals"] if listed else []), *FIGURES],
-        [
-            [
-                model.name,
-                *([_columns_of(model, selection)] if listed else []),
-                f"{model.drives:,}",
-                *figures_cells(model.pooled),
-                f"{model.condition_number:.3g}",
-            ]
-            for model in selection.models
-        ],
-        left=1 + listed,
-    )
+    _print_models(selection, everything)
     _say_left_out(selection)
     if isinstance(selection, RequestedSelection) and selection.remark:
         say(selection.remark)
@@ -120,7 +106,6 @@ def print_selection(selection: Selection[Any]) -> None:
         say(f"the distances of the nested models cannot be told: {selection.distances}")
     for name, reason in selection.skipped.items():
         say(f"model {name} was left out: {reason}")
-    print_line(f"winner: {selection.winner.model.name}. {selection.winner.reason}")
     if selection.choice is not None and (honest := selection.choice.honest) is not None:
         print_line(
             "made again inside every training fold, the whole choice has a correlation of "
@@ -128,6 +113,55 @@ def print_selection(selection: Selection[Any]) -> None:
         )
     if selection.uncertainty is not None:
         _print_uncertainty(selection.uncertainty)
+
+
+def _print_winner(selection: Selection[Any]) -> None:
+    winner = selection.winner
+    print_text(f"winner: {winner.model.name}. {winner.reason}")
+    if selection.searched is not None and winner.model in selection.searched.models:
+        print_text(f"its columns: {in_families(winner.model.signals)}")
+
+
+def _print_models(selection: Selection[Any], everything: bool) -> None:
+    """Print a table of the models, of many the best; without signals where a table above has them.
+
+    A search changes some columns from size to size: how many there are stands here.
+    """
+    where, models, listed = selection.cohort.condition, selection.models, selection.choice is None
+    ranked = sorted(models, key=lambda model: model.pooled.rmse)
+    shown = models if everything else [one for one in models if one in ranked[:BEST]]
+    found = selection.searched.models if selection.searched else ()
+
+    def signals_of(model: CrossValidation) -> str:
+        if everything:
+            return _columns_of(model, selection)
+        many = model in found
+        return number_of(len(model.signals), "column") if many else in_families(model.signals)
+
+    print_table(
+        f"{number_of(selection.cohort.drive_count, 'drive')}, "
+        f"{number_of(selection.cohort.rows, 'row')}"
+        + ("" if where.text == TRAINING_DRIVES else f" where {where}")
+        + f"; {number_of(len(models[0].folds), 'fold')} by {selection.folds.by}"
+        + ("" if selection.intercept else "; no intercept")
+        + ("" if len(shown) == len(models) else f"; the {BEST} best of {len(models)} (--all)"),
+        [
+            "model",
+            *(["signals"] if listed else []),
+            *(["drives", *ERROR, "condition number"] if everything else ERROR[:2]),
+        ],
+        [
+            [
+                model.name,
+                *([signals_of(model)] if listed else []),
+                *([f"{model.drives:,}"] if everything else []),
+                *figures_cells(model.pooled)[: None if everything else 2],
+                *([f"{model.condition_number:.3g}"] if everything else []),
+            ]
+            for model in shown
+        ],
+        left=1 + listed,
+    )
 
 
 def _say_without_label(told: WithoutLabel) -> None:
@@ -173,7 +207,7 @@ def _say_left_out(selection: Selection[Any]) -> None:
 def _print_folds(model: CrossValidation) -> None:
     print_table(
         f"\nmodel {model.name}, each fold left out in turn",
-        ["fold", "rows", "correlation", "RMSE deg", "mean deg", "std deg"],
+        ["fold", "rows", *ERROR],
         [
             [name, f"{found.rows:,}", *figures_cells(found)]
             for name, found in zip(model.fold_names, model.folds, strict=True)

@@ -1,7 +1,8 @@
 """Commands that serve models: models, show, promote, rollback, pin, unpin."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -10,7 +11,7 @@ from fleet_slip.catalogue.definitions import Definition
 from fleet_slip.cli.completing import complete_model
 from fleet_slip.cli.models.signing_commands import signing_key
 from fleet_slip.cli.options import OnlyModel
-from fleet_slip.cli.output import Json, print_json, print_table, say
+from fleet_slip.cli.output import All, Json, print_json, print_table, print_text, say
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.errors import UsageError
 from fleet_slip.export.costs import costs_content, describe_costs
@@ -39,6 +40,7 @@ def models(
         ),
     ] = None,
     file: Annotated[Path | None, typer.Argument(help="The file to import.")] = None,
+    everything: All = False,
     json: Json = False,
 ) -> None:
     """List the published model versions, or bring one in from elsewhere: models import FILE.
@@ -58,35 +60,7 @@ def models(
     if not rows:
         say("no model has been published yet. Run: fleet-slip publish NAME")
         return
-    print_table(
-        "",
-        [
-            "model",
-            "aliases",
-            "signals",
-            "published",
-            "correlation",
-            "RMSE deg",
-            "std deg",
-            "drives",
-            "rows",
-        ],
-        [
-            [
-                f"{row['name']}@{row['version']}",
-                row["aliases"],
-                row["signals"].replace(",", " "),
-                f"{row['published_at']:%Y-%m-%d %H:%M}" if row["published_at"] else "",
-                f"{row['correlation']:.4f}",
-                f"{row['rmse_deg']:.4f}",
-                f"{row['error_std_deg']:.4f}",
-                f"{row['drives']:,}",
-                f"{row['rows']:,}",
-            ]
-            for row in rows
-        ],
-        left=4,
-    )
+    _print_models(rows, everything)
     for row in rows:
         if row["trained_on_forgotten"]:
             say(f"{row['name']}@{row['version']} was trained on drives that were forgotten since")
@@ -102,6 +76,31 @@ def models(
         )
 
 
+def _print_models(rows: Sequence[Mapping[str, Any]], everything: bool) -> None:
+    """Print a line for each version; with the names of its signals if all is asked for."""
+    more = ["error std deg", "rows"] if everything else []
+    print_table(
+        "",
+        ["model", "aliases", "signals", "published", "correlation", "RMSE deg", "drives", *more],
+        [
+            [
+                f"{row['name']}@{row['version']}",
+                row["aliases"],
+                row["signals"].replace(",", " ")
+                if everything
+                else str(len(row["signals"].split(","))),
+                f"{row['published_at']:%Y-%m-%d %H:%M}" if row["published_at"] else "",
+                f"{row['correlation']:.4f}",
+                f"{row['rmse_deg']:.4f}",
+                f"{row['drives']:,}",
+                *([f"{row['error_std_deg']:.4f}", f"{row['rows']:,}"] if everything else []),
+            ]
+            for row in rows
+        ],
+        left=4,
+    )
+
+
 def _import_model(fleet: Fleet, word: str | None, file: Path, json: bool) -> None:
     if word != "import":
         raise UsageError(f"{word!r}: a file is for import. Run: fleet-slip models import {file}")
@@ -115,8 +114,12 @@ def _import_model(fleet: Fleet, word: str | None, file: Path, json: bool) -> Non
     say(f"{version.reference}: {came}. To use it: fleet-slip promote {version.reference}")
 
 
-def show(context: typer.Context, model: OnlyModel = None, json: Json = False) -> None:
-    """Show one model version: coefficients, figures, and the data that made it.
+def show(
+    context: typer.Context, model: OnlyModel = None, everything: All = False, json: Json = False
+) -> None:
+    """Show one model version: figures, the data that made it, and coefficients.
+
+    With --all, coefficients to the last digit, and what each column is.
 
     Example: **fleet-slip show waterford**
     """
@@ -130,7 +133,7 @@ def show(context: typer.Context, model: OnlyModel = None, json: Json = False) ->
         }
         print_json({**facts, **content})
     else:
-        _print_version(version)
+        _print_version(version, everything)
 
 
 def _definition_row(term: ModelTerm, one: Definition) -> list[str]:
@@ -158,21 +161,25 @@ def _teacher(learned: LearnedFrom) -> str:
     )
 
 
-def _print_version(version: ModelVersion) -> None:
+def _print_version(version: ModelVersion, everything: bool) -> None:
     manifest = version.manifest
-    figures, trained = manifest.cross_validation, manifest.trained_on
     label, origin = manifest.label, manifest.through_origin
-    terms = [] if origin else [["intercept", label.unit, repr(manifest.intercept), ""]]
+    print_text(
+        f"{version.reference}: {label.column} = {'' if origin else 'intercept + '}"
+        f"sum of coefficient * signal{', through the origin' if origin else ''}"
+    )
+    facts = {**_facts(version), **({"sha256": version.sha256} if everything else {})}
+    print_table("", ["", ""], facts.items(), left=2)
+    form = repr if everything else "{:.6g}".format
+    terms = [] if origin else [["intercept", label.unit, form(manifest.intercept), ""]]
     for term in manifest.terms:
         per_count = f"{float(term.coefficient_exact * term.scale_exact):.9g}"
-        terms.append([term.column, term.unit, repr(term.coefficient), per_count])
-    print_table(
-        f"{version.reference}: {label.column} = {'' if origin else 'intercept + '}"
-        f"sum of coefficient * signal{', through the origin' if origin else ''}",
-        ["signal", "unit", "coefficient", "per count"],
-        terms,
-        left=2,
-    )
+        terms.append([term.column, term.unit, form(term.coefficient), per_count])
+    shown = 4 if everything else 3
+    header = ["signal", "unit", "coefficient", "per count"]
+    print_table("", header[:shown], [row[:shown] for row in terms], left=2)
+    if not everything:
+        return
     if manifest.features:
         print_table(
             "\nfeatures: SQL over the counts of log_counts, clipped to +-32767, times the scale",
@@ -187,9 +194,18 @@ def _print_version(version: ModelVersion) -> None:
             [_definition_row(term, own) for term in manifest.terms if (own := term.definition)],
             left=4,
         )
+
+
+def _facts(version: ModelVersion) -> dict[str, str]:
+    """Return what a version says of itself in sentences."""
+    manifest = version.manifest
+    figures, trained, chosen = (
+        manifest.cross_validation,
+        manifest.trained_on,
+        manifest.selected_by,
+    )
     cars = "" if trained.vehicles is None else f" of {number_of(trained.vehicles, 'car')}"
     drives = f"{number_of(trained.drives, 'drive')}{cars}, {number_of(trained.rows, 'row')}"
-    chosen = manifest.selected_by
     facts = {
         "correlation": f"{figures.correlation:.4f} (s.e. {figures.correlation_standard_error:.2g})",
         "RMSE": f"{figures.rmse_deg:.4f} deg",
@@ -206,8 +222,7 @@ def _print_version(version: ModelVersion) -> None:
         facts["learned from"] = _teacher(learned)
     if one := manifest.imported_from:
         facts["imported"] = f"from {one.reference} of another data root, sha256 {one.sha256}"
-    facts["sha256"] = version.sha256
-    print_table("", ["", ""], facts.items(), left=2)
+    return facts
 
 
 @record_run
