@@ -41,8 +41,12 @@ def print_json(content: Any) -> None:
     A dataclass is printed field by field, unless it has an `as_dict` that says otherwise. pydantic
     would write decimal numbers as texts, and every start would wait for it.
     """
-    text = json.dumps(_for_json(content), indent=2, default=str, allow_nan=False)
-    sys.stdout.write(text + "\n")
+    sys.stdout.write(json_text(content))
+
+
+def json_text(content: Any) -> str:
+    """Return a JSON document as `print_json` prints it."""
+    return json.dumps(_for_json(content), indent=2, default=str, allow_nan=False) + "\n"
 
 
 def _for_json(value: Any) -> Any:

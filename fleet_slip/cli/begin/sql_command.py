@@ -8,6 +8,7 @@ import shutil
 import sys
 from collections.abc import Iterator
 from enum import StrEnum
+from pathlib import Path
 from typing import Annotated
 
 import duckdb
@@ -18,11 +19,13 @@ from pyarrow.csv import write_csv
 
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.api.session import Session
-from fleet_slip.cli.output import Json, print_json, say
-from fleet_slip.errors import QuestionError
+from fleet_slip.cli.output import Json, json_text, print_json, say
+from fleet_slip.errors import QuestionError, StorageError, UsageError
 from fleet_slip.warehouse.database import limit_memory
+from fleet_slip.words import number_of
 
 ROWS_SHOWN = 40
+ENDLESS = 2**31 - 1
 FORMULA = "^[=+@\\t\\r\\n＝＋－＠-]"
 """What a text begins with that a spreadsheet executes."""
 
@@ -42,6 +45,16 @@ def sql(
             "formulas. Otherwise these are marked by an apostrophe.",
         ),
     ] = False,
+    output: Annotated[
+        Path | None,
+        typer.Option(help="Write to a file: .parquet, .csv or .json.", show_default=False),
+    ] = None,
+    limit: Annotated[
+        int | None, typer.Option(min=0, help="Take so many rows and no more.", show_default=False)
+    ] = None,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Print all rows and columns of a table, however wide.")
+    ] = False,
     unsafe: Annotated[
         bool,
         typer.Option(
@@ -54,7 +67,8 @@ def sql(
     """Query the warehouse: log (SI), log_counts, drives, grams, models, quarantine, dictionary.
 
     Every column is described in the view dictionary. A query can read the warehouse, and nothing
-    else. A table shows the columns that fit; name some to see others, or ask for --csv or --json.
+    else. A table shows what fits of columns and rows; --all shows all. --csv, --json and --output
+    give numbers to the last digit.
 
     Example: **fleet-slip sql "SELECT vehicle_id, count(*) AS drives FROM drives GROUP BY ALL"**
     """
@@ -67,7 +81,11 @@ def sql(
         limit_memory()
     opened = (fleet.unlocked_session if unsafe else fleet.session)(text)
     with opened as session:
-        answer(session, text, Form.JSON if json else Form.CSV if csv else Form.TABLE, exact=exact)
+        if output is not None:
+            _write(session, text, output, limit, exact)
+            return
+        form = Form.JSON if json else Form.CSV if csv else Form.TABLE
+        answer(session, text, form, exact=exact, limit=limit, everything=everything)
 
 
 class Form(StrEnum):
@@ -78,29 +96,66 @@ class Form(StrEnum):
     JSON = "json"
 
 
-def answer(session: Session, text: str, form: Form, *, exact: bool = False) -> None:
-    """Print the answer to a query; `exact` leaves texts of CSV as they are."""
+def answer(
+    session: Session,
+    text: str,
+    form: Form,
+    *,
+    exact: bool = False,
+    limit: int | None = None,
+    everything: bool = False,
+) -> None:
+    """Print the answer to a query, or `limit` rows; `exact` leaves texts of CSV as they are."""
     with _representation_errors():
         if form is Form.TABLE:
-            _show(session, text)
+            _show(session, text, limit, everything)
         elif form is Form.JSON:
-            print_json(session.table(text).to_pylist())
+            print_json(_rows(session, text, limit).to_pylist())
         else:
-            rows = session.table(text)
+            rows = _rows(session, text, limit)
             sys.stdout.flush()
             write_csv(rows if exact else _mark_formulas(rows), sys.stdout.buffer)
             sys.stdout.buffer.flush()
 
 
-def _show(session: Session, text: str) -> None:
+def _rows(session: Session, text: str, limit: int | None) -> pa.Table:
+    if limit is None:
+        return session.table(text)
+    return session.compute(text, lambda answer: answer.limit(limit).to_arrow_table())
+
+
+def _write(session: Session, text: str, file: Path, limit: int | None, exact: bool) -> None:
+    """Write an answer as the suffix says. Raises `UsageError` for another, and `StorageError`."""
+    if file.suffix not in {".parquet", ".csv", ".json"}:
+        raise UsageError(f"{file}: the suffix says the format: .parquet, .csv or .json.")
+    rows = _rows(session, text, limit)
+    try:
+        with _representation_errors():
+            if file.suffix == ".parquet":
+                import pyarrow.parquet as pq  # noqa: PLC0415 - takes a while
+
+                pq.write_table(rows, file)
+            elif file.suffix == ".csv":
+                write_csv(rows if exact else _mark_formulas(rows), file)
+            else:
+                file.write_text(json_text(rows.to_pylist()), "utf-8")
+    except OSError as error:
+        raise StorageError(f"{file}: {error.strerror or error}.") from None
+    say(f"{file}: {number_of(rows.num_rows, 'row')}, {file.stat().st_size:,} bytes")
+
+
+def _show(session: Session, text: str, limit: int | None, everything: bool) -> None:
     """Print what fits of an answer, and say what is left out and how to see it."""
-    width = shutil.get_terminal_size((160, 40)).columns
-    shown, empty = session.compute(text, lambda answer: _fitting(answer, width))
+    width = ENDLESS if everything else shutil.get_terminal_size((160, 40)).columns
+    rows = limit if limit is not None else ENDLESS if everything else ROWS_SHOWN
+    shown, empty = session.compute(
+        text, lambda answer: _fitting(answer if limit is None else answer.limit(limit), width, rows)
+    )
     typer.echo(shown)
     if found := _CUT.search(shown):
         left_out = [f"{int(found[1]) - int(found[2])} of {found[1]} columns do not fit"]
         left_out += [f"without a value: {', '.join(empty)}"] if empty else []
-        say(f"{'; '.join(left_out)}. Name those to see: SELECT …; all: --csv or --json")
+        say(f"{'; '.join(left_out)}. Name those to see: SELECT …; all: --all")
     elif empty:
         say(f"columns without a value in these rows are left out: {', '.join(empty)}")
 
@@ -108,9 +163,10 @@ def _show(session: Session, text: str) -> None:
 _CUT = re.compile(r"(\d+) columns \((\d+) shown\)")
 
 
-def _fitting(answer: duckdb.DuckDBPyRelation, width: int) -> tuple[str, list[str]]:
+def _fitting(answer: duckdb.DuckDBPyRelation, width: int, rows: int) -> tuple[str, list[str]]:
     """Return a table, and the columns that it is without: what has no value gives way to others."""
-    shown = _drawn(answer, width)
+    answer = _readable(answer)
+    shown = _drawn(answer, width, rows)
     if not _CUT.search(shown):
         return shown, []
     sample = answer.limit(ROWS_SHOWN).to_arrow_table()
@@ -119,12 +175,27 @@ def _fitting(answer: duckdb.DuckDBPyRelation, width: int) -> tuple[str, list[str
     if not empty or not kept or len(set(sample.column_names)) < len(sample.column_names):
         return shown, []
     names = ", ".join('"' + name.replace('"', '""') + '"' for name in kept)
-    return _drawn(answer.project(names), width), empty
+    return _drawn(answer.project(names), width, rows), empty
 
 
-def _drawn(answer: duckdb.DuckDBPyRelation, width: int) -> str:
+def _readable(answer: duckdb.DuckDBPyRelation) -> duckdb.DuckDBPyRelation:
+    """Return an answer whose numbers have 15 digits: 52.66, where binary has 52.660000000000004."""
+    if len(set(answer.columns)) < len(answer.columns):
+        return answer
+    quoted = {name: '"' + name.replace('"', '""') + '"' for name in answer.columns}
+    return answer.project(
+        ", ".join(
+            f"CAST(printf('%.15g', {quoted[name]}) AS DOUBLE) AS {quoted[name]}"
+            if kind == "DOUBLE"
+            else quoted[name]
+            for name, kind in zip(answer.columns, answer.types, strict=True)
+        )
+    )
+
+
+def _drawn(answer: duckdb.DuckDBPyRelation, width: int, rows: int) -> str:
     with contextlib.redirect_stdout(io.StringIO()) as drawn:
-        answer.show(max_rows=ROWS_SHOWN, max_width=width)
+        answer.show(max_rows=rows, max_width=width, max_col_width=width)
     return drawn.getvalue().rstrip("\n")
 
 

@@ -1,0 +1,63 @@
+"""Where the answer to a query goes: a table for people, whole or not, or a file."""
+
+import json
+from pathlib import Path
+
+import pyarrow.csv as pc
+import pyarrow.parquet as pq
+import pytest
+
+from tests.support.commands import RunCommand
+
+QUERY = "SELECT drive_id, rows, 52.660000000000004::DOUBLE AS exact FROM drives ORDER BY 1"
+
+
+def test_a_table_has_numbers_that_people_read_and_json_those_that_are_there(
+    run_command: RunCommand, smoke_root: Path
+) -> None:
+    table = run_command("sql", QUERY, root=smoke_root).stdout
+    assert "52.66 " in table
+    assert "52.6600" not in table
+    told = run_command("sql", QUERY, "--limit", "3", "--json", root=smoke_root).json
+    assert [row["exact"] for row in told] == [52.660000000000004] * 3
+    odd = run_command("sql", "SELECT 'nan'::DOUBLE a, NULL::DOUBLE b, 1e300 c", root=smoke_root)
+    assert {"nan", "NULL", "1e+300"} <= set(odd.stdout.replace("│", " ").split())
+
+
+def test_a_table_can_be_asked_for_whole(run_command: RunCommand, smoke_root: Path) -> None:
+    query = "SELECT i, repeat('x', 300) AS long FROM range(100) r(i)"
+    cut = run_command("sql", query, root=smoke_root).stdout
+    whole = run_command("sql", query, "--all", root=smoke_root).stdout
+    assert "x" * 300 not in cut
+    assert whole.count("x" * 300) == 100
+    two = run_command("sql", query, "--all", "--limit", "2", root=smoke_root).stdout
+    assert two.count("x" * 300) == 2
+
+
+@pytest.mark.parametrize("suffix", ["parquet", "csv", "json"])
+def test_an_answer_becomes_a_file(
+    run_command: RunCommand, smoke_root: Path, tmp_path: Path, suffix: str
+) -> None:
+    file = tmp_path / f"drives.{suffix}"
+    done = run_command("sql", QUERY, "--output", str(file), "--limit", "5", root=smoke_root)
+    assert done.exit_code == 0, done.stderr
+    assert "5 rows" in done.stderr
+    match suffix:
+        case "parquet":
+            rows = pq.read_table(file).to_pylist()
+        case "csv":
+            rows = pc.read_csv(file).to_pylist()
+        case _:
+            rows = json.loads(file.read_text("utf-8"))
+    assert len(rows) == 5
+    assert rows[0]["exact"] == 52.660000000000004
+
+
+def test_where_nothing_can_be_written_is_said(
+    run_command: RunCommand, smoke_root: Path, tmp_path: Path
+) -> None:
+    other = run_command("sql", QUERY, "--output", "drives.xlsx", root=smoke_root)
+    assert (other.exit_code, ".parquet, .csv or .json" in other.stderr) == (2, True)
+    file = tmp_path / "missing" / "drives.csv"
+    absent = run_command("sql", QUERY, "--output", str(file), root=smoke_root)
+    assert (absent.exit_code, "No such file" in absent.stderr) == (6, True)
