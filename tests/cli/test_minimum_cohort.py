@@ -144,6 +144,7 @@ CALLS: dict[str, Callable[[Fleet], Any]] = {
     "unlocked_session": lambda fleet: fleet.unlocked_session(),
     "run": lambda fleet: fleet.run("smoke", models="table1"),
     "publish": lambda fleet: fleet.publish("other", fleet.cohort()),
+    "would_publish": lambda fleet: fleet.would_publish("other", fleet.cohort()),
     "score": lambda fleet: fleet.score("smoke"),
     "evaluate": lambda fleet: fleet.evaluate("smoke", scenarios=["nominal"]),
     "evaluate_blind": lambda fleet: fleet.evaluate_blind("smoke"),
