@@ -19,6 +19,9 @@ os.environ["FLEET_SLIP_LOG"] = "text"  # a test reads what a person would
 # A shell ignores interrupts for what it starts in the background, and so would all that is started.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# No test cuts the power, and the disk takes longer than the rest of a commit. What is no file fails.
+os.fsync = os.fstat  # type: ignore[assignment]
+
 # The same examples in every run, half as many as usual, and none that fails because the machine is
 # busy. The option --hypothesis-profile=search looks for new ones.
 settings.register_profile("search", deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -14,7 +14,7 @@ from fleet_slip.models.aliases import CHAMPION, AliasHistory
 from fleet_slip.models.versions import Registry
 from tests.support.commands import PATIENCE_S
 from tests.support.manifests import manifest, publish
-from tests.support.processes import SPAWN, call_at_once
+from tests.support.processes import PROCESSES, call_at_once
 
 
 def test_versions_are_consecutive_and_the_latest_published_is_champion(tmp_path: Path) -> None:
@@ -111,7 +111,7 @@ def _publish_the_same(path: Path, logs_version: int, barrier: Any) -> None:
 
 
 def test_writers_at_once_publish_the_same_estimator_once(tmp_path: Path) -> None:
-    barrier = SPAWN.Barrier(3, timeout=PATIENCE_S)
+    barrier = PROCESSES.Barrier(3, timeout=PATIENCE_S)
     call_at_once(_publish_the_same, [(tmp_path, version, barrier) for version in range(3)])
     registry = Registry(LocalFolder(tmp_path))
     for model in range(20):

@@ -6,12 +6,13 @@ from typing import Any
 
 from tests.support.commands import PATIENCE_S
 
-SPAWN = multiprocessing.get_context("spawn")
+PROCESSES = multiprocessing.get_context("forkserver")
+PROCESSES.set_forkserver_preload(["fleet_slip.api.fleet"])  # once, for all that are forked
 
 
 def call_at_once(function: Callable[..., object], arguments: Iterable[tuple[Any, ...]]) -> None:
     """Call a function with each of the arguments; an `AssertionError` if one fails or hangs."""
-    processes = [SPAWN.Process(target=function, args=one, daemon=True) for one in arguments]
+    processes = [PROCESSES.Process(target=function, args=one, daemon=True) for one in arguments]
     for process in processes:
         process.start()
     for process in processes:
