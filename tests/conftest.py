@@ -19,7 +19,7 @@ os.environ["FLEET_SLIP_LOG"] = "text"  # a test reads what a person would
 # A shell ignores interrupts for what it starts in the background, and so would all that is started.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# No test cuts the power, and the disk takes longer than the rest of a commit. What is no file fails.
+# No test cuts the power, and to wait for the disk takes as long as the rest of a commit.
 os.fsync = os.fstat  # type: ignore[assignment]
 
 # The same examples in every run, half as many as usual, and none that fails because the machine is
