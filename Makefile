@@ -37,11 +37,11 @@ gated: run
 	  AND (campaign = 'waterford' OR campaign = 'proving_ground' AND vehicle_model = 'd_class_sedan')"
 
 test: lint
-	$(BIN)/pytest -n 2
+	$(BIN)/pytest -n 2 --dist worksteal
 
 test-all: $(VENV)/.dev-installed
 	-PATH="$(abspath $(BIN)):$$PATH" tests/tools/install
-	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/pytest -n 2 -rs --tools
+	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/pytest -n 2 --dist worksteal -rs --tools
 
 lint: $(VENV)/.dev-installed
 	$(BIN)/ruff check .

@@ -167,7 +167,7 @@ FOLDINGS = st.builds(
 )
 
 
-@settings(max_examples=60)
+@settings(max_examples=20)
 @given(folding=FOLDINGS, condition=CONDITIONS)
 def test_any_cohort_over_any_folds_is_the_same_with_rollups_and_without(
     mixed: Warehouse, folding: Folding, condition: str
