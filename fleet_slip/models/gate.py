@@ -1,10 +1,11 @@
 """What a model must be before it becomes champion: above a floor, and no worse than the champion.
 
-Both are asked of rows that the challenger was not fitted on. The champion is what cars have: its
-own coefficients, not its signals fitted anew. It is compared on the same held-out drives, so that
-the error that counts is that of the difference, over what is independent in the data: cars where
-there are several, else drives. And so that many small steps do not lead downhill, the best of the
-champions so far is compared as well.
+Both are asked of rows that the challenger was not fitted on, and on which its columns were not
+chosen: a search is made again without them, for as many columns. The champion is what cars have:
+its own coefficients, not its signals fitted anew. It is compared on the same held-out drives, so
+that the error that counts is that of the difference, over what is independent in the data: cars
+where there are several, else drives. And so that many small steps do not lead downhill, the best of
+the champions so far is compared as well.
 
 Rows do not decide alone: a car that sends its rows may say that they are many. Where cars are held
 out, the median group of them must not be worse off either, each group having one vote.
@@ -38,6 +39,7 @@ from fleet_slip.regression.validation.crossval import (
 )
 from fleet_slip.regression.validation.folds import Folds
 from fleet_slip.resources import config_file
+from fleet_slip.selection.search import searching
 from fleet_slip.selection.select_models import Selection
 from fleet_slip.words import number_of
 
@@ -72,7 +74,8 @@ class Comparison:
 
     Attributes:
         by: what was held out, vehicle or drive.
-        challenger: fitted to all groups but the one that it is tested on.
+        challenger: fitted to all groups but the one that it is tested on, its columns searched for
+            there if a search found them.
         incumbents: the champion, and the best of the champions so far if that is another one.
         shortfalls: of the challenger, from each of them, over all rows.
         typical: the same in the median group, where cars are held out.
@@ -132,7 +135,9 @@ def compare(selection: Selection[Any], incumbents: Sequence[ModelVersion]) -> Co
     """
     for version in incumbents:
         _require_same_features(version)
-    label, inputs = catalogue().label, selection.winner.model.signals
+    label, winner, found = catalogue().label, selection.winner.model, selection.searched
+    searched = found is not None and winner in found.models
+    inputs = found.inputs if found is not None and searched else winner.signals
     feature_set = selection.cohort.feature_set
     models = [counts_model(version.manifest, feature_set) for version in incumbents]
     every = (name for model in models for name in model.signals)
@@ -140,8 +145,12 @@ def compare(selection: Selection[Any], incumbents: Sequence[ModelVersion]) -> Co
     cars = selection.cohort.members.count_vehicles_with((*signals, label))
     by: FoldKey = "vehicle" if cars >= LEAST_VEHICLES else "drive"
     groups = selection.cohort.folds(by, GROUPS).serving(signals, label, sparse=True)
-    procedure = least_squares(inputs, label, intercept=selection.intercept)
-    challenger = cross_validate(selection.winner.model.name, groups, procedure, input_scales())
+    intercept = selection.intercept
+    if found is not None and searched:
+        procedure = searching(found, len(winner.signals), intercept=intercept)
+    else:
+        procedure = least_squares(inputs, label, intercept=intercept)
+    challenger = cross_validate(winner.name, groups, procedure, input_scales())
     others = tuple(
         _as_it_is(version.reference, model, groups)
         for version, model in zip(incumbents, models, strict=True)

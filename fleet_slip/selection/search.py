@@ -31,10 +31,15 @@ from fleet_slip.regression.choice.subsets import SizeResult, best_subsets, pick_
 from fleet_slip.regression.choice.winner import DEFAULT_WORTH, Winner, Worth, choose
 from fleet_slip.regression.exact.figures import ErrorSums
 from fleet_slip.regression.exact.gram import Gram
-from fleet_slip.regression.exact.least_squares import Fit, fit
+from fleet_slip.regression.exact.least_squares import Fit, LinearModel, fit
 from fleet_slip.regression.inference.drive_moments import ClusterUnit
 from fleet_slip.regression.inference.evidence import Evidence
-from fleet_slip.regression.validation.crossval import CrossValidation, assemble, held_out_errors
+from fleet_slip.regression.validation.crossval import (
+    CrossValidation,
+    Procedure,
+    assemble,
+    held_out_errors,
+)
 from fleet_slip.regression.validation.folds import Folds
 from fleet_slip.selection.model_list import Search
 from fleet_slip.warehouse.minimum_cohort import tells_single_cars
@@ -202,17 +207,17 @@ class SearchedModels:
 
     Attributes:
         search: how it was searched.
-        inputs: how many inputs there were to choose among.
+        inputs: those that there were to choose among.
         models: of sizes 1, 2, ...
     """
 
     search: Search
-    inputs: int
+    inputs: tuple[str, ...]
     models: tuple[CrossValidation, ...]
 
     def as_dict(self) -> dict[str, Any]:
         """Return what a JSON document needs."""
-        return {**self.search.model_dump(), "inputs": self.inputs, "sizes": len(self.models)}
+        return {**self.search.model_dump(), "inputs": len(self.inputs), "sizes": len(self.models)}
 
 
 def search_models(
@@ -245,7 +250,21 @@ def search_models(
     )
     if not models:
         raise DataError("every input is constant or depends on others: there is nothing to choose.")
-    return SearchedModels(search, len(inputs), models)
+    return SearchedModels(search, tuple(inputs), models)
+
+
+def searching(found: SearchedModels, size: int, *, intercept: bool = True) -> Procedure:
+    """Return the procedure that searches again, in the rows that it is given, for so many columns.
+
+    It takes the largest set below where those rows allow no more.
+    """
+
+    def procedure(gram: Gram) -> LinearModel:
+        seen, label = gram if intercept else gram.about_origin(), catalogue().label
+        sets = stepwise_order(seen, found.inputs, label, found.search.method, size)
+        return fit(seen, sets[-1] if sets else (), label).model
+
+    return procedure
 
 
 def _model(folds: Folds, sums: Sequence[ErrorSums], fitted: Fit, search: Search) -> CrossValidation:

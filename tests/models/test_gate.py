@@ -1,12 +1,15 @@
 """What may become champion: above the floor, no worse than the champion itself, and by people."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from fleet_slip.catalogue.features import input_scales
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import ConfigError, RefusedError
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.rows.gram_job import update_grams
@@ -18,6 +21,13 @@ from fleet_slip.models.counts_model import counts_model
 from fleet_slip.models.diff import compare_versions
 from fleet_slip.models.publish import Publication, manifest_of, publish
 from fleet_slip.models.versions import Registry
+from fleet_slip.regression.choice.stepwise import stepwise_order
+from fleet_slip.regression.exact.least_squares import fit
+from fleet_slip.regression.validation.crossval import (
+    cross_validate,
+    held_out_errors,
+    least_squares,
+)
 from fleet_slip.resources import CONFIG_VARIABLE
 from fleet_slip.selection.answer_request import answer_request
 from fleet_slip.selection.request import SelectionRequest
@@ -27,8 +37,14 @@ from tests.support.logs import land, log_rows
 
 ROWS = 200
 
+LABEL = catalogue().label
+
 WEAK = ("ax", "steering_wheel", "steer_fl")
 """Signals of which each is 0.023 deg of the label, which is not worth refusing."""
+
+
+CHOICE = ("ay", "yaw_rate", "wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")
+"""Two signals that say something, and four that do not."""
 
 
 def counts(rng: np.random.Generator, label: float = 1.0, noise: float = 20.0) -> dict[str, Any]:
@@ -36,7 +52,8 @@ def counts(rng: np.random.Generator, label: float = 1.0, noise: float = 20.0) ->
     ay, yaw_rate, *weak = rng.normal(0, 1000, (2 + len(WEAK), ROWS))
     true = 0.3 * ay + 0.2 * yaw_rate + 0.004 * sum(weak)
     sideslip = label * true + rng.normal(0, noise, ROWS)
-    found = {"ay": ay, "yaw_rate": yaw_rate, **dict(zip(WEAK, weak, strict=True))}
+    found: dict[str, Any] = {"ay": ay, "yaw_rate": yaw_rate, **dict(zip(WEAK, weak, strict=True))}
+    found |= dict(zip(CHOICE[2:], rng.normal(0, 1000, (4, ROWS)), strict=True))
     found["sideslip"] = sideslip
     return {name: np.rint(values).astype(np.int16) for name, values in found.items()}
 
@@ -114,6 +131,25 @@ def test_the_champion_is_compared_as_it_is_not_fitted_anew(champion: Warehouse) 
     (as_it_is,) = comparison.incumbents
     assert as_it_is.counts.coefficients == counts_model(version.manifest).coefficients
     assert as_it_is.pooled.rows == comparison.challenger.pooled.rows == 48 * ROWS
+
+
+def test_a_search_is_made_again_without_the_cars_that_are_held_out(champion: Warehouse) -> None:
+    """Columns chosen with the held-out cars in view would flatter the challenger."""
+    version = registry_of(champion).load("beta", 1)
+    request = SelectionRequest(nested=",".join(CHOICE), search="forward", most=4)
+    answer = answer_request(champion, request)
+    winner = next(model for model in answer.models if len(model.signals) == 4)
+    answer = replace(answer, winner=replace(answer.winner, model=winner))
+    found = gate.compare(answer, [version]).challenger
+    groups = answer.cohort.folds("vehicle", gate.GROUPS).serving(CHOICE, LABEL, sparse=True)
+    assert found.fold_names == groups.names
+    for figures, (training, test) in zip(found.folds, groups.splits(), strict=True):
+        sets = stepwise_order(training, CHOICE, LABEL, "forward", len(winner.signals))
+        model = fit(training, sets[-1], LABEL).model
+        scale = input_scales()[LABEL]
+        assert figures.rmse == held_out_errors(model, training, test).figures(scale).rmse
+    fixed = cross_validate("fixed", groups, least_squares(winner.signals, LABEL), input_scales())
+    assert found.pooled.rmse > fixed.pooled.rmse
 
 
 @pytest.mark.parametrize(("cars", "by", "groups"), [(8, "vehicle", 8), (4, "drive", 18)])

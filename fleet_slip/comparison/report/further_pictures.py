@@ -235,7 +235,8 @@ def _by_columns(data: ReportData, memory: Memory) -> Picture:
     found = memory.searched
     caption = (
         f"Models of 1 to {len(found.models)} columns that a search by {found.search.method} finds "
-        f"among {found.inputs} inputs on the training drives alone; the test drives only judge. "
+        f"among {len(found.inputs)} inputs on the training drives alone; "
+        "the test drives only judge. "
         f"{_smallest(memory, filter_deg)} Cross-validated errors have the noise of the training "
         "drives' labels in them, test drives have none."
     )
