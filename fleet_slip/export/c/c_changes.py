@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from itertools import accumulate
 
 from fleet_slip.catalogue.course_change import (
+    BESIDE,
     COARSER,
     COURSE,
     LATE_PARTS,
@@ -136,7 +137,7 @@ def _changes(prefix: str, changed: Changed, track: int) -> str:
     numbers = {
         "CHANGED": f"{len(changed)}U",
         "MOST_TIMES": f"{most_times}U",
-        "MOST_COLUMNS": f"{max(len(one.columns) for _, one in changed)}U",
+        "MOST_COLUMNS": f"{max(len(one.computed) for _, one in changed) + len(BESIDE) + 1}U",
         "TRACK": f"{track}U",
         "TURN": f"INT64_C({units.turn})",
         "COURSE_COUNTS": f"INT64_C({2 * HALF_TURN})",

@@ -84,7 +84,7 @@ def _comments(sets: Sequence[OnBoard]) -> list[str]:
 def _counted(
     sets: Sequence[OnBoard], parts: Sequence[int], sizes: Sequence[int]
 ) -> list[list[str]]:
-    """Return the table of sets: columns, parts, where both begin, most rows, and definition."""
+    """Return the table of sets, a field of `counted_set` each."""
     numbers = [part * size for part, size in zip(parts, sizes, strict=True)]
     firsts = zip(accumulate(parts, initial=0), accumulate(numbers, initial=0), strict=True)
     return [
@@ -95,6 +95,7 @@ def _counted(
             f"{first_number}U",
             f"{most_rows(one.ranges)}U",
             f"0x{one.of.definition:016X}ULL",
+            "true" if one.complete else "false",
         ]
         for one, part, (first_part, first_number) in zip(sets, parts, firsts, strict=False)
     ]

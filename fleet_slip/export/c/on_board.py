@@ -20,15 +20,24 @@ from fleet_slip.errors import RefusedError
 from fleet_slip.export.program import Input, Steps
 from fleet_slip.grams.received.counted_sets import CountedSet, Range, counted_by_identity
 from fleet_slip.grams.received.messages import MOST_SIGNALS
+from fleet_slip.grams.rows.receiver_delay import delay_columns
 from fleet_slip.models.manifest import Manifest
+from fleet_slip.words import number_of
 
 
 @dataclass(frozen=True)
 class OnBoard:
-    """A feature set as a car counts it: its columns, or those that a model needs."""
+    """A feature set as a car counts it.
+
+    Attributes:
+        of: the set.
+        columns: of it that are counted.
+        complete: whether rows that lack some of these, and tell nothing then, are left out.
+    """
 
     of: CountedSet
     columns: tuple[str, ...]
+    complete: bool = False
 
     @property
     def computed(self) -> tuple[str, ...]:
@@ -64,23 +73,30 @@ def sets_on_board(manifest: Manifest) -> tuple[OnBoard, ...]:
     wanted = {known[one].of if one in known else one for one in manifest.signals}
     wanted |= {*COLUMNS, *BESIDE, catalogue().label}
     columns = tuple(column for column in counted.columns if column in wanted)
-    told = [one for one in columns if one in features().time_columns]
-    told = [
-        one for one in told if any(p.fact for p in features().time_columns[one].definition.parts)
+    over_time = [name for name in columns if name in features().time_columns]
+    unknown = [
+        name
+        for name in over_time
+        if any(part.fact for part in features().time_columns[name].definition.parts)
     ]
-    if told or len(columns) > MOST_SIGNALS:
-        why = f"{', '.join(told)}: of what a car knows of itself" if told else f"{len(columns)}"
+    if unknown or len(columns) > MOST_SIGNALS:
+        has = unknown[0] if unknown else number_of(len(columns), "column")
         raise RefusedError(
-            f"cars count up to {MOST_SIGNALS} columns of a feature set, and none of what a car "
-            f"knows of itself; {manifest.name} has {why}. Export it without --with-gram."
+            f"{manifest.name} has {has}: cars count up to {MOST_SIGNALS} columns of a feature set, "
+            "and none of what a car knows of itself. Export it without --with-gram."
         )
-    others = [one for one in (DELAY, CALIBRATION) if one in features().sets]
-    return (plain, OnBoard(counted, columns), *map(_whole, others))
+    delay = _counted(DELAY)
+    telling = tuple(column for column in delay.columns if column in delay_columns())
+    told = OnBoard(delay, telling, complete=True)
+    return (plain, OnBoard(counted, columns), told, _whole(CALIBRATION))
 
 
 def _whole(name: str) -> OnBoard:
-    counted = counted_by_identity()[features().identity(name)]
-    return OnBoard(counted, counted.columns)
+    return OnBoard(_counted(name), _counted(name).columns)
+
+
+def _counted(name: str) -> CountedSet:
+    return counted_by_identity()[features().identity(name)]
 
 
 def lower(sets: Sequence[OnBoard]) -> tuple[Steps, Mapping[str, int]]:

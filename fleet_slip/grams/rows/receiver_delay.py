@@ -70,8 +70,8 @@ class ChangedDelay:
     drives: tuple[str, ...]
 
 
-def _columns() -> tuple[str, ...]:
-    """Return the columns of the Gram rows: both speeds, then the sums of the acceleration."""
+def delay_columns() -> tuple[str, ...]:
+    """Return the columns of Gram rows that tell a delay: speeds, then sums of acceleration."""
     lags = range(0, STEP * STEPS + 1, STEP)
     ticks = sorted({*lags[1:], *(SPAN + lag for lag in lags)})
     return (*SPEEDS, *(f"ax_sum_{n}" for n in ticks))
@@ -79,7 +79,7 @@ def _columns() -> tuple[str, ...]:
 
 def _weights() -> FloatArray:
     """Return what the change of speed, and its integrals that are late, are of the columns."""
-    columns = _columns()
+    columns = delay_columns()
     weights = np.zeros((2 + STEPS, len(columns)))
     weights[0, :2] = 1, -1
     for late in range(STEPS + 1):
@@ -130,7 +130,7 @@ def _by_car(
     rows_of_delay: Iterable[pa.RecordBatch],
 ) -> dict[str, tuple[dict[tuple[str, str], FloatArray], int]]:
     """Return the products of each car's drives about their means, by day and name, and its rows."""
-    columns = _columns()
+    columns = delay_columns()
     found: dict[str, tuple[dict[tuple[str, str], FloatArray], int]] = {}
     for batch in rows_of_delay:
         for names, some, _ in by_signals(batch.filter(batch["vehicle_id"].is_valid())):

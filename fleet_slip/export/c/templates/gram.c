@@ -14,6 +14,7 @@ typedef struct {
     uint32_t first_number;
     uint32_t most_rows;
     uint64_t definition;
+    bool complete; /* rows that lack some columns are not counted */
 } counted_set;
 
 static const counted_set counted[SETS] = {
@@ -32,14 +33,19 @@ static void count_row(${prefix}_gram *gram, uint32_t set, uint32_t over, int32_t
 {
     const counted_set *const of = &counted[set];
     uint32_t mask = 0U;
+    uint32_t lacking = 0U;
     for (uint32_t i = 0U; i < of->columns; i++) {
         if (row[i] == MISSING) {
             row[i] = 0; /* adds nothing */
+            lacking++;
         } else {
             mask |= ((uint32_t)1U << i);
         }
     }
     uint32_t found = 0U;
+    if (of->complete && (lacking > 0U) && (lacking < of->columns)) {
+        return;
+    }
     while ((found < gram->used[set]) && ((gram->parts[of->first_part + found].mask != mask) ||
                                          (gram->parts[of->first_part + found].over != over))) {
         found++;
