@@ -20,6 +20,8 @@ from functools import partial
 from threading import Event, Thread
 from typing import Any, TypeVar
 
+import dask
+from dask.utils import parse_timedelta
 from distributed import Client
 from distributed.client import ClosedClientError
 from distributed.comm.addressing import resolve_address
@@ -48,6 +50,9 @@ PATIENCE_S = 120.0
 """How long a cluster may be without workers: so long may a container take to start."""
 
 CONNECT_ATTEMPTS = 5
+FIRST_S = 10.0
+"""How long a scheduler may take to answer at first; later, as long as Dask's own settings allow."""
+
 ANSWER_S = 20.0
 CLOSE_S = 5.0
 MARKER_FOLDER = ".cluster"
@@ -62,8 +67,8 @@ def cluster_executor(address: str, root: Folder) -> Iterator["ClusterExecutor"]:
     """Connect to the Dask scheduler at an address, such as `tcp://10.0.0.1:8786`.
 
     `root` is the data root that the workers must see too. Raises `ClusterError` if there is no
-    scheduler within the time that Dask's own settings allow, 30 s by default, and `RefusedError` if
-    the cluster has other versions.
+    scheduler within 10 s, or less where Dask's own settings say so, and `RefusedError` if the
+    cluster has other versions.
     """
     _route_logs()
     try:
@@ -118,7 +123,9 @@ async def _versions(address: str) -> dict[str, Any]:
 
     By a client of its own: one that cannot connect leaves a thread behind unless it is a coroutine.
     """
-    async with Client(address, asynchronous=True, set_as_default=False) as client:
+    usual_s = float(parse_timedelta(dask.config.get("distributed.comm.timeouts.connect")))
+    first_s = min(FIRST_S, usual_s)
+    async with Client(address, asynchronous=True, set_as_default=False, timeout=first_s) as client:
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(ANSWER_S):
                 found: Any = await client.get_versions(packages=PACKAGES)

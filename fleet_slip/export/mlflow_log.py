@@ -5,11 +5,16 @@ MLflow and pandas are the extra `fleet-slip[mlflow]`; they are imported when the
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from http.client import HTTPException
 from importlib.metadata import version as package_version
 from pathlib import Path
+from ssl import SSLError
 from tempfile import TemporaryDirectory
+from textwrap import shorten
 from typing import Any
+from urllib.error import HTTPError
 from urllib.parse import urlsplit
+from urllib.request import urlopen
 
 from fleet_slip.errors import ConfigError, StorageError, UsageError
 from fleet_slip.export.checks import Check
@@ -20,6 +25,8 @@ from fleet_slip.models.model_version import ModelVersion
 LOADER = "fleet_slip.export.mlflow_model"
 DOCUMENT = "estimator.json"
 EXAMPLE_ROWS = 50
+ANSWER_S = 10.0
+"""So long a server may take to say that it is there."""
 SHA256_TAG = "fleet_slip.sha256"
 
 _TEXTS = ("vehicle_id", "vehicle_model", "campaign", "track", "source")
@@ -43,15 +50,44 @@ def log_to_mlflow(
             "MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD instead."
         )
     mlflow = _library()
+    require_answer(uri, version.reference)
     try:
         with _tracking(mlflow, uri), TemporaryDirectory() as folder:
             found = _registered(mlflow, version)
             return found or _log(mlflow, version, program, checks, document, Path(folder))
     except mlflow.exceptions.MlflowException as error:
-        raise StorageError(
-            f"{version.reference} is published here, but MLflow did not take it: "
-            f"{str(error)[:300]} Publish it again when the server answers."
+        told = shorten(str(error), 300, placeholder=" …")
+        raise _not_taken(version.reference, told) from None
+
+
+def require_answer(uri: str, reference: str, patience_s: float = ANSWER_S) -> None:
+    """Raise `StorageError` if no server answers at a URI of HTTP, whatever its answer.
+
+    MLflow itself asks again for minutes. What is wrong with a certificate is left to it, since it
+    may know another authority.
+    """
+    if urlsplit(uri).scheme not in {"http", "https"}:
+        return
+    try:
+        with urlopen(f"{uri.rstrip('/')}/health", timeout=patience_s):  # noqa: S310 - see above
+            return
+    except HTTPError:
+        return
+    except (OSError, HTTPException) as error:  # URLError among them
+        reason = getattr(error, "reason", error)
+        if isinstance(reason, SSLError):
+            return
+        told = "no answer" if isinstance(reason, TimeoutError) else str(reason)
+        raise _not_taken(
+            reference, f"nothing answers at {uri} within {patience_s:g} s ({told})."
         ) from None
+
+
+def _not_taken(reference: str, why: str) -> StorageError:
+    return StorageError(
+        f"{reference} is published here, but MLflow did not take it: {why} Publish it again when "
+        "the server answers."
+    )
 
 
 def _library() -> Any:

@@ -17,7 +17,8 @@ from typing import Any
 import pytest
 
 import fleet_slip
-from fleet_slip.errors import ConfigError
+from fleet_slip.errors import ConfigError, StorageError
+from fleet_slip.export.mlflow_log import require_answer
 
 START_S = 120
 
@@ -116,8 +117,7 @@ def test_a_server_that_does_not_answer_is_said(smoke_root: Path, tmp_path: Path)
     root = tmp_path / "data"
     shutil.copytree(smoke_root, root)
     publish = [folder_of_mlflow() / "fleet-slip", "--root", root, "publish", "logged", "--mlflow"]
-    environment = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "0"}
-    done = run(*publish, "http://127.0.0.1:9", code=6, more=environment)
+    done = run(*publish, "http://127.0.0.1:9", code=6)
     assert "logged@1 is published here, but MLflow did not take it" in done.stderr
     done = run(*publish, "http://me:secret@127.0.0.1:9", code=2)
     assert "has a name or password in it" in done.stderr
@@ -146,3 +146,19 @@ def test_without_the_library_the_extra_is_named(
     fleet = fleet_slip.open(smoke_root)
     with pytest.raises(ConfigError, match=r"mlflow. Run: pip install 'fleet-slip\[mlflow\]'"):
         fleet.log_to_mlflow("smoke", "http://127.0.0.1:9")
+
+
+@pytest.mark.parametrize("listening", [True, False])
+def test_a_server_that_says_nothing_is_not_waited_for(listening: bool) -> None:
+    with socket.socket() as silent:
+        silent.bind(("127.0.0.1", 0))
+        if listening:
+            silent.listen()
+        uri = f"http://127.0.0.1:{silent.getsockname()[1]}"
+        told = f"ours@1 is published here, but MLflow did not take it: nothing answers at {uri}"
+        with pytest.raises(StorageError, match=told):
+            require_answer(uri, "ours@1", 0.2)
+
+
+def test_a_store_that_is_no_server_is_not_asked() -> None:
+    require_answer("sqlite:///mlflow.db", "ours@1")
