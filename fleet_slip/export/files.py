@@ -17,6 +17,7 @@ from fleet_slip.export.dbc import dbc_text
 from fleet_slip.export.document import document_of, manifest_of
 from fleet_slip.export.fmu import fmu
 from fleet_slip.export.program import Program
+from fleet_slip.export.read_me import read_me
 from fleet_slip.export.sql_source import sql_macro, sql_statement
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.trained_drives import read_drives_file
@@ -64,9 +65,12 @@ def export_files(
         for name, content in _WRITERS[to](subject).items()
     }
     if to != "json":  # that says all of it itself
-        manifest = manifest_of(version, subject.program, to, files)
         prefix = c_prefix(version) if to == "c" else file_prefix(version)
-        files[f"{prefix}_manifest.json"] = render(manifest).encode("utf-8")
+        last = f"{prefix}_manifest.json"
+        page = read_me(version, subject.program, to, prefix, [*files, last])
+        files[f"{prefix}_README.md"] = page.encode("utf-8")
+        manifest = manifest_of(version, subject.program, to, files)
+        files[last] = render(manifest).encode("utf-8")
     return files
 
 

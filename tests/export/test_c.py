@@ -1,5 +1,7 @@
 """Exported C, compiled without a warning and run under sanitizers, computes what `score` does."""
 
+import re
+import shutil
 import subprocess
 from fractions import Fraction
 from pathlib import Path
@@ -17,6 +19,7 @@ from fleet_slip.grams.rows.drive_rows import read_drives
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.predictor import Predictor
 from tests.export.compiled import (
+    DEADLINE_S,
     SANITIZED,
     build_driver,
     can_sanitize,
@@ -116,7 +119,7 @@ def samples_of(program: Program, drive: DriveCounts) -> list[Sample]:
 def test_the_self_test_passes_and_notices_another_angle(smoke_root: Path, tmp_path: Path) -> None:
     fleet = fleet_slip.open(smoke_root)
     files = export_texts(fleet.model("smoke"), fleet.warehouse, "c")
-    ends = (".h", ".c", "_test.c", "_fuzz.c", "_manifest.json")
+    ends = (".h", ".c", "_test.c", "_fuzz.c", "_README.md", "_manifest.json")
     assert list(files) == [f"sideslip_smoke{end}" for end in ends]
     for name, text in files.items():
         (tmp_path / name).write_text(text)
@@ -129,6 +132,49 @@ def test_the_self_test_passes_and_notices_another_angle(smoke_root: Path, tmp_pa
     code, printed = result_of(compile_c(tmp_path, sources))
     assert code == 1
     assert "0 of 900" not in printed.removeprefix("smoke@1: 900")
+
+
+@pytest.mark.skipif(shutil.which("c++") is None, reason="needs a C++ compiler, c++")
+def test_a_program_in_cpp_takes_the_header(smoke_root: Path, tmp_path: Path) -> None:
+    fleet = fleet_slip.open(smoke_root)
+    for name, text in export_texts(fleet.model("smoke"), fleet.warehouse, "c").items():
+        (tmp_path / name).write_text(text)
+    (tmp_path / "main.cpp").write_text("""
+        #include "sideslip_smoke.h"
+        int main() {
+            sideslip_smoke_state state;
+            sideslip_smoke_sample sample = {};
+            int32_t angle = 0;
+            sideslip_smoke_start(&state);
+            bool there = sideslip_smoke_step(&state, &sample, &angle);
+            return there && angle * SIDESLIP_SMOKE_ANGLE_SCALE > 1.0;
+        }
+    """)
+    strict = ["-Wall", "-Wextra", "-pedantic", "-Werror"]
+    for words in (
+        ["cc", "-std=c99", *strict, "-c", "sideslip_smoke.c", "-o", "smoke.o"],
+        ["c++", "-std=c++14", *strict, "main.cpp", "smoke.o", "-o", "main"],
+        ["./main"],
+    ):
+        subprocess.run(words, cwd=tmp_path, check=True, timeout=DEADLINE_S)
+
+
+def test_names_of_scales_differ_where_c_looks() -> None:
+    manifest = model_of({"wheel_fl": SMALL, "wheel_fr": SMALL}, name="m" * 15)
+    text = export_texts(ModelVersion(1, manifest, "0" * 64), None, "c")
+    (header,) = [content for name, content in text.items() if name.endswith(".h")]
+    names = re.findall(r"#define (\w+) ", header)
+    assert len({name[:31] for name in names}) == len(names) > 6
+
+
+def test_the_page_beside_them_tells_inputs_and_files(smoke_root: Path) -> None:
+    fleet = fleet_slip.open(smoke_root)
+    for to in ("c", "sql", "dbc"):
+        files = export_texts(fleet.model("smoke"), fleet.warehouse, to)
+        page = files["sideslip_smoke_README.md"]
+        assert all(f"| `{name}` | " in page for name in files if not name.endswith(".md"))
+        assert "| `ay` | m/s^2 | 0.001 | -30000 to 30000 |" in page
+        assert "every 0.01 s" in page
 
 
 def result_of(program: Path) -> tuple[int, str]:

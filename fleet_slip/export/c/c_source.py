@@ -3,9 +3,11 @@
 import re
 from collections.abc import Sequence
 
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 from fleet_slip.export.c.c_names import (
     INDENT,
     c_prefix,
+    different,
     field_names,
     integer_type,
     literal,
@@ -14,8 +16,10 @@ from fleet_slip.export.c.c_names import (
 )
 from fleet_slip.export.c.c_steps import StepWriter, ring_width, state_fields, sum_key
 from fleet_slip.export.program import Program, Steps
+from fleet_slip.export.read_me import AXES
 from fleet_slip.models.model_version import ModelVersion
 
+LONGEST_NAME = 31
 _HELPER = re.compile(r"^//: (\w+)\n", re.MULTILINE)
 """What stands before each function in `helpers.c`: what writes it, if it was done."""
 
@@ -27,9 +31,11 @@ def c_header(version: ModelVersion, program: Program) -> str:
     parts = [
         _preamble(version, program),
         f"#ifndef {upper}_H\n#define {upper}_H\n\n#include <stdbool.h>\n#include <stdint.h>\n",
+        '#ifdef __cplusplus\nextern "C" {\n#endif\n',
         f'#define {upper}_MODEL "{version.reference}"\n'
         f'#define {upper}_SHA256 "{version.sha256}"\n'
         f'#define {upper}_DRIVES_SHA256 "{version.manifest.trained_on.drives_sha256 or ""}"\n',
+        f"/* Axes: {AXES}. */\n" + "\n".join(_scales(upper, program)),
         "/* A count that is missing; one beyond its range is, too. */\n"
         f"#define {upper}_MISSING INT16_MIN\n",
         _struct(
@@ -46,9 +52,30 @@ def c_header(version: ModelVersion, program: Program) -> str:
             *parts,
             _struct("What is kept from tick to tick.", _state(program), prefix, "state"),
             _functions(prefix, program),
+            "#ifdef __cplusplus\n}\n#endif\n",
             "#endif\n",
         ]
     )
+
+
+def _scales(upper: str, program: Program) -> list[str]:
+    """Return macros of the tick and of what a count is worth, which the source does not use.
+
+    Names differ in their first 31 characters (MISRA C:2012, rule 5.4).
+    """
+    names = [f"{upper}_{one.name.upper()}_SCALE" for one in program.signals]
+    if len({name[:LONGEST_NAME] for name in names}) < len(names):
+        names = [*different(names, LONGEST_NAME)]
+    rows = [
+        f"#define {name} {one.scale:f} /* {plain_unit(one.unit)} */"
+        for name, one in zip(names, program.signals, strict=True)
+    ]
+    angle = program.angle
+    return [
+        f"#define {upper}_TICK_S {float(SAMPLE_TIME_S):g}",
+        *rows,
+        f"#define {upper}_ANGLE_SCALE {angle.scale:f} /* {plain_unit(angle.unit)} */\n",
+    ]
 
 
 def _functions(prefix: str, program: Program) -> str:
