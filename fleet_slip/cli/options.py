@@ -185,16 +185,6 @@ Model = Annotated[
         show_default=False,
     ),
 ]
-OnlyModel = Annotated[
-    str | None,
-    typer.Argument(
-        metavar="MODEL",
-        help="NAME, NAME@VERSION or NAME@ALIAS of a published model; NAME alone is its champion. "
-        "Default: the only one that there is.",
-        autocompletion=complete_model,
-        show_default=False,
-    ),
-]
 Signals = Annotated[
     str | None,
     typer.Option(

@@ -77,6 +77,8 @@ def _answer_usual(
     if request.features or request.by in (ROW_FOLDS, PARTS):
         return _answer(warehouse, logged, condition)
     try:
+        if not warehouse.logs.snapshot().rows:
+            raise NotComputedError("messages of cars have the logged signals alone.")
         return _answer(warehouse, replace(request, models=DEFAULT_MODELS), condition)
     except NotComputedError as error:
         remark = f"compared {LOGGED_MODELS}, not the usual list {DEFAULT_MODELS}: {error}"

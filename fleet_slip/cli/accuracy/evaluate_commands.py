@@ -7,8 +7,8 @@ import typer
 from fleet_slip.catalogue.sources import ALL_DRIVES
 from fleet_slip.cli.accuracy.evaluation_tables import print_blind, print_evaluation, print_summary
 from fleet_slip.cli.completing import complete_config
+from fleet_slip.cli.model_argument import OnlyModel
 from fleet_slip.cli.models.diff_command import score_against
-from fleet_slip.cli.options import OnlyModel
 from fleet_slip.cli.output import Json, print_json, print_table, say
 from fleet_slip.cli.progress_bar import progress
 from fleet_slip.cli.recorded import record_run

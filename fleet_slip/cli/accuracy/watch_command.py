@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from fleet_slip.cli.completing import complete_config
-from fleet_slip.cli.options import OnlyModel
+from fleet_slip.cli.model_argument import OnlyModel
 from fleet_slip.cli.output import say
 from fleet_slip.cli.workers import Threads
 

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from fleet_slip.cli.options import OnlyModel
+from fleet_slip.cli.model_argument import OnlyModel
 from fleet_slip.cli.output import Json, print_json, say
 from fleet_slip.export.files import Target
 

@@ -9,8 +9,8 @@ import typer
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalogue.definitions import Definition
 from fleet_slip.cli.completing import complete_model
+from fleet_slip.cli.model_argument import OnlyModel
 from fleet_slip.cli.models.signing_commands import signing_key
-from fleet_slip.cli.options import OnlyModel
 from fleet_slip.cli.output import All, Json, print_json, print_table, print_text, say
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.errors import UsageError

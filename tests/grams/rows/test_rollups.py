@@ -205,14 +205,14 @@ def test_a_selection_reads_no_row_of_a_file_whose_rollup_serves(
 ) -> None:
     fleet = fleet_slip.open(tmp_path / "data")
     receive(fleet, tmp_path, range(3))
-    whole = fleet.cohort().select()
+    whole = fleet.cohort().select(models="table1")
     for file in (tmp_path / "data/grams").glob("*.parquet"):
         stop = len(file.read_bytes()) // 2
         file.write_bytes(file.read_bytes()[:stop])  # the rows are gone, not what is before them
-    assert fleet.cohort().select().as_dict() == whole.as_dict()
+    assert fleet.cohort().select(models="table1").as_dict() == whole.as_dict()
     monkeypatch.setattr(cells, "read_rollup", lambda *_: None)
     with pytest.raises(StorageError, match=r"was damaged|ended|damaged"):
-        fleet.cohort().select()
+        fleet.cohort().select(models="table1")
 
 
 @pytest.mark.parametrize("at", [100, 2000, -1])
@@ -225,7 +225,7 @@ def test_a_damaged_rollup_is_told_and_never_used(tmp_path: Path, at: int) -> Non
     content[at] ^= 1
     file.write_bytes(content)
     with pytest.raises(StorageError, match="damaged"):
-        fleet.cohort().select()
+        fleet.cohort().select(models="table1")
     assert any(file.name in damage.path for damage in fleet.verify().damage)
 
 
