@@ -76,13 +76,14 @@ def _answer_usual(
     logged = replace(request, models=LOGGED_MODELS)
     if request.features or request.by in (ROW_FOLDS, PARTS):
         return _answer(warehouse, logged, condition)
-    try:
-        if not warehouse.logs.snapshot().rows:
-            raise NotComputedError("messages of cars have the logged signals alone.")
-        return _answer(warehouse, replace(request, models=DEFAULT_MODELS), condition)
-    except NotComputedError as error:
-        remark = f"compared {LOGGED_MODELS}, not the usual list {DEFAULT_MODELS}: {error}"
-        return replace(_answer(warehouse, logged, condition), remark=remark)
+    why = "messages of cars have the logged signals alone."
+    if warehouse.logs.snapshot().rows:
+        try:
+            return _answer(warehouse, replace(request, models=DEFAULT_MODELS), condition)
+        except NotComputedError as error:
+            why = str(error)
+    remark = f"compared {LOGGED_MODELS}, not the usual list {DEFAULT_MODELS}: {why}"
+    return replace(_answer(warehouse, logged, condition), remark=remark)
 
 
 def _answer(warehouse: Warehouse, request: SelectionRequest, condition: str) -> RequestedSelection:
