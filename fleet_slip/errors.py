@@ -81,6 +81,12 @@ class InputError(FleetSlipError):
     exit_code = 4
 
 
+class RepeatedError(InputError):
+    """A recording that is in the logs already: a second time it would count twice."""
+
+    exit_code = 15
+
+
 class DataError(FleetSlipError):
     """The data cannot answer: an empty cohort, an absent signal, a rank-deficient model."""
 

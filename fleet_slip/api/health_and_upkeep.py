@@ -215,15 +215,26 @@ class HealthAndUpkeep(PublishedModels):
         return report
 
     @record_call
-    def allow(self, *, vehicle: str | None = None, drive: str | None = None) -> bool:
-        """Let a forgotten vehicle or drive come back: land its new rows again from now on.
+    def allow(
+        self,
+        *,
+        vehicle: str | None = None,
+        drive: str | None = None,
+        source_file: str | None = None,
+    ) -> bool:
+        """Let a forgotten vehicle, drive or file come back: land its new rows again from now on.
 
-        What was forgotten stays forgotten. Returns whether that is new. Raises `UsageError` unless
-        one of `vehicle` and `drive` is given, `QuestionError` if it was never forgotten, and
+        What was forgotten stays forgotten, but a file that is given to `ingest` again lands once it
+        is allowed by its name, or its drives by theirs. Returns whether that is new. Raises
+        `UsageError` unless one subject is given, `QuestionError` if it was never forgotten, and
         `RefusedError` while it is being forgotten.
         """
         from fleet_slip.warehouse.audit import ALLOWED, Audit
 
+        if source_file is not None:
+            if vehicle is not None or drive is not None:
+                raise UsageError("give one of vehicle, drive and source_file.")
+            return self._allow_file(source_file)
         subject, audit = _forgettable(vehicle, drive), Audit(self.root)
         self.warehouse.require()
         state = audit.state(subject)
@@ -237,6 +248,23 @@ class HealthAndUpkeep(PublishedModels):
         if state != ALLOWED:
             audit.allow(subject)
         return state != ALLOWED
+
+    def _allow_file(self, name: str) -> bool:
+        from fleet_slip.warehouse.audit import Audit
+
+        self.warehouse.require()
+        states = Audit(self.root).allow_from(name).values()
+        if not states:
+            raise QuestionError(
+                f"no drive was forgotten by the name of its file {name!r}. Earlier versions kept "
+                "no such names: allow its drives, or its car."
+            )
+        if "begun" in states:
+            raise RefusedError(
+                f"the file {name!r} is being forgotten. Give the command that forgets it again, "
+                "until it is done; then allow it."
+            )
+        return "done" in states
 
     @record_call
     def retain(

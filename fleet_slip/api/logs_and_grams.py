@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from fleet_slip.grams.rows.gram_job import GramReport
     from fleet_slip.ingest.drafting.preview import Preview
     from fleet_slip.ingest.landing.ingest_job import IngestReport
+    from fleet_slip.ingest.landing.same_recordings import Replace
     from fleet_slip.ingest.logs.log_files import Log
     from fleet_slip.ingest.mapping.mapping import Mapping
     from fleet_slip.maintenance.migration import MigrationReport
@@ -107,6 +108,7 @@ class LogsAndGrams(Rooted):
         mapping: "str | Mapping",
         *,
         as_one: bool = False,
+        replace: "Replace" = "no",
         workers: Workers = None,
         each: "Callable[[IngestReport], None] | None" = None,
         progress: ShowProgress | None = None,
@@ -123,14 +125,20 @@ class LogsAndGrams(Rooted):
         format tells about how many there are. Without a cluster, threads read the small files of
         folders, and large ones come one after the other, each read by all cores.
 
+        A recording that is in the logs already, from another file or through another mapping, is
+        told by its bytes and by its samples. If `replace` is `all`, its drives give way to the new
+        ones, in one commit; if it is `corrected`, those of the same file do, whose mapping has the
+        same name and was changed since.
+
         Raises `ConfigError` for a mapping that is not valid; `InputError`, when all others are in,
-        for files that cannot be used, of which nothing is written; `StorageError` and
-        `ClusterError`.
+        for files that cannot be used, of which nothing is written, or `RepeatedError` where all of
+        these are in already; `StorageError` and `ClusterError`.
         """
         from fleet_slip.ingest.landing.ingest_job import ingest_files
         from fleet_slip.ingest.landing.known_files import KnownFiles
         from fleet_slip.ingest.logs.log_files import find_logs, find_whole_logs, names_several
         from fleet_slip.ingest.mapping.mapping import load_mapping
+        from fleet_slip.maintenance.superseding import TakingOut
 
         plan = load_mapping(mapping) if isinstance(mapping, str) else mapping
         given = [files] if isinstance(files, Path | str) else list(files)
@@ -154,7 +162,10 @@ class LogsAndGrams(Rooted):
             rows = no_progress if by_file or progress is None else _rows_of(wanted, told)
             try:
                 threads = executor if by_file else elsewhere
-                for report in ingest_files(warehouse, wanted, plan, threads, known, rows):
+                taking_out = TakingOut(self.warehouse)
+                for report in ingest_files(
+                    warehouse, wanted, plan, threads, known, rows, replace, taking_out
+                ):
                     reports[report.file] = report
                     figures.rows += report.counts.ticks if report.new else 0
                     if each is not None:
@@ -165,6 +176,21 @@ class LogsAndGrams(Rooted):
                 if known is not None:
                     known.save(warehouse)
         return [reports[str(path)] for path in wanted]
+
+    @record_call
+    def take_back(self, what: str) -> int:
+        """Take out what was ingested from a file or through a mapping; return how many drives.
+
+        `what` is the name of a file, or of a mapping, or what the names of a file's drives begin
+        with, such as `logger-0123456789ab`. Their Gram rows and refused rows go with them. Other
+        than what is forgotten, they land again when they are given again.
+
+        Raises `QuestionError` if there is no such drive, `StorageError` and `ConflictError`.
+        """
+        from fleet_slip.maintenance.superseding import take_back
+
+        with step("undo"):
+            return take_back(self.warehouse, what)
 
     def preview(
         self,

@@ -14,7 +14,7 @@ from fleet_slip.api.run_report import Training
 from fleet_slip.catalogue.car_numbers import CALIBRATION, DELAY
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
-from fleet_slip.errors import DataError, FleetSlipError, InputError
+from fleet_slip.errors import DataError, FleetSlipError, InputError, RepeatedError
 from fleet_slip.ingest.logs.log_files import Place, find_logs, is_url
 from fleet_slip.ingest.mapping.mapping import load_mapping
 from fleet_slip.models.aliases import CANDIDATE
@@ -31,6 +31,7 @@ from fleet_slip.words import number_of
 if TYPE_CHECKING:
     from fleet_slip.api.fleet import Fleet
     from fleet_slip.grams.cohorts.outweighing import Outweighing
+    from fleet_slip.ingest.landing.ingest_job import IngestReport
     from fleet_slip.monitoring.monitor import Chart
     from fleet_slip.monitoring.quality import SensorFault
 
@@ -166,11 +167,26 @@ class Night:
         except InputError:  # a night in which no car came home is no fault
             never = not self.before.drives
             return ("attention" if never else "done"), "No log is in the folder."
-        reports = self.fleet.ingest(
-            self.landing, mapping, workers=self.workers, progress=of_step(self.progress, "ingest")
-        )
+        reports: list[IngestReport] = []
+        again = ""
+        try:
+            self.fleet.ingest(
+                self.landing,
+                mapping,
+                replace="corrected",
+                workers=self.workers,
+                each=reports.append,
+                progress=of_step(self.progress, "ingest"),
+            )
+        except RepeatedError as error:  # what is there counts once
+            again = str(error)
         rows = self.fleet.warehouse.logs.snapshot().rows - self.before.rows
-        told = f"{number_of(rows, 'new row')}."
+        told = f"{number_of(max(rows, 0), 'new row')}."
+        if replaced := sum(one.drives_replaced for one in reports):
+            drives = number_of(replaced, "drive")
+            told = f"{told} The mapping was corrected: its drives are in place of {drives}."
+        if again:
+            return "attention", f"{told} Left out: {again}"
         alike = {name for one in reports for names in one.look_alikes for name in names}
         if alike:
             names = f": {', '.join(sorted(alike))}" if tells_single_cars() else ""

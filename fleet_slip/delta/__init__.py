@@ -12,11 +12,12 @@ that is made again from its source takes its place without a commit.
 from fleet_slip.delta.change import Change, TableFile, Unit, absent_columns, rows_in
 from fleet_slip.delta.conflicts import on_newest, retry_conflicts
 from fleet_slip.delta.encoding import Encoded, Encoding
-from fleet_slip.delta.snapshot import Snapshot
+from fleet_slip.delta.snapshot import WITHDRAWN, Snapshot
 from fleet_slip.delta.table import Table
 from fleet_slip.files.checksums import checksum_in, checksum_of
 
 __all__ = [
+    "WITHDRAWN",
     "Change",
     "Encoded",
     "Encoding",

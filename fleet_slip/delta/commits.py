@@ -171,23 +171,26 @@ def _object(text: Any) -> Mapping[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def read_landed_units(table: Folder, version: int) -> frozenset[str]:
-    """Return the names of all units that have landed in a version. Raises `StorageError`."""
+def read_landed_units(table: Folder, version: int) -> dict[str, int]:
+    """Return the numbers of all units that have landed in a version. Raises `StorageError`."""
     log = table / LOG
     files = log.files()
-    names: set[str] = set()
+    numbers: dict[str, int] = {}
     checkpoint = newest_checkpoint(files, version)
     after = version_of(checkpoint.name) if checkpoint else -1
     for file in files:  # a checkpoint may be of several
         if checkpoint and file.name.startswith(f"{after:020}.checkpoint."):
             with pq.ParquetFile(pa.BufferReader(log.read(file.name))) as parquet:
-                told = parquet.read(columns=["txn.appId"])["txn"].combine_chunks()
-            names.update(name for name in told.field("appId").to_pylist() if name is not None)
+                columns = ["txn.appId", "txn.version"]
+                told = parquet.read(columns=columns)["txn"].combine_chunks().drop_null()
+            each = (told.field(name).to_pylist() for name in ("appId", "version"))
+            numbers.update((n, number) for n, number in zip(*each, strict=True) if n is not None)
     for file in files:
         if COMMIT_FILE.fullmatch(file.name) and after < version_of(file.name) <= version:
             try:
                 commit = read_commit(log, file.name)
             except ValueError as error:
                 raise StorageError(f"{file}: {error}") from None
-            names.update(action["txn"]["appId"] for action in commit.actions if "txn" in action)
-    return frozenset(names)
+            stated = (action["txn"] for action in commit.actions if "txn" in action)
+            numbers.update((one["appId"], one["version"]) for one in stated)
+    return numbers

@@ -110,6 +110,7 @@ def _state_problems(snapshot: Snapshot, commits: Sequence[Commit]) -> Iterator[t
                 units[name] = number
     if files != {file.path for file in snapshot.files}:
         yield "_last_checkpoint", "the active files are not those that the commits add up to"
-    wrong = [name for name, number in units.items() if snapshot.landed(name) != number]
+    known = snapshot.units
+    wrong = [name for name, number in units.items() if known.get(name) != number]
     if wrong:
         yield "_last_checkpoint", f"does not know what has landed: {', '.join(wrong[:3])}"

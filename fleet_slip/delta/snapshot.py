@@ -2,7 +2,7 @@
 
 import hashlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 
 MANY_UNITS = 8
 """So many units of work are not asked for one by one."""
+
+WITHDRAWN = -1
+"""Number of a unit whose rows were taken out again: it may land anew."""
 
 
 @dataclass(frozen=True)
@@ -102,13 +105,16 @@ class Snapshot:
     def landed_among(self, number: int) -> Callable[[str], bool]:
         """Return what tells whether a unit has landed; for many questions it reads the log once."""
         if self.version is None or number < MANY_UNITS:
-            return lambda name: self.landed(name) is not None
-        return self._units.__contains__
+            return lambda name: self.landed(name) not in {None, WITHDRAWN}
+        return lambda name: self.units.get(name, WITHDRAWN) != WITHDRAWN
 
     @cached_property
-    def _units(self) -> frozenset[str]:
+    def units(self) -> Mapping[str, int]:
+        """The numbers of all units that have landed, `WITHDRAWN` ones among them."""
+        if self.version is None:
+            return {}
         with storage_errors(self.table.folder):
-            return read_landed_units(self.table.folder, self.version or 0)
+            return read_landed_units(self.table.folder, self.version)
 
     def moment(self, version: int) -> str | None:
         """Return the digest of the commit that made a version of this table's past, or present.

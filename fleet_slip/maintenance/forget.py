@@ -71,9 +71,11 @@ def forget(
     *,
     now: bool = False,
     progress: Progress = no_progress,
+    source_file: str | None = None,
 ) -> ForgetReport:
     """Forget drives; with `now`, delete the replaced files at once instead of by `vacuum`.
 
+    `source_file` is the file by whose name they are forgotten, and may come back.
     It can be repeated after any interruption. `progress` counts files to rewrite. Raises
     `QuestionError` if there never was such a drive, `StorageError`, or `ConflictError`.
     """
@@ -88,7 +90,7 @@ def forget(
         )
     models = audit.models_of(subject)
     if state == ALLOWED or (drives and state != "begun"):
-        models = _begin(warehouse, audit, subject, drives, located)
+        models = _begin(warehouse, audit, subject, drives, located, source_file)
     cleared, present = ClearedCars(warehouse.root), partial(cars_with_rows, warehouse)
     cleared.forget(audit, subject, present)
     for table in (warehouse.quarantine, warehouse.logs):
@@ -97,7 +99,7 @@ def forget(
     landed = _drives_of(warehouse, subject, located)
     if not landed <= drives:  # they landed before the fence
         drives |= landed
-        models = _begin(warehouse, audit, subject, drives, located)
+        models = _begin(warehouse, audit, subject, drives, located, source_file)
         cleared.forget(audit, subject, present)
     _forget_quarantined(warehouse, subject, drives)
     rows, rewritten, removed = _rewrite_logs(warehouse, subject, located, progress)
@@ -131,12 +133,14 @@ def _begin(
     subject: Forgettable,
     drives: Collection[str],
     located: Located,
+    source_file: str | None,
 ) -> list[str]:
     """Record what is to be forgotten; return the model versions that were trained on it."""
     judged = newest_versions(warehouse.root)
     models = models_trained_on(warehouse, drives)
     known = () if subject.kind == "before" else recordings_of(warehouse, subject, located)
-    audit.begin(subject, len(drives), models, judged, [one.kept() for one in known])
+    kept = [one.kept() for one in known]
+    audit.begin(subject, len(drives), models, judged, kept, source_file)
     return models
 
 
@@ -221,8 +225,10 @@ def forget_called(
             f'fleet-slip sql "SELECT drive_id, {calling} FROM drives"'
         )
     reports = []
+    source_file = value if calling == "source_file" else None
     for drive in drives:
-        reports.append(forget(warehouse, Forgettable("drive", drive), now=now))
+        subject = Forgettable("drive", drive)
+        reports.append(forget(warehouse, subject, now=now, source_file=source_file))
         progress(1, len(drives))
     return _together(reports)
 

@@ -51,6 +51,27 @@ def rewrite(
     rewritings. After a conflict the new files are deleted; raises `ConflictError` then, and
     `StorageError`.
     """
+    new = write_again(warehouse, logs, rewritings, data_change=data_change, progress=progress)
+    replaced = [file for one in rewritings for file in one.files]
+    units = rewriting_units(logs, replaced)
+    logs.commit_or_discard(
+        Change(add=new, remove=replaced, units=units, note=note, data_change=data_change)
+    )
+    return new
+
+
+def write_again(
+    warehouse: Warehouse,
+    logs: Snapshot,
+    rewritings: Sequence[Rewriting],
+    *,
+    data_change: bool = True,
+    progress: Progress = no_progress,
+) -> list[AddAction]:
+    """Write log files, and land their Gram rows ahead; nothing of the logs is committed.
+
+    Returns what is to be added. Raises `ConflictError` and `StorageError`.
+    """
     new: list[AddAction] = []
     replaced = [file for one in rewritings for file in one.files]
     try:
@@ -64,14 +85,16 @@ def rewrite(
     except FleetSlipError:
         logs.table.discard(new)
         raise
-    # The Delta library takes files that were removed without a change of data for still there. Two
-    # commits that rewrite files of a day are told of each other by the unit that both land.
-    days = sorted({str(file.day) for file in replaced})
-    units = [Unit(f"rewrite/{day}", (logs.version or 0) + 1) for day in days]
-    logs.commit_or_discard(
-        Change(add=new, remove=replaced, units=units, note=note, data_change=data_change)
-    )
     return new
+
+
+def rewriting_units(logs: Snapshot, replaced: Sequence[TableFile]) -> list[Unit]:
+    """Return what tells two commits of each other that rewrite files of a day.
+
+    The Delta library takes files that were removed without a change of data for still there.
+    """
+    days = sorted({str(file.day) for file in replaced})
+    return [Unit(f"rewrite/{day}", (logs.version or 0) + 1) for day in days]
 
 
 def read_kept_drives(

@@ -193,14 +193,17 @@ class Audit:
         models: Collection[str],
         judged: Mapping[str, int] | None = None,
         recordings: Collection[str] = (),
+        source_file: str | None = None,
     ) -> None:
         """Record what is about to be forgotten.
 
         `models` were trained on it, of all versions up to the `judged` number of each model.
-        `recordings` are those of its drives, as `Recording.kept` returns them.
+        `recordings` are those of its drives, as `Recording.kept` returns them. `source_file` is
+        the file by whose name it is forgotten.
         """
         known = {"drives": drives, "models": sorted(models), "judged": dict(judged or {})}
-        self._append(subject, {"event": "begun", **known, "recordings": sorted(recordings)})
+        begun = {"event": "begun", **known, "recordings": sorted(recordings)}
+        self._append(subject, begun, source_file)
 
     def end(self, subject: Forgettable, grams_version: int | None = None) -> None:
         """Record that it is forgotten, and since which version the Gram rows are without it."""
@@ -212,9 +215,33 @@ class Audit:
         """Whether names that no row has were taken out of all files, as since then none has any."""
         return any(entry.get("names_are_exact") for entry in self.entries())
 
+    @property
+    def allows_drives(self) -> bool:
+        """Whether some drive that was forgotten may come back."""
+        return any(k[0] == "drive" and e == ALLOWED for k, e in self._last_events().items())
+
     def allow(self, subject: Forgettable) -> None:
         """Record that a forgotten car or drive may come back."""
         self._append(subject, {"event": ALLOWED})
+
+    def allow_from(self, source_file: str) -> dict[str, str]:
+        """Let the drives come back that were forgotten by the name of their file.
+
+        Returns the event of each that was its last, by its hash; those under way are left alone.
+        """
+        last, found = self._last_events(), dict[str, str]()
+        for entry in self.entries():
+            name = _digest(f"source_file:{source_file}", entry["salt"])
+            if entry.get("source_file") != name:
+                continue
+            key = entry["kind"], entry["salt"], entry["subject"]
+            found[entry["subject"]] = last[key]
+            if last[key] == "done":
+                at = datetime.now(UTC).isoformat(timespec="seconds")
+                told = dict(zip(("kind", "salt", "subject"), key, strict=True))
+                self._folder.append({**told, "at": at, "event": ALLOWED})
+                last[key] = ALLOWED
+        return found
 
     def _of(self, subject: Forgettable) -> list[Mapping[str, Any]]:
         entries = self.entries()
@@ -222,12 +249,16 @@ class Audit:
         digests = {salt: subject.digest(salt) for salt in {entry["salt"] for entry in entries}}
         return [entry for entry in entries if entry["subject"] == digests[entry["salt"]]]
 
-    def _append(self, subject: Forgettable, content: Mapping[str, Any]) -> None:
+    def _append(
+        self, subject: Forgettable, content: Mapping[str, Any], source_file: str | None = None
+    ) -> None:
         entries = self.entries()
         salt = entries[0]["salt"] if entries else secrets.token_hex(16)
         if subject.kind == "drive" and content["event"] == "begun":
             car = Forgettable("vehicle", subject.sender) if subject.sender else None
             content = {**content, "sender": car.digest(salt) if car else None}
+        if source_file is not None:
+            content = {**content, "source_file": _digest(f"source_file:{source_file}", salt)}
         at = datetime.now(UTC).isoformat(timespec="seconds")
         known = {"kind": subject.kind, "subject": subject.digest(salt), "salt": salt, "at": at}
         self._folder.append({**known, **content})

@@ -11,6 +11,7 @@ import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import blake2b
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -89,14 +90,57 @@ class KnownRecordings:
         return bool((np.bincount(there, minlength=len(self._enough)) >= self._enough).any())
 
 
-def _hash_pieces(values: IntArray) -> Hashes:
+SPOT_TICKS = 20
+"""A recording that comes at another rate has the same samples at every fifth of a second, if its
+rate is 5, 10, 20, 25, 50 or 100 Hz."""
+
+SPOT_SIGNALS = ("yaw_rate", "ay", "wheel_fl")
+"""What is looked at, if a drive has it; of other signals the first ones, as many."""
+
+SPOTS_PER_SIGNAL, SPOT_CUT_BITS = 2, 5
+
+
+@dataclass(frozen=True)
+class Spots:
+    """Hashes that tell a drive again at another rate, with another sign or another zero.
+
+    Attributes:
+        kept: of every fifth of a second from the first sample on; the least ones, a few.
+        seen: of every fifth of a second from any of the first 20 samples on.
+    """
+
+    kept: Hashes
+    seen: Hashes
+
+
+def find_spots(ticks: NDArray[np.signedinteger[Any]], counts: Mapping[str, pa.Array]) -> Spots:
+    """Return the spots of a drive: its ticks and, by signal, its int16 counts or null."""
+    moving = [name for name, column in counts.items() if column.null_count < len(column)]
+    first = [name for name in SPOT_SIGNALS if name in moving]
+    others = sorted(set(moving).difference(first))
+    phase = (ticks.astype(np.int64) - int(ticks[0])) % SPOT_TICKS if len(ticks) else ticks
+    kept, seen = [], []
+    for name in [*first, *others][: len(SPOT_SIGNALS)]:
+        values = np.asarray(counts[name].fill_null(ABSENT), dtype="<i2").astype(np.int64)
+        there = values != ABSENT
+        for begin in range(SPOT_TICKS):
+            every = values[there & (phase == begin)]
+            hashes = np.unique(_hash_pieces(np.abs(np.diff(every)), SPOT_CUT_BITS))
+            seen.append(hashes)
+            if not begin:
+                kept.append(hashes[:SPOTS_PER_SIGNAL])
+    none = np.empty(0, np.uint64)
+    return Spots(*(np.unique(np.concatenate([none, *each])) for each in (kept, seen)))
+
+
+def _hash_pieces(values: IntArray, cut_bits: int = CUT_BITS) -> Hashes:
     """Return the hashes of the pieces of a signal in which enough happens."""
     if len(values) < BENDS:
         return np.empty(0, np.uint64)
     words: Hashes = (values & 0xFFFF).astype(np.uint64)
     fours: Hashes = words[:-3] | words[1:-2] << _U(16) | words[2:-1] << _U(32) | words[3:] << _U(48)
     mixed = _mix(fours)
-    starts = np.concatenate([[0], np.flatnonzero(mixed >> _U(64 - CUT_BITS) == 0) + 1])
+    starts = np.concatenate([[0], np.flatnonzero(mixed >> _U(64 - cut_bits) == 0) + 1])
     starts = starts[starts < len(mixed)]
     bends = (np.diff(values, 2) != 0)[: len(mixed)]
     eventful = np.add.reduceat(bends, starts, dtype=np.int64) >= BENDS

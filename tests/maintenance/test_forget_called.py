@@ -68,11 +68,29 @@ def test_every_drive_of_a_file_goes_and_does_not_come_back(
 ) -> None:
     assert run_command("forget", "--source-file", "log-0.csv").exit_code == 0
     assert {file for file, _ in drives(fleet)} == {"log-1.csv"}
-    fleet.ingest(tmp_path / "log-0.csv", mapping())
+    (report,) = fleet.ingest(tmp_path / "log-0.csv", mapping())
+    assert (report.new, report.drives_forgotten, report.counts.drives) == (False, 2, 0)
     assert {file for file, _ in drives(fleet)} == {"log-1.csv"}
     # The old files still tell the name: --now finds them when the command is repeated.
     assert run_command("forget", "--source-file", "log-0.csv", "--now").exit_code == 0
     assert b"slalom" not in bytes_below(fleet)
+
+
+def test_a_file_that_is_allowed_again_lands_when_it_is_given_again(
+    fleet: Fleet, tmp_path: Path, run_command: RunCommand
+) -> None:
+    before, rows = drives(fleet), fleet.sql("SELECT count(*) FROM log").fetchall()
+    fleet.forget(source_file="log-0.csv", now=True)
+    unknown = run_command("forget", "--source-file", "log-1.csv", "--allow")
+    assert (unknown.exit_code, "was forgotten by the name of its file" in unknown.stderr) == (5, 1)
+    assert run_command("forget", "--source-file", "log-0.csv", "--allow").exit_code == 0
+    assert not fleet.allow(source_file="log-0.csv")
+    (report,) = fleet.ingest(tmp_path / "log-0.csv", mapping())
+    assert (report.new, report.counts.drives) == (True, 2)
+    assert not fleet.ingest(tmp_path / "log-0.csv", mapping())[0].new
+    fleet.gram()
+    assert (drives(fleet), fleet.sql("SELECT count(*) FROM log").fetchall()) == (before, rows)
+    assert not fleet.verify(full=True).damage
 
 
 def test_what_may_have_the_rows_of_any_of_the_drives_is_pending(
@@ -102,7 +120,7 @@ def test_a_name_that_no_drive_has_is_a_wrong_question(
 
 @pytest.mark.parametrize(
     "words",
-    [["--drive-name", "lap", "--vehicle", "car"], ["--source-file", "log-0.csv", "--allow"], []],
+    [["--drive-name", "lap", "--vehicle", "car"], ["--drive-name", "lap", "--allow"], []],
 )
 def test_what_is_forgotten_is_said_once(words: list[str], run_command: RunCommand) -> None:
     assert run_command("forget", *words).exit_code == 2

@@ -10,7 +10,7 @@ import pytest
 
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.ingest import Mapping
-from fleet_slip.ingest.landing import ingest_job, landing
+from fleet_slip.ingest.landing import ingest_job
 from fleet_slip.maintenance.forget import forget
 from fleet_slip.warehouse.audit import Audit, Forgettable
 from fleet_slip.warehouse.tables import Warehouse
@@ -155,14 +155,15 @@ def test_a_recording_that_is_forgotten_while_it_lands_again_does_not(
     ingest_file(warehouse, write(tmp_path, recording()), a_mapping())
     (file,) = warehouse.logs.snapshot().files
     (name,) = warehouse.logs.read_names(file.path)["drive_id"].used
-    land = landing.land_batch
+    land = ingest_job.land_batch
 
     def overtaken(*written: Any) -> Any:
         forget(warehouse, Forgettable("drive", name), now=True)
         return land(*written)
 
     monkeypatch.setattr(ingest_job, "land_batch", overtaken)
-    report = ingest_file(warehouse, write(tmp_path, recording()), a_mapping(name="other"))
+    again, other = write(tmp_path, recording()), a_mapping(name="other")
+    (report,) = ingest_job.ingest_files(warehouse, [again], other, replace="all")
     assert report.drives_forgotten == 1
     assert is_empty(warehouse)
 

@@ -110,16 +110,19 @@ def _where_the_time_went(report: "SimulationReport") -> str:
 def ingest(
     context: typer.Context,
     files: Annotated[
-        list[str],
+        list[str] | None,
         typer.Argument(
             help="Measured logs (CSV, Parquet, MDF, MATLAB, CAN traces, MCAP, DuckDB), or folders "
             "of them, of which what is new is taken; also s3://, gs:// and az://.",
             show_default=False,
         ),
-    ],
+    ] = None,
     mapping: Annotated[
-        str, typer.Option(help="A mapping of configs/mappings, or the path of a TOML file.")
-    ],
+        str | None,
+        typer.Option(
+            help="A mapping of configs/mappings, or the path of a TOML file.", show_default=False
+        ),
+    ] = None,
     dry_run: Annotated[
         bool,
         typer.Option(
@@ -133,6 +136,21 @@ def ingest(
     as_one: Annotated[
         bool, typer.Option("--as-one", help="The files of each folder are parts of one log.")
     ] = False,
+    replace: Annotated[
+        bool,
+        typer.Option(
+            "--replace",
+            help="Drives of the same recordings give way, as after a correction of the mapping.",
+        ),
+    ] = False,
+    undo: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE|MAPPING",
+            help="Take out what came from a file or through a mapping, by its name, and no more.",
+            show_default=False,
+        ),
+    ] = None,
     cluster: Cluster = None,
     json: Json = False,
 ) -> None:
@@ -145,6 +163,11 @@ def ingest(
     from fleet_slip.ingest.logs.log_files import names_several  # noqa: PLC0415 - takes a while
 
     fleet: Fleet = context.obj
+    if undo is not None:
+        _take_back(fleet, undo, json, alone=not (files or mapping or replace or dry_run or as_one))
+        return
+    if not files or mapping is None:
+        raise UsageError("give files and --mapping; or --undo alone, to take drives out again.")
     if plot is not None and not (dry_run and len(files) == 1):
         raise UsageError("--plot draws one file, with --dry-run.")
     if dry_run:
@@ -157,12 +180,33 @@ def ingest(
         progress(*(("ingest", "files") if folders else ("read", "rows"))) as show,
     ):
         reports = fleet.ingest(
-            files, mapping, as_one=as_one, workers=cluster, each=each, progress=show
+            files,
+            mapping,
+            as_one=as_one,
+            replace="all" if replace else "no",
+            workers=cluster,
+            each=each,
+            progress=show,
         )
     if json:
         print_json(reports)
     elif folders:
         say(_summed_up(reports))
+
+
+def _take_back(fleet: Fleet, what: str, json: bool, *, alone: bool) -> None:
+    """Take out what came from a file or through a mapping, and say how many drives."""
+    if not alone:
+        raise UsageError("--undo takes out and brings nothing in: give it alone.")
+    with recording(fleet.root, "ingest", sys.argv[1:]):
+        drives = fleet.take_back(what)
+    if json:
+        print_json({"drives_taken_out": drives})
+        return
+    say(
+        f"{number_of(drives, 'drive')} taken out, with their Gram rows; they land again when their "
+        "files are given again"
+    )
 
 
 def _summed_up(reports: "list[IngestReport]") -> str:
@@ -174,6 +218,7 @@ def _summed_up(reports: "list[IngestReport]") -> str:
         f"{number_of(len(new), 'new file')}: {number_of(sum(r.counts.ticks for r in new), 'row')} "
         f"in {number_of(sum(r.counts.drives for r in new), 'drive')}"
         + (f"; in quarantine: {number_of(held, 'row')}" if held else "")
+        + _in_place_of(sum(report.drives_replaced for report in new))
         + _left_out(sum(report.drives_forgotten for report in new))
     )
 
@@ -217,8 +262,13 @@ def _ingested(report: dict[str, Any]) -> str:
             else ""
         )
         + (f"; in quarantine: {number_of(held, 'row')} ({reasons})" if reasons else "")
+        + _in_place_of(report["drives_replaced"])
         + _left_out(report["drives_forgotten"])
     )
+
+
+def _in_place_of(drives: int) -> str:
+    return f"; in place of {number_of(drives, 'drive')}" if drives else ""
 
 
 def _show_previews(previews: "list[Preview]", plot: Path | None, json: bool) -> None:

@@ -204,17 +204,20 @@ def forget(
     given = {name: value for name, value in subjects.items() if value is not None}
     if len(given) != 1:
         raise typer.BadParameter("give one of --vehicle, --drive, --drive-name and --source-file.")
-    if allow and not given.keys() & {"vehicle", "drive"}:
-        raise typer.BadParameter("give --allow with --vehicle or --drive.")
+    if allow and drive_name is not None:
+        raise typer.BadParameter("give --allow with --vehicle, --drive or --source-file.")
     if allow and now:
         raise typer.BadParameter("give one of --allow and --now.")
     fleet: Fleet = context.obj
     if allow:
-        changed = fleet.allow(vehicle=vehicle, drive=drive)
+        changed = fleet.allow(**given)
         if json:
             print_json({"allowed": True, "changed": changed})
         else:
-            say("its new rows are landed again from now on; what was forgotten stays forgotten")
+            say(
+                "its new rows are landed again from now on; what was forgotten stays forgotten"
+                + (" until the file is ingested again" if source_file is not None else "")
+            )
         return
     with progress("forget", "files") as show:
         report = fleet.forget(**given, now=now, progress=show)

@@ -79,17 +79,17 @@ class MeasuredStream:
     `<mapping>-<digest>-<number>`, and `-2`, `-3` … follow where a gap in time cut one.
     """
 
-    def __init__(self, file: Path, mapping: Mapping, digest: str) -> None:
-        """Take the file, the mapping, and the digest of both."""
-        self.file, self.mapping, self.digest = file, mapping, digest
+    def __init__(self, file: Path, mapping: Mapping, digest: str, content: str) -> None:
+        """Take the file, the mapping, the digest of both, and that of the file alone."""
+        self.file, self.mapping, self.digest, self.content = file, mapping, digest, content
         self.prefix = f"{mapping.name}-{digest[:12]}"
         self.checker = RowChecker(file, mapping)
         self.totals = Totals()
         self._open = OpenDrives()
         self._stretches: Counter[int] = Counter()
         self._trips = Trips()
-        self._name = os.fsencode(file.name).decode("utf-8", "replace")
-        self._stem = self._name.split(".", 1)[0] or self._name
+        self.name = os.fsencode(file.name).decode("utf-8", "replace")
+        self._stem = self.name.split(".", 1)[0] or self.name
         self._first_refused: dict[str, Any] | None = None
 
     def pieces(self) -> Iterator[Piece]:
@@ -156,7 +156,7 @@ class MeasuredStream:
         known = {
             **told,
             "drive_name": told.get("drive", self._stem),
-            "source_file": self._name,
+            "source_file": self.name,
             "trip_id": self._trips.name(name, group, rows.start_s, rows.end_s),
         }
         for base in set(rows.bases) - intervals_s.keys():
@@ -230,7 +230,7 @@ class MeasuredStream:
         metadata = self.checker.keys.metadata
         vehicles = {str(group): metadata[group].get("vehicle_id", vehicle) for group in groups}
         frame = bad.select(
-            pl.lit(self._name).alias("file"),
+            pl.lit(self.name).alias("file"),
             "row",
             pl.col("group").replace_strict(ids, return_dtype=pl.String).alias("drive_id"),
             pl.col("group")
@@ -271,17 +271,21 @@ class MeasuredStream:
 def open_measured(file: Path, mapping: Mapping) -> Iterator[MeasuredStream]:
     """Open a measured file. Raises `InputError`, if it changes until the end too."""
     with require_unchanged_log(file):
-        yield MeasuredStream(file, mapping, _identity(file, mapping))
+        yield MeasuredStream(file, mapping, *_identity(file, mapping))
 
 
-def _identity(file: Path, mapping: Mapping) -> str:
+def _identity(file: Path, mapping: Mapping) -> tuple[str, str]:
+    """Return the digest of a file and a mapping, and that of the file and its folders' keys."""
     digest = log_digest(file)
+    content = digest.copy()
     used = {name for names in mapping.time_bases().values() for name in names}
     for part in parts_of(file):
-        if keys := {key: text for key, text in partition_keys(part).items() if key in used}:
+        told = partition_keys(part)
+        if keys := {key: text for key, text in told.items() if key in used}:
             digest.update(canonical_ascii(keys).encode())
+        content.update(canonical_ascii(told).encode())
     digest.update(mapping.canonical_json().encode())
-    return digest.hexdigest()
+    return digest.hexdigest(), content.hexdigest()
 
 
 def _reach(blocks: list[Block]) -> int:

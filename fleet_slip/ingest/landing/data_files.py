@@ -17,6 +17,7 @@ from fleet_slip.catalogue.counts import as_arrow
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.delta import Table, Unit
 from fleet_slip.ingest.drives.measured_drives import MeasuredDrive
+from fleet_slip.ingest.landing.marks import FILES
 from fleet_slip.ingest.mapping.mapping import Mapping
 
 FILE_ROWS = 2**18
@@ -53,7 +54,7 @@ class Part:
 
 def unit_of(digest: str) -> Unit:
     """Return the unit of work that a file's content is."""
-    return Unit(f"ingest/{digest}", 1)
+    return Unit(f"{FILES}{digest}", 1)
 
 
 def digest_of(digests: Sequence[str]) -> str:

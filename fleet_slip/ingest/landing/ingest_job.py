@@ -7,20 +7,21 @@ from functools import partial
 from typing import Any, TypeAlias
 
 from fleet_slip.compute.tasks import run_tasks
-from fleet_slip.errors import InputError
+from fleet_slip.errors import InputError, RepeatedError
 from fleet_slip.files.folder import StoredFile
 from fleet_slip.ingest.drives.checking import find_look_alikes
 from fleet_slip.ingest.drives.measured_drives import IngestCounts
 from fleet_slip.ingest.drives.suspicion import Suspicion
+from fleet_slip.ingest.landing.committing import Superseding, land_batch
 from fleet_slip.ingest.landing.data_files import unit_of
 from fleet_slip.ingest.landing.known_files import KnownFiles
 from fleet_slip.ingest.landing.landing import (
     AskedFile,
     FileOutcome,
     WrittenBatch,
-    land_batch,
     write_batch,
 )
+from fleet_slip.ingest.landing.same_recordings import Replace, are_gone
 from fleet_slip.ingest.logs.log_files import Log, StoredParts
 from fleet_slip.ingest.mapping.mapping import Mapping
 from fleet_slip.progress import Progress, no_progress
@@ -49,6 +50,8 @@ class IngestReport:
     """Drives that were left out: of cars that were forgotten, or forgotten themselves."""
     suspicions: tuple[Suspicion, ...] = ()
     """What looks wrong in its longest drive; of small files that land together, in one of all."""
+    drives_replaced: int = 0
+    """Drives that gave way to it: its recording, from another file or through another mapping."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `ingest --json` prints."""
@@ -62,6 +65,7 @@ class IngestReport:
             "quarantined": self.counts.quarantined,
             "drives": self.counts.drives,
             "drives_forgotten": self.drives_forgotten,
+            "drives_replaced": self.drives_replaced,
             "drives_resampled": self.counts.drives_resampled,
             "ticks": self.counts.ticks,
             "look_alikes": self.look_alikes,
@@ -76,29 +80,33 @@ def ingest_files(
     executor: Executor | None = None,
     known: KnownFiles | None = None,
     progress: Progress = no_progress,
+    replace: Replace = "no",
+    superseding: Superseding | None = None,
 ) -> Iterator[IngestReport]:
     """Ingest files, and yield a report of each as it is committed; small files land together.
 
     With an executor batches are read and written by its workers, in any order; threads of this
     process take those of small files only, since a large one keeps all cores and much of the
-    memory busy by itself. `known` remembers what landed, and refuses a file that has changed since.
+    memory busy by itself. `known` remembers what landed. A recording that is there is refused,
+    unless it is to be replaced: then `superseding` takes it out in the same commit.
     `progress` counts rows of each file as it is read, but for those that an executor's workers
     read.
 
     A file that is not usable does not hold up the others: when they are done `InputError` tells
-    of it. Raises `ClusterError` at the end for files that workers died of.
+    of it, or `RepeatedError` where all such files are there already. Raises `ClusterError` at the
+    end for files that workers died of.
     """
-    write = partial(write_batch, warehouse, mapping)
+    write = partial(write_batch, warehouse, mapping, replace=replace)
     if executor is None:
         write = partial(write, progress=progress)
     warehouse.logs.require_writable(mapping.signals)
     failures: list[InputError] = []
     asked = (AskedFile(file, known.digest_of(file) if known else None) for file in files)
     for batch, written in _written(executor, write, _batches(asked)):
-        failures += written.failures
         # Not the file's name: it may name a car, and the Delta log outlives what is forgotten.
         note = {"job": "ingest", "mapping": mapping.name, "digest": written.digest}
-        landed, new = land_batch(warehouse, written, partial(write, batch), note)
+        landed, new = land_batch(warehouse, written, partial(write, batch), note, superseding)
+        failures += landed.failures
         for outcome in landed.outcomes:
             yield _report(warehouse, outcome, new)
             new -= {unit_of(outcome.digest).name}  # the same content in another file is not new
@@ -150,11 +158,20 @@ def _size_of(log: Log) -> int:
 
 def _report(warehouse: Warehouse, outcome: FileOutcome, new: frozenset[str]) -> IngestReport:
     is_new = unit_of(outcome.digest).name in new
+    if not is_new and not outcome.left_out and are_gone(warehouse, outcome.digest):
+        outcome.left_out = outcome.counts.drives
+        outcome.counts = outcome.counts.without(outcome.left_out, 0)
     vehicles = _find_vehicles_like(warehouse, outcome.vehicles) if is_new else ()
     look_alikes = tuple(sorted({*outcome.look_alikes, *vehicles}))
     suspicions = outcome.suspicions if is_new else ()
     return IngestReport(
-        str(outcome.file), is_new, outcome.counts, look_alikes, outcome.left_out, suspicions
+        str(outcome.file),
+        is_new,
+        outcome.counts,
+        look_alikes,
+        outcome.left_out,
+        suspicions,
+        outcome.found.drives if is_new else 0,
     )
 
 
@@ -177,7 +194,8 @@ def _joined(failures: list[InputError]) -> InputError:
         return failures[0]
     told = " ".join(map(str, failures[:FAILURES_SHOWN]))
     more = len(failures) - FAILURES_SHOWN
-    return InputError(
+    kind = RepeatedError if all(isinstance(o, RepeatedError) for o in failures) else InputError
+    return kind(
         f"{number_of(len(failures), 'file')} cannot be used; all others are in. {told}"
         + (f" And {more:,} more." if more > 0 else "")
     )

@@ -15,11 +15,15 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+from fleet_slip.delta import Snapshot
 from fleet_slip.files.folder import StoredFile
 from fleet_slip.ingest.landing.data_files import unit_of
 from fleet_slip.ingest.logs.log_files import Log, StoredParts
 from fleet_slip.ingest.mapping.mapping import Mapping
 from fleet_slip.warehouse.tables import Warehouse
+
+WITHDRAWALS = "withdrawals"
+"""Unit of every commit that takes files out again, with a number that grows."""
 
 
 @dataclass
@@ -37,6 +41,8 @@ class KnownFiles:
     digests: dict[str, tuple[int, int | str, str]] = field(default_factory=dict)
     landed: set[str] = field(default_factory=set)
     moment: tuple[int, str] | None = None
+    withdrawals: int | None = None
+    """What the unit of them had as number at that moment: what has landed may be gone since."""
 
     @classmethod
     def of(cls, warehouse: Warehouse, mapping: Mapping) -> "KnownFiles":
@@ -49,7 +55,8 @@ class KnownFiles:
                 kept = {"files": kept, "landed": [], "moment": (0, "")}
             files = {path: (int(s), t, str(d)) for path, (s, t, d) in kept["files"].items()}
             version, commit = kept["moment"]
-            return cls(cache, files, set(kept["landed"]), (int(version), str(commit)))
+            moment = int(version), str(commit)
+            return cls(cache, files, set(kept["landed"]), moment, kept.get("withdrawals"))
         return cls(cache)
 
     def without_landed(self, files: Iterable[Log], warehouse: Warehouse) -> list[Log]:
@@ -57,8 +64,16 @@ class KnownFiles:
         snapshot = warehouse.logs.snapshot()
         if self.moment is None or snapshot.moment(self.moment[0]) != self.moment[1]:
             self.landed.clear()  # another table, or one that was restored
+        self._forget_withdrawn(snapshot)
         landed = snapshot.landed_among(len(self.digests))
         return [file for file in files if not self._has_landed(file, landed)]
+
+    def _forget_withdrawn(self, snapshot: Snapshot) -> None:
+        if self.moment and snapshot.version == self.moment[0]:
+            return
+        if (withdrawals := snapshot.landed(WITHDRAWALS)) != self.withdrawals:
+            self.landed.clear()
+        self.withdrawals = withdrawals
 
     def _has_landed(self, file: Log, landed: Callable[[str], bool]) -> bool:
         known = self.digests.get(_name_of(file))
@@ -79,6 +94,7 @@ class KnownFiles:
     def save(self, warehouse: Warehouse) -> None:
         """Write the cache; what cannot be written is not kept."""
         snapshot = warehouse.logs.snapshot()
+        self._forget_withdrawn(snapshot)
         asked = {digest for _, _, digest in self.digests.values()}
         has_landed = snapshot.landed_among(len(asked))
         self.landed = {d for d in asked if d in self.landed or has_landed(unit_of(d).name)}
@@ -87,6 +103,7 @@ class KnownFiles:
             "files": self.digests,
             "landed": sorted(self.landed),
             "moment": [version, snapshot.moment(version)],
+            "withdrawals": self.withdrawals,
         }
         with suppress(OSError):
             self.cache.parent.mkdir(parents=True, exist_ok=True)

@@ -1,12 +1,13 @@
 """The way of a batch of measured files into the warehouse, from an open file to the commit.
 
 `write_batch` goes through the files of a batch, `_write_file` through the rows of one: what was
-forgotten is left out, drives and refused rows become data files. `land_batch` commits them as one.
+forgotten is left out, drives and refused rows become data files. `landing.committing` commits them.
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import chain, count, pairwise
 
 import polars as pl
@@ -14,23 +15,24 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.catalogue.counts import as_arrow
-from fleet_slip.delta import Change, Table, retry_conflicts
+from fleet_slip.delta import Table
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.drafting.preview import signals_of
-from fleet_slip.ingest.drives.measured_drives import IngestCounts, MeasuredDrive
+from fleet_slip.ingest.drives.measured_drives import IngestCounts, MeasuredDrive, drive_id
 from fleet_slip.ingest.drives.stream import MeasuredStream, open_measured
 from fleet_slip.ingest.drives.suspicion import Suspicion, find_suspicions
 from fleet_slip.ingest.formats.reading import expected_rows
 from fleet_slip.ingest.landing import data_files
 from fleet_slip.ingest.landing.data_files import DataFiles, Part, Rows, TableName, digest_of
+from fleet_slip.ingest.landing.marks import FileMarks, Origin
+from fleet_slip.ingest.landing.same_recordings import Found, Replace, SameRecordings, let_return
 from fleet_slip.ingest.logs.log_files import LocalCopies, Log
 from fleet_slip.ingest.logs.spool import Spool
 from fleet_slip.ingest.mapping.mapping import Mapping
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.audit import Audit
-from fleet_slip.warehouse.recordings import Recording, record_drive
+from fleet_slip.warehouse.recordings import Recording, Spots, find_spots, record_drive
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA, Warehouse
-from fleet_slip.words import shown
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,8 @@ class FileOutcome:
     suspicions: tuple[Suspicion, ...] = ()
     vehicles: set[str] = field(default_factory=set)
     left_out: int = 0
+    marks: FileMarks = field(default_factory=FileMarks)
+    found: Found = field(default_factory=Found)
 
 
 @dataclass(frozen=True)
@@ -70,6 +74,11 @@ class WrittenBatch:
     parts: dict[TableName, Part]
 
     @property
+    def replaced(self) -> frozenset[Origin]:
+        """What gives way to it."""
+        return frozenset[Origin]().union(*(one.found.replaced for one in self.outcomes))
+
+    @property
     def digest(self) -> str:
         """Digest of what landed first time, of all files together."""
         return digest_of([outcome.digest for outcome in self.outcomes])
@@ -80,30 +89,45 @@ def write_batch(
     mapping: Mapping,
     files: tuple[AskedFile, ...],
     progress: Progress = no_progress,
+    replace: Replace = "no",
 ) -> WrittenBatch:
     """Read files, and write their rows together: one data file a day. Nothing is committed.
 
     A file that cannot be used is a failure of its own, and nothing of it is written. What landed
-    before is not written again. The longest drive of what is new is looked at: one of a batch, so
-    that a folder of small files is not held up. `progress` counts rows of each file.
+    before is not written again, nor a recording that is there, unless that is to give way. The
+    longest drive of what is new is looked at: one of a batch, so that a folder of small files is
+    not held up. `progress` counts rows of each file.
     """
     audit = Audit(warehouse.root)
     forgotten = audit.begun()
     longest: tuple[FileOutcome, MeasuredDrive] | None = None
     outcomes: list[FileOutcome] = []
     failures: list[InputError] = []
-    landed = {n: t.snapshot().landed_among(len(files)) for n, t in _tables(warehouse).items()}
+    snapshots = {name: table.snapshot() for name, table in tables_of(warehouse).items()}
+    landed = {name: one.landed_among(len(files)) for name, one in snapshots.items()}
+    same = SameRecordings(warehouse, snapshots["logs"], mapping.name, replace)
     copies = LocalCopies(asked.file for asked in files)
     with copies, ThreadPoolExecutor(data_files.WRITERS) as threads:
         tables = {
-            name: DataFiles(table, mapping, threads, landed[name])
-            for name, table in _tables(warehouse).items()
+            name: DataFiles(table, mapping, threads, partial(_has_landed, landed, name))
+            for name, table in tables_of(warehouse).items()
         }
         for asked in files:
             try:
                 with copies.of(asked.file) as file, open_measured(file, mapping) as stream:
-                    _require_not_grown(asked, stream.digest, landed["logs"], mapping)
+                    if not tables["logs"].lacks(stream.digest) and let_return(
+                        warehouse, stream.digest, drive_id(stream.prefix, 0)
+                    ):
+                        for name, stored in tables_of(warehouse).items():
+                            landed[name] = stored.snapshot().landed_among(len(files))
                     outcome, drive, rest = _write_file(stream, asked.file, tables, audit, progress)
+                    if outcome.is_new:
+                        earlier = asked.earlier
+                        if earlier and not landed["logs"](data_files.unit_of(earlier).name):
+                            earlier = None
+                        outcome.found = same.judge(
+                            asked.file, stream.name, stream.digest, outcome.marks, earlier
+                        )
             except BaseException as error:
                 for table in tables.values():
                     table.discard_file()
@@ -125,6 +149,10 @@ def write_batch(
     return WrittenBatch(tuple(outcomes), tuple(failures), forgotten, parts)
 
 
+def _has_landed(landed: dict[TableName, Callable[[str], bool]], name: TableName, unit: str) -> bool:
+    return landed[name](unit)
+
+
 def _write_file(
     stream: MeasuredStream,
     file: Log,
@@ -139,12 +167,15 @@ def _write_file(
     refused, rest = _RefusedRows(stream), dict[TableName, Rows]()
     longest: MeasuredDrive | None = None
     left_out, vehicles, ticks = set[str](), set[str](), 0
+    spots: list[tuple[str, Spots]] = []
     for drives in _groups(_read_drives(stream, refused, progress)):
         longest = max([*([longest] if longest else []), *drives], key=lambda one: one.ticks.size)
         kept = keep_drives(sorted(drives, key=lambda drive: drive.drive_id), audit)
         left_out |= {drive.drive_id for drive in drives} - {drive.drive_id for drive in kept}
         vehicles |= set(map(_car_of, kept))
         ticks += _rows_of(kept)
+        if is_new:
+            spots += [(one.drive_id, find_spots(one.ticks, one.counts)) for one in kept]
         if not kept or "logs" not in lacking:
             continue
         if _rows_of(drives) >= data_files.FILE_ROWS:
@@ -167,6 +198,8 @@ def _write_file(
     outcome.counts = counts.without(len(left_out), ticks)
     outcome.vehicles, outcome.left_out = vehicles, len(left_out)
     outcome.suspicions = stream.suspicions()
+    if ticks:
+        outcome.marks = FileMarks.of(stream.digest, stream.content, spots)
     return outcome, longest, rest
 
 
@@ -252,44 +285,8 @@ def keep_refused(refused: pa.Table, audit: Audit, left_out: Collection[str] = ()
     return refused
 
 
-def land_batch(
-    warehouse: Warehouse,
-    written: WrittenBatch,
-    write: Callable[[], WrittenBatch],
-    note: dict[str, str],
-) -> tuple[WrittenBatch, frozenset[str]]:
-    """Commit what was written of a batch; return it, and the units that are now in the logs.
-
-    Where something was forgotten, or landed by another process, since it was written, `write`
-    writes it again. Each table's files are one commit, with a note: refused rows, then drives.
-    """
-    tables = _tables(warehouse)
-
-    def commit(name: TableName) -> frozenset[str]:
-        nonlocal written
-        snapshot = tables[name].snapshot()
-        # Asked after the snapshot: who forgets a car from now on makes this commit a conflict.
-        audit = Audit(warehouse.root)
-        landed = snapshot.landed_among(len(written.parts[name].units))
-        while audit.begun() != written.forgotten or any(
-            landed(unit.name) for unit in written.parts[name].units
-        ):
-            for other, table in tables.items():
-                table.discard(written.parts[other].files)
-            written = write()
-            snapshot = tables[name].snapshot()
-            landed = snapshot.landed_among(len(written.parts[name].units))
-        part = written.parts[name]
-        if part.files:
-            snapshot.commit(Change(add=part.files, units=part.units, note=note))
-        return frozenset(unit.name for unit in part.units) if part.files else frozenset()
-
-    retry_conflicts(lambda: commit("quarantine"))
-    new = retry_conflicts(lambda: commit("logs"))
-    return written, new
-
-
-def _tables(warehouse: Warehouse) -> dict[TableName, Table]:
+def tables_of(warehouse: Warehouse) -> dict[TableName, Table]:
+    """Return the tables that files land in, in the order in which they are committed."""
     return {"quarantine": warehouse.quarantine, "logs": warehouse.logs}
 
 
@@ -308,17 +305,3 @@ def _recording_of(drive: MeasuredDrive) -> Recording:
 
 def _names(rows: pa.Table, column: str) -> frozenset[str]:
     return frozenset(rows[column].unique().drop_null().cast(pa.string()).to_pylist())
-
-
-def _require_not_grown(
-    asked: AskedFile, digest: str, landed: Callable[[str], bool], mapping: Mapping
-) -> None:
-    """Raise `InputError` for a file whose earlier content is in the logs: it would count twice."""
-    earlier = asked.earlier
-    if earlier is None or earlier == digest or not landed(data_files.unit_of(earlier).name):
-        return
-    raise InputError(
-        f"{shown(asked.file)}: it has changed since it was ingested, and its drives would count "
-        f"twice. Forget the old ones, {mapping.name}-{earlier[:12]}-1 and those that follow, with "
-        "fleet-slip forget --drive; or give the changed file another name."
-    )

@@ -1,0 +1,223 @@
+"""A corrected mapping replaces, and a recording that is in is told by its bytes and its samples."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fleet_slip
+from fleet_slip import Fleet
+from fleet_slip.delta import Change, Snapshot
+from fleet_slip.errors import QuestionError, RepeatedError
+from fleet_slip.ingest import Mapping
+from tests.support.measured import SIGNALS, a_mapping, csv_text
+
+ROWS = 6000
+
+
+def recording(seed: int = 1, rows: int = ROWS) -> dict[str, list[str]]:
+    """A drive with noise, as sensors have it, and a row for the quarantine."""
+    noise = np.random.default_rng(seed).normal(size=(2, rows)).cumsum(axis=1) / 50
+    ax, beta = ([f"{x:.3f}" for x in np.clip(some, -9, 9)] for some in noise)
+    ax[100] = "broken"
+    return {"t": [f"{i / 100:.2f}" for i in range(rows)], "ax": ax, "beta": beta}
+
+
+def write(file: Path, columns: dict[str, list[str]]) -> Path:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(csv_text(columns))
+    return file
+
+
+def corrected(**changes: object) -> Mapping:
+    turned = {"column": "beta", "unit": "deg", "negate": True}
+    return a_mapping(signals={**SIGNALS, "sideslip": turned}, **changes)
+
+
+@pytest.fixture
+def fleet(tmp_path: Path) -> Fleet:
+    """A recording and another one, and Gram rows of them."""
+    fleet = fleet_slip.open(tmp_path / "data")
+    write(tmp_path / "monday.csv", recording())
+    fleet.ingest([tmp_path / "monday.csv", write(tmp_path / "b.csv", recording(2))], a_mapping())
+    fleet.gram()
+    return fleet
+
+
+def drives(fleet: Fleet) -> dict[str, float]:
+    """Mean side-slip angle by file; a file twice would be an error."""
+    found = fleet.sql(
+        "SELECT source_file, count(DISTINCT drive_id), avg(sideslip_rad) FROM log GROUP BY ALL"
+    ).fetchall()
+    assert all(many == 1 for _, many, _ in found)
+    return {file: mean for file, _, mean in found}
+
+
+def test_a_corrected_mapping_replaces_what_came_through_the_old_one(
+    fleet: Fleet, tmp_path: Path
+) -> None:
+    before = drives(fleet)
+    version = fleet.warehouse.logs.snapshot().version
+    with pytest.raises(RepeatedError, match=r"monday.csv: its recording is in the logs.*--replace"):
+        fleet.ingest(tmp_path / "monday.csv", corrected())
+    assert drives(fleet) == before
+    (report,) = fleet.ingest(tmp_path / "monday.csv", corrected(), replace="all")
+    assert (report.new, report.drives_replaced) == (True, 1)
+    assert fleet.warehouse.logs.snapshot().version == (version or 0) + 1
+    after = drives(fleet)
+    assert after["monday.csv"] == -before["monday.csv"]
+    assert after["b.csv"] == before["b.csv"]
+    refused = fleet.sql("SELECT file, count(*) FROM quarantine GROUP BY ALL ORDER BY ALL")
+    assert refused.fetchall() == [("b.csv", 1), ("monday.csv", 1)]
+    fleet.gram()
+    assert fleet.sql("SELECT count(DISTINCT drive_id) FROM grams").fetchall() == [(2,)]
+    assert fleet.check().drives == 2
+    assert not fleet.verify(full=True).damage
+    (again,) = fleet.ingest(tmp_path / "monday.csv", corrected())
+    assert not again.new
+
+
+def test_the_old_mapping_can_come_back(fleet: Fleet, tmp_path: Path) -> None:
+    before = drives(fleet)
+    fleet.ingest(tmp_path / "monday.csv", corrected(), replace="all")
+    fleet.ingest(tmp_path / "monday.csv", a_mapping(), replace="all")
+    assert drives(fleet) == before
+    assert not fleet.verify().damage
+
+
+def faster(columns: dict[str, list[str]]) -> dict[str, list[str]]:
+    return {name: values[::2] for name, values in columns.items()}
+
+
+COPIES: dict[str, Callable[[dict[str, list[str]]], tuple[dict[str, list[str]], Mapping]]] = {
+    "another name": lambda columns: (columns, a_mapping()),
+    "another mapping": lambda columns: (columns, corrected(name="other")),
+    "another model": lambda columns: (columns, a_mapping(drive={"vehicle_model": "coupe"})),
+    "another car": lambda columns: (columns, a_mapping(drive={"vehicle_id": "B"})),
+    "one row less": lambda columns: ({n: v[1:] for n, v in columns.items()}, a_mapping()),
+    "50 Hz": lambda columns: (faster(columns), a_mapping()),
+    "25 Hz": lambda columns: (faster(faster(columns)), a_mapping()),
+    "two thirds": lambda columns: ({n: v[1000:5000] for n, v in columns.items()}, a_mapping()),
+}
+
+
+@pytest.mark.parametrize("change", COPIES)
+def test_a_copy_is_told(change: str, fleet: Fleet, tmp_path: Path) -> None:
+    before = drives(fleet)
+    columns, mapping = COPIES[change](recording())
+    file = write(tmp_path / "copy.csv", columns)
+    with file.open("a") as stream:
+        stream.write("\n")
+    with pytest.raises(RepeatedError, match=r"copy.csv: its recording is in the logs.*monday.csv"):
+        fleet.ingest(file, mapping)
+    assert drives(fleet) == before
+    (report,) = fleet.ingest(file, mapping, replace="all")
+    assert report.drives_replaced == 1
+    assert drives(fleet).keys() == {"copy.csv", "b.csv"}
+
+
+def test_copies_that_come_together_are_told(tmp_path: Path) -> None:
+    fleet = fleet_slip.open(tmp_path / "data")
+    write(tmp_path / "landing" / "a.csv", recording())
+    write(tmp_path / "landing" / "b.csv", faster(recording()))
+    write(tmp_path / "landing" / "c.csv", recording(3))
+    with pytest.raises(RepeatedError, match=r"b.csv: it has the recording of .*a.csv"):
+        fleet.ingest(tmp_path / "landing", a_mapping())
+    assert drives(fleet).keys() == {"a.csv", "c.csv"}
+
+
+def test_what_was_taken_in_can_be_taken_back(fleet: Fleet, tmp_path: Path) -> None:
+    before = drives(fleet)
+    assert fleet.take_back("monday.csv") == 1
+    assert drives(fleet).keys() == {"b.csv"}
+    assert fleet.sql("SELECT count(*) FROM quarantine").fetchall() == [(1,)]
+    with pytest.raises(QuestionError, match="no drive of the logs came"):
+        fleet.take_back("monday.csv")
+    assert fleet.ingest(tmp_path / "monday.csv", a_mapping())[0].new
+    assert drives(fleet) == before
+    assert fleet.take_back("test") == 2
+    assert drives(fleet) == {}
+    assert not fleet.verify(full=True).damage
+
+
+def test_a_folder_takes_in_again_what_was_taken_back(tmp_path: Path) -> None:
+    fleet = fleet_slip.open(tmp_path / "data")
+    write(tmp_path / "landing" / "a.csv", recording())
+    fleet.ingest(tmp_path / "landing", a_mapping())
+    assert fleet.ingest(tmp_path / "landing", a_mapping()) == []
+    fleet.take_back("a.csv")
+    assert [report.new for report in fleet.ingest(tmp_path / "landing", a_mapping())] == [True]
+
+
+def test_a_file_that_has_changed_replaces_what_it_had(tmp_path: Path) -> None:
+    fleet = fleet_slip.open(tmp_path / "data")
+    file = write(tmp_path / "landing" / "a.csv", recording())
+    fleet.ingest(tmp_path / "landing", a_mapping())
+    write(file, recording(5))
+    with pytest.raises(RepeatedError, match="changed since it was ingested"):
+        fleet.ingest(tmp_path / "landing", a_mapping())
+    before = drives(fleet)
+    (report,) = fleet.ingest(tmp_path / "landing", a_mapping(), replace="all")
+    assert report.drives_replaced == 1
+    assert drives(fleet) != before
+
+
+def test_the_night_replaces_what_came_through_a_mapping_that_was_corrected(
+    fleet: Fleet, tmp_path: Path
+) -> None:
+    before = drives(fleet)
+    for mapping in (corrected(name="other"), a_mapping(name="other")):
+        with pytest.raises(RepeatedError, match="monday"):
+            fleet.ingest(tmp_path / "monday.csv", mapping, replace="corrected")
+    (report,) = fleet.ingest(tmp_path / "monday.csv", corrected(), replace="corrected")
+    assert report.drives_replaced == 1
+    assert drives(fleet)["monday.csv"] == -before["monday.csv"]
+
+
+def test_two_that_land_a_recording_at_once_land_it_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fleet = fleet_slip.open(tmp_path / "data")
+    other = fleet_slip.open(tmp_path / "data")
+    first = write(tmp_path / "first.csv", recording())
+    second = write(tmp_path / "second.csv", faster(recording()))
+    commit, waiting = Snapshot.commit, [second]
+
+    def commit_later(self: Snapshot, change: Change) -> None:
+        if self.table.folder.name == "logs" and waiting:
+            other.ingest(waiting.pop(), a_mapping())
+        commit(self, change)
+
+    monkeypatch.setattr(Snapshot, "commit", commit_later)
+    with pytest.raises(RepeatedError, match=r"first.csv: its recording is in the logs"):
+        fleet.ingest(first, a_mapping())
+    assert drives(fleet).keys() == {"second.csv"}
+
+
+def test_a_replacement_that_stops_at_any_commit_ends_as_if_it_had_not(
+    fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = drives(fleet)
+    commit = Snapshot.commit
+    for stop in (0, 1, 1):  # refused rows, once and for all; Gram rows, then logs
+        number = iter(range(99))
+
+        def stopping(
+            self: Snapshot, change: Change, number: Iterator[int] = number, stop: int = stop
+        ) -> None:
+            if next(number) == stop:
+                raise KeyboardInterrupt
+            commit(self, change)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Snapshot, "commit", stopping)
+            with pytest.raises(KeyboardInterrupt):
+                fleet.ingest(tmp_path / "monday.csv", corrected(), replace="all")
+        assert drives(fleet) == before
+    fleet.ingest(tmp_path / "monday.csv", corrected(), replace="all")
+    assert drives(fleet)["monday.csv"] == -before["monday.csv"]
+    assert fleet.sql("SELECT count(*) FROM quarantine").fetchall() == [(2,)]
+    fleet.gram()
+    assert fleet.check().drives == 2
+    assert not fleet.verify(full=True).damage
