@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from fleet_slip.maintenance.vacuum import VacuumReport
     from fleet_slip.maintenance.verify_files import Verification
     from fleet_slip.models.model_version import ModelVersion
+    from fleet_slip.monitoring.examined import Examined
     from fleet_slip.monitoring.fitness import Fitness
     from fleet_slip.monitoring.monitor import Chart
     from fleet_slip.monitoring.quality import QualityReport
@@ -73,6 +74,16 @@ class HealthAndUpkeep(PublishedModels):
         from fleet_slip.monitoring.quality import examine_drives
 
         return examine_drives(self.warehouse, cohort)
+
+    def leave_out_faulty(self, cohort: str = TRAINING_DRIVES) -> "Examined":
+        """Examine the drives of a cohort; return the condition of those that are in order.
+
+        As `quality` does, for measured drives and those without a log, and once: what was found is
+        kept as long as the data are what they were. Raises what `quality` raises.
+        """
+        from fleet_slip.monitoring.examined import leave_out_faulty
+
+        return leave_out_faulty(self.warehouse, cohort)
 
     def calibrate(self, cohort: str = ALL_DRIVES) -> "Calibration":
         """Return how the sensors of every car are off, and what else its drives tell of it.

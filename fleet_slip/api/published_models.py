@@ -82,10 +82,12 @@ class PublishedModels(Rooted):
         whatever is published while the champion is held by `rollback` or `pin`. `sign_key` is the
         private key that signs the version.
 
-        Raises `RefusedError` for a worse winner, or one that a late or false course taught;
+        Raises `RefusedError` for a worse winner, one that a late or false course taught, or a first
+        one of measured drives that contradict any car;
         `UsageError` for a name that no model may have, `ConfigError` for a key that cannot be used,
         and what `FleetCohort.select` raises.
         """
+        from fleet_slip.models.first_look import require_sound_drives
         from fleet_slip.models.in_time import require_in_time
         from fleet_slip.models.publish import manifest_of, publish, with_straight_intercept
         from fleet_slip.models.sound_course import require_sound_course
@@ -97,6 +99,8 @@ class PublishedModels(Rooted):
             delays_s = require_in_time(self.warehouse, manifest)
             require_sound_course(self.warehouse, manifest, delays_s)
         registry = self.registry(sign_key)
+        if not (force or candidate or registry.champion(name)):
+            require_sound_drives(self.warehouse, manifest)
         return publish(registry, manifest, selection, force=force, candidate=candidate)
 
     def would_publish(

@@ -2,10 +2,19 @@
 
 from collections.abc import Mapping
 
+from fleet_slip.api.fleet import Fleet
 from fleet_slip.cli.output import say
 from fleet_slip.regression.inference.influential import Influential
 from fleet_slip.warehouse.minimum_cohort import MINIMUM_VARIABLE, tells_single_cars
 from fleet_slip.words import number_of
+
+
+def examine_cohort(fleet: Fleet, cohort: str) -> str:
+    """Return a cohort without the drives that are not in order, and say which were left out."""
+    examined = fleet.leave_out_faulty(cohort)
+    if told := str(examined):
+        say(told)
+    return examined.cohort
 
 
 def say_without_log(drives: int, feature_set: str) -> None:

@@ -132,6 +132,13 @@ Cohort = Annotated[
     str,
     typer.Option(help="SQL condition on the view drives, such as \"track = 'waterford_hills'\"."),
 ]
+Unexamined = Annotated[
+    bool,
+    typer.Option(
+        "--unexamined",
+        help="Take drives whose sensors are not in order, too. As a rule all are examined first.",
+    ),
+]
 By = Annotated[FoldKey, typer.Option(help="What a fold is made of.")]
 FoldCount = Annotated[str | None, SELECTION["folds"]]
 Worth = Annotated[str | None, SELECTION["worth"]]

@@ -14,6 +14,7 @@ from hashlib import blake2b
 from typing import Any
 
 import numpy as np
+import polars as pl
 import pyarrow as pa
 from numpy.typing import NDArray
 
@@ -118,29 +119,38 @@ def find_spots(ticks: NDArray[np.signedinteger[Any]], counts: Mapping[str, pa.Ar
     moving = [name for name, column in counts.items() if column.null_count < len(column)]
     first = [name for name in SPOT_SIGNALS if name in moving]
     others = sorted(set(moving).difference(first))
-    phase = (ticks.astype(np.int64) - int(ticks[0])) % SPOT_TICKS if len(ticks) else ticks
+    phase = ((ticks - ticks[:1]) % SPOT_TICKS).astype(np.uint8)
     kept, seen = [], []
     for name in [*first, *others][: len(SPOT_SIGNALS)]:
-        values = np.asarray(counts[name].fill_null(ABSENT), dtype="<i2").astype(np.int64)
+        filled = pl.Series(counts[name]).cast(pl.Int64).fill_null(ABSENT)
+        values = filled.to_numpy()  # Arrow's own would load pandas
         there = values != ABSENT
-        for begin in range(SPOT_TICKS):
-            every = values[there & (phase == begin)]
-            hashes = np.unique(_hash_pieces(np.abs(np.diff(every)), SPOT_CUT_BITS))
-            seen.append(hashes)
-            if not begin:
-                kept.append(hashes[:SPOTS_PER_SIGNAL])
+        order = np.argsort(phase[there], kind="stable")
+        by_phase, phases = values[there][order], phase[there][order]
+        begins = np.searchsorted(phases, np.arange(1, SPOT_TICKS))
+        changes = np.abs(np.diff(by_phase))
+        own = _hash_pieces(changes[: max(int(begins[0]) - 1, 0)], SPOT_CUT_BITS)
+        kept.append(np.unique(own)[:SPOTS_PER_SIGNAL])
+        seen.append(_hash_pieces(changes, SPOT_CUT_BITS, begins))
     none = np.empty(0, np.uint64)
     return Spots(*(np.unique(np.concatenate([none, *each])) for each in (kept, seen)))
 
 
-def _hash_pieces(values: IntArray, cut_bits: int = CUT_BITS) -> Hashes:
-    """Return the hashes of the pieces of a signal in which enough happens."""
+def _hash_pieces(
+    values: IntArray, cut_bits: int = CUT_BITS, begins: IntArray | None = None
+) -> Hashes:
+    """Return the hashes of the pieces of a signal in which enough happens.
+
+    At `begins` it is cut, too.
+    """
     if len(values) < BENDS:
         return np.empty(0, np.uint64)
     words: Hashes = (values & 0xFFFF).astype(np.uint64)
     fours: Hashes = words[:-3] | words[1:-2] << _U(16) | words[2:-1] << _U(32) | words[3:] << _U(48)
     mixed = _mix(fours)
     starts = np.concatenate([[0], np.flatnonzero(mixed >> _U(64 - cut_bits) == 0) + 1])
+    if begins is not None:
+        starts = np.union1d(starts, begins)
     starts = starts[starts < len(mixed)]
     bends = (np.diff(values, 2) != 0)[: len(mixed)]
     eventful = np.add.reduceat(bends, starts, dtype=np.int64) >= BENDS

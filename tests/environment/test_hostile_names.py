@@ -54,6 +54,7 @@ def test_cars_and_drives_of_one_file_that_look_the_same_are_pointed_out(
 ) -> None:
     columns = good_columns() | {"car": [NFC] * 10 + [NFD] * 10}
     for place in ("vehicle_id", "column"):
+        columns["ax"] = [f"{len(place)}"] * 20
         drive = {place: {"column": "car"}} if place == "vehicle_id" else {place: "car"}
         (tmp_path / "log.csv").write_text(csv_text(columns))
         (report,) = ingest_files(warehouse, [tmp_path / "log.csv"], a_mapping(drive=drive))
@@ -64,8 +65,9 @@ def test_a_car_that_looks_like_one_of_the_logs_is_pointed_out(
     tmp_path: Path, warehouse: Warehouse
 ) -> None:
     found = []
-    for name in (NFC, "other", NFD):
-        (tmp_path / "log.csv").write_text(csv_text(good_columns()))
+    for number, name in enumerate((NFC, "other", NFD)):
+        columns = good_columns() | {"ax": [f"{number}"] * 20}
+        (tmp_path / "log.csv").write_text(csv_text(columns))
         mapping = a_mapping(drive={"vehicle_id": name})
         found += [r.look_alikes for r in ingest_files(warehouse, [tmp_path / "log.csv"], mapping)]
     assert found == [(), (), ((NFD, NFC),)]

@@ -6,8 +6,9 @@ import typer
 
 from fleet_slip.cli.begin.select_command import print_selection
 from fleet_slip.cli.completing import complete_model
+from fleet_slip.cli.left_out import examine_cohort
 from fleet_slip.cli.models.signing_commands import SignKey, signing_key
-from fleet_slip.cli.options import RESAMPLING, selection_options
+from fleet_slip.cli.options import RESAMPLING, Unexamined, selection_options
 from fleet_slip.cli.output import All, Json, print_json, say
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.models.manifest import require_model_name
@@ -34,6 +35,7 @@ def publish(
             "drives, of a new model."
         ),
     ] = None,
+    unexamined: Unexamined = False,
     force: Annotated[
         bool, typer.Option("--force", help="Publish even what is worse than the champion.")
     ] = False,
@@ -66,8 +68,9 @@ def publish(
     recipe = recipe_for(context.obj.registry(), name, request, cohort)
     if recipe.told:
         say(f"{name}: {recipe.told}")
+    cohort = recipe.cohort if unexamined else examine_cohort(context.obj, recipe.cohort)
     with step("select"):
-        selection = answer_request(context.obj.warehouse, recipe.request, recipe.cohort)
+        selection = answer_request(context.obj.warehouse, recipe.request, cohort)
     if dry_run:
         told = context.obj.would_publish(name, selection)
         if json:

@@ -8,13 +8,14 @@ import typer
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli.left_out import (
+    examine_cohort,
     say_influential,
     say_outweighing,
     say_revoked,
     say_untold,
     say_without_log,
 )
-from fleet_slip.cli.options import Cohort, selection_options
+from fleet_slip.cli.options import Cohort, Unexamined, selection_options
 from fleet_slip.cli.output import (
     All,
     Json,
@@ -57,6 +58,7 @@ def select(
     context: typer.Context,
     request: SelectionRequest,
     cohort: Cohort = TRAINING_DRIVES,
+    unexamined: Unexamined = False,
     everything: All = False,
     json: Json = False,
 ) -> None:
@@ -70,6 +72,8 @@ def select(
 
     Search all subsets: **fleet-slip select --all-subsets --criterion cv --bootstrap 1000**
     """
+    if not unexamined:
+        cohort = examine_cohort(context.obj, cohort)
     selection = answer_request(context.obj.warehouse, request, cohort)
     if json:
         print_json(selection)

@@ -48,7 +48,7 @@ class KnownFiles:
     def of(cls, warehouse: Warehouse, mapping: Mapping) -> "KnownFiles":
         """Return what is remembered for a data root and a mapping."""
         about = sha256(f"{warehouse.root.uri}\n{mapping.canonical_json()}".encode()).hexdigest()
-        cache = _cache_folder() / f"{about[:32]}.json"
+        cache = cache_folder("ingested") / f"{about[:32]}.json"
         with suppress(OSError, ValueError, TypeError, KeyError, AttributeError):
             kept: dict[str, Any] = json.loads(cache.read_bytes())
             if "files" not in kept:  # of an earlier version, which remembered no moment
@@ -129,7 +129,8 @@ def _state_of(log: Log) -> tuple[int, int | str] | None:
     return found.st_size, found.st_mtime_ns
 
 
-def _cache_folder() -> Path:
+def cache_folder(name: str) -> Path:
+    """Return a folder of this user for what can be lost."""
     service = os.environ.get("CACHE_DIRECTORY", "").partition(":")[0]
     home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")  # noqa: PTH111
-    return Path(service or Path(home, "fleet-slip"), "ingested")
+    return Path(service or Path(home, "fleet-slip"), name)

@@ -1,0 +1,89 @@
+"""Looks at drives before the first champion: nobody can be worse than no champion.
+
+Later ones are compared with a champion on held-out drives. A first one has only its data, and
+where these are wrong alike, such as a label with the other sign, no drive is unlike its peers. So a
+few of the longest drives are looked at as a file is at `ingest`: for what contradicts any car.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from fleet_slip.arrays import FloatArray
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.errors import RefusedError
+from fleet_slip.ingest.drives.measured_drives import SOURCE
+from fleet_slip.ingest.drives.suspicion import Suspicion, find_suspicions
+from fleet_slip.models.manifest import Manifest
+from fleet_slip.warehouse.condition import asking, parse_condition
+from fleet_slip.warehouse.table_views import connect_tables
+from fleet_slip.warehouse.tables import Warehouse
+
+DRIVES = 5
+"""That are looked at, of as many cars if there are so many."""
+
+MOST_TICKS = 100_000
+
+_LONGEST = """
+    SELECT drive_id, day FROM drives WHERE source = $source AND ({condition})
+    ORDER BY row_number() OVER (PARTITION BY vehicle_id ORDER BY rows DESC, drive_id),
+        rows DESC, drive_id
+    LIMIT $drives
+"""
+
+
+def require_sound_drives(warehouse: Warehouse, manifest: Manifest) -> None:
+    """Raise `RefusedError` if most of some measured drives of a cohort contradict any car.
+
+    What is looked at is the label, and the signals that a model has columns of. Simulated drives,
+    and those of cars that sent no log, are passed over.
+    """
+    found, looked_at = _look(warehouse, manifest.trained_on.cohort)
+    used = {manifest.label.signal}
+    for term in manifest.terms:
+        used |= set(term.definition.signals) if term.definition else {term.signal}
+    for (_, signals), examples in found.items():
+        if used.isdisjoint(signals) or 2 * len(examples) <= looked_at:
+            continue
+        raise RefusedError(
+            f"{manifest.name} was not published: {len(examples)} of {looked_at} drives that were "
+            f"looked at contradict what any car does: {examples[0]} Correct the mapping and give "
+            "ingest again with --replace, or publish it with force all the same."
+        )
+
+
+def _look(
+    warehouse: Warehouse, cohort: str
+) -> tuple[dict[tuple[str, tuple[str, ...]], list[Suspicion]], int]:
+    """Return what looks wrong in some long drives, and how many these are."""
+    found: dict[tuple[str, tuple[str, ...]], list[Suspicion]] = {}
+    condition = parse_condition(cohort)
+    query = _LONGEST.format(condition=condition.sql)
+    with connect_tables(warehouse, query + "log_counts") as database, asking(database, condition):
+        given = {"source": SOURCE, "drives": DRIVES}
+        chosen = database.execute(query, given).fetchall()
+        for drive, day in chosen:
+            columns = database.execute(
+                "SELECT * FROM log_counts WHERE day = $day AND drive_id = $drive ORDER BY tick "
+                f"LIMIT {MOST_TICKS}",
+                {"day": day, "drive": drive},
+            ).fetchnumpy()
+            for one in find_suspicions(_signals(columns)):
+                found.setdefault((one.kind, one.signals), []).append(one)
+    return found, len(chosen)
+
+
+def _signals(columns: Mapping[str, Any]) -> dict[str, FloatArray]:
+    """Return the signals of a drive in SI units on consecutive ticks, NaN where there is none."""
+    ticks = np.asarray(columns["tick"], dtype=np.int64)
+    found = {}
+    for name, signal in catalogue().signals.items():
+        if name not in columns:
+            continue
+        values = np.ma.filled(np.ma.asarray(columns[name], dtype=np.float64), np.nan)
+        if np.isfinite(values).any():
+            dense = np.full(int(ticks[-1] - ticks[0]) + 1, np.nan)
+            dense[ticks - ticks[0]] = values * float(signal.scale)
+            found[name] = dense
+    return found

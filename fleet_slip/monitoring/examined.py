@@ -1,0 +1,100 @@
+"""Which drives of a cohort are to train: those that were examined, and are in order.
+
+A cohort is examined once: what was found is kept in the user's cache, as hashes of drives, as long
+as logs, Gram rows and thresholds are what they were. Simulated drives are not examined: what is
+wrong in them is meant.
+"""
+
+import json
+import os
+from collections import Counter
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from hashlib import sha256
+from pathlib import Path
+
+from fleet_slip.canonical import canonical_json
+from fleet_slip.catalogue.sources import RECEIVED
+from fleet_slip.errors import DataError
+from fleet_slip.ingest.drives.measured_drives import SOURCE
+from fleet_slip.ingest.landing.known_files import cache_folder
+from fleet_slip.monitoring.quality import examine_drives
+from fleet_slip.monitoring.thresholds import thresholds
+from fleet_slip.runs.nights import hash_drive, without_drives
+from fleet_slip.warehouse.condition import parse_condition
+from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.words import number_of
+
+NAME = "drive"
+"""Stands for a model's name in the hashes of drives."""
+
+_EXAMINED = parse_condition(f"source IN ('{SOURCE}', '{RECEIVED}')")
+
+
+@dataclass(frozen=True)
+class Examined:
+    """What was found.
+
+    Attributes:
+        cohort: the condition without the drives that are not in order.
+        drives: how many were long enough to be examined.
+        faults: how many drives have each fault, such as `reversed sideslip`.
+    """
+
+    cohort: str
+    drives: int = 0
+    faults: Mapping[str, int] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        """Return what is left out as a sentence; nothing if all are in order."""
+        if not self.faults:
+            return ""
+        told = ", ".join(f"{number:,} {fault}" for fault, number in self.faults.items())
+        out = number_of(sum(self.faults.values()), "drive")
+        return (
+            f"{out} of {self.drives:,} left out, not in order: {told}. See fleet-slip quality; "
+            "--unexamined takes them all the same."
+        )
+
+
+def leave_out_faulty(warehouse: Warehouse, cohort: str) -> Examined:
+    """Examine the drives of a cohort like `quality`; return it without those not in order.
+
+    Raises what `examine_drives` raises; where no drive is measured there is nothing to examine.
+    """
+    kept = _cache(warehouse, cohort)
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        known = json.loads(kept.read_bytes())
+        return Examined(
+            without_drives(cohort, NAME, map(str, known["drives"])),
+            int(known["examined"]),
+            {str(fault): int(number) for fault, number in known["faults"].items()},
+        )
+    try:
+        report = examine_drives(warehouse, parse_condition(cohort) & _EXAMINED)
+    except DataError:
+        return Examined(cohort)
+    hashes = sorted(hash_drive(NAME, one.drive_id) for one in report.findings)
+    faults = Counter(" ".join((one.fault.kind, *one.fault.signals)) for one in report.findings)
+    content = {"drives": hashes, "examined": report.drives, "faults": faults}
+    with suppress(OSError):
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        draft = kept.with_suffix(f".{os.getpid()}")
+        draft.write_text(json.dumps(content))
+        draft.replace(kept)
+    return Examined(without_drives(cohort, NAME, hashes), report.drives, dict(faults))
+
+
+def _cache(warehouse: Warehouse, cohort: str) -> Path:
+    """Return the file for what was found of a cohort, in the tables as they are now."""
+    moments = []
+    for table in (warehouse.logs, warehouse.grams):
+        snapshot = table.snapshot()
+        version = snapshot.version
+        moments.append([version, None if version is None else snapshot.moment(version)])
+    limits = thresholds().quality.model_dump(mode="json")
+    about = {"root": warehouse.root.uri, "cohort": cohort, "tables": moments, "limits": limits}
+    return (
+        cache_folder("examined") / f"{sha256(canonical_json(about).encode()).hexdigest()[:32]}.json"
+    )
