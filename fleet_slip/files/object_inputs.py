@@ -78,7 +78,13 @@ def parse_url(url: str) -> tuple[ObjectFolder, str]:
             "a file on an object store is written as s3://BUCKET/PATH, gs://BUCKET/PATH or "
             "az://CONTAINER/PATH. Credentials are not part of it: they come from the environment."
         )
-    return ObjectFolder(found["bucket"], ""), (found["path"] or "").rstrip("/")
+    path = (found["path"] or "").rstrip("/")
+    if not {".", ".."}.isdisjoint(path.split("/")):
+        raise InputError(
+            f"{found['bucket']}: a path in a bucket has no folder '.' or '..'. Write it "
+            "as the store lists it."
+        )
+    return ObjectFolder(found["bucket"], ""), path
 
 
 def find_object(url: str) -> StoredFile | None:

@@ -37,6 +37,7 @@ _REFUSED = {
     "not_a_number": ("texts", "Name those that mean no value under missing."),
     "not_finite": ("values", 'Write missing = ["nan"] if they mean no value.'),
 }
+_OF_TIME = ("time", "isolated", "too_short")
 _FACTORS = {57.3: "degrees and radians", 9.81: "g and m/s^2", 3.6: "km/h and m/s"}
 
 
@@ -79,13 +80,25 @@ def find_suspicions(signals: Signals) -> list[Suspicion]:
     return found
 
 
-def find_refusals(refused: Mapping[tuple[str, str], int], rows: int) -> Iterator[Suspicion]:
-    """Yield the signals of which more than a tenth of a file's rows were refused, by reason."""
+def find_refusals(
+    refused: Mapping[tuple[str, str], int], rows: int, others: Mapping[str, int] | None = None
+) -> Iterator[Suspicion]:
+    """Yield the signals of which more than a tenth of a file's rows were refused, by reason.
+
+    `others` are the rows refused for anything but a signal, by reason: together they are another.
+    """
     for (name, reason), count in refused.items():
         if count > max(rows * LARGEST_REFUSED, FEWEST_REFUSED):
             kind, remedy = _REFUSED.get(reason, ("values", "Look at the column."))
             figure = f"{count:,} of {rows:,} rows are refused for it, {reason}"
             yield Suspicion(kind, (name,), figure, remedy)
+    total = sum((others or {}).values())
+    if others and total > max(rows * LARGEST_REFUSED, FEWEST_REFUSED):
+        reason = max(others, key=lambda one: others[one])
+        of = "time" if reason.startswith(_OF_TIME) else "drive"
+        remedy = "Check the column of times, its unit and its format."
+        figure = f"{total:,} of {rows:,} rows are refused, {others[reason]:,} as {reason}"
+        yield Suspicion("values", (of,), figure, remedy if of == "time" else "Look at its columns.")
 
 
 def speed_mps(signals: Signals) -> FloatArray | None:

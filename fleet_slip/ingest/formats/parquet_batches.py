@@ -59,6 +59,8 @@ class ParquetSource:
         """Yield rows. Raises `InputError`."""
         require_columns(self._file, [*self._schema.names, *self._keys], columns)
         inside = [name for name in columns if name not in self._keys]
+        for name in inside:  # before anything is decoded: one list can be all of a file
+            _require_readable(self._schema.field(name).type, name, self._file)
         keys = [pl.lit(self._keys[name]).alias(name) for name in columns if name in self._keys]
         for batch in _parquet_batches(self._stream, self._file, inside):
             yield batch.with_columns(keys)
@@ -116,7 +118,12 @@ def _require_sane_footer(stream: pa.NativeFile, file: Path) -> None:
 def _require_within(budget: Budget, metadata: pq.FileMetaData) -> None:
     """Raise `InputError` for more rows or bytes than a file can have, or those of another file."""
     groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
-    budget.require_rows(max(metadata.num_rows, sum(group.num_rows for group in groups)))
+    values = [
+        max((group.column(i).num_values for i in range(group.num_columns)), default=0)
+        for group in groups
+    ]
+    rows = (metadata.num_rows, sum(group.num_rows for group in groups), sum(values))
+    budget.require_rows(max(rows))
     budget.require_unfolded(sum(group.total_byte_size for group in groups))
     if any(group.num_columns and group.column(0).file_path for group in groups):
         raise InputError(
@@ -160,10 +167,16 @@ def plain_column(array: pa.Array, name: str, file: Path) -> pa.Array:
         return pc.cast(array, pa.float64(), safe=False)
     if pa.types.is_null(kind):
         return pc.cast(array, pa.float64())
-    raise InputError(
-        f"{shown(file)}: column {name!r} has the type {shown(kind)[:80]}, which is neither a "
-        "number, text nor a time. Convert it or map another one."
-    )
+    _require_readable(kind, name, file)
+    return array
+
+
+def _require_readable(kind: pa.DataType, name: str, file: Path) -> None:
+    if not is_readable(kind):
+        raise InputError(
+            f"{shown(file)}: column {name!r} has the type {shown(kind)[:80]}, which is neither a "
+            "number, text nor a time. Convert it or map another one."
+        )
 
 
 def _in_calendar(array: pa.Array) -> pa.Array:

@@ -89,10 +89,20 @@ def find_files(path: Path) -> list[Path]:
         return _matching(path)
     if not path.is_dir():
         return [path]
+    _require_no_root(path, (path / "logs" / "_delta_log").is_dir())
     inside = sorted(_logs_below(path))
     if not inside:
         raise InputError(f"{shown(path)}: {_NO_LOG}")
     return _without_strays(inside, path)
+
+
+def _require_no_root(place: Place, is_root: bool) -> None:
+    """Raise `InputError` for a data root: what is in it is in it."""
+    if is_root:
+        raise InputError(
+            f"{shown(place)}: it is or has a data root, whose logs were ingested before. Name the "
+            "folder where logs land."
+        )
 
 
 def names_several(place: Place) -> bool:
@@ -140,6 +150,7 @@ def _stored(url: str) -> list[StoredFile]:
     if (one := find_object(url)) is not None:
         return [one]
     below = find_below(url)
+    _require_no_root(url, any("/logs/_delta_log/" in f"/{file.path}" for file in below))
     seen = [file for file in below if not _HIDDEN.search(str(file)) or "/." in url]
     if is_pattern(url):
         found, none = seen, "no object matches this pattern. Look at its folder."
