@@ -64,6 +64,9 @@ def floor() -> Floor:
 LEAST_VEHICLES = 5
 """With fewer cars their difference says little of other cars, and drives are held out instead."""
 
+SURE = 3.0
+"""So many standard errors worse is no chance: a champion does not give way to that."""
+
 GROUPS = 20
 """Into so many groups, or fewer, cars or drives are dealt. Each is an exact fit."""
 
@@ -96,6 +99,13 @@ class Comparison:
             for incumbent, shortfalls in zip(self.incumbents, both, strict=True)
             if not all(one is None or one.negligible for one in shortfalls)
         )
+
+    @property
+    def drifts(self) -> bool:
+        """Whether the champion is better by much more than chance, though hardly worth it."""
+        first = self.shortfalls[0]
+        enough = len(self.challenger.folds) >= LEAST_VEHICLES
+        return enough and first.rmse > SURE * first.standard_error
 
     @property
     def contradicted(self) -> bool:

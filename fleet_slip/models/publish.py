@@ -183,6 +183,9 @@ def publish(
         judgement = _judge(registry, champion, manifest, selection)
         if not force and not candidate:
             judgement.require_passed(manifest.name)
+        if champion and judgement.drifts and not (force or candidate or held):
+            reason = f"The champion stays, since it is better for sure. {judgement.reason}"
+            return Publication(champion, False, reason)
         if candidate or held:
             return _wait(registry, added(), newest_move, judgement.reason, held)
         version = added()
@@ -247,11 +250,13 @@ class _Judgement:
         problems: why it is not to become champion.
         compared: with what it was compared.
         best: the number of a champion of before that is better than it; None if none is.
+        drifts: whether the champion is better for sure, if not by what is worth a refusal.
     """
 
     problems: tuple[str, ...]
     compared: str
     best: int | None = None
+    drifts: bool = False
 
     @property
     def reason(self) -> str:
@@ -298,7 +303,7 @@ def _judge(
             f"{champion.reference}"
         )
     best = next((one.version for one in incumbents if one.reference == comparison.best), None)
-    return _Judgement(tuple(problems), str(comparison), best)
+    return _Judgement(tuple(problems), str(comparison), best, comparison.drifts)
 
 
 def _incumbents(registry: Registry, champion: ModelVersion) -> list[ModelVersion]:

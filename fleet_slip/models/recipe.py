@@ -9,6 +9,7 @@ from fleet_slip.errors import ConfigError, QuestionError
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.versions import Registry
+from fleet_slip.runs.nights import with_all_drives
 from fleet_slip.selection.answer_request import GIVEN
 from fleet_slip.selection.model_list import load_model_list
 from fleet_slip.selection.request import SelectionRequest
@@ -51,7 +52,8 @@ def recipe_for(
     asked = _asked(request)
     if before is None:
         return Recipe(request, cohort or TRAINING_DRIVES)
-    was, chosen_from = before.manifest.trained_on.cohort, before.manifest.selected_by.model_list
+    chosen_from = before.manifest.selected_by.model_list
+    was = with_all_drives(before.manifest.trained_on.cohort)
     if asked.keys() & _WHAT:
         wanted = request
         told = f"not as {before.reference}, chosen from {chosen_from}"
@@ -80,11 +82,12 @@ def _kept(version: ModelVersion) -> tuple[SelectionRequest, str]:
     """Return what a version was asked for, and of which drives. Raises `QuestionError`."""
     manifest = version.manifest
     chosen = manifest.selected_by
+    cohort = with_all_drives(manifest.trained_on.cohort)
     if chosen.asked is None:
-        return _of_list(manifest, version.reference), manifest.trained_on.cohort
+        return _of_list(manifest, version.reference), cohort
     known = {field.name for field in fields(SelectionRequest)}
     asked: dict[str, Any] = {name: one for name, one in chosen.asked.items() if name in known}
-    return SelectionRequest(**asked), str(chosen.asked.get(COHORT, manifest.trained_on.cohort))
+    return SelectionRequest(**asked), with_all_drives(str(chosen.asked.get(COHORT, cohort)))
 
 
 def _of_list(manifest: Manifest, reference: str) -> SelectionRequest:

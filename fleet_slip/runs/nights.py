@@ -7,6 +7,7 @@ the whole night and judges the model that was champion before it. Faulty drives 
 hashes: the record outlives what is forgotten.
 """
 
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import date
@@ -125,3 +126,15 @@ def without_drives(cohort: str, model: str, hashes: Iterable[str]) -> str:
     return (
         f"({cohort}) AND left(sha256('{model} ' || drive_id), {HASH_CHARACTERS}) NOT IN ({listed})"
     )
+
+
+_LEFT_OUT = re.compile(
+    r"\((.*)\) AND left\(sha256\('[^']*' \|\| drive_id\), \d+\) NOT IN \([^()]*\)", re.DOTALL
+)
+
+
+def with_all_drives(cohort: str) -> str:
+    """Return a condition as it was before `without_drives` left out some."""
+    while found := _LEFT_OUT.fullmatch(cohort):
+        cohort = found[1]
+    return cohort

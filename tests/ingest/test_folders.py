@@ -14,6 +14,7 @@ import fleet_slip
 from fleet_slip.delta import Snapshot
 from fleet_slip.errors import InputError
 from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.files.object_inputs import parse_url
 from fleet_slip.ingest.landing import ingest_job as job
 from fleet_slip.ingest.landing.landing import write_batch
 from fleet_slip.ingest.mapping.mapping import Mapping
@@ -267,3 +268,15 @@ def test_threads_read_small_files_and_large_ones_come_alone(
     assert sorted(drives(folder).values()) == [20, 21, 22, 23, 24, 200]
     assert read_by.pop(threading.get_ident()) == {"large.csv"}
     assert set().union(*read_by.values()) == {f"{i}.csv" for i in range(5)}
+
+
+def test_a_data_root_is_no_folder_of_logs(folder: Path) -> None:
+    ingest(folder)
+    with pytest.raises(InputError, match="it is or has a data root"):
+        ingest(folder, folder.parent / "root")
+
+
+@pytest.mark.parametrize("url", ["s3://bucket/ok/../ok/f.csv", "gs://bucket/./f.csv"])
+def test_dots_in_a_bucket_are_told(url: str) -> None:
+    with pytest.raises(InputError, match=r"has no folder '\.' or '\.\.'"):
+        parse_url(url)

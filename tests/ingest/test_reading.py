@@ -11,7 +11,7 @@ import pytest
 from fleet_slip.catalogue.counts import as_arrow
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.drives import checking, log_rows
-from fleet_slip.ingest.formats import csv_batches
+from fleet_slip.ingest.formats import csv_batches, parquet_batches
 from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.parquet_batches import open_parquet
 from tests.support.logs import without_names
@@ -262,3 +262,18 @@ def test_a_row_group_that_is_a_whole_file_is_not_in_memory_as_a_whole(tmp_path: 
         batches = source.batches(["ax"])
         next(batches)
         assert pa.total_allocated_bytes() - before < values.nbytes / 2
+
+
+def test_a_list_is_refused_before_it_is_decoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two rows may hold millions of equal values in a few bytes."""
+    values = pa.ListArray.from_arrays(pa.array([0, 1, 3_000_000], pa.int32()), np.zeros(3_000_000))
+    table = pa.table({"t": [0.0, 0.01], "ax": values, "beta": [0.0, 0.0]})
+    pq.write_table(table, tmp_path / "log.parquet")
+    monkeypatch.setattr(parquet_batches, "_parquet_batches", None)
+    with pytest.raises(InputError, match=r"3,000,000 rows or more"):
+        read_measured(tmp_path / "log.parquet", a_mapping())
+    pq.write_table(table.slice(0, 1), tmp_path / "log.parquet")
+    with pytest.raises(InputError, match=r"has the type list<.*, which is neither a number"):
+        read_measured(tmp_path / "log.parquet", a_mapping())

@@ -9,11 +9,14 @@ import polars as pl
 import pytest
 from typer.testing import CliRunner
 
+import fleet_slip
 from fleet_slip.arrays import FloatArray
 from fleet_slip.cli.app import app
 from fleet_slip.errors import AlarmError, UsageError
 from fleet_slip.ingest.drives import relations
 from fleet_slip.ingest.drives.suspicion import RADIUS_M, WHEELS, find_refusals, find_suspicions
+from tests.ingest.test_folders import MAPPING as PLAIN
+from tests.support.measured import csv_text, good_columns
 from tests.support.reported import call
 from tests.support.textbook_car import Car, a_car
 
@@ -230,3 +233,22 @@ def test_a_dry_run_of_what_looks_wrong_calls_for_attention(tmp_path: Path) -> No
     with pytest.raises(AlarmError, match="1 thing to look at before ingesting") as caught:
         call(tmp_path / "root", "ingest", file, "--mapping", mapping, "--dry-run", "--json")
     assert caught.value.exit_code == 10
+
+
+def test_rows_that_are_refused_for_their_time_call_for_attention(tmp_path: Path) -> None:
+    columns = {name: [f"{v}" for v in values] for name, values in good_columns(300).items()}
+    columns["t"] = [f"{i // 3 / 100:.2f}" for i in range(300)]
+    (tmp_path / "log.csv").write_text(csv_text(columns))
+    (tmp_path / "test.toml").write_text(PLAIN.format(day="2024-05-31"))
+    words = ("ingest", str(tmp_path / "log.csv"), "--mapping", str(tmp_path / "test.toml"))
+    with pytest.raises(AlarmError, match="200 of 300 rows were refused"):
+        call(tmp_path / "root", *words)
+    fleet = fleet_slip.open(tmp_path / "root")
+    assert fleet.sql("SELECT count(*) FROM log").fetchall() == [(100,)]
+
+
+def test_reasons_together_are_told() -> None:
+    found = list(find_refusals({}, 1000, {"time_duplicate": 60, "time_backwards": 50}))
+    assert [(one.kind, one.signals) for one in found] == [("values", ("time",))]
+    assert "110 of 1,000 rows are refused, 60 as time_duplicate" in str(found[0])
+    assert not list(find_refusals({}, 1000, {"no_value": 90}))

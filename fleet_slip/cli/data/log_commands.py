@@ -192,6 +192,24 @@ def ingest(
         print_json(reports)
     elif folders:
         say(_summed_up(reports))
+    _require_few_refused(reports)
+
+
+def _require_few_refused(reports: "list[IngestReport]") -> None:
+    """Raise `AlarmError` if more than a tenth of a file's rows were refused."""
+    from fleet_slip.ingest.drives.suspicion import (  # noqa: PLC0415 - takes a while
+        FEWEST_REFUSED,
+        LARGEST_REFUSED,
+    )
+
+    for report in reports:
+        refused, read = sum(report.counts.quarantined.values()), report.counts.rows_read
+        if report.new and refused > max(read * LARGEST_REFUSED, FEWEST_REFUSED):
+            raise AlarmError(
+                f"{report.file}: {refused:,} of {number_of(read, 'row')} were refused. See: "
+                'fleet-slip sql "FROM quarantine". Correct the mapping and give the command again '
+                "with --replace."
+            )
 
 
 def _take_back(fleet: Fleet, what: str, json: bool, *, alone: bool) -> None:

@@ -259,7 +259,11 @@ class MeasuredStream:
 
     def suspicions(self) -> tuple[Suspicion, ...]:
         """Return the signals of which many values were refused, once all pieces were taken."""
-        return tuple(find_refusals(self.totals.refused, self.checker.rows))
+        of_signals = Counter[str]()
+        for (_, reason), count in self.totals.refused.items():
+            of_signals[reason] += count
+        others = self.totals.quarantined - of_signals
+        return tuple(find_refusals(self.totals.refused, self.checker.rows, others))
 
     def look_alikes(self) -> tuple[tuple[str, ...], ...]:
         """Return names of drives or cars in the file that differ only in their Unicode form."""

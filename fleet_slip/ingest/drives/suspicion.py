@@ -37,7 +37,7 @@ _REFUSED = {
     "not_a_number": ("texts", "Name those that mean no value under missing."),
     "not_finite": ("values", 'Write missing = ["nan"] if they mean no value.'),
 }
-_OF_TIME = ("time", "isolated", "too_short")
+_OF_TIME = ("time", "isolated", "too_short", "not_a_time")
 _FACTORS = {57.3: "degrees and radians", 9.81: "g and m/s^2", 3.6: "km/h and m/s"}
 
 
@@ -95,10 +95,12 @@ def find_refusals(
     total = sum((others or {}).values())
     if others and total > max(rows * LARGEST_REFUSED, FEWEST_REFUSED):
         reason = max(others, key=lambda one: others[one])
-        of = "time" if reason.startswith(_OF_TIME) else "drive"
-        remedy = "Check the column of times, its unit and its format."
         figure = f"{total:,} of {rows:,} rows are refused, {others[reason]:,} as {reason}"
-        yield Suspicion("values", (of,), figure, remedy if of == "time" else "Look at its columns.")
+        if reason.startswith(_OF_TIME):
+            remedy = "Check the column of times, its unit and its format."
+            yield Suspicion("values", ("time",), figure, remedy)
+        else:
+            yield Suspicion("values", ("rows",), figure, "Look at the view quarantine.")
 
 
 def speed_mps(signals: Signals) -> FloatArray | None:
