@@ -20,14 +20,14 @@ NEGATED = {"sideslip_rad": "-sideslip_rad"}
 
 @pytest.fixture(scope="module")
 def landed(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Path:
-    """A folder with logs of a car, two drives with the label turned, and a root, `data`."""
+    """A folder with logs of a car, two drives with ay stuck, and a root, `data`."""
 
     def make(folder: Path) -> None:
         landing = Landing(folder / "landing", smoke_root)
         landing.prepare()
         drives, fleet = landing.drives(), fleet_slip.open(folder / "data")
         good = landing.land("good", drives[:6], date(2026, 10, 5))
-        bad = landing.land("bad", drives[6:8], date(2026, 10, 6), **NEGATED)
+        bad = landing.land("bad", drives[6:8], date(2026, 10, 6), ay_mps2="1.0 + 0 * ay_mps2")
         fleet.ingest([good, bad], str(landing.mapping))
         fleet.gram()
 
@@ -46,7 +46,7 @@ def test_drives_that_are_not_in_order_train_nothing_by_hand(
     fleet: Fleet, run_command: RunCommand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = fleet.leave_out_faulty()
-    assert (found.drives, found.faults) == (8, {"reversed sideslip": 2})
+    assert (found.drives, found.faults) == (8, {"stuck ay": 2})
 
     def examine_again(*_: object) -> None:
         raise AssertionError("examined again")
@@ -56,7 +56,7 @@ def test_drives_that_are_not_in_order_train_nothing_by_hand(
     monkeypatch.undo()
     told = run_command("select", "--models", "table1")
     assert told.exit_code == 0
-    assert "2 drives of 8 left out, not in order: 2 reversed sideslip" in told.stderr
+    assert "2 drives of 8 left out, not in order: 2 stuck ay" in told.stderr
     assert "6 drives" in told.stdout
     assert "8 drives" in run_command("select", "--models", "table1", "--unexamined").stdout
     assert run_command("publish", "m", "--models", "table1").exit_code == 0
