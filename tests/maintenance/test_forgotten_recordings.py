@@ -10,7 +10,7 @@ import pytest
 
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.ingest import Mapping
-from fleet_slip.ingest.landing import ingest_job
+from fleet_slip.ingest.landing import committing, ingest_job
 from fleet_slip.maintenance.forget import forget
 from fleet_slip.warehouse.audit import Audit, Forgettable
 from fleet_slip.warehouse.tables import Warehouse
@@ -155,7 +155,7 @@ def test_a_recording_that_is_forgotten_while_it_lands_again_does_not(
     ingest_file(warehouse, write(tmp_path, recording()), a_mapping())
     (file,) = warehouse.logs.snapshot().files
     (name,) = warehouse.logs.read_names(file.path)["drive_id"].used
-    land = ingest_job.land_batch
+    land = committing.land_batch
 
     def overtaken(*written: Any) -> Any:
         forget(warehouse, Forgettable("drive", name), now=True)
