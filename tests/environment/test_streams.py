@@ -1,6 +1,7 @@
 """Standard streams that are closed, full, or a pipe that nobody reads: the work is done."""
 
 import shlex
+import shutil
 from pathlib import Path
 
 import pytest
@@ -32,17 +33,23 @@ def run_in_shell(root: Path, arguments: str, redirection: str) -> Finished:
         pytest.param("2>/dev/full", 0, marks=needs_a_full_device),
         ("| head -0", 0),
         ("2>&1 | head -0", 0),
-        ("<&- >&- 2>&-", STORAGE),
     ],
 )
 def test_a_job_is_done_whatever_its_streams_are(
-    tmp_path: Path, redirection: str, exit_code: int
+    smoke_root: Path, tmp_path: Path, redirection: str, exit_code: int
 ) -> None:
-    done = run_in_shell(tmp_path / "data", "run --campaign smoke --days 1", redirection)
+    root = shutil.copytree(smoke_root, tmp_path / "data")
+    done = run_in_shell(root, "publish other --models table1", redirection)
     assert done.exit_code == exit_code
-    assert (tmp_path / "data/models/smoke/versions/1.json").exists()
-    if exit_code and "2>&-" not in redirection:
+    assert (root / "models/other/versions/1.json").exists()
+    if exit_code:
         assert "error: standard output:" in done.stderr
+
+
+def test_a_whole_job_is_done_without_any_stream(tmp_path: Path) -> None:
+    done = run_in_shell(tmp_path / "data", "run --campaign smoke --days 1", "<&- >&- 2>&-")
+    assert done.exit_code == STORAGE
+    assert (tmp_path / "data/models/smoke/versions/1.json").exists()
 
 
 @needs_a_full_device
