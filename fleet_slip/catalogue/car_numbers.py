@@ -81,7 +81,8 @@ CAR_NUMBERS: dict[NumberName, CarNumber] = {
     "steer_per_curvature": CarNumber(
         unit="m",
         grain=Decimal("0.002"),
-        description="Steering angle for each curvature: the wheelbase, as driven",
+        description="Steering angle for each curvature by wheels of 0.31 m: the wheelbase over "
+        "speed_ratio",
     ),
     "understeer": CarNumber(
         unit="rad*s^2/m",
