@@ -1,6 +1,6 @@
 """Tells two model versions apart: what each was made of, and what it came to."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
 
@@ -46,7 +46,7 @@ class Difference:
     other: ModelVersion
     drives: CommonDrives | None
     facts: dict[str, tuple[Any, Any]]
-    terms: tuple[Term, ...]
+    terms: tuple[Term, ...] = field(repr=False)
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `diff --json` prints."""

@@ -6,6 +6,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol, overload
 
 from fleet_slip.models.manifest import Manifest
+from fleet_slip.pages.notebook_table import notebook_table
 
 if TYPE_CHECKING:
     import polars as pl
@@ -37,6 +38,22 @@ class ModelVersion:
     version: int
     manifest: Manifest
     sha256: str
+
+    def __repr__(self) -> str:
+        """Return its name, how many signals it has, and how good it is."""
+        figures = self.manifest.cross_validation
+        return (
+            f"<{type(self).__name__} {self.reference}: {len(self.manifest.terms)} signals, RMSE "
+            f"{figures.rmse_deg:.4f} deg, correlation {figures.correlation:.4f}>"
+        )
+
+    def _repr_html_(self) -> str:
+        """Return the coefficients as a table, drawn per count of its signal."""
+        terms = self.manifest.terms
+        rows = [[term.column, term.unit, f"{term.coefficient:.6g}"] for term in terms]
+        rows.append(["intercept", self.manifest.label.unit, f"{self.manifest.intercept:.6g}"])
+        sizes = [*(term.coefficient * float(term.scale) for term in terms), 0.0]
+        return notebook_table(repr(self)[1:-1], ["signal", "unit", "coefficient"], rows, sizes)
 
     @property
     def reference(self) -> str:

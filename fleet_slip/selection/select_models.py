@@ -14,6 +14,7 @@ from fleet_slip.grams.cohorts.fold_sums import SummedCohort
 from fleet_slip.grams.cohorts.folding import ROW_FOLDS, Folding
 from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.grams.cohorts.outweighing import drives_by_car
+from fleet_slip.pages.notebook_table import notebook_table
 from fleet_slip.regression.choice.nested_choice import NestedDistances
 from fleet_slip.regression.choice.winner import Winner, Worth
 from fleet_slip.regression.inference.influential import Influential
@@ -63,6 +64,32 @@ class Selection(Generic[AnyCohort]):
     uncertainty: Uncertainty | None = None
     distances: NestedDistances | str | None = None
     intercept: bool = True
+
+    def __repr__(self) -> str:
+        """Return the winner, among how many, and of which drives."""
+        winner = self.winner.model
+        return (
+            f"<{type(self).__name__}: {winner.name}, {len(winner.signals)} signals, RMSE "
+            f"{winner.pooled.rmse_deg:.4f} deg, correlation {winner.correlation:.4f}, of "
+            f"{len(self.models)} models; {self.cohort.drive_count:,} drives where "
+            f"{self.cohort.condition.text}>"
+        )
+
+    def _repr_html_(self) -> str:
+        """Return the best models as a table, with their errors drawn."""
+        best = sorted(self.models, key=lambda model: model.pooled.rmse)[:10]
+        rows = [
+            [
+                one.name,
+                str(len(one.signals)),
+                f"{one.correlation:.4f}",
+                f"{one.pooled.rmse_deg:.4f}",
+            ]
+            for one in best
+        ]
+        header = ["model", "signals", "correlation", "RMSE deg"]
+        title = f"winner: {self.winner.model.name}. {self.winner.reason}"
+        return notebook_table(title, header, rows, [one.pooled.rmse_deg for one in best])
 
     def _gram_rows(self, model: CrossValidation) -> dict[str, str]:
         """Return which Gram rows a model is made of, for SQL; it may name cars."""
@@ -167,7 +194,7 @@ def validate(
     )
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class RequestedSelection(Selection[Any]):
     """A selection that can be published: it tells what it was made from.
 

@@ -1,7 +1,7 @@
 """Ordinary least squares of a Gram, solved exactly and rounded once (equation (4) of the paper)."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property
 
@@ -29,8 +29,8 @@ class LinearModel:
 
     signals: tuple[str, ...]
     label: str
-    coefficients: tuple[Fraction, ...]
-    intercept: Fraction
+    coefficients: tuple[Fraction, ...] = field(repr=False)  # of thousands of digits
+    intercept: Fraction = field(repr=False)
 
     def physical(self, scales: Scales) -> "LinearModel":
         """Return the model of physical values, from a model of counts."""

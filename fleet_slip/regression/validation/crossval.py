@@ -6,7 +6,7 @@ the sums of all folds are pooled before the correlation is taken.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
 
@@ -40,12 +40,12 @@ class CrossValidation:
     signals: tuple[str, ...]
     drives: int
     pooled: Figures
-    folds: tuple[Figures, ...]
-    fold_names: tuple[str, ...]
+    folds: tuple[Figures, ...] = field(repr=False)
+    fold_names: tuple[str, ...] = field(repr=False)
     condition_number: float
-    model: LinearModel
-    counts: LinearModel
-    sums: ErrorSums
+    model: LinearModel = field(repr=False)
+    counts: LinearModel = field(repr=False)
+    sums: ErrorSums = field(repr=False)
 
     @property
     def correlation(self) -> float:

@@ -1,0 +1,29 @@
+"""What a notebook shows of answers is short, and a table where there are many."""
+
+from pathlib import Path
+
+import fleet_slip
+
+
+def test_answers_are_shown_on_a_line_or_two(smoke_root: Path) -> None:
+    fleet = fleet_slip.open(smoke_root)
+    cohort = fleet.cohort()
+    selection = cohort.select(models="table1")
+    assert repr(selection).startswith("<RequestedSelection: ")
+    assert "RMSE" in repr(selection)
+    model = fleet.model("smoke")
+    assert repr(model).startswith("<ModelVersion smoke@1: ")
+    for answer in (selection, model, *cohort.shrink("ax,ay,yaw_rate")):
+        assert len(repr(answer)) < 500
+    assert len(repr(selection.models[0].model)) < 200  # its fractions may have 10,000 digits
+    assert len(repr(fleet.diff(model, model))) < 1000
+
+
+def test_a_notebook_gets_a_table_with_bars(smoke_root: Path) -> None:
+    fleet = fleet_slip.open(smoke_root)
+    selection = fleet.cohort("campaign <> '<script>'").select(models="table1")
+    assert selection._repr_html_().count("<tr>") == 6
+    page = fleet.model("smoke")._repr_html_()
+    assert page.count("<tr>") == len(fleet.model("smoke").manifest.terms) + 2
+    assert page.count("<svg ") == page.count("<tr>") - 1
+    assert "<script>" not in selection._repr_html_() + page
