@@ -15,9 +15,11 @@ def _():
     import matplotlib as mpl
     import numpy as np
     import polars as pl
+    from matplotlib.colors import LinearSegmentedColormap
     from matplotlib.figure import Figure
 
     import fleet_slip
+    from fleet_slip.comparison.report.track_map import CLASSES
     from fleet_slip.comparison.watch.drive_frames import drive_frames
     from fleet_slip.errors import FleetSlipError
     from fleet_slip.monitoring.control_chart import control_chart
@@ -25,8 +27,8 @@ def _():
     from fleet_slip.words import number_of
 
     return (
-        DESK, STYLE, Figure, FleetSlipError, alt, colour, control_chart, drive_frames, fleet_slip,
-        mo, mpl, np, number_of, pl,
+        CLASSES, DESK, STYLE, Figure, FleetSlipError, LinearSegmentedColormap, alt, colour,
+        control_chart, drive_frames, fleet_slip, mo, mpl, np, number_of, pl,
     )  # fmt: skip
 
 
@@ -37,7 +39,7 @@ def _(fleet_slip, mo, number_of):
         drives = session.sql("SELECT * FROM drives ORDER BY drive_id").pl()
         trained = session.sql("SELECT DISTINCT name FROM models ORDER BY 1").pl()["name"].to_list()
     found = f"{number_of(drives.height, 'drive')}, {number_of(len(trained), 'model')}"
-    mo.md(f"# {fleet.root}\n\n{found}")
+    mo.md(f"# Drives and models of {fleet.root}\n\n{found}")
     return drives, fleet, trained
 
 
@@ -107,20 +109,24 @@ def _(mo, trained, training):
 
 
 @app.cell
-def _(Figure, colour, drive, drive_frames, fleet, mo, name, np):
+def _(
+    CLASSES, Figure, LinearSegmentedColormap, colour, drive, drive_frames, fleet, mo, name, np
+):  # fmt: skip
     mo.stop(name.value is None, mo.md("No model yet: `fleet-slip publish`."))
     frames = drive_frames(fleet.warehouse, drive.value, fleet.model(name.value))
     error = frames.estimate_deg - frames.sideslip_deg
+    # As in the report; the hundredth of the points beyond the bound have the last colour.
+    shades = LinearSegmentedColormap.from_list("error", [colour(one) for one in CLASSES])
     bound = max(float(np.nanquantile(abs(error), 0.99)), 0.01)
     error_map = Figure(figsize=(9, 4.5), layout="constrained")
     _axes = error_map.subplots()
     _axes.plot(*frames.track, color=colour("grid"), linewidth=6, zorder=0)
     _seen = _axes.scatter(
-        frames.x_m, frames.y_m, c=error, cmap="RdBu", vmin=-bound, vmax=bound, s=6
+        frames.x_m, frames.y_m, c=error, cmap=shades, vmin=-bound, vmax=bound, s=6
     )
     _axes.set_aspect("equal")
     _axes.axis("off")
-    error_map.colorbar(_seen, label="error, deg", shrink=0.7)
+    error_map.colorbar(_seen, label="estimate - truth, deg", shrink=0.7, extend="both")
     error_map
     return
 

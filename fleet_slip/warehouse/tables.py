@@ -46,7 +46,10 @@ class Warehouse:
     def require(self) -> None:
         """Raise `StorageError` if there is no data root: a wrong path is not an empty warehouse."""
         if not self.root.exists():
-            raise StorageError(f"{self.root}: there is no data root. Choose another.")
+            raise StorageError(
+                f"{self.root}: there is no data root. Make one with: fleet-slip run, or fleet-slip "
+                "ingest; or choose another with --root."
+            )
 
     @cached_property
     def logs(self) -> Table:
