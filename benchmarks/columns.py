@@ -46,17 +46,21 @@ HALVES = {
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("root", type=Path)
-    fleet = fleet_slip.open(parser.parse_args().root)
-    cross_validated(fleet)
+    parser.add_argument("--most", type=int, default=max(SIZES), help="columns")
+    given = parser.parse_args()
+    fleet = fleet_slip.open(given.root)
+    sizes = [size for size in SIZES if size <= given.most]
+    cross_validated(fleet, sizes)
     inputs, folds = folds_of(fleet, SIMULATED, "vehicle", 20)
-    print("| columns | " + " | ".join(map(str, SIZES)) + " |")
-    print(f"| alike (Jaccard) | {' | '.join(f'{one:.2f}' for one in alike(inputs, folds.grams))} |")
+    print("| columns | " + " | ".join(map(str, sizes)) + " |")
+    told = [f"{one:.2f}" for one in alike(inputs, folds.grams, sizes)]
+    print(f"| alike (Jaccard) | {' | '.join(told)} |")
     for name, half in HALVES.items():
         for where, condition, others in (
             ("from", half, f"NOT ({half})"),
             ("to", f"NOT ({half})", half),
         ):
-            told = [f"{error:.3f}" for error in elsewhere(fleet, condition, others)]
+            told = [f"{error:.3f}" for error in elsewhere(fleet, condition, others, sizes)]
             print(f"| {where} {name} | {' | '.join(told)} |", flush=True)
 
 
@@ -67,40 +71,40 @@ def folds_of(fleet: Fleet, condition: str, by: FoldKey, count: int) -> tuple[Seq
     return inputs, cohort.folds(by, count).serving(inputs, LABEL)
 
 
-def cross_validated(fleet: Fleet) -> None:
+def cross_validated(fleet: Fleet, sizes: Sequence[int]) -> None:
     """Print errors by number of columns, and how far each falls short of the best."""
     folding = Folding(by="drive", count=5)
     cohort = sum_cohort(fleet.warehouse, folding, SIMULATED, "windows")
-    search = Search(method="exchange", most=max(SIZES))
+    search = Search(method="exchange", most=max(sizes))
     models = search_models(cohort, inputs_of(cohort, WHOLE_SET), folding, search).models
     best = max(models, key=lambda model: model.sums.signed_r_squared)
     print("| columns | RMSE deg | short of the best | lacks deg | condition |")
     for model in models:
-        if len(model.signals) in SIZES or model is best:
+        if len(model.signals) in sizes or model is best:
             short = fall_short(model, best, Worth(0.0))
             lacks = math.degrees(short.lacks)
             figures = f"{model.pooled.rmse_deg:.4f} | {short} | {lacks:.3f}"
             print(f"| {len(model.signals)} | {figures} | {model.condition_number:.2g} |")
 
 
-def alike(inputs: Sequence[str], cars: Sequence[Gram]) -> Iterator[float]:
+def alike(inputs: Sequence[str], cars: Sequence[Gram], sizes: Sequence[int]) -> Iterator[float]:
     """Yield by size how alike the columns are that random four fifths of groups of cars choose."""
     rng, chosen = np.random.default_rng(0), []
     for _ in range(8):
         some = [cars[i] for i in rng.permutation(len(cars))[: len(cars) * 4 // 5]]
         total = sum(some[1:], some[0])
-        chosen.append(stepwise_order(total, inputs, LABEL, "exchange", max(SIZES)))
-    for size in SIZES:
+        chosen.append(stepwise_order(total, inputs, LABEL, "exchange", max(sizes)))
+    for size in sizes:
         pairs = combinations([set(sets[size - 1]) for sets in chosen], 2)
         yield fmean(len(one & other) / len(one | other) for one, other in pairs)
 
 
-def elsewhere(fleet: Fleet, condition: str, others: str) -> Iterator[float]:
+def elsewhere(fleet: Fleet, condition: str, others: str, sizes: Sequence[int]) -> Iterator[float]:
     """Yield by size the error on other drives than those that a model was chosen and fitted on."""
     inputs, here = folds_of(fleet, f"{SIMULATED} AND {condition}", "drive", 5)
     _, there = folds_of(fleet, f"{SIMULATED} AND {others}", "drive", 5)
-    sets = stepwise_order(here.total, inputs, LABEL, "exchange", max(SIZES))
-    for size in SIZES:
+    sets = stepwise_order(here.total, inputs, LABEL, "exchange", max(sizes))
+    for size in sizes:
         model = fit(here.total, sets[size - 1], LABEL).model
         yield error_sums(model, there.total).figures(input_scales()[LABEL]).rmse_deg
 
