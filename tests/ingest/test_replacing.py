@@ -167,6 +167,9 @@ def test_the_night_replaces_what_came_through_a_mapping_that_was_corrected(
     fleet: Fleet, tmp_path: Path
 ) -> None:
     before = drives(fleet)
+    copy = write(tmp_path / "copy.csv", faster(recording()))
+    with pytest.raises(RepeatedError, match="copy.csv"):
+        fleet.ingest(copy, a_mapping(), replace="corrected")
     for mapping in (corrected(name="other"), a_mapping(name="other")):
         with pytest.raises(RepeatedError, match="monday"):
             fleet.ingest(tmp_path / "monday.csv", mapping, replace="corrected")

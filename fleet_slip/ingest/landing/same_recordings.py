@@ -74,7 +74,7 @@ class SameRecordings:
         gives_way = self._replace == "all" or (
             self._replace == "corrected"
             and not changed
-            and replaced <= origins
+            and replaced <= {one.file for one in origins} & origins
             and all(drive.startswith(f"{self._mapping}-{_digest(drive)}") for drive in drives)
         )
         if drives and not gives_way:
