@@ -33,6 +33,10 @@ from fleet_slip.warehouse.condition import parse_cohort
 from fleet_slip.warehouse.tables import Warehouse
 
 
+ODD = 2.0
+"""A champion whose error is so many times what it was meets drives that are odd: a person looks."""
+
+
 @dataclass(frozen=True)
 class Publication:
     """What publishing came to."""
@@ -302,6 +306,15 @@ def _judge(
             f"steps have led away: {comparison}. To begin anew at the champion: fleet-slip promote "
             f"{champion.reference}"
         )
+    then = champion.manifest
+    if then.learned_from is None and manifest.learned_from is None:
+        was, now = then.cross_validation.rmse_deg, comparison.incumbents[0].pooled.rmse_deg
+        if now > ODD * was and not problems:
+            problems.append(
+                f"{champion.reference} had an RMSE of {was:.4f} deg on drives that did not train "
+                f"it, and has {now:.4f} deg on these: most of it comes from drives unlike those "
+                f"that vouch for it. Look at them before they teach: {comparison}"
+            )
     best = next((one.version for one in incumbents if one.reference == comparison.best), None)
     return _Judgement(tuple(problems), str(comparison), best, comparison.drifts)
 
