@@ -32,7 +32,6 @@ from fleet_slip.selection.select_models import RequestedSelection, Selection
 from fleet_slip.warehouse.condition import parse_cohort
 from fleet_slip.warehouse.tables import Warehouse
 
-
 ODD = 2.0
 """A champion whose error is so many times what it was meets drives that are odd: a person looks."""
 

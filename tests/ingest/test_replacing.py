@@ -168,7 +168,7 @@ def test_the_night_replaces_what_came_through_a_mapping_that_was_corrected(
 ) -> None:
     before = drives(fleet)
     copy = write(tmp_path / "copy.csv", faster(recording()))
-    with pytest.raises(RepeatedError, match="copy.csv"):
+    with pytest.raises(RepeatedError, match=r"copy\.csv"):
         fleet.ingest(copy, a_mapping(), replace="corrected")
     for mapping in (corrected(name="other"), a_mapping(name="other")):
         with pytest.raises(RepeatedError, match="monday"):
