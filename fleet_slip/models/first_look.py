@@ -48,8 +48,9 @@ def require_sound_drives(warehouse: Warehouse, manifest: Manifest) -> None:
             continue
         raise RefusedError(
             f"{manifest.name} was not published: {len(examples)} of {looked_at} drives that were "
-            f"looked at contradict what any car does: {examples[0]} Correct the mapping and give "
-            "ingest again with --replace, or publish it with force all the same."
+            f"looked at contradict what any car does: {examples[0]} Publish it with "
+            "force all the same, or correct the mapping and run: fleet-slip ingest LOGS --mapping "
+            "M --replace"
         )
 
 

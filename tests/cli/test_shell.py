@@ -58,7 +58,8 @@ def test_a_name_of_a_view_is_no_sql(
     typed = Typed(session)
     assert typed.obey(".schema grams")
     assert typed.obey(".schema x' OR '1' = '1")
-    assert asked == ["FROM dictionary WHERE \"view\" = 'grams'"]
+    (only,) = asked
+    assert only.endswith("FROM dictionary WHERE \"view\" = 'grams'")
 
 
 def test_tab_completes_views_columns_and_commands(session: Session) -> None:

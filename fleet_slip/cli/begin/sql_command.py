@@ -161,6 +161,7 @@ def _show(session: Session, text: str, limit: int | None, everything: bool) -> N
 
 
 _CUT = re.compile(r"(\d+) columns \((\d+) shown\)")
+_NOTHING_FITS = "┌───┐\n│ … │"
 
 
 def _fitting(answer: duckdb.DuckDBPyRelation, width: int, rows: int) -> tuple[str, list[str]]:
@@ -194,8 +195,11 @@ def _readable(answer: duckdb.DuckDBPyRelation) -> duckdb.DuckDBPyRelation:
 
 
 def _drawn(answer: duckdb.DuckDBPyRelation, width: int, rows: int) -> str:
-    with contextlib.redirect_stdout(io.StringIO()) as drawn:
-        answer.show(max_rows=rows, max_width=width, max_col_width=width)
+    for longest in (width, width // 2):  # a text as wide as all leaves no column any room
+        with contextlib.redirect_stdout(io.StringIO()) as drawn:
+            answer.show(max_rows=rows, max_width=width, max_col_width=longest)
+        if not drawn.getvalue().startswith(_NOTHING_FITS):
+            break
     return drawn.getvalue().rstrip("\n")
 
 

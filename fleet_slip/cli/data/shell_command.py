@@ -95,8 +95,8 @@ class Typed:
         if view and view not in self.views():
             say(f"error: there is no view {view}. .tables lists them.", logging.ERROR)
             return True
-        chosen = f"WHERE \"view\" = '{view}'" if view else ""
-        answer(self._session, f"FROM dictionary {chosen}", self._form)
+        chosen = f'SELECT "column", unit, description FROM dictionary WHERE "view" = \'{view}\''
+        answer(self._session, chosen if view else "FROM dictionary", self._form)
         return True
 
     def _mode(self, name: str) -> bool:
