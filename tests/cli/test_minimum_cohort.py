@@ -165,17 +165,8 @@ OF_NO_CAR = {
     *("models", "model", "promote", "rollback", "pin", "unpin", "diff", "sign", "import_model"),
     *("estimator", "export", "log_to_mlflow", "registry", "resolve", "simulate", "receive"),
     *("ingest", "preview", "gram", "check", "migrate", "status", "examine", "verify", "repair"),
-    *(
-        "compact",
-        "vacuum",
-        "preview_vacuum",
-        "take_back",
-        "forget",
-        "allow",
-        "retain",
-        "nightly",
-        "cohort",
-    ),
+    *("compact", "vacuum", "preview_vacuum", "forget", "allow", "retain", "nightly", "cohort"),
+    *("take_back", "leave_out_faulty"),
 }
 """Calls without figures of cars in the warehouse: of versions, of jobs, of files that are given."""
 
