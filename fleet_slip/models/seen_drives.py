@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fleet_slip.catalogue.sources import RECEIVED
 from fleet_slip.grams.rows.rollup import hash_numbers
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.score import cohort_of_rows
@@ -32,10 +33,11 @@ class SeenDrives:
 def find_seen(
     warehouse: Warehouse, registry: Registry, manifest: Manifest, condition: str | Condition
 ) -> SeenDrives:
-    """Return which drives of a cohort of rows made a version. Raises as `score`."""
+    """Return which drives with a log of a cohort of rows made a version. Raises as `score`."""
     cohort = cohort_of_rows(condition)
     view = "log" if cohort.columns - set(drive_columns()) else "drives"
-    query = f"SELECT DISTINCT drive_id FROM {view} WHERE {cohort.sql} ORDER BY 1"
+    logged = f"({cohort.sql}) AND source <> '{RECEIVED}'"
+    query = f"SELECT DISTINCT drive_id FROM {view} WHERE {logged} ORDER BY 1"
     with connect_tables(warehouse, query) as database, asking(database, cohort):
         names = database.sql(query).to_arrow_table()["drive_id"]
     made = read_trained_drives(registry.folder_of(manifest.name), manifest)

@@ -29,8 +29,6 @@ from fleet_slip.words import number_of
 NAME = "drive"
 """Stands for a model's name in the hashes of drives."""
 
-_EXAMINED = parse_condition(f"source IN ('{SOURCE}', '{RECEIVED}')")
-
 
 @dataclass(frozen=True)
 class Examined:
@@ -72,7 +70,8 @@ def leave_out_faulty(warehouse: Warehouse, cohort: str) -> Examined:
             {str(fault): int(number) for fault, number in known["faults"].items()},
         )
     try:
-        report = examine_drives(warehouse, parse_condition(cohort) & _EXAMINED)
+        examined = parse_condition(f"source IN ('{SOURCE}', '{RECEIVED}')")
+        report = examine_drives(warehouse, parse_condition(cohort) & examined)
     except DataError:
         return Examined(cohort)
     hashes = sorted(hash_drive(NAME, one.drive_id) for one in report.findings)

@@ -14,7 +14,6 @@ from hashlib import blake2b
 from typing import Any
 
 import numpy as np
-import polars as pl
 import pyarrow as pa
 from numpy.typing import NDArray
 
@@ -116,6 +115,8 @@ class Spots:
 
 def find_spots(ticks: NDArray[np.signedinteger[Any]], counts: Mapping[str, pa.Array]) -> Spots:
     """Return the spots of a drive: its ticks and, by signal, its int16 counts or null."""
+    import polars as pl  # noqa: PLC0415 - takes a while
+
     moving = [name for name, column in counts.items() if column.null_count < len(column)]
     first = [name for name in SPOT_SIGNALS if name in moving]
     others = sorted(set(moving).difference(first))

@@ -89,7 +89,7 @@ def test_select_reports_the_models_in_the_list_s_order(
         (("--worth", "0.000001deg"), "5"),
         (("--worth", "1deg"), "1"),
     ):
-        asked = run_command("select", *worth, "--json", root=smoke_root).json
+        asked = run_command(*listed, *worth, root=smoke_root).json
         assert asked["winner"] == winner
     table = run_command("select", "--nested", "ay,yaw_rate,steering_wheel", root=smoke_root).stdout
     assert "first 3" in table

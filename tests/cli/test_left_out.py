@@ -20,7 +20,7 @@ def test_columns_without_a_value_give_way_and_the_others_are_counted(smoke_root:
     assert "columns do not fit; without a value: " in told.stderr
     assert "gear_number" in told.stderr
     assert "SELECT …" in told.stderr
-    assert "--csv" in told.stderr
+    assert "all: --all" in told.stderr
 
 
 def test_what_fits_is_shown_whole_and_nothing_is_said(smoke_root: Path) -> None:

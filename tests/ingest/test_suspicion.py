@@ -193,7 +193,9 @@ def test_a_unit_that_lies_so_much_that_rows_are_refused_is_told(tmp_path: Path) 
     car = a_car()
     file, mapping = write_car(tmp_path, {**car, "yaw_rate": 57.3 * car["yaw_rate"]})
     command = ("ingest", file, "--mapping", mapping, "--json")
-    (report,) = json.loads(call(tmp_path / "root", *command))
+    ended = CliRunner().invoke(app, ["--root", str(tmp_path / "root"), *command])
+    assert isinstance(ended.exception, AlarmError)  # most rows are refused
+    (report,) = json.loads(ended.stdout)
     (found,) = report["suspicions"]
     assert (found["kind"], found["signals"]) == ("unit", ["yaw_rate"])
     refused = report["quarantined"]["out_of_range"]

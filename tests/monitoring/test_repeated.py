@@ -89,28 +89,28 @@ def test_one_message_of_a_day_does_not_accuse_the_drives_of_that_day(start_s: in
     )
 
 
-def test_a_log_through_a_corrected_mapping_counts_twice_and_quality_says_so(
+def test_two_recordings_of_a_car_at_once_count_twice_and_quality_says_so(
     tmp_path: Path, run_command: RunCommand
 ) -> None:
     rows = range(4000)
-    log = {
-        "t": [(BEGAN + timedelta(milliseconds=10 * i)).isoformat() for i in rows],
-        "ax": [f"{i % 7 / 10:.1f}" for i in rows],
-        "beta": [f"{i % 5 / 10:.1f}" for i in rows],
+    plan = {
+        "name": "test",
+        "time": {"column": "t", "format": "%Y-%m-%dT%H:%M:%S%.f%:z"},
+        "drive": {"vehicle_id": "car", "vehicle_model": "sedan"},
+        "signals": {
+            "ax": {"column": "ax", "unit": "m/s^2"},
+            "sideslip": {"column": "beta", "unit": "deg"},
+        },
     }
-    file = tmp_path / "log.csv"
-    file.write_text(csv_text(log))
     fleet = fleet_slip.open(tmp_path / "data")
-    for unit in ("m/s^2", "g"):
-        plan = {
-            "name": "test",
-            "time": {"column": "t", "format": "%Y-%m-%dT%H:%M:%S%.f%:z"},
-            "drive": {"vehicle_id": "car", "vehicle_model": "sedan"},
-            "signals": {
-                "ax": {"column": "ax", "unit": unit},
-                "sideslip": {"column": "beta", "unit": "deg"},
-            },
+    for logger, period in (("front", 7), ("rear", 9)):
+        log = {
+            "t": [(BEGAN + timedelta(milliseconds=10 * i)).isoformat() for i in rows],
+            "ax": [f"{i % period / 10:.1f}" for i in rows],
+            "beta": [f"{i % (period - 2) / 10:.1f}" for i in rows],
         }
+        file = tmp_path / f"{logger}.csv"
+        file.write_text(csv_text(log))
         fleet.ingest(file, Mapping.model_validate(plan))
     fleet.gram()
     told = run_command("quality", "--json")

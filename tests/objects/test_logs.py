@@ -22,7 +22,7 @@ from tests.support.prepared import server as prepared_server
 from tests.support.s3_server import Server, command_on
 from tests.support.state import state
 
-INPUT, STORAGE = 4, 6
+INPUT, STORAGE, REPEATED = 4, 6, 15
 
 
 @pytest.fixture
@@ -69,9 +69,9 @@ def copies(here: Path) -> list[Path]:
     return list((here / "temporary").glob("fleet-slip-copies-*"))
 
 
-def refused(root: Path, *arguments: str) -> Finished:
+def refused(root: Path, *arguments: str, exit_code: int = INPUT) -> Finished:
     done = run_on(root, "ingest", *arguments, "--mapping", str(root.parent / "car.toml"))
-    assert done.exit_code == INPUT, done.stderr
+    assert done.exit_code == exit_code, done.stderr
     return done
 
 
@@ -115,7 +115,7 @@ def test_an_object_that_changed_since_it_landed_is_refused(here: Path, bucket: s
     ingest(here / "root", f"{bucket}/landing")
     write_log(here / "landing" / "day 1" / "münchen 1.csv", rows=50)
     put_all(bucket, here / "landing")
-    done = refused(here / "root", f"{bucket}/landing")
+    done = refused(here / "root", f"{bucket}/landing", exit_code=REPEATED)
     assert f"{bucket}/landing/day 1/münchen 1.csv: it has changed since" in done.stderr
 
 
