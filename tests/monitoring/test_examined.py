@@ -8,6 +8,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip import Fleet
+from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.errors import RefusedError
 from fleet_slip.monitoring import examined
 from fleet_slip.runs.nights import hash_drive, with_all_drives, without_drives
@@ -85,3 +86,13 @@ def test_a_cohort_tells_what_it_was_before_drives_were_left_out() -> None:
     twice = without_drives(once, "fleet", [hash_drive("fleet", "b")])
     assert once != asked != twice
     assert with_all_drives(twice) == with_all_drives(once) == with_all_drives(asked) == asked
+
+
+def test_more_drives_than_take_seconds_are_not_examined_and_that_is_said(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(examined, "MOST_DRIVES", 7)
+    found = fleet.leave_out_faulty()
+    assert (found.cohort, found.drives, found.unexamined) == (TRAINING_DRIVES, 0, 8)
+    assert str(found).startswith("8 drives were not examined: more than 7 take too long.")
+    assert fleet.leave_out_faulty(f"{TRAINING_DRIVES} AND day = DATE '2026-10-05'").drives == 6
