@@ -28,11 +28,14 @@ BROUGHT = {"gymnasium", "pandas", "pygame"}
 PROGRAM = """
 import json, sys
 absent = set(json.loads(sys.argv[1]))
-class Absent:
-    def find_spec(self, name, *_):
-        if name.partition(".")[0] in absent:
-            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
-sys.meta_path.insert(0, Absent())
+class Finder:
+    def __init__(self, finder):
+        self.finder = finder
+    def __getattr__(self, name):
+        return getattr(self.finder, name)
+    def find_spec(self, name, *where):
+        return None if name.partition(".")[0] in absent else self.finder.find_spec(name, *where)
+sys.meta_path = [Finder(one) for one in sys.meta_path]
 from fleet_slip.cli.main import main
 codes = []
 for words in json.loads(sys.argv[2]):
