@@ -17,7 +17,7 @@ from pathlib import Path
 from fleet_slip.canonical import canonical_json
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.sources import RECEIVED
-from fleet_slip.errors import DataError
+from fleet_slip.errors import DataError, NotComputedError
 from fleet_slip.grams.cohorts.reader import GramReader
 from fleet_slip.ingest.drives.measured_drives import SOURCE
 from fleet_slip.ingest.landing.known_files import cache_folder
@@ -25,6 +25,7 @@ from fleet_slip.monitoring.quality import examine_drives
 from fleet_slip.monitoring.thresholds import thresholds
 from fleet_slip.runs.nights import hash_drive, without_drives
 from fleet_slip.warehouse.condition import Condition, asking, parse_condition
+from fleet_slip.warehouse.table_views import connect_tables
 from fleet_slip.warehouse.tables import Warehouse
 from fleet_slip.words import number_of
 
@@ -44,12 +45,14 @@ class Examined:
         drives: how many were long enough to be examined.
         faults: how many drives have each fault, such as `reversed sideslip`.
         unexamined: how many were not examined, since they are too many.
+        why_not: why none was examined, although some are measured.
     """
 
     cohort: str
     drives: int = 0
     faults: Mapping[str, int] = field(default_factory=dict)
     unexamined: int = 0
+    why_not: str = ""
 
     def __str__(self) -> str:
         """Return what is left out as a sentence; nothing if all are in order."""
@@ -58,6 +61,8 @@ class Examined:
                 f"{self.unexamined:,} drives were not examined: more than {MOST_DRIVES:,} take too "
                 "long. A night examines what is new; of a part of them: fleet-slip quality --cohort"
             )
+        if self.why_not:
+            return f"drives were not examined: {self.why_not}"
         if not self.faults:
             return ""
         told = ", ".join(f"{number:,} {fault}" for fault, number in self.faults.items())
@@ -82,14 +87,18 @@ def leave_out_faulty(warehouse: Warehouse, cohort: str) -> Examined:
             int(known["examined"]),
             {str(fault): int(number) for fault, number in known["faults"].items()},
         )
+    measured = parse_condition(f"source IN ('{SOURCE}', '{RECEIVED}')")
+    condition = parse_condition(cohort) & measured
     try:
-        measured = parse_condition(f"source IN ('{SOURCE}', '{RECEIVED}')")
-        condition = parse_condition(cohort) & measured
         if (many := _count_drives(warehouse, condition)) > MOST_DRIVES:
             return Examined(cohort, unexamined=many)
         report = examine_drives(warehouse, condition)
+    except NotComputedError as error:
+        return Examined(cohort, why_not=str(error))
     except DataError:
-        return Examined(cohort)
+        if not _has_drives(warehouse, condition):
+            return Examined(cohort)
+        return Examined(cohort, why_not="their Gram rows are not there. Run: fleet-slip gram")
     hashes = sorted(hash_drive(NAME, one.drive_id) for one in report.findings)
     faults = Counter(" ".join((one.fault.kind, *one.fault.signals)) for one in report.findings)
     content = {"drives": hashes, "examined": report.drives, "faults": faults}
@@ -99,6 +108,13 @@ def leave_out_faulty(warehouse: Warehouse, cohort: str) -> Examined:
         draft.write_text(json.dumps(content))
         draft.replace(kept)
     return Examined(without_drives(cohort, NAME, hashes), report.drives, dict(faults))
+
+
+def _has_drives(warehouse: Warehouse, condition: Condition) -> bool:
+    """Whether the logs have a drive that satisfies a condition."""
+    query = f"SELECT 1 FROM drives WHERE {condition.sql} LIMIT 1"
+    with connect_tables(warehouse, query) as database, asking(database, condition):
+        return bool(database.execute(query).fetchall())
 
 
 def _count_drives(warehouse: Warehouse, condition: Condition) -> int:

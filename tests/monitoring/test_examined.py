@@ -96,3 +96,11 @@ def test_more_drives_than_take_seconds_are_not_examined_and_that_is_said(
     assert (found.cohort, found.drives, found.unexamined) == (TRAINING_DRIVES, 0, 8)
     assert str(found).startswith("8 drives were not examined: more than 7 take too long.")
     assert fleet.leave_out_faulty(f"{TRAINING_DRIVES} AND day = DATE '2026-10-05'").drives == 6
+
+
+def test_drives_without_gram_rows_are_told_as_not_examined(landed: Path, tmp_path: Path) -> None:
+    fleet = fleet_slip.open(shutil.copytree(landed / "data", tmp_path / "data"))
+    shutil.rmtree(tmp_path / "data" / "grams")
+    fleet.gram("calibration")
+    told = str(fleet.leave_out_faulty())
+    assert told.startswith("drives were not examined: ") and "fleet-slip gram" in told

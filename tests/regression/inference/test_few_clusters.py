@@ -56,12 +56,12 @@ def by_rows(
     return float(square * (eta - q + 1) / (eta * q)), float(eta - q + 1)
 
 
-@pytest.mark.parametrize("shared", [0, 3])
-def test_it_is_what_the_definition_says_of_the_rows(shared: int) -> None:
+@pytest.mark.parametrize("common", [0, 3])
+def test_it_is_what_the_definition_says_of_the_rows(common: int) -> None:
     """A car may be in both cohorts: then its rows of both are one cluster."""
     random = np.random.default_rng(4)
     one, other = drives_of(random, 7, 2), drives_of(random, 9, 2)
-    numbers = list(range(7)), list(range(7 - shared, 16 - shared))
+    numbers = list(range(7)), list(range(7 - common, 16 - common))
     found = compared(one, other, numbers)
     f, degrees = by_rows(one, other, numbers)
     assert found.numerator == 3
