@@ -170,8 +170,10 @@ signals = ["curvature_mean_16", "ay_mean_16"]
 """
 
 
-def test_parts_are_told_where_a_set_has_none(tmp_path: Path, run_command: RunCommand) -> None:
-    done = run_command("select", "--by", "part")
+def test_parts_are_told_where_a_set_has_none(
+    root_to_fail_in: Path, run_command: RunCommand
+) -> None:
+    done = run_command("select", "--by", "part", root=root_to_fail_in)
     assert done.exit_code == 5
     assert "does not divide the rows of a drive" in done.stderr
     assert "bands, blocks" in done.stderr
