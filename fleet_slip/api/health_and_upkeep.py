@@ -14,7 +14,7 @@ from fleet_slip.api.calls import (
     unless_local,
     within_reach,
 )
-from fleet_slip.api.published_models import PublishedModels
+from fleet_slip.api.judged_models import JudgedModels
 from fleet_slip.catalogue.sources import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.errors import QuestionError, RefusedError, UsageError
 from fleet_slip.runs.log import step
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from fleet_slip.warehouse.audit import Forgettable
 
 
-class HealthAndUpkeep(PublishedModels):
+class HealthAndUpkeep(JudgedModels):
     """Health, quality and drift; checking, compacting and forgetting.
 
     Nothing here raises `AlarmError` or `DamageError`: the answers say what calls for attention.

@@ -1,15 +1,12 @@
-"""The part of a `Fleet` that publishes models, serves them and evaluates them."""
+"""The part of a `Fleet` that publishes models and serves them."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fleet_slip.api.calls import Rooted, ShowProgress, count_from_start, open_workers, record_call
+from fleet_slip.api.calls import Rooted, record_call
 from fleet_slip.api.cohort import FleetCohort
-from fleet_slip.catalogue.sources import ALL_DRIVES
 from fleet_slip.errors import UsageError
-from fleet_slip.extras import needed
 from fleet_slip.models.aliases import CHAMPION
 from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.model_version import ModelVersion
@@ -18,15 +15,10 @@ from fleet_slip.models.versions import Registry
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from fleet_slip.comparison.evaluation.blind import BlindRow
-    from fleet_slip.comparison.evaluation.evaluate import TrainRivals
-    from fleet_slip.comparison.report.page import Written
     from fleet_slip.export.estimator import Estimator
     from fleet_slip.export.files import Target
-    from fleet_slip.files.documents import Document
     from fleet_slip.models.diff import Difference
     from fleet_slip.models.publish import DryRun, Publication
-    from fleet_slip.models.score import Score
     from fleet_slip.selection.select_models import RequestedSelection
 
 
@@ -177,146 +169,6 @@ class PublishedModels(Rooted):
         registry.sign(name, int(version))
         return registry.load(name, int(version))
 
-    def score(self, model: str | ModelVersion | None = None, cohort: str | None = None) -> "Score":
-        """Evaluate a model on the rows of a cohort; angles are in degrees.
-
-        `cohort` is an SQL condition on the view `drives`, by default all drives that the model was
-        not trained on, or all if there are no others. Raises `DataError` if no row of the
-        cohort has the model's signals, `QuestionError` for a condition that is not valid, and what
-        `model` raises.
-        """
-        from fleet_slip.models.score import score
-        from fleet_slip.models.seen_drives import find_seen
-
-        manifest = self.resolve(model).manifest
-        asked = ALL_DRIVES if cohort is None else cohort
-        seen = find_seen(self.warehouse, self.registry(), manifest, asked)
-        found = score(self.warehouse, manifest, asked if cohort else seen.others)
-        without = 0 if cohort or seen.trained == seen.drives else seen.trained or 0
-        return replace(
-            found, drives=seen.drives, drives_trained=seen.trained, drives_left_out=without
-        )
-
-    @record_call
-    def evaluate(
-        self,
-        model: str | ModelVersion | None = None,
-        others: Sequence[str | ModelVersion] = (),
-        *,
-        scenarios: Sequence[str] = (),
-        rivals: bool = False,
-        threads: int | None = None,
-        progress: ShowProgress | None = None,
-    ) -> "Document":
-        """Evaluate models on the paper's test drives and on others; simulate those missing.
-
-        The models of Table I are fitted on the cohort of each and evaluated beside it. `scenarios`
-        are names of those that ship or paths of TOML files, by default all that ship. `rivals`
-        trains networks, trees and neuro-fuzzy rules as well, with scikit-learn. Progress is in
-        simulated rows. Returns the document that is kept below `evaluations/`.
-
-        Raises `ConfigError` for a scenario that is not valid, `DataError`, `RefusedError` for a
-        scenario that was changed since its drive was simulated, and what `model` raises.
-        """
-        from fleet_slip.comparison.evaluation.evaluate import evaluate, keep
-        from fleet_slip.comparison.evaluation.scenario_runs import simulate_scenarios
-        from fleet_slip.files.documents import Document
-        from fleet_slip.simulation.scenario import load_scenario, shipped_scenarios
-
-        chosen = tuple(map(load_scenario, scenarios)) if scenarios else shipped_scenarios()
-        first, *rest = [self.resolve(one) for one in (model, *others)]
-        with open_workers(self.root, threads) as executor:
-            told = count_from_start(progress)
-            simulate_scenarios(self.warehouse, chosen, executor, told)
-            found = evaluate(self.warehouse, chosen, first, rest, executor, _rivals_if(rivals))
-        content = found.as_dict()
-        kept = keep(self.warehouse, content)
-        return Document(kept.number, content, kept.sha256)
-
-    def evaluate_blind(
-        self,
-        model: str | ModelVersion | None = None,
-        others: Sequence[str | ModelVersion] = (),
-        *,
-        rivals: bool = False,
-        threads: int | None = None,
-    ) -> "tuple[BlindRow, ...]":
-        """Judge models, and all that `evaluate` trains beside them, on drives of the first.
-
-        Roads, cars, weather and noise are drawn from the hash of its version, so that nobody has
-        seen them before it was published (`configs/blind.toml`). No drive is written. Returns
-        figures over all drives, by class of road, by weather and by drive.
-
-        Raises what `evaluate` raises.
-        """
-        from fleet_slip.comparison.evaluation.blind import judge_blindly
-        from fleet_slip.comparison.evaluation.evaluate import train_competitors
-
-        first, *rest = [self.resolve(one) for one in (model, *others)]
-        with open_workers(self.root, threads) as executor:
-            trained = train_competitors(self.warehouse, first, rest, executor, _rivals_if(rivals))
-        return judge_blindly(first.sha256, trained.estimators)
-
-    def report(
-        self, model: str | ModelVersion | None = None, output: Path | None = None
-    ) -> "Written":
-        """Write one page that lays our figures beside the paper's, from the latest evaluation.
-
-        `output` is a folder, by default `report` in the data root. Raises `DataError` if the model
-        has not been evaluated, or not on today's data, `CohortError` where a minimum cohort is
-        asked for, and what `model` raises.
-        """
-        from fleet_slip.files.local_folder import LocalFolder
-        from fleet_slip.warehouse.minimum_cohort import require_single_cars
-
-        require_single_cars("the report", "Ask evaluate, of drives that are simulated.")
-
-        with needed("report", "the report"):
-            from fleet_slip.comparison.report.page import write_report
-
-        folder = LocalFolder(output) if output else self.root / "report"
-        return write_report(self.warehouse, self.resolve(model), folder)
-
-    @record_call
-    def watch(
-        self,
-        what: str,
-        model: str | ModelVersion | None,
-        output: Path,
-        *,
-        from_s: float = 0.0,
-        until_s: float | None = None,
-        threads: int | None = None,
-    ) -> Path:
-        """Write a drive as a page that plays, or as a film: .html, .mp4 or .gif; return the file.
-
-        `what` is the name of a scenario that ships, the path of one, or a drive of the logs. The
-        test drive of a scenario is simulated if it is not there. Of the drive the part from
-        `from_s` until `until_s` is shown, in seconds.
-
-        Raises `UsageError` for another suffix or an empty part, `QuestionError` if there is no such
-        drive, `ExtraError` without the extra `watch`, and what `model` raises.
-        """
-        with needed("watch", "a page or a film of a drive"):
-            from fleet_slip.comparison.watch.drive_frames import (
-                drive_frames,
-                is_scenario,
-                scenario_frames,
-            )
-            from fleet_slip.comparison.watch.playing import write_film, write_page
-
-        writers = {".html": write_page, ".mp4": write_film, ".gif": write_film}
-        if output.suffix not in writers:
-            raise UsageError(f"{output}: the suffix says the format: {', '.join(writers)}.")
-        version = self.resolve(model)
-        if is_scenario(what):
-            with open_workers(self.root, threads) as executor:
-                frames = scenario_frames(self.warehouse, what, version, executor)
-        else:
-            frames = drive_frames(self.warehouse, what, version)
-        writers[output.suffix](frames.part(from_s, until_s), output)
-        return output
-
     @record_call
     def import_model(self, file: Path, *, sign_key: Path | None = None) -> ModelVersion:
         """Bring a version in that another data root exported to JSON; return it.
@@ -395,12 +247,3 @@ class PublishedModels(Rooted):
     def resolve(self, model: str | ModelVersion | None) -> ModelVersion:
         """Return the version that a reference names; a version is returned as it is."""
         return model if isinstance(model, ModelVersion) else self.model(model)
-
-
-def _rivals_if(wanted: bool) -> "TrainRivals | None":
-    """Return what trains the rivals, where they are wanted."""
-    if not wanted:
-        return None
-    from fleet_slip.comparison.rivals import compare  # an optional extra
-
-    return compare.train_rivals
