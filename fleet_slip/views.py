@@ -7,6 +7,7 @@ import duckdb
 
 from fleet_slip.catalogue.car_numbers import CALIBRATION, DELAY
 from fleet_slip.catalogue.features import features
+from fleet_slip.catalogue.sources import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.files.data_root import data_root
 from fleet_slip.files.folder import Folder
 from fleet_slip.models.versions import Registry
@@ -30,12 +31,15 @@ _ABOUT_ALL_VIEWS = re.compile(
     r"duckdb_|information_schema|pragma_|pg_|sqlite_|\b(?:show|tables|databases|dictionary)\b", re.I
 )
 
+_SOURCE = re.compile(r"\bsource\b", re.I)
+
 
 def connect(
     root: Folder | Path | str | None = None,
     *,
     threads: int | None = None,
     query: str | None = None,
+    scenarios: bool = False,
 ) -> duckdb.DuckDBPyConnection:
     """Return a DuckDB connection with the views of the warehouse at `root`, a path or a URL.
 
@@ -45,21 +49,26 @@ def connect(
     takes longer the more files there are, and so does reading every model version. Computing
     `calibration` takes longest: without a `query` it is not there before `add_calibration`.
 
+    The views show the fleet. Drives that models are tested on are there too with `scenarios`, or
+    with a `query` that asks for them: that names the column `source`.
+
     It can open the files of the snapshot and no others, and its settings cannot be changed. DuckDB
     knows no right to read without the right to write: ask SQL of others through `Fleet.sql`.
     """
-    database, paths = _open_views(data_root(root), query, threads)
+    database, paths = _open_views(data_root(root), query, threads, scenarios=scenarios)
     lock(database, paths)
     return database
 
 
-def connect_unlocked(root: Folder, query: str | None = None) -> duckdb.DuckDBPyConnection:
+def connect_unlocked(
+    root: Folder, query: str | None = None, *, scenarios: bool = False
+) -> duckdb.DuckDBPyConnection:
     """Return a connection as `connect` does that can open any file and change any setting."""
-    return _open_views(root, query)[0]
+    return _open_views(root, query, scenarios=scenarios)[0]
 
 
 def _open_views(
-    root: Folder, query: str | None, threads: int | None = None
+    root: Folder, query: str | None, threads: int | None = None, *, scenarios: bool
 ) -> tuple[duckdb.DuckDBPyConnection, list[str]]:
     """Return a connection with views, and the paths of all files that they read."""
     warehouse = Warehouse(root)
@@ -68,7 +77,9 @@ def _open_views(
     if CALIBRATION in wanted:
         wanted |= {"grams"}
     snapshots = table_snapshots(warehouse, wanted)
-    database = open_tables(warehouse, wanted, snapshots, threads=threads)
+    scenarios = scenarios or _SOURCE.search(query or "") is not None
+    of = ALL_DRIVES if scenarios else TRAINING_DRIVES
+    database = open_tables(warehouse, wanted, snapshots, threads=threads, of=of)
     paths = paths_of(snapshots, wanted)
     if "runs" in wanted:
         runs = lend_runs(warehouse.root, database)

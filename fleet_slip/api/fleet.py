@@ -34,24 +34,29 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
     raises `StorageError` where the data root cannot be read or written.
     """
 
-    def sql(self, query: str, *, threads: int | None = None) -> "duckdb.DuckDBPyRelation":
+    def sql(
+        self, query: str, *, threads: int | None = None, scenarios: bool = False
+    ) -> "duckdb.DuckDBPyRelation":
         """Return the answer to an SQL query on the views as a DuckDB relation.
 
         The views are those of `fleet_slip.connect`, of the newest commits at the time of the call.
         A relation is computed when it is asked for rows: `.df()`, `.pl()`, `.to_arrow_table()`,
         `.fetchall()`; it and all that is made of it keep their connection open. It can read the
-        warehouse and nothing else, and write nothing.
+        warehouse and nothing else, and write nothing. The drives of evaluation scenarios are there
+        with `scenarios`, or if the query names the column `source`.
 
         Raises `QuestionError` for a query that is not valid or would write, and `StorageError`
         without a data root.
         """
-        return self.session(query, threads=threads).sql(query)
+        return self.session(query, threads=threads, scenarios=scenarios).sql(query)
 
-    def session(self, query: str | None = None, *, threads: int | None = None) -> "Session":
+    def session(
+        self, query: str | None = None, *, threads: int | None = None, scenarios: bool = False
+    ) -> "Session":
         """Open the views of this moment for many queries, all of which see the same commits.
 
-        With a `query`, only the views that it names are opened, which is faster. Raises
-        `StorageError` without a data root.
+        With a `query`, only the views that it names are opened, which is faster. For `scenarios`
+        see `sql`. Raises `StorageError` without a data root.
         """
         from fleet_slip.api.session import Session, query_of_many
         from fleet_slip.views import connect
@@ -59,9 +64,10 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
 
         if not tells_single_cars():
             return Session(connect(self.root, query=" ".join(VIEWS_WITHOUT_CARS)), query_of_many)
-        return Session(connect(self.root, threads=threads, query=query))
+        opened = connect(self.root, threads=threads, query=query, scenarios=scenarios)
+        return Session(opened)
 
-    def unlocked_session(self, query: str | None = None) -> "Session":
+    def unlocked_session(self, query: str | None = None, *, scenarios: bool = False) -> "Session":
         """Open a session that allows any statement, and any file that you may read or write.
 
         Only for SQL that you trust: it can overwrite the warehouse. Else like `session`.
@@ -70,7 +76,7 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
         from fleet_slip.views import connect_unlocked
 
         require_many_cars()
-        return Session(connect_unlocked(self.root, query), any_statement)
+        return Session(connect_unlocked(self.root, query, scenarios=scenarios), any_statement)
 
     def cohort(self, condition: str = TRAINING_DRIVES) -> FleetCohort:
         """Return the drives that satisfy an SQL condition on the view `drives`.

@@ -237,7 +237,7 @@ def _drives_called(
     warehouse: Warehouse, calling: Calling, value: str, *, old: bool
 ) -> frozenset[str]:
     """Return the drives in logs and Gram rows, and in old files too if these are to go."""
-    with connect(warehouse.root, query="drives") as database:
+    with connect(warehouse.root, query="drives", scenarios=True) as database:
         statement = f"SELECT DISTINCT drive_id FROM drives WHERE {calling} = $value"
         found = {name for (name,) in database.execute(statement, {"value": value}).fetchall()}
     for rows in _named_rows(warehouse, calling, old=old):

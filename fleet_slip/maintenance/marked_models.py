@@ -156,7 +156,7 @@ def _in_cohorts(
     from fleet_slip.warehouse.condition import asking, parse_condition  # noqa: PLC0415
 
     found = {}
-    with connect(warehouse.root, query="grams") as database:
+    with connect(warehouse.root, query="grams", scenarios=True) as database:
         database.register(
             "forgotten", pa.table({"drive_id": pa.array(sorted(drives), pa.string())})
         )

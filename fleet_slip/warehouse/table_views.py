@@ -9,6 +9,7 @@ import pyarrow as pa
 
 from fleet_slip.catalogue.course_change import COURSE_LATE
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, SignalCatalogue, catalogue
+from fleet_slip.catalogue.sources import ALL_DRIVES
 from fleet_slip.columns.column_sql import with_absent
 from fleet_slip.delta import Snapshot, absent_columns
 from fleet_slip.errors import ConflictError
@@ -88,8 +89,12 @@ def open_tables(
     snapshots: Sequence[Snapshot],
     *,
     threads: int | None = None,
+    of: str = ALL_DRIVES,
 ) -> duckdb.DuckDBPyConnection:
-    """Return a connection, to be locked yet, with some views on snapshots of their tables."""
+    """Return a connection, to be locked yet, with some views on snapshots of their tables.
+
+    Logs and Gram rows are `of` the drives that satisfy this SQL condition.
+    """
     database = open_database(threads=threads, reading=warehouse.root, spill=True)
     tables = {snapshot.table.folder.name: snapshot for snapshot in snapshots}
     if "grams" in tables:
@@ -97,6 +102,9 @@ def open_tables(
         database.execute("SET VARIABLE active_log_files = $active", {"active": active})
     read = {_STORED_IN[name] for name in wanted if name in _STORED_IN}
     sources = {f"stored_{name}": _source(database, tables[name]) for name in read}
+    if of != ALL_DRIVES:
+        for name in sources.keys() - {"stored_quarantine"}:
+            sources[name] = f"(FROM {sources[name]} WHERE {of})"
     columns = _generated_columns(warehouse.catalogue)
     with database_errors(f"opening the warehouse {warehouse.root}"):
         for view in TABLE_VIEWS:

@@ -29,6 +29,10 @@ ENDLESS = 2**31 - 1
 FORMULA = "^[=+@\\t\\r\\n＝＋－＠-]"
 """What a text begins with that a spreadsheet executes."""
 
+Scenarios = Annotated[
+    bool, typer.Option("--scenarios", help="Show the drives that models are tested on as well.")
+]
+
 
 def sql(
     context: typer.Context,
@@ -55,6 +59,7 @@ def sql(
     everything: Annotated[
         bool, typer.Option("--all", help="Print all rows and columns of a table, however wide.")
     ] = False,
+    scenarios: Scenarios = False,
     unsafe: Annotated[
         bool,
         typer.Option(
@@ -66,9 +71,10 @@ def sql(
 ) -> None:
     """Query the warehouse: log (SI), log_counts, drives, grams, models, quarantine, dictionary.
 
-    Every column is described in the view dictionary. A query can read the warehouse, and nothing
-    else. A table shows what fits of columns and rows; --all shows all. --csv, --json and --output
-    give numbers to the last digit.
+    Every column is described in the view dictionary. Test drives are there with --scenarios, or
+    if the query names the column source. A query can read the warehouse, and nothing else. A table
+    shows what fits of columns and rows; --all shows all. --csv, --json and --output give numbers to
+    the last digit.
 
     Example: **fleet-slip sql "SELECT vehicle_id, count(*) AS drives FROM drives GROUP BY ALL"**
     """
@@ -79,7 +85,7 @@ def sql(
         raise QuestionError("the query on stdin is not UTF-8 text.") from None
     if not unsafe:
         limit_memory()
-    opened = (fleet.unlocked_session if unsafe else fleet.session)(text)
+    opened = (fleet.unlocked_session if unsafe else fleet.session)(text, scenarios=scenarios)
     with opened as session:
         if output is not None:
             _write(session, text, output, limit, exact)

@@ -12,7 +12,7 @@ from pathlib import Path
 import typer
 
 from fleet_slip.api.session import Session
-from fleet_slip.cli.begin.sql_command import Form, answer
+from fleet_slip.cli.begin.sql_command import Form, Scenarios, answer
 from fleet_slip.cli.output import print_text, say
 from fleet_slip.errors import FleetSlipError, QueryGoesOnError
 from fleet_slip.warehouse.database import limit_memory
@@ -21,7 +21,7 @@ HISTORY_LINES = 1000
 PRIVATE = 0o600
 
 
-def shell(context: typer.Context) -> None:
+def shell(context: typer.Context, scenarios: Scenarios = False) -> None:
     """Type SQL queries against the warehouse, one after the other. End with .quit or Ctrl-D.
 
     A query ends with a semicolon or an empty line. Tab completes views, columns and commands; the
@@ -30,7 +30,7 @@ def shell(context: typer.Context) -> None:
     Example: **fleet-slip shell**
     """
     limit_memory()
-    with context.obj.session() as session, _kept_history(), _stdin_as_it_is():
+    with context.obj.session(scenarios=scenarios) as session, _kept_history(), _stdin_as_it_is():
         typed = Typed(session)
         readline.set_completer(partial(complete, typed.words()))
         readline.set_completer_delims(" \t\n,();=<>'\"")

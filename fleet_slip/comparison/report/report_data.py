@@ -275,7 +275,10 @@ def _coefficients(trained: TrainedModels, own: Cohort) -> tuple[Coefficients, ..
 
 
 def _tables(warehouse: Warehouse) -> tuple[TableSize, ...]:
-    with connect(warehouse.root) as database, reading_files(database, "counting drives"):
+    with (
+        connect(warehouse.root, scenarios=True) as database,
+        reading_files(database, "counting drives"),
+    ):
         counted = database.execute(
             "SELECT source = $scenario, count(*) FROM drives GROUP BY ALL", {"scenario": SCENARIO}
         ).fetchall()

@@ -106,7 +106,7 @@ def drive_frames(warehouse: Warehouse, drive_id: str, version: ModelVersion) -> 
     require_single_cars("a drive of the logs", "Watch a scenario, which is simulated.")
     names = [one.column for one in catalogue().signals.values()]
     query = f"SELECT time_s, track, vehicle_model, mass_kg, {', '.join(names)} FROM log"
-    with connect(warehouse.root, query=query) as database:
+    with connect(warehouse.root, query=query, scenarios=True) as database:
         statement = f"{query} WHERE drive_id = $drive ORDER BY time_s"
         rows = database.sql(statement, params={"drive": drive_id}).to_arrow_table()
     if not rows.num_rows:

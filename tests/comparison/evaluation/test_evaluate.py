@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import fleet_slip
 from fleet_slip.cli.app import app
 from fleet_slip.comparison.evaluation.estimators import published_estimate
 from fleet_slip.comparison.evaluation.evaluate import keep
@@ -110,6 +111,26 @@ def test_a_changed_scenario_is_refused(root: Path, tmp_path: Path) -> None:
         evaluate(copy, str(file))
 
 
+def test_views_show_test_drives_to_those_who_ask(root: Path) -> None:
+    fleet = fleet_slip.open(root)
+    count = "SELECT count(*) FROM drives"
+    for hidden in (
+        count,
+        "SELECT count(DISTINCT drive_id) FROM log",
+        "SELECT count(DISTINCT drive_id) FROM grams",
+    ):
+        assert fleet.sql(hidden).fetchall() == [(8,)]
+        ((shown,),) = fleet.sql(hidden, scenarios=True).fetchall()
+        assert shown > 8
+    asked = fleet.sql("SELECT count(*) FROM drives WHERE source = 'scenario'").fetchall()
+    with fleet.session() as fleet_alone, fleet.session(scenarios=True) as everything:
+        hidden_too = "SELECT count(*) FROM drives WHERE source = 'scenario'"
+        assert fleet_alone.sql(hidden_too).fetchall() == [(0,)]
+        assert everything.sql(hidden_too).fetchall() == asked != [(0,)]
+    assert call(root, "sql", count) == [{"count_star()": 8}]
+    assert call(root, "sql", "--scenarios", count) == [{"count_star()": 8 + asked[0][0]}]
+
+
 def test_the_published_model_gets_the_same_estimates_as_in_sql(root: Path) -> None:
     """SQL measures against the noisy label, here the truth counts: 0.03 degrees between them."""
     manifest = Registry(LocalFolder(root / "models")).resolve("smoke").manifest
@@ -166,7 +187,7 @@ def test_the_filters_are_tuned_once(root: Path) -> None:
 def test_a_filter_gives_the_same_estimates_here_as_by_itself(root: Path) -> None:
     scenario = load_scenario("nominal")
     (drive,) = load_drives(Warehouse(LocalFolder(root)), [scenario])
-    with connect(root) as database:
+    with connect(root, scenarios=True) as database:
         alone = read_drive(database, scenario.drive_id)
     expected = kalman.estimate(alone.signals, scenario.car, kalman.FilterNoise())
     found = FilterEstimate(FILTERS[0], FILTERS[0].parameters, scenario.car)(drive.signals)
