@@ -151,6 +151,12 @@ class CohortError(FleetSlipError):
     exit_code = 14
 
 
+class UnexaminedError(FleetSlipError):
+    """What is to train a model could not be examined first."""
+
+    exit_code = 16
+
+
 class ExtraError(FleetSlipError):
     """A package that only some commands need is not installed."""
 

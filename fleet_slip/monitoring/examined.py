@@ -1,39 +1,42 @@
 """Which drives of a cohort are to train: those that were examined, and are in order.
 
-A cohort is examined once: what was found is kept in the user's cache, as hashes of drives, as long
-as logs, Gram rows and thresholds are what they were. Simulated drives are not examined: what is
-wrong in them is meant.
+Drives are examined once: what was found is kept in the user's cache, as hashes of drives, as long
+as Gram rows and thresholds are what they were. Many drives are examined in pieces of whole days, so
+that a night costs its own piece. Simulated drives are not examined: what is wrong in them is meant.
 """
 
 import json
 import os
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from datetime import date
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 from fleet_slip.canonical import canonical_json
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.sources import RECEIVED
-from fleet_slip.errors import DataError, NotComputedError
+from fleet_slip.delta import Snapshot, TableFile
 from fleet_slip.grams.cohorts.reader import GramReader
+from fleet_slip.grams.rows.backlog import find_backlog
 from fleet_slip.ingest.drives.measured_drives import SOURCE
 from fleet_slip.ingest.landing.known_files import cache_folder
 from fleet_slip.monitoring.quality import examine_drives
 from fleet_slip.monitoring.thresholds import thresholds
 from fleet_slip.runs.nights import hash_drive, without_drives
 from fleet_slip.warehouse.condition import Condition, asking, parse_condition
-from fleet_slip.warehouse.table_views import connect_tables
+from fleet_slip.warehouse.table_views import gram_snapshots, lock, open_tables, views_in
 from fleet_slip.warehouse.tables import Warehouse
 from fleet_slip.words import number_of
 
 NAME = "drive"
 """Stands for a model's name in the hashes of drives."""
 
-MOST_DRIVES = 200_000
-"""That are examined on the way to something else: it takes some 10 s and 600 MiB for 100,000."""
+PIECE = 100_000
+"""Drives that are compared with one another, or a quarter more: some 10 s and 600 MiB."""
 
 
 @dataclass(frozen=True)
@@ -44,100 +47,142 @@ class Examined:
         cohort: the condition without the drives that are not in order.
         drives: how many were long enough to be examined.
         faults: how many drives have each fault, such as `reversed sideslip`.
-        unexamined: how many were not examined, since they are too many.
-        why_not: why none was examined, although some are measured.
+        missing: how many measured drives were not, since they have no Gram rows.
+        missing_rows: how many rows of the logs are to be read for these.
     """
 
     cohort: str
     drives: int = 0
     faults: Mapping[str, int] = field(default_factory=dict)
-    unexamined: int = 0
-    why_not: str = ""
+    missing: int = 0
+    missing_rows: int = 0
+
+    @property
+    def lacking(self) -> str:
+        """What was not examined and what to do, as a sentence; nothing if all were examined."""
+        if not self.missing:
+            return ""
+        return (
+            f"{number_of(self.missing, 'measured drive')} not examined: the Gram rows of their "
+            "signals are not there. Run: fleet-slip gram"
+        )
 
     def __str__(self) -> str:
-        """Return what is left out as a sentence; nothing if all are in order."""
-        if self.unexamined:
-            return (
-                f"{self.unexamined:,} drives were not examined: more than {MOST_DRIVES:,} take too "
-                "long. A night examines what is new; of a part of them: fleet-slip quality --cohort"
-            )
-        if self.why_not:
-            return f"drives were not examined: {self.why_not}"
+        """Return what is left out, and what was not examined; nothing if all are in order."""
         if not self.faults:
-            return ""
+            return self.lacking
         told = ", ".join(f"{number:,} {fault}" for fault, number in self.faults.items())
         out = number_of(sum(self.faults.values()), "drive")
-        return (
+        left_out = (
             f"{out} of {self.drives:,} left out, not in order: {told}. See fleet-slip quality; "
             "--unexamined takes them all the same."
         )
+        return f"{left_out} {self.lacking}".strip()
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """Days whose drives are examined together; `rows` are hashes of their Gram rows."""
+
+    days: tuple[date, ...]
+    drives: int
+    rows: tuple[int, ...]
+
+    def __add__(self, other: "_Piece") -> "_Piece":
+        return _Piece(self.days + other.days, self.drives + other.drives, self.rows + other.rows)
+
+    @property
+    def condition(self) -> Condition:
+        return parse_condition(f"day BETWEEN DATE '{self.days[0]}' AND DATE '{self.days[-1]}'")
 
 
 def leave_out_faulty(warehouse: Warehouse, cohort: str) -> Examined:
     """Examine the drives of a cohort like `quality`; return it without those not in order.
 
-    Raises what `examine_drives` raises; where no drive is measured there is nothing to examine,
-    and more than `MOST_DRIVES` are not examined.
+    Drives without Gram rows of `signals` are not examined, and counted. Raises what
+    `examine_drives` raises; where no drive is measured there is nothing to examine.
     """
-    kept = _cache(warehouse, cohort)
-    with suppress(OSError, ValueError, KeyError, TypeError):
-        known = json.loads(kept.read_bytes())
-        return Examined(
-            without_drives(cohort, NAME, map(str, known["drives"])),
-            int(known["examined"]),
-            {str(fault): int(number) for fault, number in known["faults"].items()},
-        )
     measured = parse_condition(f"source IN ('{SOURCE}', '{RECEIVED}')")
     condition = parse_condition(cohort) & measured
-    try:
-        if (many := _count_drives(warehouse, condition)) > MOST_DRIVES:
-            return Examined(cohort, unexamined=many)
-        report = examine_drives(warehouse, condition)
-    except NotComputedError as error:
-        return Examined(cohort, why_not=str(error))
-    except DataError:
-        if not _has_drives(warehouse, condition):
-            return Examined(cohort)
-        return Examined(cohort, why_not="their Gram rows are not there. Run: fleet-slip gram")
+    grams, logs = gram_snapshots(warehouse)
+    missing, missing_rows = _lacking(warehouse, grams, logs, condition)
+    found: list[Mapping[str, Any]] = []
+    for piece in _pieces(warehouse, condition) if grams.rows else []:
+        about = {"cohort": cohort, "from": piece.days[0], "root": warehouse.root.uri}
+        limits = thresholds().quality.model_dump(mode="json")
+        state = [list(piece.rows), sha256(canonical_json(limits).encode()).hexdigest()]
+        name = sha256(canonical_json({k: str(v) for k, v in about.items()}).encode()).hexdigest()
+        kept = cache_folder("examined") / f"{name[:32]}.json"
+        found.append(_known(kept, state) or _examine(warehouse, condition & piece.condition))
+        _keep(kept, {**found[-1], "state": state})
+    hashes = {name for one in found for name in one["drives"]}
+    faults = sum((Counter(one["faults"]) for one in found), Counter[str]())
+    examined = sum(one["examined"] for one in found)
+    kept_cohort = without_drives(cohort, NAME, hashes)
+    return Examined(kept_cohort, examined, dict(faults), missing, missing_rows)
+
+
+def _examine(warehouse: Warehouse, condition: Condition) -> Mapping[str, Any]:
+    report = examine_drives(warehouse, condition)
     hashes = sorted(hash_drive(NAME, one.drive_id) for one in report.findings)
     faults = Counter(" ".join((one.fault.kind, *one.fault.signals)) for one in report.findings)
-    content = {"drives": hashes, "examined": report.drives, "faults": faults}
+    return {"drives": hashes, "examined": report.drives, "faults": faults}
+
+
+def _known(kept: Path, state: list[Any]) -> Mapping[str, Any] | None:
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        known = json.loads(kept.read_bytes())
+        if known["state"] == state:
+            return {
+                "drives": [str(one) for one in known["drives"]],
+                "examined": int(known["examined"]),
+                "faults": {str(fault): int(many) for fault, many in known["faults"].items()},
+            }
+    return None
+
+
+def _keep(kept: Path, content: Mapping[str, Any]) -> None:
     with suppress(OSError):
         kept.parent.mkdir(parents=True, exist_ok=True)
         draft = kept.with_suffix(f".{os.getpid()}")
         draft.write_text(json.dumps(content))
         draft.replace(kept)
-    return Examined(without_drives(cohort, NAME, hashes), report.drives, dict(faults))
 
 
-def _has_drives(warehouse: Warehouse, condition: Condition) -> bool:
-    """Whether the logs have a drive that satisfies a condition."""
-    query = f"SELECT 1 FROM drives WHERE {condition.sql} LIMIT 1"
-    with connect_tables(warehouse, query) as database, asking(database, condition):
-        return bool(database.execute(query).fetchall())
-
-
-def _count_drives(warehouse: Warehouse, condition: Condition) -> int:
-    """Return how many drives satisfy a condition if they can be many, else 0."""
-    if warehouse.grams.snapshot().rows <= MOST_DRIVES:
-        return 0
+def _pieces(warehouse: Warehouse, condition: Condition) -> list[_Piece]:
+    """Divide a cohort's days, so that new days change the last piece alone."""
     with GramReader(warehouse) as reader:
         opened = reader.opened(PLAIN, condition)
-        cohort = opened.statement("cohort.sql", condition)
+        statement = opened.statement("examined_days.sql", condition)
         with asking(opened.database, condition):
-            (many,) = opened.database.sql(f"SELECT count(*) FROM ({cohort}\n)").fetchall()[0]
-    return int(many)
+            days = opened.database.execute(statement).fetchall()
+    pieces: list[_Piece] = []
+    for day in (_Piece((day,), drives, (rows,)) for day, drives, rows in days):
+        if pieces and pieces[-1].drives < PIECE:
+            pieces[-1] += day
+        else:
+            pieces.append(day)
+    if len(pieces) > 1 and 4 * pieces[-1].drives < PIECE:
+        pieces[-2:] = [pieces[-2] + pieces[-1]]
+    return pieces
 
 
-def _cache(warehouse: Warehouse, cohort: str) -> Path:
-    """Return the file for what was found of a cohort, in the tables as they are now."""
-    moments = []
-    for table in (warehouse.logs, warehouse.grams):
-        snapshot = table.snapshot()
-        version = snapshot.version
-        moments.append([version, None if version is None else snapshot.moment(version)])
-    limits = thresholds().quality.model_dump(mode="json")
-    about = {"root": warehouse.root.uri, "cohort": cohort, "tables": moments, "limits": limits}
-    return (
-        cache_folder("examined") / f"{sha256(canonical_json(about).encode()).hexdigest()[:32]}.json"
-    )
+def _lacking(
+    warehouse: Warehouse, grams: Snapshot, logs: Snapshot, condition: Condition
+) -> tuple[int, int]:
+    """Return how many drives of a cohort's logs lack Gram rows, and the rows to read for them."""
+    missing = find_backlog(logs, grams).missing
+    if not missing:
+        return 0, 0
+    query = f"SELECT count(*) FROM drives WHERE {condition.sql} AND source <> '{RECEIVED}'"
+    others = frozenset(_paths(logs.files)) - frozenset(_paths(missing))
+    only = [grams, replace(logs, without=others)]
+    with open_tables(warehouse, views_in(query), only) as database:
+        lock(database, [path for one in only for path in one.paths])
+        with asking(database, condition):
+            [(drives,)] = database.execute(query).fetchall()
+    return int(drives), sum(file.rows for file in missing)
+
+
+def _paths(files: Iterable[TableFile]) -> list[str]:
+    return [file.path for file in files]

@@ -9,9 +9,13 @@ import pytest
 import fleet_slip
 from fleet_slip import Fleet
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.errors import RefusedError
-from fleet_slip.monitoring import examined
+from fleet_slip.cli import left_out
+from fleet_slip.errors import RefusedError, UnexaminedError
+from fleet_slip.monitoring import examined, quality
+from fleet_slip.monitoring.quality import QualityReport
 from fleet_slip.runs.nights import hash_drive, with_all_drives, without_drives
+from fleet_slip.warehouse.condition import Condition
+from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand
 from tests.support.landing import Landing
 from tests.support.once import made_once
@@ -27,8 +31,9 @@ def landed(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Path:
         landing = Landing(folder / "landing", smoke_root)
         landing.prepare()
         drives, fleet = landing.drives(), fleet_slip.open(folder / "data")
-        good = landing.land("good", drives[:6], date(2026, 10, 5))
-        bad = landing.land("bad", drives[6:8], date(2026, 10, 6), ay_mps2="1.0 + 0 * ay_mps2")
+        good = landing.land("good", drives[:4], date(2026, 10, 5))
+        bad = landing.land("bad", drives[4:6], date(2026, 10, 6), ay_mps2="1.0 + 0 * ay_mps2")
+        landing.land("late", drives[6:8], date(2026, 10, 7), yaw_rate_rad_s="0.1 + 0 * time_s")
         fleet.ingest([good, bad], str(landing.mapping))
         fleet.gram()
 
@@ -47,7 +52,7 @@ def test_drives_that_are_not_in_order_train_nothing_by_hand(
     fleet: Fleet, run_command: RunCommand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = fleet.leave_out_faulty()
-    assert (found.drives, found.faults) == (8, {"stuck ay": 2})
+    assert (found.drives, found.faults) == (6, {"stuck ay": 2})
 
     def examine_again(*_: object) -> None:
         raise AssertionError("examined again")
@@ -57,11 +62,11 @@ def test_drives_that_are_not_in_order_train_nothing_by_hand(
     monkeypatch.undo()
     told = run_command("select", "--models", "table1")
     assert told.exit_code == 0
-    assert "2 drives of 8 left out, not in order: 2 stuck ay" in told.stderr
-    assert "6 drives" in told.stdout
-    assert "8 drives" in run_command("select", "--models", "table1", "--unexamined").stdout
+    assert "2 drives of 6 left out, not in order: 2 stuck ay" in told.stderr
+    assert "4 drives" in told.stdout
+    assert "6 drives" in run_command("select", "--models", "table1", "--unexamined").stdout
     assert run_command("publish", "m", "--models", "table1").exit_code == 0
-    assert fleet.model("m").manifest.trained_on.drives == 6
+    assert fleet.model("m").manifest.trained_on.drives == 4
 
 
 def test_a_first_champion_of_a_label_that_is_turned_in_all_drives_is_refused(
@@ -88,19 +93,40 @@ def test_a_cohort_tells_what_it_was_before_drives_were_left_out() -> None:
     assert with_all_drives(twice) == with_all_drives(once) == with_all_drives(asked) == asked
 
 
-def test_more_drives_than_take_seconds_are_not_examined_and_that_is_said(
-    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+def test_many_drives_are_examined_in_pieces_of_days_and_each_piece_once(
+    landed: Path, fleet: Fleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(examined, "MOST_DRIVES", 7)
+    asked: list[str] = []
+    real = quality.examine_drives
+
+    def counted(warehouse: Warehouse, condition: Condition) -> QualityReport:
+        asked.append(condition.text)
+        return real(warehouse, condition)
+
+    monkeypatch.setattr(examined, "examine_drives", counted)
+    monkeypatch.setattr(examined, "PIECE", 4)
     found = fleet.leave_out_faulty()
-    assert (found.cohort, found.drives, found.unexamined) == (TRAINING_DRIVES, 0, 8)
-    assert str(found).startswith("8 drives were not examined: more than 7 take too long.")
-    assert fleet.leave_out_faulty(f"{TRAINING_DRIVES} AND day = DATE '2026-10-05'").drives == 6
+    assert (found.drives, found.faults, len(asked)) == (6, {"stuck ay": 2}, 2)
+    landing = Landing(landed / "landing", landed)
+    fleet.ingest(sorted(landing.folder.glob("late*")), str(landing.mapping))
+    fleet.gram()
+    found = fleet.leave_out_faulty()
+    assert (found.drives, found.faults, len(asked)) == (8, {"stuck ay": 2, "stuck yaw_rate": 2}, 3)
+    assert "2026-10-06" in asked[-1] and "2026-10-05" not in asked[-1]
 
 
-def test_drives_without_gram_rows_are_told_as_not_examined(landed: Path, tmp_path: Path) -> None:
-    fleet = fleet_slip.open(shutil.copytree(landed / "data", tmp_path / "data"))
-    shutil.rmtree(tmp_path / "data" / "grams")
+def test_drives_without_gram_rows_are_reduced_and_examined_before_they_train(
+    fleet: Fleet, run_command: RunCommand, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As after `gram --features`, where the rows that are examined may not be there."""
+    shutil.rmtree(Path(str(fleet.root)) / "grams")
     fleet.gram("calibration")
     told = str(fleet.leave_out_faulty())
-    assert told.startswith("drives were not examined: ") and "fleet-slip gram" in told
+    assert told.startswith("6 measured drives not examined: ") and "Run: fleet-slip gram" in told
+    monkeypatch.setattr(left_out, "READ_ON_THE_WAY", 100)
+    with pytest.raises(UnexaminedError, match=r"6 measured drives .* with --unexamined"):
+        left_out.examine_before_publishing(fleet, TRAINING_DRIVES)
+    done = run_command("publish", "m", "--models", "table1")
+    assert done.exit_code == 0, done.stderr
+    assert "made the Gram rows of 6 measured drives" in done.stderr
+    assert fleet.model("m").manifest.trained_on.drives == 4

@@ -6,7 +6,7 @@ import typer
 
 from fleet_slip.cli.begin.select_command import print_selection
 from fleet_slip.cli.completing import complete_model
-from fleet_slip.cli.left_out import examine_cohort
+from fleet_slip.cli.left_out import examine_before_publishing
 from fleet_slip.cli.models.signing_commands import SignKey, signing_key
 from fleet_slip.cli.options import RESAMPLING, Unexamined, selection_options
 from fleet_slip.cli.output import All, Json, print_json, say
@@ -68,7 +68,9 @@ def publish(
     recipe = recipe_for(context.obj.registry(), name, request, cohort)
     if recipe.told:
         say(f"{name}: {recipe.told}")
-    cohort = recipe.cohort if unexamined else examine_cohort(context.obj, recipe.cohort)
+    cohort = recipe.cohort
+    if not unexamined:
+        cohort = examine_before_publishing(context.obj, cohort)
     with step("select"):
         selection = answer_request(context.obj.warehouse, recipe.request, cohort)
     if dry_run:
