@@ -157,6 +157,8 @@ class CrossValidated(Config):
     error_mean_deg: FiniteFloat
     error_std_deg: NotNegative
     condition_number: NotNegative
+    label_noise_deg: Annotated[NotNegative | None, _LEFT_OUT] = None
+    """White noise of the label, which all errors here have in them; None where it is not known."""
 
     @model_validator(mode="after")
     def _can_be(self) -> Self:

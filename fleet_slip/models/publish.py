@@ -326,7 +326,7 @@ def _incumbents(registry: Registry, champion: ModelVersion) -> list[ModelVersion
     return [champion, *others]
 
 
-def _cross_validated(winner: CrossValidation, selection: Selection[Any]) -> CrossValidated:
+def _cross_validated(winner: CrossValidation, selection: RequestedSelection) -> CrossValidated:
     figures = winner.pooled
     return CrossValidated(
         folds_by=selection.folds.by,
@@ -337,4 +337,5 @@ def _cross_validated(winner: CrossValidation, selection: Selection[Any]) -> Cros
         error_mean_deg=figures.error_mean_deg,
         error_std_deg=figures.error_std_deg,
         condition_number=winner.condition_number,
+        label_noise_deg=selection.label_noise_deg,
     )

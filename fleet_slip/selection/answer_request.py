@@ -20,6 +20,7 @@ from fleet_slip.regression.choice.winner import Worth, fall_short
 from fleet_slip.regression.exact.special import student_t_two_sided
 from fleet_slip.regression.validation.crossval import CrossValidation
 from fleet_slip.selection.influence import influential_cars, without_vehicles
+from fleet_slip.selection.label_noise import label_noise_deg
 from fleet_slip.selection.model_list import (
     WHOLE_SET,
     CandidateModel,
@@ -66,7 +67,8 @@ def answer_request(
     if isinstance(answer.cohort, TaughtCohort):  # its figures are of the angle
         return answer
     told = without_label(warehouse, answer.cohort, answer.winner.model.pooled.rmse_deg)
-    return replace(answer, without_label=told)
+    noise_deg = None if told else label_noise_deg(warehouse, answer.cohort)
+    return replace(answer, without_label=told, label_noise_deg=noise_deg)
 
 
 def _answer_usual(

@@ -203,6 +203,7 @@ class RequestedSelection(Selection[Any]):
         config_sha256: checksum of all that says what to compare.
         left_out: the cars that `robust` left out, and what influence they had.
         without_label: what changes of the course tell of the winner, if they taught it alone.
+        label_noise_deg: of the label, which every error has in it; None where it is not known.
         request, asked: what was asked for, and of which drives.
         remark: why another list than the usual one was compared.
     """
@@ -211,6 +212,7 @@ class RequestedSelection(Selection[Any]):
     config_sha256: str
     left_out: Mapping[str, Influential] = field(default_factory=dict)
     without_label: WithoutLabel | None = None
+    label_noise_deg: float | None = None
     request: SelectionRequest = field(default_factory=SelectionRequest)
     asked: str = TRAINING_DRIVES
     remark: str = ""
@@ -219,7 +221,11 @@ class RequestedSelection(Selection[Any]):
         """Return what `select --json` prints."""
         told = self.left_out.items() if tells_single_cars() else ()
         named = {car: one.times for car, one in told}
-        document = {**super().as_dict(), "vehicles_left_out": named}
+        document = {
+            **super().as_dict(),
+            "vehicles_left_out": named,
+            "label_noise_deg": self.label_noise_deg,
+        }
         course = {"without_label": self.without_label.as_dict()} if self.without_label else {}
         remark = {"remark": self.remark} if self.remark else {}
         return {**document, **course, **remark}

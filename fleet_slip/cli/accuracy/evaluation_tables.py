@@ -93,7 +93,8 @@ def print_ranking(ranking: dict[str, Any]) -> None:
     print_table(
         f"\n{ours} wins {ranking['won']} of {ranking['drives']} test drives by RMSE, and is within "
         f"{ranking['close_ratio']:g} of the winner on {ranking['close']} others.\nAll compete that "
-        f"need no GPS and estimate {least:.0%} of the rows.",
+        f"need no GPS and estimate {least:.0%} of the rows. Drives that differ in GPS alone are "
+        "one.",
         ["scenario", "won by", "RMSE deg", f"{ours} deg", "ratio"],
         [
             [
@@ -104,6 +105,7 @@ def print_ranking(ranking: dict[str, Any]) -> None:
                 cell(one["ratio"], ".2f"),
             ]
             for one in ranking["standings"]
+            if one["same_as"] is None
         ],
         left=2,
     )

@@ -34,6 +34,7 @@ from fleet_slip.regression.choice.nested_choice import CROSS_VALIDATION, NestedD
 from fleet_slip.regression.inference.evidence import Evidence
 from fleet_slip.regression.validation.crossval import CrossValidation
 from fleet_slip.selection.answer_request import answer_request
+from fleet_slip.selection.label_noise import beyond_noise_deg
 from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.selection.search import SearchChoice
 from fleet_slip.selection.select_models import RequestedSelection, Selection
@@ -94,6 +95,8 @@ def print_selection(selection: Selection[Any], everything: bool = False) -> None
         say(selection.remark)
     if isinstance(selection, RequestedSelection) and selection.without_label is not None:
         _say_without_label(selection.without_label)
+    if isinstance(selection, RequestedSelection):
+        _say_label_noise(selection)
     if isinstance(selection.cohort, TaughtCohort):
         say(
             f"a change of the course has {selection.cohort.weight} times the weight of a row with "
@@ -166,6 +169,20 @@ def _print_models(selection: Selection[Any], everything: bool) -> None:
         ],
         left=1 + listed,
     )
+
+
+def _say_label_noise(selection: RequestedSelection) -> None:
+    """Say how much of the errors is noise of the label they are measured against."""
+    if selection.without_label is not None or isinstance(selection.cohort, TaughtCohort):
+        return
+    noise, rmse = selection.label_noise_deg, selection.winner.model.pooled.rmse_deg
+    if noise is None:
+        say("how noisy the label is, is not known: all errors have its noise in them.")
+    else:
+        say(
+            f"all errors have the label's own noise in them, {noise:.4f} deg; without it the "
+            f"winner has {beyond_noise_deg(rmse, noise):.4f} deg."
+        )
 
 
 def _say_without_label(told: WithoutLabel) -> None:

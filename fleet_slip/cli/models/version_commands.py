@@ -16,8 +16,9 @@ from fleet_slip.cli.recorded import record_run
 from fleet_slip.errors import UsageError
 from fleet_slip.export.costs import costs_content, describe_costs
 from fleet_slip.models.aliases import CHAMPION
-from fleet_slip.models.manifest import LearnedFrom, ModelTerm
+from fleet_slip.models.manifest import CrossValidated, LearnedFrom, ModelTerm
 from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.selection.label_noise import beyond_noise_deg
 from fleet_slip.words import number_of
 
 Reference = Annotated[
@@ -209,6 +210,7 @@ def _facts(version: ModelVersion) -> dict[str, str]:
     facts = {
         "correlation": f"{figures.correlation:.4f} (s.e. {figures.correlation_standard_error:.2g})",
         "RMSE": f"{figures.rmse_deg:.4f} deg",
+        "label noise": _label_noise(figures),
         "error std": f"{figures.error_std_deg:.4f} deg",
         "error mean": f"{figures.error_mean_deg:+.4f} deg",
         "on board": describe_costs(manifest),
@@ -223,6 +225,15 @@ def _facts(version: ModelVersion) -> dict[str, str]:
     if one := manifest.imported_from:
         facts["imported"] = f"from {one.reference} of another data root, sha256 {one.sha256}"
     return facts
+
+
+def _label_noise(figures: CrossValidated) -> str:
+    """Return how much of the RMSE is noise of the label."""
+    noise = figures.label_noise_deg
+    if noise is None:
+        return "not known, and part of the RMSE"
+    left = beyond_noise_deg(figures.rmse_deg, noise)
+    return f"{noise:.4f} deg, without which the RMSE is {left:.4f} deg"
 
 
 @record_run

@@ -1,11 +1,13 @@
 """Who wins a test drive, and whether a fleet-trained model beats the one-car model there."""
 
 from collections.abc import Collection, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from fleet_slip.comparison.evaluation.estimators import TrainedModels
 from fleet_slip.comparison.evaluation.scenario_runs import EvaluatedScenario
+from fleet_slip.simulation.scenario import Failure, Scenario, load_scenario
+from fleet_slip.simulation.sensing.sensors import GPS_SIGNALS
 
 LEAST_COVERAGE = 0.99
 """Share of a drive's rows that a competitor must have estimates for: who skips rows cannot win."""
@@ -23,6 +25,8 @@ class Standing:
         winner, winner_rmse_deg: who has the smallest RMSE; None where nobody competes.
         rmse_deg: of the one estimator; None where it has too few estimates to compete.
         best_other, best_other_rmse_deg: the best of the others.
+        same_as: an earlier test drive that differs from this one in satellite navigation alone, so
+            that nobody who competes tells them apart.
     """
 
     scenario: str
@@ -31,6 +35,7 @@ class Standing:
     rmse_deg: float | None
     best_other: str | None
     best_other_rmse_deg: float | None
+    same_as: str | None = None
 
     @property
     def won(self) -> bool:
@@ -47,21 +52,26 @@ class Standing:
 
 @dataclass(frozen=True)
 class Ranking:
-    """How one estimator stands on all test drives."""
+    """How one estimator stands on all test drives; those that are the same count once."""
 
     estimator: str
     standings: tuple[Standing, ...]
 
     @property
+    def counted(self) -> tuple[Standing, ...]:
+        """The standings on drives that are not the same as one before."""
+        return tuple(one for one in self.standings if one.same_as is None)
+
+    @property
     def won(self) -> int:
         """Number of drives that it wins."""
-        return sum(one.won for one in self.standings)
+        return sum(one.won for one in self.counted)
 
     @property
     def close(self) -> int:
         """Number of drives that it loses with at most `CLOSE` times the winner's RMSE."""
         return sum(
-            one.ratio is not None and one.ratio <= CLOSE and not one.won for one in self.standings
+            one.ratio is not None and one.ratio <= CLOSE and not one.won for one in self.counted
         )
 
     def as_dict(self) -> dict[str, Any]:
@@ -70,7 +80,7 @@ class Ranking:
             "estimator": self.estimator,
             "least_coverage": LEAST_COVERAGE,
             "close_ratio": CLOSE,
-            "drives": len(self.standings),
+            "drives": len(self.counted),
             "won": self.won,
             "close": self.close,
             "standings": [
@@ -81,7 +91,13 @@ class Ranking:
 
 def rank(runs: Sequence[EvaluatedScenario], estimator: str, gps: Collection[str]) -> Ranking:
     """Rank an estimator on every drive against all that use no GPS; it wins a tie."""
-    return Ranking(estimator, tuple(_stand(run, estimator, gps) for run in runs))
+    return Ranking(
+        estimator,
+        tuple(
+            replace(_stand(run, estimator, gps), same_as=_same_as(run.scenario, runs[:number]))
+            for number, run in enumerate(runs)
+        ),
+    )
 
 
 def _stand(run: EvaluatedScenario, estimator: str, gps: Collection[str]) -> Standing:
@@ -99,6 +115,20 @@ def _stand(run: EvaluatedScenario, estimator: str, gps: Collection[str]) -> Stan
     if ours is not None and (others is None or ours <= others):
         winner, least = estimator, ours
     return Standing(run.scenario.name, winner, least, ours, other, others)
+
+
+def _same_as(scenario: Scenario, runs: Sequence[EvaluatedScenario]) -> str | None:
+    """Return the first of some drives that is the same for whoever does not see GPS."""
+    seen = _without_gps(scenario)
+    return next((r.scenario.name for r in runs if _without_gps(r.scenario) == seen), None)
+
+
+def _without_gps(scenario: Scenario) -> tuple[str, tuple[Failure, ...]]:
+    """Return what of a scenario matters to who does not see GPS."""
+    sensors = scenario.sensors.model_copy(update={"gps": load_scenario("nominal").sensors.gps})
+    drive = scenario.model_copy(update={"drive": "any", "sensors": sensors}).batch()
+    failures = tuple(f for f in scenario.failures if not set(f.signals) <= set(GPS_SIGNALS))
+    return drive.digest, failures
 
 
 @dataclass(frozen=True)

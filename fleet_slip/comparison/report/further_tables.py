@@ -153,7 +153,7 @@ def won(data: ReportData) -> str:
     return (
         f"Among all without satellite navigation {found['estimator']} wins {found['won']} of "
         f"{found['drives']} drives, and comes within {found['close_ratio']} times the winner in "
-        f"{found['close']} more. "
+        f"{found['close']} more; drives that differ in satellite navigation alone are one. "
     )
 
 

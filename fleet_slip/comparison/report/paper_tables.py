@@ -42,6 +42,7 @@ def table_one(data: ReportData) -> ReportTable:
         note=(
             f"{folding.count} folds by {folding.by}, "
             f"{count(data.trained.selection.cohort.rows)} rows. {winner}"
+            + _label_noise(data)
             + (BY_SPEED if data.by_speed else "")
         ),
     )
@@ -51,6 +52,13 @@ BY_SPEED = (
     " By speed: whole bands of the drives' speed are left out one after another, so that no model "
     "has seen the speeds it is tested at. Folds by drive interpolate between neighbours."
 )
+
+
+def _label_noise(data: ReportData) -> str:
+    noise = data.version.manifest.cross_validation.label_noise_deg
+    if noise is None:
+        return " How noisy the label is, is not known: every RMSE here has its noise in it."
+    return f" Every RMSE here has the label's own noise in it, {degrees(noise, 4)}."
 
 
 def _by_speed(data: ReportData, name: str) -> list[str]:

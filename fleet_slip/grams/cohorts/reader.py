@@ -14,6 +14,7 @@ from fleet_slip.catalogue.car_numbers import CALIBRATION
 from fleet_slip.catalogue.course_change import TURNED
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import ALL_DRIVES, LONGEST_PAUSE_S, TRAINING_DRIVES
 from fleet_slip.delta import Snapshot
 from fleet_slip.errors import DataError, NotComputedError
@@ -97,6 +98,11 @@ class OpenedGrams:
             return 0
         [(count,)] = self._rows(self.statement("count_without_log.sql", condition), condition)
         return int(count)
+
+    def label_sources(self, condition: Condition) -> list[tuple[str, str | None, int]]:
+        """Return source, campaign and number of the rows of a cohort that have the label."""
+        statement = self.statement("label_sources.sql", condition, label=catalogue().label)
+        return [(source, name, int(n)) for source, name, n in self._rows(statement, condition)]
 
     def files(self, condition: Condition) -> set[str]:
         """Return the log files that have a drive of a cohort."""

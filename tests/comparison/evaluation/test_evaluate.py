@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,9 @@ import pytest
 from typer.testing import CliRunner
 
 import fleet_slip
+from fleet_slip.arrays import FloatArray
 from fleet_slip.cli.app import app
+from fleet_slip.comparison.evaluation import evaluated_drives
 from fleet_slip.comparison.evaluation.estimators import published_estimate
 from fleet_slip.comparison.evaluation.evaluate import keep
 from fleet_slip.comparison.evaluation.evaluated_drives import load_drives
@@ -23,6 +26,8 @@ from fleet_slip.files.documents import DocumentFolder
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.models.score import score
 from fleet_slip.models.versions import Registry
+from fleet_slip.simulation.campaign import DriveSpec
+from fleet_slip.simulation.drives import exact_motion
 from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
@@ -140,9 +145,29 @@ def test_the_published_model_gets_the_same_estimates_as_in_sql(root: Path) -> No
     assert here["rows"] == in_sql.rows == one["truth"]["rows"]
     assert here["error_mean_deg"] == pytest.approx(in_sql.error_mean_deg, abs=0.001)
     label_noise_deg = np.degrees(load_scenario("nominal").sensors.sideslip_std_rad)
-    # The truth is vy / vx in counts of 0.005 m/s: some 0.006 degrees, which the label has not.
     expected = np.hypot(here["error_std_deg"], label_noise_deg)
-    assert in_sql.error_std_deg == pytest.approx(expected, rel=0.04)
+    assert in_sql.error_std_deg == pytest.approx(expected, rel=0.01)
+
+
+def test_the_truth_is_the_simulators_and_not_the_logs(root: Path) -> None:
+    (drive,) = load_drives(Warehouse(LocalFolder(root)), [load_scenario("nominal")])
+    with connect(root) as database:
+        logged = database.sql(
+            "SELECT vy_mps FROM log WHERE drive_id = 'scenario-nominal' ORDER BY time_s"
+        ).fetchnumpy()["vy_mps"]
+    off = np.abs(drive.vy_mps - logged)
+    assert 0.002 < off.max() <= 0.0025 + 1e-9, "half a count of 0.005 m/s"
+
+
+def test_a_drive_that_this_program_drives_otherwise_has_no_exact_truth(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def faster(specs: Sequence[DriveSpec]) -> list[dict[str, FloatArray]]:
+        return [{**one, "vx_mps": one["vx_mps"] + 0.1} for one in exact_motion(specs)]
+
+    monkeypatch.setattr(evaluated_drives, "exact_motion", faster)
+    with pytest.raises(RefusedError, match="exact angle is not known"):
+        load_drives(Warehouse(LocalFolder(root)), [load_scenario("nominal")])
 
 
 def test_stability_is_lost_on_the_slippery_road_alone(root: Path) -> None:

@@ -13,18 +13,17 @@ from fleet_slip.comparison.evaluation.estimators import Signals
 from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive, visible_signals
 from fleet_slip.comparison.evaluation.ranking import Ranking, rank
 from fleet_slip.comparison.evaluation.scenario_runs import EvaluatedScenario, evaluate_drive
-from fleet_slip.simulation.scenario import load_scenario
+from fleet_slip.simulation.scenario import Scenario, load_scenario
 
 ROWS = 1000
 
 
-def drive() -> EvaluatedDrive:
+def drive(scenario: Scenario) -> EvaluatedDrive:
     """Return a drive straight ahead: the estimate is the error."""
     zeros, speed = np.zeros(ROWS), np.full(ROWS, 20.0)
     signals = {catalogue()[name].column: zeros for name in visible_signals()}
-    return EvaluatedDrive(
-        load_scenario("nominal"), np.arange(ROWS) / 100, signals, speed, zeros, zeros, zeros, None
-    )
+    time_s = np.arange(ROWS) / 100
+    return EvaluatedDrive(scenario, time_s, signals, speed, zeros, zeros, zeros, None)
 
 
 def off_by(error_deg: float, missing: int = 0) -> Callable[[Signals], FloatArray]:
@@ -36,9 +35,12 @@ def off_by(error_deg: float, missing: int = 0) -> Callable[[Signals], FloatArray
     return estimate
 
 
-def run(**errors_deg: float | tuple[float, int]) -> EvaluatedScenario:
+def run(
+    scenario: Scenario | None = None, **errors_deg: float | tuple[float, int]
+) -> EvaluatedScenario:
     parts = {k: v if isinstance(v, tuple) else (v, 0) for k, v in errors_deg.items()}
-    return evaluate_drive(drive(), {name: off_by(*part) for name, part in parts.items()})
+    estimators = {name: off_by(*part) for name, part in parts.items()}
+    return evaluate_drive(drive(scenario or load_scenario("nominal")), estimators)
 
 
 def test_the_smallest_error_wins() -> None:
@@ -67,13 +69,27 @@ def test_who_leaves_rows_out_neither_wins_nor_is_close() -> None:
     assert two.won
 
 
+def test_drives_that_differ_in_satellite_navigation_alone_count_once() -> None:
+    names = ("gps_clear", "nominal", "gps_urban", "wheel_missing", "gps_tunnel", "noise_doubled")
+    found = rank([run(load_scenario(name), ours=0.1, ekf=0.2) for name in names], "ours", gps=())
+    same = [one.same_as for one in found.standings]
+    assert same == [None, "gps_clear", "gps_clear", None, "gps_clear", None]
+    document = found.as_dict()
+    assert (document["drives"], document["won"]) == (3, 3)
+    assert len(document["standings"]) == 6
+
+
 def test_nobody_wins_a_drive_without_estimates() -> None:
     (one,) = rank([run(ours=(0.1, ROWS), ekf=(0.1, ROWS))], "ours", gps=()).standings
     assert (one.winner, one.won, one.ratio) == (None, False, None)
 
 
 def test_wins_and_close_losses_are_counted_apart() -> None:
-    runs = [run(ours=a, ekf=0.2) for a in (0.1, 0.2, 0.24, 0.26)]
+    nominal = load_scenario("nominal")
+    runs = [
+        run(nominal.model_copy(update={"seed": seed}), ours=error, ekf=0.2)
+        for seed, error in enumerate((0.1, 0.2, 0.24, 0.26))
+    ]
     found = rank(runs, "ours", gps=())
     assert (found.won, found.close) == (2, 1), "a tie is won, 1.2 is close and 1.3 is not"
     document = found.as_dict()
