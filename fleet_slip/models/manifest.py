@@ -160,6 +160,11 @@ class CrossValidated(Config):
     label_noise_deg: Annotated[NotNegative | None, _LEFT_OUT] = None
     """White noise of the label, which all errors here have in them; None where it is not known."""
 
+    @property
+    def beyond_label_noise_deg(self) -> float:
+        """The RMSE without the label's noise."""
+        return math.sqrt(max(self.rmse_deg**2 - (self.label_noise_deg or 0.0) ** 2, 0.0))
+
     @model_validator(mode="after")
     def _can_be(self) -> Self:
         if abs(self.error_mean_deg) > self.rmse_deg * (1 + 1e-9) + 1e-12:

@@ -1,5 +1,6 @@
 """Compares candidate models on a cohort by cross-validation and chooses one; no log row is read."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Generic
@@ -216,6 +217,14 @@ class RequestedSelection(Selection[Any]):
     request: SelectionRequest = field(default_factory=SelectionRequest)
     asked: str = TRAINING_DRIVES
     remark: str = ""
+
+    @property
+    def beyond_label_noise_deg(self) -> float | None:
+        """The winner's RMSE without the label's noise."""
+        if self.label_noise_deg is None:
+            return None
+        rmse_deg = self.winner.model.pooled.rmse_deg
+        return math.sqrt(max(rmse_deg**2 - self.label_noise_deg**2, 0.0))
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `select --json` prints."""

@@ -115,7 +115,7 @@ def test_an_evaluation_is_a_screen(shown: Shown) -> None:
         "drives": 1,
         "won": 0,
         "close": 0,
-        "standings": [{**standing, "ratio": 2.0}],
+        "standings": [{**standing, "ratio": 2.0, "same_as": None}],
     }
     result = {"rmse_deg": 0.2, "coverage": 0.35}
     scenario = {

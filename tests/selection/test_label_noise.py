@@ -11,8 +11,8 @@ from fleet_slip import open as open_fleet
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.models.publish import manifest_of
-from fleet_slip.selection.label_noise import beyond_noise_deg, label_noise_deg
-from fleet_slip.simulation import campaign
+from fleet_slip.selection import label_noise
+from fleet_slip.selection.label_noise import label_noise_deg
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -35,8 +35,8 @@ def test_a_selection_and_its_manifest_tell_it(smoke_root: Path) -> None:
     assert selection.as_dict()["label_noise_deg"] == pytest.approx(noise)
     figures = manifest_of(selection, "told").cross_validation
     assert figures.label_noise_deg == pytest.approx(noise)
-    assert beyond_noise_deg(figures.rmse_deg, noise) < figures.rmse_deg
-    assert beyond_noise_deg(0.02, noise) == 0
+    assert math.hypot(figures.beyond_label_noise_deg, noise) == pytest.approx(figures.rmse_deg)
+    assert selection.beyond_label_noise_deg == figures.beyond_label_noise_deg
 
 
 def test_nobody_knows_the_noise_of_a_campaign_that_is_not_there(
@@ -44,6 +44,6 @@ def test_nobody_knows_the_noise_of_a_campaign_that_is_not_there(
 ) -> None:
     root = tmp_path / "data"
     shutil.copytree(smoke_root, root)
-    monkeypatch.setattr(campaign, "find_config", lambda *_: tmp_path / "none.toml")
+    monkeypatch.setattr(label_noise, "find_config", lambda *_: tmp_path / "none.toml")
     warehouse = Warehouse(LocalFolder(root))
     assert label_noise_deg(warehouse, load_cohort(warehouse)) is None

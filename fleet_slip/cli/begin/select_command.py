@@ -34,7 +34,6 @@ from fleet_slip.regression.choice.nested_choice import CROSS_VALIDATION, NestedD
 from fleet_slip.regression.inference.evidence import Evidence
 from fleet_slip.regression.validation.crossval import CrossValidation
 from fleet_slip.selection.answer_request import answer_request
-from fleet_slip.selection.label_noise import beyond_noise_deg
 from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.selection.search import SearchChoice
 from fleet_slip.selection.select_models import RequestedSelection, Selection
@@ -175,13 +174,13 @@ def _say_label_noise(selection: RequestedSelection) -> None:
     """Say how much of the errors is noise of the label they are measured against."""
     if selection.without_label is not None or isinstance(selection.cohort, TaughtCohort):
         return
-    noise, rmse = selection.label_noise_deg, selection.winner.model.pooled.rmse_deg
+    noise = selection.label_noise_deg
     if noise is None:
         say("how noisy the label is, is not known: all errors have its noise in them.")
     else:
         say(
             f"all errors have the label's own noise in them, {noise:.4f} deg; without it the "
-            f"winner has {beyond_noise_deg(rmse, noise):.4f} deg."
+            f"winner has {selection.beyond_label_noise_deg:.4f} deg."
         )
 
 

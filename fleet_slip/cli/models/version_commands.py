@@ -18,7 +18,6 @@ from fleet_slip.export.costs import costs_content, describe_costs
 from fleet_slip.models.aliases import CHAMPION
 from fleet_slip.models.manifest import CrossValidated, LearnedFrom, ModelTerm
 from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.selection.label_noise import beyond_noise_deg
 from fleet_slip.words import number_of
 
 Reference = Annotated[
@@ -229,11 +228,10 @@ def _facts(version: ModelVersion) -> dict[str, str]:
 
 def _label_noise(figures: CrossValidated) -> str:
     """Return how much of the RMSE is noise of the label."""
-    noise = figures.label_noise_deg
-    if noise is None:
+    if figures.label_noise_deg is None:
         return "not known, and part of the RMSE"
-    left = beyond_noise_deg(figures.rmse_deg, noise)
-    return f"{noise:.4f} deg, without which the RMSE is {left:.4f} deg"
+    left = figures.beyond_label_noise_deg
+    return f"{figures.label_noise_deg:.4f} deg, without which the RMSE is {left:.4f} deg"
 
 
 @record_run
